@@ -1,0 +1,1 @@
+"""The daemon of a node: registration, telemetry, grants."""

@@ -1,0 +1,93 @@
+"""Positions, areas and altitude bands as manifests spell them (WGS 84 degrees, metres)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import ConfigDict, Field, model_validator
+
+from fractus_core.api.model import InvalidObject, Model, rules
+
+Latitude = Annotated[float, Field(ge=-90, le=90, description="Degrees north, WGS 84, -90 to 90.")]
+Longitude = Annotated[float, Field(ge=-180, le=180, description="Degrees east, WGS 84, -180 to 180.")]
+Reference = Literal["home", "amsl", "terrain"]
+
+
+class Point(Model):
+    """A place on the ground."""
+
+    lat: Latitude
+    lon: Longitude
+
+
+class Position(Point):
+    """A place in the air."""
+
+    alt: float | None = Field(
+        default=None,
+        ge=-1000,
+        le=20000,
+        description="Metres in the datum of altitudeReference; unset keeps the current altitude.",
+    )
+    altitude_reference: Reference = Field(
+        default="home", description="What alt is measured from: the drone's home, mean sea level, or the terrain below."
+    )
+
+
+class Circle(Model):
+    """A disc on the ground."""
+
+    center: Point
+    radius: float = Field(gt=0, le=200_000, description="Metres, above 0.")
+
+
+Ring = Annotated[tuple[Point, ...], Field(min_length=3, max_length=1000)]
+
+
+class Polygon(Model):
+    """A polygon with holes; rings close by themselves and must not cross themselves.
+
+    A ring follows the shorter way between neighbours, so it may cross the antimeridian.
+    """
+
+    exterior: Ring = Field(description="The outer ring, three points or more, in order, not closed.")
+    holes: tuple[Ring, ...] = Field(default=(), max_length=100, description="Rings cut out of the exterior.")
+
+
+class Area(Model):
+    """A piece of ground: either a polygon or a circle."""
+
+    model_config = ConfigDict(
+        json_schema_extra=rules(
+            ("has(self.polygon) != has(self.circle)", "give either polygon or circle, and only one of them")
+        )
+    )
+
+    polygon: Polygon | None = None
+    circle: Circle | None = None
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> Self:
+        if (self.polygon is None) == (self.circle is None):
+            raise InvalidObject("", "give either polygon or circle, and only one of them")
+        return self
+
+
+class AltitudeBand(Model):
+    """A slab of air between two altitudes."""
+
+    model_config = ConfigDict(
+        json_schema_extra=rules(
+            ("!has(self.lower) || !has(self.upper) || self.lower < self.upper", "lower must be below upper")
+        )
+    )
+
+    lower: float | None = Field(default=None, ge=-1000, le=20000, description="Metres; unset reaches to the ground.")
+    upper: float | None = Field(default=None, ge=-1000, le=20000, description="Metres; unset has no ceiling.")
+    reference: Reference = Field(default="home", description="What lower and upper are measured from.")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.lower is not None and self.upper is not None and self.lower >= self.upper:
+            raise InvalidObject("lower", f"must be below upper ({self.lower} is not below {self.upper})")
+        return self

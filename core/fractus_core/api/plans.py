@@ -1,0 +1,202 @@
+"""DeploymentPlan and Grant: what the operator decided, and what a node needs to enforce it offline."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field, WithJsonSchema
+
+from fractus_core.api.applications import ControlPoint, Placement, PointsOfInterest, ServiceRequest
+from fractus_core.api.geometry import AltitudeBand, Area, Point, Position
+from fractus_core.api.model import Condition, Model, OpenModel, Resource
+from fractus_core.api.policies import PolicySpec
+
+Role = Literal["drone", "static", "hybrid-edge", "hybrid-drone", "cloud"]
+GeoJson = Annotated[dict[str, Any], WithJsonSchema({"type": "object", "x-kubernetes-preserve-unknown-fields": True})]
+
+
+class Alternative(Model):
+    """A drone that could fly the application, with what ranks it."""
+
+    node: str
+    score: float = Field(description="Higher is better; comparable within one plan only.")
+
+
+class DroneChoice(Model):
+    """The drone that flies, and the runners-up in order."""
+
+    node: str
+    alternatives: tuple[Alternative, ...] = ()
+
+
+class Serves(Model):
+    """Which instance a hybrid instance is near to."""
+
+    component: str
+    node: str
+
+
+class PlannedInstance(Model):
+    """One instance of a component on a node."""
+
+    component: str
+    instance: str = Field(description="Name of the instance, unique in the namespace; pods and grants carry it.")
+    node: str | None = Field(description="Name of the node; null: any cloud node.", default=None)
+    placement: Placement
+    role: Role
+    replicas: int = Field(default=1, ge=1)
+    serves: Serves | None = None
+    coverage: float | None = Field(default=None, ge=0, le=1, description="Share of the operation area it adds.")
+
+
+class Rejection(Model):
+    """A node that was considered for a component and dropped."""
+
+    component: str
+    node: str
+    reason: str = Field(description="CamelCase, for programs.")
+    message: str = Field(description="One sentence for people.")
+
+
+class DeploymentPlanSpec(Model):
+    """What was decided and why."""
+
+    application: str
+    application_generation: int | None = None
+    operation_area: GeoJson | None = Field(default=None, description="GeoJSON (lon, lat) MultiPolygon.")
+    drone: DroneChoice | None = None
+    placements: tuple[PlannedInstance, ...] = ()
+    rejected: tuple[Rejection, ...] = ()
+
+
+class DeploymentPlan(Resource):
+    """The plan of an application: areas, placements, scores, rejected nodes with reasons."""
+
+    KIND: ClassVar[str] = "DeploymentPlan"
+    PLURAL: ClassVar[str] = "deploymentplans"
+    SHORT: ClassVar[str] = "fplan"
+    NAMESPACED: ClassVar[bool] = True
+    COLUMNS = (
+        ("Application", "string", ".spec.application"),
+        ("Drone", "string", ".spec.drone.node"),
+        ("Age", "date", ".metadata.creationTimestamp"),
+    )
+
+    kind: Literal["DeploymentPlan"] = "DeploymentPlan"
+    spec: DeploymentPlanSpec
+
+
+class GrantedZone(Model):
+    """A zone of a granted policy, with its geometry, so that the node needs nothing else."""
+
+    name: str
+    area: Area
+    altitude: AltitudeBand | None = None
+
+
+class GrantedPolicy(Model):
+    """A policy that holds for the instance, with its zones resolved."""
+
+    name: str
+    spec: PolicySpec
+    zones: tuple[GrantedZone, ...] = Field(default=(), description="Empty: everywhere.")
+
+
+class GrantApplication(Model):
+    """Whose grant it is."""
+
+    namespace: str
+    name: str
+    uid: str
+
+
+class GrantedLimits(Model):
+    """What the airframe can do."""
+
+    max_altitude: float = Field(gt=0, description="Metres above home.")
+    max_speed: float = Field(gt=0, description="Metres per second.")
+
+
+class GrantSpec(Model):
+    """The policy configuration of one component instance on one node."""
+
+    node: str
+    application: GrantApplication
+    component: str
+    instance: str
+    class_: Literal["driver", "passenger"] | None = Field(default=None, alias="class")
+    control: Literal["full", "partial"] | None = None
+    control_points: tuple[ControlPoint, ...] = ()
+    points_of_interest: PointsOfInterest | None = None
+    services: tuple[ServiceRequest, ...] = ()
+    operation_area: tuple[Area, ...] = Field(
+        default=(), description="Where services may be used; empty: anywhere (for fixed nodes)."
+    )
+    corridor: tuple[Area, ...] = Field(
+        default=(), description="Where the drone may be to get from its depot to the operation area and back."
+    )
+    depot: Point | None = None
+    home: Position | None = None
+    limits: GrantedLimits | None = None
+    policies: tuple[GrantedPolicy, ...] = ()
+    issued_at: datetime | None = None
+
+    @property
+    def identity(self) -> str:
+        """The SPIFFE id of the instance that the grant is for."""
+        return component_identity(self.application.namespace, self.application.name, self.component, self.instance)
+
+    def methods(self, service: str) -> frozenset[str]:
+        """The methods granted on a service; a driver may always get and return control."""
+        granted = {m for s in self.services if s.service == service for m in s.methods}
+        if service == "mobility" and self.class_ == "driver":
+            granted |= {"GetControl", "ReturnControl"}
+        return frozenset(granted)
+
+
+TRUST_DOMAIN = "fractus.dev"
+
+
+def component_identity(namespace: str, application: str, component: str, instance: str) -> str:
+    """SPIFFE id of a component instance."""
+    return f"spiffe://{TRUST_DOMAIN}/ns/{namespace}/app/{application}/component/{component}/instance/{instance}"
+
+
+def node_identity(node: str) -> str:
+    """SPIFFE id of a node's agent and system services."""
+    return f"spiffe://{TRUST_DOMAIN}/node/{node}"
+
+
+def node_server_name(node: str) -> str:
+    """DNS name in the certificate of a node's services; clients check it whatever address they dial."""
+    return f"{node}.node.{TRUST_DOMAIN}"
+
+
+class GrantStatus(OpenModel):
+    """What became of the grant on its node."""
+
+    phase: Literal["Pending", "Active", "Complete", "Revoked", "Failed"] | None = None
+    message: str | None = None
+    observed_generation: int | None = None
+    conditions: tuple[Condition, ...] = ()
+
+
+class Grant(Resource):
+    """The policy configuration of one component instance on one node."""
+
+    KIND: ClassVar[str] = "Grant"
+    PLURAL: ClassVar[str] = "grants"
+    SHORT: ClassVar[str] = "fgr"
+    SELECTABLE = (".spec.node",)
+    COLUMNS = (
+        ("Node", "string", ".spec.node"),
+        ("Application", "string", ".spec.application.name"),
+        ("Component", "string", ".spec.component"),
+        ("Phase", "string", ".status.phase"),
+        ("Age", "date", ".metadata.creationTimestamp"),
+    )
+
+    kind: Literal["Grant"] = "Grant"
+    spec: GrantSpec
+    status: GrantStatus | None = None

@@ -1,0 +1,1 @@
+"""Frames, distances and areas."""

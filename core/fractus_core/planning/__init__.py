@@ -1,0 +1,1 @@
+"""From an application and an inventory to a plan that explains itself."""

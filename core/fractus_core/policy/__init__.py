@@ -1,0 +1,1 @@
+"""Policies and plan to Grant; call, situation and Grant to Verdict."""

@@ -1,0 +1,209 @@
+import datetime
+
+from fractus_proto.v1 import types_pb2 as _types_pb2
+from google.protobuf import timestamp_pb2 as _timestamp_pb2
+from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class GetControlRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class ControlEvent(_message.Message):
+    __slots__ = ("state", "control_point", "reason", "waypoints_reached")
+    class State(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+        __slots__ = ()
+        STATE_UNSPECIFIED: _ClassVar[ControlEvent.State]
+        STATE_WAITING: _ClassVar[ControlEvent.State]
+        STATE_GRANTED: _ClassVar[ControlEvent.State]
+        STATE_LOST: _ClassVar[ControlEvent.State]
+        STATE_COMPLETE: _ClassVar[ControlEvent.State]
+    STATE_UNSPECIFIED: ControlEvent.State
+    STATE_WAITING: ControlEvent.State
+    STATE_GRANTED: ControlEvent.State
+    STATE_LOST: ControlEvent.State
+    STATE_COMPLETE: ControlEvent.State
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    CONTROL_POINT_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    WAYPOINTS_REACHED_FIELD_NUMBER: _ClassVar[int]
+    state: ControlEvent.State
+    control_point: int
+    reason: str
+    waypoints_reached: int
+    def __init__(self, state: _Optional[_Union[ControlEvent.State, str]] = ..., control_point: _Optional[int] = ..., reason: _Optional[str] = ..., waypoints_reached: _Optional[int] = ...) -> None: ...
+
+class ReturnControlRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class ReturnControlResponse(_message.Message):
+    __slots__ = ("mission_complete",)
+    MISSION_COMPLETE_FIELD_NUMBER: _ClassVar[int]
+    mission_complete: bool
+    def __init__(self, mission_complete: bool = ...) -> None: ...
+
+class ArmRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class ArmResponse(_message.Message):
+    __slots__ = ("decision",)
+    DECISION_FIELD_NUMBER: _ClassVar[int]
+    decision: _types_pb2.Decision
+    def __init__(self, decision: _Optional[_Union[_types_pb2.Decision, _Mapping]] = ...) -> None: ...
+
+class DisarmRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class DisarmResponse(_message.Message):
+    __slots__ = ("decision",)
+    DECISION_FIELD_NUMBER: _ClassVar[int]
+    decision: _types_pb2.Decision
+    def __init__(self, decision: _Optional[_Union[_types_pb2.Decision, _Mapping]] = ...) -> None: ...
+
+class TakeoffRequest(_message.Message):
+    __slots__ = ("altitude_m",)
+    ALTITUDE_M_FIELD_NUMBER: _ClassVar[int]
+    altitude_m: float
+    def __init__(self, altitude_m: _Optional[float] = ...) -> None: ...
+
+class LandRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class GotoRequest(_message.Message):
+    __slots__ = ("target", "yaw_deg", "acceptance_radius_m")
+    TARGET_FIELD_NUMBER: _ClassVar[int]
+    YAW_DEG_FIELD_NUMBER: _ClassVar[int]
+    ACCEPTANCE_RADIUS_M_FIELD_NUMBER: _ClassVar[int]
+    target: _types_pb2.Position
+    yaw_deg: float
+    acceptance_radius_m: float
+    def __init__(self, target: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., yaw_deg: _Optional[float] = ..., acceptance_radius_m: _Optional[float] = ...) -> None: ...
+
+class ReturnToLaunchRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class MotionProgress(_message.Message):
+    __slots__ = ("decision", "target", "position", "distance_m", "complete")
+    DECISION_FIELD_NUMBER: _ClassVar[int]
+    TARGET_FIELD_NUMBER: _ClassVar[int]
+    POSITION_FIELD_NUMBER: _ClassVar[int]
+    DISTANCE_M_FIELD_NUMBER: _ClassVar[int]
+    COMPLETE_FIELD_NUMBER: _ClassVar[int]
+    decision: _types_pb2.Decision
+    target: _types_pb2.Position
+    position: _types_pb2.Position
+    distance_m: float
+    complete: bool
+    def __init__(self, decision: _Optional[_Union[_types_pb2.Decision, _Mapping]] = ..., target: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., position: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., distance_m: _Optional[float] = ..., complete: bool = ...) -> None: ...
+
+class HoverRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class HoverResponse(_message.Message):
+    __slots__ = ("decision",)
+    DECISION_FIELD_NUMBER: _ClassVar[int]
+    decision: _types_pb2.Decision
+    def __init__(self, decision: _Optional[_Union[_types_pb2.Decision, _Mapping]] = ...) -> None: ...
+
+class SetSpeedRequest(_message.Message):
+    __slots__ = ("speed_mps",)
+    SPEED_MPS_FIELD_NUMBER: _ClassVar[int]
+    speed_mps: float
+    def __init__(self, speed_mps: _Optional[float] = ...) -> None: ...
+
+class SetSpeedResponse(_message.Message):
+    __slots__ = ("decision", "speed_mps")
+    DECISION_FIELD_NUMBER: _ClassVar[int]
+    SPEED_MPS_FIELD_NUMBER: _ClassVar[int]
+    decision: _types_pb2.Decision
+    speed_mps: float
+    def __init__(self, decision: _Optional[_Union[_types_pb2.Decision, _Mapping]] = ..., speed_mps: _Optional[float] = ...) -> None: ...
+
+class GetSpeedRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class GetSpeedResponse(_message.Message):
+    __slots__ = ("decision", "speed_mps")
+    DECISION_FIELD_NUMBER: _ClassVar[int]
+    SPEED_MPS_FIELD_NUMBER: _ClassVar[int]
+    decision: _types_pb2.Decision
+    speed_mps: float
+    def __init__(self, decision: _Optional[_Union[_types_pb2.Decision, _Mapping]] = ..., speed_mps: _Optional[float] = ...) -> None: ...
+
+class GetPositionRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class GetPositionResponse(_message.Message):
+    __slots__ = ("decision", "position", "velocity")
+    DECISION_FIELD_NUMBER: _ClassVar[int]
+    POSITION_FIELD_NUMBER: _ClassVar[int]
+    VELOCITY_FIELD_NUMBER: _ClassVar[int]
+    decision: _types_pb2.Decision
+    position: _types_pb2.Position
+    velocity: _types_pb2.Velocity
+    def __init__(self, decision: _Optional[_Union[_types_pb2.Decision, _Mapping]] = ..., position: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., velocity: _Optional[_Union[_types_pb2.Velocity, _Mapping]] = ...) -> None: ...
+
+class SubscribeTelemetryRequest(_message.Message):
+    __slots__ = ("interval_s",)
+    INTERVAL_S_FIELD_NUMBER: _ClassVar[int]
+    interval_s: float
+    def __init__(self, interval_s: _Optional[float] = ...) -> None: ...
+
+class Telemetry(_message.Message):
+    __slots__ = ("time", "position", "altitude_amsl_m", "velocity", "yaw_deg", "battery_remaining", "battery_voltage_v", "battery_current_a", "armed", "in_air", "mode", "ready", "home", "flight_state", "controller", "autopilot_connected", "missions")
+    class MissionsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: str
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
+    TIME_FIELD_NUMBER: _ClassVar[int]
+    POSITION_FIELD_NUMBER: _ClassVar[int]
+    ALTITUDE_AMSL_M_FIELD_NUMBER: _ClassVar[int]
+    VELOCITY_FIELD_NUMBER: _ClassVar[int]
+    YAW_DEG_FIELD_NUMBER: _ClassVar[int]
+    BATTERY_REMAINING_FIELD_NUMBER: _ClassVar[int]
+    BATTERY_VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
+    BATTERY_CURRENT_A_FIELD_NUMBER: _ClassVar[int]
+    ARMED_FIELD_NUMBER: _ClassVar[int]
+    IN_AIR_FIELD_NUMBER: _ClassVar[int]
+    MODE_FIELD_NUMBER: _ClassVar[int]
+    READY_FIELD_NUMBER: _ClassVar[int]
+    HOME_FIELD_NUMBER: _ClassVar[int]
+    FLIGHT_STATE_FIELD_NUMBER: _ClassVar[int]
+    CONTROLLER_FIELD_NUMBER: _ClassVar[int]
+    AUTOPILOT_CONNECTED_FIELD_NUMBER: _ClassVar[int]
+    MISSIONS_FIELD_NUMBER: _ClassVar[int]
+    time: _timestamp_pb2.Timestamp
+    position: _types_pb2.Position
+    altitude_amsl_m: float
+    velocity: _types_pb2.Velocity
+    yaw_deg: float
+    battery_remaining: float
+    battery_voltage_v: float
+    battery_current_a: float
+    armed: bool
+    in_air: bool
+    mode: str
+    ready: bool
+    home: _types_pb2.Position
+    flight_state: str
+    controller: str
+    autopilot_connected: bool
+    missions: _containers.ScalarMap[str, str]
+    def __init__(self, time: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., position: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., altitude_amsl_m: _Optional[float] = ..., velocity: _Optional[_Union[_types_pb2.Velocity, _Mapping]] = ..., yaw_deg: _Optional[float] = ..., battery_remaining: _Optional[float] = ..., battery_voltage_v: _Optional[float] = ..., battery_current_a: _Optional[float] = ..., armed: bool = ..., in_air: bool = ..., mode: _Optional[str] = ..., ready: bool = ..., home: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., flight_state: _Optional[str] = ..., controller: _Optional[str] = ..., autopilot_connected: bool = ..., missions: _Optional[_Mapping[str, str]] = ...) -> None: ...

@@ -1,0 +1,1 @@
+"""System services of a node and what they share."""

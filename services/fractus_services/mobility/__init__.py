@@ -1,0 +1,1 @@
+"""The mobility service: policy-checked motion of one drone."""

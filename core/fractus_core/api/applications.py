@@ -216,8 +216,9 @@ class Component(Model):
     name: ComponentName
     placement: Placement
     class_: Literal["driver", "passenger"] | None = Field(default=None, alias="class")
-    control: Literal["full", "partial"] = Field(
-        default="full", description="For a driver: control from arming to landing, or only at its control points."
+    control: Literal["full", "partial"] | None = Field(
+        default=None,
+        description="For a driver: control from arming to landing (full, the default), or only at its control points.",
     )
     control_points: tuple[ControlPoint, ...] = Field(default=(), max_length=100)
     points_of_interest: PointsOfInterest | None = None

@@ -1,0 +1,156 @@
+"""The CRD generator: `python -m fractus_core.api.crd DIR` writes one manifest a kind.
+
+Kubernetes wants structural schemas (inline, typed, no $ref, no null), pydantic writes JSON Schema 2020-12; this module
+maps the one to the other and refuses what it does not understand, so that nothing is lost in silence.
+"""
+
+from __future__ import annotations
+
+import pathlib
+import sys
+from typing import Any
+
+import yaml
+
+from fractus_core.api import KINDS
+from fractus_core.api.model import GROUP, VERSION, Resource
+
+Schema = dict[str, Any]
+
+_KEPT = {
+    "type", "description", "enum", "minimum", "maximum", "exclusiveMinimum", "exclusiveMaximum", "minLength",
+    "maxLength", "pattern", "minItems", "maxItems", "minProperties", "maxProperties", "required", "format", "default",
+    "x-kubernetes-validations", "x-kubernetes-list-type", "x-kubernetes-list-map-keys",
+    "x-kubernetes-preserve-unknown-fields", "x-kubernetes-int-or-string",
+}  # fmt: skip
+_DROPPED = {"title", "additionalProperties", "properties", "items", "anyOf", "$ref", "const", "$defs", "examples"}
+
+
+def crd(kind: type[Resource]) -> Schema:
+    """The CustomResourceDefinition of a kind."""
+    schema = kind.model_json_schema(by_alias=True, mode="validation")
+    definitions = schema.get("$defs", {})
+    properties = {
+        "apiVersion": {"type": "string"},
+        "kind": {"type": "string"},
+        "metadata": {"type": "object"},
+    }
+    for name in ("spec", "status"):
+        if name in schema["properties"]:
+            properties[name] = structural(schema["properties"][name], definitions, f"{kind.KIND}.{name}")
+    version: Schema = {
+        "name": VERSION,
+        "served": True,
+        "storage": True,
+        "schema": {
+            "openAPIV3Schema": {
+                "type": "object",
+                "description": (kind.__doc__ or "").strip(),
+                "properties": properties,
+                "required": ["spec"],
+            }
+        },
+        "additionalPrinterColumns": [
+            {"name": title, "type": type_, "jsonPath": path} for title, type_, path in kind.COLUMNS
+        ],
+    }
+    if "status" in properties:
+        version["subresources"] = {"status": {}}
+    if kind.SELECTABLE:
+        version["selectableFields"] = [{"jsonPath": path} for path in kind.SELECTABLE]
+    return {
+        "apiVersion": "apiextensions.k8s.io/v1",
+        "kind": "CustomResourceDefinition",
+        "metadata": {"name": f"{kind.PLURAL}.{GROUP}"},
+        "spec": {
+            "group": GROUP,
+            "scope": "Namespaced" if kind.NAMESPACED else "Cluster",
+            "names": {
+                "kind": kind.KIND,
+                "listKind": f"{kind.KIND}List",
+                "plural": kind.PLURAL,
+                "singular": kind.KIND.lower(),
+                "shortNames": [kind.SHORT],
+                "categories": ["fractus"],
+            },
+            "versions": [version],
+        },
+    }
+
+
+def structural(schema: Schema, definitions: dict[str, Schema], path: str) -> Schema:
+    """A JSON Schema as a Kubernetes structural schema.
+
+    Raises:
+        ValueError: it uses a keyword that has no structural form.
+    """
+    merged = _resolved(schema, definitions)
+    unknown = set(merged) - _KEPT - _DROPPED
+    if unknown:
+        raise ValueError(f"{path}: no structural form for {', '.join(sorted(unknown))}")
+    out: Schema = {k: v for k, v in merged.items() if k in _KEPT}
+    if "const" in merged:
+        out["enum"] = [merged["const"]]
+    if "anyOf" in merged:
+        out.update(_union(merged["anyOf"], definitions, path))
+    if "properties" in merged:
+        out["properties"] = {
+            name: structural(value, definitions, f"{path}.{name}") for name, value in merged["properties"].items()
+        }
+    elif isinstance(merged.get("additionalProperties"), dict):
+        out["additionalProperties"] = structural(merged["additionalProperties"], definitions, f"{path}.*")
+    if "items" in merged:
+        out["items"] = structural(merged["items"], definitions, f"{path}[]")
+    for bound in ("Minimum", "Maximum"):
+        exclusive = out.pop(f"exclusive{bound}", None)
+        if exclusive is not None:
+            out[bound.lower()] = exclusive
+            out[f"exclusive{bound}"] = True
+    default = out.get("default")
+    if default is None or default in ([], {}, ""):
+        out.pop("default", None)
+    return out
+
+
+def _resolved(schema: Schema, definitions: dict[str, Schema]) -> Schema:
+    """The schema with its reference and its nullable wrapper unfolded; outer keywords win."""
+    merged = dict(schema)
+    while True:
+        if "$ref" in merged:
+            name = merged.pop("$ref").rsplit("/", 1)[1]
+            merged = {**definitions[name], **merged}
+            continue
+        options = [o for o in merged.get("anyOf", ()) if o.get("type") != "null"]
+        if len(options) == 1:
+            del merged["anyOf"]
+            merged = {**options[0], **merged}
+            continue
+        return merged
+
+
+def _union(options: list[Schema], definitions: dict[str, Schema], path: str) -> Schema:
+    kinds = sorted(_resolved(o, definitions).get("type", "") for o in options if o.get("type") != "null")
+    if kinds == ["integer", "string"]:
+        return {"x-kubernetes-int-or-string": True, "anyOf": [{"type": "integer"}, {"type": "string"}]}
+    raise ValueError(f"{path}: a union of {kinds} has no structural form")
+
+
+class _Plain(yaml.SafeDumper):
+    """YAML without anchors: shared lists are written out where they are used."""
+
+    def ignore_aliases(self, data: object) -> bool:
+        """Say that nothing is shared."""
+        return True
+
+
+def write(directory: pathlib.Path) -> None:
+    """Write crds/<plural>.yaml for every kind."""
+    directory.mkdir(parents=True, exist_ok=True)
+    for kind in KINDS:
+        text = "# Generated from the models in core/fractus_core/api; change those, then run `make generate`.\n"
+        text += yaml.dump(crd(kind), Dumper=_Plain, sort_keys=False, width=120)
+        (directory / f"{kind.PLURAL}.yaml").write_text(text)
+
+
+if __name__ == "__main__":
+    write(pathlib.Path(sys.argv[1]))

@@ -1,0 +1,157 @@
+"""Areas of manifests as shapely geometries in a local frame, and back as GeoJSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from fractus_core.api.geometry import Area, Circle, Point, Polygon, Position
+from fractus_core.api.model import InvalidObject
+from fractus_core.geo.frames import LocalFrame
+
+CIRCLE_SEGMENTS = 32
+"""Straight pieces per quarter of a circle."""
+
+
+def points_xy(frame: LocalFrame, points: Iterable[Point]) -> list[tuple[float, float]]:
+    """Metres east and north of each point."""
+    return [frame.xy(p.lat, p.lon) for p in points]
+
+
+def polygon(frame: LocalFrame, area: Area) -> shapely.Polygon:
+    """The area in metres east and north of the frame's origin; a circle is circumscribed, never cut short.
+
+    Raises:
+        InvalidObject: a ring crosses itself, encloses nothing, or a hole leaves the exterior.
+    """
+    if area.circle is not None:
+        return _circle(frame, area.circle)
+    if area.polygon is None:
+        raise InvalidObject("", "give either polygon or circle")
+    return _polygon(frame, area.polygon)
+
+
+def _circle(frame: LocalFrame, circle: Circle) -> shapely.Polygon:
+    x, y = frame.xy(circle.center.lat, circle.center.lon)
+    circumscribed = circle.radius / math.cos(math.pi / (4 * CIRCLE_SEGMENTS))
+    return shapely.Point(x, y).buffer(circumscribed, quad_segs=CIRCLE_SEGMENTS)
+
+
+def _polygon(frame: LocalFrame, spec: Polygon) -> shapely.Polygon:
+    exterior = _ring(frame, spec.exterior, "polygon.exterior")
+    holes = []
+    for i, hole in enumerate(spec.holes):
+        ring = _ring(frame, hole, f"polygon.holes[{i}]")
+        if not exterior.covers(ring):
+            raise InvalidObject(f"polygon.holes[{i}]", "the hole must lie inside the exterior")
+        holes.append(ring.exterior.coords)
+    whole = shapely.Polygon(exterior.exterior.coords, holes)
+    if not whole.is_valid:
+        raise InvalidObject("polygon.holes", f"holes must not cross each other ({shapely.is_valid_reason(whole)})")
+    return whole
+
+
+def _ring(frame: LocalFrame, ring: Sequence[Point], field: str) -> shapely.Polygon:
+    shape = shapely.Polygon(points_xy(frame, ring))
+    if not shape.is_valid:
+        at = shapely.is_valid_reason(shape)
+        where = ""
+        if "[" in at:
+            x, y = (float(v) for v in at[at.index("[") + 1 : at.index("]")].split()[:2])
+            lat, lon = frame.latlon(x, y)
+            where = f" near lat {lat:.6f}, lon {lon:.6f}"
+        raise InvalidObject(field, f"the ring crosses itself{where}; list the points in order around the area")
+    if shape.area < 1e-6:
+        raise InvalidObject(field, "the ring encloses no area; give at least three points that are not in line")
+    return shape
+
+
+def corridor(frame: LocalFrame, points: Iterable[Point], radius_m: float) -> BaseGeometry:
+    """A path dilated by a radius, in metres; the boundary is circumscribed."""
+    xy = points_xy(frame, points)
+    line: BaseGeometry = shapely.Point(xy[0]) if len(set(xy)) == 1 else shapely.LineString(xy)
+    return line.buffer(radius_m / math.cos(math.pi / (4 * CIRCLE_SEGMENTS)), quad_segs=CIRCLE_SEGMENTS)
+
+
+def middle(area: Area) -> Point:
+    """A point that serves as the origin of a frame for the area."""
+    if area.circle is not None:
+        return area.circle.center
+    if area.polygon is None:
+        raise InvalidObject("", "give either polygon or circle")
+    return middle_of(area.polygon.exterior)
+
+
+def middle_of(points: Iterable[Point]) -> Point:
+    """The middle of points on the sphere; it is right across the antimeridian and near the poles."""
+    rad = np.radians([(p.lat, p.lon) for p in points])
+    lat, lon = rad[:, 0], rad[:, 1]
+    vector = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]).mean(axis=1)
+    if np.linalg.norm(vector) < 1e-9:
+        return Point(lat=float(np.degrees(lat[0])), lon=float(np.degrees(lon[0])))
+    return Point(
+        lat=float(np.degrees(np.arctan2(vector[2], np.hypot(vector[0], vector[1])))),
+        lon=float(np.degrees(np.arctan2(vector[1], vector[0]))),
+    )
+
+
+def area_of(frame: LocalFrame, shape: BaseGeometry) -> tuple[Area, ...]:
+    """A (multi)polygon in metres as areas of the API."""
+    return tuple(
+        Area(
+            polygon=Polygon(
+                exterior=tuple(_point(frame, x, y) for x, y in part.exterior.coords[:-1]),
+                holes=tuple(tuple(_point(frame, x, y) for x, y in hole.coords[:-1]) for hole in part.interiors),
+            )
+        )
+        for part in shapely.get_parts(shape)
+        if isinstance(part, shapely.Polygon) and not part.is_empty
+    )
+
+
+def geojson(frame: LocalFrame, shape: BaseGeometry) -> dict[str, Any]:
+    """A (multi)polygon in metres as a GeoJSON MultiPolygon, lon before lat, split at the antimeridian (RFC 7946)."""
+    polygons = []
+    for part in shapely.get_parts(shape):
+        rings = [_unwrapped(frame, part.exterior.coords)] + [_unwrapped(frame, hole.coords) for hole in part.interiors]
+        reference = rings[0][0][0]
+        rings = [[(_near(lon, reference), lat) for lon, lat in ring] for ring in rings]
+        whole = shapely.Polygon(rings[0], rings[1:])
+        for shift in (0.0, 360.0, -360.0):
+            window = shapely.box(-180.0, -90.0, 180.0, 90.0)
+            moved = shapely.transform(whole, lambda c, s=shift: c + np.array([s, 0.0]))
+            inside = moved.intersection(window)
+            polygons += [p for p in shapely.get_parts(inside) if isinstance(p, shapely.Polygon) and p.area > 0]
+    coordinates = [
+        [[[round(x, 7), round(y, 7)] for x, y in ring.coords] for ring in (p.exterior, *p.interiors)]
+        for p in (shapely.orient_polygons(q) for q in polygons)
+    ]
+    return {"type": "MultiPolygon", "coordinates": coordinates}
+
+
+def _unwrapped(frame: LocalFrame, coords: Iterable[tuple[float, ...]]) -> list[tuple[float, float]]:
+    """Lon, lat of a ring, each longitude within 180 degrees of its neighbour."""
+    out: list[tuple[float, float]] = []
+    for c in coords:
+        lat, lon = frame.latlon(c[0], c[1])
+        out.append((_near(lon, out[-1][0]) if out else lon, lat))
+    return out
+
+
+def _near(lon: float, reference: float) -> float:
+    return lon + 360.0 * round((reference - lon) / 360.0)
+
+
+def _point(frame: LocalFrame, x: float, y: float) -> Point:
+    lat, lon = frame.latlon(x, y)
+    return Point(lat=round(lat, 9), lon=round(lon, 9))
+
+
+def ground(position: Position) -> Point:
+    """The place on the ground below a position."""
+    return Point(lat=position.lat, lon=position.lon)

@@ -1,0 +1,122 @@
+"""Local metric frames on the WGS 84 ellipsoid, and geodesic distances."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from geographiclib.geodesic import Geodesic
+from numpy.typing import NDArray
+
+from fractus_core.api.geometry import Point
+
+SEMI_MAJOR_AXIS_M = 6_378_137.0
+FLATTENING = 1 / 298.257223563
+_E2 = FLATTENING * (2 - FLATTENING)
+_MAX_ITERATIONS = 12
+
+Coordinates = NDArray[np.float64]
+
+
+def geodesic_m(a: Point, b: Point) -> float:
+    """Length in metres of the shortest line between two points on the WGS 84 ellipsoid.
+
+    Source: C. F. F. Karney, "Algorithms for geodesics", J. Geodesy 87 (2013).
+    """
+    return float(Geodesic.WGS84.Inverse(a.lat, a.lon, b.lat, b.lon, Geodesic.DISTANCE)["s12"])
+
+
+class LocalFrame:
+    """Orthographic projection of the WGS 84 ellipsoid around an origin: metres east and north.
+
+    Planar distances fall short of geodesic ones by a factor of about (s/R)^2/6 at a distance s from the origin:
+    1e-5 at 50 km, nothing that matters within a flight. Neither the antimeridian nor the poles are special.
+    Points beyond the horizon (a quarter of the globe away) have no meaning in it.
+    """
+
+    __slots__ = ("_cos_lat", "_cos_lon", "_origin", "_sin_lat", "_sin_lon", "lat", "lon")
+
+    def __init__(self, lat: float, lon: float) -> None:
+        self.lat = lat
+        self.lon = lon
+        phi, lam = math.radians(lat), math.radians(lon)
+        self._sin_lat, self._cos_lat = math.sin(phi), math.cos(phi)
+        self._sin_lon, self._cos_lon = math.sin(lam), math.cos(lam)
+        n = SEMI_MAJOR_AXIS_M / math.sqrt(1 - _E2 * self._sin_lat**2)
+        self._origin = (
+            n * self._cos_lat * self._cos_lon,
+            n * self._cos_lat * self._sin_lon,
+            n * (1 - _E2) * self._sin_lat,
+        )
+
+    @classmethod
+    def at(cls, point: Point) -> LocalFrame:
+        """The frame whose origin is a point."""
+        return cls(point.lat, point.lon)
+
+    def xy(self, lat: float, lon: float) -> tuple[float, float]:
+        """Metres east and north of the origin, of a point on the ellipsoid in degrees."""
+        phi, lam = math.radians(lat), math.radians(lon)
+        sin_phi, cos_phi = math.sin(phi), math.cos(phi)
+        n = SEMI_MAJOR_AXIS_M / math.sqrt(1 - _E2 * sin_phi * sin_phi)
+        dx = n * cos_phi * math.cos(lam) - self._origin[0]
+        dy = n * cos_phi * math.sin(lam) - self._origin[1]
+        dz = n * (1 - _E2) * sin_phi - self._origin[2]
+        east = -self._sin_lon * dx + self._cos_lon * dy
+        north = -self._sin_lat * (self._cos_lon * dx + self._sin_lon * dy) + self._cos_lat * dz
+        return east, north
+
+    def xy_array(self, lats: Coordinates, lons: Coordinates) -> Coordinates:
+        """Metres east and north, shape (n, 2), of points on the ellipsoid in degrees, shapes (n,)."""
+        phi, lam = np.radians(lats), np.radians(lons)
+        sin_phi, cos_phi = np.sin(phi), np.cos(phi)
+        n = SEMI_MAJOR_AXIS_M / np.sqrt(1 - _E2 * sin_phi * sin_phi)
+        dx = n * cos_phi * np.cos(lam) - self._origin[0]
+        dy = n * cos_phi * np.sin(lam) - self._origin[1]
+        dz = n * (1 - _E2) * sin_phi - self._origin[2]
+        east = -self._sin_lon * dx + self._cos_lon * dy
+        north = -self._sin_lat * (self._cos_lon * dx + self._sin_lon * dy) + self._cos_lat * dz
+        return np.column_stack((east, north))
+
+    def latlon(self, x: float, y: float) -> tuple[float, float]:
+        """Degrees north and east of the point x metres east and y metres north; the inverse of xy.
+
+        Raises:
+            ValueError: the point lies beyond the horizon of the frame.
+        """
+        up = 0.0
+        for _ in range(_MAX_ITERATIONS):
+            p, q, z = self._ecef(x, y, up)
+            # How far the point is above the ellipsoid, to first order, along the frame's vertical.
+            a, b = SEMI_MAJOR_AXIS_M, SEMI_MAJOR_AXIS_M * (1 - FLATTENING)
+            f = (p * p + q * q) / (a * a) + z * z / (b * b) - 1
+            slope = 2 * (
+                (p * self._cos_lat * self._cos_lon + q * self._cos_lat * self._sin_lon) / (a * a)
+                + z * self._sin_lat / (b * b)
+            )
+            if slope <= 0:
+                break
+            step = f / slope
+            up -= step
+            if abs(step) < 1e-6:
+                p, q, z = self._ecef(x, y, up)
+                return (
+                    math.degrees(math.atan2(z, (1 - _E2) * math.hypot(p, q))),
+                    math.degrees(math.atan2(q, p)),
+                )
+        raise ValueError(f"({x:.0f}, {y:.0f}) m is beyond the horizon of the frame at {self.lat}, {self.lon}")
+
+    def _ecef(self, east: float, north: float, up: float) -> tuple[float, float, float]:
+        p = (
+            self._origin[0]
+            - self._sin_lon * east
+            - self._sin_lat * self._cos_lon * north
+            + self._cos_lat * self._cos_lon * up
+        )
+        q = (
+            self._origin[1]
+            + self._cos_lon * east
+            - self._sin_lat * self._sin_lon * north
+            + self._cos_lat * self._sin_lon * up
+        )
+        return p, q, self._origin[2] + self._cos_lat * north + self._sin_lat * up

@@ -1,0 +1,127 @@
+"""The area where an application uses the drone (thesis Algorithm 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from fractus_core.api.applications import ApplicationSpec, ControlPoint
+from fractus_core.api.geometry import Area, Circle, Point, Position
+from fractus_core.api.model import InvalidObject
+from fractus_core.api.nodes import Depot
+from fractus_core.geo import LocalFrame, corridor, ground, middle, middle_of, polygon
+
+
+@dataclass(frozen=True, slots=True)
+class OperationArea:
+    """Where the drone works, in metres east and north of the frame's origin.
+
+    Attributes:
+        shape: the ground the application may use the drone's services above.
+        route: the points visited in order, without the way to the first and home from the last.
+    """
+
+    frame: LocalFrame
+    shape: BaseGeometry
+    route: tuple[Position, ...]
+
+    @property
+    def start(self) -> Point:
+        """Where the work begins."""
+        return ground(self.route[0])
+
+
+def operation_area(spec: ApplicationSpec, depots: Mapping[str, Depot], safety_radius_m: float) -> OperationArea | None:
+    """The union of the areas of all control points, or of the points of interest; None without drone components.
+
+    Paths are dilated by the safety radius; a leg that starts at a depot opens to the whole depot, since a drone may
+    stand anywhere in it. Regions count as given.
+
+    Raises:
+        InvalidObject: a depot is unknown or a ring crosses itself; the field is relative to spec.
+    """
+    route = _route(spec, depots)
+    if not route:
+        return None
+    frame = LocalFrame.at(middle_of(route))
+    parts: list[BaseGeometry] = []
+    driver = spec.driver
+    poi = spec.points_of_interest
+    if driver is not None:
+        index = spec.components.index(driver)
+        for i, point in enumerate(driver.control_points):
+            parts.append(
+                _control_area(frame, point, depots, safety_radius_m, f"components[{index}].controlPoints[{i}]")
+            )
+    elif poi is not None and poi.service_access == "points":
+        parts += [corridor(frame, [ground(p)], safety_radius_m) for p in poi.points]
+    elif poi is not None:
+        parts.append(corridor(frame, [ground(p) for p in poi.points], safety_radius_m))
+    return OperationArea(frame, shapely.union_all(parts), tuple(route))
+
+
+def start_of(point: ControlPoint, depots: Mapping[str, Depot]) -> Position | None:
+    """Where a control point begins, None when it is left open.
+
+    Raises:
+        InvalidObject: the depot is unknown.
+    """
+    if point.point is None:
+        return None
+    if point.point.position is not None:
+        return point.point.position
+    name = point.point.depot or ""
+    if name not in depots:
+        known = ", ".join(sorted(depots)) or "there is none yet; apply one"
+        raise InvalidObject("point.depot", f"there is no Depot {name} ({known})")
+    location = depots[name].spec.location
+    return Position(lat=location.lat, lon=location.lon)
+
+
+def _route(spec: ApplicationSpec, depots: Mapping[str, Depot]) -> list[Position]:
+    route: list[Position] = []
+    if spec.driver is not None:
+        index = spec.components.index(spec.driver)
+        for i, point in enumerate(spec.driver.control_points):
+            try:
+                start = start_of(point, depots)
+            except InvalidObject as error:
+                raise InvalidObject(f"components[{index}].controlPoints[{i}].{error.field}", error.problem) from None
+            if start is not None:
+                route.append(start)
+            route += point.path or ()
+            if point.region is not None:
+                centre = middle(point.region)
+                route.append(Position(lat=centre.lat, lon=centre.lon))
+    elif spec.points_of_interest is not None:
+        route += spec.points_of_interest.points
+    return route
+
+
+def _control_area(
+    frame: LocalFrame, point: ControlPoint, depots: Mapping[str, Depot], radius_m: float, field: str
+) -> BaseGeometry:
+    if point.region is not None:
+        try:
+            return polygon(frame, point.region)
+        except InvalidObject as error:
+            raise InvalidObject(f"{field}.region.{error.field}", error.problem) from None
+    path = [ground(p) for p in point.path or ()]
+    area = corridor(frame, path, radius_m)
+    start = start_of(point, depots)
+    if start is None:
+        return area
+    if point.point is not None and point.point.depot is not None:
+        depot = depots[point.point.depot].spec
+        stand = polygon(frame, Area(circle=Circle(center=depot.location, radius=depot.radius + radius_m)))
+        return area.union(shapely.union(stand, corridor(frame, path[:1], radius_m)).convex_hull)
+    return area.union(corridor(frame, [ground(start), *path], radius_m))
+
+
+def length_m(frame: LocalFrame, points: Sequence[Point]) -> float:
+    """Length of a polyline over ground in metres."""
+    xy = [frame.xy(p.lat, p.lon) for p in points]
+    return sum(((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2) ** 0.5 for a, b in zip(xy, xy[1:], strict=False))

@@ -1,0 +1,128 @@
+"""Which nodes can host a component, and why the others cannot (thesis Algorithms 6 to 8)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from fractus_core.api.applications import Component
+from fractus_core.api.model import quantity
+from fractus_core.api.nodes import Interface, NodeServices
+from fractus_core.api.plans import Rejection
+from fractus_core.planning.inventory import Host, Settings
+
+
+class Ledger:
+    """What hosts have left while a plan is made: allocatable minus requested minus what the plan already placed."""
+
+    def __init__(self, hosts: Mapping[str, Host], reclaimed: Mapping[str, Mapping[str, float]] | None = None) -> None:
+        self._hosts = hosts
+        self._reclaimed = reclaimed or {}
+        self._placed: dict[str, dict[str, float]] = {}
+
+    def shortage(self, node: str, component: Component) -> str | None:
+        """The first resource that does not suffice, with figures; None when the component fits."""
+        host = self._hosts[node]
+        placed = self._placed.get(node, {})
+        back = self._reclaimed.get(node, {})
+        for resource, wanted in requests(component).items():
+            free = (
+                host.allocatable.get(resource, 0.0)
+                - host.requested.get(resource, 0.0)
+                - placed.get(resource, 0.0)
+                + back.get(resource, 0.0)
+            )
+            if wanted > free + 1e-9:
+                return f"{resource}: {wanted:g} asked, {max(free, 0.0):g} free"
+        return None
+
+    def take(self, node: str, component: Component) -> None:
+        """Book the component's requests on the node."""
+        placed = self._placed.setdefault(node, {})
+        for resource, wanted in requests(component).items():
+            placed[resource] = placed.get(resource, 0.0) + wanted
+
+
+def requests(component: Component) -> dict[str, float]:
+    """What a pod of the component asks for: requests, with limits where requests say nothing, as Kubernetes does."""
+    resources = component.container.resources
+    return {name: quantity(q) for name, q in {**resources.limits, **resources.requests}.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """The outcome of looking at one node: suitable, or the first rule it fails."""
+
+    reason: str = ""
+    message: str = ""
+
+    def __bool__(self) -> bool:
+        """Whether the node is suitable."""
+        return not self.reason
+
+    def rejection(self, component: Component | str, node: str) -> Rejection:
+        """The failed check as the plan reports it."""
+        name = component if isinstance(component, str) else component.name
+        return Rejection(component=name, node=node, reason=self.reason, message=self.message)
+
+
+SUITABLE = Check()
+
+
+def check_host(hosts: Mapping[str, Host], node: str, settings: Settings) -> Check:
+    """Whether the Kubernetes Node behind a drone or edge node takes pods."""
+    host = hosts.get(node)
+    if host is None:
+        return Check("NodeMissing", f"no Kubernetes Node is called {node}")
+    if node in settings.excluded:
+        return Check("Excluded", settings.excluded[node])
+    if not host.ready:
+        return Check("NodeNotReady", f"the Kubernetes Node {node} is not Ready")
+    if not host.schedulable:
+        return Check("NodeUnschedulable", f"the Kubernetes Node {node} is cordoned")
+    return SUITABLE
+
+
+def check_services(offered: NodeServices, components: Iterable[Component]) -> Check:
+    """Whether a node offers every service and method that the components ask for."""
+    for component in components:
+        for request in component.services:
+            service = getattr(offered, request.service)
+            if service is None:
+                return Check("ServiceMissing", f"it has no {request.service} service, which {component.name} needs")
+            missing = sorted(set(request.methods) - set(service.methods) - {"GetControl", "ReturnControl"})
+            if missing:
+                return Check(
+                    "MethodMissing",
+                    f"its {request.service} service has no {', '.join(missing)}, which {component.name} needs",
+                )
+    return SUITABLE
+
+
+def check_resources(ledger: Ledger, node: str, components: Iterable[Component]) -> Check:
+    """Whether each of the components fits into what the node has left."""
+    for component in components:
+        shortage = ledger.shortage(node, component)
+        if shortage is not None:
+            return Check("InsufficientResources", f"{component.name} does not fit ({shortage})")
+    return SUITABLE
+
+
+def direct_reach_m(ours: Iterable[Interface], theirs: Iterable[Interface]) -> float | None:
+    """How far two nodes can be apart and still talk directly, in metres; None when no interfaces match.
+
+    Interfaces match in technology and pairing mode; the lesser range counts.
+    """
+    theirs = tuple(theirs)
+    reaches = [
+        min(a.range, b.range)
+        for a in ours
+        for b in theirs
+        if a.technology == b.technology
+        and a.range is not None
+        and b.range is not None
+        and a.pairing is not None
+        and b.pairing is not None
+        and a.pairing.mode == b.pairing.mode
+    ]
+    return max(reaches, default=None)

@@ -1,0 +1,97 @@
+"""The local frame and areas against geodesics and closed forms."""
+
+import math
+
+import pytest
+import shapely
+from fractus_core.api import InvalidObject
+from fractus_core.api.geometry import Area, Circle, Point, Polygon
+from fractus_core.geo import LocalFrame, area_of, corridor, geodesic_m, geojson, middle_of, polygon
+from hypothesis import given
+from hypothesis import strategies as st
+
+latitudes = st.floats(-89.9, 89.9)
+longitudes = st.floats(-180, 180)
+
+
+@given(latitudes, longitudes, st.floats(0, 2 * math.pi), st.floats(1, 50_000))
+def test_planar_distance_is_geodesic_within_a_tenth_of_a_percent(lat, lon, bearing, distance):
+    frame = LocalFrame(lat, lon)
+    x, y = distance * math.sin(bearing), distance * math.cos(bearing)
+    there_lat, there_lon = frame.latlon(x, y)
+    geodesic = geodesic_m(Point(lat=lat, lon=lon), Point(lat=there_lat, lon=there_lon))
+    assert geodesic == pytest.approx(distance, rel=1e-3)
+
+
+@given(latitudes, longitudes, st.floats(-50_000, 50_000), st.floats(-50_000, 50_000))
+def test_frame_round_trips(lat, lon, x, y):
+    frame = LocalFrame(lat, lon)
+    assert frame.xy(*frame.latlon(x, y)) == pytest.approx((x, y), abs=1e-3)
+
+
+def test_frame_says_when_a_point_is_beyond_the_horizon():
+    with pytest.raises(ValueError, match="beyond the horizon"):
+        LocalFrame(10, 20).latlon(9_000_000, 0)
+
+
+@pytest.mark.parametrize("lat", [0, 45, 80, -80])
+@pytest.mark.parametrize("lon", [0, 179.9999, -180])
+def test_circle_area_anywhere(lat, lon):
+    area = Area(circle=Circle(center=Point(lat=lat, lon=lon), radius=500))
+    shape = polygon(LocalFrame(lat, lon), area)
+    assert shape.area == pytest.approx(math.pi * 500**2, rel=5e-3)
+    assert shape.area >= math.pi * 500**2
+
+
+def square(lat, lon, half):
+    corners = [(-half, -half), (-half, half), (half, half), (half, -half)]
+    wrap = lambda v: (v + 180) % 360 - 180  # noqa: E731
+    return tuple(Point(lat=lat + a, lon=wrap(lon + b)) for a, b in corners)
+
+
+def test_polygon_across_the_antimeridian_is_small():
+    ring = square(10, 180, 0.01)
+    shape = polygon(LocalFrame(10, 180), Area(polygon=Polygon(exterior=ring)))
+    assert shape.area == pytest.approx(2211.9 * 2193.0, rel=5e-3)
+    collection = geojson(LocalFrame(10, 180), shape)
+    assert len(collection["coordinates"]) == 2
+    assert all(-180 <= lon <= 180 for part in collection["coordinates"] for lon, _ in part[0])
+
+
+def test_bow_tie_names_the_ring_and_the_place():
+    a, b, c, d = square(0, 0, 0.01)
+    with pytest.raises(InvalidObject, match=r"polygon\.exterior: the ring crosses itself near lat -?0\.0"):
+        polygon(LocalFrame(0, 0), Area(polygon=Polygon(exterior=(a, c, b, d))))
+
+
+def test_ring_without_area_is_refused():
+    line = tuple(Point(lat=0, lon=v) for v in (0, 0.1, 0.2))
+    with pytest.raises(InvalidObject, match=r"polygon\.exterior"):
+        polygon(LocalFrame(0, 0), Area(polygon=Polygon(exterior=line)))
+
+
+def test_hole_outside_is_refused():
+    with pytest.raises(InvalidObject, match=r"holes\[0\]"):
+        polygon(LocalFrame(0, 0), Area(polygon=Polygon(exterior=square(0, 0, 0.01), holes=(square(1, 1, 0.01),))))
+
+
+def test_corridor_covers_what_is_within_its_radius():
+    frame = LocalFrame(47, 8)
+    points = [Point(lat=47, lon=8), Point(lat=47.002, lon=8), Point(lat=47.002, lon=8.002)]
+    shape = corridor(frame, points, 7)
+    x, y = frame.xy(47.001, 8)
+    assert shape.covers(shapely.Point(x + 6.999, y))
+    assert not shape.covers(shapely.Point(x + 7.05, y))
+
+
+@given(latitudes, longitudes)
+def test_areas_survive_the_round_trip(lat, lon):
+    frame = LocalFrame(lat, lon)
+    shape = shapely.Polygon([(0, 0), (100, 0), (100, 80), (0, 80)], [[(10, 10), (20, 10), (20, 20)]])
+    (area,) = area_of(frame, shape)
+    assert polygon(frame, area).symmetric_difference(shape).area < 0.5
+
+
+def test_middle_is_right_across_the_antimeridian():
+    middle = middle_of([Point(lat=0, lon=179), Point(lat=0, lon=-179)])
+    assert abs(middle.lon) == pytest.approx(180)

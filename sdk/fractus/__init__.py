@@ -1,1 +1,65 @@
 """What a component of a Fractus application imports."""
+
+from fractus import sync
+from fractus.control import Control
+from fractus.drone import Mobility, Motion, mobility
+from fractus.environment import Endpoint, control_points, egress, endpoint
+from fractus.errors import (
+    ControlLost,
+    Corrected,
+    FractusError,
+    InvalidRequest,
+    MissionComplete,
+    NotConfigured,
+    PolicyDenied,
+    Unavailable,
+)
+from fractus.pictures import Camera, camera
+from fractus.values import (
+    Action,
+    AltitudeReference,
+    ControlPoint,
+    Decision,
+    ImageInfo,
+    Position,
+    PositionResult,
+    Progress,
+    Result,
+    SpeedResult,
+    Telemetry,
+    Velocity,
+)
+
+__all__ = [
+    "Action",
+    "AltitudeReference",
+    "Camera",
+    "Control",
+    "ControlLost",
+    "ControlPoint",
+    "Corrected",
+    "Decision",
+    "Endpoint",
+    "FractusError",
+    "ImageInfo",
+    "InvalidRequest",
+    "MissionComplete",
+    "Mobility",
+    "Motion",
+    "NotConfigured",
+    "PolicyDenied",
+    "Position",
+    "PositionResult",
+    "Progress",
+    "Result",
+    "SpeedResult",
+    "Telemetry",
+    "Unavailable",
+    "Velocity",
+    "camera",
+    "control_points",
+    "egress",
+    "endpoint",
+    "mobility",
+    "sync",
+]

@@ -1,0 +1,156 @@
+"""A mutually authenticated connection to a node service that outlives its restarts and our certificates."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import grpc
+import grpc.aio
+
+from fractus.environment import Endpoint
+from fractus.errors import NotConfigured, translate
+
+CALL_TIMEOUT_S = 10.0
+PATIENCE_S = 15.0
+"""How long a call waits for a service that is restarting; the drone's driver has as long to come back."""
+
+_OPTIONS = (
+    ("grpc.keepalive_time_ms", 10_000),
+    ("grpc.keepalive_timeout_ms", 5_000),
+    ("grpc.keepalive_permit_without_calls", 0),
+    ("grpc.http2.max_pings_without_data", 0),
+    ("grpc.initial_reconnect_backoff_ms", 100),
+    ("grpc.min_reconnect_backoff_ms", 500),
+    ("grpc.max_reconnect_backoff_ms", 1_000),
+    ("grpc.enable_retries", 0),
+    ("grpc.enable_http_proxy", 0),
+    ("grpc.max_receive_message_length", 8 * 2**20),
+)
+
+_FILES = ("ca.crt", "tls.key", "tls.crt")
+_Stamp = tuple[tuple[int, int, int], ...]
+
+
+def backoff(first_s: float = 0.1, cap_s: float = 2.0, rng: random.Random | None = None) -> Iterator[float]:
+    """Delays that double from `first_s` to `cap_s`, each jittered down by up to half."""
+    draw = (rng or random).uniform
+    delay = first_s
+    while True:
+        yield delay * draw(0.5, 1.0)
+        delay = min(delay * 2, cap_s)
+
+
+@dataclass(eq=False, slots=True)
+class _Connection:
+    channel: Any
+    stub: Any
+    stamp: _Stamp
+    calls: int = 0
+    retired: bool = False
+
+
+class ServiceChannel:
+    """Calls on one service of one node.
+
+    Certificates are read again when their files change: calls that begin then use a new connection, and the old one
+    closes after its last call, so that renewal never interrupts a flight.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        stub: Callable[[Any], Any],
+        *,
+        timeout_s: float = CALL_TIMEOUT_S,
+        patience_s: float = PATIENCE_S,
+    ) -> None:
+        self.address = endpoint.address
+        self._endpoint = endpoint
+        self._make_stub = stub
+        self._timeout_s = timeout_s
+        self.patience_s = patience_s
+        self._connection: _Connection | None = None
+        self._retired: set[_Connection] = set()
+
+    async def close(self) -> None:
+        """Close every connection; calls in flight are cancelled."""
+        connections = [*self._retired, *([self._connection] if self._connection else [])]
+        self._retired.clear()
+        self._connection = None
+        for connection in connections:
+            await connection.channel.close()
+
+    @asynccontextmanager
+    async def stub(self) -> AsyncIterator[Any]:
+        """The service's stub on a connection that stays open until the block ends."""
+        connection = self._current()
+        connection.calls += 1
+        try:
+            yield connection.stub
+        finally:
+            connection.calls -= 1
+            await self._close_unused()
+
+    async def unary(self, method: str, request: Any, *, timeout_s: float | None = None) -> Any:
+        """One call with a deadline; while the service restarts it is tried again, for `patience_s` at most.
+
+        Raises:
+            FractusError: one of the typed errors; `Unavailable` when the service did not come back.
+        """
+        loop = asyncio.get_running_loop()
+        give_up = loop.time() + self.patience_s
+        for delay in backoff():
+            try:
+                async with self.stub() as stub:
+                    return await getattr(stub, method)(request, timeout=timeout_s or self._timeout_s)
+            except grpc.aio.AioRpcError as error:
+                if error.code() is not grpc.StatusCode.UNAVAILABLE or loop.time() + delay > give_up:
+                    raise translate(error, method, self.address) from None
+            await asyncio.sleep(delay)
+        raise AssertionError("backoff is endless")
+
+    def _current(self) -> _Connection:
+        stamp = self._stamp()
+        current = self._connection
+        if current is not None and current.stamp == stamp:
+            return current
+        fresh = self._connect()
+        if current is not None:
+            current.retired = True
+            self._retired.add(current)
+        self._connection = fresh
+        return fresh
+
+    async def _close_unused(self) -> None:
+        for connection in [c for c in self._retired if not c.calls]:
+            self._retired.discard(connection)
+            await connection.channel.close()
+
+    def _stamp(self) -> _Stamp:
+        try:
+            found = [(self._endpoint.tls_dir / name).stat() for name in _FILES]
+        except OSError as error:
+            raise NotConfigured(
+                f"cannot read {error.filename}: {error.strerror}; mount the component's certificate there"
+            ) from None
+        return tuple((s.st_mtime_ns, s.st_size, s.st_ino) for s in found)
+
+    def _connect(self) -> _Connection:
+        stamp = self._stamp()
+        for _ in range(3):  # until no file changed while we read: key and certificate must belong together
+            try:
+                ca, key, chain = ((self._endpoint.tls_dir / name).read_bytes() for name in _FILES)
+            except OSError as error:
+                raise NotConfigured(f"cannot read {error.filename}: {error.strerror}") from None
+            before, stamp = stamp, self._stamp()
+            if before == stamp:
+                break
+        credentials = grpc.ssl_channel_credentials(ca, key, chain)
+        options = (*_OPTIONS, ("grpc.ssl_target_name_override", self._endpoint.server_name))
+        channel = grpc.aio.secure_channel(self.address, credentials, options=options)
+        return _Connection(channel, self._make_stub(channel), stamp)

@@ -1,0 +1,198 @@
+"""Control of the drone: taken, kept alive in the background, lost, given back."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from types import TracebackType
+from typing import Any, Self
+
+import grpc
+import grpc.aio
+from fractus_proto.v1 import mobility_pb2
+
+from fractus.channel import ServiceChannel, backoff
+from fractus.errors import ControlLost, FractusError, MissionComplete, Unavailable, translate
+
+_log = logging.getLogger("fractus")
+_Event = mobility_pb2.ControlEvent
+
+
+class Control:
+    """The right to move the drone, for one control point.
+
+    The stream behind it is this component's sign of life: while it is open the drone is ours, and when the process dies
+    the system hovers and then flies home. If the service restarts, the stream is opened again and motions go on.
+
+    Use it as `async with drone.control() as control:`. Leaving the block normally returns control; leaving it by an
+    exception does not, so that the system, or this component after a restart, decides what comes next.
+    """
+
+    def __init__(self, channel: ServiceChannel, *, timeout_s: float | None = None) -> None:
+        self._channel = channel
+        self._timeout_s = timeout_s
+        self._granted = asyncio.Event()
+        self._lost: FractusError | None = None
+        self._watcher: asyncio.Task[None] | None = None
+        self._owner: asyncio.Task[Any] | None = None
+        self._calls: dict[Any, asyncio.Task[Any] | None] = {}
+        self._held = False
+        self._returning = False
+        self._interrupted = False
+        self._cancellations = 0
+        self.control_point = 0
+        """Index of the control point that this is for."""
+        self.waypoints_reached = 0
+        """How many of its waypoints were reached before, by an earlier life of this component."""
+        self.mission_complete = False
+        """After control was returned: whether that was the last control point."""
+
+    @property
+    def lost(self) -> FractusError | None:
+        """Why control was lost; None while it is ours."""
+        return self._lost
+
+    async def take(self) -> Self:
+        """Wait until the drone is at the control point and is ours.
+
+        Raises:
+            MissionComplete: this component has nothing left to fly.
+            ControlLost: the system or a pilot keeps the drone.
+            PolicyDenied: this component may not drive.
+            Unavailable: the service did not answer, or the wait was longer than the timeout.
+        """
+        self._watcher = asyncio.create_task(self._watch(), name="fractus-control")
+        try:
+            async with asyncio.timeout(self._timeout_s):
+                await self.ready()
+        except TimeoutError:
+            await self.abandon()
+            raise Unavailable(f"GetControl: control was not granted within {self._timeout_s:.0f} s") from None
+        except BaseException:
+            await self.abandon()
+            raise
+        return self
+
+    async def ready(self) -> None:
+        """Wait while the service restarts.
+
+        Raises:
+            FractusError: why control is lost.
+        """
+        if self._watcher is None:
+            raise ControlLost("control was not taken; use `async with drone.control():`")
+        granted = asyncio.ensure_future(self._granted.wait())
+        try:
+            await asyncio.wait([granted, self._watcher], return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            granted.cancel()
+        if self._lost is not None:
+            raise self._lost
+        if not self._granted.is_set():
+            raise ControlLost("control was returned")
+
+    async def give_back(self) -> bool:
+        """Return control at the end of this control point's task.
+
+        Returns:
+            Whether that was the last one; the system then flies the drone home.
+        """
+        self._returning = True
+        try:
+            reply = await self._channel.unary("ReturnControl", mobility_pb2.ReturnControlRequest())
+        finally:
+            await self.abandon()
+        self.mission_complete = bool(reply.mission_complete)
+        return self.mission_complete
+
+    async def abandon(self) -> None:
+        """Let the stream break without returning control: the system hovers, then flies home."""
+        self._returning = True
+        self._granted.clear()
+        if self._watcher is not None:
+            self._watcher.cancel()
+            await asyncio.gather(self._watcher, return_exceptions=True)
+
+    def begin(self, call: Any) -> None:
+        """Register a motion's call, to be stopped when control is lost."""
+        self._calls[call] = asyncio.current_task()
+
+    def end(self, call: Any) -> None:
+        """Forget a motion's call."""
+        self._calls.pop(call, None)
+
+    async def __aenter__(self) -> Self:
+        self._owner = asyncio.current_task()
+        self._cancellations = self._owner.cancelling() if self._owner else 0
+        return await self.take()
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        owner, self._owner = self._owner, None
+        if kind is None and self._lost is None:
+            await self.give_back()
+            return
+        try:
+            await self.abandon()
+        except asyncio.CancelledError:
+            if not self._interrupted:
+                raise
+        # As in asyncio.timeout: only a cancellation that was ours becomes an error of ours.
+        ours = self._interrupted and owner is not None and owner.uncancel() <= self._cancellations
+        if self._lost is not None and (kind is None or (ours and kind is asyncio.CancelledError)):
+            raise self._lost from error
+
+    async def _watch(self) -> None:
+        """Keep the stream open; ends when control is lost or was returned."""
+        loop = asyncio.get_running_loop()
+        give_up = loop.time() + self._channel.patience_s
+        delays = backoff()
+        while True:
+            try:
+                await self._follow()
+            except grpc.aio.AioRpcError as error:
+                failure = translate(error, "GetControl", self._channel.address)
+                transient = error.code() is grpc.StatusCode.UNAVAILABLE
+            else:
+                failure, transient = Unavailable("GetControl: the service ended the stream"), True
+            if self._returning or self._lost is not None:
+                return
+            if self._granted.is_set():
+                self._granted.clear()
+                delays, give_up = backoff(), loop.time() + self._channel.patience_s
+                _log.warning("the mobility service is away; waiting for it to come back")
+            delay = next(delays)
+            if not transient or loop.time() + delay > give_up:
+                self._lose(failure)
+                return
+            await asyncio.sleep(delay)
+
+    async def _follow(self) -> None:
+        async with self._channel.stub() as stub:
+            async for event in stub.GetControl(mobility_pb2.GetControlRequest()):
+                if event.state == _Event.STATE_GRANTED:
+                    self.control_point = event.control_point
+                    self.waypoints_reached = event.waypoints_reached
+                    self._held = True
+                    self._granted.set()
+                elif event.state == _Event.STATE_LOST:
+                    self._lose(ControlLost(event.reason or "the system took the drone"))
+                    return
+                elif event.state == _Event.STATE_COMPLETE:
+                    if not self._returning:
+                        self._lose(MissionComplete(event.reason or "every control point is done"))
+                    return
+
+    def _lose(self, reason: FractusError) -> None:
+        """Remember why, and stop what the component is doing with the drone."""
+        if self._held and not isinstance(reason, (ControlLost, MissionComplete)):
+            reason = ControlLost(str(reason))
+        self._lost = reason
+        owner_flies = False
+        for call, task in list(self._calls.items()):
+            owner_flies |= task is self._owner
+            call.cancel()
+        if self._owner is not None and self._held and not owner_flies:
+            self._interrupted = True
+            self._owner.cancel()

@@ -1,0 +1,314 @@
+"""The drone that this component rides on: motion, state, and control of it."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Generator
+from contextlib import aclosing
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+import grpc
+import grpc.aio
+from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
+
+from fractus.channel import CALL_TIMEOUT_S, PATIENCE_S, ServiceChannel, backoff
+from fractus.control import Control
+from fractus.environment import Endpoint, endpoint
+from fractus.errors import Corrected, FractusError, translate
+from fractus.values import (
+    AltitudeReference,
+    Decision,
+    Position,
+    PositionResult,
+    Progress,
+    Result,
+    SpeedResult,
+    Telemetry,
+    Velocity,
+)
+
+R = TypeVar("R", bound=Result)
+OnProgress = Callable[[Progress], Awaitable[None] | None]
+
+
+class Motion:
+    """A motion that starts when it is awaited or iterated.
+
+    Awaiting it flies until the motion is complete and gives the last `Progress`; iterating gives every step of it.
+    Cancelling the task, or leaving the iteration early, stops the motion: the drone hovers. When the service restarts
+    while this component holds control, the motion is asked for again.
+
+    Raises:
+        PolicyDenied: policies forbid it; the drone goes on hovering.
+        Corrected: the client is strict and a policy changed the target; the motion is stopped.
+        ControlLost: the system or a pilot took the drone.
+        Unavailable: the service is away, and did not come back.
+    """
+
+    def __init__(
+        self,
+        channel: ServiceChannel,
+        control: Control | None,
+        method: str,
+        request: Any,
+        *,
+        strict: bool = False,
+        progress: OnProgress | None = None,
+        timeout_s: float | None = None,
+    ) -> None:
+        self._channel = channel
+        self._control = control
+        self._method = method
+        self._request = request
+        self._strict = strict
+        self._progress = progress
+        self._timeout_s = timeout_s
+
+    def __await__(self) -> Generator[Any, None, Progress]:
+        return self._complete().__await__()
+
+    async def __aiter__(self) -> AsyncGenerator[Progress, None]:
+        loop = asyncio.get_running_loop()
+        give_up: float | None = None
+        delays = backoff()
+        while True:
+            if self._control is not None:
+                await self._control.ready()
+            try:
+                async with aclosing(self._attempt()) as steps:
+                    async for step in steps:
+                        give_up, delays = None, backoff()
+                        yield step
+            except grpc.aio.AioRpcError as error:
+                failure = translate(error, self._method, self._channel.address)
+                give_up = give_up or loop.time() + self._channel.patience_s
+                delay = next(delays)
+                again = error.code() is grpc.StatusCode.UNAVAILABLE and self._control is not None
+                if not again or loop.time() + delay > give_up:
+                    raise failure from None
+            else:
+                return
+            await asyncio.sleep(delay)
+
+    async def _complete(self) -> Progress:
+        last: Progress | None = None
+        async with aclosing(self.__aiter__()) as steps:
+            async for last in steps:
+                if self._progress is not None:
+                    outcome = self._progress(last)
+                    if inspect.isawaitable(outcome):
+                        await outcome
+        if last is None or not last.complete:
+            raise FractusError(f"{self._method}: the service ended the motion before it was complete")
+        return last
+
+    async def _attempt(self) -> AsyncGenerator[Progress, None]:
+        first: Progress | None = None
+        async with self._channel.stub() as stub:
+            call = getattr(stub, self._method)(self._request, timeout=self._timeout_s)
+            if self._control is not None:
+                self._control.begin(call)
+            try:
+                async for message in call:
+                    step = Progress.from_proto(message, first)
+                    first = first or step
+                    if self._strict and step.corrected:
+                        raise Corrected(step)
+                    yield step
+                    if step.complete:
+                        return
+            except asyncio.CancelledError:
+                if self._control is not None and self._control.lost is not None:
+                    raise self._control.lost from None
+                raise
+            finally:
+                call.cancel()
+                if self._control is not None:
+                    self._control.end(call)
+
+
+class Mobility:
+    """The mobility service of the node that this component runs on.
+
+    Passengers may ask where the drone is; a driver takes control and then moves it. Every answer tells what policies
+    made of the call (`result.decision`, `result.corrected`).
+
+    Args:
+        endpoint: where the service is; by default, what the pod's environment says.
+        strict: raise `Corrected` instead of accepting what a policy corrected.
+        timeout_s: deadline of each call that is not a motion.
+        patience_s: how long to wait for a service that is restarting.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        *,
+        strict: bool = False,
+        timeout_s: float = CALL_TIMEOUT_S,
+        patience_s: float = PATIENCE_S,
+    ) -> None:
+        self._channel = ServiceChannel(
+            endpoint,
+            mobility_pb2_grpc.MobilityServiceStub,
+            timeout_s=timeout_s,
+            patience_s=patience_s,
+        )
+        self._strict = strict
+        self._control: Control | None = None
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Close the connection; control that is still held breaks off."""
+        if self._control is not None:
+            await self._control.abandon()
+        await self._channel.close()
+
+    def control(self, *, timeout_s: float | None = None) -> Control:
+        """Control of the drone for the next control point, as a context manager.
+
+        Args:
+            timeout_s: how long to wait for it; by default as long as the drone takes to get there.
+        """
+        self._control = Control(self._channel, timeout_s=timeout_s)
+        return self._control
+
+    async def arm(self) -> Result:
+        """Start the motors."""
+        return await self._unary("Arm", mobility_pb2.ArmRequest())
+
+    async def disarm(self) -> Result:
+        """Stop the motors; refused in the air."""
+        return await self._unary("Disarm", mobility_pb2.DisarmRequest())
+
+    async def hover(self) -> Result:
+        """Stop and stay."""
+        return await self._unary("Hover", mobility_pb2.HoverRequest())
+
+    async def set_speed(self, speed_mps: float) -> SpeedResult:
+        """Fly at this speed over ground from now on.
+
+        Returns:
+            The speed in force, after correction.
+        """
+        reply = await self._call("SetSpeed", mobility_pb2.SetSpeedRequest(speed_mps=speed_mps))
+        return self._judged(SpeedResult(decision=Decision.from_proto(reply.decision), speed_mps=reply.speed_mps))
+
+    async def speed(self) -> SpeedResult:
+        """The speed over ground, as measured."""
+        reply = await self._call("GetSpeed", mobility_pb2.GetSpeedRequest())
+        return SpeedResult(decision=Decision.from_proto(reply.decision), speed_mps=reply.speed_mps)
+
+    async def position(self) -> PositionResult:
+        """Where the drone is, above home, and how it moves."""
+        reply = await self._call("GetPosition", mobility_pb2.GetPositionRequest())
+        return PositionResult(
+            decision=Decision.from_proto(reply.decision),
+            position=Position.from_proto(reply.position),
+            velocity=Velocity.from_proto(reply.velocity),
+        )
+
+    def takeoff(
+        self, altitude_m: float, *, progress: OnProgress | None = None, timeout_s: float | None = None
+    ) -> Motion:
+        """Climb from the ground to an altitude above home."""
+        return self._motion("Takeoff", mobility_pb2.TakeoffRequest(altitude_m=altitude_m), progress, timeout_s)
+
+    def land(self, *, progress: OnProgress | None = None, timeout_s: float | None = None) -> Motion:
+        """Land here, and disarm."""
+        return self._motion("Land", mobility_pb2.LandRequest(), progress, timeout_s)
+
+    def return_to_launch(self, *, progress: OnProgress | None = None, timeout_s: float | None = None) -> Motion:
+        """Fly home and land there."""
+        return self._motion("ReturnToLaunch", mobility_pb2.ReturnToLaunchRequest(), progress, timeout_s)
+
+    def goto(
+        self,
+        lat: float,
+        lon: float,
+        alt: float,
+        *,
+        reference: AltitudeReference = AltitudeReference.HOME,
+        yaw_deg: float | None = None,
+        acceptance_radius_m: float = 0.0,
+        progress: OnProgress | None = None,
+        timeout_s: float | None = None,
+    ) -> Motion:
+        """Fly straight to a position.
+
+        Args:
+            lat: degrees north.
+            lon: degrees east.
+            alt: metres above `reference`.
+            reference: what `alt` is measured from; by default the drone's home.
+            yaw_deg: heading in degrees clockwise from true north; unset leaves it to the autopilot.
+            acceptance_radius_m: how near counts as reached; 0 leaves it to the service (1 m).
+            progress: called with each step of the way.
+            timeout_s: gives up, and hovers, after this long.
+        """
+        request = mobility_pb2.GotoRequest(
+            target=Position(lat, lon, alt, reference).to_proto(),
+            yaw_deg=yaw_deg,
+            acceptance_radius_m=acceptance_radius_m,
+        )
+        return self._motion("Goto", request, progress, timeout_s)
+
+    async def telemetry(self, interval_s: float = 0.2) -> AsyncIterator[Telemetry]:
+        """The drone's state, every `interval_s` seconds, until the iteration is left."""
+        request = mobility_pb2.SubscribeTelemetryRequest(interval_s=interval_s)
+        async with self._channel.stub() as stub:
+            call = stub.SubscribeTelemetry(request)
+            try:
+                async for message in call:
+                    yield Telemetry.from_proto(message)
+            except grpc.aio.AioRpcError as error:
+                raise translate(error, "SubscribeTelemetry", self._channel.address) from None
+            finally:
+                call.cancel()
+
+    def _motion(self, method: str, request: Any, progress: OnProgress | None, timeout_s: float | None) -> Motion:
+        return Motion(
+            self._channel,
+            self._control,
+            method,
+            request,
+            strict=self._strict,
+            progress=progress,
+            timeout_s=timeout_s,
+        )
+
+    async def _unary(self, method: str, request: Any) -> Result:
+        reply = await self._call(method, request)
+        return self._judged(Result(decision=Decision.from_proto(reply.decision)))
+
+    async def _call(self, method: str, request: Any) -> Any:
+        if self._control is not None and self._control.lost is not None:
+            raise self._control.lost
+        return await self._channel.unary(method, request)
+
+    def _judged(self, result: R) -> R:
+        if self._strict and result.corrected:
+            raise Corrected(result)
+        return result
+
+
+def mobility(target: Endpoint | None = None, *, strict: bool = False) -> Mobility:
+    """The mobility service of this node: `async with fractus.mobility() as drone`.
+
+    Args:
+        target: where it is; by default what the pod's environment says.
+        strict: raise `Corrected` when a policy changes what was asked.
+
+    Raises:
+        NotConfigured: not in a pod of a Fractus application, and no target given.
+    """
+    return Mobility(target or endpoint("mobility"), strict=strict)

@@ -1,0 +1,87 @@
+"""What Fractus puts into the environment of a component's pod: identity, addresses, control points."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from fractus.errors import NotConfigured
+from fractus.values import ControlPoint
+
+MOBILITY_PORT = 50051
+CAMERA_PORT = 50052
+DEFAULT_TLS_DIR = "/var/run/fractus/tls"
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """Where a node service listens, and how both sides prove who they are.
+
+    Attributes:
+        address: host:port.
+        server_name: the name that the service's certificate must carry.
+        tls_dir: folder with tls.crt, tls.key and ca.crt of this component.
+    """
+
+    address: str
+    server_name: str
+    tls_dir: Path
+
+
+def endpoint(service: str, env: Mapping[str, str] | None = None) -> Endpoint:
+    """The endpoint of `mobility` or `camera` on the node that this pod runs on.
+
+    Raises:
+        NotConfigured: a variable is missing; the message names it.
+    """
+    values = os.environ if env is None else env
+    node = _needed(values, "FRACTUS_NODE")
+    address = values.get(f"FRACTUS_{service.upper()}_ADDRESS")
+    if not address:
+        port = {"mobility": MOBILITY_PORT, "camera": CAMERA_PORT}[service]
+        address = f"{_needed(values, 'FRACTUS_HOST_IP')}:{port}"
+    return Endpoint(address, f"{node}.node.fractus.dev", Path(values.get("FRACTUS_TLS_DIR", DEFAULT_TLS_DIR)))
+
+
+def egress(component: str, env: Mapping[str, str] | None = None) -> str:
+    """Address (`host:port`) of a component that this one may call.
+
+    Args:
+        component: its name in the application, such as `ImageChecker`.
+        env: variables to read instead of the process' own.
+
+    Raises:
+        NotConfigured: the application does not list it in this component's egress.
+    """
+    values = os.environ if env is None else env
+    kebab = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", component)
+    name = f"FRACTUS_SERVICE_{kebab.upper().replace('-', '_')}"
+    address = values.get(name)
+    if not address:
+        raise NotConfigured(f"{name} is not set; list {component} in the egress of this component")
+    return address
+
+
+def control_points(env: Mapping[str, str] | None = None) -> tuple[ControlPoint, ...]:
+    """The driver's control points, in the order flown.
+
+    Raises:
+        NotConfigured: the variable is missing or is not what Fractus writes.
+    """
+    values = os.environ if env is None else env
+    text = _needed(values, "FRACTUS_CONTROL_POINTS")
+    try:
+        return tuple(ControlPoint.from_manifest(point) for point in json.loads(text))
+    except (ValueError, AttributeError, TypeError) as error:
+        raise NotConfigured(f"FRACTUS_CONTROL_POINTS is not a JSON list of control points: {error}") from None
+
+
+def _needed(values: Mapping[str, str], name: str) -> str:
+    value = values.get(name)
+    if not value:
+        raise NotConfigured(f"{name} is not set; run this as a component of a Fractus application, or pass an Endpoint")
+    return value

@@ -1,0 +1,116 @@
+"""What can go wrong in a call, as types that programs can tell apart."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import grpc
+from fractus_proto.v1 import types_pb2
+from grpc_status import rpc_status  # type: ignore[import-untyped]
+
+from fractus.values import Action, Decision, Result
+
+
+class FractusError(Exception):
+    """Root of everything that the SDK raises; its text is one sentence for people."""
+
+
+class InvalidRequest(FractusError):
+    """The service cannot make sense of an argument: a NaN, a latitude of 95, an unknown picture."""
+
+
+class PolicyDenied(FractusError):
+    """Policies forbid the call and nothing of it was carried out.
+
+    Attributes:
+        decision: what the policy checker answered.
+        code: CamelCase reason for programs, such as `InsideExclusionZone`.
+        reason: one sentence for people.
+        policies: names of the policies that decided, most restrictive first.
+    """
+
+    def __init__(self, decision: Decision) -> None:
+        self.decision = decision
+        self.code = decision.code
+        self.reason = decision.reason
+        self.policies = decision.policies
+        named = f" (by {', '.join(decision.policies)})" if decision.policies else ""
+        super().__init__(f"{decision.reason or decision.code or 'not allowed'}{named}")
+
+
+class Corrected(FractusError):
+    """A policy changed the call's arguments and the client is strict.
+
+    Attributes:
+        result: what was carried out instead; a corrected motion is stopped.
+    """
+
+    def __init__(self, result: Result) -> None:
+        self.result = result
+        self.decision = result.decision
+        super().__init__(f"corrected: {result.decision.reason}")
+
+
+class ControlLost(FractusError):
+    """The system or a human pilot took the drone, or this component never had it."""
+
+
+class MissionComplete(FractusError):
+    """Every control point of this component is done; the drone is home or on its way there."""
+
+
+class Unavailable(FractusError):
+    """The service cannot be reached, or did not answer in time."""
+
+
+class NotConfigured(FractusError):
+    """The environment lacks what Fractus gives the pods of a component."""
+
+
+def decision_of(error: Any) -> Decision | None:
+    """The policy checker's decision in the status details of a failed call, if it carries one."""
+    metadata = error.trailing_metadata()
+    if metadata is None:
+        return None
+    try:
+        status = rpc_status.from_call(error)
+    except ValueError:  # the details contradict the status: not ours
+        return None
+    for detail in status.details if status is not None else ():
+        message = types_pb2.Decision()
+        if detail.Is(message.DESCRIPTOR) and detail.Unpack(message):
+            return Decision.from_proto(message)
+    return None
+
+
+def translate(error: Any, what: str, address: str) -> FractusError:
+    """Turn a failed gRPC call into one of our types.
+
+    Args:
+        error: the `grpc.aio.AioRpcError`.
+        what: the method, as the user knows it.
+        address: where the call went.
+    """
+    code, text = error.code(), error.details() or ""
+    decision = decision_of(error)
+    if code in {grpc.StatusCode.PERMISSION_DENIED, grpc.StatusCode.FAILED_PRECONDITION}:
+        return _refusal(code, text, what, decision)
+    if code in {grpc.StatusCode.INVALID_ARGUMENT, grpc.StatusCode.NOT_FOUND, grpc.StatusCode.OUT_OF_RANGE}:
+        return InvalidRequest(f"{what}: {text}")
+    if code in {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED}:
+        return Unavailable(f"{what}: no answer from {address} ({text or code.name})")
+    return FractusError(f"{what}: {text or code.name}")
+
+
+def _refusal(code: grpc.StatusCode, text: str, what: str, decision: Decision | None) -> FractusError:
+    if (decision is not None and decision.code == "MissionComplete") or "mission is complete" in text:
+        return MissionComplete(text)
+    if decision is not None and decision.code in _CONTROL_CODES:
+        return ControlLost(decision.reason or text)
+    if code is grpc.StatusCode.PERMISSION_DENIED:
+        return PolicyDenied(decision or Decision(Action.DENY, reason=text or f"{what} is not allowed"))
+    return FractusError(f"{what}: {text}")
+
+
+_CONTROL_CODES = frozenset({"NotInControl", "ControlLost", "NoControl"})
+"""Codes of refusals that say who flies, not what is forbidden."""

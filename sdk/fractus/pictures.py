@@ -1,0 +1,96 @@
+"""The camera of the node that this component runs on."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Self
+
+import grpc
+import grpc.aio
+from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
+
+from fractus.channel import CALL_TIMEOUT_S, PATIENCE_S, ServiceChannel
+from fractus.environment import Endpoint, endpoint
+from fractus.errors import Unavailable, translate
+from fractus.values import Decision, ImageInfo, Result
+
+RETRIEVE_TIMEOUT_S = 60.0
+
+
+class Camera:
+    """The camera service of this node: pictures are taken, kept on the node, and fetched from there."""
+
+    def __init__(
+        self, endpoint: Endpoint, *, timeout_s: float = CALL_TIMEOUT_S, patience_s: float = PATIENCE_S
+    ) -> None:
+        self._channel = ServiceChannel(
+            endpoint, camera_pb2_grpc.CameraServiceStub, timeout_s=timeout_s, patience_s=patience_s
+        )
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Close the connection."""
+        await self._channel.close()
+
+    async def capture(self, width: int = 0, height: int = 0) -> ImageInfo:
+        """Take a picture; 0 leaves width and height to the camera.
+
+        Raises:
+            PolicyDenied: no pictures from here, or not of this.
+        """
+        reply = await self._channel.unary("CaptureImage", camera_pb2.CaptureImageRequest(width=width, height=height))
+        return ImageInfo.from_proto(reply.image, reply.decision)
+
+    async def retrieve(self, name: str, *, timeout_s: float = RETRIEVE_TIMEOUT_S) -> bytes:
+        """Fetch a picture, with what privacy policies demand already done to it.
+
+        Raises:
+            PolicyDenied: not this one.
+            InvalidRequest: there is no such picture.
+            Unavailable: the transfer broke off.
+        """
+        parts: list[bytes] = []
+        size: int | None = None
+        async with self._channel.stub() as stub:
+            try:
+                async for chunk in stub.RetrieveImage(camera_pb2.RetrieveImageRequest(name=name), timeout=timeout_s):
+                    parts.append(chunk.data)
+                    if chunk.HasField("image") and chunk.image.size_bytes:
+                        size = chunk.image.size_bytes
+            except grpc.aio.AioRpcError as error:
+                raise translate(error, "RetrieveImage", self._channel.address) from None
+        picture = b"".join(parts)
+        if size is not None and len(picture) != size:
+            raise Unavailable(f"RetrieveImage: {name} ended after {len(picture)} of {size} bytes; fetch it again")
+        return picture
+
+    async def list(self) -> tuple[ImageInfo, ...]:
+        """The pictures of this component on the node, oldest first."""
+        reply = await self._channel.unary("ListImages", camera_pb2.ListImagesRequest())
+        return tuple(ImageInfo.from_proto(image, reply.decision) for image in reply.images)
+
+    async def delete(self, name: str) -> Result:
+        """Delete a picture from the node."""
+        reply: types_pb2.Decision = (
+            await self._channel.unary("DeleteImage", camera_pb2.DeleteImageRequest(name=name))
+        ).decision
+        return Result(decision=Decision.from_proto(reply))
+
+
+def camera(target: Endpoint | None = None) -> Camera:
+    """The camera service of this node: `async with fractus.camera() as camera`.
+
+    Args:
+        target: where it is; by default what the pod's environment says.
+
+    Raises:
+        NotConfigured: not in a pod of a Fractus application, and no target given.
+    """
+    return Camera(target or endpoint("camera"))

@@ -1,0 +1,248 @@
+"""What the services answer with, as plain frozen values: positions, decisions, progress, pictures."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any
+
+from fractus_proto.v1 import camera_pb2, mobility_pb2, types_pb2
+
+
+class AltitudeReference(enum.Enum):
+    """What an altitude is measured from."""
+
+    HOME = types_pb2.ALTITUDE_REFERENCE_HOME
+    AMSL = types_pb2.ALTITUDE_REFERENCE_AMSL
+    TERRAIN = types_pb2.ALTITUDE_REFERENCE_TERRAIN
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """A point in the air: degrees of WGS 84, and metres above `reference`."""
+
+    lat: float
+    lon: float
+    alt: float = 0.0
+    reference: AltitudeReference = AltitudeReference.HOME
+
+    @classmethod
+    def from_proto(cls, message: types_pb2.Position) -> Position:
+        """Read the wire form."""
+        return cls(
+            message.latitude_deg,
+            message.longitude_deg,
+            message.altitude_m,
+            AltitudeReference(message.altitude_reference),
+        )
+
+    def to_proto(self) -> types_pb2.Position:
+        """Write the wire form."""
+        return types_pb2.Position(
+            latitude_deg=self.lat,
+            longitude_deg=self.lon,
+            altitude_m=self.alt,
+            altitude_reference=self.reference.value,
+        )
+
+    def __str__(self) -> str:
+        return f"{self.lat:.6f}, {self.lon:.6f}, {self.alt:.1f} m"
+
+
+@dataclass(frozen=True, slots=True)
+class Velocity:
+    """Metres per second north, east and down."""
+
+    north: float = 0.0
+    east: float = 0.0
+    down: float = 0.0
+
+    @classmethod
+    def from_proto(cls, message: types_pb2.Velocity) -> Velocity:
+        """Read the wire form."""
+        return cls(message.north_mps, message.east_mps, message.down_mps)
+
+
+class Action(enum.Enum):
+    """What the policy checker did with a call."""
+
+    UNSPECIFIED = types_pb2.Decision.ACTION_UNSPECIFIED
+    ALLOW = types_pb2.Decision.ACTION_ALLOW
+    CORRECT = types_pb2.Decision.ACTION_CORRECT
+    DENY = types_pb2.Decision.ACTION_DENY
+    TAKEOVER = types_pb2.Decision.ACTION_TAKEOVER
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What the policy checker decided on a call, and why.
+
+    Attributes:
+        action: allowed, corrected, denied, or taken over.
+        reason: one sentence for people; empty when the call was allowed as asked.
+        code: CamelCase and stable, for programs: AltitudeAboveLimit, InsideExclusionZone.
+        policies: names of the policies that decided, most restrictive first.
+    """
+
+    action: Action = Action.ALLOW
+    reason: str = ""
+    code: str = ""
+    policies: tuple[str, ...] = ()
+
+    @classmethod
+    def from_proto(cls, message: types_pb2.Decision) -> Decision:
+        """Read the wire form."""
+        return cls(Action(message.action), message.reason, message.code, tuple(message.policies))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Result:
+    """The outcome of a call that was carried out."""
+
+    decision: Decision = field(default_factory=Decision)
+
+    @property
+    def corrected(self) -> bool:
+        """Whether a policy changed what was asked before it was carried out."""
+        return self.decision.action is Action.CORRECT
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Progress(Result):
+    """A motion on its way: where it leads, where the drone is, how far it still has to go."""
+
+    target: Position
+    position: Position
+    distance_m: float
+    complete: bool = False
+
+    @classmethod
+    def from_proto(cls, message: mobility_pb2.MotionProgress, first: Progress | None) -> Progress:
+        """Read the wire form; decision and target come in the first message and hold for all."""
+        has_decision = message.HasField("decision") or first is None
+        has_target = message.HasField("target") or first is None
+        return cls(
+            decision=Decision.from_proto(message.decision) if has_decision else first.decision,  # type: ignore[union-attr]
+            target=Position.from_proto(message.target) if has_target else first.target,  # type: ignore[union-attr]
+            position=Position.from_proto(message.position),
+            distance_m=message.distance_m,
+            complete=message.complete,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpeedResult(Result):
+    """A speed over ground, in force or measured."""
+
+    speed_mps: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PositionResult(Result):
+    """Where the drone is and how it moves."""
+
+    position: Position
+    velocity: Velocity
+
+
+@dataclass(frozen=True, slots=True)
+class Telemetry:
+    """One sample of the drone's state; altitudes of `position` and `home` are above home and AMSL."""
+
+    time: datetime
+    position: Position
+    altitude_amsl_m: float
+    velocity: Velocity
+    yaw_deg: float
+    battery_remaining: float
+    armed: bool
+    in_air: bool
+    mode: str
+    ready: bool
+    home: Position
+    flight_state: str
+    controller: str
+
+    @classmethod
+    def from_proto(cls, message: mobility_pb2.Telemetry) -> Telemetry:
+        """Read the wire form."""
+        return cls(
+            time=message.time.ToDatetime(tzinfo=UTC),
+            position=Position.from_proto(message.position),
+            altitude_amsl_m=message.altitude_amsl_m,
+            velocity=Velocity.from_proto(message.velocity),
+            yaw_deg=message.yaw_deg,
+            battery_remaining=message.battery_remaining,
+            armed=message.armed,
+            in_air=message.in_air,
+            mode=message.mode,
+            ready=message.ready,
+            home=Position.from_proto(message.home),
+            flight_state=message.flight_state,
+            controller=message.controller,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImageInfo(Result):
+    """A picture in the camera's store."""
+
+    name: str
+    time: datetime
+    width: int
+    height: int
+    size_bytes: int
+    media_type: str
+    position: Position | None
+
+    @classmethod
+    def from_proto(cls, message: camera_pb2.ImageInfo, decision: types_pb2.Decision) -> ImageInfo:
+        """Read the wire form."""
+        return cls(
+            decision=Decision.from_proto(decision),
+            name=message.name,
+            time=message.time.ToDatetime(tzinfo=UTC),
+            width=message.width,
+            height=message.height,
+            size_bytes=message.size_bytes,
+            media_type=message.media_type,
+            position=Position.from_proto(message.position) if message.HasField("position") else None,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ControlPoint:
+    """One of the driver's control points, as its application declares it.
+
+    Attributes:
+        navigation: `pathBased` or `regionBased`.
+        path: waypoints in the order to fly; empty for a region.
+        region: the area as the manifest spells it (`{"polygon": ...}` or `{"circle": ...}`), or None.
+    """
+
+    navigation: str
+    path: tuple[Position, ...] = ()
+    region: Mapping[str, Any] | None = None
+
+    @classmethod
+    def from_manifest(cls, value: Mapping[str, Any]) -> ControlPoint:
+        """Read a control point from the JSON of the pod's environment.
+
+        Raises:
+            ValueError: a position lacks lat or lon, or navigation is missing.
+        """
+        try:
+            path = tuple(
+                Position(
+                    float(point["lat"]),
+                    float(point["lon"]),
+                    float(point.get("alt") or 0.0),
+                    AltitudeReference[str(point.get("altitudeReference", "home")).upper()],
+                )
+                for point in value.get("path") or ()
+            )
+            return cls(str(value["navigation"]), path, value.get("region"))
+        except KeyError as error:
+            raise ValueError(f"a control point lacks {error.args[0]}") from None

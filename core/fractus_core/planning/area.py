@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -124,4 +126,4 @@ def _control_area(
 def length_m(frame: LocalFrame, points: Sequence[Point]) -> float:
     """Length of a polyline over ground in metres."""
     xy = [frame.xy(p.lat, p.lon) for p in points]
-    return sum(((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2) ** 0.5 for a, b in zip(xy, xy[1:], strict=False))
+    return sum(math.dist(a, b) for a, b in itertools.pairwise(xy))

@@ -69,14 +69,17 @@ class Check:
 SUITABLE = Check()
 
 
-def check_host(hosts: Mapping[str, Host], node: str, settings: Settings) -> Check:
-    """Whether the Kubernetes Node behind a drone or edge node takes pods."""
+def check_host(hosts: Mapping[str, Host], node: str, settings: Settings, *, kept: bool = False) -> Check:
+    """Whether the Kubernetes Node behind a drone or edge node takes pods.
+
+    A node that already hosts the instance (kept) may be out of reach: its pods run on, and it comes back.
+    """
     host = hosts.get(node)
     if host is None:
         return Check("NodeMissing", f"no Kubernetes Node is called {node}")
     if node in settings.excluded:
         return Check("Excluded", settings.excluded[node])
-    if not host.ready:
+    if not host.ready and not kept:
         return Check("NodeNotReady", f"the Kubernetes Node {node} is not Ready")
     if not host.schedulable:
         return Check("NodeUnschedulable", f"the Kubernetes Node {node} is cordoned")

@@ -112,16 +112,16 @@ class _Planning:
         leader = self.spec.driver or components[0]
         ranked: list[tuple[tuple[bool, bool, float, str], Drone, float]] = []
         dropped: list[Rejection] = []
+        before = self.previous.drone.node if self.previous is not None and self.previous.drone is not None else None
         for drone in self.inventory.drones.values():
-            check = self._check_drone(drone, components, area)
+            kept = drone.name == before
+            check = self._check_drone(drone, components, area, kept=kept)
             if not check:
                 dropped.append(check.rejection(leader, drone.name))
                 continue
             minutes = _remaining_minutes(drone)
-            kept = self.previous is not None and self.previous.drone is not None
-            kept = kept and self.previous.drone.node == drone.name  # type: ignore[union-attr]
-            in_use = drone.status is not None and drone.status.flight_state == "charging"
-            ranked.append(((not kept, in_use, -minutes, drone.name), drone, minutes))
+            charging = drone.status is not None and drone.status.flight_state == "charging"
+            ranked.append(((not kept, charging, -minutes, drone.name), drone, minutes))
         dropped.sort(key=lambda r: r.node)
         if not ranked:
             why = "; ".join(f"{r.node}: {r.message}" for r in dropped[:5]) or "there is no drone"
@@ -139,15 +139,22 @@ class _Planning:
             alternatives=tuple(Alternative(node=d.name, score=round(m, 2)) for _, d, m in ranked[1:11]),
         )
 
-    def _check_drone(self, drone: Drone, components: list[Component], area: OperationArea) -> Check:
+    def _check_drone(self, drone: Drone, components: list[Component], area: OperationArea, *, kept: bool) -> Check:
+        """Whether the drone can fly the application.
+
+        A drone that already has it (kept) is not given up for what passes or comes with the mission: a lost link, a
+        restarted service, a battery that the flight has drained.
+        """
         owner = self.inventory.claimed.get(drone.name)
         if owner is not None and owner != self.application.key:
             return Check("Claimed", f"{owner[0]}/{owner[1]} has it")
+        lasting = self._check_stand(drone, area) and check_services(drone.spec.services, components)
+        if kept:
+            return check_host(self.inventory.hosts, drone.name, self.settings, kept=True) and lasting
         return (
             check_host(self.inventory.hosts, drone.name, self.settings)
             and _check_state(drone)
-            and self._check_stand(drone, area)
-            and check_services(drone.spec.services, components)
+            and lasting
             and self._check_flight_time(drone, area)
             and check_resources(self.ledger, drone.name, components)
         )
@@ -241,8 +248,9 @@ class _Planning:
         self.rejected += sorted((r for n, r in rejected.items() if n not in placed), key=lambda r: r.node)
 
     def _check_edge(self, node: EdgeNode, components: Sequence[Component]) -> Check:
+        kept = all((c.name, node.name) in self.used_before for c in components)
         return (
-            check_host(self.inventory.hosts, node.name, self.settings)
+            check_host(self.inventory.hosts, node.name, self.settings, kept=kept)
             and check_services(node.spec.services, components)
             and check_resources(self.ledger, node.name, components)
         )
@@ -333,7 +341,7 @@ class _Planning:
     # -- the cloud --
 
     def _place_cloud(self, component: Component, replicas: int) -> None:
-        rejected = []
+        rejected: list[Rejection] = []
         for host in sorted(self.inventory.hosts.values(), key=lambda h: h.name):
             if host.node_class != "cloud":
                 continue

@@ -1,0 +1,225 @@
+"""From a plan and the policies to Grants: all that a node needs to enforce offline (thesis 8.7)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import shapely
+
+from fractus_core.api import Application, Component, Drone, EdgeNode, InvalidObject, Policy, Zone
+from fractus_core.api.geometry import Area, Circle, Point, Position
+from fractus_core.api.plans import (
+    DeploymentPlanSpec,
+    GrantApplication,
+    GrantedLimits,
+    GrantedPolicy,
+    GrantedZone,
+    GrantSpec,
+    PlannedInstance,
+)
+from fractus_core.api.policies import NodeExpression, PolicySpec
+from fractus_core.geo import LocalFrame, area_of, ground, middle, polygon
+from fractus_core.planning.area import OperationArea, operation_area
+from fractus_core.planning.inventory import Inventory, Settings
+
+FIXED_NODE_REACH_M = 1000.0
+"""Zones further than this from a fixed node do not concern it."""
+
+
+def compile_grants(
+    application: Application, plan: DeploymentPlanSpec, inventory: Inventory, settings: Settings | None = None
+) -> tuple[GrantSpec, ...]:
+    """One Grant for each planned instance that uses system services, in the plan's order.
+
+    Policies are those whose node and application selectors match, with their zones resolved; zones that the node can
+    never reach are left out.
+
+    Raises:
+        InvalidObject: a policy that holds for an instance selects a zone which does not exist or is broken. Nothing is
+            granted then: what cannot be enforced must not be flown.
+    """
+    settings = settings or Settings()
+    area = operation_area(application.spec, inventory.depots, settings.safety_radius_m)
+    grants = []
+    for placed in plan.placements:
+        component = application.spec.component(placed.component)
+        if not component.services or placed.node is None:
+            continue
+        if placed.placement == "drone" and area is not None:
+            grants.append(_drone_grant(application, component, placed, inventory, area))
+        else:
+            grants.append(_edge_grant(application, component, placed, inventory))
+    return tuple(grants)
+
+
+def _drone_grant(
+    application: Application, component: Component, placed: PlannedInstance, inventory: Inventory, area: OperationArea
+) -> GrantSpec:
+    drone = inventory.drones[placed.node or ""]
+    mobility = drone.spec.services.mobility
+    depot = inventory.depots.get(drone.spec.depot or "")
+    home = drone.spec.home
+    base = ground(home) if home is not None else depot.spec.location if depot is not None else area.start
+    reach_m = mobility.max_speed * mobility.max_flight_time * 60 if mobility is not None else FIXED_NODE_REACH_M
+    stand = Area(circle=Circle(center=base, radius=depot.spec.radius if depot is not None else 30.0))
+    way = shapely.union(area.shape, polygon(area.frame, stand)).convex_hull
+    driver = component.class_ == "driver"
+    return GrantSpec(
+        node=drone.name,
+        application=_owner(application),
+        component=component.name,
+        instance=placed.instance,
+        class_=component.class_,
+        control=(component.control or "full") if driver else None,
+        control_points=_opened(component, inventory) if driver else (),
+        points_of_interest=component.points_of_interest,
+        services=component.services,
+        operation_area=area_of(area.frame, area.shape),
+        corridor=area_of(area.frame, way),
+        depot=depot.spec.location if depot is not None else None,
+        home=home,
+        limits=GrantedLimits(max_altitude=mobility.max_altitude, max_speed=mobility.max_speed) if mobility else None,
+        policies=_policies(application, component, drone, inventory, base=base, reach_m=reach_m),
+    )
+
+
+def _opened(component: Component, inventory: Inventory) -> tuple[Any, ...]:
+    """Control points with depots replaced by their positions: the node knows no depots."""
+    opened = []
+    for point in component.control_points:
+        if point.point is not None and point.point.depot is not None:
+            location = inventory.depots[point.point.depot].spec.location
+            start = point.point.model_copy(
+                update={"depot": None, "position": Position(lat=location.lat, lon=location.lon)}
+            )
+            point = point.model_copy(update={"point": start})  # noqa: PLW2901
+        opened.append(point)
+    return tuple(opened)
+
+
+def _edge_grant(
+    application: Application, component: Component, placed: PlannedInstance, inventory: Inventory
+) -> GrantSpec:
+    node = inventory.edge_nodes[placed.node or ""]
+    return GrantSpec(
+        node=node.name,
+        application=_owner(application),
+        component=component.name,
+        instance=placed.instance,
+        services=component.services,
+        home=node.spec.location,
+        policies=_policies(
+            application, component, node, inventory, base=ground(node.spec.location), reach_m=FIXED_NODE_REACH_M
+        ),
+    )
+
+
+def _owner(application: Application) -> GrantApplication:
+    namespace, name = application.key
+    return GrantApplication(namespace=namespace, name=name, uid=application.metadata.uid or "")
+
+
+def _policies(
+    application: Application,
+    component: Component,
+    node: Drone | EdgeNode,
+    inventory: Inventory,
+    *,
+    base: Point,
+    reach_m: float,
+) -> tuple[GrantedPolicy, ...]:
+    attributes = node_attributes(node)
+    granted = []
+    for policy in sorted(inventory.policies.values(), key=lambda p: p.name):
+        if not selects(policy.spec, application, component, attributes):
+            continue
+        zones = [_zone(policy, i, name, inventory.zones) for i, name in enumerate(policy.spec.selector.zones)]
+        near = [z for z in zones if _distance_m(z.area, base) <= reach_m]
+        # An inclusion zone out of reach still forbids everything else.
+        if zones and not near and policy.spec.kind != "inclusion":
+            continue
+        kept = zones if policy.spec.kind == "inclusion" else near
+        granted.append(GrantedPolicy(name=policy.name, spec=policy.spec, zones=tuple(kept)))
+    return tuple(granted)
+
+
+def _zone(policy: Policy, index: int, name: str, zones: Mapping[str, Zone]) -> GrantedZone:
+    if name not in zones:
+        raise InvalidObject(
+            f"Policy {policy.name} spec.selector.zones[{index}]",
+            f"there is no Zone {name}; apply it, or correct the policy",
+        )
+    spec = zones[name].spec
+    try:
+        polygon(LocalFrame.at(middle(spec.area)), spec.area)
+    except InvalidObject as error:
+        raise InvalidObject(f"Zone {name} spec.area.{error.field}", error.problem) from None
+    return GrantedZone(name=name, area=spec.area, altitude=spec.altitude)
+
+
+def _distance_m(area: Area, base: Point) -> float:
+    frame = LocalFrame.at(middle(area))
+    x, y = frame.xy(base.lat, base.lon)
+    return float(polygon(frame, area).distance(shapely.Point(x, y)))
+
+
+def selects(
+    policy: PolicySpec, application: Application, component: Component, attributes: Mapping[str, object]
+) -> bool:
+    """Whether a policy holds for a component of an application on a node (its zones are judged in flight)."""
+    wanted = policy.selector.applications
+    unknown = policy.kind != "grant"
+    if wanted is not None:
+        namespace, name = application.key
+        if wanted.namespaces and namespace not in wanted.namespaces:
+            return False
+        if wanted.names and name not in wanted.names:
+            return False
+        if wanted.components and component.name not in wanted.components:
+            return False
+    return all(matches(expression, attributes, unknown=unknown) for expression in policy.selector.nodes)
+
+
+def matches(expression: NodeExpression, attributes: Mapping[str, object], *, unknown: bool) -> bool:
+    """Whether a node's attributes satisfy an expression; `unknown` is the answer for an attribute not stated.
+
+    A restriction holds for a node that does not say whether it is concerned (a drone of unknown mass is a heavy one);
+    a permission does not.
+    """
+    value = attributes.get(expression.key)
+    if expression.operator == "Exists":
+        return value is not None
+    if value is None:
+        return unknown
+    if expression.operator in {"In", "NotIn"}:
+        return (str(value) in expression.values) == (expression.operator == "In")
+    try:
+        figure = float(str(value))
+    except ValueError:
+        return unknown
+    bound = float(expression.values[0])
+    return figure > bound if expression.operator == "Gt" else figure < bound
+
+
+def node_attributes(node: Drone | EdgeNode) -> dict[str, object]:
+    """Attributes of a node for selectors: dotted paths of its spec, and the last part alone where that is unique.
+
+    So `physicalFeatures.mtom` is also `mtom`; `name` and `kind` come from the object.
+    """
+    flat = dict(_flatten("", node.spec.to_dict()))
+    short: dict[str, list[object]] = {}
+    for path, value in flat.items():
+        short.setdefault(path.rsplit(".", 1)[-1], []).append(value)
+    attributes: dict[str, object] = {key: values[0] for key, values in short.items() if len(values) == 1}
+    attributes.update(flat)
+    attributes.update({f"labels.{k}": v for k, v in node.metadata.labels.items()})
+    return {**attributes, "name": node.name, "kind": node.KIND}
+
+
+def _flatten(prefix: str, value: object) -> Iterable[tuple[str, object]]:
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from _flatten(f"{prefix}.{key}" if prefix else key, inner)
+    elif not isinstance(value, list):
+        yield prefix, value

@@ -1,0 +1,73 @@
+"""What a schema cannot say: rings that cross, zones and depots that do not exist."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+from fractus_core.api import Application, Depot, InvalidObject, Policy, Zone
+from fractus_core.api.geometry import Area
+from fractus_core.geo import LocalFrame, geodesic_m, middle, polygon
+from fractus_core.planning.area import operation_area
+
+MAX_EXTENT_M = 1_000_000.0
+"""No point of an area may be further from its middle: beyond, a local frame means nothing."""
+
+
+def check_area(area: Area, field: str) -> None:
+    """Refuse rings that cross themselves, holes outside, and areas of continental size.
+
+    Raises:
+        InvalidObject: with the field below `field`.
+    """
+    try:
+        centre = middle(area)
+        for i, point in enumerate(area.polygon.exterior if area.polygon is not None else ()):
+            if geodesic_m(centre, point) > MAX_EXTENT_M:
+                raise InvalidObject(
+                    f"polygon.exterior[{i}]",
+                    f"is more than {MAX_EXTENT_M / 1000:.0f} km from the middle; split the area",
+                )
+        polygon(LocalFrame.at(centre), area)
+    except InvalidObject as error:
+        raise InvalidObject(f"{field}.{error.field}", error.problem) from None
+
+
+def check_zone(zone: Zone) -> None:
+    """Refuse a zone whose geometry is broken.
+
+    Raises:
+        InvalidObject: naming the ring.
+    """
+    check_area(zone.spec.area, "spec.area")
+
+
+def check_policy(policy: Policy, zones: Collection[str]) -> None:
+    """Refuse a policy that selects zones which do not exist.
+
+    Raises:
+        InvalidObject: naming the first such zone.
+    """
+    for i, name in enumerate(policy.spec.selector.zones):
+        if name not in zones:
+            known = ", ".join(sorted(zones)[:10]) or "there is none yet"
+            raise InvalidObject(
+                f"spec.selector.zones[{i}]", f"there is no Zone {name} ({known}); apply it, or correct the name"
+            )
+
+
+def check_application(application: Application, depots: Mapping[str, Depot]) -> None:
+    """Refuse an application that names unknown depots or has broken regions.
+
+    Raises:
+        InvalidObject: naming the field.
+    """
+    driver = application.spec.driver
+    if driver is not None:
+        index = application.spec.components.index(driver)
+        for i, point in enumerate(driver.control_points):
+            if point.region is not None:
+                check_area(point.region, f"spec.components[{index}].controlPoints[{i}].region")
+    try:
+        operation_area(application.spec, depots, safety_radius_m=1.0)
+    except InvalidObject as error:
+        raise InvalidObject(f"spec.{error.field}", error.problem) from None

@@ -1,0 +1,135 @@
+"""Kinds: what is accepted, and the sentence for what is not."""
+
+import pathlib
+
+import pytest
+import yaml
+from fractus_core.api import KINDS, Application, InvalidObject, Policy, Zone
+from fractus_core.api.crd import crd
+from fractus_core.api.model import quantity
+from fractus_core.validation import check_application, check_area, check_policy
+from test_planning import CHECKER, PATH, STORE, VIEWER, application, component, manifest, navigator
+
+ROOT = pathlib.Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda k: k.KIND)
+def test_crds_are_not_older_than_the_models(kind):
+    assert yaml.safe_load((ROOT / "crds" / f"{kind.PLURAL}.yaml").read_text()) == crd(kind), "run `make generate`"
+
+
+def test_every_number_has_its_unit_or_meaning():
+    def walk(schema, path):
+        if schema.get("type") in {"number", "integer"} and "status" not in path and not path.endswith("*"):
+            yield path, schema.get("description", "")
+        for name, inner in schema.get("properties", {}).items():
+            yield from walk(inner, f"{path}.{name}")
+        for key in ("items", "additionalProperties"):
+            if isinstance(schema.get(key), dict):
+                yield from walk(schema[key], path)
+
+    known = {"port", "replicas", "priority", "observedGeneration", "applicationGeneration"}
+    for kind in KINDS:
+        spec = crd(kind)["spec"]["versions"][0]["schema"]["openAPIV3Schema"]["properties"]["spec"]
+        missing = [p for p, d in walk(spec, kind.KIND) if not d and p.rsplit(".", 1)[1] not in known]
+        assert missing == []
+
+
+def bad(*components):
+    with pytest.raises(InvalidObject) as caught:
+        application(*components)
+    return str(caught.value)
+
+
+def edge_component(**more):
+    return component("GroundViewer", "edge", **({"locations": [{"center": {"lat": 1, "lon": 2}, "radius": 10}]} | more))
+
+
+def test_sentences_of_bad_applications():
+    plain = {"lat": 1, "lon": 2}
+    cases = [
+        ([VIEWER | {"egress": []}], "spec.components[0].pointsOfInterest: an application with drone components needs"),
+        ([navigator(PATH), navigator(PATH) | {"name": "Second"}], "spec.components[1].class: an application has at most one driver"),
+        ([navigator([])], "spec.components[0].controlPoints[0].path: "),
+        ([navigator([plain | {"lat": 95}])], "spec.components[0].controlPoints[0].path[0].lat: input should be less than or equal to 90, not 95"),
+        ([STORE | {"replicas": 0}], "spec.components[0].replicas: input should be greater than or equal to 1, not 0"),
+        ([edge_component(locations=[{"center": plain, "radius": -1}])], "spec.components[0].locations[0].radius: input should be greater than 0, not -1"),
+        ([edge_component(locations=[{"center": plain, "radius": 1, "instances": 0}])], "spec.components[0].locations[0].instances: must be 1 to 10000 or '*', not 0"),
+        ([edge_component(locations=[])], "spec.components[0].locations: is needed for placement edge"),
+        ([STORE | {"egress": ["Nobody"]}], "spec.components[0].egress[0]: there is no component Nobody"),
+        ([STORE | {"egress": ["DataStore"]}], "spec.components[0].egress[0]: a component does not refer to itself"),
+        ([edge_component(services=[{"service": "camera", "methods": ["Fly"]}])], "spec.components[0].services[0].methods[0]: input should be 'Arm'"),
+        ([edge_component(services=[{"service": "camera", "methods": ["Goto"]}])], "spec.components[0].services[0].methods[0]: the camera service has no Goto"),
+        ([edge_component(services=[{"service": "mobility", "methods": ["Goto"]}])], "spec.components[0].services: the mobility service is on drones only"),
+        ([STORE, STORE | {"name": "data-store"}], "spec.components[1].name: data-store and DataStore get the same object name"),
+        ([STORE | {"replica": 2}], "spec.components[0].replica: extra inputs are not permitted, not 2"),
+        ([STORE | {"container": {"image": "x", "resources": {"limits": {"cpu": "much"}}}}], "spec.components[0].container.resources.limits.cpu: 'much' is not a quantity"),
+    ]  # fmt: skip
+    for components, sentence in cases:
+        assert bad(*components).startswith(sentence), (bad(*components), sentence)
+
+
+def test_nan_is_refused_everywhere():
+    assert "finite number" in bad(navigator([{"lat": float("nan"), "lon": 2}]))
+
+
+def test_a_good_application_survives_the_round_trip():
+    app = application(navigator(PATH), VIEWER, CHECKER, STORE)
+    assert Application.from_body(app.to_dict()) == app
+    assert [c.slug for c in app.spec.components] == ["navigator", "aerial-viewer", "image-checker", "data-store"]
+
+
+def test_unknown_depot_names_the_field():
+    with pytest.raises(
+        InvalidObject, match=r"spec\.components\[0\]\.controlPoints\[0\]\.point\.depot: there is no Depot base"
+    ):
+        check_application(application(navigator(PATH)), {})
+
+
+def test_crossing_region_names_the_ring():
+    cross = [{"lat": 0, "lon": 0}, {"lat": 1e-3, "lon": 1e-3}, {"lat": 0, "lon": 1e-3}, {"lat": 1e-3, "lon": 0}]
+    point = {"navigation": "regionBased", "region": {"polygon": {"exterior": cross}}}
+    app = application(navigator(PATH) | {"controlPoints": [point]})
+    with pytest.raises(InvalidObject, match=r"controlPoints\[0\]\.region\.polygon\.exterior: the ring crosses itself"):
+        check_application(app, {})
+
+
+def test_area_of_continental_size_is_refused():
+    corners = [{"lat": 0, "lon": 0}, {"lat": 50, "lon": 0}, {"lat": 50, "lon": 50}]
+    zone = Zone.from_body(manifest("Zone", "z", {"area": {"polygon": {"exterior": corners}}}))
+    with pytest.raises(InvalidObject, match=r"spec\.area\.polygon\.exterior\[0\]: is more than 1000 km"):
+        check_area(zone.spec.area, "spec.area")
+
+
+@pytest.mark.parametrize(
+    ("spec", "sentence"),
+    [
+        ({"type": "AccessControl", "kind": "speed"}, "spec.kind: AccessControl takes grant or denial"),
+        ({"type": "AccessControl", "kind": "denial"}, "spec.methods: AccessControl needs at least one method"),
+        ({"type": "LimitControl", "kind": "speed"}, "spec.upperLimit: LimitControl needs upperLimit or lowerLimit"),
+        (
+            {"type": "LimitControl", "kind": "altitude", "lowerLimit": 9, "upperLimit": 5},
+            "spec.lowerLimit: must not be above upperLimit",
+        ),
+        (
+            {"type": "GeofenceControl", "kind": "exclusion"},
+            "spec.selector.zones: GeofenceControl needs at least one zone",
+        ),
+        ({"type": "PrivacyControl", "kind": "camera"}, "spec.action: PrivacyControl needs an image filter"),
+    ],
+)
+def test_sentences_of_bad_policies(spec, sentence):
+    with pytest.raises(InvalidObject) as caught:
+        Policy.from_body(manifest("Policy", "p", spec))
+    assert str(caught.value).startswith(sentence)
+
+
+def test_policy_with_an_unknown_zone_names_it():
+    spec = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["a", "b"]}}
+    with pytest.raises(InvalidObject, match=r"spec\.selector\.zones\[1\]: there is no Zone b \(a\)"):
+        check_policy(Policy.from_body(manifest("Policy", "p", spec)), {"a"})
+
+
+@pytest.mark.parametrize(("text", "value"), [("250m", 0.25), ("2", 2), ("512Mi", 2**29), ("1.5G", 1.5e9), (3, 3)])
+def test_quantities(text, value):
+    assert quantity(text) == pytest.approx(value)

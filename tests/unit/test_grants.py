@@ -1,0 +1,114 @@
+"""Grants: which policies reach which instance, and that what cannot be resolved grants nothing."""
+
+import pytest
+from fractus_core.api import InvalidObject, Policy, Zone
+from fractus_core.api.policies import NodeExpression
+from fractus_core.planning import plan
+from fractus_core.policy.grants import compile_grants, matches, node_attributes
+from test_planning import PATH, VIEWER, application, at, drone, edge, inventory, manifest, navigator
+
+
+def zone(name, where, radius=50):
+    return Zone.from_body(manifest("Zone", name, {"area": {"circle": {"center": at(*where), "radius": radius}}}))
+
+
+def policy(name, zones=(), nodes=(), applications=None, **spec):
+    selector = {"zones": list(zones), "nodes": list(nodes)} | ({"applications": applications} if applications else {})
+    return Policy.from_body(manifest("Policy", name, {**spec, "selector": selector}))
+
+
+ALTITUDE = {"type": "LimitControl", "kind": "altitude", "upperLimit": 50}
+FENCE = {"type": "GeofenceControl", "kind": "exclusion", "action": "land"}
+
+
+def compiled(*policies, zones=(), components=None):
+    stock = inventory([drone("d")], zones={z.name: z for z in zones}, policies={p.name: p for p in policies})
+    app = application(*(components or [navigator(PATH)]))
+    return compile_grants(app, plan(app, stock), stock)
+
+
+def test_driver_and_passenger_get_their_own_grants():
+    driver, passenger = compiled(components=(navigator(PATH), VIEWER | {"egress": []}))
+    assert driver.class_ == "driver"
+    assert driver.control == "full"
+    assert driver.methods("mobility") == {"Arm", "Takeoff", "Goto", "GetControl", "ReturnControl"}
+    assert driver.methods("camera") == frozenset()
+    assert driver.control_points[0].point.position.lat == pytest.approx(at(0, 0)["lat"])
+    assert driver.control_points[0].point.depot is None
+    assert passenger.class_ == "passenger"
+    assert passenger.control is None
+    assert passenger.methods("camera") == {"CaptureImage"}
+    assert driver.operation_area == passenger.operation_area != ()
+    assert (
+        driver.identity == "spiffe://fractus.dev/ns/default/app/traffic/component/Navigator/instance/traffic-navigator"
+    )
+
+
+def test_policies_come_with_their_zones_sorted_by_name():
+    (grant,) = compiled(policy("b", **ALTITUDE), policy("a", zones=["z"], **FENCE), zones=[zone("z", (100, 100))])
+    assert [p.name for p in grant.policies] == ["a", "b"]
+    assert [z.name for z in grant.policies[0].zones] == ["z"]
+    assert grant.policies[1].zones == ()
+
+
+def test_unknown_zone_grants_nothing():
+    with pytest.raises(InvalidObject, match=r"Policy a spec\.selector\.zones\[0\]: there is no Zone nowhere"):
+        compiled(policy("a", zones=["nowhere"], **FENCE))
+
+
+def test_zone_beyond_reach_is_left_out_but_not_for_inclusion():
+    far = zone("far", (80_000, 0))
+    (grant,) = compiled(policy("a", zones=["far"], **FENCE), zones=[far])
+    assert grant.policies == ()
+    (grant,) = compiled(policy("a", zones=["far"], **(FENCE | {"kind": "inclusion"})), zones=[far])
+    assert [p.name for p in grant.policies] == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("applications", "expected"),
+    [
+        ({"names": ["traffic"]}, True),
+        ({"names": ["other"]}, False),
+        ({"namespaces": ["default"]}, True),
+        ({"namespaces": ["prod"]}, False),
+        ({"components": ["Navigator"]}, True),
+        ({"components": ["AerialViewer"]}, False),
+    ],
+)
+def test_application_selector(applications, expected):
+    (grant,) = compiled(policy("a", applications=applications, **ALTITUDE))
+    assert bool(grant.policies) is expected
+
+
+@pytest.mark.parametrize(
+    ("key", "operator", "values", "attributes", "restriction", "permission"),
+    [
+        ("class", "In", ["C2", "C3"], {"class": "C2"}, True, True),
+        ("class", "In", ["C2"], {"class": "C0"}, False, False),
+        ("class", "In", ["C2"], {}, True, False),
+        ("class", "NotIn", ["C2"], {"class": "C0"}, True, True),
+        ("class", "NotIn", ["C2"], {"class": "C2"}, False, False),
+        ("mtom", "Gt", ["2000"], {"mtom": 2500.0}, True, True),
+        ("mtom", "Gt", ["2000"], {"mtom": 2000.0}, False, False),
+        ("mtom", "Gt", ["2000"], {}, True, False),
+        ("mtom", "Lt", ["2000"], {"mtom": 1999.0}, True, True),
+        ("mtom", "Lt", ["2000"], {"mtom": "heavy"}, True, False),
+        ("camera", "Exists", [], {"camera": 1}, True, True),
+        ("camera", "Exists", [], {}, False, False),
+    ],
+)
+def test_node_expressions_hold_for_the_unknown_when_they_restrict(
+    key, operator, values, attributes, restriction, permission
+):
+    expression = NodeExpression(key=key, operator=operator, values=tuple(values))
+    assert matches(expression, attributes, unknown=True) is restriction
+    assert matches(expression, attributes, unknown=False) is permission
+
+
+def test_attributes_of_nodes():
+    attributes = node_attributes(drone("d"))
+    assert attributes["name"] == "d"
+    assert attributes["kind"] == "Drone"
+    assert attributes["maxSpeed"] == 15
+    assert attributes["services.mobility.maxSpeed"] == 15
+    assert node_attributes(edge("e", (0, 0)))["location.lat"] == pytest.approx(at(0, 0)["lat"])

@@ -1,0 +1,339 @@
+"""Plans: who is chosen, who is dropped and why, and that nothing depends on order."""
+
+import math
+import random
+
+import pytest
+import shapely
+from fractus_core.api import Application, Depot, Drone, EdgeNode
+from fractus_core.geo import LocalFrame
+from fractus_core.planning import Host, Infeasible, Inventory, Settings, instance_name, plan
+
+LAT, LON = 39.3606, 22.9307
+FRAME = LocalFrame(LAT, LON)
+ALL = ["Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "Goto", "Hover", "GetPosition", "ReturnToLaunch"]
+CAMERA = ["CaptureImage", "RetrieveImage", "ListImages"]
+
+
+def at(x, y, alt=None):
+    lat, lon = FRAME.latlon(x, y)
+    return {"lat": lat, "lon": lon} | ({"alt": alt} if alt is not None else {})
+
+
+def manifest(kind, name, spec, **extra):
+    return {"apiVersion": "fractus.dev/v1alpha1", "kind": kind, "metadata": {"name": name}, "spec": spec, **extra}
+
+
+def drone(name, home=(0, 0), battery=1.0, ready="True", minutes=15, methods=ALL, depot="base"):
+    return Drone.from_body(
+        manifest(
+            "Drone",
+            name,
+            {
+                "depot": depot,
+                "home": at(*home),
+                "interfaces": [
+                    {"technology": "WiFi", "range": 80, "pairing": {"networkId": "a"}},
+                    {"technology": "4G"},
+                ],
+                "services": {
+                    "mobility": {"maxAltitude": 80, "maxFlightTime": minutes, "maxSpeed": 15, "methods": methods},
+                    "camera": {"methods": CAMERA},
+                },
+            },
+            status={
+                "battery": {"remaining": battery},
+                "conditions": [
+                    {
+                        "type": "Ready",
+                        "status": ready,
+                        "reason": "Because",
+                        "message": "autopilot not connected",
+                        "lastTransitionTime": "2026-01-01T00:00:00Z",
+                    }
+                ],
+            },
+        )
+    )
+
+
+def edge(name, where, wifi=80, camera=True):
+    interfaces = [{"technology": "Ethernet"}]
+    if wifi:
+        interfaces.append({"technology": "WiFi", "range": wifi, "pairing": {"networkId": name}})
+    services = {"camera": {"methods": CAMERA}} if camera else {}
+    return EdgeNode.from_body(
+        manifest("EdgeNode", name, {"location": at(*where), "interfaces": interfaces, "services": services})
+    )
+
+
+def host(name, node_class, cpu=4.0, gpu=1.0, **more):
+    return Host(name, {"fractus.dev/class": node_class}, {"cpu": cpu, "fractus.dev/gpu": gpu}, {}, **more)
+
+
+def component(name, placement, **more):
+    container = {"image": "app", "ports": [{"port": 8080}], "resources": {"requests": {"cpu": "100m"}}}
+    return {"name": name, "placement": placement, "container": container, **more}
+
+
+def navigator(path, point=None, **more):
+    return component(
+        "Navigator",
+        "drone",
+        services=[{"service": "mobility", "methods": ["Arm", "Takeoff", "Goto"]}],
+        controlPoints=[{"point": point or {"depot": "base"}, "navigation": "pathBased", "path": path}],
+        **{"class": "driver", **more},
+    )
+
+
+VIEWER = component(
+    "AerialViewer",
+    "drone",
+    egress=["ImageChecker"],
+    services=[{"service": "camera", "methods": ["CaptureImage"]}],
+    **{"class": "passenger"},
+)
+CHECKER = component("ImageChecker", "hybrid", hybridTo=["AerialViewer"], heuristic={"kind": "preferDirect"})
+STORE = component("DataStore", "cloud", replicas=3)
+
+
+def application(*components):
+    return Application.from_body(
+        {
+            **manifest("Application", "traffic", {"components": list(components)}),
+            "metadata": {"name": "traffic", "namespace": "default"},
+        }
+    )
+
+
+def inventory(drones=(), edges=(), hosts=(), **more):
+    found = {d.name: host(d.name, "drone") for d in drones} | {e.name: host(e.name, "edge") for e in edges}
+    found |= {"cloud-1": host("cloud-1", "cloud")} | {h.name: h for h in hosts}
+    depot = Depot.from_body(manifest("Depot", "base", {"location": at(0, 0), "radius": 20}))
+    return Inventory(
+        hosts=found,
+        drones={d.name: d for d in drones},
+        edge_nodes={e.name: e for e in edges},
+        depots={"base": depot},
+        **more,
+    )
+
+
+PATH = [at(100, 0, 10), at(300, 0, 10)]
+
+
+def nodes_of(result, name):
+    return [p.node for p in result.placements if p.component == name]
+
+
+def reasons(result):
+    return {(r.component, r.node): r.reason for r in result.rejected}
+
+
+def test_the_fullest_drone_of_the_depot_flies():
+    fleet = [drone("d1", battery=0.8), drone("d2", battery=0.9), drone("d3", home=(5000, 0), depot="far")]
+    result = plan(application(navigator(PATH)), inventory(fleet))
+    assert result.drone.node == "d2"
+    assert [a.node for a in result.drone.alternatives] == ["d1"]
+    assert reasons(result) == {("Navigator", "d3"): "OtherDepot"}
+
+
+@pytest.mark.parametrize(
+    ("fleet", "reason"),
+    [
+        ([drone("d", ready="False")], "DroneNotReady"),
+        ([drone("d", methods=["Arm", "Takeoff"])], "MethodMissing"),
+        ([drone("d", minutes=2)], "FlightTooLong"),
+        ([drone("d", battery=0.25)], "FlightTooLong"),
+    ],
+)
+def test_unsuitable_drone_is_named_with_its_reason(fleet, reason):
+    with pytest.raises(Infeasible) as caught:
+        plan(application(navigator(PATH)), inventory(fleet))
+    assert [(r.node, r.reason) for r in caught.value.rejected] == [("d", reason)]
+    assert caught.value.component == "Navigator"
+
+
+def test_no_drone_at_all_says_so():
+    with pytest.raises(Infeasible, match="there is no drone"):
+        plan(application(navigator(PATH)), inventory())
+
+
+def test_claimed_drone_is_left_alone():
+    with pytest.raises(Infeasible) as caught:
+        plan(application(navigator(PATH)), inventory([drone("d")], claimed={"d": ("other", "app")}))
+    assert caught.value.reason == "DroneBusy"
+    assert plan(application(navigator(PATH)), inventory([drone("d")], claimed={"d": ("default", "traffic")}))
+
+
+def test_host_that_is_missing_cordoned_or_full():
+    for bad, reason in (
+        (host("d", "drone", ready=False), "NodeNotReady"),
+        (host("d", "drone", schedulable=False), "NodeUnschedulable"),
+        (host("d", "drone", cpu=0.05), "InsufficientResources"),
+    ):
+        with pytest.raises(Infeasible) as caught:
+            plan(application(navigator(PATH)), inventory([drone("d")], hosts=[bad]))
+        assert [r.reason for r in caught.value.rejected] == [reason]
+
+
+def test_a_flying_drone_is_kept_through_what_passes():
+    app = application(navigator(PATH))
+    before = plan(app, inventory([drone("d2")]))
+    tired = drone("d2", battery=0.3, ready="False")
+    now = inventory([drone("d1"), tired], hosts=[host("d2", "drone", ready=False)])
+    assert plan(app, now, previous=before).drone.node == "d2"
+    assert plan(app, now).drone.node == "d1"
+
+
+def test_static_instances_by_distance_and_count():
+    edges = [edge("e1", (50, 0)), edge("e2", (10, 0)), edge("e3", (500, 0)), edge("e4", (20, 0), camera=False)]
+    viewer = component(
+        "GroundViewer",
+        "edge",
+        locations=[{"center": at(0, 0), "radius": 100, "instances": 1}],
+        services=[{"service": "camera", "methods": ["CaptureImage"]}],
+    )
+    result = plan(application(viewer), inventory(edges=edges))
+    assert nodes_of(result, "GroundViewer") == ["e2"]
+    viewer["locations"][0]["instances"] = "*"
+    result = plan(application(viewer), inventory(edges=edges))
+    assert nodes_of(result, "GroundViewer") == ["e2", "e1"]
+    assert reasons(result) == {("GroundViewer", "e3"): "OutsideLocation", ("GroundViewer", "e4"): "ServiceMissing"}
+
+
+def test_static_location_without_nodes_is_infeasible():
+    viewer = component("GroundViewer", "edge", locations=[{"center": at(9000, 0), "radius": 10, "instances": 2}])
+    with pytest.raises(Infeasible, match=r"locations\[0\]"):
+        plan(application(viewer), inventory(edges=[edge("e1", (0, 0))]))
+
+
+def test_hybrid_serves_static_instance_on_its_own_node_or_beside():
+    viewer = component("GroundViewer", "edge", locations=[{"center": at(0, 0), "radius": 5}], egress=["ImageChecker"])
+    checker = component("ImageChecker", "hybrid", hybridTo=["GroundViewer"])
+    edges = [edge("e1", (0, 0)), edge("e2", (60, 0)), edge("e3", (40, 0), wifi=30), edge("e4", (70, 0))]
+    result = plan(application(viewer, checker), inventory(edges=edges))
+    assert nodes_of(result, "ImageChecker") == [None, "e1"]
+    checker["container"]["resources"] = {"limits": {"fractus.dev/gpu": 1}}
+    result = plan(application(viewer, checker), inventory(edges=edges, hosts=[host("e1", "edge", gpu=0)]))
+    assert nodes_of(result, "ImageChecker") == [None, "e2"]
+    assert reasons(result)["ImageChecker", "e1"] == "InsufficientResources"
+
+
+def test_no_node_beside_leaves_the_cloud_base():
+    viewer = component("GroundViewer", "edge", locations=[{"center": at(0, 0), "radius": 5}], egress=["ImageChecker"])
+    checker = component("ImageChecker", "hybrid", hybridTo=["GroundViewer"])
+    checker["container"]["resources"] = {"limits": {"fractus.dev/gpu": 1}}
+    result = plan(
+        application(viewer, checker), inventory(edges=[edge("e1", (0, 0))], hosts=[host("e1", "edge", gpu=0)])
+    )
+    assert nodes_of(result, "ImageChecker") == [None]
+
+
+def test_cover_equals_plain_greedy_on_random_scenes():
+    """Oracle: sets of sample points instead of polygons."""
+    rng = random.Random(7)
+    for _ in range(5):
+        edges = [
+            edge(f"e{i}", (rng.uniform(-50, 400), rng.uniform(-60, 60)), wifi=rng.uniform(40, 80)) for i in range(8)
+        ]
+        app = application(navigator(PATH), VIEWER, CHECKER)
+        result = plan(app, inventory([drone("d", minutes=30)], edges))
+        chosen = [p.node for p in result.placements if p.role == "hybrid-drone"]
+        shape = shapely.union_all(
+            [
+                shapely.Polygon([FRAME.xy(lat, lon) for lon, lat in part[0]])
+                for part in result.operation_area["coordinates"]
+            ]
+        )
+        west, south, east, north = shape.bounds
+        grid = [
+            (west + (east - west) * i / 160, south + (north - south) * j / 60) for i in range(161) for j in range(61)
+        ]
+        inside = {p for p in grid if shape.covers(shapely.Point(p))}
+        reach = {
+            e.name: {
+                p
+                for p in inside
+                if math.dist(p, FRAME.xy(e.spec.location.lat, e.spec.location.lon))
+                <= min(80, e.spec.interfaces[1].range)
+            }
+            for e in edges
+        }
+        covered: set = set()
+        for name in chosen:
+            best = max(len(points - covered) for points in reach.values())
+            assert len(reach[name] - covered) >= best - 0.02 * len(inside)
+            covered |= reach[name]
+        if len(covered) < 0.93 * len(inside):
+            assert max(len(points - covered) for points in reach.values()) <= 0.02 * len(inside)
+
+
+def test_node_that_covers_nothing_or_cannot_pair_is_dropped():
+    edges = [edge("near", (200, 0)), edge("far", (200, 500)), edge("wired", (150, 0), wifi=None)]
+    result = plan(application(navigator(PATH), VIEWER, CHECKER), inventory([drone("d")], edges))
+    assert nodes_of(result, "ImageChecker") == [None, "near"]
+    dropped = reasons(result)
+    assert dropped["ImageChecker", "far"] == "NoCoverage"
+    assert dropped["ImageChecker", "wired"] == "NoDirectInterface"
+    near = next(p for p in result.placements if p.node == "near")
+    assert 0.2 < near.coverage < 1
+    assert (near.serves.component, near.serves.node) == ("AerialViewer", "d")
+
+
+def test_cloud_needs_a_node():
+    empty = Inventory(hosts={"w": host("w", "edge")})
+    with pytest.raises(Infeasible) as caught:
+        plan(application(STORE), empty)
+    assert caught.value.reason == "NoCloudNode"
+    assert plan(application(STORE), inventory()).placements[0].replicas == 3
+
+
+def test_a_plan_books_what_it_places():
+    greedy = component("GroundViewer", "edge", locations=[{"center": at(0, 0), "radius": 5}])
+    greedy["container"]["resources"] = {"requests": {"cpu": "3"}}
+    other = component("Other", "edge", locations=[{"center": at(0, 0), "radius": 5}])
+    other["container"]["resources"] = {"requests": {"cpu": "2"}}
+    with pytest.raises(Infeasible, match=r"cpu: 2 asked, 1 free"):
+        plan(application(greedy, other), inventory(edges=[edge("e1", (0, 0))]))
+
+
+def test_order_of_the_inventory_does_not_matter():
+    edges = [edge(f"e{i}", (i * 40, (i % 3) * 20)) for i in range(9)]
+    fleet = [drone(f"d{i}") for i in range(4)]
+    app = application(navigator(PATH), VIEWER, CHECKER, STORE)
+    first = plan(app, inventory(fleet, edges))
+    for seed in range(5):
+        shuffled = random.Random(seed)
+        f, e = fleet[:], edges[:]
+        shuffled.shuffle(f)
+        shuffled.shuffle(e)
+        assert plan(app, inventory(f, e)) == first
+
+
+def test_replanning_moves_nothing_that_still_fits():
+    edges = [edge("e5", (20, 0)), edge("e6", (30, 0))]
+    viewer = component("GroundViewer", "edge", locations=[{"center": at(0, 0), "radius": 100}])
+    app = application(viewer)
+    before = plan(app, inventory(edges=[edges[1]]))
+    assert nodes_of(plan(app, inventory(edges=edges), previous=before), "GroundViewer") == ["e6"]
+    assert nodes_of(plan(app, inventory(edges=edges)), "GroundViewer") == ["e5"]
+
+
+def test_operation_area_opens_to_the_whole_depot():
+    result = plan(application(navigator(PATH)), inventory([drone("d")]), Settings(safety_radius_m=7))
+    shape = shapely.union_all(
+        [shapely.Polygon([FRAME.xy(lat, lon) for lon, lat in part[0]]) for part in result.operation_area["coordinates"]]
+    )
+    for x, y in ((-26, 0), (0, 26), (100, 6.9), (306, 0)):
+        assert shape.covers(shapely.Point(x, y))
+    for x, y in ((-28, 0), (200, 7.2), (310, 0)):
+        assert not shape.covers(shapely.Point(x, y))
+
+
+def test_instance_names_are_labels_of_bounded_length():
+    thing = application(STORE).spec.component("DataStore")
+    assert instance_name("traffic", thing) == "traffic-data-store"
+    long = instance_name("a" * 63, thing, "node-1")
+    assert len(long) <= 57
+    assert long != instance_name("a" * 63, thing, "node-2")

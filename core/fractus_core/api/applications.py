@@ -179,19 +179,19 @@ class Container(Model):
 
 _COMPONENT_RULES = rules(
     (
-        "self.placement == 'drone' ? has(self['class']) : !has(self['class'])",
+        "self.placement == 'drone' ? has(self.class) : !has(self.class)",
         "class (driver or passenger) is needed for placement drone, and only there",
     ),
     (
-        "!has(self['class']) || self['class'] != 'driver' || (has(self.controlPoints) && size(self.controlPoints) > 0)",
+        "!has(self.class) || self.class != 'driver' || (has(self.controlPoints) && size(self.controlPoints) > 0)",
         "a driver needs controlPoints",
     ),
     (
-        "!has(self.controlPoints) || size(self.controlPoints) == 0 || (has(self['class']) && self['class'] == 'driver')",
+        "!has(self.controlPoints) || size(self.controlPoints) == 0 || (has(self.class) && self.class == 'driver')",
         "controlPoints are for a component of class driver",
     ),
     (
-        "!has(self.pointsOfInterest) || (has(self['class']) && self['class'] == 'passenger')",
+        "!has(self.pointsOfInterest) || (has(self.class) && self.class == 'passenger')",
         "pointsOfInterest are for a component of class passenger",
     ),
     (
@@ -277,13 +277,20 @@ def _check_drone_part(component: Component) -> None:
 
 _APPLICATION_RULES = rules(
     (
-        "self.components.filter(c, has(c['class']) && c['class'] == 'driver').size() <= 1",
+        "self.components.filter(c, has(c.class) && c.class == 'driver').size() <= 1",
         "an application has at most one driver",
     ),
     (
         "!self.components.exists(c, c.placement == 'drone') ||"
-        " self.components.exists(c, (has(c['class']) && c['class'] == 'driver') || has(c.pointsOfInterest))",
+        " self.components.exists(c, (has(c.class) && c.class == 'driver') || has(c.pointsOfInterest))",
         "an application with drone components needs a driver, or one passenger with pointsOfInterest",
+    ),
+    *(
+        (
+            f"self.components.all(c, !has(c.{field}) || c.{field}.all(n, self.components.exists(d, d.name == n)))",
+            f"{field} names a component that the application does not have",
+        )
+        for field in ("ingress", "egress", "hybridTo")
     ),
 )
 

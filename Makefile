@@ -1,0 +1,88 @@
+# Fractus: `make help` lists everything.
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+MAKEFLAGS += --no-print-directory
+
+# embedded: a real Kubernetes that Fractus brings up on this machine. current: the cluster of KUBECONFIG (k3s, kind).
+CLUSTER ?= embedded
+OUT ?= out
+UV_VERSION := 0.13.8
+APT_PACKAGES := buildah ca-certificates conntrack containerd containernetworking-plugins debootstrap iproute2 \
+	iptables nftables python3-venv runc
+
+UV := $(shell command -v uv || echo .tools/bin/uv)
+RUN := $(UV) run --frozen --all-extras
+GO_PATH := $(PATH):/usr/local/go/bin
+export PATH := $(GO_PATH)
+
+.PHONY: help
+help: ## List the targets
+	@awk 'BEGIN {FS = ":.*## "} /^[a-z0-9-]+:.*## / {printf "  %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+.PHONY: demo
+demo: packages env ## Fly the traffic-monitoring example and leave its report in out/demo (CLUSTER=embedded|current)
+	$(RUN) python -m fractus_sim.demo --cluster $(CLUSTER) --out $(OUT)/demo
+
+.PHONY: test
+test: packages env lint ## Everything: lint, types, unit, integration and end-to-end tests
+	$(RUN) pytest tests/unit tests/integration tests/e2e
+
+.PHONY: test-fast
+test-fast: env lint ## The inner loop: lint, types and unit tests
+	$(RUN) pytest -q tests/unit
+
+.PHONY: test-e2e
+test-e2e: packages env ## End-to-end tests only, on the embedded cluster or on FRACTUS_E2E_CLUSTER=current
+	$(RUN) pytest tests/e2e
+
+.PHONY: lint
+lint: env ## Style, types and the direction of imports
+	$(RUN) ruff check
+	$(RUN) ruff format --check
+	$(RUN) mypy
+	$(RUN) lint-imports
+
+.PHONY: format
+format: env ## Format the code
+	$(RUN) ruff check --fix
+	$(RUN) ruff format
+
+.PHONY: generate
+generate: env ## Generate the CRDs from the models and the stubs from the .proto files
+	$(RUN) python -m fractus_core.api.crd crds
+	$(RUN) python -m grpc_tools.protoc -Iproto --python_out=proto --pyi_out=proto --grpc_python_out=proto \
+		proto/fractus_proto/v1/*.proto
+
+.PHONY: images
+images: packages env ## Build the container images
+	$(RUN) python -m fractus_sim.cluster.images build
+
+.PHONY: bench
+bench: env ## Run every benchmark
+	for file in bench/*.py; do $(RUN) python "$$file" --quick; done
+
+.PHONY: packages
+packages: ## Install the Debian packages that are missing (root)
+	@missing="$$(dpkg-query -W -f='$${db:Status-Status} $${Package}\n' $(APT_PACKAGES) 2>/dev/null \
+		| awk '$$1 == "installed" {print $$2}' | sort | comm -13 - <(printf '%s\n' $(APT_PACKAGES) | sort) || true)"; \
+	if [ -n "$$missing" ]; then \
+		command -v apt-get > /dev/null || { echo "install these first: $$missing" >&2; exit 1; }; \
+		echo "installing: "$$missing; \
+		apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $$missing > /dev/null; \
+	fi
+
+.PHONY: env
+env: .venv/.synced
+
+.venv/.synced: pyproject.toml uv.lock | $(if $(filter .tools/bin/uv,$(UV)),.tools/bin/uv)
+	$(UV) sync --frozen --all-extras --quiet
+	@touch $@
+
+.tools/bin/uv:
+	python3 -m venv .tools || { echo "python3-venv is missing: apt-get install -y python3-venv" >&2; exit 1; }
+	.tools/bin/pip install --quiet uv==$(UV_VERSION)
+
+.PHONY: clean
+clean: ## Remove what was built here (not the caches)
+	rm -rf .venv .tools out dist .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,94 @@
+"""Files that survive kill -9 and power loss: a reader sees the old content or the new, never a part."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import uuid
+from collections.abc import Mapping
+from pathlib import Path
+
+CURRENT = "..data"
+"""Symbolic link to the directory that holds the current set of files (as kubelet does for Secret volumes)."""
+
+
+def write_file(path: Path, content: bytes, mode: int = 0o600) -> None:
+    """Replace a file in one step and wait until it is on the disk.
+
+    The temporary file begins with a dot and ends in .tmp; one that a kill left behind is written over next time.
+
+    Raises:
+        OSError: the disk is full, read-only or gone; the old content is untouched.
+    """
+    temporary = path.with_name(f".{path.name}.tmp")
+    _write_new(temporary, content, mode)
+    temporary.replace(path)
+    _sync_directory(path.parent)
+
+
+def remove_file(path: Path) -> bool:
+    """Remove a file and wait until that is on the disk; False when it was not there."""
+    try:
+        path.unlink()
+    except FileNotFoundError:
+        return False
+    _sync_directory(path.parent)
+    return True
+
+
+def write_set(directory: Path, files: Mapping[str, bytes], mode: int = 0o600) -> None:
+    """Replace several files that belong together in one step.
+
+    Each name becomes a symbolic link through `..data`, and the swap of that one link changes all of them at once.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    fresh = directory / f"..{uuid.uuid4().hex}"
+    fresh.mkdir(mode=0o700)
+    for name, content in files.items():
+        _write_new(fresh / name, content, mode)
+    _sync_directory(fresh)
+    _link(directory / CURRENT, fresh.name)
+    for name in files:
+        target = f"{CURRENT}/{name}"
+        if not (directory / name).is_symlink() or str((directory / name).readlink()) != target:
+            _link(directory / name, target)
+    _sync_directory(directory)
+    for left in directory.glob("..*"):
+        if left.is_dir() and not left.is_symlink() and left != fresh:
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def read_set(directory: Path, names: tuple[str, ...]) -> dict[str, bytes] | None:
+    """Read files written together; None when one of them is missing."""
+    try:
+        home = (directory / CURRENT).resolve(strict=True)
+        return {name: (home / name).read_bytes() for name in names}
+    except FileNotFoundError:
+        return None
+
+
+def _write_new(path: Path, content: bytes, mode: int) -> None:
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, mode)
+    try:
+        os.fchmod(handle, mode)
+        view = memoryview(content)
+        while view:
+            view = view[os.write(handle, view) :]
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _link(path: Path, target: str) -> None:
+    temporary = path.with_name(f"{path.name}_tmp")
+    temporary.unlink(missing_ok=True)
+    temporary.symlink_to(target)
+    temporary.replace(path)
+
+
+def _sync_directory(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

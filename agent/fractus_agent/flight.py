@@ -1,0 +1,24 @@
+"""What a drone is doing at one moment, in the API's terms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """The drone at one moment."""
+
+    flight_state: str
+    controller: str
+    connected: bool
+    ready: bool
+    in_air: bool
+    mode: str
+    position: tuple[float, float, float, str] | None
+    """Degrees north, degrees east, metres, and what the metres are measured from."""
+    battery_remaining: float
+    battery_voltage_v: float
+    battery_current_a: float
+    missions: Mapping[str, str] = field(default_factory=dict)

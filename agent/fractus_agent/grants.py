@@ -1,0 +1,234 @@
+"""Grants of this node: from the API server to the disk, and what became of them back to the API server."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections.abc import AsyncIterator, Mapping
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+from fractus_core.api.model import InvalidObject
+from fractus_core.api.plans import Grant
+
+from fractus_agent.backoff import Backoff
+from fractus_agent.durable import remove_file, write_file
+from fractus_agent.store import Changed, Conflict, Deleted, GrantEvent, Listed, Object, Rejected, Unavailable
+
+LOG = logging.getLogger(__name__)
+
+Phase = Literal["Pending", "Active", "Complete", "Revoked", "Failed"]
+ENDED: frozenset[str] = frozenset({"Complete", "Revoked", "Failed"})
+_OUTCOMES: dict[str, Phase] = {"complete": "Complete", "revoked": "Revoked", "failed": "Failed"}
+REVIEW_S = 60.0
+"""Seconds after which reports and failed writes are looked at again, if nothing happens before."""
+
+
+class GrantStore(Protocol):
+    """What the keeper of grants needs of the store."""
+
+    def grants(self) -> AsyncIterator[GrantEvent]:
+        """Follow the node's grants."""
+
+    async def apply_status(self, kind: str, name: str, status: Object) -> Object | None:
+        """Apply a status."""
+
+
+class GrantDirectory:
+    """The stored grants: one complete JSON file each, whenever the machine stops."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def open(self) -> None:
+        """Make the directory, and clear what a kill left half-written."""
+        self._path.mkdir(parents=True, exist_ok=True, mode=0o700)
+        for left in self._path.glob(".*.tmp"):
+            left.unlink()
+
+    def names(self) -> set[str]:
+        """Names of the grants on disk."""
+        return {path.stem for path in self._path.glob("*.json")}
+
+    def put(self, grant: Grant) -> bool:
+        """Store a grant; False when the same was stored already."""
+        path, content = self._file(grant.name), stored_form(grant)
+        try:
+            if path.read_bytes() == content:
+                return False
+        except FileNotFoundError:
+            pass
+        write_file(path, content)
+        return True
+
+    def drop(self, name: str) -> bool:
+        """Remove a grant; False when it was not there."""
+        return remove_file(self._file(name))
+
+    def _file(self, name: str) -> Path:
+        return self._path / f"{name}.json"
+
+
+def stored_form(grant: Grant) -> bytes:
+    """The manifest as services read it: without what changes when only the status does."""
+    body = grant.to_dict()
+    body.pop("status", None)
+    body["metadata"].pop("resourceVersion", None)
+    return json.dumps(body, sort_keys=True, indent=1).encode() + b"\n"
+
+
+def outcome_of(grant: Grant, missions: Mapping[str, str]) -> tuple[Phase, str] | None:
+    """How the grant's mission ended, as the mobility service tells; None while it has not."""
+    for key in (grant.metadata.uid, grant.spec.identity, grant.spec.instance):
+        if key and key in missions:
+            kind, _, message = missions[key].partition(":")
+            phase = _OUTCOMES.get(kind.strip().lower())
+            return (phase, message.strip()) if phase else ("Failed", missions[key])
+    return None
+
+
+def status_of(grant: Grant, missions: Mapping[str, str], problem: str | None) -> dict[str, Any]:
+    """The status that the agent reports of a grant; an end once reported is never taken back."""
+    reported = grant.status
+    if reported is not None and reported.phase in ENDED:
+        phase, message = reported.phase, reported.message or ""
+    elif problem is not None:
+        phase, message = "Pending", problem
+    else:
+        phase, message = outcome_of(grant, missions) or ("Active", "")
+    return {"phase": phase, "message": message, "observedGeneration": grant.metadata.generation or 0}
+
+
+class GrantKeeper:
+    """Mirrors the node's grants to disk and reports their phases.
+
+    Files go only on word of the API server: a deletion, or absence from a complete list.
+    """
+
+    def __init__(self, store: GrantStore, directory: GrantDirectory, node: str) -> None:
+        self._store = store
+        self._directory = directory
+        self._node = node
+        self._grants: dict[str, Grant] = {}
+        self._unreadable: dict[str, dict[str, Any]] = {}
+        self._unstored: dict[str, str] = {}
+        self._unremoved: set[str] = set()
+        self._reported: dict[str, dict[str, Any]] = {}
+        self._missions: Mapping[str, str] = {}
+        self._work = asyncio.Event()
+
+    def missions_changed(self, missions: Mapping[str, str]) -> None:
+        """Take what the mobility service says of ended missions."""
+        if dict(missions) != self._missions:
+            self._missions = dict(missions)
+            self._work.set()
+
+    async def follow(self) -> None:
+        """Keep the directory in step with the API server, for ever."""
+        self._directory.open()
+        async for event in self._store.grants():
+            self.take(event)
+
+    def take(self, event: GrantEvent) -> None:
+        """Bring one piece of news to the disk."""
+        match event:
+            case Listed(grants):
+                names = {body["metadata"]["name"] for body in grants}
+                for gone in (self._directory.names() | set(self._grants)) - names:
+                    self._remove(gone)
+                for body in grants:
+                    self._put(body)
+            case Changed(body):
+                self._put(body)
+            case Deleted(name):
+                self._remove(name)
+        self._work.set()
+
+    async def report(self) -> None:
+        """Bring phases to the API server, for ever; what cannot be written now is written later."""
+        backoff = Backoff(0.5, 15.0)
+        while True:
+            delay_s = REVIEW_S
+            self._work.clear()
+            try:
+                await self.report_once()
+                backoff.succeeded()
+            except (Unavailable, Conflict, Rejected) as error:
+                LOG.log(logging.DEBUG if backoff.attempts else logging.WARNING, "phases wait: %s", error)
+                delay_s = backoff.delay_s()
+                await asyncio.sleep(delay_s)
+                continue
+            try:
+                await asyncio.wait_for(self._work.wait(), delay_s)
+            except TimeoutError:
+                self._retry_disk()
+
+    async def report_once(self) -> None:
+        """Report every grant whose status at the API server is not what the node knows."""
+        wanted = {
+            name: status_of(grant, self._missions, self._unstored.get(name)) for name, grant in self._grants.items()
+        }
+        for name, status in (wanted | self._unreadable).items():
+            if self._reported.get(name) == status:
+                continue
+            await self._store.apply_status("Grant", name, status)
+            self._reported[name] = status
+            LOG.info("grant %s is %s%s", name, status["phase"], f": {status['message']}" if status["message"] else "")
+
+    def _put(self, body: Object) -> None:
+        name = body["metadata"]["name"]
+        try:
+            grant = Grant.from_body(body)
+        except InvalidObject as error:
+            # What it forbids cannot be known, so nothing of it is kept: the services bring the drone home.
+            LOG.error("grant %s cannot be read, so nothing is granted: %s", name, error)  # noqa: TRY400
+            self._remove(name)
+            self._unreadable[name] = {
+                "phase": "Failed",
+                "message": f"The agent of {self._node} cannot read the grant: {error}",
+                "observedGeneration": body["metadata"].get("generation", 0),
+            }
+            return
+        if grant.metadata.deletion_timestamp is not None or grant.spec.node != self._node:
+            self._remove(name)
+            return
+        self._unreadable.pop(name, None)
+        self._unremoved.discard(name)
+        old = self._grants.get(name)
+        if old is None or old.metadata.uid != grant.metadata.uid:
+            self._reported.pop(name, None)
+        self._grants[name] = grant
+        if grant.status is not None:
+            self._reported[name] = {
+                "phase": grant.status.phase,
+                "message": grant.status.message or "",
+                "observedGeneration": grant.status.observed_generation or 0,
+            }
+        self._write(grant)
+
+    def _write(self, grant: Grant) -> None:
+        try:
+            if self._directory.put(grant):
+                LOG.info("stored grant %s of %s", grant.name, grant.spec.identity)
+            self._unstored.pop(grant.name, None)
+        except OSError as error:
+            LOG.exception("grant %s cannot be stored", grant.name)
+            self._unstored[grant.name] = f"The node cannot store the grant: {error.strerror or error}."
+
+    def _retry_disk(self) -> None:
+        for name in list(self._unstored):
+            self._write(self._grants[name])
+        for name in list(self._unremoved):
+            self._remove(name)
+
+    def _remove(self, name: str) -> None:
+        for record in (self._grants, self._unreadable, self._unstored, self._reported):
+            record.pop(name, None)
+        self._unremoved.discard(name)
+        try:
+            if self._directory.drop(name):
+                LOG.info("removed grant %s", name)
+        except OSError:
+            LOG.exception("grant %s cannot be removed from the disk; trying again soon", name)
+            self._unremoved.add(name)

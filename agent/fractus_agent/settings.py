@@ -1,0 +1,50 @@
+"""Where the agent finds things: its node, its files, the services beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+
+class MissingSetting(Exception):
+    """A setting that has no default is not set."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What differs between nodes; everything else is a constant of the module that uses it."""
+
+    node: str
+    description: Path
+    state: Path
+    mobility_address: str
+    log_level: str = "INFO"
+
+    @property
+    def grants(self) -> Path:
+        """Directory of the stored grants, which the node's services watch."""
+        return self.state / "grants"
+
+    @property
+    def tls(self) -> Path:
+        """Directory of the node's certificate, key and authority."""
+        return self.state / "tls"
+
+    @classmethod
+    def from_environment(cls, environment: Mapping[str, str]) -> Settings:
+        """Read FRACTUS_NODE (needed), FRACTUS_DESCRIPTION, FRACTUS_STATE_DIR, FRACTUS_MOBILITY, FRACTUS_LOG_LEVEL.
+
+        Raises:
+            MissingSetting: FRACTUS_NODE is not set.
+        """
+        node = environment.get("FRACTUS_NODE", "")
+        if not node:
+            raise MissingSetting("FRACTUS_NODE is not set: give it the node's name (fieldRef spec.nodeName)")
+        return cls(
+            node=node,
+            description=Path(environment.get("FRACTUS_DESCRIPTION", "/etc/fractus/node.yaml")),
+            state=Path(environment.get("FRACTUS_STATE_DIR", "/var/lib/fractus")),
+            mobility_address=environment.get("FRACTUS_MOBILITY", "127.0.0.1:50051"),
+            log_level=environment.get("FRACTUS_LOG_LEVEL", "INFO").upper(),
+        )

@@ -1,0 +1,233 @@
+"""The status of the node's Drone or EdgeNode: what it says, and when it is worth a write."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any, Protocol, get_args
+
+from fractus_core.api.nodes import FlightState
+
+from fractus_agent.backoff import Backoff
+from fractus_agent.findings import Finding, conditions, timestamp
+from fractus_agent.flight import Snapshot
+from fractus_agent.store import Conflict, Object, Rejected, Unavailable
+
+LOG = logging.getLogger(__name__)
+
+_FLIGHT_STATES = get_args(FlightState)
+_DEGREE_M = 111_320.0
+STILL_M = 2.0
+"""Metres that a standing drone's position may wander without being worth a write."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """Seconds between writes of a status."""
+
+    urgent_s: float = 1.0
+    """After a change of flight state, controller or a condition."""
+    moving_s: float = 10.0
+    """After a change of position or battery."""
+    idle_s: float = 30.0
+    """When nothing changed: lastSeen only."""
+
+
+DRONE_PACE = Pace()
+EDGE_PACE = Pace(idle_s=60.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Observed:
+    """All that the agent knows of its node now."""
+
+    kind: str
+    has_mobility: bool
+    needs_certificate: bool
+    certified: Finding
+    snapshot: Snapshot | None = None
+    problem: str | None = None
+    described: Finding | None = None
+
+
+def readiness(observed: Observed) -> Finding:
+    """Whether components can work on the node, and the first thing in the way."""
+
+    def unready(reason: str, message: str) -> Finding:
+        return Finding("Ready", "False", reason, message)
+
+    seen = observed.snapshot
+    if observed.needs_certificate and not observed.certified.holds:
+        return unready("NoCertificate", observed.certified.message)
+    if not observed.has_mobility:
+        return Finding("Ready", "True", "AgentRunning", "The node's agent runs.")
+    if observed.problem is not None or seen is None:
+        return unready("MobilityUnreachable", observed.problem or "The mobility service has not answered yet.")
+    if not seen.connected:
+        return unready("AutopilotDisconnected", "The mobility service has no link to the autopilot.")
+    if not (seen.ready or seen.in_air):
+        return unready("AutopilotNotReady", f"The autopilot would not arm now (mode {seen.mode or 'unknown'}).")
+    return Finding("Ready", "True", "AutopilotReady", "The mobility service answers and the autopilot is ready.")
+
+
+def node_status(observed: Observed, previous: Object, generation: int | None, now: datetime) -> dict[str, Any]:
+    """The status to write; what cannot be seen now is kept from the previous one."""
+    findings = [readiness(observed), observed.certified]
+    if observed.described is not None:
+        findings.append(observed.described)
+    status: dict[str, Any] = {
+        "lastSeen": timestamp(now),
+        "conditions": conditions(findings, previous.get("conditions") or (), generation, now),
+    }
+    if observed.kind == "Drone":
+        kept = {key: previous[key] for key in ("flightState", "position", "battery", "controller") if key in previous}
+        status |= {"flightState": "inactive"} | kept
+        if observed.snapshot is not None and observed.problem is None:
+            status |= _flight(observed.snapshot)
+    return status
+
+
+def _flight(seen: Snapshot) -> dict[str, Any]:
+    flight: dict[str, Any] = {}
+    if seen.flight_state in _FLIGHT_STATES:
+        flight["flightState"] = seen.flight_state
+    if seen.controller:
+        flight["controller"] = seen.controller
+    if seen.position is not None:
+        lat, lon, alt, reference = seen.position
+        flight["position"] = {
+            "lat": round(lat, 7), "lon": round(lon, 7), "alt": round(alt, 2), "altitudeReference": reference,
+        }  # fmt: skip
+    if seen.connected:
+        flight["battery"] = {
+            "remaining": round(seen.battery_remaining, 2),
+            "voltage": round(seen.battery_voltage_v, 1),
+            "current": round(seen.battery_current_a, 1),
+        }
+    return flight
+
+
+def due_s(old: Object | None, new: Object, since_s: float, pace: Pace) -> float:
+    """Seconds until the new status is to be written, given the one written since_s ago; 0: now."""
+    if old is None:
+        return 0.0
+    if _urgent(old) != _urgent(new):
+        wait_s = pace.urgent_s
+    elif _moved(old, new):
+        wait_s = pace.moving_s
+    else:
+        wait_s = pace.idle_s
+    return max(0.0, wait_s - since_s)
+
+
+def _urgent(status: Object) -> tuple[object, ...]:
+    facts: Sequence[Object] = status.get("conditions") or ()
+    return (
+        status.get("flightState"),
+        status.get("controller"),
+        tuple((c["type"], c["status"], c["reason"], c.get("observedGeneration")) for c in facts),
+    )
+
+
+def _moved(old: Object, new: Object) -> bool:
+    messages = [[c.get("message") for c in status.get("conditions") or ()] for status in (old, new)]
+    if messages[0] != messages[1]:
+        return True
+    charge = [(status.get("battery") or {}).get("remaining", 0.0) for status in (old, new)]
+    if abs(charge[0] - charge[1]) >= 0.01:
+        return True
+    before, after = old.get("position"), new.get("position")
+    if before is None or after is None:
+        return before is not after
+    north_m = (after["lat"] - before["lat"]) * _DEGREE_M
+    east_m = (after["lon"] - before["lon"]) * _DEGREE_M * math.cos(math.radians(before["lat"]))
+    return math.hypot(north_m, east_m, (after.get("alt") or 0.0) - (before.get("alt") or 0.0)) > STILL_M
+
+
+class StatusStore(Protocol):
+    """What the reporter needs of the store."""
+
+    async def apply_status(self, kind: str, name: str, status: Object) -> Object | None:
+        """Apply a status."""
+
+
+class StatusReporter:
+    """Writes the node's status when it is due.
+
+    Args:
+        store: where to.
+        body: the Drone or EdgeNode as the API server has it now, None while it is absent.
+        observe: what the agent knows now, given that object.
+        written: takes the object that a write returned; None when the object is gone.
+        wall: the wall clock, for time stamps.
+        monotonic: seconds that never jump, for the pace.
+    """
+
+    def __init__(
+        self,
+        store: StatusStore,
+        *,
+        body: Callable[[], Object | None],
+        observe: Callable[[Object], Observed],
+        written: Callable[[Object | None], None],
+        wall: Callable[[], datetime],
+        monotonic: Callable[[], float],
+    ) -> None:
+        self._store = store
+        self._body = body
+        self._observe = observe
+        self._written = written
+        self._wall = wall
+        self._monotonic = monotonic
+        self._last: Object | None = None
+        self._last_uid: str | None = None
+        self._last_s = 0.0
+        self._news = asyncio.Event()
+
+    def poke(self) -> None:
+        """Something may have changed."""
+        self._news.set()
+
+    async def run(self) -> None:
+        """Report, for ever."""
+        backoff = Backoff(0.5, 15.0)
+        while True:
+            self._news.clear()
+            try:
+                wait_s = await self.step()
+                backoff.succeeded()
+            except (Unavailable, Conflict, Rejected) as error:
+                LOG.log(logging.DEBUG if backoff.attempts else logging.WARNING, "the status waits: %s", error)
+                await asyncio.sleep(backoff.delay_s())
+                continue
+            try:
+                await asyncio.wait_for(self._news.wait(), wait_s)
+            except TimeoutError:
+                continue
+
+    async def step(self) -> float:
+        """Write the status if it is due; seconds until it will be if nothing happens."""
+        body = self._body()
+        if body is None:
+            return 5.0
+        observed = self._observe(body)
+        metadata = body["metadata"]
+        if metadata.get("uid") != self._last_uid:
+            self._last = None
+        previous = self._last or body.get("status") or {}
+        status = node_status(observed, previous, metadata.get("generation"), self._wall())
+        pace = DRONE_PACE if observed.kind == "Drone" else EDGE_PACE
+        wait_s = due_s(self._last, status, self._monotonic() - self._last_s, pace)
+        if wait_s > 0:
+            return wait_s
+        result = await self._store.apply_status(observed.kind, metadata["name"], status)
+        self._written(result)
+        if result is None:
+            self._last = None
+            return 5.0
+        self._last, self._last_uid, self._last_s = status, metadata.get("uid"), self._monotonic()
+        return pace.moving_s

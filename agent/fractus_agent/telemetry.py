@@ -1,0 +1,124 @@
+"""What the drone is doing, from the mobility service of the node."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import grpc
+from fractus_core.api.plans import node_server_name
+from fractus_proto.v1.mobility_pb2 import SubscribeTelemetryRequest, Telemetry
+from fractus_proto.v1.mobility_pb2_grpc import MobilityServiceStub
+from fractus_proto.v1.types_pb2 import AltitudeReference
+
+from fractus_agent.backoff import Backoff
+from fractus_agent.durable import read_set
+from fractus_agent.flight import Snapshot
+from fractus_agent.identity import FILES
+
+LOG = logging.getLogger(__name__)
+
+INTERVAL_S = 1.0
+SILENCE_S = 5.0
+"""Seconds without a message after which the service counts as unreachable."""
+
+_REFERENCES = {
+    AltitudeReference.ALTITUDE_REFERENCE_HOME: "home",
+    AltitudeReference.ALTITUDE_REFERENCE_AMSL: "amsl",
+    AltitudeReference.ALTITUDE_REFERENCE_TERRAIN: "terrain",
+}
+
+
+def snapshot(message: Telemetry) -> Snapshot:
+    """Translate a telemetry message."""
+    position = None
+    if message.HasField("position"):
+        place = message.position
+        reference = _REFERENCES.get(place.altitude_reference, "home")
+        position = (place.latitude_deg, place.longitude_deg, place.altitude_m, reference)
+    return Snapshot(
+        flight_state=message.flight_state,
+        controller=message.controller,
+        connected=message.autopilot_connected,
+        ready=message.ready,
+        in_air=message.in_air,
+        mode=message.mode,
+        position=position,
+        battery_remaining=min(1.0, max(0.0, message.battery_remaining)),
+        battery_voltage_v=message.battery_voltage_v,
+        battery_current_a=message.battery_current_a,
+        missions=dict(message.missions),
+    )
+
+
+class TelemetryFeed:
+    """Keeps the latest snapshot, and why there is none.
+
+    Args:
+        address: host and port of the mobility service.
+        tls: directory of the node's certificate, the client's identity here.
+        node: name of the node, for the server's name.
+        serial: counts changes of the certificate; the feed reconnects when it moves.
+        changed: called after every message and every loss.
+    """
+
+    def __init__(
+        self, address: str, tls: Path, node: str, *, serial: Callable[[], int], changed: Callable[[], None]
+    ) -> None:
+        self._address = address
+        self._tls = tls
+        self._node = node
+        self._serial = serial
+        self._changed = changed
+        self.latest: Snapshot | None = None
+        self.problem: str | None = "The mobility service has not answered yet."
+
+    async def run(self) -> None:
+        """Stay subscribed, for ever."""
+        backoff = Backoff(0.5, 5.0)
+        while True:
+            try:
+                async for message in self._messages():
+                    if self.problem is not None:
+                        LOG.info("telemetry of the mobility service flows")
+                    self.latest, self.problem = snapshot(message), None
+                    backoff.succeeded()
+                    self._changed()
+                self._lost("the certificate changed, connecting again", expected=True)
+                continue
+            except grpc.aio.AioRpcError as error:
+                self._lost(f"{error.code().name}: {error.details()}")
+            except TimeoutError:
+                self._lost(f"silent for {SILENCE_S:.0f} s")
+            except (OSError, ValueError) as error:
+                self._lost(str(error))
+            await asyncio.sleep(backoff.delay_s())
+
+    async def _messages(self) -> AsyncIterator[Telemetry]:
+        files = read_set(self._tls, FILES)
+        if files is None:
+            raise FileNotFoundError("the node has no certificate yet")
+        serial = self._serial()
+        credentials = grpc.ssl_channel_credentials(files["ca.crt"], files["tls.key"], files["tls.crt"])
+        options = (("grpc.ssl_target_name_override", node_server_name(self._node)), ("grpc.enable_http_proxy", 0))
+        async with grpc.aio.secure_channel(self._address, credentials, options=options) as channel:
+            stub = MobilityServiceStub(channel)  # type: ignore[no-untyped-call]
+            call = stub.SubscribeTelemetry(SubscribeTelemetryRequest(interval_s=INTERVAL_S))
+            try:
+                while self._serial() == serial:
+                    message = await asyncio.wait_for(call.read(), SILENCE_S)
+                    if message is grpc.aio.EOF:
+                        raise ConnectionResetError(f"the service ended the stream: {await call.details()}")
+                    yield message
+            finally:
+                call.cancel()
+
+    def _lost(self, why: str, *, expected: bool = False) -> None:
+        problem = f"The mobility service is out of reach: {why}."
+        if self.problem is None and not expected:
+            LOG.warning("%s", problem)
+        if problem != self.problem and not expected:
+            self.problem = problem
+            self._changed()

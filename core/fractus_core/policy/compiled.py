@@ -1,0 +1,301 @@
+"""A grant made ready for the engine: geometries in metres, indexed, so that a check takes microseconds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Literal
+
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from fractus_core.api.geometry import AltitudeBand, Area, Point, Reference
+from fractus_core.api.methods import METHODS_OF
+from fractus_core.api.plans import GrantedPolicy, GrantSpec
+from fractus_core.api.policies import PolicySpec
+from fractus_core.geo import LocalFrame, middle, polygon
+from fractus_core.policy.values import Home, Situation
+
+FOREVER = float("inf")
+REACH_M = 500_000.0
+"""Ground further than this from the origin is left out of the frame: no drone of ours gets there."""
+OPERATION_AREA = "operation-area"
+"""Name under which verdicts list the fence that every grant implies."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """A policy that holds for the instance, without its zones."""
+
+    name: str
+    spec: PolicySpec
+    valid_from_s: float
+    valid_until_s: float
+
+    def in_force(self, time_s: float) -> bool:
+        """Whether the policy is in its validity window."""
+        return self.valid_from_s <= time_s < self.valid_until_s
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """One zone of one policy."""
+
+    rule: Rule
+    zone: str
+    shape: BaseGeometry
+    band: AltitudeBand | None
+
+
+def height_m(value: float, reference: Reference, home: Home | None, flat_terrain: bool) -> float | None:
+    """An altitude as metres above home; None where nothing tells how high that datum lies."""
+    if reference == "home":
+        return value
+    if reference == "amsl":
+        return None if home is None else value - home.amsl_m
+    return value if flat_terrain else None
+
+
+class Patches:
+    """Zones of policies in a spatial index, and the policies that hold everywhere."""
+
+    __slots__ = ("_tree", "everywhere", "patches")
+
+    def __init__(self, patches: Iterable[Patch] = (), everywhere: Iterable[Rule] = ()) -> None:
+        self.patches = tuple(patches)
+        self.everywhere = tuple(everywhere)
+        self._tree = shapely.STRtree([p.shape for p in self.patches]) if self.patches else None
+
+    def __bool__(self) -> bool:
+        return bool(self.patches or self.everywhere)
+
+    def near(
+        self, ground: BaseGeometry, distance_m: float, lower_m: float, upper_m: float, now: Situation, flat: bool
+    ) -> Iterator[Patch]:
+        """Patches in force whose column of air comes within a distance of the ground between two altitudes.
+
+        A band whose datum is unknown reaches from the ground to the sky.
+        """
+        if self._tree is None:
+            return
+        for index in self._tree.query(ground, predicate="dwithin", distance=distance_m):
+            patch = self.patches[index]
+            if patch.rule.in_force(now.time_s) and band_meets(patch.band, lower_m, upper_m, now.home, flat):
+                yield patch
+
+
+def band_meets(band: AltitudeBand | None, lower_m: float, upper_m: float, home: Home | None, flat: bool) -> bool:
+    """Whether altitudes from lower to upper (above home) may touch a band; unknown datums may."""
+    if band is None:
+        return True
+    if band.lower is not None:
+        floor = height_m(band.lower, band.reference, home, flat)
+        if floor is not None and upper_m < floor:
+            return False
+    if band.upper is not None:
+        ceiling = height_m(band.upper, band.reference, home, flat)
+        if ceiling is not None and lower_m > ceiling:
+            return False
+    return True
+
+
+def band_holds(band: AltitudeBand | None, lower_m: float, upper_m: float, home: Home | None, flat: bool) -> bool:
+    """Whether altitudes from lower to upper (above home) surely lie inside a band; unknown datums do not."""
+    if band is None:
+        return True
+    for edge, inside in ((band.lower, lambda h: h <= lower_m), (band.upper, lambda h: h >= upper_m)):
+        if edge is not None:
+            height = height_m(edge, band.reference, home, flat)
+            if height is None or not inside(height):
+                return False
+    return True
+
+
+@dataclass(frozen=True, slots=True)
+class Inclusion:
+    """A policy that keeps the drone inside the union of its zones."""
+
+    rule: Rule
+    patches: tuple[Patch, ...]
+    shape: BaseGeometry
+    border: BaseGeometry
+    banded: bool
+
+    def at(self, lower_m: float, upper_m: float, now: Situation, flat: bool) -> tuple[BaseGeometry, BaseGeometry]:
+        """The allowed ground and its border for a range of altitudes above home."""
+        if not self.banded:
+            return self.shape, self.border
+        kept = [p.shape for p in self.patches if band_holds(p.band, lower_m, upper_m, now.home, flat)]
+        shape = shapely.union_all(kept) if kept else shapely.Polygon()
+        return shape, shape.boundary
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledGrant:
+    """What the engine knows of one component instance.
+
+    Attributes:
+        methods: granted methods of all services.
+        denials: per method, policies that forbid it.
+        allowances: per method, policies that say where and when it is granted; a method that none of them names is
+            granted by the grant itself.
+        operation: where services may be used; None: anywhere.
+        passage: operation area and the way between it and home; None: anywhere.
+    """
+
+    identity: str
+    frame: LocalFrame
+    methods: frozenset[str]
+    driver: bool
+    max_altitude_m: float | None
+    max_speed_mps: float | None
+    denials: dict[str, Patches]
+    allowances: dict[str, Patches]
+    altitude_limits: Patches
+    speed_limits: Patches
+    exclusions: Patches
+    inclusions: tuple[Inclusion, ...]
+    privacy: Patches
+    operation: BaseGeometry | None
+    operation_border: BaseGeometry | None
+    passage: BaseGeometry | None
+    passage_border: BaseGeometry | None
+    flat_terrain: bool
+
+
+def compile_grant(spec: GrantSpec, origin: Point | None = None, flat_terrain: bool = False) -> CompiledGrant:
+    """Prepare a grant for the engine.
+
+    Args:
+        spec: the grant as the operator wrote it.
+        origin: origin of the metric frame, the drone's home say; by default the grant's own home, depot or area.
+        flat_terrain: take the ground everywhere for as high as home. Otherwise what is measured from terrain is unknown,
+            and policies that need it refuse.
+
+    Raises:
+        InvalidObject: an area of the grant has no sound geometry.
+    """
+    frame = LocalFrame.at(origin or _origin(spec))
+    zoned = [(_rule(policy), policy) for policy in spec.policies]
+    methods = frozenset().union(*(spec.methods(service) for service in METHODS_OF))
+    operation = _union(frame, spec.operation_area)
+    passage = operation
+    if operation is not None and spec.corridor and spec.control != "partial":
+        passage = shapely.union(operation, _union(frame, spec.corridor))
+    return CompiledGrant(
+        identity=spec.identity,
+        frame=frame,
+        methods=methods,
+        driver=spec.class_ == "driver",
+        max_altitude_m=spec.limits.max_altitude if spec.limits else None,
+        max_speed_mps=spec.limits.max_speed if spec.limits else None,
+        denials=_by_method(frame, zoned, "denial", methods),
+        allowances=_by_method(frame, zoned, "grant", methods),
+        altitude_limits=_patches(frame, zoned, "LimitControl", "altitude"),
+        speed_limits=_patches(frame, zoned, "LimitControl", "speed"),
+        exclusions=_patches(frame, zoned, "GeofenceControl", "exclusion"),
+        inclusions=tuple(_inclusion(frame, r, p) for r, p in zoned if p.spec.kind == "inclusion"),
+        privacy=_patches(frame, zoned, "PrivacyControl", "camera"),
+        operation=operation,
+        operation_border=_prepared(operation.boundary) if operation is not None else None,
+        passage=_prepared(passage) if passage is not None else None,
+        passage_border=_prepared(passage.boundary) if passage is not None else None,
+        flat_terrain=flat_terrain,
+    )
+
+
+def _origin(spec: GrantSpec) -> Point:
+    if spec.home is not None:
+        return Point(lat=spec.home.lat, lon=spec.home.lon)
+    if spec.depot is not None:
+        return spec.depot
+    if spec.operation_area:
+        return middle(spec.operation_area[0])
+    for policy in spec.policies:
+        if policy.zones:
+            return middle(policy.zones[0].area)
+    return Point(lat=0.0, lon=0.0)
+
+
+def _rule(policy: GrantedPolicy) -> Rule:
+    spec = policy.spec
+    return Rule(policy.name, spec, _unix(spec.valid_from, -FOREVER), _unix(spec.valid_until, FOREVER))
+
+
+def _unix(moment: datetime | None, default: float) -> float:
+    if moment is None:
+        return default
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
+def _prepared(shape: BaseGeometry) -> BaseGeometry:
+    shapely.prepare(shape)
+    return shape
+
+
+def _union(frame: LocalFrame, areas: tuple[Area, ...]) -> BaseGeometry | None:
+    if not areas:
+        return None
+    return _prepared(shapely.union_all([polygon(frame, area) for area in areas]))
+
+
+def _zone_patches(frame: LocalFrame, rule: Rule, policy: GrantedPolicy) -> list[Patch]:
+    patches = []
+    for zone in policy.zones:
+        if _within_reach(frame, zone.area):
+            patches.append(Patch(rule, zone.name, _prepared(polygon(frame, zone.area)), zone.altitude))
+    return patches
+
+
+def _within_reach(frame: LocalFrame, area: Area) -> bool:
+    """Whether the frame can show the area: some of it is near, or it may reach around the frame."""
+    if area.circle is not None:
+        center = LocalFrame.at(area.circle.center)
+        x, y = center.xy(frame.lat, frame.lon)
+        near = abs(frame.lat - area.circle.center.lat) < 60 and abs(x) + abs(y) < REACH_M + area.circle.radius
+        return near and _same_side(frame, area.circle.center)
+    ring = area.polygon.exterior if area.polygon is not None else ()
+    if not all(_same_side(frame, point) for point in ring):
+        return False
+    xy = [frame.xy(p.lat, p.lon) for p in ring]
+    (west, east), (south, north) = ((min(a), max(a)) for a in zip(*xy, strict=True))
+    return west < REACH_M and east > -REACH_M and south < REACH_M and north > -REACH_M
+
+
+def _same_side(frame: LocalFrame, point: Point) -> bool:
+    """Whether a point lies on the frame's half of the globe."""
+    apart = abs((point.lon - frame.lon + 180.0) % 360.0 - 180.0)
+    return apart < 80.0 or (abs(frame.lat) > 60.0 and abs(point.lat) > 30.0)
+
+
+def _patches(
+    frame: LocalFrame, zoned: list[tuple[Rule, GrantedPolicy]], kind: str, which: str, method: str | None = None
+) -> Patches:
+    chosen = [
+        (rule, policy)
+        for rule, policy in zoned
+        if rule.spec.type == kind and rule.spec.kind == which and (method is None or method in rule.spec.methods)
+    ]
+    return Patches(
+        [patch for rule, policy in chosen for patch in _zone_patches(frame, rule, policy)],
+        [rule for rule, policy in chosen if not policy.zones],
+    )
+
+
+def _by_method(
+    frame: LocalFrame,
+    zoned: list[tuple[Rule, GrantedPolicy]],
+    which: Literal["grant", "denial"],
+    methods: frozenset[str],
+) -> dict[str, Patches]:
+    named = {m for rule, _ in zoned if rule.spec.kind == which for m in rule.spec.methods} & methods
+    return {method: _patches(frame, zoned, "AccessControl", which, method) for method in sorted(named)}
+
+
+def _inclusion(frame: LocalFrame, rule: Rule, policy: GrantedPolicy) -> Inclusion:
+    patches = tuple(_zone_patches(frame, rule, policy))
+    shape = shapely.union_all([p.shape for p in patches]) if patches else shapely.Polygon()
+    return Inclusion(
+        rule, patches, _prepared(shape), _prepared(shape.boundary), any(p.band is not None for p in patches)
+    )

@@ -1,0 +1,418 @@
+"""The policy engine: a call in a situation under a grant becomes a verdict that explains itself (thesis 8.7).
+
+Deny by default; the most restrictive policy wins, and among equals the one of higher priority.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import shapely
+
+from fractus_core.policy.access import judge_access, judge_privacy
+from fractus_core.policy.compiled import CompiledGrant, height_m
+from fractus_core.policy.fences import Breach, breaches, last_legal
+from fractus_core.policy.limits import Bound, Clamped, altitude_bounds, clamp, speed_bounds
+from fractus_core.policy.motion import XY, Leg, stop_altitude_m, stop_point
+from fractus_core.policy.values import (
+    Call,
+    CaptureArgs,
+    GotoArgs,
+    SetSpeedArgs,
+    Situation,
+    TakeoffArgs,
+    Takeover,
+    Verdict,
+    deny,
+)
+
+MAX_RANGE_M = 100_000.0
+MAX_ALTITUDE_M = 20_000.0
+MAX_SPEED_MPS = 100.0
+MAX_PIXELS = 20_000
+LEAST_ALTITUDE_M = 0.5
+"""A takeoff goes at least this high."""
+
+
+def judge(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
+    """Decide on a call.
+
+    Args:
+        call: method and arguments as the component gave them.
+        now: state of drone and node.
+        grant: what the component may do.
+
+    Returns:
+        The verdict; an internal error is the caller's to turn into refusal and hover.
+    """
+    problem = _check_arguments(call) or judge_access(call, now, grant)
+    if problem is not None:
+        return problem
+    rule = _RULES.get(call.method)
+    return rule(call, now, grant) if rule is not None else Verdict("allow", call.args)
+
+
+def margin_m(now: Situation) -> float:
+    """How far a leg keeps from fences: position error, and how far the drone strays from a leg.
+
+    The stopping distance enters along the direction of motion, where it belongs: a leg sweeps the triangle of present
+    position, turning point and target.
+    """
+    return now.position_error_m + now.airframe.tracking_m
+
+
+def height_margin_m(now: Situation) -> float:
+    """How far a leg keeps from floors and ceilings of zones."""
+    return now.altitude_error_m + now.airframe.tracking_m
+
+
+# Arguments
+
+
+def _check_arguments(call: Call) -> Verdict | None:
+    args = call.args
+    expected = _ARGS.get(call.method)
+    if expected is not None and not isinstance(args, expected):
+        return deny("InvalidArgument", f"{call.method} needs its arguments")
+    if isinstance(args, TakeoffArgs):
+        return _within("altitude", args.altitude_m, LEAST_ALTITUDE_M, MAX_ALTITUDE_M, "m above home")
+    if isinstance(args, SetSpeedArgs):
+        return _within("speed", args.speed_mps, 0.1, MAX_SPEED_MPS, "m/s")
+    if isinstance(args, GotoArgs):
+        return (
+            _within("latitude", args.lat, -90, 90, "degrees")
+            or _within("longitude", args.lon, -180, 180, "degrees")
+            or (None if args.alt is None else _within("altitude", args.alt, -1000, MAX_ALTITUDE_M, "m"))
+            or (None if args.yaw_deg is None else _within("yaw", args.yaw_deg, -360, 360, "degrees"))
+            or (None if args.speed_mps is None else _within("speed", args.speed_mps, 0.1, MAX_SPEED_MPS, "m/s"))
+        )
+    if isinstance(args, CaptureArgs):
+        return _within("width", args.width, 0, MAX_PIXELS, "pixels") or _within(
+            "height", args.height, 0, MAX_PIXELS, "pixels"
+        )
+    return None
+
+
+_ARGS: dict[str, type] = {"Takeoff": TakeoffArgs, "Goto": GotoArgs, "SetSpeed": SetSpeedArgs}
+
+
+def _within(what: str, value: float, lower: float, upper: float, unit: str) -> Verdict | None:
+    if math.isfinite(value) and lower <= value <= upper:
+        return None
+    return deny("InvalidArgument", f"{what} must be {lower:g} to {upper:g} {unit}, not {value:g}")
+
+
+# Motion
+
+
+def _judge_goto(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
+    args = call.args
+    if not isinstance(args, GotoArgs):
+        return deny("InvalidArgument", "Goto needs its arguments")
+    where = _located(now, grant)
+    if isinstance(where, Verdict):
+        return where
+    target = grant.frame.xy(args.lat, args.lon)
+    if not math.hypot(target[0] - where[0], target[1] - where[1]) <= MAX_RANGE_M or _beyond(args, grant):
+        return deny("InvalidArgument", f"the target is more than {MAX_RANGE_M / 1000:.0f} km away")
+    altitude = now.altitude_m if args.alt is None else height_m(args.alt, args.reference, now.home, grant.flat_terrain)
+    if altitude is None:
+        return deny(
+            "TerrainUnknown", "the target is given above terrain, and no terrain model is loaded; use home or amsl"
+        )
+    notes: list[Clamped] = []
+    if args.alt is not None and args.reference == "terrain":
+        notes.append(
+            Clamped(
+                altitude, "TerrainAssumedFlat", "no terrain model is loaded; the ground is taken as level with home"
+            )
+        )
+    verdict = _fly_leg(args, now, grant, where, target, altitude, notes, adjusting=True)
+    if isinstance(verdict, Verdict):
+        return verdict
+    return _outcome(args, verdict, notes, grant)
+
+
+def _beyond(args: GotoArgs, grant: CompiledGrant) -> bool:
+    """Whether the target lies on the far side of the globe, where the frame folds over."""
+    x, y = grant.frame.xy(args.lat, args.lon)
+    lat, lon = grant.frame.latlon(x, y)
+    return abs(lat - args.lat) > 1e-6 or abs((lon - args.lon + 180.0) % 360.0 - 180.0) > 1e-5
+
+
+def _fly_leg(
+    args: GotoArgs,
+    now: Situation,
+    grant: CompiledGrant,
+    at: XY,
+    target: XY,
+    altitude_m: float,
+    notes: list[Clamped],
+    adjusting: bool,
+) -> tuple[XY, float, float | None] | Verdict:
+    """The target, altitude and speed that may be flown, or the verdict that forbids the leg."""
+    margin, height_margin = margin_m(now), height_margin_m(now)
+    turn, rest = stop_point(now, at), stop_altitude_m(now)
+    leg = _leg(at, turn, target, now, rest, altitude_m)
+    ground = leg.ground
+    bounds = altitude_bounds(grant, now, ground, leg.lower_m, leg.upper_m, margin)
+    if isinstance(bounds, Verdict):
+        return bounds
+    clamped = clamp("Altitude", "m above home", altitude_m, bounds)
+    if isinstance(clamped, Verdict):
+        return clamped
+    if clamped.code:
+        notes.append(clamped)
+        leg = _leg(at, turn, target, now, rest, clamped.value)
+    entering = _altitude_on_entry(at, now, bounds, height_margin)
+    if entering is not None:
+        return entering
+    speed = _speed_on_leg(args, now, grant, leg, margin)
+    if isinstance(speed, Verdict):
+        return speed
+    if speed.code:
+        notes.append(speed)
+    found = breaches(leg, now, grant, margin, height_margin)
+    if found:
+        return _react(found, leg, args, now, grant, at, clamped.value, notes, adjusting)
+    blocked = _way_home_blocked(target, clamped.value, now, grant)
+    if blocked is not None:
+        return blocked
+    flown_mps = speed.value if speed.code or args.speed_mps is not None else None
+    return target, clamped.value, flown_mps
+
+
+def _leg(at: XY, turn: XY, target: XY, now: Situation, rest_m: float, altitude_m: float) -> Leg:
+    return Leg(at, turn, target, min(now.altitude_m, rest_m, altitude_m), max(now.altitude_m, rest_m, altitude_m))
+
+
+def _react(
+    found: list[Breach],
+    leg: Leg,
+    args: GotoArgs,
+    now: Situation,
+    grant: CompiledGrant,
+    at: XY,
+    altitude_m: float,
+    notes: list[Clamped],
+    adjusting: bool,
+) -> tuple[XY, float, float | None] | Verdict:
+    """Shorten the leg where every broken fence agrees to that; otherwise the strictest reaction."""
+    if adjusting and all(b.action == "adjust" for b in found):
+        shorter = last_legal(leg, found)
+        if shorter is not None:
+            names = tuple(dict.fromkeys(b.policy for b in found))
+            reason = f"{found[0].reason}; the leg ends at the last legal point"
+            notes.append(Clamped(0.0, "LegShortened", reason, names))
+            return _fly_leg(args, now, grant, at, shorter, altitude_m, notes, adjusting=False)
+    return _broken(found)
+
+
+def _broken(found: list[Breach]) -> Verdict:
+    worst = found[0]
+    names = tuple(dict.fromkeys(b.policy for b in found))
+    takeover = _TAKEOVERS.get(worst.action) if worst.enters else None
+    if takeover is None:
+        return deny(worst.code, worst.reason, names)
+    return Verdict("takeover", None, worst.code, f"{worst.reason}; {_DOES[takeover]}", names, takeover)
+
+
+_TAKEOVERS: dict[str, Takeover] = {
+    "hover": "hover",
+    "land": "land",
+    "returnToLaunch": "returnToLaunch",
+    "revoke": "revoke",
+}
+_DOES: dict[Takeover, str] = {
+    "hover": "the system takes the drone and hovers",
+    "land": "the system takes the drone and lands it",
+    "returnToLaunch": "the system takes the drone and flies it home",
+    "revoke": "access is revoked and the system flies the drone home",
+}
+
+
+def _altitude_on_entry(at: XY, now: Situation, bounds: list[Bound], slack_m: float) -> Verdict | None:
+    """The denial of a leg that would carry the present altitude into a zone where it is not allowed."""
+    here = shapely.Point(at)
+    for bound in bounds:
+        if bound.shape is None or bound.shape.intersects(here):
+            continue
+        if bound.upper is not None and now.altitude_m > bound.upper + slack_m:
+            return deny(
+                "AltitudeAboveLimit",
+                f"the leg enters the zone of policy {bound.name} at {now.altitude_m:.1f} m, above its limit of"
+                f" {bound.upper:.1f} m; descend first",
+                (bound.name,),
+            )
+        if bound.lower is not None and now.altitude_m < bound.lower - slack_m:
+            return deny(
+                "AltitudeBelowLimit",
+                f"the leg enters the zone of policy {bound.name} at {now.altitude_m:.1f} m, below its limit of"
+                f" {bound.lower:.1f} m; climb first",
+                (bound.name,),
+            )
+    return None
+
+
+def _speed_on_leg(args: GotoArgs, now: Situation, grant: CompiledGrant, leg: Leg, margin: float) -> Clamped | Verdict:
+    asked = now.speed_setpoint_mps if args.speed_mps is None else args.speed_mps
+    bounds = speed_bounds(grant, now, leg.ground, leg.lower_m, leg.upper_m, margin)
+    return clamp("Speed", "m/s", asked, bounds)
+
+
+def _way_home_blocked(target: XY, altitude_m: float, now: Situation, grant: CompiledGrant) -> Verdict | None:
+    """The denial of a target from which the straight way home is not legal.
+
+    That way is the autopilot's own: it climbs to its return altitude, flies straight, and descends at home.
+    """
+    if now.home is None:
+        return deny(
+            "HomeUnknown", "home is unknown, so nothing can be said of the way back; wait for the home position"
+        )
+    if not grant.exclusions.patches and not grant.inclusions:
+        return None
+    home = grant.frame.xy(now.home.lat, now.home.lon)
+    height_m = max(altitude_m, now.airframe.return_altitude_m)
+    margin, slack = margin_m(now), height_margin_m(now)
+    parts = (
+        Leg(target, target, home, height_m, height_m),
+        Leg(target, target, target, altitude_m, height_m),
+        Leg(home, home, home, 0.0, height_m),
+    )
+    for part in parts:
+        ground = part.ground
+        lower, upper = part.lower_m - slack, part.upper_m + slack
+        for patch in grant.exclusions.near(ground, margin, lower, upper, now, grant.flat_terrain):
+            return deny(
+                "WayHomeBlocked",
+                f"from the target the straight way home, at {height_m:.1f} m, is blocked by zone {patch.zone} of policy"
+                f" {patch.rule.name}",
+                (patch.rule.name,),
+            )
+    lane = parts[0].ground
+    for fence in grant.inclusions:
+        if fence.rule.in_force(now.time_s):
+            shape, _ = fence.at(height_m, height_m, now, grant.flat_terrain)
+            if not shape.covers(lane):
+                return deny(
+                    "WayHomeBlocked",
+                    f"from the target the straight way home, at {height_m:.1f} m, leaves the zones of policy"
+                    f" {fence.rule.name}",
+                    (fence.rule.name,),
+                )
+    return None
+
+
+def _outcome(
+    args: GotoArgs, flown: tuple[XY, float, float | None], notes: list[Clamped], grant: CompiledGrant
+) -> Verdict:
+    target, altitude_m, speed_mps = flown
+    moved = any(note.code == "LegShortened" for note in notes)
+    lat, lon = grant.frame.latlon(*target) if moved else (args.lat, args.lon)
+    new = replace(args, lat=lat, lon=lon, alt=altitude_m, reference="home", speed_mps=speed_mps)
+    if not notes:
+        return Verdict("allow", new)
+    ordered = sorted(notes, key=lambda n: n.code == "TerrainAssumedFlat")
+    names = tuple(dict.fromkeys(name for note in ordered for name in note.policies))
+    action: str = "allow" if all(n.code == "TerrainAssumedFlat" for n in notes) else "correct"
+    reason = "; ".join(note.reason for note in ordered)
+    if action == "allow":
+        return Verdict("allow", new, ordered[0].code, reason, names)
+    return Verdict("correct", new, ordered[0].code, reason, names)
+
+
+def _located(now: Situation, grant: CompiledGrant) -> XY | Verdict:
+    known = now.lat is not None and now.lon is not None
+    if not known or now.lat is None or now.lon is None:
+        return deny("PositionUnknown", "the drone's position is unknown; wait for a fix")
+    figures = (now.lat, now.lon, now.altitude_m, now.north_mps, now.east_mps, now.down_mps)
+    if not all(math.isfinite(figure) for figure in figures):
+        return deny("PositionUnknown", "the drone's position or velocity is not a number; wait for a fix")
+    return grant.frame.xy(now.lat, now.lon)
+
+
+def _judge_takeoff(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
+    args = call.args
+    if not isinstance(args, TakeoffArgs):
+        return deny("InvalidArgument", "Takeoff needs its arguments")
+    at = _located(now, grant)
+    if isinstance(at, Verdict):
+        return at
+    leg = _leg(at, at, at, now, now.altitude_m, args.altitude_m)
+    bounds = altitude_bounds(grant, now, leg.ground, leg.lower_m, leg.upper_m, margin_m(now))
+    if isinstance(bounds, Verdict):
+        return bounds
+    clamped = clamp("Altitude", "m above home", args.altitude_m, bounds)
+    if isinstance(clamped, Verdict):
+        return clamped
+    problem = _column(at, now, grant, now.altitude_m, clamped.value) or _way_home_blocked(at, clamped.value, now, grant)
+    if problem is not None:
+        return problem
+    if not clamped.code:
+        return Verdict("allow", args)
+    return Verdict("correct", TakeoffArgs(clamped.value), clamped.code, clamped.reason, clamped.policies)
+
+
+def _judge_arm(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
+    at = _located(now, grant)
+    if isinstance(at, Verdict):
+        return at
+    return _column(at, now, grant, now.altitude_m, now.altitude_m) or Verdict("allow", call.args)
+
+
+def _judge_land(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
+    at = _located(now, grant)
+    if isinstance(at, Verdict):
+        return at
+    ground = stop_point(now, at)
+    return _column(ground, now, grant, 0.0, now.altitude_m) or Verdict("allow", call.args)
+
+
+def _column(at: XY, now: Situation, grant: CompiledGrant, lower_m: float, upper_m: float) -> Verdict | None:
+    """The denial of a vertical motion, or of standing, where fences forbid it; no such request is a takeover."""
+    leg = Leg(at, at, at, min(lower_m, upper_m), max(lower_m, upper_m))
+    found = breaches(leg, now, grant, margin_m(now), height_margin_m(now))
+    if not found:
+        return None
+    return deny(found[0].code, found[0].reason, tuple(dict.fromkeys(b.policy for b in found)))
+
+
+def _judge_disarm(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
+    if now.in_air:
+        return deny("InAir", f"the drone is in the air at {now.altitude_m:.1f} m; land before disarming")
+    return Verdict("allow", call.args)
+
+
+def _judge_speed(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
+    args = call.args
+    if not isinstance(args, SetSpeedArgs):
+        return deny("InvalidArgument", "SetSpeed needs its arguments")
+    at = _located(now, grant)
+    if isinstance(at, Verdict):
+        return at
+    bounds = speed_bounds(grant, now, shapely.Point(at), now.altitude_m, now.altitude_m, margin_m(now))
+    clamped = clamp("Speed", "m/s", args.speed_mps, bounds)
+    if isinstance(clamped, Verdict):
+        return clamped
+    if not clamped.code:
+        return Verdict("allow", args)
+    return Verdict("correct", SetSpeedArgs(clamped.value), clamped.code, clamped.reason, clamped.policies)
+
+
+def _judge_picture(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
+    verdict = judge_privacy(now, grant)
+    return verdict if verdict.action == "deny" else replace(verdict, args=call.args)
+
+
+_RULES: dict[str, Callable[[Call, Situation, CompiledGrant], Verdict]] = {
+    "Arm": _judge_arm,
+    "Disarm": _judge_disarm,
+    "Takeoff": _judge_takeoff,
+    "Land": _judge_land,
+    "Goto": _judge_goto,
+    "SetSpeed": _judge_speed,
+    "CaptureImage": _judge_picture,
+    "RetrieveImage": _judge_picture,
+}

@@ -1,0 +1,254 @@
+"""Geofences against a leg: what it breaks, and how far along it is legal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from fractus_core.policy.compiled import OPERATION_AREA, CompiledGrant, Inclusion, Patch
+from fractus_core.policy.motion import XY, Leg
+from fractus_core.policy.values import Situation
+
+FenceAction = Literal["ignore", "adjust", "hover", "returnToLaunch", "land", "revoke"]
+
+SEVERITY: dict[str, int] = {"adjust": 0, "ignore": 1, "hover": 2, "returnToLaunch": 3, "land": 4, "revoke": 5}
+"""The more a reaction takes from the application, the more restrictive it is."""
+
+HOME_RADIUS_M = 5.0
+"""A target this near to home is the way home, wherever the operation area lies."""
+
+INSIDE_M = 0.25
+"""A corrected target keeps this much more than the margin, so that it never lies on a border."""
+
+_SAMPLES = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Breach:
+    """What a leg does to one fence.
+
+    Attributes:
+        enters: the motion asked for itself breaks the fence; otherwise it only comes too close.
+        legal: the ground (in frame metres, margin taken off) on which the fence would have no objection, worked out only
+            when asked for.
+    """
+
+    policy: str
+    priority: int
+    action: FenceAction
+    code: str
+    reason: str
+    enters: bool
+    legal: Callable[[], BaseGeometry]
+
+    @property
+    def severity(self) -> int:
+        """How much the reaction takes; coming too close never costs more than the request."""
+        return SEVERITY[self.action] if self.enters else min(SEVERITY[self.action], SEVERITY["ignore"])
+
+
+def breaches(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float, height_margin_m: float) -> list[Breach]:
+    """Every fence that a leg breaks, most restrictive first."""
+    lower, upper = leg.lower_m - height_margin_m, leg.upper_m + height_margin_m
+    found = [
+        *_operation_area(leg, now, grant, margin_m),
+        *_exclusions(leg, now, grant, margin_m, lower, upper),
+        *_inclusions(leg, now, grant, margin_m, lower, upper),
+    ]
+    return sorted(found, key=lambda b: (-b.severity, -b.priority, b.policy))
+
+
+def _operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float) -> Iterator[Breach]:
+    """The fence that the grant itself implies: fly to where the application works, and stay there."""
+    operation, border = grant.operation, grant.operation_border
+    if operation is None or border is None or grant.passage is None or grant.passage_border is None:
+        return
+    target = shapely.Point(leg.target)
+    homeward = False
+    if now.home is not None:
+        homeward = target.distance(shapely.Point(grant.frame.xy(now.home.lat, now.home.lon))) <= HOME_RADIUS_M
+    vertical = leg.start == leg.target
+    within = operation.covers(target) and not border.dwithin(target, margin_m)
+    if not within and not homeward and not vertical:
+        inside = operation.covers(target)
+        away_m = border.distance(target)
+        reason = (
+            f"the target is {away_m:.1f} m from the border of the operation area; keep {margin_m:.1f} m inside it"
+            if inside
+            else f"the target is {away_m:.1f} m outside the operation area"
+        )
+        yield _area_breach(reason, not inside)
+        return
+    working = operation.covers(leg.unavoidable) and not homeward and not vertical
+    shape, edge = (operation, border) if working else (grant.passage, grant.passage_border)
+    if not _stays_inside(shape, edge, leg, margin_m):
+        reason = f"the leg leaves the {'operation area' if working else 'way to the operation area'} or comes within {margin_m:.1f} m of its border"
+        yield _area_breach(reason, not shape.covers(leg.ground))
+
+
+def _area_breach(reason: str, enters: bool) -> Breach:
+    return Breach(OPERATION_AREA, 0, "ignore", "OutsideOperationArea", reason, enters, shapely.Polygon)
+
+
+def _exclusions(
+    leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float, lower_m: float, upper_m: float
+) -> Iterator[Breach]:
+    if not grant.exclusions.patches:
+        return
+    ground = leg.ground
+    for patch in grant.exclusions.near(ground, margin_m, lower_m, upper_m, now, grant.flat_terrain):
+        shape = patch.shape
+        clearance_m = _clearance_outside(shape, leg.unavoidable)
+        if clearance_m < margin_m and _leads_out(shape, leg, margin_m):
+            continue
+        # What the drone does anyway is not the request's doing.
+        enters = clearance_m > 0 and shape.intersects(ground)
+        yield _exclusion_breach(patch, leg, margin_m, enters)
+
+
+def _exclusion_breach(patch: Patch, leg: Leg, margin_m: float, enters: bool) -> Breach:
+    shape, name = patch.shape, patch.rule.name
+    target = shapely.Point(leg.target)
+    if shape.intersects(target):
+        depth_m = shape.boundary.distance(target)
+        code, reason = "InsideExclusionZone", f"the target is {depth_m:.1f} m inside zone {patch.zone}"
+    elif shape.intersects(leg.ground):
+        inside_m = shape.intersection(leg.line).length
+        code, reason = "LegThroughExclusionZone", f"the leg crosses zone {patch.zone} for {inside_m:.1f} m"
+    else:
+        away_m = shape.distance(leg.ground)
+        code = "TooCloseToExclusionZone"
+        reason = f"the leg comes within {away_m:.1f} m of zone {patch.zone}; keep {margin_m:.1f} m away"
+    return Breach(
+        name,
+        patch.rule.spec.priority,
+        _action(patch.rule.spec.action),
+        code,
+        f"{reason} of policy {name}",
+        enters,
+        lambda: leg.line.difference(shape.buffer(margin_m + INSIDE_M)),
+    )
+
+
+def _action(action: str | None) -> FenceAction:
+    for known in ("ignore", "adjust", "hover", "returnToLaunch", "land", "revoke"):
+        if action == known:
+            return known
+    return "ignore"
+
+
+def _inclusions(
+    leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float, lower_m: float, upper_m: float
+) -> Iterator[Breach]:
+    for fence in grant.inclusions:
+        if not fence.rule.in_force(now.time_s):
+            continue
+        shape, border = fence.at(lower_m, upper_m, now, grant.flat_terrain)
+        if not _stays_inside(shape, border, leg, margin_m):
+            yield _inclusion_breach(fence, shape, border, leg, margin_m)
+
+
+def _inclusion_breach(fence: Inclusion, shape: BaseGeometry, border: BaseGeometry, leg: Leg, margin_m: float) -> Breach:
+    name = fence.rule.name
+    target = shapely.Point(leg.target)
+    zones = ", ".join(dict.fromkeys(p.zone for p in fence.patches)) or "its zones"
+    if shape.is_empty:
+        code, reason = "OutsideInclusionZone", f"none of {zones} allows this altitude"
+    elif not shape.covers(target):
+        code, reason = "OutsideInclusionZone", f"the target is {shape.distance(target):.1f} m outside {zones}"
+    elif not shape.covers(leg.ground):
+        code, reason = "LegOutsideInclusionZone", f"the leg leaves {zones}"
+    else:
+        away_m = border.distance(leg.ground)
+        code = "TooCloseToInclusionBorder"
+        reason = f"the leg comes within {away_m:.1f} m of the border of {zones}; keep {margin_m:.1f} m inside"
+    enters = shape.covers(leg.unavoidable) and not shape.covers(leg.ground)
+    return Breach(
+        name,
+        fence.rule.spec.priority,
+        _action(fence.rule.spec.action),
+        code,
+        f"{reason} (policy {name})",
+        enters,
+        lambda: leg.line.intersection(shape.buffer(-(margin_m + INSIDE_M))),
+    )
+
+
+def _clearance_outside(shape: BaseGeometry, unavoidable: BaseGeometry) -> float:
+    return 0.0 if shape.intersects(unavoidable) else float(shape.distance(unavoidable))
+
+
+def _stays_inside(shape: BaseGeometry, border: BaseGeometry, leg: Leg, margin_m: float) -> bool:
+    """Whether a leg keeps its margin inside a shape, or leads back into it."""
+    ground = leg.ground
+    if shape.covers(ground) and not border.dwithin(ground, margin_m):
+        return True
+    if shape.covers(leg.unavoidable) and not border.dwithin(leg.unavoidable, margin_m):
+        return False
+    inner = shape.buffer(-margin_m)
+    return _returns(leg, inner, lambda point: _signed(shape, border, point))
+
+
+def _leads_out(shape: BaseGeometry, leg: Leg, margin_m: float) -> bool:
+    """Whether a leg that starts in or too close to an excluded shape leads away from it."""
+    border = shape.boundary
+    outer = shape.buffer(margin_m)
+    line = leg.line
+    target = shapely.Point(leg.target)
+    if outer.intersects(target):
+        return False
+    return _monotone(line.intersection(outer), leg.turn, lambda point: -_signed(shape, border, point))
+
+
+def _returns(leg: Leg, inner: BaseGeometry, clearance: Callable[[BaseGeometry], float]) -> bool:
+    target = shapely.Point(leg.target)
+    if not inner.intersects(target):
+        return False
+    return _monotone(leg.line.difference(inner), leg.turn, clearance)
+
+
+def _monotone(part: BaseGeometry, turn: XY, clearance: Callable[[BaseGeometry], float]) -> bool:
+    """Whether the illegal part of a line is one piece that begins at the turning point and only gets better."""
+    if part.is_empty:
+        return True
+    if not isinstance(part, shapely.LineString | shapely.Point):
+        return False
+    if shapely.Point(turn).distance(part) > 1e-6:
+        return False
+    last = float("-inf")
+    for i in range(_SAMPLES + 1):
+        point = part.interpolate(i / _SAMPLES, normalized=True) if isinstance(part, shapely.LineString) else part
+        now = clearance(point)
+        if now < last - 1e-6:
+            return False
+        last = max(last, now)
+    return True
+
+
+def _signed(shape: BaseGeometry, border: BaseGeometry, point: BaseGeometry) -> float:
+    """Distance to the border: positive inside the shape, negative outside."""
+    distance = float(border.distance(point)) if not border.is_empty else float("inf")
+    return distance if shape.covers(point) else -distance
+
+
+def last_legal(leg: Leg, found: list[Breach]) -> XY | None:
+    """The furthest point of a leg that no breached fence objects to, or None when there is none worth flying to."""
+    line = leg.line
+    start = shapely.Point(leg.turn)
+    if not isinstance(line, shapely.LineString):
+        return None
+    reach = line.length
+    for breach in found:
+        legal = breach.legal()
+        pieces = [p for p in shapely.get_parts(legal) if p.distance(start) < 1e-6 and isinstance(p, shapely.LineString)]
+        if not pieces:
+            return None
+        reach = min(reach, pieces[0].length)
+    if reach < 0.5:
+        return None
+    point = line.interpolate(reach - 0.01)
+    return (point.x, point.y)

@@ -1,0 +1,156 @@
+"""Limits on altitude and speed: clamp what may be enforced, refuse the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from shapely.geometry.base import BaseGeometry
+
+from fractus_core.policy.compiled import CompiledGrant, Patch, Patches, Rule, height_m
+from fractus_core.policy.values import Situation, Verdict, deny
+
+SLACK = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """One limit in force; heights above home, or speeds."""
+
+    name: str
+    priority: int
+    lower: float | None
+    upper: float | None
+    refuses: bool
+    shape: BaseGeometry | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Clamped:
+    """A value inside all limits, and what had to be done for it."""
+
+    value: float
+    code: str = ""
+    reason: str = ""
+    policies: tuple[str, ...] = ()
+
+
+def altitude_bounds(
+    grant: CompiledGrant, now: Situation, ground: BaseGeometry, lower_m: float, upper_m: float, margin_m: float
+) -> list[Bound] | Verdict:
+    """Altitude limits, in metres above home, along a piece of ground; a denial when one cannot be worked out."""
+    bounds = []
+    if grant.max_altitude_m is not None:
+        bounds.append(Bound("", 0, None, grant.max_altitude_m, refuses=False))
+    for rule, patch in _in_force(grant.altitude_limits, grant, now, ground, lower_m, upper_m, margin_m):
+        spec = rule.spec
+        edges = []
+        for edge in (spec.lower_limit, spec.upper_limit):
+            height = None if edge is None else height_m(edge, spec.altitude_reference, now.home, grant.flat_terrain)
+            if edge is not None and height is None:
+                return _datum_unknown(rule)
+            edges.append(height)
+        bounds.append(
+            Bound(rule.name, spec.priority, edges[0], edges[1], spec.action == "refuse", patch.shape if patch else None)
+        )
+    return bounds
+
+
+def _datum_unknown(rule: Rule) -> Verdict:
+    what = "no terrain model is loaded" if rule.spec.altitude_reference == "terrain" else "home is unknown"
+    code = "TerrainUnknown" if rule.spec.altitude_reference == "terrain" else "HomeUnknown"
+    return deny(
+        code,
+        f"policy {rule.name} limits altitude above {rule.spec.altitude_reference} level, and {what}",
+        (rule.name,),
+    )
+
+
+def speed_bounds(
+    grant: CompiledGrant, now: Situation, ground: BaseGeometry, lower_m: float, upper_m: float, margin_m: float
+) -> list[Bound]:
+    """Speed limits, in metres per second, along a piece of ground between two altitudes."""
+    bounds = []
+    if grant.max_speed_mps is not None:
+        bounds.append(Bound("", 0, None, grant.max_speed_mps, refuses=False))
+    for rule, _ in _in_force(grant.speed_limits, grant, now, ground, lower_m, upper_m, margin_m):
+        spec = rule.spec
+        bounds.append(Bound(rule.name, spec.priority, spec.lower_limit, spec.upper_limit, spec.action == "refuse"))
+    return bounds
+
+
+def _in_force(
+    patches: Patches,
+    grant: CompiledGrant,
+    now: Situation,
+    ground: BaseGeometry,
+    lower_m: float,
+    upper_m: float,
+    margin_m: float,
+) -> Iterator[tuple[Rule, Patch | None]]:
+    for rule in patches.everywhere:
+        if rule.in_force(now.time_s):
+            yield rule, None
+    for patch in patches.near(ground, margin_m, lower_m, upper_m, now, grant.flat_terrain):
+        yield patch.rule, patch
+
+
+def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Clamped | Verdict:
+    """Bring a value inside every limit.
+
+    Args:
+        quantity: "Altitude" or "Speed", for codes and sentences.
+        unit: its unit, for sentences.
+        value: what was asked for.
+        bounds: the limits in force.
+
+    Returns:
+        The nearest value that every limit allows, or the denial of a limit that refuses, or of limits that contradict
+        each other.
+    """
+    above = sorted((b for b in bounds if b.upper is not None and value > b.upper + SLACK), key=_strictest_upper)
+    below = sorted((b for b in bounds if b.lower is not None and value < b.lower - SLACK), key=_strictest_lower)
+    if not above and not below:
+        return Clamped(value)
+    violated, side = (above, "Above") if above else (below, "Below")
+    code = f"{quantity}{side}Limit"
+    names = tuple(dict.fromkeys(b.name for b in violated if b.name))
+    refusing = [b for b in (*above, *below) if b.refuses]
+    if refusing:
+        bound = refusing[0]
+        limit = bound.upper if bound in above else bound.lower
+        code = f"{quantity}{'Above' if bound in above else 'Below'}Limit"
+        return deny(
+            code,
+            f"{quantity.lower()} {value:.1f} {unit} breaks the limit of {limit:.1f} {unit} of {_source(bound)}, which refuses it",
+            tuple(dict.fromkeys(b.name for b in refusing if b.name)),
+        )
+    highest = min((b.upper for b in bounds if b.upper is not None), default=float("inf"))
+    lowest = max((b.lower for b in bounds if b.lower is not None), default=float("-inf"))
+    if lowest > highest + SLACK:
+        every = tuple(dict.fromkeys(b.name for b in bounds if b.name and (b.upper == highest or b.lower == lowest)))
+        return deny(
+            "ConflictingLimits",
+            f"no {quantity.lower()} is at least {lowest:.1f} and at most {highest:.1f} {unit}; ask for another place",
+            every,
+        )
+    new = min(max(value, lowest), highest)
+    word = "above" if above else "below"
+    return Clamped(
+        new,
+        code,
+        f"{quantity.lower()} {value:.1f} {unit} is {word} the limit of {_source(violated[0])}; corrected to {new:.1f} {unit}",
+        names,
+    )
+
+
+def _strictest_upper(bound: Bound) -> tuple[float, int, str]:
+    return (bound.upper if bound.upper is not None else float("inf"), -bound.priority, bound.name)
+
+
+def _strictest_lower(bound: Bound) -> tuple[float, int, str]:
+    return (-(bound.lower if bound.lower is not None else float("-inf")), -bound.priority, bound.name)
+
+
+def _source(bound: Bound) -> str:
+    return f"policy {bound.name}" if bound.name else "the drone"

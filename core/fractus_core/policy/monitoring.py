@@ -1,0 +1,175 @@
+"""The continuous check of a flying drone's present state, with a look ahead to where it can stop."""
+
+from __future__ import annotations
+
+import math
+
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from fractus_core.policy.compiled import OPERATION_AREA, CompiledGrant
+from fractus_core.policy.limits import Bound, altitude_bounds, speed_bounds
+from fractus_core.policy.motion import XY, stop_altitude_m, stop_point
+from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Situation, Takeover, Verdict, deny
+
+DEEPER_M = 0.3
+"""A drone on the wrong side of a fence is stopped again only when it moves this much further in."""
+
+_TAKEOVERS: dict[str, Takeover] = {
+    "hover": "hover",
+    "land": "land",
+    "returnToLaunch": "returnToLaunch",
+    "revoke": "revoke",
+}
+_RANK = {None: 0, "hover": 1, "returnToLaunch": 2, "land": 3, "revoke": 4}
+
+
+def monitor(now: Situation, grant: CompiledGrant) -> Verdict | None:
+    """What the system must do about a flying drone at this moment.
+
+    Judged is the way from the present position to where the drone comes to rest if it is told to stop now, with the
+    position error around it: a smaller margin than that of accepted legs, so that a leg flown as accepted never alarms.
+
+    Returns:
+        None when all is well; a takeover; a denial with `hover`, when the motion is to be stopped and the application
+        keeps control; or a correction, with the arguments to carry out.
+    """
+    if not now.in_air:
+        return None
+    if now.lat is None or now.lon is None or not _finite(now):
+        return Verdict("takeover", None, "PositionUnknown", "the drone's position is unknown", (), "hover")
+    start = grant.frame.xy(now.lat, now.lon)
+    stop = stop_point(now, start)
+    rest_m = stop_altitude_m(now)
+    way = shapely.Point(start) if start == stop else shapely.LineString((start, stop))
+    lower = min(now.altitude_m, rest_m) - now.altitude_error_m
+    upper = max(now.altitude_m, rest_m) + now.altitude_error_m
+    found = [
+        *_fences(now, grant, way, start, stop, lower, upper),
+    ]
+    if found:
+        return min(found, key=lambda f: (-_RANK[f[1].takeover if f[1].action == "takeover" else None], -f[0]))[1]
+    return _limits(now, grant, start, stop, rest_m)
+
+
+def _finite(now: Situation) -> bool:
+    figures = (now.lat or 0.0, now.lon or 0.0, now.altitude_m, now.north_mps, now.east_mps, now.down_mps)
+    return all(math.isfinite(figure) for figure in figures)
+
+
+def _fences(
+    now: Situation, grant: CompiledGrant, way: BaseGeometry, start: XY, stop: XY, lower: float, upper: float
+) -> list[tuple[int, Verdict]]:
+    found: list[tuple[int, Verdict]] = []
+    margin = now.position_error_m
+    here, rest = shapely.Point(start), shapely.Point(stop)
+    if grant.exclusions.patches:
+        for patch in grant.exclusions.near(way, margin, lower, upper, now, grant.flat_terrain):
+            inside = patch.shape.intersects(here)
+            worse = _depth(patch.shape, rest) > _depth(patch.shape, here) + DEEPER_M
+            where = "is inside" if inside else "is about to enter"
+            verdict = _reaction(
+                patch.rule.spec.action,
+                inside,
+                worse or (not inside and patch.shape.intersects(way)),
+                "InsideExclusionZone" if inside else "ExclusionZoneAhead",
+                f"the drone {where} zone {patch.zone} of policy {patch.rule.name}",
+                patch.rule.name,
+            )
+            if verdict is not None:
+                found.append((patch.rule.spec.priority, verdict))
+    if grant.passage is not None and grant.passage_border is not None:
+        verdict = _kept_in(
+            grant.passage, grant.passage_border, way, here, rest, margin, "ignore", OPERATION_AREA,
+            "OutsideOperationArea", "the operation area",
+        )  # fmt: skip
+        if verdict is not None:
+            found.append((0, verdict))
+    for fence in grant.inclusions:
+        if not fence.rule.in_force(now.time_s):
+            continue
+        shape, border = fence.at(lower, upper, now, grant.flat_terrain)
+        zones = ", ".join(dict.fromkeys(p.zone for p in fence.patches)) or "its zones"
+        verdict = _kept_in(
+            shape, border, way, here, rest, margin, fence.rule.spec.action, fence.rule.name,
+            "OutsideInclusionZone", f"{zones} of policy {fence.rule.name}",
+        )  # fmt: skip
+        if verdict is not None:
+            found.append((fence.rule.spec.priority, verdict))
+    return found
+
+
+def _kept_in(
+    shape: BaseGeometry,
+    border: BaseGeometry,
+    way: BaseGeometry,
+    here: BaseGeometry,
+    rest: BaseGeometry,
+    margin: float,
+    action: str | None,
+    policy: str,
+    code: str,
+    name: str,
+) -> Verdict | None:
+    if shape.covers(way) and not border.dwithin(way, margin):
+        return None
+    outside = not shape.covers(here)
+    if shape.is_empty:
+        worse = False
+    else:
+        worse = -_signed_depth(shape, border, rest) > -_signed_depth(shape, border, here) + DEEPER_M
+    leaving = worse or (not outside and not shape.covers(way))
+    return _reaction(
+        action, outside, leaving, code, f"the drone {'is outside' if outside else 'is about to leave'} {name}", policy
+    )
+
+
+def _reaction(action: str | None, broken: bool, worse: bool, code: str, reason: str, policy: str) -> Verdict | None:
+    """What follows from a fence that is broken or about to be.
+
+    A policy that takes the drone over does so for both; one that ignores requests only stops the motion that makes
+    things worse.
+    """
+    takeover = _TAKEOVERS.get(action or "ignore")
+    if takeover is not None and (broken or worse):
+        return Verdict("takeover", None, code, reason, (policy,), takeover)
+    if worse:
+        return Verdict("deny", None, code, f"{reason}; the motion is stopped", (policy,), "hover")
+    return None
+
+
+def _depth(shape: BaseGeometry, point: BaseGeometry) -> float:
+    return _signed_depth(shape, shape.boundary, point)
+
+
+def _signed_depth(shape: BaseGeometry, border: BaseGeometry, point: BaseGeometry) -> float:
+    distance = float(border.distance(point))
+    return distance if shape.covers(point) else -distance
+
+
+def _limits(now: Situation, grant: CompiledGrant, start: XY, stop: XY, rest_m: float) -> Verdict | None:
+    here = shapely.Point(start)
+    if grant.max_altitude_m is not None or grant.altitude_limits:
+        bounds = altitude_bounds(grant, now, here, now.altitude_m, now.altitude_m, 0.0)
+        if isinstance(bounds, Verdict):
+            return deny(bounds.code, bounds.reason, bounds.policies) if now.down_mps < -0.5 else None
+        over = _lowest(bounds)
+        slack = now.altitude_error_m + now.airframe.tracking_m
+        if over is not None and over.upper is not None and max(now.altitude_m, rest_m) > over.upper + slack:
+            lat, lon = grant.frame.latlon(*stop)
+            reason = f"the drone climbs to {max(now.altitude_m, rest_m):.1f} m, above the limit of {over.upper:.1f} m"
+            names = (over.name,) if over.name else ()
+            return Verdict("correct", GotoArgs(lat, lon, over.upper), "AltitudeAboveLimit", reason, names)
+    if grant.max_speed_mps is not None or grant.speed_limits:
+        speed = math.hypot(now.north_mps, now.east_mps)
+        over = _lowest(speed_bounds(grant, now, here, now.altitude_m, now.altitude_m, 0.0))
+        if over is not None and over.upper is not None and speed > over.upper * 1.1 + 1.0:
+            reason = f"the drone flies at {speed:.1f} m/s, above the limit of {over.upper:.1f} m/s"
+            names = (over.name,) if over.name else ()
+            return Verdict("correct", SetSpeedArgs(over.upper), "SpeedAboveLimit", reason, names)
+    return None
+
+
+def _lowest(bounds: list[Bound]) -> Bound | None:
+    capped = [b for b in bounds if b.upper is not None]
+    return min(capped, key=lambda b: (b.upper if b.upper is not None else 0.0, -b.priority, b.name), default=None)

@@ -1,0 +1,81 @@
+"""How far a drone travels before it can stop, and the ground that a leg sweeps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from fractus_core.policy.values import Situation
+
+XY = tuple[float, float]
+
+
+def stopping_distance_m(speed_mps: float, accel_mps2: float, position_gain: float) -> float:
+    """Distance ArduPilot's position controller needs to stop from a speed.
+
+    It follows a square-root controller: v/kP while v < a/kP, else a/(2 kP^2) + v^2/(2 a).
+    """
+    speed = abs(speed_mps)
+    if speed < accel_mps2 / position_gain:
+        return speed / position_gain
+    return accel_mps2 / (2 * position_gain**2) + speed * speed / (2 * accel_mps2)
+
+
+def stop_point(situation: Situation, at: XY) -> XY:
+    """Where the drone comes to rest, in frame metres, when it is told to stop now."""
+    speed = math.hypot(situation.north_mps, situation.east_mps)
+    if speed < 0.05:
+        return at
+    frame = situation.airframe
+    run = speed * situation.latency_s + stopping_distance_m(speed, frame.accel_mps2, frame.position_gain)
+    return at[0] + situation.east_mps / speed * run, at[1] + situation.north_mps / speed * run
+
+
+def stop_altitude_m(situation: Situation) -> float:
+    """Altitude above home at which the drone comes to rest when it is told to stop now."""
+    climb = -situation.down_mps
+    if abs(climb) < 0.05:
+        return situation.altitude_m
+    run = abs(climb) * situation.latency_s + stopping_distance_m(climb, situation.airframe.climb_accel_mps2, 1.0)
+    return situation.altitude_m + math.copysign(run, climb)
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """A motion in frame metres: from where the drone is, by where it can turn, to a target.
+
+    The drone may be anywhere in the triangle of present position, turning point and target, at any altitude between
+    the three: autopilots shape the axes independently, so no straighter promise can be made.
+    """
+
+    start: XY
+    turn: XY
+    target: XY
+    lower_m: float
+    upper_m: float
+
+    @property
+    def ground(self) -> BaseGeometry:
+        """The ground below the leg: a triangle, a line or a point."""
+        start, turn, target = self.start, self.turn, self.target
+        if start == turn:
+            return shapely.Point(start) if start == target else shapely.LineString((start, target))
+        if turn == target:
+            return shapely.LineString((start, turn))
+        doubled = (turn[0] - start[0]) * (target[1] - start[1]) - (turn[1] - start[1]) * (target[0] - start[0])
+        if abs(doubled) < 1e-6:
+            return shapely.MultiPoint((start, turn, target)).convex_hull
+        return shapely.Polygon((start, turn, target))
+
+    @property
+    def unavoidable(self) -> BaseGeometry:
+        """The part that the drone flies whatever it is told."""
+        return shapely.Point(self.start) if self.start == self.turn else shapely.LineString((self.start, self.turn))
+
+    @property
+    def line(self) -> BaseGeometry:
+        """From the turning point straight to the target."""
+        return shapely.Point(self.turn) if self.turn == self.target else shapely.LineString((self.turn, self.target))

@@ -1,0 +1,177 @@
+"""What the policy engine takes and gives: calls, situations, verdicts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from fractus_core.api.geometry import Reference
+
+Action = Literal["allow", "correct", "deny", "takeover"]
+Takeover = Literal["hover", "land", "returnToLaunch", "revoke"]
+
+
+@dataclass(frozen=True, slots=True)
+class TakeoffArgs:
+    """Climb from the ground.
+
+    Attributes:
+        altitude_m: metres above home.
+    """
+
+    altitude_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class GotoArgs:
+    """Fly straight to a point.
+
+    Attributes:
+        lat: degrees north, WGS 84.
+        lon: degrees east, WGS 84.
+        alt: metres in the datum of `reference`; None keeps the present altitude.
+        reference: what `alt` is measured from.
+        yaw_deg: heading to hold, degrees clockwise from true north; None leaves it to the autopilot.
+        speed_mps: horizontal speed to fly at; None keeps the speed in force.
+    """
+
+    lat: float
+    lon: float
+    alt: float | None = None
+    reference: Reference = "home"
+    yaw_deg: float | None = None
+    speed_mps: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SetSpeedArgs:
+    """Change the horizontal speed over ground, in metres per second."""
+
+    speed_mps: float
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureArgs:
+    """Take a picture of so many pixels; 0 means the camera's default."""
+
+    width: int = 0
+    height: int = 0
+
+
+Args = TakeoffArgs | GotoArgs | SetSpeedArgs | CaptureArgs | None
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """One service method with its arguments, as a component asked for it."""
+
+    method: str
+    args: Args = None
+
+    @property
+    def service(self) -> Literal["mobility", "camera"]:
+        """The system service that the method belongs to."""
+        return "camera" if self.method in _CAMERA else "mobility"
+
+
+_CAMERA = frozenset({"CaptureImage", "RetrieveImage", "ListImages", "DeleteImage"})
+
+
+@dataclass(frozen=True, slots=True)
+class Home:
+    """Where the drone took off and returns to: degrees, and metres above mean sea level."""
+
+    lat: float
+    lon: float
+    amsl_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Airframe:
+    """How the autopilot moves the drone; the defaults are ArduCopter's.
+
+    Attributes:
+        accel_mps2: horizontal acceleration it brakes with.
+        position_gain: proportional gain of the position controller, 1/s.
+        climb_accel_mps2: vertical acceleration.
+        return_altitude_m: altitude above home at which it returns to launch.
+        tracking_m: how far it strays from a straight leg, sideways and in height, in still air.
+    """
+
+    accel_mps2: float = 2.5
+    position_gain: float = 1.0
+    climb_accel_mps2: float = 1.0
+    return_altitude_m: float = 15.0
+    tracking_m: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """The state of node and drone at the moment of a decision.
+
+    Attributes:
+        time_s: Unix time in seconds.
+        lat: degrees north; None while the position is unknown.
+        lon: degrees east; None while the position is unknown.
+        altitude_m: metres above home.
+        north_mps: velocity over ground.
+        east_mps: velocity over ground.
+        down_mps: velocity over ground.
+        home: None while it is unknown, and on fixed nodes.
+        position_error_m: bound of the horizontal position error.
+        altitude_error_m: bound of the vertical position error.
+        latency_s: time from a decision to its effect on the motion.
+        speed_setpoint_mps: horizontal speed that the autopilot flies legs with.
+        vertical: whether the drone is taking off or landing, when lower altitude limits do not hold.
+    """
+
+    time_s: float
+    lat: float | None = None
+    lon: float | None = None
+    altitude_m: float = 0.0
+    north_mps: float = 0.0
+    east_mps: float = 0.0
+    down_mps: float = 0.0
+    home: Home | None = None
+    armed: bool = False
+    in_air: bool = False
+    position_error_m: float = 1.5
+    altitude_error_m: float = 1.0
+    latency_s: float = 0.3
+    speed_setpoint_mps: float = 5.0
+    vertical: bool = False
+    airframe: Airframe = field(default_factory=Airframe)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What becomes of a call, and why.
+
+    Attributes:
+        action: allow as asked, correct the arguments, deny, or take the drone over.
+        args: the arguments to carry out, after correction.
+        code: CamelCase and stable, for programs; empty when allowed.
+        reason: one sentence with figures, for people; empty when allowed.
+        policies: names of the policies that decided, most restrictive first.
+        takeover: what the system does with the drone; set with action takeover, and with a denial after an
+            internal error.
+        filters: what must be done to a picture before it is handed out.
+    """
+
+    action: Action
+    args: Args = None
+    code: str = ""
+    reason: str = ""
+    policies: tuple[str, ...] = ()
+    takeover: Takeover | None = None
+    filters: tuple[str, ...] = ()
+
+    @property
+    def permits(self) -> bool:
+        """Whether something is carried out."""
+        return self.action in {"allow", "correct"}
+
+
+def deny(code: str, reason: str, policies: tuple[str, ...] = ()) -> Verdict:
+    """A refusal."""
+    return Verdict("deny", None, code, reason, policies)

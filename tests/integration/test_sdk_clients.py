@@ -1,0 +1,326 @@
+"""The SDK's clients against real gRPC servers with mutual TLS."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import fractus
+import grpc
+import pytest
+from cryptography import x509
+from fractus.drone import Mobility
+from fractus.pictures import Camera
+from fractus_proto.v1 import mobility_pb2
+from sdk_service import NAVIGATOR, Authority, Drone, Event, Pictures, Server
+
+pytestmark = pytest.mark.timeout(60)
+WAIT_S = 15.0
+
+
+@dataclass
+class Stage:
+    """A running drone service and what a client needs to reach it."""
+
+    authority: Authority
+    drone: Drone
+    pictures: Pictures
+    server: Server
+    endpoint: fractus.Endpoint
+
+    def renew(self) -> None:
+        self.authority.issue(self.endpoint.tls_dir, [x509.UniformResourceIdentifier(NAVIGATOR)])
+
+    def client(self, **options: object) -> Mobility:
+        return Mobility(self.endpoint, **options)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+async def stage(tmp_path: Path) -> AsyncIterator[Stage]:
+    authority = Authority()
+    server_tls = authority.issue(tmp_path / "server", [x509.DNSName("drone-1.node.fractus.dev")])
+    drone, pictures = Drone(), Pictures()
+    server = Server(drone, pictures, server_tls)
+    await server.start()
+    endpoint = fractus.Endpoint(f"127.0.0.1:{server.port}", "drone-1.node.fractus.dev", tmp_path / "client")
+    stage = Stage(authority, drone, pictures, server, endpoint)
+    stage.renew()
+    yield stage
+    await server.stop()
+
+
+async def test_a_driver_flies_and_returns_control(stage: Stage) -> None:
+    steps: list[float] = []
+    async with stage.client() as drone:
+        async with drone.control() as control:
+            assert control.control_point == 0
+            await drone.arm()
+            result = await drone.goto(40.0, 22.0, 20.0, progress=lambda step: steps.append(step.distance_m))
+        assert control.mission_complete
+    assert result.complete
+    assert not result.corrected
+    assert result.target.alt == 20.0, "the target of the first message holds for the last one"
+    assert steps == [2.0, 1.0, 0.0]
+    assert stage.drone.calls == ["GetControl", "Arm", "Goto", "ReturnControl"]
+    assert set(stage.drone.identities) == {NAVIGATOR}
+
+
+async def test_every_unary_call_has_a_deadline(stage: Stage) -> None:
+    async with stage.client(timeout_s=3.0) as drone:
+        await drone.arm()
+        await drone.position()
+    assert all(left is not None and 0 < left < 3.5 for left in stage.drone.deadlines)
+
+
+async def test_a_correction_shows_in_the_result(stage: Stage) -> None:
+    async with stage.client() as drone, drone.control():
+        result = await drone.goto(40.0, 22.0, 120.0)
+        speed = await drone.set_speed(30.0)
+    assert result.corrected
+    assert result.target.alt == 60.0
+    assert result.decision.policies == ("limit",)
+    assert speed.corrected
+    assert speed.speed_mps == 10.0
+
+
+async def test_a_strict_client_raises_instead_of_taking_a_correction(stage: Stage) -> None:
+    stage.drone.release = asyncio.Event()
+    async with stage.client(strict=True) as drone, drone.control():
+        with pytest.raises(fractus.Corrected) as motion:
+            await drone.goto(40.0, 22.0, 120.0)
+        await asyncio.wait_for(stage.drone.hovering.wait(), WAIT_S)
+        with pytest.raises(fractus.Corrected):
+            await drone.set_speed(30.0)
+    assert motion.value.decision.code == "AboveLimit"
+
+
+async def test_a_refusal_names_code_reason_and_policies(stage: Stage) -> None:
+    async with stage.client() as drone, drone.control():
+        with pytest.raises(fractus.PolicyDenied) as refusal:
+            await drone.goto(40.02, 22.0, 20.0)
+        assert (await drone.goto(40.0, 22.0, 20.0)).complete, "the flight goes on"
+    assert refusal.value.code == "InsideExclusionZone"
+    assert refusal.value.policies == ("no-fly-hospital",)
+    assert "exclusion zone hospital (by no-fly-hospital)" in str(refusal.value)
+
+
+async def test_cancelling_a_motion_stops_the_drone(stage: Stage) -> None:
+    stage.drone.release = asyncio.Event()
+    async with stage.client() as drone, drone.control():
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.3):
+                await drone.goto(40.0, 22.0, 20.0)
+        await asyncio.wait_for(stage.drone.hovering.wait(), WAIT_S)
+    assert stage.drone.calls[-1] == "ReturnControl"
+
+
+async def test_leaving_an_iteration_stops_the_drone(stage: Stage) -> None:
+    stage.drone.release = asyncio.Event()
+    async with stage.client() as drone, drone.control():
+        async with contextlib.aclosing(aiter(drone.goto(40.0, 22.0, 20.0))) as steps:
+            async for step in steps:
+                assert step.distance_m == 2.0
+                break
+        await asyncio.wait_for(stage.drone.hovering.wait(), WAIT_S)
+
+
+async def test_losing_control_ends_the_motion_with_the_reason(stage: Stage) -> None:
+    stage.drone.release = asyncio.Event()
+    async with stage.client() as drone:
+        with pytest.raises(fractus.ControlLost, match="the pilot took over"):
+            async with drone.control():
+                flight = asyncio.ensure_future(stage.drone.moving.wait())
+                flight.add_done_callback(
+                    lambda _: stage.drone.control.put_nowait(
+                        Event(state=Event.STATE_LOST, reason="the pilot took over")
+                    )
+                )
+                await drone.goto(40.0, 22.0, 20.0)
+        with pytest.raises(fractus.ControlLost):
+            await drone.arm()
+    assert "ReturnControl" not in stage.drone.calls
+
+
+async def test_losing_control_interrupts_other_work_of_the_body(stage: Stage) -> None:
+    async with stage.client() as drone:
+        with pytest.raises(fractus.ControlLost, match="revoked"):
+            async with drone.control():
+                stage.drone.control.put_nowait(Event(state=Event.STATE_LOST, reason="revoked"))
+                await asyncio.sleep(WAIT_S)
+    task = asyncio.current_task()
+    assert task is not None
+    assert not task.cancelling()
+
+
+async def test_a_body_may_catch_the_loss_itself(stage: Stage) -> None:
+    stage.drone.release = asyncio.Event()
+    seen: list[str] = []
+    async with stage.client() as drone:
+        with pytest.raises(fractus.ControlLost):
+            async with drone.control():
+                motion = asyncio.ensure_future(stage.drone.moving.wait())
+                motion.add_done_callback(
+                    lambda _: stage.drone.control.put_nowait(Event(state=Event.STATE_LOST, reason="revoked"))
+                )
+                try:
+                    await drone.goto(40.0, 22.0, 20.0)
+                except fractus.ControlLost as loss:
+                    seen.append(str(loss))
+    assert seen == ["revoked"]
+
+
+async def test_an_error_in_the_body_does_not_return_control(stage: Stage) -> None:
+    async with stage.client() as drone:
+        with pytest.raises(ZeroDivisionError):
+            async with drone.control():
+                _ = 1 / 0
+        await asyncio.wait_for(stage.drone.stream_closed.wait(), WAIT_S)
+    assert "ReturnControl" not in stage.drone.calls
+
+
+async def test_outside_cancellation_stays_a_cancellation(stage: Stage) -> None:
+    async def fly() -> None:
+        async with stage.client() as drone, drone.control():
+            await asyncio.sleep(WAIT_S)
+
+    task = asyncio.create_task(fly())
+    await asyncio.wait_for(stage.drone.stream_open.wait(), WAIT_S)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+
+
+async def test_a_finished_mission_says_so(stage: Stage) -> None:
+    stage.drone.refuse_control = (grpc.StatusCode.FAILED_PRECONDITION, "the mission is complete")
+    async with stage.client() as drone:
+        with pytest.raises(fractus.MissionComplete):
+            async with drone.control():
+                pytest.fail("nobody drives after the mission")
+
+
+async def test_a_flight_survives_a_restart_of_the_service(stage: Stage) -> None:
+    stage.drone.release = asyncio.Event()
+    async with stage.client() as drone, drone.control() as control:
+        flight = asyncio.create_task(_fly(drone))
+        await asyncio.wait_for(stage.drone.moving.wait(), WAIT_S)
+        await stage.server.stop()
+        stage.drone.waypoints_reached = 3
+        stage.drone.release = None
+        await stage.server.start()
+        assert (await asyncio.wait_for(flight, WAIT_S)).complete
+        assert control.waypoints_reached == 3
+    assert stage.drone.calls.count("GetControl") == 2
+    assert stage.drone.calls.count("Goto") == 2
+
+
+async def _fly(drone: Mobility) -> fractus.Progress:
+    return await drone.goto(40.0, 22.0, 20.0)
+
+
+async def test_control_is_lost_when_the_service_stays_away(stage: Stage) -> None:
+    stage.drone.release = asyncio.Event()
+    async with stage.client(patience_s=0.5) as drone:
+        with pytest.raises(fractus.ControlLost, match="no answer"):
+            async with drone.control():
+                flight = asyncio.ensure_future(stage.drone.moving.wait())
+                await asyncio.gather(drone.goto(40.0, 22.0, 20.0), _stop(flight, stage.server))
+    await stage.server.start()
+
+
+async def _stop(when: asyncio.Future[bool], server: Server) -> None:
+    await when
+    await server.stop()
+
+
+async def test_a_call_waits_for_a_restarting_service_and_no_longer(stage: Stage) -> None:
+    await stage.server.stop()
+    async with stage.client(patience_s=0.5) as drone:
+        with pytest.raises(fractus.Unavailable, match=stage.endpoint.address):
+            await drone.position()
+    async with stage.client() as drone:
+        call = asyncio.create_task(drone.position())
+        await asyncio.wait({call}, timeout=0.3)
+        assert not call.done()
+        await stage.server.start()
+        assert (await asyncio.wait_for(call, WAIT_S)).velocity.north == 1.0
+
+
+async def test_a_renewed_certificate_is_used_without_ending_the_flight(stage: Stage) -> None:
+    stage.drone.release = asyncio.Event()
+    async with stage.client() as drone, drone.control() as control:
+        flight = asyncio.create_task(_fly(drone))
+        await asyncio.wait_for(stage.drone.moving.wait(), WAIT_S)
+        stage.renew()
+        await drone.position()
+        assert len(stage.drone.certificates) == 2
+        assert stage.drone.stream_open.is_set()
+        assert control.lost is None
+        stage.drone.release.set()
+        assert (await asyncio.wait_for(flight, WAIT_S)).complete
+
+
+async def test_the_server_must_be_the_node_that_was_meant(stage: Stage) -> None:
+    other = replace(stage.endpoint, server_name="drone-2.node.fractus.dev")
+    async with Mobility(other, patience_s=0.3) as drone:
+        with pytest.raises(fractus.Unavailable):
+            await drone.position()
+    assert stage.drone.calls == []
+
+
+async def test_a_stranger_gets_no_answer(stage: Stage, tmp_path: Path) -> None:
+    tls = Authority().issue(tmp_path / "stranger", [x509.UniformResourceIdentifier(NAVIGATOR)])
+    (tls / "ca.crt").write_bytes((stage.endpoint.tls_dir / "ca.crt").read_bytes())
+    async with Mobility(replace(stage.endpoint, tls_dir=tls), patience_s=0.3) as drone:
+        with pytest.raises(fractus.Unavailable):
+            await drone.position()
+    assert stage.drone.calls == []
+
+
+async def test_missing_certificates_are_named(stage: Stage, tmp_path: Path) -> None:
+    async with Mobility(replace(stage.endpoint, tls_dir=tmp_path / "nowhere")) as drone:
+        with pytest.raises(fractus.NotConfigured, match=r"nowhere/ca\.crt"):
+            await drone.position()
+
+
+async def test_pictures_come_whole_or_not_at_all(stage: Stage) -> None:
+    async with Camera(stage.endpoint, patience_s=0.5) as camera:
+        info = await camera.capture(width=800)
+        assert info.width == 800
+        assert await camera.retrieve(info.name) == stage.pictures.picture
+        with pytest.raises(fractus.InvalidRequest, match=r"no picture 2\.jpg"):
+            await camera.retrieve("2.jpg")
+        stage.pictures.cut = True
+        with pytest.raises(fractus.Unavailable, match="524288 of 614400 bytes"):
+            await camera.retrieve(info.name)
+
+
+async def test_the_same_without_asyncio(stage: Stage) -> None:
+    def fly() -> tuple[fractus.Progress, bool]:
+        with fractus.sync.mobility(stage.endpoint) as drone:
+            with drone.control() as control:
+                drone.arm()
+                with pytest.raises(fractus.PolicyDenied):
+                    drone.goto(40.02, 22.0, 20.0)
+                result = drone.goto(40.0, 22.0, 120.0)
+            return result, control.mission_complete
+
+    result, complete = await asyncio.to_thread(fly)
+    assert result.corrected
+    assert complete
+
+
+async def test_losing_control_without_asyncio(stage: Stage) -> None:
+    stage.drone.release = asyncio.Event()
+
+    def fly() -> None:
+        with fractus.sync.mobility(stage.endpoint) as drone, drone.control():
+            drone.goto(40.0, 22.0, 20.0)
+
+    flight = asyncio.create_task(asyncio.to_thread(fly))
+    await asyncio.wait_for(stage.drone.moving.wait(), WAIT_S)
+    stage.drone.control.put_nowait(mobility_pb2.ControlEvent(state=Event.STATE_LOST, reason="battery low"))
+    with pytest.raises(fractus.ControlLost, match="battery low"):
+        await asyncio.wait_for(flight, WAIT_S)

@@ -1,0 +1,75 @@
+"""What the SDK reads from a pod's environment."""
+
+from __future__ import annotations
+
+import json
+
+import fractus
+import pytest
+from fractus.environment import control_points, egress, endpoint
+
+POD = {
+    "FRACTUS_NODE": "drone-1",
+    "FRACTUS_HOST_IP": "10.200.0.11",
+    "FRACTUS_MOBILITY_ADDRESS": "10.200.0.11:50051",
+    "FRACTUS_TLS_DIR": "/tls",
+    "FRACTUS_SERVICE_IMAGE_CHECKER": "traffic-image-checker.default.svc:8080",
+}
+
+
+def test_the_mobility_service_is_the_node_s_own() -> None:
+    found = endpoint("mobility", POD)
+    assert found.address == "10.200.0.11:50051"
+    assert found.server_name == "drone-1.node.fractus.dev"
+    assert str(found.tls_dir) == "/tls"
+
+
+def test_the_camera_is_found_by_the_host_unless_it_has_an_address() -> None:
+    assert endpoint("camera", POD).address == "10.200.0.11:50052"
+    assert endpoint("camera", POD | {"FRACTUS_CAMERA_ADDRESS": "10.0.0.1:1"}).address == "10.0.0.1:1"
+
+
+@pytest.mark.parametrize("missing", ["FRACTUS_NODE", "FRACTUS_HOST_IP"])
+def test_a_missing_variable_is_named(missing: str) -> None:
+    env = {k: v for k, v in POD.items() if k not in {missing, "FRACTUS_MOBILITY_ADDRESS"}}
+    with pytest.raises(fractus.NotConfigured, match=missing):
+        endpoint("mobility", env)
+
+
+@pytest.mark.parametrize("component", ["ImageChecker", "image-checker"])
+def test_egress_gives_the_address_of_a_component(component: str) -> None:
+    assert egress(component, POD) == "traffic-image-checker.default.svc:8080"
+
+
+def test_egress_that_the_application_does_not_list_is_refused() -> None:
+    with pytest.raises(fractus.NotConfigured, match="list DataStore in the egress"):
+        egress("DataStore", POD)
+
+
+def test_control_points_are_read_as_the_manifest_spells_them() -> None:
+    text = json.dumps(
+        [
+            {
+                "navigation": "pathBased",
+                "path": [
+                    {"lat": 40.0, "lon": 22.0, "alt": 20, "altitudeReference": "home"},
+                    {"lat": 40.1, "lon": 22.1, "alt": 200, "altitudeReference": "amsl"},
+                    {"lat": 40.2, "lon": 22.2},
+                ],
+            },
+            {"navigation": "regionBased", "region": {"circle": {"center": {"lat": 1, "lon": 2}, "radius": 50}}},
+        ]
+    )
+    path, region = control_points({"FRACTUS_CONTROL_POINTS": text})
+    assert path.path[0] == fractus.Position(40.0, 22.0, 20.0)
+    assert path.path[1].reference is fractus.AltitudeReference.AMSL
+    assert path.path[2].alt == 0.0
+    assert region.path == ()
+    assert region.region is not None
+    assert region.region["circle"]["radius"] == 50
+
+
+@pytest.mark.parametrize("text", ["{", "3", '[{"path": []}]', '[{"navigation": "pathBased", "path": [{"lat": 1}]}]'])
+def test_control_points_that_are_not_ours_are_refused(text: str) -> None:
+    with pytest.raises(fractus.NotConfigured, match="FRACTUS_CONTROL_POINTS"):
+        control_points({"FRACTUS_CONTROL_POINTS": text})

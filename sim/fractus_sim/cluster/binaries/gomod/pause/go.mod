@@ -1,0 +1,3 @@
+module fractus.dev/binaries/pause
+
+go 1.25.0

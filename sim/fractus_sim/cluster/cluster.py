@@ -1,0 +1,441 @@
+"""The embedded cluster itself: bringing it up, keeping it as described, taking it down."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from fractus_sim.cluster import machine, manifests, network
+from fractus_sim.cluster.addressing import Addressing
+from fractus_sim.cluster.apiclient import ApiClient, ApiError
+from fractus_sim.cluster.binaries import Binaries, ensure_binaries
+from fractus_sim.cluster.cgroups import Branch, cluster_branch
+from fractus_sim.cluster.commands import run
+from fractus_sim.cluster.controlplane import (
+    API_PORT,
+    ControlPlaneFiles,
+    administrator,
+    control_plane_units,
+    server_url,
+    write_control_plane,
+)
+from fractus_sim.cluster.errors import ClusterError
+from fractus_sim.cluster.images.store import ImageStore
+from fractus_sim.cluster.locking import locked
+from fractus_sim.cluster.node import Node, init_command
+from fractus_sim.cluster.nodeconfig import shortfalls
+from fractus_sim.cluster.pki import Authority, write_private
+from fractus_sim.cluster.prerequisites import check_prerequisites, check_root
+from fractus_sim.cluster.prerequisites import machine as describe_machine
+from fractus_sim.cluster.processes import kill, read_record, spawn, write_record
+from fractus_sim.cluster.spec import ClusterSpec, load_spec
+from fractus_sim.cluster.state import Memory, StateDirectory, only_cluster, state_of
+
+_LOCK_TIMEOUT_S = 300.0
+_API_TIMEOUT_S = 60.0
+_READY_TIMEOUT_S = 90.0
+_POLL_S = 0.1
+_CONTROL_PLANE = "control-plane"
+_ENVIRONMENT = {
+    "PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
+    "HOME": "/root",
+    "LANG": "C.UTF-8",
+}
+
+Report = Callable[[str], None]
+
+
+def silent(_message: str) -> None:
+    """Take a line of progress and drop it."""
+
+
+@dataclass(frozen=True, slots=True)
+class NodeStatus:
+    """How a node is.
+
+    Attributes:
+        name: Its name.
+        node_class: drone, edge or cloud.
+        address: Its address on the cluster's network.
+        powered: Whether it runs.
+        linked: Whether its uplink is up.
+        ready: What the API server says of it; None when that cannot be asked.
+        vehicle_running: Whether its vehicle runs; None when it has none.
+    """
+
+    name: str
+    node_class: str
+    address: str
+    powered: bool
+    linked: bool
+    ready: bool | None
+    vehicle_running: bool | None
+
+
+class Cluster:
+    """A cluster described by a file, whether it is up or not."""
+
+    def __init__(self, spec: ClusterSpec, *, report: Report = silent) -> None:
+        """Make a handle on a cluster; nothing happens yet.
+
+        Args:
+            spec: What it is to be.
+            report: Told about progress, a line at a time.
+        """
+        self.spec = spec
+        self._report = report
+        self._state: StateDirectory = state_of(spec.name)
+
+    @classmethod
+    def load(cls, source: Path | str | ClusterSpec, *, name: str | None = None, report: Report = silent) -> Cluster:
+        """Return the cluster of a file.
+
+        Args:
+            source: The file, or the cluster it would describe.
+            name: Its name instead of the one in the file.
+            report: Told about progress, a line at a time.
+
+        Raises:
+            ClusterError: The file is missing or wrong.
+        """
+        spec = source if isinstance(source, ClusterSpec) else load_spec(Path(source))
+        if name is not None:
+            spec = ClusterSpec.model_validate({**spec.model_dump(by_alias=True), "name": name})
+        return cls(spec, report=report)
+
+    @classmethod
+    def existing(cls, name: str | None = None, *, report: Report = silent) -> Cluster:
+        """Return a cluster that was brought up before.
+
+        Args:
+            name: Its name; may be left out when there is only one.
+            report: Told about progress, a line at a time.
+
+        Raises:
+            ClusterError: There is none of that name.
+        """
+        chosen = only_cluster() if name is None else name
+        spec = state_of(chosen).read_spec()
+        if spec is None:
+            raise ClusterError(f"there is no cluster {chosen}; bring one up: fractus cluster up FILE")
+        return cls(spec, report=report)
+
+    @property
+    def name(self) -> str:
+        """The cluster's name."""
+        return self.spec.name
+
+    @property
+    def kubeconfig(self) -> Path:
+        """The administrator's kubeconfig; there once the cluster is up."""
+        return self._state.kubeconfig
+
+    @property
+    def logs(self) -> Path:
+        """Logs: `control-plane/PROGRAM.log` and `NODE/PROGRAM.log`."""
+        return self._state.logs
+
+    @property
+    def nodes(self) -> list[Node]:
+        """The nodes.
+
+        Raises:
+            ClusterError: The cluster was never up, so they have no addresses.
+        """
+        memory = self._memory()
+        branch = cluster_branch(self.name)
+        wiring = self._wiring(memory)
+        return [
+            Node(spec, memory.indexes[spec.name], wiring, self._state, branch)
+            for spec in self.spec.nodes
+            if spec.name in memory.indexes
+        ]
+
+    def node(self, name: str) -> Node:
+        """Return one node.
+
+        Raises:
+            ClusterError: There is none of that name.
+        """
+        for node in self.nodes:
+            if node.name == name:
+                return node
+        raise ClusterError(
+            f"cluster {self.name} has no node {name}; it has {', '.join(n.name for n in self.spec.nodes)}"
+        )
+
+    def up(self, *, images: Sequence[str] = ()) -> None:
+        """Make the cluster be as described, whatever state it is in; a no-op when it is.
+
+        Dead processes are started again, nodes switched on, links healed, dead vehicles replaced.
+
+        Args:
+            images: Images in the machine's store that every node gets before it starts pods.
+
+        Raises:
+            PrerequisiteError: The machine lacks something.
+            ClusterError: Something did not come up; the message names the log to read.
+        """
+        started = time.monotonic()
+        check_root()
+        if self._state.read_memory() is None or machine.holder(self.name) is None:
+            check_prerequisites()
+        binaries = ensure_binaries(report=self._report)
+        for sentence in (text for node in self.spec.nodes for text in shortfalls(node, describe_machine())):
+            self._report(f"note: {sentence}")
+        with self._locked():
+            memory = self._claim()
+            self._state.write_spec(self.spec)
+            authority = Authority(self._state.pki)
+            self._start_control_plane(binaries, authority, memory)
+            nodes = self.nodes
+            self._place_nodes(nodes, binaries, authority, images)
+            with self._api(authority, memory) as api:
+                api.wait_ready(timeout_s=_API_TIMEOUT_S)
+                self._apply_objects(api, nodes, memory)
+                for node in nodes:
+                    node.power_on()
+                    node.start_vehicle()
+                self._write_kubeconfig(authority, memory)
+                self._wait_nodes(api, nodes)
+            self.load_images(images)
+        self._report(f"cluster {self.name} is up: {len(nodes)} nodes, {time.monotonic() - started:.1f} s")
+
+    def down(self) -> None:
+        """Take the cluster away with everything that it put on the machine; a no-op when there is none.
+
+        Raises:
+            ClusterError: Something could not be removed; call it again when the cause is gone.
+        """
+        check_root()
+        with self._locked(remove=True):
+            branch = cluster_branch(self.name)
+            branch.kill_all()
+            branch.remove()
+            memory = self._state.read_memory()
+            block = memory.block if memory else None
+            if block is not None:
+                network.unwire(self._wiring(Memory(block, {})))
+            held = machine.holder(self.name)
+            if held is None or held == self._state.path:
+                machine.release(self.name)
+            if self._state.path.exists():
+                shutil.rmtree(self._state.path)
+        machine.remove_directory()
+        self._report(f"cluster {self.name} is down")
+
+    def status(self) -> list[NodeStatus]:
+        """Return how each node is."""
+        memory = self._memory()
+        cut = network.links_cut(self._wiring(memory))
+        ready = self._ready_nodes(memory)
+        return [
+            NodeStatus(
+                node.name,
+                node.spec.node_class,
+                str(node.address),
+                node.powered,
+                node.index not in cut,
+                None if ready is None else ready.get(node.name, False),
+                node.vehicle_running,
+            )
+            for node in self.nodes
+        ]
+
+    @property
+    def running(self) -> bool:
+        """Whether the control plane's programs run."""
+        record = read_record(self._state.process(_CONTROL_PLANE))
+        return record is not None and record.alive
+
+    def load_images(self, images: Sequence[str]) -> dict[str, int]:
+        """Deliver images to all nodes that are on.
+
+        Args:
+            images: Names in buildah's storage, or paths of OCI or Docker archives.
+
+        Returns:
+            For each node, how many images were new to it.
+
+        Raises:
+            ClusterError: An image does not exist or a node refuses it.
+        """
+        store = ImageStore.default(report=self._report)
+        return store.deliver(store.fetch(images), [node for node in self.nodes if node.powered])
+
+    def kubectl(
+        self, *arguments: str, input_text: str | None = None, timeout_s: float = 60.0, check: bool = True
+    ) -> subprocess.CompletedProcess[str]:
+        """Run kubectl against the cluster to its end and return what it wrote.
+
+        Raises:
+            ClusterError: It failed (with `check`) or took too long.
+        """
+        program = ensure_binaries(["kubectl"], report=self._report)["kubectl"]
+        environment = {**os.environ, "KUBECONFIG": str(self.kubeconfig)}
+        return run([program, *arguments], input_text=input_text, timeout_s=timeout_s, check=check, env=environment)
+
+    def _locked(self, *, remove: bool = False):  # type: ignore[no-untyped-def]
+        return locked(
+            machine.cluster_lock(self.name),
+            timeout_s=_LOCK_TIMEOUT_S,
+            what=f"another command works on cluster {self.name}",
+            report=self._report,
+            remove=remove,
+        )
+
+    def _memory(self) -> Memory:
+        memory = self._state.read_memory()
+        if memory is None:
+            raise ClusterError(f"cluster {self.name} is not up")
+        return memory
+
+    def _wiring(self, memory: Memory) -> network.Wiring:
+        return network.Wiring(self.name, Addressing(memory.block), self._state.marks)
+
+    def _branch(self) -> Branch:
+        return cluster_branch(self.name)
+
+    def _claim(self) -> Memory:
+        """Claim addresses, and remove the nodes that the description has no more."""
+        remembered = self._state.read_memory()
+        names = [node.name for node in self.spec.nodes]
+        block = machine.claim(self.name, self._state.path, remembered.block if remembered else None)
+        memory = (remembered or Memory(block, {})).with_nodes(names)
+        old_spec = self._state.read_spec()
+        if remembered is not None and old_spec is not None:
+            gone = [spec for spec in old_spec.nodes if spec.name in remembered.indexes and spec.name not in names]
+            for spec in gone:
+                self._report(f"removing node {spec.name}")
+                index = remembered.indexes[spec.name]
+                Node(spec, index, self._wiring(remembered), self._state, self._branch()).remove()
+        if memory != remembered:
+            self._state.write_memory(memory)
+        return memory
+
+    def _files(self) -> ControlPlaneFiles:
+        return ControlPlaneFiles(self._state.control_plane, self._state.logs / _CONTROL_PLANE)
+
+    def _start_control_plane(self, binaries: Binaries, authority: Authority, memory: Memory) -> None:
+        wiring, files = self._wiring(memory), self._files()
+        network.wire_control_plane(wiring)
+        units = control_plane_units(binaries, authority, wiring.addressing, files)
+        view = {"hostname": None, "files": "", "logs": "", "programs": {}, "sysctls": {}}
+        config = json.dumps({"view": view, "units": units}, indent=1)
+        path = files.directory / "init.json"
+        if self.running and path.exists() and path.read_text() == config:
+            return
+        self._stop_control_plane()
+        files.directory.mkdir(parents=True, exist_ok=True)
+        write_control_plane(authority, wiring.addressing, files, cluster=self.name)
+        write_private(path, config)
+        record = spawn(
+            init_command(path, wiring.namespace_path()),
+            log=files.logs / "init.log",
+            cgroup_files=self._branch().below(_CONTROL_PLANE).create(),
+            env=_ENVIRONMENT,
+        )
+        write_record(self._state.process(_CONTROL_PLANE), record)
+
+    def _stop_control_plane(self) -> None:
+        record = read_record(self._state.process(_CONTROL_PLANE))
+        if record is not None:
+            kill(record)
+        self._branch().below(_CONTROL_PLANE).kill_all()
+
+    def _place_nodes(self, nodes: list[Node], binaries: Binaries, authority: Authority, images: Sequence[str]) -> None:
+        """Wire the nodes and write their files; new ones get their images on disk before they ever start."""
+        for node in nodes:
+            network.wire_node(node.wiring, node.name, node.index)
+            node.write_files(node.files(binaries, authority))
+        fresh = [node for node in nodes if not node.powered]
+        store = ImageStore.default(report=self._report)
+        with ThreadPoolExecutor(max_workers=2) as pool:
+            list(pool.map(store.template(store.fetch(images), binaries["pause"]).furnish, fresh))
+
+    def _api(self, authority: Authority, memory: Memory) -> ApiClient:
+        return ApiClient(
+            str(Addressing(memory.block).control_plane),
+            API_PORT,
+            ca=authority.credential.certificate,
+            credential=administrator(authority),
+        )
+
+    def _apply_objects(self, api: ApiClient, nodes: list[Node], memory: Memory) -> None:
+        place = Addressing(memory.block)
+        objects = [manifests.node_object(node.spec, node.index, place) for node in nodes]
+        objects += manifests.dns_objects(place.control_plane)
+        names = {node.name for node in nodes}
+        for present in api.request("GET", "/api/v1/nodes")["items"]:
+            name = present["metadata"]["name"]
+            if name not in names and "fractus-sim" in str(present["metadata"].get("managedFields")):
+                api.request("DELETE", f"/api/v1/nodes/{name}")
+        for path, body in objects:
+            api.apply(path, body)
+
+    def _write_kubeconfig(self, authority: Authority, memory: Memory) -> None:
+        text = authority.kubeconfig(
+            administrator(authority), server=server_url(Addressing(memory.block)), cluster=f"fractus-{self.name}"
+        )
+        if not self.kubeconfig.exists() or self.kubeconfig.read_text() != text:
+            write_private(self.kubeconfig, text)
+
+    def _wait_nodes(self, api: ApiClient, nodes: list[Node]) -> None:
+        """Wait until every node is Ready and offers its extended resources."""
+        deadline = time.monotonic() + _READY_TIMEOUT_S
+        waiting = {node.name: node for node in nodes}
+        while True:
+            for item in api.request("GET", "/api/v1/nodes")["items"]:
+                node = waiting.get(item["metadata"]["name"])
+                if node is not None and _is_ready(item):
+                    patch = manifests.extended_resources_patch(node.spec)
+                    if patch and _lacks(item, node.spec.extended_resources):
+                        api.patch(*patch)
+                    else:
+                        del waiting[node.name]
+            if not waiting:
+                return
+            for node in waiting.values():
+                if not node.powered:
+                    raise ClusterError(f"node {node.name} did not start; see {self.logs / node.name / 'init.log'}")
+            if time.monotonic() > deadline:
+                names = ", ".join(waiting)
+                raise ClusterError(f"not Ready within {_READY_TIMEOUT_S:.0f} s: {names}; see the logs in {self.logs}")
+            time.sleep(_POLL_S)
+
+    def _ready_nodes(self, memory: Memory) -> dict[str, bool] | None:
+        if not self.running:
+            return None
+        try:
+            with self._api(Authority(self._state.pki), memory) as api:
+                items = api.request("GET", "/api/v1/nodes")["items"]
+        except ApiError:
+            raise
+        except ClusterError:
+            return None
+        return {item["metadata"]["name"]: _is_ready(item) for item in items}
+
+
+def _is_ready(item: dict[str, object]) -> bool:
+    status = item.get("status")
+    conditions = status.get("conditions", []) if isinstance(status, dict) else []
+    return any(entry["type"] == "Ready" and entry["status"] == "True" for entry in conditions)
+
+
+def _lacks(item: dict[str, object], resources: dict[str, str]) -> bool:
+    status = item.get("status")
+    capacity = status.get("capacity", {}) if isinstance(status, dict) else {}
+    return any(str(capacity.get(name)) != amount for name, amount in resources.items())
+
+
+def print_report(message: str) -> None:
+    """Write a line of progress to standard error."""
+    print(message, file=sys.stderr, flush=True)

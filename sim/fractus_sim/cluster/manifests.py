@@ -1,0 +1,84 @@
+"""The objects that a cluster starts with: its nodes and its DNS. Pure builders of what is applied."""
+
+from __future__ import annotations
+
+from ipaddress import IPv4Address
+from typing import Any
+
+from fractus_sim.cluster.addressing import DNS_SERVICE, Addressing
+from fractus_sim.cluster.spec import NodeSpec
+
+Json = dict[str, Any]
+
+DNS_USER = "fractus-sim:dns"
+CLASS_LABEL = "fractus.dev/class"
+
+
+def node_object(node: NodeSpec, index: int, addressing: Addressing) -> tuple[str, Json]:
+    """Return path and content of the Node, made before its kubelet starts so that its labels are there at once."""
+    pods = str(addressing.pods(index))
+    labels = {
+        "kubernetes.io/hostname": node.name,
+        "kubernetes.io/os": "linux",
+        CLASS_LABEL: node.node_class,
+        **node.labels,
+    }
+    return f"/api/v1/nodes/{node.name}", {
+        "apiVersion": "v1",
+        "kind": "Node",
+        "metadata": {"name": node.name, "labels": labels},
+        "spec": {"podCIDR": pods, "podCIDRs": [pods]},
+    }
+
+
+def dns_objects(listen: IPv4Address) -> list[tuple[str, Json]]:
+    """Return path and content of the objects that point the well-known DNS address at the DNS of the cluster."""
+    metadata = {"name": "kube-dns", "namespace": "kube-system"}
+    ports = [{"name": "dns", "port": 53, "protocol": "UDP"}, {"name": "dns-tcp", "port": 53, "protocol": "TCP"}]
+    service: Json = {
+        "apiVersion": "v1",
+        "kind": "Service",
+        "metadata": {**metadata, "labels": {"k8s-app": "kube-dns"}},
+        "spec": {
+            "clusterIP": str(DNS_SERVICE),
+            "ports": [{**port, "targetPort": port["port"]} for port in ports],
+        },
+    }
+    endpoints: Json = {
+        "apiVersion": "discovery.k8s.io/v1",
+        "kind": "EndpointSlice",
+        "metadata": {**metadata, "labels": {"kubernetes.io/service-name": "kube-dns"}},
+        "addressType": "IPv4",
+        "ports": ports,
+        "endpoints": [{"addresses": [str(listen)], "conditions": {"ready": True}}],
+    }
+    role: Json = {
+        "apiVersion": "rbac.authorization.k8s.io/v1",
+        "kind": "ClusterRole",
+        "metadata": {"name": DNS_USER},
+        "rules": [
+            {"apiGroups": [""], "resources": ["services", "pods", "namespaces"], "verbs": ["list", "watch"]},
+            {"apiGroups": ["discovery.k8s.io"], "resources": ["endpointslices"], "verbs": ["list", "watch"]},
+        ],
+    }
+    binding: Json = {
+        "apiVersion": "rbac.authorization.k8s.io/v1",
+        "kind": "ClusterRoleBinding",
+        "metadata": {"name": DNS_USER},
+        "roleRef": {"apiGroup": "rbac.authorization.k8s.io", "kind": "ClusterRole", "name": DNS_USER},
+        "subjects": [{"apiGroup": "rbac.authorization.k8s.io", "kind": "User", "name": DNS_USER}],
+    }
+    rbac = "/apis/rbac.authorization.k8s.io/v1"
+    return [
+        ("/api/v1/namespaces/kube-system/services/kube-dns", service),
+        ("/apis/discovery.k8s.io/v1/namespaces/kube-system/endpointslices/kube-dns", endpoints),
+        (f"{rbac}/clusterroles/{DNS_USER}", role),
+        (f"{rbac}/clusterrolebindings/{DNS_USER}", binding),
+    ]
+
+
+def extended_resources_patch(node: NodeSpec) -> tuple[str, Json] | None:
+    """Return path and merge patch that give a node its extended resources; None when it has none."""
+    if not node.extended_resources:
+        return None
+    return f"/api/v1/nodes/{node.name}/status", {"status": {"capacity": dict(node.extended_resources)}}

@@ -1,0 +1,187 @@
+"""`fractus-vehicle`: runs simulated ArduCopters in real time (or faster) behind real links."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from pathlib import Path
+
+import click
+
+from fractus_sim.vehicle.body import Wind
+from fractus_sim.vehicle.earth import Place
+from fractus_sim.vehicle.links import Hub, LinkError, LinkSpec
+from fractus_sim.vehicle.params import UnknownParameterError
+from fractus_sim.vehicle.simulation import Simulation, formation
+from fractus_sim.vehicle.vehicle import CONTROL_STEP_S, VehicleConfig
+
+DEFAULT_LISTEN = "tcp:127.0.0.1:5760"
+MAX_BATCH = 25
+MAX_LAG_S = 1.0
+MIN_SLEEP_S = 0.001
+
+
+class _Stop:
+    """Set by a signal."""
+
+    def __init__(self) -> None:
+        self.wanted = False
+
+    def __call__(self, *_: object) -> None:
+        self.wanted = True
+
+
+def run(simulation: Simulation, hub: Hub, speedup: float, stop: _Stop, until_s: float | None = None) -> None:
+    """Keep simulated time at `speedup` times real time (0: as fast as possible) until stopped."""
+    wall_0, time_0 = time.monotonic(), simulation.time_s
+    while not stop.wanted and (until_s is None or simulation.time_s < until_s):
+        hub.poll()
+        if speedup > 0.0:
+            behind = time_0 + (time.monotonic() - wall_0) * speedup - simulation.time_s
+            steps = min(int(behind / CONTROL_STEP_S + 1e-6), MAX_BATCH)
+            if behind > MAX_LAG_S * max(speedup, 1.0):
+                wall_0, time_0 = time.monotonic(), simulation.time_s
+        else:
+            steps = 1
+        for _ in range(steps):
+            simulation.step()
+        hub.flush()
+        if speedup > 0.0:
+            ahead = (simulation.time_s + CONTROL_STEP_S - time_0) / speedup - (time.monotonic() - wall_0)
+            if ahead > 0.0:
+                time.sleep(max(ahead, MIN_SLEEP_S))
+
+
+def _place(_context: click.Context, _option: click.Parameter, text: str) -> Place:
+    try:
+        lat, lon, alt = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise click.BadParameter("expected LAT,LON,ALT_AMSL") from error
+    if not (abs(lat) <= 90.0 and abs(lon) <= 180.0 and abs(alt) < 10_000.0):
+        raise click.BadParameter("latitude, longitude or altitude is out of range")
+    return Place.from_degrees(lat, lon, alt)
+
+
+def _wind(_context: click.Context, _option: click.Parameter, text: str | None) -> Wind:
+    if text is None:
+        return Wind()
+    try:
+        numbers = [float(part) for part in text.split(",")]
+        speed, direction, turbulence = [*numbers, 0.0, 0.0][:3]
+    except ValueError as error:
+        raise click.BadParameter("expected SPEED,DIR[,TURBULENCE]") from error
+    if not 0.0 <= speed < 60.0 or not 0.0 <= turbulence < 30.0:
+        raise click.BadParameter("wind speed must lie between 0 and 60 m/s")
+    return Wind(speed, direction % 360.0, turbulence)
+
+
+def _parameters(_context: click.Context, _option: click.Parameter, texts: tuple[str, ...]) -> dict[str, float]:
+    values: dict[str, float] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        try:
+            values[name.strip()] = float(value)
+        except ValueError as error:
+            raise click.BadParameter(f"{text!r}: expected NAME=VALUE") from error
+        if not equals:
+            raise click.BadParameter(f"{text!r}: expected NAME=VALUE")
+    return values
+
+
+@click.command()
+@click.option(
+    "--listen",
+    "links",
+    multiple=True,
+    metavar="LINK",
+    help="tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT, serial:DEVICE[:BAUD] or pty:PATH; repeat for more "
+    f"links.  [default: {DEFAULT_LISTEN}]",
+)
+@click.option(
+    "--home",
+    callback=_place,
+    default="-35.3632621,149.1652374,584.0",
+    show_default=True,
+    metavar="LAT,LON,ALT_AMSL",
+    help="Where the vehicle stands at the start.",
+)
+@click.option("--heading", "heading_deg", type=float, default=0.0, help="Heading at the start, degrees.")
+@click.option("--sysid", type=click.IntRange(1, 250), default=1, help="MAVLink system id.")
+@click.option("--speedup", type=click.FloatRange(0.0), default=1.0, help="Times real time; 0: as fast as possible.")
+@click.option("--seed", type=int, default=1, help="Seed of all noise.")
+@click.option("--param", "parameters", multiple=True, callback=_parameters, metavar="NAME=VALUE", help="A parameter.")
+@click.option("--wind", callback=_wind, metavar="SPEED,DIR[,TURB]", help="Wind, m/s and degrees it comes from.")
+@click.option("--ready-after", type=click.FloatRange(0.1), default=32.0, help="Seconds until ready to arm.")
+@click.option("--count", type=click.IntRange(1, 200), default=1, help="Number of vehicles; ports and ids count up.")
+@click.option("--spacing", type=float, default=10.0, help="Distance between vehicles, metres toward east.")
+@click.option("--store", type=click.Path(path_type=Path), help="File that keeps changed parameters.")
+@click.option("--tlog", type=click.Path(path_type=Path), help="Record what the (first) vehicle says to a tlog.")
+@click.option("--duration", type=float, help="End after so many simulated seconds.")
+def vehicle(
+    links: tuple[str, ...],
+    home: Place,
+    heading_deg: float,
+    sysid: int,
+    speedup: float,
+    seed: int,
+    parameters: dict[str, float],
+    wind: Wind,
+    ready_after: float,
+    count: int,
+    spacing: float,
+    store: Path | None,
+    tlog: Path | None,
+    duration: float | None,
+) -> None:
+    """Simulate ArduCopter-compatible vehicles that speak MAVLink 2."""
+    values = dict(parameters)
+    if wind.speed_mps or wind.turbulence_mps:
+        values |= {
+            "SIM_WIND_SPD": wind.speed_mps,
+            "SIM_WIND_DIR": wind.from_deg,
+            "SIM_WIND_TURB": wind.turbulence_mps,
+        }
+    config = VehicleConfig(
+        start=home,
+        heading_deg=heading_deg,
+        sysid=sysid,
+        seed=seed,
+        ready_after_s=ready_after,
+        parameters=values,
+        wind=wind,
+        store=store,
+        epoch_us=int(time.time() * 1e6),
+    )
+    hub = Hub()
+    stop = _Stop()
+    signal.signal(signal.SIGTERM, stop)
+    signal.signal(signal.SIGINT, stop)
+    try:
+        simulation = Simulation(formation(config, count, spacing))
+        for at, craft in enumerate(simulation.crafts):
+            for text in links or (DEFAULT_LISTEN,):
+                hub.open(LinkSpec.parse(text).shifted(at), craft)
+    except LinkError as error:
+        raise click.ClickException(str(error)) from error
+    except UnknownParameterError as error:
+        raise click.ClickException(f"unknown parameter {error.args[0]}") from error
+    click.echo(f"vehicle {sysid} ready for connections on {' '.join(links or (DEFAULT_LISTEN,))}", err=True)
+    log = tlog.open("wb") if tlog is not None else None
+    try:
+        if log is not None:
+            simulation.crafts[0].record(log)
+        run(simulation, hub, speedup, stop, duration)
+    finally:
+        hub.close()
+        if log is not None:
+            log.close()
+
+
+def main() -> None:
+    """Entry point of `fractus-vehicle`."""
+    vehicle.main(args=sys.argv[1:], prog_name="fractus-vehicle")
+
+
+if __name__ == "__main__":
+    main()

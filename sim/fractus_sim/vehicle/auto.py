@@ -1,0 +1,219 @@
+"""AUTO: flying the stored mission."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from fractus_sim.vehicle.descent import descend
+from fractus_sim.vehicle.flight import Flight
+from fractus_sim.vehicle.mav import ABSOLUTE_FRAMES, Command, Frame, Mode, Severity
+
+if TYPE_CHECKING:
+    from fractus_sim.vehicle.mission import Item
+    from fractus_sim.vehicle.vehicle import Vehicle
+
+
+class AutoFlight(Flight):
+    """AUTO mode: runs NAV commands one after the other, DO commands at once when reached."""
+
+    def __init__(self) -> None:
+        self._item: Item | None = None
+        self._index = 0
+        self._arrived_s: float | None = None
+        self._landing = False
+        self._returning: Flight | None = None
+        self._wait_until_s = 0.0
+        self.paused = False
+        self._circle_centre: tuple[float, float] | None = None
+        self._turned = 0.0
+        self._angle = 0.0
+
+    def begin(self, v: Vehicle) -> None:
+        v.control.hold_here()
+        v.yaw.follow_course()
+        mission = v.mission
+        if mission.complete or int(v.params["MIS_RESTART"]) == 1 or mission.current == 0:
+            mission.rewind()
+            first = mission.next_after(0)
+        else:
+            first = mission.current
+        self._start_from(v, first)
+
+    def pause(self, v: Vehicle, *, paused: bool) -> None:
+        """DO_PAUSE_CONTINUE: stop where it is; continuing repeats the current item."""
+        if paused and not self.paused:
+            v.control.hold_here()
+        elif not paused and self.paused and self._item is not None:
+            self._begin_item(v, self._index, self._item)
+        self.paused = paused
+
+    def jump_to(self, v: Vehicle, index: int) -> None:
+        """Continue at an item (DO_SET_MISSION_CURRENT)."""
+        self._returning = None
+        self._landing = False
+        v.mission.complete = False
+        self._start_from(v, index)
+
+    def _start_from(self, v: Vehicle, index: int | None) -> None:
+        """Run DO commands until a NAV command is reached, and begin that."""
+        for _ in range(len(v.mission.items) + 1):
+            if index is None or index >= len(v.mission.items):
+                self._finish(v)
+                return
+            item = v.mission.items[index]
+            v.mission.current = index
+            if item.navigates:
+                v.say(Severity.INFO, f"Mission: {index} {_title(item)}")
+                self._begin_item(v, index, item)
+                return
+            self._do(v, item)
+            if item.command == Command.CONDITION_DELAY:
+                self._wait_until_s = v.time_s + max(item.param1, 0.0)
+            index = v.mission.next_after(index)
+
+    def _finish(self, v: Vehicle) -> None:
+        self._item = None
+        v.mission.complete = True
+        v.say(Severity.INFO, "Mission complete" if v.mission.items else "Mission: no items")
+        if v.landed:
+            v.disarm("mission complete")
+        else:
+            v.force_mode(Mode.LOITER, "mission complete") if v.position_ok else v.force_mode(Mode.LAND, "mission")
+
+    def _place(self, v: Vehicle, item: Item) -> tuple[float, float, float]:
+        return item_target(v, item)
+
+    def _begin_item(self, v: Vehicle, index: int, item: Item) -> None:
+        self._item, self._index = item, index
+        self._arrived_s = None
+        self._landing = False
+        self._returning = None
+        north, east, down = self._place(v, item)
+        match item.command:
+            case Command.NAV_TAKEOFF:
+                if v.landed:
+                    v.begin_takeoff(down)
+                else:
+                    v.control.go_to(*v.control.target, down)
+            case Command.NAV_RETURN_TO_LAUNCH:
+                self._returning = v.new_return()
+                self._returning.begin(v)
+            case Command.NAV_LOITER_TURNS:
+                self._circle_centre = (north, east)
+                self._turned = 0.0
+                self._angle = math.atan2(v.est.east - east, v.est.north - north)
+                v.control.go_to(north, east, down)
+            case Command.NAV_DELAY:
+                self._arrived_s = v.time_s
+            case Command.NAV_GUIDED_ENABLE:
+                self._arrived_s = v.time_s
+            case _:
+                v.control.go_to(north, east, down)
+
+    def _do(self, v: Vehicle, item: Item) -> None:
+        match item.command:
+            case Command.DO_CHANGE_SPEED:
+                v.change_speed(int(item.param1), item.param2)
+            case Command.CONDITION_YAW:
+                v.turn_to(item.param1, item.param2, int(item.param3), relative=item.param4 > 0.5)
+            case Command.DO_SET_ROI | Command.DO_SET_ROI_LOCATION:
+                north, east, _ = self._place(v, item)
+                v.yaw.look_at((north, east) if item.has_place else None)
+            case Command.DO_SET_ROI_NONE:
+                v.yaw.look_at(None)
+            case Command.DO_FENCE_ENABLE:
+                v.params.assign("FENCE_ENABLE", 1.0 if item.param1 > 0.5 else 0.0)
+            case Command.DO_SET_HOME:
+                v.set_home_here() if item.param1 > 0.5 else v.set_home_at(item.x, item.y, item.z)
+            case _:
+                pass
+
+    def step(self, v: Vehicle, dt: float) -> None:
+        item = self._item
+        if item is None or self.paused:
+            return
+        if self._returning is not None:
+            self._returning.step(v, dt)
+            return
+        if v.time_s < self._wait_until_s:
+            return
+        if item.command == Command.NAV_LAND:
+            self._land(v)
+        elif item.command == Command.NAV_LOITER_TURNS and self._circle_centre is not None:
+            self._turn(v, item, dt)
+        elif self._done(v, item):
+            v.broadcast("MISSION_ITEM_REACHED", {"seq": self._index})
+            v.say(Severity.INFO, f"Reached command #{self._index}")
+            self._start_from(v, v.mission.next_after(self._index))
+        v.yaw.step(v, dt)
+
+    def _land(self, v: Vehicle) -> None:
+        north, east = v.control.target
+        if not self._landing and math.hypot(north - v.est.north, east - v.est.east) < 2.0:
+            self._landing = True
+            v.touch_time_s = 0.0
+        if self._landing:
+            descend(v)
+            if not v.armed:
+                v.broadcast("MISSION_ITEM_REACHED", {"seq": self._index})
+
+    def _turn(self, v: Vehicle, item: Item, dt: float) -> None:
+        radius = min(max(abs(item.param3) or v.params["CIRCLE_RADIUS"] / 100.0, 1.0), 500.0)
+        rate = min(math.radians(v.params["CIRCLE_RATE"]), v.control.limits.speed_mps / radius)
+        step = math.copysign(rate * dt, item.param3 or 1.0)
+        centre = self._circle_centre or (v.est.north, v.est.east)
+        self._angle += step
+        self._turned += abs(step)
+        v.control.target = (centre[0] + radius * math.cos(self._angle), centre[1] + radius * math.sin(self._angle))
+        if self._turned >= 2.0 * math.pi * max(item.param1, 1.0):
+            v.broadcast("MISSION_ITEM_REACHED", {"seq": self._index})
+            self._start_from(v, v.mission.next_after(self._index))
+
+    def _done(self, v: Vehicle, item: Item) -> bool:
+        if item.command == Command.NAV_TAKEOFF:
+            return v.takeoff_done()
+        if item.command == Command.NAV_LOITER_UNLIM:
+            return False
+        if item.command == Command.NAV_DELAY:
+            return v.time_s - (self._arrived_s or 0.0) >= max(item.param1, 0.0)
+        if item.command == Command.NAV_GUIDED_ENABLE:
+            return True
+        if self._arrived_s is None:
+            dn, de = v.control.target[0] - v.est.north, v.control.target[1] - v.est.east
+            radius = max(v.params["WPNAV_RADIUS"] / 100.0, 0.3)
+            if math.sqrt(dn * dn + de * de + (v.control.target_down - v.est.down) ** 2) > radius:
+                return False
+            self._arrived_s = v.time_s
+        return v.time_s - self._arrived_s >= max(item.param1, 0.0)
+
+
+def item_target(v: Vehicle, item: Item) -> tuple[float, float, float]:
+    """Where an item lies in the local frame; a missing position means here."""
+    origin = v.origin or v.start
+    home_alt = v.home.alt_m if v.home is not None else origin.alt_m
+    if item.frame in ABSOLUTE_FRAMES:
+        down = origin.alt_m - item.z
+    elif item.frame == Frame.GLOBAL_TERRAIN_ALT:
+        down = origin.alt_m - (v.start.alt_m + item.z)
+    else:
+        down = origin.alt_m - (home_alt + item.z)
+    if not item.has_place:
+        return (v.control.target[0], v.control.target[1], down)
+    north, east, _ = origin.vector_to(type(origin)(item.x, item.y, 0.0))
+    return (north, east, down)
+
+
+def _title(item: Item) -> str:
+    names = {
+        Command.NAV_WAYPOINT: "WP",
+        Command.NAV_SPLINE_WAYPOINT: "SplineWP",
+        Command.NAV_TAKEOFF: "Takeoff",
+        Command.NAV_LAND: "Land",
+        Command.NAV_RETURN_TO_LAUNCH: "RTL",
+        Command.NAV_LOITER_UNLIM: "LoitUnlim",
+        Command.NAV_LOITER_TIME: "LoitTime",
+        Command.NAV_LOITER_TURNS: "LoitTurns",
+        Command.NAV_DELAY: "Delay",
+    }
+    return names.get(Command(item.command), "Cmd") if item.command in set(Command) else "Cmd"

@@ -1,0 +1,167 @@
+"""The autopilot's own geofence: shapes, altitude band and home circle, and what a position breaches."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntFlag
+
+from fractus_sim.vehicle.mav import Command
+
+
+class Breach(IntFlag):
+    """FENCE_TYPE bits."""
+
+    NONE = 0
+    ALT_MAX = 1
+    CIRCLE = 2
+    POLYGON = 4
+    ALT_MIN = 8
+
+
+NAMES = {Breach.ALT_MAX: "Max Alt", Breach.CIRCLE: "Circle", Breach.POLYGON: "Polygon", Breach.ALT_MIN: "Min Alt"}
+
+Vertex = tuple[float, float]
+
+
+class FenceShapeError(ValueError):
+    """Fence items that do not form shapes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Polygon:
+    """A polygon in local metres (north, east)."""
+
+    vertices: tuple[Vertex, ...]
+    inclusion: bool
+
+    def contains(self, north: float, east: float) -> bool:
+        """Even-odd rule."""
+        inside = False
+        previous = self.vertices[-1]
+        for vertex in self.vertices:
+            if (vertex[1] > east) != (previous[1] > east):
+                crossing = (previous[0] - vertex[0]) * (east - vertex[1]) / (previous[1] - vertex[1]) + vertex[0]
+                if north < crossing:
+                    inside = not inside
+            previous = vertex
+        return inside
+
+
+@dataclass(frozen=True, slots=True)
+class Circle:
+    """A circle in local metres."""
+
+    north: float
+    east: float
+    radius_m: float
+    inclusion: bool
+
+    def contains(self, north: float, east: float) -> bool:
+        """Whether the point lies inside."""
+        return math.hypot(north - self.north, east - self.east) <= self.radius_m
+
+
+Shape = Polygon | Circle
+
+
+@dataclass(frozen=True, slots=True)
+class FenceItem:
+    """One uploaded item: command, first parameter, position in local metres."""
+
+    command: int
+    param1: float
+    north: float
+    east: float
+
+
+def build_shapes(items: Sequence[FenceItem]) -> tuple[Shape, ...]:
+    """Group the items of an upload into shapes.
+
+    Raises:
+        FenceShapeError: a polygon is incomplete or too small, a radius not positive, or a command foreign.
+    """
+    shapes: list[Shape] = []
+    at = 0
+    while at < len(items):
+        item = items[at]
+        if item.command in (Command.NAV_FENCE_CIRCLE_INCLUSION, Command.NAV_FENCE_CIRCLE_EXCLUSION):
+            if not item.param1 > 0.0:
+                raise FenceShapeError(f"fence item {at}: radius {item.param1} must be positive")
+            inclusion = item.command == Command.NAV_FENCE_CIRCLE_INCLUSION
+            shapes.append(Circle(item.north, item.east, item.param1, inclusion))
+            at += 1
+        elif item.command in (
+            Command.NAV_FENCE_POLYGON_VERTEX_INCLUSION,
+            Command.NAV_FENCE_POLYGON_VERTEX_EXCLUSION,
+        ):
+            count = int(item.param1)
+            group = items[at : at + count]
+            if count < 3 or len(group) < count or any(g.command != item.command or g.param1 != count for g in group):
+                raise FenceShapeError(f"fence item {at}: polygon of {count} vertices is incomplete")
+            inclusion = item.command == Command.NAV_FENCE_POLYGON_VERTEX_INCLUSION
+            shapes.append(Polygon(tuple((g.north, g.east) for g in group), inclusion))
+            at += count
+        elif item.command == Command.NAV_FENCE_RETURN_POINT:
+            at += 1
+        else:
+            raise FenceShapeError(f"fence item {at}: command {item.command} is no fence command")
+    return tuple(shapes)
+
+
+@dataclass(slots=True)
+class Fence:
+    """Settings, shapes and the breaches of the moment."""
+
+    enabled: bool = False
+    types: int = 7
+    alt_max_m: float = 100.0
+    alt_min_m: float = -10.0
+    radius_m: float = 300.0
+    shapes: tuple[Shape, ...] = ()
+    breaches: Breach = Breach.NONE
+    breach_count: int = 0
+    breach_time_s: float = 0.0
+
+    def outside(self, north: float, east: float, altitude_m: float, home: Vertex = (0.0, 0.0)) -> Breach:
+        """What a point (local metres, altitude above home) would breach if the fence is enabled."""
+        found = Breach.NONE
+        if not self.enabled:
+            return found
+        if self.types & Breach.ALT_MAX and altitude_m >= self.alt_max_m:
+            found |= Breach.ALT_MAX
+        if self.types & Breach.ALT_MIN and altitude_m <= self.alt_min_m:
+            found |= Breach.ALT_MIN
+        if self.types & Breach.CIRCLE and math.hypot(north - home[0], east - home[1]) >= self.radius_m:
+            found |= Breach.CIRCLE
+        if self.types & Breach.POLYGON and any(s.contains(north, east) != s.inclusion for s in self.shapes):
+            found |= Breach.POLYGON
+        return found
+
+    def check(self, north: float, east: float, altitude_m: float, home: Vertex, now_s: float) -> Breach:
+        """Update the breaches and return the new ones."""
+        found = self.outside(north, east, altitude_m, home)
+        new = found & ~self.breaches
+        self.breaches = found
+        if new:
+            self.breach_count = min(self.breach_count + 1, 65535)
+            self.breach_time_s = now_s
+        return new
+
+    @property
+    def breach_type(self) -> int:
+        """FENCE_BREACH for FENCE_STATUS."""
+        if self.breaches & Breach.ALT_MIN:
+            return 1
+        if self.breaches & Breach.ALT_MAX:
+            return 2
+        return 3 if self.breaches else 0
+
+
+def breach_names(breaches: Breach) -> str:
+    """The breaches as ArduPilot writes them: `Max Alt and Circle fences`."""
+    names = [name for bit, name in NAMES.items() if breaches & bit]
+    if len(names) <= 1:
+        return f"{''.join(names)} fence".strip()
+    return f"{', '.join(names[:-1])} and {names[-1]} fences"

@@ -1,0 +1,376 @@
+"""Item lists that clients upload and download: mission, fence and rally points, by the MAVLink mission protocol."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from fractus_sim.vehicle.mav import GLOBAL_FRAMES, Command, Frame, MissionKind, MissionResult
+
+if TYPE_CHECKING:
+    from fractus_sim.vehicle.channel import Channel
+    from fractus_sim.vehicle.wire import Message
+
+MAX_ITEMS = 724
+UPLOAD_TIMEOUT_S = 8.0
+RETRY_S = 1.0
+
+FENCE_COMMANDS = frozenset(range(5000, 5005))
+SUPPORTED = frozenset(
+    {
+        Command.NAV_WAYPOINT,
+        Command.NAV_SPLINE_WAYPOINT,
+        Command.NAV_LOITER_UNLIM,
+        Command.NAV_LOITER_TURNS,
+        Command.NAV_LOITER_TIME,
+        Command.NAV_RETURN_TO_LAUNCH,
+        Command.NAV_LAND,
+        Command.NAV_TAKEOFF,
+        Command.NAV_DELAY,
+        Command.NAV_GUIDED_ENABLE,
+        Command.CONDITION_DELAY,
+        Command.CONDITION_DISTANCE,
+        Command.CONDITION_YAW,
+        Command.DO_JUMP,
+        Command.DO_CHANGE_SPEED,
+        Command.DO_SET_HOME,
+        Command.DO_SET_RELAY,
+        Command.DO_SET_SERVO,
+        Command.DO_LAND_START,
+        Command.DO_SET_ROI_LOCATION,
+        Command.DO_SET_ROI_NONE,
+        Command.DO_SET_ROI,
+        Command.DO_DIGICAM_CONTROL,
+        Command.DO_MOUNT_CONTROL,
+        Command.DO_SET_CAM_TRIGG_DIST,
+        Command.DO_FENCE_ENABLE,
+        Command.DO_PAUSE_CONTINUE,
+        205,
+        530,
+        531,
+        532,
+        1000,
+        2000,
+        2001,
+        2500,
+        2501,
+    }
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One item of a list; x and y are degrees times 1e7."""
+
+    command: int
+    frame: int = Frame.GLOBAL_RELATIVE_ALT
+    param1: float = 0.0
+    param2: float = 0.0
+    param3: float = 0.0
+    param4: float = 0.0
+    x: int = 0
+    y: int = 0
+    z: float = 0.0
+    autocontinue: int = 1
+
+    @property
+    def has_place(self) -> bool:
+        """Whether the item names a position (0, 0 means: here)."""
+        return self.x != 0 or self.y != 0
+
+    @property
+    def navigates(self) -> bool:
+        """Whether this is a NAV command, which the mission waits for."""
+        return self.command < 95 and self.command != 0
+
+
+@dataclass(slots=True)
+class Upload:
+    """A transfer toward the vehicle."""
+
+    channel: Channel
+    sysid: int
+    compid: int
+    kind: MissionKind
+    next: int
+    last: int
+    items: list[Item]
+    partial: bool
+    heard_s: float
+    asked_s: float
+
+
+@dataclass(slots=True)
+class ItemStore:
+    """One list and what happens when it is replaced; `accept` may refuse it."""
+
+    kind: MissionKind
+    items: list[Item] = field(default_factory=list)
+    accept: Callable[[list[Item]], MissionResult] = lambda _items: MissionResult.ACCEPTED
+
+
+def item_from(message: Message) -> Item:
+    """Read MISSION_ITEM_INT, or MISSION_ITEM with its degrees in floats."""
+    frame = message.integer("frame")
+    x, y = message.real("x"), message.real("y")
+    scale = 1e7 if frame in GLOBAL_FRAMES else 1e4
+    if message.name == "MISSION_ITEM":
+        x, y = (x * scale if math.isfinite(x) else 0.0), (y * scale if math.isfinite(y) else 0.0)
+    aliases = {Frame.GLOBAL_INT: 0, Frame.GLOBAL_RELATIVE_ALT_INT: 3, Frame.GLOBAL_TERRAIN_ALT_INT: 10}
+    return Item(
+        command=message.integer("command"),
+        frame=int(aliases.get(Frame(frame), frame)) if frame in set(Frame) else frame,
+        param1=message.real("param1"),
+        param2=message.real("param2"),
+        param3=message.real("param3"),
+        param4=message.real("param4"),
+        x=int(max(-2147483648, min(2147483647, round(x)))),
+        y=int(max(-2147483648, min(2147483647, round(y)))),
+        z=message.real("z"),
+        autocontinue=message.integer("autocontinue"),
+    )
+
+
+def judge(item: Item, kind: MissionKind) -> MissionResult:
+    """Whether an item may be stored in a list of that kind."""
+    if kind is MissionKind.FENCE:
+        known = item.command in FENCE_COMMANDS
+    elif kind is MissionKind.RALLY:
+        known = item.command == Command.NAV_RALLY_POINT
+    else:
+        known = item.command in SUPPORTED
+    if not known:
+        return MissionResult.UNSUPPORTED
+    if item.frame not in GLOBAL_FRAMES and item.frame != Frame.MISSION and item.has_place:
+        return MissionResult.UNSUPPORTED_FRAME
+    if abs(item.x) > 900_000_000 or abs(item.y) > 1_800_000_000 or not math.isfinite(item.z):
+        return MissionResult.INVALID
+    return MissionResult.ACCEPTED
+
+
+class Transfers:
+    """The vehicle's side of the mission protocol, for all kinds and links (one upload at a time, as ArduPilot)."""
+
+    def __init__(self, stores: dict[MissionKind, ItemStore]) -> None:
+        self.stores = stores
+        self.upload: Upload | None = None
+
+    def _ack(self, channel: Channel, message: Message, kind: int, result: MissionResult) -> None:
+        channel.send(
+            "MISSION_ACK",
+            {
+                "target_system": message.sysid,
+                "target_component": message.compid,
+                "type": int(result),
+                "mission_type": kind,
+            },
+        )
+
+    def handle(self, channel: Channel, message: Message, now_s: float) -> None:
+        """Answer one message of the protocol."""
+        kind_number = message.integer("mission_type") if message.has("mission_type") else 0
+        if kind_number == 255 and message.name == "MISSION_CLEAR_ALL":
+            for store in self.stores.values():
+                self._replace(store, [])
+            self._ack(channel, message, kind_number, MissionResult.ACCEPTED)
+            return
+        if kind_number not in set(MissionKind):
+            self._ack(channel, message, kind_number, MissionResult.UNSUPPORTED)
+            return
+        kind = MissionKind(kind_number)
+        store = self.stores[kind]
+        match message.name:
+            case "MISSION_COUNT":
+                self._begin(channel, message, store, 0, message.integer("count") - 1, now_s, partial=False)
+            case "MISSION_WRITE_PARTIAL_LIST":
+                start, end = message.integer("start_index"), message.integer("end_index")
+                if not 0 <= start <= end < len(store.items):
+                    self._ack(channel, message, kind, MissionResult.ERROR)
+                else:
+                    self._begin(channel, message, store, start, end, now_s, partial=True)
+            case "MISSION_ITEM" | "MISSION_ITEM_INT":
+                self._take(channel, message, store, now_s)
+            case "MISSION_REQUEST_LIST":
+                channel.send("MISSION_COUNT", self._address(message, kind) | {"count": len(store.items)})
+            case "MISSION_REQUEST_PARTIAL_LIST":
+                self._ack(channel, message, kind, MissionResult.UNSUPPORTED)
+            case "MISSION_REQUEST" | "MISSION_REQUEST_INT":
+                self._give(channel, message, store)
+            case "MISSION_CLEAR_ALL":
+                self._ack(channel, message, kind, self._replace(store, []))
+            case "MISSION_ACK":
+                self.upload = None if self._is_uploader(channel, message) else self.upload
+
+    @staticmethod
+    def _address(message: Message, kind: MissionKind) -> dict[str, int | float | bytes | tuple[int | float, ...]]:
+        return {"target_system": message.sysid, "target_component": message.compid, "mission_type": int(kind)}
+
+    def _is_uploader(self, channel: Channel, message: Message) -> bool:
+        up = self.upload
+        return up is not None and up.channel is channel and (up.sysid, up.compid) == (message.sysid, message.compid)
+
+    def _begin(
+        self,
+        channel: Channel,
+        message: Message,
+        store: ItemStore,
+        first: int,
+        last: int,
+        now_s: float,
+        *,
+        partial: bool,
+    ) -> None:
+        if self.upload is not None and not self._is_uploader(channel, message):
+            self._ack(channel, message, store.kind, MissionResult.DENIED)
+            return
+        if last >= MAX_ITEMS:
+            self._ack(channel, message, store.kind, MissionResult.NO_SPACE)
+            return
+        if last < first:
+            self._ack(channel, message, store.kind, self._replace(store, []))
+            return
+        items = list(store.items) if partial else []
+        self.upload = Upload(
+            channel, message.sysid, message.compid, store.kind, first, last, items, partial, now_s, now_s
+        )
+        self._ask(self.upload, now_s)
+
+    def _ask(self, up: Upload, now_s: float) -> None:
+        up.asked_s = now_s
+        up.channel.send(
+            "MISSION_REQUEST",
+            {
+                "target_system": up.sysid,
+                "target_component": up.compid,
+                "seq": up.next,
+                "mission_type": int(up.kind),
+            },
+        )
+
+    def _take(self, channel: Channel, message: Message, store: ItemStore, now_s: float) -> None:
+        up = self.upload
+        if up is None or not self._is_uploader(channel, message) or up.kind is not store.kind:
+            self._ack(channel, message, store.kind, MissionResult.ERROR)
+            return
+        seq = message.integer("seq")
+        if seq != up.next:
+            if seq > up.next:
+                self._ack(channel, message, store.kind, MissionResult.INVALID_SEQUENCE)
+            return
+        item = item_from(message)
+        verdict = MissionResult.ACCEPTED if seq == 0 and store.kind is MissionKind.MISSION else judge(item, store.kind)
+        if verdict is not MissionResult.ACCEPTED:
+            self.upload = None
+            self._ack(channel, message, store.kind, verdict)
+            return
+        if up.partial:
+            up.items[seq] = item
+        else:
+            up.items.append(item)
+        up.next += 1
+        up.heard_s = now_s
+        if up.next <= up.last:
+            self._ask(up, now_s)
+            return
+        self.upload = None
+        self._ack(channel, message, store.kind, self._replace(store, up.items))
+
+    @staticmethod
+    def _replace(store: ItemStore, items: list[Item]) -> MissionResult:
+        result = store.accept(items)
+        if result is MissionResult.ACCEPTED:
+            store.items = items
+        return result
+
+    def _give(self, channel: Channel, message: Message, store: ItemStore) -> None:
+        seq = message.integer("seq")
+        if not 0 <= seq < len(store.items):
+            self._ack(channel, message, store.kind, MissionResult.INVALID_SEQUENCE)
+            return
+        item = store.items[seq]
+        integers = message.name == "MISSION_REQUEST_INT"
+        channel.send(
+            "MISSION_ITEM_INT" if integers else "MISSION_ITEM",
+            self._address(message, store.kind)
+            | {
+                "seq": seq,
+                "frame": item.frame,
+                "command": item.command,
+                "current": 0,
+                "autocontinue": item.autocontinue,
+                "param1": item.param1,
+                "param2": item.param2,
+                "param3": item.param3,
+                "param4": item.param4,
+                "x": item.x if integers else item.x * 1e-7,
+                "y": item.y if integers else item.y * 1e-7,
+                "z": item.z,
+            },
+        )
+
+    def step(self, now_s: float) -> Upload | None:
+        """Repeat an unanswered request; return an upload that was given up."""
+        up = self.upload
+        if up is None:
+            return None
+        if now_s - up.heard_s > UPLOAD_TIMEOUT_S:
+            self.upload = None
+            up.channel.send(
+                "MISSION_ACK",
+                {
+                    "target_system": up.sysid,
+                    "target_component": up.compid,
+                    "type": int(MissionResult.CANCELLED),
+                    "mission_type": int(up.kind),
+                },
+            )
+            return up
+        if now_s - up.asked_s > RETRY_S:
+            self._ask(up, now_s)
+        return None
+
+
+class Mission:
+    """The stored mission and where its execution stands; item 0 is home, as in ArduPilot."""
+
+    def __init__(self) -> None:
+        self.store = ItemStore(MissionKind.MISSION)
+        self.current = 0
+        self.complete = False
+        self._jumps: dict[int, int] = {}
+
+    @property
+    def items(self) -> list[Item]:
+        """The stored items."""
+        return self.store.items
+
+    def rewind(self) -> None:
+        """Start from the first item after home."""
+        self.current = 0
+        self.complete = False
+        self._jumps.clear()
+
+    def next_after(self, index: int) -> int | None:
+        """The item to execute after `index`, jumps followed; None at the end."""
+        at = index + 1
+        for _ in range(100):
+            if at >= len(self.items):
+                return None
+            item = self.items[at]
+            if item.command != Command.DO_JUMP:
+                return at
+            done = self._jumps.get(at, 0)
+            target = int(item.param1)
+            if 0 < target < len(self.items) and (item.param2 < 0 or done < int(item.param2)):
+                self._jumps[at] = done + 1
+                at = target
+            else:
+                at += 1
+        return None
+
+    def with_home(self, home: Item) -> None:
+        """Keep item 0 equal to home."""
+        if self.items:
+            self.items[0] = replace(home, frame=Frame.GLOBAL, command=Command.NAV_WAYPOINT)

@@ -1,0 +1,219 @@
+"""The flight modes: what each does when it begins and at every control step."""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+from typing import TYPE_CHECKING
+
+from fractus_sim.vehicle.auto import AutoFlight
+from fractus_sim.vehicle.control import Axis
+from fractus_sim.vehicle.descent import LANDING_CONFIRMED_S, descend
+from fractus_sim.vehicle.flight import Flight
+from fractus_sim.vehicle.guided import GuidedFlight
+from fractus_sim.vehicle.mav import Mode
+from fractus_sim.vehicle.shaping import clamp
+
+if TYPE_CHECKING:
+    from fractus_sim.vehicle.vehicle import Vehicle
+
+
+def stick_rate(pwm: int, dead_zone: int = 30) -> float:
+    """A stick's deflection from its centre, -1 to 1."""
+    offset = pwm - 1500
+    if abs(offset) <= dead_zone:
+        return 0.0
+    return clamp((offset - math.copysign(dead_zone, offset)) / (500.0 - dead_zone), -1.0, 1.0)
+
+
+def pilot_climb(v: Vehicle) -> None:
+    """Climb and yaw rates from the sticks, as in ALT_HOLD and LOITER; takes off when the pilot raises throttle."""
+    up = v.params["PILOT_SPEED_UP"] / 100.0
+    down = (v.params["PILOT_SPEED_DN"] / 100.0) or up
+    throttle = stick_rate(v.sticks[2], 100)
+    if v.landed and throttle > 0.0:
+        v.begin_takeoff(v.est.down - 1.0)
+        v.taking_off_until_m = None
+        v.landed = False
+    rate = -throttle * (up if throttle > 0.0 else down)
+    if rate == 0.0:
+        if v.control.vertical is Axis.VELOCITY:
+            v.control.vertical = Axis.POSITION
+            v.control.target_down = v.control.stopping_down()
+    elif not v.landed:
+        v.control.climb(rate)
+    yaw = stick_rate(v.sticks[3])
+    v.control.yaw_rate = yaw * math.radians(120.0) if yaw else None
+    if not yaw:
+        v.control.target_yaw = v.control.yaw_setpoint
+    if v.body.on_ground and rate > 0.0:
+        v.touch_time_s += v.control_step_s
+        if v.touch_time_s >= LANDING_CONFIRMED_S:
+            v.land_complete()
+    else:
+        v.touch_time_s = 0.0
+
+
+class Stabilize(Flight):
+    """Sticks set lean angles and thrust."""
+
+    needs_position = False
+    manual_throttle = True
+
+    def begin(self, v: Vehicle) -> None:
+        v.control.horizontal = Axis.ATTITUDE
+
+    def step(self, v: Vehicle, dt: float) -> None:
+        share = clamp((v.sticks[2] - 1000) / 1000.0, 0.0, 1.0)
+        lean = v.control.limits.tilt_max_rad
+        v.control.attitude = (stick_rate(v.sticks[0]) * lean, stick_rate(v.sticks[1]) * lean)
+        v.control.throttle = share * 2.0 * v.body.airframe.hover_share
+        yaw = stick_rate(v.sticks[3])
+        v.control.yaw_rate = yaw * math.radians(120.0) if yaw else None
+        if share > 0.55 and v.landed:
+            v.landed = False
+        if v.body.on_ground and share < 0.1:
+            v.land_complete()
+
+
+class AltHold(Flight):
+    """Sticks set lean angles; the altitude holds unless the throttle leaves its centre."""
+
+    needs_position = False
+
+    def begin(self, v: Vehicle) -> None:
+        v.control.hold_here()
+        v.control.horizontal = Axis.ATTITUDE
+
+    def step(self, v: Vehicle, dt: float) -> None:
+        lean = v.control.limits.tilt_max_rad
+        v.control.attitude = (stick_rate(v.sticks[0]) * lean, stick_rate(v.sticks[1]) * lean)
+        pilot_climb(v)
+
+
+class Loiter(Flight):
+    """Holds position; sticks move it."""
+
+    def begin(self, v: Vehicle) -> None:
+        v.control.hold_here()
+
+    def step(self, v: Vehicle, dt: float) -> None:
+        forward, right = -stick_rate(v.sticks[1]), stick_rate(v.sticks[0])
+        if forward or right:
+            speed = v.params["LOIT_SPEED"] / 100.0
+            yaw = v.est.yaw
+            v.control.fly(
+                speed * (forward * math.cos(yaw) - right * math.sin(yaw)),
+                speed * (forward * math.sin(yaw) + right * math.cos(yaw)),
+            )
+        elif v.control.horizontal is Axis.VELOCITY:
+            v.control.go_to(*v.control.stopping_point())
+        pilot_climb(v)
+
+
+class Brake(Flight):
+    """Stops at once and holds."""
+
+    def begin(self, v: Vehicle) -> None:
+        v.control.hold_here()
+
+
+class Land(Flight):
+    """Descends where it is and disarms."""
+
+    needs_position = False
+
+    def begin(self, v: Vehicle) -> None:
+        v.touch_time_s = 0.0
+        if v.position_ok:
+            v.control.go_to(*v.control.stopping_point())
+        else:
+            v.control.horizontal = Axis.ATTITUDE
+            v.control.attitude = (0.0, 0.0)
+        v.control.yaw_rate = None
+        v.control.target_yaw = v.control.yaw_setpoint
+
+    def step(self, v: Vehicle, dt: float) -> None:
+        if v.control.horizontal is not Axis.ATTITUDE and not v.position_ok:
+            v.control.horizontal = Axis.ATTITUDE
+            v.control.attitude = (0.0, 0.0)
+        descend(v)
+
+
+class RtlStage(Enum):
+    """The stages of RTL."""
+
+    CLIMB = 1
+    RETURN = 2
+    LOITER = 3
+    LAND = 4
+    HOLD = 5
+
+
+class ReturnToLaunch(Flight):
+    """Climbs, returns to home (or the nearest rally point), waits, lands, disarms."""
+
+    def __init__(self) -> None:
+        self.stage = RtlStage.CLIMB
+        self._loiter_until_s = 0.0
+        self._target = (0.0, 0.0)
+
+    def begin(self, v: Vehicle) -> None:
+        p = v.params
+        north, east, base_down = v.return_point()
+        self._target = (north, east)
+        distance = math.hypot(north - v.est.north, east - v.est.east)
+        height = base_down - v.est.down
+        wanted = max(height + p["RTL_CLIMB_MIN"] / 100.0, max(p["RTL_ALT"] / 100.0, 2.0))
+        if p["RTL_CONE_SLOPE"] >= 0.5:
+            wanted = min(wanted, max(distance * p["RTL_CONE_SLOPE"], 2.0))
+        ceiling = v.fence.alt_max_m - p["FENCE_MARGIN"]
+        if v.fence.enabled and v.fence.types & 1:
+            wanted = min(wanted, ceiling)
+        wanted = max(wanted, height)
+        if p["RTL_SPEED"] > 0.0:
+            v.control.limits.speed_mps = p["RTL_SPEED"] / 100.0
+        v.control.go_to(*v.control.stopping_point(), base_down - wanted)
+        v.control.yaw_rate = None
+        v.control.target_yaw = v.control.yaw_setpoint
+        v.touch_time_s = 0.0
+
+    def step(self, v: Vehicle, dt: float) -> None:
+        control = v.control
+        if self.stage is RtlStage.CLIMB:
+            if abs(v.est.down - control.target_down) < 0.5 or v.est.down < control.target_down:
+                self.stage = RtlStage.RETURN
+                control.go_to(*self._target)
+        elif self.stage is RtlStage.RETURN:
+            near = math.hypot(self._target[0] - v.est.north, self._target[1] - v.est.east)
+            if near < max(v.params["WPNAV_RADIUS"] / 100.0, 0.5):
+                self.stage = RtlStage.LOITER
+                self._loiter_until_s = v.time_s + v.params["RTL_LOIT_TIME"] / 1000.0
+                control.target_yaw = v.armed_heading
+        elif self.stage is RtlStage.LOITER:
+            if v.time_s >= self._loiter_until_s:
+                final = v.params["RTL_ALT_FINAL"] / 100.0
+                self.stage = RtlStage.HOLD if final > 0.0 else RtlStage.LAND
+                if final > 0.0:
+                    control.go_to(*self._target, v.return_point()[2] - final)
+        elif self.stage is RtlStage.LAND:
+            descend(v)
+
+
+FLIGHTS: dict[Mode, type[Flight]] = {
+    Mode.STABILIZE: Stabilize,
+    Mode.ALT_HOLD: AltHold,
+    Mode.LOITER: Loiter,
+    Mode.BRAKE: Brake,
+    Mode.LAND: Land,
+    Mode.RTL: ReturnToLaunch,
+}
+
+
+def new_flight(mode: Mode) -> Flight:
+    """The object that flies a mode."""
+    if mode is Mode.GUIDED:
+        return GuidedFlight()
+    if mode is Mode.AUTO:
+        return AutoFlight()
+    return FLIGHTS[mode]()

@@ -1,0 +1,123 @@
+"""The vehicle's parameters: ArduCopter's names, defaults and types, with what was changed."""
+
+from __future__ import annotations
+
+import functools
+import math
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+TYPES = {"INT8": 2, "INT16": 4, "INT32": 6, "REAL32": 9}
+RANGES = {"INT8": (-128.0, 127.0), "INT16": (-32768.0, 32767.0), "INT32": (-2147483648.0, 2147483647.0)}
+# Names of later ArduCopter releases for the same thing, accepted beside the ones of this release.
+ALIASES = {"MAV_GCS_SYSID": "SYSID_MYGCS", "MAV_SYSID": "SYSID_THISMAV"}
+READ_ONLY = frozenset({"FORMAT_VERSION", "MIS_TOTAL", "FENCE_TOTAL", "RALLY_TOTAL", "SYSID_THISMAV"})
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One line of the table: a name, its default and its MAVLink type."""
+
+    name: str
+    default: float
+    kind: str
+
+    @property
+    def wire_type(self) -> int:
+        """MAV_PARAM_TYPE."""
+        return TYPES[self.kind]
+
+    def coerce(self, value: float) -> float:
+        """The value as this type stores it."""
+        if self.kind == "REAL32":
+            rounded: float = struct.unpack("<f", struct.pack("<f", value))[0]
+            return rounded
+        low, high = RANGES[self.kind]
+        return float(round(min(max(value, low), high)))
+
+
+@functools.cache
+def table() -> tuple[Parameter, ...]:
+    """All parameters in the order in which they are listed."""
+    text = resources.files(__package__).joinpath("parameters.txt").read_text(encoding="ascii")
+    rows = (line.split() for line in text.splitlines() if line)
+    return tuple(Parameter(name, float(default), kind) for name, default, kind in rows)
+
+
+@functools.cache
+def _index() -> dict[str, int]:
+    return {parameter.name: at for at, parameter in enumerate(table())}
+
+
+class UnknownParameterError(KeyError):
+    """A parameter name that this vehicle does not have."""
+
+
+class Parameters:
+    """Current values; `changed` is called with the name after each change."""
+
+    def __init__(self, overrides: Mapping[str, float] | None = None, store: Path | None = None) -> None:
+        self._values = {parameter.name: parameter.coerce(parameter.default) for parameter in table()}
+        self._store = store
+        self.changed: Callable[[str], None] = lambda _name: None
+        if store is not None and store.exists():
+            for line in store.read_text(encoding="ascii").splitlines():
+                stored, _, text = line.partition(",")
+                if stored in self._values:
+                    self._values[stored] = table()[_index()[stored]].coerce(float(text))
+        for name, value in (overrides or {}).items():
+            self.assign(name, value)
+
+    def __getitem__(self, name: str) -> float:
+        return self._values[name]
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def assign(self, name: str, value: float) -> float:
+        """Set a parameter as its owner does (also read-only ones) and return the stored value.
+
+        Raises:
+            UnknownParameterError: there is no such parameter.
+        """
+        name = ALIASES.get(name, name)
+        index = _index().get(name)
+        if index is None:
+            raise UnknownParameterError(name)
+        self._values[name] = table()[index].coerce(value)
+        self.changed(name)
+        return self._values[name]
+
+    def set(self, name: str, value: float) -> bool:
+        """Set a parameter as a ground station does; False when it is unknown, read-only or not a number."""
+        name = ALIASES.get(name, name)
+        if name not in self._values or name in READ_ONLY or not math.isfinite(value):
+            return False
+        self.assign(name, value)
+        self._save()
+        return True
+
+    def find(self, name: str, index: int = -1) -> tuple[str, Parameter, int] | None:
+        """A parameter by index or, with a negative index, by name: the name asked for, the row, its position."""
+        if index >= 0:
+            if index >= len(table()):
+                return None
+            row = table()[index]
+            return row.name, row, index
+        at = _index().get(ALIASES.get(name, name))
+        return None if at is None else (name, table()[at], at)
+
+    def _save(self) -> None:
+        if self._store is None:
+            return
+        changed = (row for row in table() if self._values[row.name] != row.coerce(row.default))
+        text = "".join(f"{row.name},{self._values[row.name]:.9g}\n" for row in changed)
+        scratch = self._store.with_suffix(".new")
+        scratch.write_text(text, encoding="ascii")
+        scratch.replace(self._store)

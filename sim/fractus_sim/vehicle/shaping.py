@@ -1,0 +1,117 @@
+"""Motion shaping: how fast a target may be approached under speed, acceleration and jerk limits.
+
+The square-root controller and the kinematic shaping are ArduPilot's (AP_Math/control.cpp), written anew for
+scalars and pairs of floats, because they decide the figures a user sees: time to target and peak speed.
+"""
+
+from __future__ import annotations
+
+import math
+
+# ArduPilot brakes with this share of the acceleration limit, so that corners do not overshoot.
+BRAKING_SHARE = 1.0 / math.sqrt(2.0)
+
+
+def clamp(value: float, low: float, high: float) -> float:
+    """`value` limited to [low, high]."""
+    if value < low:
+        return low
+    return min(value, high)
+
+
+def wrap_pi(angle_rad: float) -> float:
+    """The angle in [-pi, pi)."""
+    return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def wrap_degrees(angle_deg: float) -> float:
+    """The angle in [0, 360)."""
+    return angle_deg % 360.0
+
+
+def sqrt_controller(error: float, gain: float, limit: float, dt: float) -> float:
+    """Proportional near zero, square root beyond, so that the correction's own rate never exceeds `limit`."""
+    linear = limit / (gain * gain)
+    if error > linear:
+        correction = math.sqrt(2.0 * limit * (error - linear / 2.0))
+    elif error < -linear:
+        correction = -math.sqrt(2.0 * limit * (-error - linear / 2.0))
+    else:
+        correction = error * gain
+    bound = abs(error) / dt
+    return clamp(correction, -bound, bound)
+
+
+def shape_velocity(
+    target: float, velocity: float, acceleration: float, accel_max: float, jerk_max: float, dt: float
+) -> float:
+    """Next acceleration that brings `velocity` to `target` under both limits."""
+    wanted = sqrt_controller(target - velocity, jerk_max / accel_max, jerk_max, dt)
+    wanted = clamp(wanted, -accel_max, accel_max)
+    step = jerk_max * dt
+    return acceleration + clamp(wanted - acceleration, -step, step)
+
+
+def shape_position(
+    error: float,
+    velocity: float,
+    acceleration: float,
+    speed_low: float,
+    speed_high: float,
+    accel_max: float,
+    jerk_max: float,
+    dt: float,
+) -> float:
+    """Next acceleration that closes a position `error` in one axis; speeds are limited to [speed_low, speed_high]."""
+    target = sqrt_controller(error, 0.5 * jerk_max / accel_max, accel_max * BRAKING_SHARE, dt)
+    return shape_velocity(clamp(target, speed_low, speed_high), velocity, acceleration, accel_max, jerk_max, dt)
+
+
+def shape_velocity_xy(
+    target: tuple[float, float],
+    velocity: tuple[float, float],
+    acceleration: tuple[float, float],
+    accel_max: float,
+    jerk_max: float,
+    dt: float,
+) -> tuple[float, float]:
+    """`shape_velocity` for the horizontal plane: limits hold for the vector's length."""
+    error_n, error_e = target[0] - velocity[0], target[1] - velocity[1]
+    size = math.hypot(error_n, error_e)
+    wanted_n = wanted_e = 0.0
+    if size > 1e-9:
+        scale = min(sqrt_controller(size, jerk_max / accel_max, jerk_max, dt), accel_max) / size
+        wanted_n, wanted_e = error_n * scale, error_e * scale
+    delta_n, delta_e = wanted_n - acceleration[0], wanted_e - acceleration[1]
+    size = math.hypot(delta_n, delta_e)
+    step = jerk_max * dt
+    scale = step / size if size > step else 1.0
+    return acceleration[0] + delta_n * scale, acceleration[1] + delta_e * scale
+
+
+def shape_position_xy(
+    error: tuple[float, float],
+    velocity: tuple[float, float],
+    acceleration: tuple[float, float],
+    speed_max: float,
+    accel_max: float,
+    jerk_max: float,
+    dt: float,
+    feedforward: tuple[float, float] = (0.0, 0.0),
+) -> tuple[float, float]:
+    """`shape_position` for the horizontal plane; `feedforward` is the target's own velocity."""
+    size = math.hypot(error[0], error[1])
+    target_n, target_e = feedforward
+    if size > 1e-9:
+        speed = sqrt_controller(size, 0.5 * jerk_max / accel_max, accel_max * BRAKING_SHARE, dt)
+        scale = min(speed, speed_max) / size
+        target_n += error[0] * scale
+        target_e += error[1] * scale
+    return shape_velocity_xy((target_n, target_e), velocity, acceleration, accel_max, jerk_max, dt)
+
+
+def stopping_distance(speed_mps: float, gain: float, accel_mps2: float) -> float:
+    """Distance a square-root controller needs to stop (ArduPilot's own formula)."""
+    if speed_mps < accel_mps2 / gain:
+        return speed_mps / gain
+    return accel_mps2 / (2.0 * gain * gain) + speed_mps * speed_mps / (2.0 * accel_mps2)

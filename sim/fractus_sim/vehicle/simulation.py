@@ -1,0 +1,135 @@
+"""Some vehicles and their links' channels under one simulated time: receive, advance, forward, record."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import replace
+from typing import BinaryIO
+
+from fractus_sim.vehicle.body import Wind
+from fractus_sim.vehicle.channel import Channel
+from fractus_sim.vehicle.dispatch import dispatch
+from fractus_sim.vehicle.streams import ALL_GROUPS, GROUPS
+from fractus_sim.vehicle.vehicle import CONTROL_STEP_S, Vehicle, VehicleConfig
+from fractus_sim.vehicle.wire import Message, Signing
+
+# Never passed on from one link to another: they speak about the link itself.
+_LINK_LOCAL = frozenset({"RADIO_STATUS", "RADIO", "SETUP_SIGNING"})
+
+
+class Craft:
+    """One vehicle with its links; survives a reboot of the vehicle."""
+
+    def __init__(self, config: VehicleConfig) -> None:
+        self.config = config
+        self.vehicle = Vehicle(config)
+        self._recorder: BinaryIO | None = None
+
+    def open(self, name: str) -> Channel:
+        """Open a link and return its channel."""
+        channel = Channel(self.config.sysid, name=name)
+        key = self.vehicle.signing_key
+        if key is not None:
+            channel.signing = Signing(key, signing_clock(self.vehicle.unix_us))
+        self.vehicle.attach(channel)
+        return channel
+
+    def close(self, channel: Channel) -> None:
+        """Close a link."""
+        if channel in self.vehicle.channels:
+            self.vehicle.detach(channel)
+
+    def receive(self, channel: Channel, data: bytes) -> None:
+        """Take bytes that arrived on a link."""
+        for message in channel.receive(data):
+            self._route(channel, message)
+            dispatch(self.vehicle, message, channel)
+
+    def _route(self, source: Channel, message: Message) -> None:
+        """Pass a message on to the links where its target was heard, as ArduPilot does."""
+        if len(self.vehicle.channels) < 2 or message.name in _LINK_LOCAL or message.sysid == self.config.sysid:
+            return
+        system = message.integer("target_system") if message.has("target_system") else 0
+        component = message.integer("target_component") if message.has("target_component") else 0
+        if system == self.config.sysid and component in (0, self.vehicle.compid):
+            return
+        for channel in self.vehicle.channels:
+            if channel is not source and (
+                any(system in (0, peer) and component in (0, part) for peer, part in channel.peers)
+            ):
+                channel.forward(message.frame)
+
+    def step(self) -> None:
+        """Advance by one control step."""
+        vehicle = self.vehicle
+        vehicle.step()
+        if vehicle.reboot_wanted:
+            self._reboot()
+
+    def _reboot(self) -> None:
+        channels = self.vehicle.channels
+        wind = self.vehicle.wind
+        place = self.vehicle.true_place
+        self.vehicle = Vehicle(replace(self.config, start=replace(place, alt_m=self.config.start.alt_m), wind=wind))
+        for channel in channels:
+            channel.streams.clear()
+            channel.parameters.clear()
+            self.vehicle.attach(channel)
+
+    def record(self, file: BinaryIO, rate_hz: float = 4.0) -> None:
+        """Write everything the vehicle says on a link of its own to a tlog, with every stream at `rate_hz`."""
+        vehicle = self.vehicle
+
+        def tap(frame: bytes) -> None:
+            file.write(struct.pack(">Q", self.vehicle.unix_us) + frame)
+
+        channel = Channel(self.config.sysid, name="recorder", tap=tap, discard=True)
+        vehicle.attach(channel)
+        for group in ALL_GROUPS:
+            for name in GROUPS[group][1]:
+                channel.set_interval(name, 1.0 / rate_hz, vehicle.time_s)
+
+
+def signing_clock(unix_us: int) -> int:
+    """The time of MAVLink signing: units of 10 µs since 1 January 2015."""
+    return (unix_us - 1_420_070_400_000_000) // 10
+
+
+class Simulation:
+    """A fleet that shares time."""
+
+    def __init__(self, configs: list[VehicleConfig]) -> None:
+        self.crafts = [Craft(config) for config in configs]
+        self.ticks = 0
+
+    @property
+    def time_s(self) -> float:
+        """Simulated time since the start."""
+        return self.ticks * CONTROL_STEP_S
+
+    def step(self) -> None:
+        """Advance every vehicle by one control step."""
+        self.ticks += 1
+        for craft in self.crafts:
+            craft.step()
+
+    def advance(self, duration_s: float) -> None:
+        """Advance by a duration, in lockstep with the caller."""
+        for _ in range(round(duration_s / CONTROL_STEP_S)):
+            self.step()
+
+
+def formation(config: VehicleConfig, count: int, spacing_m: float) -> list[VehicleConfig]:
+    """`count` vehicles in a row toward east, with consecutive system ids."""
+    return [
+        replace(
+            config,
+            sysid=config.sysid + at,
+            start=config.start.offset(0.0, at * spacing_m),
+            wind=Wind(config.wind.speed_mps, config.wind.from_deg, config.wind.turbulence_mps),
+            store=config.store.with_name(f"{config.store.stem}-{config.sysid + at}{config.store.suffix}")
+            if config.store is not None and count > 1
+            else config.store,
+        )
+        for at in range(count)
+    ]

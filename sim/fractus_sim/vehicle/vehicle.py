@@ -1,0 +1,654 @@
+"""One simulated ArduCopter: body, senses, controllers, modes and memory, advanced by fixed steps, without a clock."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fractus_sim.vehicle.body import Airframe, Body, Wind
+from fractus_sim.vehicle.channel import PARAMETERS_PER_TICK, Channel
+from fractus_sim.vehicle.control import Control, Estimate
+from fractus_sim.vehicle.earth import Place, valid_coordinates
+from fractus_sim.vehicle.failsafes import Failsafes
+from fractus_sim.vehicle.fence import Fence, FenceItem, FenceShapeError, build_shapes
+from fractus_sim.vehicle.flight import Flight
+from fractus_sim.vehicle.guided import Heading
+from fractus_sim.vehicle.mav import VERSION_TEXT, Landed, MissionKind, MissionResult, Mode, Severity
+from fractus_sim.vehicle.mission import Item, ItemStore, Mission, Transfers
+from fractus_sim.vehicle.modes import ReturnToLaunch, new_flight
+from fractus_sim.vehicle.params import Parameters
+from fractus_sim.vehicle.sensors import Battery, Drift, Gps
+from fractus_sim.vehicle.shaping import clamp, wrap_pi
+from fractus_sim.vehicle.streams import BUILDERS
+from fractus_sim.vehicle.wire import Message, Value
+
+CONTROL_STEP_S = 0.01
+PHYSICS_PER_CONTROL = 2
+ARMING_DELAY_S = 2.0
+GPS_INTERVAL_S = 0.2
+GPS_TIMEOUT_S = 5.0
+STICKS_CENTRED = (1500,) * 4 + (1800,) + (1000,) * 3 + (0,) * 10
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleConfig:
+    """What distinguishes one vehicle from another."""
+
+    start: Place
+    heading_deg: float = 0.0
+    sysid: int = 1
+    seed: int = 1
+    ready_after_s: float = 32.0
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    wind: Wind = field(default_factory=Wind)
+    store: Path | None = None
+    epoch_us: int = 1_700_000_000_000_000
+    position_noise_m: float = 0.12
+
+
+class Vehicle:
+    """The vehicle; `step` advances it, `handle` takes a message, `broadcast` and `say` speak on every link."""
+
+    control_step_s = CONTROL_STEP_S
+
+    def __init__(self, config: VehicleConfig) -> None:
+        self.config = config
+        self.sysid = config.sysid
+        self.compid = 1
+        self.start = config.start
+        self.rng = random.Random(f"{config.seed}:{config.sysid}")  # noqa: S311 - a simulation, not a secret
+        self.params = Parameters(config.parameters, config.store)
+        self.params.assign("SYSID_THISMAV", config.sysid)
+        self.time_s = 0.0
+        self.ticks = 0
+        self.wind = config.wind
+        self.body = Body(Airframe(), config.heading_deg)
+        self.control = Control(self.body.airframe)
+        self.battery = Battery(self.params["SIM_BATT_VOLTAGE"], self.params["BATT_CAPACITY"])
+        self.gps = Gps()
+        self.drift = Drift(self.rng, config.position_noise_m)
+        self.fence = Fence()
+        self.failsafes = Failsafes()
+        self.mission = Mission()
+        self.rally = ItemStore(MissionKind.RALLY)
+        self.fence_items = ItemStore(MissionKind.FENCE, accept=self._accept_fence)
+        self.mission.store.accept = self._accept_mission
+        self.rally.accept = self._accept_rally
+        self.transfers = Transfers(
+            {
+                MissionKind.MISSION: self.mission.store,
+                MissionKind.FENCE: self.fence_items,
+                MissionKind.RALLY: self.rally,
+            }
+        )
+        self.channels: list[Channel] = []
+        self.yaw = Heading()
+        self.armed = False
+        self.armed_at_s = 0.0
+        self.armed_heading = math.radians(config.heading_deg)
+        self.mode = Mode.STABILIZE
+        self.flight: Flight = new_flight(Mode.STABILIZE)
+        self.landed = True
+        self.touch_time_s = 0.0
+        self.taking_off_until_m: float | None = None
+        self._lift_after_s = 0.0
+        self._idle_since_s = 0.0
+        self.origin: Place | None = None
+        self.home: Place | None = None
+        self._home_locked = False
+        self.position_ok = False
+        self._gps_seen_s = -1e9
+        self._next_gps_s = 0.0
+        self._announced = 0
+        self.reboot_wanted = False
+        self.signing_key: bytes | None = None
+        self.sticks: tuple[int, ...] = STICKS_CENTRED
+        self._sticks_until_s = 0.0
+        self.est = self._estimate()
+        self.params.changed = self._parameter_changed
+        self._apply_parameters()
+        self.control.reset(self.est)
+
+    # -- what others ask ---------------------------------------------------------------------------------------
+
+    @property
+    def unix_us(self) -> int:
+        """Time of day in microseconds."""
+        return self.config.epoch_us + int(self.time_s * 1e6)
+
+    @property
+    def place(self) -> Place:
+        """Where the vehicle believes to be."""
+        return (self.origin or self.start).offset(self.est.north, self.est.east, self.est.down)
+
+    @property
+    def true_place(self) -> Place:
+        """Where the vehicle is."""
+        return self.start.offset(self.body.north, self.body.east, self.body.down)
+
+    @property
+    def true_altitude_amsl_m(self) -> float:
+        """True altitude above mean sea level."""
+        return self.start.alt_m - self.body.down
+
+    @property
+    def home_xy(self) -> tuple[float, float]:
+        """Home in local metres."""
+        if self.home is None or self.origin is None:
+            return (0.0, 0.0)
+        return self.origin.vector_to(self.home)[:2]
+
+    @property
+    def altitude_m(self) -> float:
+        """Estimated altitude above home."""
+        home = self.home or self.origin or self.start
+        return (self.origin or self.start).alt_m - self.est.down - home.alt_m
+
+    @property
+    def height_m(self) -> float:
+        """Estimated height above the ground (flat, at the altitude of the start)."""
+        return -self.est.down
+
+    @property
+    def heading_cdeg(self) -> int:
+        """Heading in hundredths of a degree."""
+        return round(math.degrees(self.est.yaw) % 360.0 * 100.0) % 36000
+
+    @property
+    def throttle_percent(self) -> int:
+        """Throttle for VFR_HUD."""
+        if not self.armed:
+            return 0
+        return round(clamp(sum(self.body.motors) / (4.0 * self.body.airframe.full_thrust_n), 0.0, 1.0) * 100.0)
+
+    @property
+    def flying_wanted(self) -> bool:
+        """Whether a takeoff is under way."""
+        return self.taking_off_until_m is not None
+
+    @property
+    def landed_state(self) -> Landed:
+        """MAV_LANDED_STATE."""
+        if self.landed:
+            return Landed.ON_GROUND
+        if self.taking_off_until_m is not None:
+            return Landed.TAKEOFF
+        return Landed.LANDING if self.mode is Mode.LAND else Landed.IN_AIR
+
+    @property
+    def ekf_flags(self) -> int:
+        """EKF_STATUS_FLAGS."""
+        if self.position_ok:
+            return 831  # all estimates, predicted positions
+        if self.origin is not None:
+            return 167  # attitude, vertical position, constant position mode
+        return 1024 if self.time_s < 0.1 * self.config.ready_after_s else 165
+
+    def mission_state(self) -> int:
+        """MISSION_STATE."""
+        if len(self.mission.items) <= 1:
+            return 1
+        if self.mission.complete:
+            return 5
+        return 3 if self.mode is Mode.AUTO else 2
+
+    def arming_refusal(self) -> str | None:
+        """Why the vehicle would not arm now, or None."""
+        if self.time_s < 0.5 * self.config.ready_after_s:
+            return "AHRS: EKF3 not healthy"
+        if self.gps.fix_type < 3 and self._needs_position(self.mode):
+            return "GPS 1: Bad fix"
+        if not self.position_ok and (self._needs_position(self.mode) or self.fence.enabled):
+            return "Need Position Estimate"
+        if self.time_s < self.config.ready_after_s:
+            return "AHRS: waiting for home"
+        if 0.0 < self.battery.voltage_v < self.params["BATT_ARM_VOLT"]:
+            return "Battery 1 below minimum arming voltage"
+        if self.failsafes.battery or self.battery.voltage_v < self.params["BATT_CRT_VOLT"]:
+            return "Battery 1 low voltage failsafe" if self.failsafes.battery else "Battery 1 critical voltage failsafe"
+        if self.failsafes.gcs:
+            return "GCS failsafe on"
+        if self.home is not None and self.fence.outside(self.est.north, self.est.east, 0.0, self.home_xy):
+            return "vehicle outside fence"
+        return None
+
+    @staticmethod
+    def _needs_position(mode: Mode) -> bool:
+        return new_flight(mode).needs_position
+
+    # -- speaking ----------------------------------------------------------------------------------------------
+
+    def broadcast(self, name: str, values: Mapping[str, Value]) -> None:
+        """Send a message on every link."""
+        for channel in self.channels:
+            channel.send(name, values)
+
+    def say(self, severity: Severity, text: str) -> None:
+        """Send a STATUSTEXT on every link, in chunks when it is long."""
+        data = text.encode("ascii", "replace")
+        for channel in self.channels:
+            for chunk in range(0, max(len(data), 1), 50):
+                channel.send(
+                    "STATUSTEXT",
+                    {
+                        "severity": int(severity),
+                        "text": data[chunk : chunk + 50],
+                        "id": 1 + self.ticks % 65000 if len(data) > 50 else 0,
+                        "chunk_seq": chunk // 50,
+                    },
+                )
+
+    def banner(self) -> None:
+        """Say what this is, as at a connection."""
+        self.say(Severity.INFO, VERSION_TEXT)
+        self.say(Severity.INFO, "Frame: QUAD/X")
+
+    def send(self, channel: Channel, name: str) -> bool:
+        """Send one of the telemetry messages on one link; False when there is no such message now."""
+        builder = BUILDERS.get(name)
+        values = None if builder is None else builder(self)
+        if values is None:
+            return False
+        channel.send(name, values)
+        return True
+
+    # -- arming and modes --------------------------------------------------------------------------------------
+
+    def arm(self) -> None:
+        """Start the motors; the caller has checked that it is allowed."""
+        self.armed = True
+        self.armed_at_s = self._idle_since_s = self.time_s
+        self.armed_heading = self.est.yaw
+        self.landed = True
+        self.taking_off_until_m = None
+        self.touch_time_s = 0.0
+        self.mission.complete = False
+        if not self._home_locked and self.position_ok:
+            self._set_home(self.place)
+        self.control.reset(self.est)
+        self.say(Severity.INFO, "Arming motors")
+
+    def disarm(self, _reason: str, *, force: bool = False) -> None:
+        """Stop the motors."""
+        if not self.armed:
+            return
+        self.armed = False
+        self.taking_off_until_m = None
+        if force or self.landed:
+            self.landed = self.landed or self.body.on_ground
+        self.say(Severity.INFO, "Disarming motors")
+
+    def land_complete(self) -> None:
+        """The vehicle rests on the ground."""
+        self.landed = True
+        self.taking_off_until_m = None
+        self._idle_since_s = self.time_s
+
+    def mode_refusal(self, mode: Mode) -> str | None:
+        """Why a mode cannot be entered now, or None."""
+        if self._needs_position(mode) and not self.position_ok and (self.armed or mode is Mode.RTL):
+            return f"Mode change to {mode.name} failed: requires position"
+        if mode is Mode.AUTO and len(self.mission.items) <= 1:
+            return "Mode change to AUTO failed: init failed"
+        return None
+
+    def set_mode(self, mode: Mode) -> bool:
+        """Change the mode as a ground station asks; False when it is refused."""
+        if mode is self.mode:
+            return True
+        refusal = self.mode_refusal(mode)
+        if refusal is not None:
+            self.say(Severity.WARNING, refusal)
+            return False
+        self.force_mode(mode, "command")
+        return True
+
+    def force_mode(self, mode: Mode, _reason: str) -> None:
+        """Change the mode without asking."""
+        self.mode = mode
+        self.flight = new_flight(mode)
+        self._apply_limits()
+        self.control.throttle = None
+        self.control.yaw_rate = None
+        if self.landed or not self.armed:
+            self.control.reset(self.est)
+        self.taking_off_until_m = None
+        self.flight.begin(self)
+        for channel in self.channels:
+            self.send(channel, "HEARTBEAT")
+
+    def new_return(self) -> Flight:
+        """An RTL for a mission to run."""
+        return ReturnToLaunch()
+
+    def begin_takeoff(self, down: float) -> None:
+        """Spool up and climb to `down` (local)."""
+        self.taking_off_until_m = down
+        ready = self.armed_at_s + ARMING_DELAY_S
+        spool = self.params["MOT_SPOOL_TIME"] + 0.5 * self.params["TKOFF_SLEW_TIME"]
+        self._lift_after_s = max(self.time_s, ready) + spool
+        self.control.reset(self.est)
+        self.control.go_to(self.est.north, self.est.east, down)
+
+    def takeoff_done(self) -> bool:
+        """Whether the climb of a takeoff is over; ends it."""
+        target = self.taking_off_until_m
+        if target is None:
+            return True
+        if self.landed or abs(self.est.down - target) > 0.3:
+            return False
+        self.taking_off_until_m = None
+        return True
+
+    # -- motion settings ---------------------------------------------------------------------------------------
+
+    def change_speed(self, kind: int, speed_mps: float) -> bool:
+        """DO_CHANGE_SPEED: 0 and 1 horizontal, 2 climb, 3 descent."""
+        if not speed_mps > 0.0 or not math.isfinite(speed_mps):
+            return False
+        limits = self.control.limits
+        if kind in (0, 1):
+            limits.speed_mps = max(speed_mps, 0.2)
+        elif kind == 2:
+            limits.climb_mps = max(speed_mps, 0.1)
+        elif kind == 3:
+            limits.sink_mps = max(speed_mps, 0.1)
+        else:
+            return False
+        return True
+
+    def turn_to(self, angle_deg: float, rate_dps: float, direction: int, *, relative: bool) -> bool:
+        """CONDITION_YAW."""
+        if not math.isfinite(angle_deg) or not 0.0 <= abs(angle_deg) <= 360.0:
+            return False
+        control = self.control
+        if relative:
+            sign = -1.0 if direction < 0 else 1.0
+            control.target_yaw = wrap_pi(control.yaw_setpoint + sign * math.radians(angle_deg))
+        else:
+            control.target_yaw = wrap_pi(math.radians(angle_deg))
+        control.yaw_rate = None
+        default = math.radians(self.params["ATC_SLEW_YAW"] / 100.0)
+        control.limits.yaw_rate_rps = math.radians(rate_dps) if rate_dps > 0.0 else default
+        self.yaw.hold(control.target_yaw)
+        return True
+
+    def return_point(self) -> tuple[float, float, float]:
+        """Where RTL goes (local): home or the nearest rally point, and the altitude to count from."""
+        origin = self.origin or self.start
+        home = self.home or origin
+        best = origin.vector_to(home)
+        here = (self.est.north, self.est.east)
+        limit = self.params["RALLY_LIMIT_KM"] * 1000.0
+        rallies = [origin.vector_to(Place(item.x, item.y, home.alt_m)) for item in self.rally.items]
+        rallies = [r for r in rallies if limit <= 0.0 or math.dist(r[:2], here) <= limit]
+        if not rallies:
+            return best
+        nearest = min(rallies, key=lambda r: math.dist(r[:2], here))
+        if int(self.params["RALLY_INCL_HOME"]) and math.dist(best[:2], here) <= math.dist(nearest[:2], here):
+            return best
+        return nearest
+
+    def set_home_here(self) -> bool:
+        """Make the present position home."""
+        if not self.position_ok:
+            return False
+        self._home_locked = True
+        self._set_home(self.place)
+        return True
+
+    def set_home_at(self, lat_e7: int, lon_e7: int, alt_amsl_m: float) -> bool:
+        """Make a given position home."""
+        if not valid_coordinates(lat_e7, lon_e7) or (lat_e7 == 0 and lon_e7 == 0) or self.origin is None:
+            return False
+        self._home_locked = True
+        self._set_home(Place(lat_e7, lon_e7, alt_amsl_m))
+        return True
+
+    def _set_home(self, place: Place) -> None:
+        self.home = place
+        self.mission.with_home(Item(command=16, frame=0, x=place.lat_e7, y=place.lon_e7, z=place.alt_m))
+        for channel in self.channels:
+            self.send(channel, "HOME_POSITION")
+
+    def set_sticks(self, values: tuple[int, ...]) -> None:
+        """RC overrides, in microseconds; 0 releases a channel, 65535 leaves it."""
+        sticks = list(self.sticks)
+        for at, value in enumerate(values[: len(sticks)]):
+            if value == 0:
+                sticks[at] = STICKS_CENTRED[at]
+            elif value != 65535:
+                sticks[at] = int(clamp(value, 800, 2200))
+        self.sticks = tuple(sticks)
+        self._sticks_until_s = self.time_s + max(self.params["RC_OVERRIDE_TIME"], 0.0)
+
+    # -- stored lists ------------------------------------------------------------------------------------------
+
+    def _accept_mission(self, items: list[Item]) -> MissionResult:
+        if items and self.home is not None:
+            home = self.home
+            items[0] = Item(command=16, frame=0, x=home.lat_e7, y=home.lon_e7, z=home.alt_m)
+        self.params.assign("MIS_TOTAL", len(items))
+        if self.mode is not Mode.AUTO:
+            self.mission.rewind()
+        return MissionResult.ACCEPTED
+
+    def _accept_fence(self, items: list[Item]) -> MissionResult:
+        local = []
+        for item in items:
+            north, east, _ = self.start.vector_to(Place(item.x, item.y, 0.0))
+            local.append(FenceItem(item.command, item.param1, north, east))
+        try:
+            self.fence.shapes = build_shapes(local)
+        except FenceShapeError as error:
+            self.say(Severity.WARNING, f"Fence: {error}")
+            return MissionResult.INVALID
+        self.params.assign("FENCE_TOTAL", len(items))
+        return MissionResult.ACCEPTED
+
+    def _accept_rally(self, items: list[Item]) -> MissionResult:
+        self.params.assign("RALLY_TOTAL", len(items))
+        return MissionResult.ACCEPTED
+
+    # -- parameters --------------------------------------------------------------------------------------------
+
+    def _parameter_changed(self, name: str) -> None:
+        prefix = name.split("_", 1)[0]
+        if prefix in ("WPNAV", "PSC", "ANGLE", "ATC", "MOT", "LOIT"):
+            self._apply_limits()
+        elif prefix in ("FENCE", "SIM", "BATT"):
+            self._apply_parameters()
+
+    def _apply_parameters(self) -> None:
+        p = self.params
+        fence = self.fence
+        fence.enabled = int(p["FENCE_ENABLE"]) != 0
+        fence.types = int(p["FENCE_TYPE"])
+        fence.alt_max_m, fence.alt_min_m = p["FENCE_ALT_MAX"], p["FENCE_ALT_MIN"]
+        fence.radius_m = p["FENCE_RADIUS"]
+        self.battery.capacity_mah = max(p["BATT_CAPACITY"], 1.0)
+        self.battery.full_v = p["SIM_BATT_VOLTAGE"]
+        if p["SIM_WIND_SPD"] > 0.0 or p["SIM_WIND_TURB"] > 0.0 or self.time_s > 0.0:
+            self.wind.speed_mps = p["SIM_WIND_SPD"]
+            self.wind.from_deg = p["SIM_WIND_DIR"]
+            self.wind.turbulence_mps = p["SIM_WIND_TURB"]
+        self._apply_limits()
+
+    def _apply_limits(self) -> None:
+        p, limits, gains = self.params, self.control.limits, self.control.gains
+        limits.speed_mps = max(p["WPNAV_SPEED"] / 100.0, 0.2)
+        limits.climb_mps = max(p["WPNAV_SPEED_UP"] / 100.0, 0.1)
+        limits.sink_mps = max(p["WPNAV_SPEED_DN"] / 100.0, 0.1)
+        limits.accel_mps2 = max(p["WPNAV_ACCEL"] / 100.0, 0.5)
+        limits.accel_z_mps2 = max(p["WPNAV_ACCEL_Z"] / 100.0, 0.5)
+        limits.jerk_mps3 = max(p["PSC_JERK_XY"], 1.0)
+        limits.tilt_max_rad = math.radians(clamp((p["PSC_ANGLE_MAX"] or p["ANGLE_MAX"] / 100.0), 10.0, 80.0))
+        limits.yaw_rate_rps = math.radians(clamp(p["ATC_SLEW_YAW"] / 100.0, 5.0, 180.0))
+        gains.position = clamp(p["PSC_POSXY_P"], 0.2, 3.0)
+        gains.velocity = clamp(p["PSC_VELXY_P"], 0.1, 6.0)
+        gains.velocity_i = clamp(p["PSC_VELXY_I"], 0.0, 2.0)
+
+    # -- time --------------------------------------------------------------------------------------------------
+
+    def step(self) -> None:
+        """Advance by one control step (10 ms)."""
+        self.ticks += 1
+        self.time_s = self.ticks * CONTROL_STEP_S
+        self._sense()
+        self.failsafes.step(self)
+        if self.time_s > self._sticks_until_s and self.sticks is not STICKS_CENTRED:
+            self.sticks = STICKS_CENTRED
+        if self.armed:
+            self.flight.step(self, CONTROL_STEP_S)
+            self._check_idle()
+        self._move()
+        self.est = self._estimate()
+        if self.transfers.upload is not None and self.transfers.step(self.time_s) is not None:
+            self.say(Severity.WARNING, "Mission upload timeout")
+        for channel in self.channels:
+            self._serve(channel)
+
+    def _move(self) -> None:
+        dt = CONTROL_STEP_S / PHYSICS_PER_CONTROL
+        body = self.body
+        full = body.airframe.full_thrust_n
+        share = self.battery.thrust_share
+        lifting = self.armed and self._may_lift()
+        if body.on_ground and not lifting:
+            spin = 0.05 * full if self.armed and self.time_s > self.armed_at_s + ARMING_DELAY_S else 0.0
+            idle = (spin, spin, spin, spin)
+            self.battery.step(CONTROL_STEP_S, 4.0 * spin / (body.airframe.mass_kg * 9.8))
+            body.step(dt, idle, (0.0, 0.0, 0.0))
+            return
+        for _ in range(PHYSICS_PER_CONTROL):
+            air = self.wind.step(dt, self.rng, -body.down)
+            commands = self.control.step(dt, self.est, full * share) if lifting else (0.0, 0.0, 0.0, 0.0)
+            failed = int(self.params["SIM_ENGINE_FAIL"])
+            if failed:
+                left = self.params["SIM_ENGINE_MUL"]
+                m = [c * left if failed >> at & 1 else c for at, c in enumerate(commands)]
+                commands = (m[0], m[1], m[2], m[3])
+            body.step(dt, commands, air)
+            self.est = self._estimate()
+        self.battery.step(CONTROL_STEP_S, sum(body.motors) / (body.airframe.mass_kg * 9.80665))
+        if self.landed and not body.on_ground:
+            self.landed = False
+
+    def _may_lift(self) -> bool:
+        if not self.landed:
+            return True
+        if self.taking_off_until_m is not None:
+            return self.time_s >= self._lift_after_s
+        return self.flight.manual_throttle and self.sticks[2] > 1550
+
+    def _check_idle(self) -> None:
+        delay = self.params["DISARM_DELAY"]
+        if not self.landed or self.flying_wanted:
+            self._idle_since_s = self.time_s
+        elif self.mode in (Mode.LAND, Mode.RTL) and self.time_s - self._idle_since_s > 1.0:
+            self.disarm("landed")
+        elif delay > 0.0 and self.time_s - self._idle_since_s >= delay:
+            self.disarm("idle")
+
+    def _estimate(self) -> Estimate:
+        b, d = self.body, self.drift
+        roll, pitch, yaw = b.euler()
+        return Estimate(
+            b.north + d.north,
+            b.east + d.east,
+            b.down + d.down,
+            b.vn + d.rate_n,
+            b.ve + d.rate_e,
+            b.vd,
+            roll,
+            pitch,
+            yaw,
+            b.p,
+            b.q,
+            b.r,
+            b.quaternion,
+        )
+
+    def _sense(self) -> None:
+        if self.time_s < self._next_gps_s:
+            return
+        self._next_gps_s += GPS_INTERVAL_S
+        ready = self.config.ready_after_s
+        if int(self.params["SIM_GPS1_ENABLE"]) and self.time_s >= 0.35 * ready:
+            body = self.body
+            noise = max(self.params["SIM_GPS1_NOISE"], 0.0) + self.config.position_noise_m
+            satellites = int(self.params["SIM_GPS1_NUMSATS"])
+            self.gps.update(self.true_place, body.vn, body.ve, noise, satellites, self.rng)
+            if self.gps.fix_type >= 3:
+                self._gps_seen_s = self.time_s
+        elif self.time_s >= 0.05 * ready:
+            self.gps.lose()
+        aided = self.time_s - self._gps_seen_s < GPS_TIMEOUT_S and self.time_s >= 0.8 * ready
+        blind = self.origin is not None and self.time_s - self._gps_seen_s > 2.0 * GPS_INTERVAL_S
+        self.drift.step(GPS_INTERVAL_S, aided=not blind)
+        if self.origin is None and self.gps.fix_type >= 3 and self.time_s >= 0.8 * ready:
+            self.origin = self.start
+        if aided and self.origin is not None and self.home is None and self.time_s >= ready:
+            self._set_home(self.place)
+        self.position_ok = aided and self.origin is not None
+        self._announce_readiness()
+
+    def _announce_readiness(self) -> None:
+        ready = self.config.ready_after_s
+        texts = (
+            (0.05, "EKF3 IMU0 initialised"),
+            (0.1, "AHRS: EKF3 active"),
+            (0.12, "EKF3 IMU0 tilt alignment complete"),
+            (0.15, "EKF3 IMU0 MAG0 initial yaw alignment complete"),
+            (0.35, "GPS 1: detected u-blox"),
+            (0.8, "EKF3 IMU0 origin set"),
+            (0.9, "EKF3 IMU0 is using GPS"),
+        )
+        while self._announced < len(texts) and self.time_s >= texts[self._announced][0] * ready:
+            self.say(Severity.INFO, texts[self._announced][1])
+            self._announced += 1
+
+    # -- links -------------------------------------------------------------------------------------------------
+
+    def _serve(self, channel: Channel) -> None:
+        for name in channel.due(self.time_s):
+            self.send(channel, name)
+        for _ in range(min(PARAMETERS_PER_TICK, len(channel.parameters))):
+            self.send_parameter(channel, "", channel.parameters.popleft())
+
+    def send_parameter(self, channel: Channel, name: str, index: int, shown_index: int | None = None) -> bool:
+        """Send PARAM_VALUE by name or index; False when there is no such parameter."""
+        found = self.params.find(name, index)
+        if found is None:
+            return False
+        shown, row, at = found
+        channel.send(
+            "PARAM_VALUE",
+            {
+                "param_id": shown.encode("ascii"),
+                "param_value": self.params[row.name],
+                "param_type": row.wire_type,
+                "param_count": len(self.params),
+                "param_index": at if shown_index is None else shown_index,
+            },
+        )
+        return True
+
+    def attach(self, channel: Channel) -> None:
+        """Open a link: HEARTBEAT at 1 Hz and silence otherwise, unless SR parameters ask for streams."""
+        self.channels.append(channel)
+        channel.set_interval("HEARTBEAT", 1.0, self.time_s)
+
+    def detach(self, channel: Channel) -> None:
+        """Close a link."""
+        self.channels.remove(channel)
+        if self.transfers.upload is not None and self.transfers.upload.channel is channel:
+            self.transfers.upload = None
+
+    def heard(self, message: Message) -> None:
+        """Note a heartbeat of the ground station that failsafes watch."""
+        if message.sysid == int(self.params["SYSID_MYGCS"]):
+            self.failsafes.gcs_seen_s = self.time_s

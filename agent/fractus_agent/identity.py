@@ -127,7 +127,7 @@ class Identity:
                     asked_s = loop.time()
                 self._backoff.succeeded()
             except Refused as refusal:
-                self._find("False", refusal.reason, str(refusal))
+                self._refused(refusal)
                 delay_s = max(30.0, self._backoff.delay_s())
             except (Unavailable, Rejected, Conflict, OSError) as error:
                 if self._wanting():
@@ -262,11 +262,18 @@ class Identity:
         self._find("True", "Issued", f"Valid until {validity.not_after:%F %T} UTC.")
         self.ready.set()
 
+    def _refused(self, refusal: Refused) -> None:
+        validity = self._validity()
+        if validity is None or self._wanting():
+            self._find("False", refusal.reason, str(refusal))
+        else:
+            until = f"Valid until {validity.not_after:%F %T} UTC"
+            self._find("True", "Issued", f"{until}, but not renewed: {refusal.reason}: {refusal}")
+
     def _find(self, status: str, reason: str, message: str) -> None:
         found = Finding("Certified", "True" if status == "True" else "False", reason, message)
         if found == self.finding:
             return
-        if (found.status, found.reason) != (self.finding.status, self.finding.reason) or status != "True":
-            LOG.log(logging.INFO if found.holds else logging.WARNING, "certificate %s: %s", reason, message)
+        LOG.log(logging.INFO if found.holds else logging.WARNING, "certificate %s: %s", reason, message)
         self.finding = found
         self._changed()

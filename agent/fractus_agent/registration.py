@@ -188,13 +188,13 @@ class Registration:
         digest = description_hash(described)
         try:
             if body is None:
-                metadata = {
+                made: Object = {
                     "name": self._node,
                     "labels": described.metadata.labels,
                     "annotations": described.metadata.annotations | {HASH_ANNOTATION: digest},
                 }
                 said = {key: value for key, value in described.to_dict().items() if key != "status"}
-                created = await self._store.create(said | {"metadata": metadata})
+                created = await self._store.create(said | {"metadata": made})
                 LOG.info("registered %s %s", described.kind, self._node)
                 return created
             known = body["metadata"].get("annotations", {}).get(HASH_ANNOTATION)

@@ -1,0 +1,96 @@
+"""A certificate authority for tests, and the operator's part of the CSR API."""
+
+import base64
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
+
+
+class TestAuthority:
+    """Signs what it is given."""
+
+    __test__ = False
+
+    def __init__(self, name: str = "test authority") -> None:
+        self.key = ec.generate_private_key(ec.SECP256R1())
+        self.name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+        now = datetime.now(UTC)
+        usage = x509.KeyUsage(
+            digital_signature=True, key_cert_sign=True, crl_sign=True, content_commitment=False,
+            key_encipherment=False, data_encipherment=False, key_agreement=False, encipher_only=False,
+            decipher_only=False,
+        )  # fmt: skip
+        self.certificate = (
+            x509.CertificateBuilder()
+            .subject_name(self.name)
+            .issuer_name(self.name)
+            .public_key(self.key.public_key())
+            .serial_number(x509.random_serial_number())
+            .not_valid_before(now - timedelta(days=3650))
+            .not_valid_after(now + timedelta(days=3650))
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(usage, critical=True)
+            .add_extension(x509.SubjectKeyIdentifier.from_public_key(self.key.public_key()), critical=False)
+            .sign(self.key, hashes.SHA256())
+        )
+        self.pem = self.certificate.public_bytes(serialization.Encoding.PEM)
+
+    def sign(
+        self, request_pem: bytes, begin: datetime | None = None, life: timedelta = timedelta(days=30)
+    ) -> bytes:
+        """A certificate for a signing request, names taken over."""
+        request = x509.load_pem_x509_csr(request_pem)
+        assert request.is_signature_valid
+        names = request.extensions.get_extension_for_class(x509.SubjectAlternativeName)
+        begin = begin or datetime.now(UTC) - timedelta(minutes=5)
+        issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key())  # type: ignore[arg-type]
+        return (
+            x509.CertificateBuilder()
+            .subject_name(request.subject)
+            .issuer_name(self.name)
+            .public_key(request.public_key())
+            .serial_number(x509.random_serial_number())
+            .not_valid_before(begin)
+            .not_valid_after(begin + life)
+            .add_extension(names.value, critical=False)
+            .add_extension(issuer, critical=False)
+            .sign(self.key, hashes.SHA256())
+            .public_bytes(serialization.Encoding.PEM)
+        )
+
+
+class FakeSigner:
+    """The store as identity sees it, with an operator behind it that signs, denies or keeps silent."""
+
+    def __init__(self, authority: TestAuthority) -> None:
+        self.ca = authority
+        self.published: bytes | None = authority.pem
+        self.requests: dict[str, dict[str, Any]] = {}
+        self.made = 0
+        self.conditions: list[dict[str, str]] = []
+        self.sign_with: dict[str, Any] = {}
+        self.error: Exception | None = None
+
+    async def authority(self) -> bytes | None:
+        if self.error:
+            raise self.error
+        return self.published
+
+    async def request_certificate(self, name: str, request_pem: bytes, life_s: int) -> None:
+        if self.error:
+            raise self.error
+        self.made += 1
+        status: dict[str, Any] = {"conditions": self.conditions}
+        if not self.conditions:
+            status["certificate"] = base64.b64encode(self.ca.sign(request_pem, **self.sign_with)).decode()
+        self.requests[name] = {"metadata": {"name": name}, "status": status}
+
+    async def certificate_request(self, name: str) -> dict[str, Any] | None:
+        return self.requests.get(name)
+
+    async def drop_certificate_requests(self) -> None:
+        self.requests.clear()

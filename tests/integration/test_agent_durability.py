@@ -1,0 +1,154 @@
+"""Stored files are whole whenever the agent dies: at every system call, and under kill -9."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from fractus_agent.durable import read_set, write_file, write_set
+
+WATCHED = ("open", "write", "fsync", "fchmod", "replace", "symlink", "mkdir", "unlink", "rename")
+
+
+class Died(BaseException):
+    """The process is gone."""
+
+
+def die_at(step: int, patch: pytest.MonkeyPatch) -> None:
+    """Make the step-th system call from now the last one; a write gets through by half."""
+    count = 0
+
+    def wrap(name: str) -> None:
+        real = getattr(os, name)
+
+        def call(*args: object, **more: object) -> object:
+            nonlocal count
+            count += 1
+            if count == step:
+                if name == "write":
+                    real(args[0], bytes(args[1])[: len(bytes(args[1])) // 2])  # type: ignore[arg-type]
+                raise Died
+            return real(*args, **more)
+
+        patch.setattr(os, name, call)
+
+    for name in WATCHED:
+        wrap(name)
+
+
+def die_everywhere(action: Callable[[], object], check: Callable[[bool], None]) -> int:
+    """Run an action once for every system call in it, dying there; how many there are."""
+    for step in range(1, 200):
+        done = False
+        with pytest.MonkeyPatch.context() as patch:
+            die_at(step, patch)
+            try:
+                action()
+                done = True
+            except Died:
+                pass
+        check(done)
+        if done:
+            return step - 1
+    raise AssertionError("no end")
+
+
+def test_a_file_is_the_old_or_the_new(tmp_path: Path) -> None:
+    file = tmp_path / "g.json"
+    old, new = b'{"version": 1}', b'{"version": 2, "long": "' + b"x" * 5000 + b'"}'
+    write_file(file, old)
+
+    def check(done: bool) -> None:
+        assert file.read_bytes() in ((new,) if done else (old, new))
+        assert [p.name for p in tmp_path.glob("*.json")] == ["g.json"]
+        write_file(file, old)
+
+    assert die_everywhere(lambda: write_file(file, new), check) >= 5
+
+
+@pytest.mark.parametrize("before", ["nothing", "a set", "loose files", "half a set"])
+def test_a_set_is_all_old_or_all_new(tmp_path: Path, before: str) -> None:
+    old = {name: b"old" for name in ("tls.crt", "tls.key", "ca.crt")}
+    new = {name: b"new" for name in old}
+    count = 0
+
+    def directory() -> Path:
+        return tmp_path / str(count)
+
+    def prepare() -> None:
+        nonlocal count
+        count += 1
+        directory().mkdir()
+        if before == "a set":
+            write_set(directory(), old)
+        elif before == "loose files":
+            for name, content in old.items():
+                (directory() / name).write_bytes(content)
+        elif before == "half a set":
+            (directory() / "..gone").mkdir()
+            (directory() / "..data").symlink_to("..missing")
+            (directory() / "tls.crt").symlink_to("..data/tls.crt")
+
+    def check(done: bool) -> None:
+        found = read_set(directory(), tuple(old))
+        assert found == new or (not done and found == (old if before == "a set" else None))
+        write_set(directory(), new)
+        assert {name: (directory() / name).read_bytes() for name in old} == new
+        assert (directory() / "tls.key").stat().st_mode & 0o777 == 0o600
+        assert len([p for p in directory().iterdir() if p.is_dir() and not p.is_symlink()]) == 1
+        prepare()
+
+    prepare()
+    assert die_everywhere(lambda: write_set(directory(), new), check) > 10
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from fractus_agent.grants import GrantDirectory, GrantKeeper
+from fractus_agent.store import Listed
+def grant(name, size):
+    return {"apiVersion": "fractus.dev/v1alpha1", "kind": "Grant", "metadata": {"name": name, "uid": name},
+        "spec": {"node": "n", "application": {"namespace": "d", "name": "a", "uid": "u"}, "component": "C",
+                 "instance": "i" * size}}
+directory = GrantDirectory(Path(sys.argv[1]))
+directory.open()
+keeper = GrantKeeper(None, directory, "n")
+print("ready", flush=True)
+turn = 0
+while True:
+    turn += 1
+    keeper.take(Listed(tuple(grant(f"g{i}", turn % 700 + 1) for i in range(turn % 5))))
+"""
+
+
+def test_kill_9_leaves_only_whole_grants(tmp_path: Path) -> None:
+    seed = int(os.environ.get("SEED", "20260501"))
+    print("seed", seed)
+    source = random.Random(seed)
+    seen = 0
+    for _ in range(12):
+        writer = subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path)], stdout=subprocess.PIPE)
+        try:
+            assert writer.stdout is not None
+            assert writer.stdout.readline() == b"ready\n"
+            moment = time.monotonic() + source.uniform(0.0, 0.05)
+            while time.monotonic() < moment:
+                for file in tmp_path.glob("*.json"):
+                    try:
+                        json.loads(file.read_bytes())
+                    except FileNotFoundError:
+                        continue
+        finally:
+            writer.send_signal(signal.SIGKILL)
+            writer.wait(10)
+        for file in tmp_path.glob("*.json"):
+            assert json.loads(file.read_bytes())["kind"] == "Grant"
+            seen += 1
+    assert seen > 0

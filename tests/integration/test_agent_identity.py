@@ -1,0 +1,246 @@
+"""The node's certificate: real keys and files, a signer of the test's own, a clock of the test's own."""
+
+import asyncio
+import contextlib
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from agent_pki import FakeSigner, TestAuthority
+from cryptography import x509
+from cryptography.hazmat.primitives import serialization
+from fractus_agent.certificates import Unusable, inspect
+from fractus_agent.csr import make_request
+from fractus_agent.durable import read_set, write_set
+from fractus_agent.identity import FILES, Identity, Refused, make_request_apart
+from fractus_agent.store import Unavailable
+
+NODE = "drone-1"
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = datetime.now(UTC)
+
+    def __call__(self) -> datetime:
+        return self.now
+
+
+async def made_here(node: str) -> tuple[bytes, bytes]:
+    return make_request(node)
+
+
+class Bench:
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self.clock = Clock()
+        self.signer = FakeSigner(TestAuthority())
+        self.identity = self.agent()
+
+    def agent(self) -> Identity:
+        return Identity(self.signer, self.directory, NODE, self.clock, make_request=made_here)
+
+    def files(self) -> dict[str, bytes]:
+        files = read_set(self.directory, FILES)
+        assert files is not None
+        return files
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Bench:
+    return Bench(tmp_path / "tls")
+
+
+async def test_round_trip(bench: Bench) -> None:
+    await bench.identity.step()
+    assert bench.identity.ready.is_set()
+    assert bench.identity.finding.holds
+    assert (bench.directory / "tls.key").stat().st_mode & 0o777 == 0o600
+    certificate = x509.load_pem_x509_certificate(bench.files()["tls.crt"])
+    names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert names.get_values_for_type(x509.UniformResourceIdentifier) == ["spiffe://fractus.dev/node/drone-1"]
+    assert names.get_values_for_type(x509.DNSName) == ["drone-1.node.fractus.dev"]
+    assert names.get_values_for_type(x509.IPAddress) == []
+    key = serialization.load_pem_private_key(bench.files()["tls.key"], None)
+    assert key.public_key() == certificate.public_key()
+    assert bench.signer.requests == {}
+
+
+async def test_the_key_process_makes_a_usable_pair(bench: Bench) -> None:
+    key, request = await make_request_apart(NODE)
+    write_set(bench.directory, {"tls.key": key, "tls.crt": bench.signer.ca.sign(request), "ca.crt": bench.signer.ca.pem})
+    assert inspect(bench.directory, NODE).begun(datetime.now(UTC))
+
+
+async def test_a_restarted_agent_asks_for_nothing(bench: Bench) -> None:
+    await bench.identity.step()
+    before = bench.files()
+    again = bench.agent()
+    await again.step()
+    assert bench.signer.made == 1
+    assert bench.files() == before
+    assert again.ready.is_set()
+
+
+async def test_renewal_at_two_thirds_with_a_new_key(bench: Bench) -> None:
+    await bench.identity.step()
+    before = bench.files()
+    bench.clock.now += timedelta(days=19.5)
+    await bench.identity.step()
+    assert bench.files() == before
+    bench.clock.now += timedelta(days=2)
+    bench.signer.sign_with = {"begin": bench.clock.now}
+    await bench.identity.step()
+    assert bench.signer.made == 2
+    assert bench.files()["tls.key"] != before["tls.key"]
+    assert bench.identity.serial == 2
+
+
+async def test_a_renewal_that_fails_leaves_the_certificate_in_use(bench: Bench) -> None:
+    await bench.identity.step()
+    before = bench.files()
+    bench.clock.now += timedelta(days=22)
+    bench.signer.error = Unavailable("no API server")
+    with pytest.raises(Unavailable):
+        await bench.identity.step()
+    assert bench.files() == before
+    assert bench.identity.finding.holds
+
+
+async def test_an_expired_certificate_is_replaced(bench: Bench) -> None:
+    await bench.identity.step()
+    bench.clock.now += timedelta(days=40)
+    bench.signer.sign_with = {"begin": bench.clock.now}
+    await bench.identity.step()
+    assert bench.signer.made == 2
+    assert bench.identity.finding.holds
+
+
+async def test_rotation_to_a_bundle_keeps_the_certificate(bench: Bench) -> None:
+    await bench.identity.step()
+    before = bench.files()
+    bench.signer.published = TestAuthority("next").pem + bench.signer.ca.pem
+    await bench.identity.step()
+    assert bench.signer.made == 1
+    assert bench.files() == before | {"ca.crt": bench.signer.published}
+
+
+async def test_rotation_to_another_authority_asks_anew(bench: Bench) -> None:
+    await bench.identity.step()
+    bench.signer.ca = TestAuthority("next")
+    bench.signer.published = bench.signer.ca.pem
+    await bench.identity.step()
+    assert bench.signer.made == 2
+    assert bench.files()["ca.crt"] == bench.signer.ca.pem
+    assert inspect(bench.directory, NODE)
+
+
+@pytest.mark.parametrize("harm", ["no key", "cut certificate", "other key", "empty authority", "dangling", "other node"])
+async def test_a_spoilt_directory_is_mended(bench: Bench, harm: str) -> None:
+    await bench.identity.step()
+    files = bench.files()
+    if harm == "dangling":
+        (bench.directory / "..data").unlink()
+    elif harm == "no key":
+        (bench.directory / "tls.key").unlink()
+    elif harm == "other node":
+        key, request = make_request("drone-2")
+        write_set(bench.directory, files | {"tls.key": key, "tls.crt": bench.signer.ca.sign(request)})
+    else:
+        write_set(
+            bench.directory,
+            files
+            | {
+                "cut certificate": {"tls.crt": files["tls.crt"][:200]},
+                "other key": {"tls.key": make_request(NODE)[0]},
+                "empty authority": {"ca.crt": b""},
+            }[harm],
+        )
+    with pytest.raises(Unusable):
+        inspect(bench.directory, NODE)
+    again = bench.agent()
+    await again.step()
+    assert inspect(bench.directory, NODE)
+    assert again.ready.is_set()
+
+
+@pytest.mark.parametrize("kind", ["Denied", "Failed"])
+async def test_a_refusal_is_said(bench: Bench, kind: str) -> None:
+    bench.signer.conditions = [{"type": kind, "message": "node drone-1 is not in the fleet"}]
+    with pytest.raises(Refused, match="not in the fleet") as refusal:
+        await bench.identity.step()
+    assert refusal.value.reason == kind
+    assert not bench.identity.ready.is_set()
+    assert not (bench.directory / "tls.crt").exists()
+
+
+async def test_a_refusal_reaches_the_condition(bench: Bench) -> None:
+    bench.signer.conditions = [{"type": "Denied", "message": "node drone-1 is not in the fleet"}]
+    said = asyncio.Event()
+    identity = Identity(bench.signer, bench.directory, NODE, bench.clock, changed=said.set, make_request=made_here)
+    task = asyncio.create_task(identity.run())
+    try:
+        while identity.finding.reason != "Denied":
+            await asyncio.wait_for(said.wait(), 10.0)
+            said.clear()
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+    assert (identity.finding.type, identity.finding.status) == ("Certified", "False")
+    assert "not in the fleet" in identity.finding.message
+
+
+async def test_a_denied_renewal_leaves_the_node_certified(bench: Bench) -> None:
+    await bench.identity.step()
+    bench.clock.now += timedelta(days=22)
+    bench.signer.conditions = [{"type": "Denied", "message": "fleet frozen"}]
+    task = asyncio.create_task(bench.identity.run())
+    try:
+        async with asyncio.timeout(10):
+            while "fleet frozen" not in bench.identity.finding.message:
+                await asyncio.sleep(0.01)
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+    assert bench.identity.finding.holds
+    assert bench.signer.made == 2
+
+
+async def test_a_certificate_of_a_strange_authority_is_not_installed(bench: Bench) -> None:
+    bench.signer.published = TestAuthority("other").pem
+    with pytest.raises(Refused, match="of no use"):
+        await bench.identity.step()
+    assert not (bench.directory / "tls.crt").exists()
+
+
+async def test_no_authority_is_said(bench: Bench) -> None:
+    bench.signer.published = None
+    with pytest.raises(Refused) as refusal:
+        await bench.identity.step()
+    assert refusal.value.reason == "NoAuthority"
+
+
+async def test_a_clock_behind_asks_for_nothing_and_recovers(bench: Bench) -> None:
+    await bench.identity.step()
+    now = bench.clock.now
+    bench.clock.now = datetime(1970, 1, 1, tzinfo=UTC)
+    await bench.identity.step()
+    assert bench.identity.finding.reason == "ClockSkew"
+    assert bench.signer.made == 1
+    bench.clock.now = now
+    await bench.identity.step()
+    assert bench.identity.finding.holds
+
+
+async def test_a_clock_ahead_is_said_and_recovers(bench: Bench) -> None:
+    now = bench.clock.now
+    bench.clock.now = now + timedelta(days=900)
+    with pytest.raises(Refused) as refusal:
+        await bench.identity.step()
+    assert refusal.value.reason == "ClockSkew"
+    bench.clock.now = now
+    await bench.identity.step()
+    assert bench.identity.finding.holds
+    assert bench.signer.made == 1

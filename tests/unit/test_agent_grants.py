@@ -1,0 +1,184 @@
+"""What becomes of grants: phases, and which news changes the disk."""
+
+import json
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fractus_agent.backoff import Backoff
+from fractus_agent.grants import GrantDirectory, GrantKeeper, outcome_of, status_of, stored_form
+from fractus_agent.store import Changed, Deleted, GrantEvent, Listed, Unavailable
+from fractus_core.api.plans import Grant
+
+
+def manifest(name: str = "g1", uid: str = "u1", version: str = "1", **more: Any) -> dict[str, Any]:
+    return {
+        "apiVersion": "fractus.dev/v1alpha1",
+        "kind": "Grant",
+        "metadata": {"name": name, "uid": uid, "generation": 1, "resourceVersion": version} | more.pop("metadata", {}),
+        "spec": {
+            "node": "drone-1",
+            "application": {"namespace": "default", "name": "app", "uid": "a"},
+            "component": "Navigator",
+            "instance": "app-navigator",
+        }
+        | more.pop("spec", {}),
+        **more,
+    }
+
+
+class FakeStore:
+    def __init__(self) -> None:
+        self.statuses: list[tuple[str, dict[str, Any]]] = []
+        self.down = False
+
+    async def apply_status(self, kind: str, name: str, status: dict[str, Any]) -> dict[str, Any] | None:
+        if self.down:
+            raise Unavailable("down")
+        self.statuses.append((name, status))
+        return {}
+
+    async def grants(self) -> AsyncIterator[GrantEvent]:
+        raise NotImplementedError
+        yield
+
+
+@pytest.fixture
+def store() -> FakeStore:
+    return FakeStore()
+
+
+@pytest.fixture
+def keeper(store: FakeStore, tmp_path: Path) -> GrantKeeper:
+    directory = GrantDirectory(tmp_path)
+    directory.open()
+    return GrantKeeper(store, directory, "drone-1")
+
+
+def on_disk(path: Path) -> set[str]:
+    return {p.name for p in path.iterdir()}
+
+
+def test_only_a_list_or_a_deletion_removes(keeper: GrantKeeper, tmp_path: Path) -> None:
+    keeper.take(Listed((manifest("g1"), manifest("g2"))))
+    assert on_disk(tmp_path) == {"g1.json", "g2.json"}
+    keeper.take(Changed(manifest("g3")))
+    assert on_disk(tmp_path) == {"g1.json", "g2.json", "g3.json"}
+    keeper.take(Deleted("g1"))
+    assert on_disk(tmp_path) == {"g2.json", "g3.json"}
+    keeper.take(Listed((manifest("g3"),)))
+    assert on_disk(tmp_path) == {"g3.json"}
+
+
+def test_a_new_agent_removes_what_a_full_list_lacks(store: FakeStore, tmp_path: Path) -> None:
+    (tmp_path / "old.json").write_text("{}")
+    (tmp_path / ".half.json.tmp").write_text("{")
+    directory = GrantDirectory(tmp_path)
+    directory.open()
+    assert on_disk(tmp_path) == {"old.json"}
+    GrantKeeper(store, directory, "drone-1").take(Listed(()))
+    assert on_disk(tmp_path) == set()
+
+
+def test_a_file_is_the_grant_and_only_its_content_rewrites_it(keeper: GrantKeeper, tmp_path: Path) -> None:
+    keeper.take(Changed(manifest()))
+    file = tmp_path / "g1.json"
+    assert Grant.from_body(json.loads(file.read_text())).spec.identity.endswith("/instance/app-navigator")
+    assert file.stat().st_mode & 0o777 == 0o600
+    first = file.stat().st_ino
+    keeper.take(Changed(manifest(version="2", status={"phase": "Active"})))
+    assert file.stat().st_ino == first
+    keeper.take(Changed(manifest(version="3", spec={"control": "full"})))
+    assert file.stat().st_ino != first
+    assert json.loads(file.read_text())["spec"]["control"] == "full"
+
+
+def test_a_grant_being_deleted_or_of_another_node_is_gone(keeper: GrantKeeper, tmp_path: Path) -> None:
+    keeper.take(Listed((manifest("g1"), manifest("g2"))))
+    keeper.take(Changed(manifest("g1", metadata={"deletionTimestamp": "2026-01-01T00:00:00Z"})))
+    keeper.take(Changed(manifest("g2", spec={"node": "drone-2"})))
+    assert on_disk(tmp_path) == set()
+
+
+async def test_an_unreadable_grant_grants_nothing_and_says_so(
+    keeper: GrantKeeper, store: FakeStore, tmp_path: Path
+) -> None:
+    keeper.take(Listed((manifest(),)))
+    keeper.take(Changed(manifest(spec={"newRestriction": True})))
+    assert on_disk(tmp_path) == set()
+    await keeper.report_once()
+    (name, status) = store.statuses[-1]
+    assert (name, status["phase"]) == ("g1", "Failed")
+    assert "spec.newRestriction" in status["message"]
+
+
+async def test_phases_are_reported_once_and_survive_outages(keeper: GrantKeeper, store: FakeStore) -> None:
+    keeper.take(Listed((manifest(),)))
+    store.down = True
+    with pytest.raises(Unavailable):
+        await keeper.report_once()
+    store.down = False
+    await keeper.report_once()
+    await keeper.report_once()
+    assert [s["phase"] for _, s in store.statuses] == ["Active"]
+    keeper.missions_changed({"u1": "failed: driver lost"})
+    await keeper.report_once()
+    assert store.statuses[-1] == ("g1", {"phase": "Failed", "message": "driver lost", "observedGeneration": 1})
+
+
+async def test_a_new_agent_does_not_repeat_what_is_reported(keeper: GrantKeeper, store: FakeStore) -> None:
+    status = {"phase": "Active", "message": "", "observedGeneration": 1}
+    keeper.take(Listed((manifest(status=status),)))
+    await keeper.report_once()
+    assert store.statuses == []
+
+
+async def test_a_grant_that_cannot_be_stored_is_pending_until_it_can(
+    keeper: GrantKeeper, store: FakeStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.fsync", full)
+        keeper.take(Listed((manifest(),)))
+    await keeper.report_once()
+    assert store.statuses[-1][1]["phase"] == "Pending"
+    assert "No space left" in store.statuses[-1][1]["message"]
+    keeper._retry_disk()
+    await keeper.report_once()
+    assert store.statuses[-1][1]["phase"] == "Active"
+
+
+def test_outcomes() -> None:
+    grant = Grant.from_body(manifest())
+    assert outcome_of(grant, {}) is None
+    assert outcome_of(grant, {"u1": "complete"}) == ("Complete", "")
+    assert outcome_of(grant, {grant.spec.identity: "revoked: zone closed: now"}) == ("Revoked", "zone closed: now")
+    assert outcome_of(grant, {"app-navigator": "failed: driver lost"}) == ("Failed", "driver lost")
+    assert outcome_of(grant, {"u1": "exploded"}) == ("Failed", "exploded")
+    assert outcome_of(grant, {"u2": "complete"}) is None
+
+
+def test_a_reported_end_is_final() -> None:
+    grant = Grant.from_body(manifest(status={"phase": "Complete", "message": "done"}))
+    assert status_of(grant, {}, None)["phase"] == "Complete"
+    assert status_of(grant, {"u1": "failed: x"}, "disk full")["phase"] == "Complete"
+
+
+def test_the_stored_form_is_stable() -> None:
+    one = Grant.from_body(manifest(version="1"))
+    two = Grant.from_body(manifest(version="2", status={"phase": "Active"}))
+    assert stored_form(one) == stored_form(two)
+    assert json.loads(stored_form(one))["metadata"]["uid"] == "u1"
+
+
+def test_backoff_doubles_to_its_cap_and_starts_again() -> None:
+    backoff = Backoff(0.5, 15.0)
+    delays = [backoff.delay_s() for _ in range(50)]
+    for attempt, delay in enumerate(delays):
+        full = min(15.0, 0.5 * 2**attempt)
+        assert full / 2 <= delay <= full
+    backoff.succeeded()
+    assert backoff.delay_s() <= 0.5

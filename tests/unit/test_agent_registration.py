@@ -1,0 +1,248 @@
+"""Registration: created once, the owner's edits stay, a changed description is taken over."""
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from fractus_agent.geohash import geohash
+from fractus_agent.registration import (
+    HASH_ANNOTATION,
+    InvalidDescription,
+    Registration,
+    description_hash,
+    label_changes,
+    location_labels,
+    parse_description,
+)
+from fractus_agent.store import Rejected
+
+MANIFEST: dict[str, Any] = {
+    "apiVersion": "fractus.dev/v1alpha1",
+    "kind": "Drone",
+    "metadata": {"name": "drone-1", "labels": {"fleet": "north"}},
+    "spec": {
+        "interfaces": [{"technology": "WiFi"}, {"technology": "4G"}],
+        "services": {
+            "mobility": {"maxAltitude": 120, "maxFlightTime": 25, "maxSpeed": 15, "methods": ["Goto", "GetPosition"]}
+        },
+        "depot": "campus",
+    },
+}
+
+
+class FakeStore:
+    """One node's object and labels, with the API server's bookkeeping."""
+
+    def __init__(self) -> None:
+        self.object: dict[str, Any] | None = None
+        self.labels: dict[str, str] | None = {"fractus.dev/class": "drone", "other": "x"}
+        self.writes = 0
+        self.refuse = False
+
+    async def node_labels(self) -> dict[str, str] | None:
+        return None if self.labels is None else dict(self.labels)
+
+    async def label_node(self, labels: dict[str, str | None]) -> None:
+        assert self.labels is not None
+        for key, value in labels.items():
+            if value is None:
+                self.labels.pop(key)
+            else:
+                self.labels[key] = value
+
+    async def described(self, kind: str) -> dict[str, Any] | None:
+        return copy.deepcopy(self.object) if self.object and self.object["kind"] == kind else None
+
+    async def create(self, body: dict[str, Any]) -> dict[str, Any]:
+        assert self.object is None
+        if self.refuse:
+            raise Rejected("spec.depot: no")
+        return self._store(body, 1)
+
+    async def replace(self, body: dict[str, Any]) -> dict[str, Any]:
+        assert self.object is not None
+        assert body["metadata"]["resourceVersion"] == self.object["metadata"]["resourceVersion"]
+        return self._store(body, self.object["metadata"]["generation"] + (body["spec"] != self.object["spec"]))
+
+    def _store(self, body: dict[str, Any], generation: int) -> dict[str, Any]:
+        self.writes += 1
+        body = copy.deepcopy(body)
+        body["metadata"] |= {"resourceVersion": str(self.writes), "generation": generation, "uid": "u"}
+        self.object = body
+        return copy.deepcopy(body)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    file = tmp_path / "node.yaml"
+    file.write_text(yaml.safe_dump(MANIFEST))
+    return file
+
+
+def edited(**spec: Any) -> str:
+    return yaml.safe_dump(MANIFEST | {"spec": MANIFEST["spec"] | spec})
+
+
+async def test_registers_once_and_labels_the_node(path: Path) -> None:
+    store = FakeStore()
+    for _ in range(3):
+        await Registration(store, path, "drone-1").step()
+    assert store.writes == 1
+    assert store.object is not None
+    assert store.object["metadata"]["labels"] == {"fleet": "north"}
+    assert store.labels == {
+        "fractus.dev/class": "drone",
+        "other": "x",
+        "fractus.dev/depot": "campus",
+        "fractus.dev/interface-wifi": "true",
+        "fractus.dev/interface-4g": "true",
+    }
+
+
+async def test_the_owners_edits_stay(path: Path) -> None:
+    store = FakeStore()
+    registration = Registration(store, path, "drone-1")
+    await registration.step()
+    assert store.object is not None
+    store.object["spec"]["depot"] = "harbour"
+    store.object["metadata"]["generation"] += 1
+    path.write_text("# a comment\n" + yaml.safe_dump(MANIFEST, default_flow_style=True))
+    await registration.step()
+    await Registration(store, path, "drone-1").step()
+    assert store.writes == 1
+    assert store.object["spec"]["depot"] == "harbour"
+    assert store.labels is not None
+    assert store.labels["fractus.dev/depot"] == "harbour"
+
+
+async def test_a_changed_description_is_taken_over_once(path: Path) -> None:
+    store = FakeStore()
+    registration = Registration(store, path, "drone-1")
+    await registration.step()
+    path.write_text(edited(depot="airfield", interfaces=[]))
+    await registration.step()
+    await registration.step()
+    assert store.writes == 2
+    assert store.object is not None
+    assert store.object["spec"]["depot"] == "airfield"
+    assert store.labels == {"fractus.dev/class": "drone", "other": "x", "fractus.dev/depot": "airfield"}
+
+
+async def test_an_owners_object_is_adopted_unchanged(path: Path) -> None:
+    store = FakeStore()
+    store.object = {
+        "apiVersion": "fractus.dev/v1alpha1",
+        "kind": "Drone",
+        "metadata": {"name": "drone-1", "generation": 4, "resourceVersion": "9"},
+        "spec": {"depot": "mine"},
+    }
+    await Registration(store, path, "drone-1").step()
+    assert store.object["spec"] == {"depot": "mine"}
+    assert HASH_ANNOTATION in store.object["metadata"]["annotations"]
+
+
+async def test_without_a_description_the_owners_object_is_awaited(tmp_path: Path) -> None:
+    store = FakeStore()
+    registration = Registration(store, tmp_path / "node.yaml", "drone-1")
+    await registration.step()
+    assert registration.body is None
+    assert store.writes == 0
+    store.object = {
+        "apiVersion": "fractus.dev/v1alpha1",
+        "kind": "Drone",
+        "metadata": {"name": "drone-1", "generation": 1, "resourceVersion": "1"},
+        "spec": {},
+    }
+    await registration.step()
+    assert registration.body is not None
+    assert registration.described is None
+
+
+async def test_a_deleted_object_is_registered_again(path: Path) -> None:
+    store = FakeStore()
+    registration = Registration(store, path, "drone-1")
+    await registration.step()
+    store.object = None
+    registration.seen(None)
+    assert registration.body is None
+    await registration.step()
+    assert store.object is not None
+
+
+async def test_a_bad_description_is_reported_and_the_object_kept(path: Path) -> None:
+    store = FakeStore()
+    registration = Registration(store, path, "drone-1")
+    await registration.step()
+    before = copy.deepcopy(store.object)
+    path.write_text(edited(depot="No Such Name!"))
+    await registration.step()
+    assert store.object == before
+    assert registration.described is not None
+    assert "spec.depot" in registration.described.message
+    path.write_text(edited())
+    await registration.step()
+    assert registration.described is None
+
+
+async def test_a_refused_object_is_said(path: Path) -> None:
+    store = FakeStore()
+    store.refuse = True
+    registration = Registration(store, path, "drone-1")
+    with pytest.raises(Rejected):
+        await registration.step()
+    assert registration.described is not None
+    assert "spec.depot: no" in registration.described.message
+    assert registration.body is None
+
+
+async def test_a_description_of_the_other_class_is_refused(path: Path) -> None:
+    store = FakeStore()
+    store.labels = {"fractus.dev/class": "edge"}
+    registration = Registration(store, path, "drone-1")
+    await registration.step()
+    assert store.object is None
+    assert registration.described is not None
+    assert "EdgeNode" in registration.described.message
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("a: [", "is not YAML"),
+        ("- 1", "kind"),
+        ("kind: Depot", "kind"),
+        (yaml.safe_dump(MANIFEST).replace("drone-1", "drone-2"), "metadata.name: is drone-2"),
+        (yaml.safe_dump(MANIFEST).replace("maxSpeed: 15", "maxSpeed: -1"), "maxSpeed"),
+    ],
+)
+def test_bad_descriptions(text: str, says: str) -> None:
+    with pytest.raises(InvalidDescription, match=says):
+        parse_description(text, "drone-1")
+
+
+def test_hash_is_of_what_is_said() -> None:
+    first = parse_description(yaml.safe_dump(MANIFEST), "drone-1")
+    again = parse_description("# x\n" + yaml.safe_dump(MANIFEST, sort_keys=False, default_flow_style=True), "drone-1")
+    other = parse_description(edited(depot="x"), "drone-1")
+    assert description_hash(first) == description_hash(again) != description_hash(other)
+
+
+def test_edge_nodes_are_labelled_by_geohash() -> None:
+    edge = {
+        "apiVersion": "fractus.dev/v1alpha1",
+        "kind": "EdgeNode",
+        "metadata": {"name": "e"},
+        "spec": {"location": {"lat": 57.64911, "lon": 10.40744}},
+    }
+    assert location_labels(parse_description(yaml.safe_dump(edge), "e")) == {"fractus.dev/geohash": "u4pruy"}
+    assert geohash(57.64911, 10.40744, 11) == "u4pruydqqvj"
+
+
+def test_only_our_stale_labels_go() -> None:
+    present = {"fractus.dev/interface-ble": "true", "fractus.dev/class": "drone", "zone": "a"}
+    assert label_changes({"fractus.dev/depot": "d"}, present) == {
+        "fractus.dev/interface-ble": None,
+        "fractus.dev/depot": "d",
+    }

@@ -1,0 +1,222 @@
+"""What the agent writes into status, and when."""
+
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import pytest
+from fractus_agent.findings import Finding
+from fractus_agent.flight import Snapshot
+from fractus_agent.status import DRONE_PACE, EDGE_PACE, Observed, StatusReporter, due_s, node_status, readiness
+from fractus_agent.store import Unavailable
+from fractus_agent.telemetry import snapshot
+from fractus_core.api.nodes import DroneStatus, EdgeNodeStatus
+from fractus_proto.v1.mobility_pb2 import Telemetry
+from fractus_proto.v1.types_pb2 import AltitudeReference, Position
+
+NOW = datetime(2026, 5, 1, 12, 0, 0, tzinfo=UTC)
+ISSUED = Finding("Certified", "True", "Issued", "Valid.")
+
+
+def seen(**changes: Any) -> Snapshot:
+    facts: dict[str, Any] = {
+        "flight_state": "flying",
+        "controller": "system",
+        "connected": True,
+        "ready": True,
+        "in_air": True,
+        "mode": "GUIDED",
+        "position": (39.36, 22.94, 20.0, "home"),
+        "battery_remaining": 0.83,
+        "battery_voltage_v": 15.9,
+        "battery_current_a": 12.1,
+    }
+    return Snapshot(**(facts | changes))
+
+
+def observed(**changes: Any) -> Observed:
+    facts: dict[str, Any] = {
+        "kind": "Drone",
+        "has_mobility": True,
+        "needs_certificate": True,
+        "certified": ISSUED,
+        "snapshot": seen(),
+    }
+    return Observed(**(facts | changes))
+
+
+def test_telemetry_becomes_a_valid_drone_status() -> None:
+    message = Telemetry(
+        position=Position(
+            latitude_deg=39.36, longitude_deg=22.94, altitude_m=20.0,
+            altitude_reference=AltitudeReference.ALTITUDE_REFERENCE_AMSL,
+        ),
+        battery_remaining=0.834, battery_voltage_v=15.93, battery_current_a=12.14, in_air=True, mode="GUIDED",
+        flight_state="flying", controller="spiffe://fractus.dev/ns/a/app/b/component/c/instance/d",
+        autopilot_connected=True, ready=True, missions={"x": "complete"},
+    )  # fmt: skip
+    status = node_status(observed(snapshot=snapshot(message)), {}, 3, NOW)
+    parsed = DroneStatus.model_validate(status)
+    assert parsed.flight_state == "flying"
+    assert parsed.controller == "spiffe://fractus.dev/ns/a/app/b/component/c/instance/d"
+    assert parsed.position is not None
+    assert parsed.position.to_dict() == {"lat": 39.36, "lon": 22.94, "alt": 20.0, "altitudeReference": "amsl"}
+    assert parsed.battery is not None
+    assert parsed.battery.to_dict() == {"remaining": 0.83, "voltage": 15.9, "current": 12.1}
+    assert parsed.last_seen == NOW
+    assert {(c.type, c.status, c.observed_generation) for c in parsed.conditions} == {
+        ("Ready", "True", 3),
+        ("Certified", "True", 3),
+    }
+
+
+@pytest.mark.parametrize(
+    ("facts", "reason"),
+    [
+        ({"certified": Finding("Certified", "False", "Denied", "no")}, "NoCertificate"),
+        ({"problem": "The mobility service is out of reach: x."}, "MobilityUnreachable"),
+        ({"snapshot": None}, "MobilityUnreachable"),
+        ({"snapshot": seen(connected=False)}, "AutopilotDisconnected"),
+        ({"snapshot": seen(ready=False, in_air=False)}, "AutopilotNotReady"),
+    ],
+)
+def test_a_drone_is_not_ready_when(facts: dict[str, Any], reason: str) -> None:
+    finding = readiness(observed(**facts))
+    assert (finding.status, finding.reason) == ("False", reason)
+    assert finding.message
+
+
+def test_a_flying_drone_is_ready_though_it_would_not_arm() -> None:
+    assert readiness(observed(snapshot=seen(ready=False, in_air=True))).holds
+
+
+def test_edge_node_without_services_is_ready_without_certificate() -> None:
+    bare = observed(
+        kind="EdgeNode", has_mobility=False, needs_certificate=False, snapshot=None,
+        certified=Finding("Certified", "False", "Requested", "waits"),
+    )  # fmt: skip
+    status = node_status(bare, {}, 1, NOW)
+    EdgeNodeStatus.model_validate(status)
+    assert "flightState" not in status
+    assert readiness(bare).holds
+
+
+def test_what_cannot_be_seen_is_kept() -> None:
+    before = node_status(observed(), {}, 1, NOW)
+    blind = node_status(observed(snapshot=None, problem="gone"), before, 1, NOW + timedelta(seconds=9))
+    for key in ("flightState", "position", "battery", "controller"):
+        assert blind[key] == before[key]
+    assert blind["conditions"][0]["status"] == "False"
+
+
+def test_transition_time_moves_only_with_the_status() -> None:
+    first = node_status(observed(), {}, 1, NOW)
+    later = node_status(observed(), first, 2, NOW + timedelta(minutes=1))
+    assert later["conditions"][0]["lastTransitionTime"] == "2026-05-01T12:00:00Z"
+    worse = node_status(observed(problem="gone"), later, 2, NOW + timedelta(minutes=2))
+    assert worse["conditions"][0]["lastTransitionTime"] == "2026-05-01T12:02:00Z"
+
+
+def moved(north_m: float) -> dict[str, Any]:
+    return node_status(observed(snapshot=seen(position=(39.36 + north_m / 111_320, 22.94, 20.0, "home"))), {}, 1, NOW)
+
+
+def test_changes_are_due_by_their_weight() -> None:
+    base = moved(0)
+    assert due_s(None, base, 0.0, DRONE_PACE) == 0.0
+    assert due_s(base, base, 4.0, DRONE_PACE) == DRONE_PACE.idle_s - 4.0
+    assert due_s(base, base, 4.0, EDGE_PACE) == EDGE_PACE.idle_s - 4.0
+    assert due_s(base, moved(50.0), 4.0, DRONE_PACE) == 6.0
+    assert due_s(base, moved(50.0), 10.0, DRONE_PACE) == 0.0
+    assert due_s(base, moved(1.0), 10.0, DRONE_PACE) == 20.0
+    landing = node_status(observed(snapshot=seen(flight_state="landing")), {}, 1, NOW)
+    assert due_s(base, landing, 1.0, DRONE_PACE) == 0.0
+    assert due_s(base, landing, 0.2, DRONE_PACE) == pytest.approx(0.8)
+    drained = node_status(observed(snapshot=seen(battery_remaining=0.82)), {}, 1, NOW)
+    assert due_s(base, drained, 5.0, DRONE_PACE) == 5.0
+
+
+class FakeStore:
+    """Counts writes; can be out of reach or without the object."""
+
+    def __init__(self) -> None:
+        self.writes: list[dict[str, Any]] = []
+        self.down = False
+        self.absent = False
+
+    async def apply_status(self, kind: str, name: str, status: dict[str, Any]) -> dict[str, Any] | None:
+        if self.down:
+            raise Unavailable("down")
+        if self.absent:
+            return None
+        self.writes.append(status)
+        return {"kind": kind, "metadata": {"name": name, "uid": "1", "generation": 1}, "status": status}
+
+
+class Bench:
+    """A reporter with a clock of its own and telemetry at 1 Hz."""
+
+    def __init__(self) -> None:
+        self.store = FakeStore()
+        self.seconds = 0.0
+        self.observed = observed()
+        self.body: dict[str, Any] | None = {"kind": "Drone", "metadata": {"name": "d", "uid": "1", "generation": 1}}
+        self.returned: list[Any] = []
+        self.reporter = StatusReporter(
+            self.store,
+            body=lambda: self.body,
+            observe=lambda _: self.observed,
+            written=self.returned.append,
+            wall=lambda: NOW + timedelta(seconds=self.seconds),
+            monotonic=lambda: self.seconds,
+        )
+
+    async def second(self, snap: Snapshot) -> None:
+        self.seconds += 1.0
+        self.observed = observed(snapshot=snap)
+        await self.reporter.step()
+
+
+async def test_flying_straight_writes_every_ten_seconds() -> None:
+    bench = Bench()
+    for second in range(60):
+        await bench.second(seen(position=(39.36 + second * 1e-4, 22.94, 20.0, "home")))
+    assert len(bench.store.writes) == 6
+
+
+async def test_a_change_of_flight_state_is_written_at_once() -> None:
+    bench = Bench()
+    await bench.second(seen(flight_state="takingOff"))
+    await bench.second(seen(flight_state="flying"))
+    assert [w["flightState"] for w in bench.store.writes] == ["takingOff", "flying"]
+
+
+async def test_a_standing_drone_writes_every_thirty_seconds() -> None:
+    bench = Bench()
+    for second in range(120):
+        jitter = (second % 3) * 3e-6
+        await bench.second(seen(flight_state="inactive", in_air=False, position=(39.36 + jitter, 22.94, 0.0, "home")))
+    assert len(bench.store.writes) == 4
+
+
+async def test_no_change_is_lost_over_an_outage() -> None:
+    bench = Bench()
+    await bench.second(seen(flight_state="flying"))
+    bench.store.down = True
+    with pytest.raises(Unavailable):
+        await bench.second(seen(flight_state="landing"))
+    bench.store.down = False
+    await bench.second(seen(flight_state="landing"))
+    assert bench.store.writes[-1]["flightState"] == "landing"
+
+
+async def test_a_vanished_object_is_reported_and_its_successor_written() -> None:
+    bench = Bench()
+    await bench.second(seen())
+    bench.store.absent = True
+    bench.seconds += 60
+    await bench.second(seen())
+    assert bench.returned[-1] is None
+    bench.store.absent = False
+    bench.body = {"kind": "Drone", "metadata": {"name": "d", "uid": "2", "generation": 1}}
+    await bench.second(seen())
+    assert len(bench.store.writes) == 2

@@ -1,0 +1,145 @@
+"""`python -m fractus_operator`: connects, learns the cluster, then lets kopf run the Applications."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import sys
+from collections.abc import Awaitable, Callable, Coroutine
+from datetime import UTC, datetime
+from typing import Any
+
+import kopf
+
+from fractus_operator import handlers, kinds
+from fractus_operator.authority import BrokenAuthority, open_authority
+from fractus_operator.deployments import Deployments
+from fractus_operator.inventory import LiveInventory
+from fractus_operator.kinds import Key, Kind
+from fractus_operator.location import Locations
+from fractus_operator.orphans import Orphans
+from fractus_operator.readiness import Readiness
+from fractus_operator.settings import BadSetting, Settings
+from fractus_operator.signing import NodeSigning
+from fractus_operator.store import Store, StoreError, Unconfigured
+from fractus_operator.worklist import Worklist
+
+logger = logging.getLogger("fractus_operator")
+
+
+def _now() -> datetime:
+    return datetime.now(UTC).replace(microsecond=0)
+
+
+async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
+    """Run the operator until it is told to stop, or a part of it fails.
+
+    Args:
+        settings: How to run.
+        stop: Set it to end the operator; signals do so as well.
+    """
+    store = Store.connect()
+    try:
+        authority = await open_authority(store, settings.namespace)
+        live = LiveInventory(store)
+        deployments = Deployments(store, live, authority, _now, settings.planning)
+        signing = NodeSigning(store, live.signing_requests.get, authority, settings.agent_user, _now)
+        lists = worklists(store, live, signing)
+        registry = kopf.OperatorRegistry()
+        handlers.register(registry, live, deployments)
+        kopf_settings = kopf.OperatorSettings()
+        handlers.configure(kopf_settings)
+        background: list[Coroutine[Any, Any, None]] = [r.run() for r in live.reflectors()]
+        background += [worklist.run() for worklist in lists]
+        main = kopf.operator(
+            registry=registry,
+            settings=kopf_settings,
+            clusterwide=True,
+            liveness_endpoint=settings.health,
+            stop_flag=stop,
+        )
+        await _together(main, background)
+    finally:
+        await store.close()
+
+
+def worklists(store: Store, live: LiveInventory, signing: NodeSigning) -> list[Worklist]:
+    """What is reconciled beside Applications, each fed by the reflectors of its inputs."""
+    locations, readiness, orphans = Locations(store, live), Readiness(store, live, _now), Orphans(store, live)
+    lists: list[Worklist] = []
+
+    def listed(name: str, reconcile: Callable[[Key], Awaitable[None]], *inputs: Kind) -> Worklist:
+        worklist = Worklist(name, reconcile)
+        lists.append(worklist)
+        for kind in inputs:
+            live.listen(kind, worklist.add)
+        return worklist
+
+    async def once_synced(key: Key) -> None:
+        await live.synced()
+        await locations.reconcile(key)
+
+    async def policy_once_synced(key: Key) -> None:
+        await live.synced()
+        await readiness.reconcile_policy(key)
+
+    async def orphan_once_synced(key: Key) -> None:
+        await live.synced()
+        await orphans.reconcile(key)
+
+    listed("signing request", signing.reconcile, kinds.SIGNING_REQUEST)
+    listed("node", once_synced, kinds.NODE, kinds.DRONE, kinds.EDGE_NODE)
+    listed("zone", readiness.reconcile_zone, kinds.ZONE)
+    policies = listed("policy", policy_once_synced, kinds.POLICY)
+    grants = listed("grant", orphan_once_synced, kinds.GRANT)
+
+    def zone_changed(key: Key) -> None:
+        for policy in readiness.policies_of(key[1]):
+            policies.add(policy)
+
+    def application_changed(key: Key) -> None:
+        if live.applications.get(key) is None:
+            for grant in live.grants_of(key):
+                grants.add(("", grant.name))
+
+    live.listen(kinds.ZONE, zone_changed)
+    live.listen(kinds.APPLICATION, application_changed)
+    return lists
+
+
+async def _together(main: Coroutine[Any, Any, None], background: list[Coroutine[Any, Any, None]]) -> None:
+    """Run the main part until it ends; a background part that fails ends it all."""
+    tasks = [asyncio.create_task(part) for part in (main, *background)]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def main() -> int:
+    """Run the operator as a program; returns its exit code."""
+    try:
+        settings = Settings.from_environment(os.environ)
+    except BadSetting as error:
+        print(error, file=sys.stderr)
+        return 2
+    logging.basicConfig(
+        level=settings.log_level, format="%(asctime)s %(levelname)-7s %(name)s: %(message)s", stream=sys.stderr
+    )
+    logging.getLogger("httpx2").setLevel(logging.WARNING)
+    logging.getLogger("kopf").setLevel(max(settings.log_level, logging.WARNING))
+    try:
+        asyncio.run(run(settings))
+    except (Unconfigured, BrokenAuthority, StoreError) as error:
+        logger.critical("%s", error)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,133 @@
+"""What the operator makes for an Application: applied where it differs, removed where it is stale."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Collection, Mapping, Sequence
+
+from fractus_core.api import Application
+
+from fractus_operator import kinds
+from fractus_operator.difference import digest, is_current, stamped
+from fractus_operator.inventory import LiveInventory
+from fractus_operator.kinds import Body, Key, Kind, key_of
+from fractus_operator.labels import APPLICATION_LABEL, MANAGED_SELECTOR, NAMESPACE_LABEL, label_value
+from fractus_operator.store import NotFound, Store
+
+logger = logging.getLogger(__name__)
+
+_PARALLEL = 8
+
+
+class NameTaken(Exception):
+    """An object that is not the application's own has the name of one of its children."""
+
+
+class Children:
+    """The children of Applications."""
+
+    def __init__(self, store: Store, live: LiveInventory) -> None:
+        self._store = store
+        self._live = live
+        self._parallel = asyncio.Semaphore(_PARALLEL)
+        self._normalised: dict[tuple[Kind, Key], tuple[object, ...] | None] = {}
+
+    async def observed(self, kind: Kind, key: Key) -> Body | None:
+        """The object as the watch last showed it; where it showed none, as the API server has it."""
+        cached = self._live.children[kind].get(key)
+        if cached is not None:
+            return cached
+        try:
+            return await self._store.get(kind, key[1], key[0])
+        except NotFound:
+            return None
+
+    async def apply(self, application: Application, kind: Kind, bodies: Sequence[Body]) -> None:
+        """Apply those objects of a kind that are not as they should be.
+
+        Raises:
+            NameTaken: somebody else's object has the name of one of them.
+        """
+        results = await asyncio.gather(
+            *(self._apply_one(application, kind, body) for body in bodies), return_exceptions=True
+        )
+        for result in results:
+            if isinstance(result, BaseException):
+                raise result
+
+    async def _apply_one(self, application: Application, kind: Kind, body: Body) -> None:
+        key = key_of(body)
+        desired = stamped(body)
+        async with self._parallel:
+            observed = await self.observed(kind, key)
+            if is_current(desired, observed) or self._is_normalised(kind, key, desired, observed):
+                return
+            if observed is not None and not _is_child(application, kind, observed):
+                raise NameTaken(f"{kind.name} {key[1]} exists and is not of this application; rename one of them")
+            if kind is kinds.GRANT and observed is not None and _moved(observed, body):
+                # A Grant belongs to one node for its whole life: its status tells what happened there.
+                await self._store.delete(kind, key, observed["metadata"]["uid"])
+            applied = await self._store.apply(kind, desired)
+            self._live.children[kind].note(key, applied)
+            if not is_current(desired, applied):
+                # The API server spells some value its own way (0.5 cores become 500m).
+                self._normalised[kind, key] = _state(desired, applied)
+
+    def _is_normalised(self, kind: Kind, key: Key, desired: Body, observed: Body | None) -> bool:
+        known = self._normalised.get((kind, key))
+        return known is not None and known == _state(desired, observed)
+
+    async def prune(
+        self, application: Application, wanted: Mapping[Kind, Sequence[Body]], *, keep_secrets: Collection[str]
+    ) -> None:
+        """Delete children that are not wanted any more, what runs first."""
+        for kind in reversed(kinds.CHILDREN):
+            names = set(keep_secrets) if kind is kinds.SECRET else {body["metadata"]["name"] for body in wanted[kind]}
+            for child in self._live.children_of(application.key, kind):
+                if child["metadata"]["name"] not in names and _is_child(application, kind, child):
+                    await self._delete(kind, child)
+
+    async def remove(self, key: Key, kind: Kind) -> bool:
+        """Delete every child of a kind; True if there was any."""
+        children = self._live.children_of(key, kind)
+        for child in children:
+            self._normalised.pop((kind, key_of(child)), None)
+            await self._delete(kind, child)
+        return bool(children)
+
+    async def revoke(self, key: Key) -> bool:
+        """Delete every Grant of an application, also those the watch has not shown yet; True if there was any."""
+        namespace, name = key
+        selector = f"{MANAGED_SELECTOR},{NAMESPACE_LABEL}={namespace},{APPLICATION_LABEL}={label_value(name)}"
+        known = bool(self._live.children_of(key, kinds.GRANT))
+        grants = await self._store.list(kinds.GRANT, selectors={"labelSelector": selector})
+        for grant in grants:
+            await self._delete(kinds.GRANT, grant)
+        return known or bool(grants)
+
+    async def _delete(self, kind: Kind, body: Body) -> None:
+        if "deletionTimestamp" in body["metadata"]:
+            return
+        logger.info("removing %s %s", kind.name, body["metadata"]["name"])
+        await self._store.delete(kind, key_of(body), body["metadata"].get("uid"))
+
+
+def _state(desired: Body, observed: Body | None) -> tuple[object, ...] | None:
+    """What tells that neither the desired nor the observed object changed; status changes do not count."""
+    if observed is None:
+        return None
+    metadata = observed["metadata"]
+    return (digest(desired), metadata.get("uid"), metadata.get("generation") or metadata.get("resourceVersion"))
+
+
+def _is_child(application: Application, kind: Kind, body: Body) -> bool:
+    if kind is kinds.GRANT:
+        owner = body.get("spec", {}).get("application", {})
+        return bool(owner.get("uid") == application.metadata.uid)
+    owners = body["metadata"].get("ownerReferences") or ()
+    return any(owner.get("uid") == application.metadata.uid for owner in owners)
+
+
+def _moved(observed: Body, desired: Body) -> bool:
+    return bool(observed["spec"]["node"] != desired["spec"]["node"])

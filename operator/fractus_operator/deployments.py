@@ -1,0 +1,295 @@
+"""The service behind Applications: plans them, deploys the plan, follows the mission, takes it all down."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timedelta
+
+from fractus_core.api import Application, Component, Condition, InvalidObject, component_identity
+from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec, PlannedInstance
+from fractus_core.planning.inventory import Settings
+from fractus_core.planning.plan import Infeasible, plan
+from fractus_core.policy.grants import compile_grants
+from fractus_core.validation import check_application
+
+from fractus_operator import builders, kinds
+from fractus_operator.authority import Authority
+from fractus_operator.children import Children, NameTaken
+from fractus_operator.conditions import Fact, merge
+from fractus_operator.inventory import SETTLED, LiveInventory, Submitted
+from fractus_operator.kinds import Body, Key, Kind
+from fractus_operator.labels import FINALIZER
+from fractus_operator.missions import (
+    Hindered,
+    Phase,
+    Standing,
+    deployed_standing,
+    finished_standing,
+    hindered_standing,
+    mission_outcome,
+    replan_reason,
+    stuck_nodes,
+)
+from fractus_operator.store import Store, StoreError, Taken
+
+logger = logging.getLogger(__name__)
+
+RESYNC_S = 30.0
+EXCLUSION = timedelta(minutes=5)
+"""How long a node that the scheduler refused is left out of an application's plans."""
+
+
+@dataclass
+class _Memory:
+    """What is remembered of one application between reconciles; all of it can be lost."""
+
+    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+    excluded: dict[str, tuple[datetime, str]] = field(default_factory=dict)
+    status: tuple[str, Body] | None = None
+    """(uid, status) as last written: the watch may be behind."""
+
+
+class Deployments:
+    """Brings every Application to where its spec, the inventory and its mission want it."""
+
+    def __init__(
+        self,
+        store: Store,
+        live: LiveInventory,
+        authority: Authority,
+        clock: Callable[[], datetime],
+        settings: Settings | None = None,
+    ) -> None:
+        self._store = store
+        self._live = live
+        self._authority = authority
+        self._clock = clock
+        self._settings = settings or Settings()
+        self._children = Children(store, live)
+        self._memories: dict[Key, _Memory] = {}
+        self._torn_down: set[str] = set()
+
+    # -- entry points --
+
+    async def reconcile(self, key: Key) -> float:
+        """Go one step towards the desired state; safe to be killed at any point and to run again.
+
+        Returns:
+            In how many seconds to run again if nothing changes before.
+        """
+        submitted = self._live.applications.get(key)
+        if submitted is None:
+            return RESYNC_S
+        metadata = submitted.metadata
+        # Without the finalizer nothing is made: a deletion now would leave grants behind.
+        if metadata.deletion_timestamp or FINALIZER not in metadata.finalizers or metadata.uid in self._torn_down:
+            return RESYNC_S
+        memory = self._memories.setdefault(key, _Memory())
+        async with memory.lock:
+            if metadata.uid in self._torn_down:
+                return RESYNC_S
+            standing, again_s = await self._advance(key, submitted, memory)
+            if standing is not None:
+                await self._report(submitted, standing, memory)
+            return min(again_s, RESYNC_S)
+
+    async def teardown(self, key: Key, uid: str) -> None:
+        """Revoke every grant of an application that is being deleted; what it owns is collected after it.
+
+        The drone is brought home by its own services once its grant is gone.
+        """
+        self._torn_down.add(uid)
+        memory = self._memories.setdefault(key, _Memory())
+        async with memory.lock:
+            await self._children.revoke(key)
+            for kind in (kinds.DEPLOYMENT, kinds.SECRET):
+                await self._children.remove(key, kind)
+        self._memories.pop(key, None)
+        self._live.forget(key)
+
+    # -- steps --
+
+    async def _advance(self, key: Key, submitted: Submitted, memory: _Memory) -> tuple[Standing | None, float]:
+        """One step; the standing to report, if any, and when to look again."""
+        status = self._status(submitted, memory)
+        if status.get("phase") in SETTLED:
+            same = status.get("observedGeneration") == submitted.metadata.generation
+            left_over = await self._clear(key)
+            if same or left_over:
+                # The last mission's grants must be gone before a new one begins.
+                return None, RESYNC_S if same else 1.0
+        present = self._present(key, submitted.metadata.uid or "")
+        outcome = mission_outcome(submitted.metadata.uid, self._live.grants_of(key))
+        if outcome is not None:
+            # Reported before anything is removed: the grants are the only other record of it.
+            await self._report(submitted, finished_standing(outcome, present), memory)
+            await self._clear(key)
+            return None, RESYNC_S
+        try:
+            return await self._progress(key, submitted, memory)
+        except Hindered as hindrance:
+            return hindered_standing(hindrance, present), hindrance.again_s
+
+    async def _progress(self, key: Key, submitted: Submitted, memory: _Memory) -> tuple[Standing, float]:
+        application = submitted.application
+        if application is None:
+            raise Hindered("Invalid", "Planned", "Invalid", str(submitted.error))
+        try:
+            check_application(application, self._live.snapshot().depots)
+            decided, again_s = self._plan(application, memory)
+        except InvalidObject as error:
+            raise Hindered("Invalid", "Planned", "Invalid", str(error)) from error
+        except Infeasible as none:
+            phase: Phase = "Queued" if none.reason == "DroneBusy" else "Pending"
+            raise Hindered(phase, "Planned", none.reason, none.message) from none
+        try:
+            grants = compile_grants(application, decided, self._live.snapshot(), self._settings)
+        except InvalidObject as error:
+            raise Hindered("Pending", "Granted", "PolicyInvalid", str(error)) from error
+        try:
+            await self._deploy(application, decided, grants)
+        except NameTaken as error:
+            raise Hindered("Pending", "Deployed", "NameTaken", str(error), again_s=2.0) from error
+        return deployed_standing(decided, self._live.pods_of(key), len(grants)), again_s
+
+    def _plan(self, application: Application, memory: _Memory) -> tuple[DeploymentPlanSpec, float]:
+        """The plan to deploy: the present one while it stands, else a new one that moves as little as it can.
+
+        There is no await between looking at the inventory and deciding, so two applications never
+        get one drone.
+        """
+        key, uid, now = application.key, application.metadata.uid or "", self._clock()
+        inventory = self._live.snapshot()
+        previous = self._live.plan_of(key, uid)
+        stuck, again_s = stuck_nodes(previous, self._live.pods_of(key), now)
+        reason = replan_reason(application, previous, inventory, stuck)
+        if previous is not None and reason is None:
+            return previous, again_s or RESYNC_S
+        memory.excluded = {n: (until, why) for n, (until, why) in memory.excluded.items() if until > now}
+        memory.excluded |= {node: (now + EXCLUSION, why) for node, why in stuck.items()}
+        settings = replace(self._settings, excluded={n: why for n, (_, why) in memory.excluded.items()})
+        decided = plan(application, inventory, settings, previous)
+        self._live.decide(key, uid, decided)
+        drone = f" with drone {decided.drone.node}" if decided.drone is not None else ""
+        logger.info("%s/%s is planned (%s)%s", *key, reason, drone)
+        return decided, RESYNC_S
+
+    async def _deploy(
+        self, application: Application, decided: DeploymentPlanSpec, grants: tuple[GrantSpec, ...]
+    ) -> None:
+        """Make the children what the plan says: what is stale goes first, then each kind in order."""
+        wanted: dict[Kind, list[Body]] = {kind: [] for kind in kinds.CHILDREN}
+        wanted[kinds.DEPLOYMENT_PLAN] = [builders.deployment_plan(application, decided)]
+        wanted[kinds.GRANT] = [builders.grant(application, spec) for spec in grants]
+        for component in _with_service(application):
+            wanted[kinds.SERVICE].append(builders.service(application, component))
+            if component.placement == "hybrid":
+                wanted[kinds.ENDPOINT_SLICE].append(self._base_path(application, decided, component))
+        drones = self._live.snapshot().drones
+        for placed in decided.placements:
+            drone = drones.get(placed.node) if placed.node is not None else None
+            wanted[kinds.DEPLOYMENT].append(builders.deployment(application, placed, drone))
+        secrets = {builders.secret_name(placed.instance): placed for placed in decided.placements}
+        await self._children.prune(application, wanted, keep_secrets=secrets.keys())
+        for placed in secrets.values():
+            wanted[kinds.SECRET].append(await self._certificate(application, placed))
+        for kind in kinds.CHILDREN:
+            await self._children.apply(application, kind, wanted[kind])
+
+    def _base_path(self, application: Application, decided: DeploymentPlanSpec, component: Component) -> Body:
+        instances = set(builders.base_instances(decided, component))
+        pods = [pod for pod in self._live.pods_of(application.key) if pod.instance in instances]
+        return builders.endpoint_slice(application, component, pods)
+
+    async def _certificate(self, application: Application, placed: PlannedInstance) -> Body:
+        """The Secret of an instance: the present certificate while it is good, so that a restart renews nothing."""
+        namespace, name = application.key
+        identity = component_identity(namespace, name, placed.component, placed.instance)
+        observed = await self._children.observed(kinds.SECRET, (namespace, builders.secret_name(placed.instance)))
+        data = dict((observed or {}).get("data") or {})
+        now = self._clock()
+        if not self._authority.still_good(data, identity, now):
+            data = self._authority.issue_component(identity, now)
+        return builders.tls_secret(application, placed, data)
+
+    async def _clear(self, key: Key) -> bool:
+        """Remove what a mission that is over leaves, but the plan; True if there was anything."""
+        removed = False
+        for kind in (kinds.GRANT, kinds.DEPLOYMENT, kinds.ENDPOINT_SLICE, kinds.SERVICE, kinds.SECRET):
+            removed |= await self._children.remove(key, kind)
+        if removed:
+            self._live.forget(key)
+        return removed
+
+    # -- reporting --
+
+    def _present(self, key: Key, uid: str) -> Standing | None:
+        """What is deployed by an earlier plan, if anything."""
+        decided = self._live.plan_of(key, uid)
+        if decided is None or not self._live.children_of(key, kinds.DEPLOYMENT):
+            return None
+        return deployed_standing(decided, self._live.pods_of(key), 0)
+
+    def _status(self, submitted: Submitted, memory: _Memory) -> Body:
+        if memory.status is not None and memory.status[0] == submitted.metadata.uid:
+            return memory.status[1]
+        return dict(submitted.body.get("status") or {})
+
+    async def _report(self, submitted: Submitted, standing: Standing, memory: _Memory) -> None:
+        """Write the status if it differs from the present one, then an Event for each transition."""
+        now = self._clock()
+        before = self._status(submitted, memory)
+        previous = [Condition.model_validate(c) for c in before.get("conditions") or ()]
+        generation = submitted.metadata.generation
+        conditions, news = merge(previous, standing.facts, generation, now)
+        status: Body = {
+            "observedGeneration": generation,
+            "phase": standing.phase,
+            "message": standing.message,
+            "conditions": [condition.to_dict() for condition in conditions],
+        }
+        if standing.drone is not None:
+            status["drone"] = standing.drone
+        if standing.pods is not None:
+            status["pods"] = standing.pods
+        if status == before:
+            return
+        try:
+            await self._store.apply(
+                kinds.APPLICATION, builders.application_status(submitted.body, status), subresource="status"
+            )
+        except Taken:
+            return
+        memory.status = (submitted.metadata.uid or "", status)
+        await self._announce(submitted, news, now)
+
+    async def _announce(self, submitted: Submitted, news: tuple[Fact, ...], now: datetime) -> None:
+        for i, fact in enumerate(_worth_telling(news)):
+            name = f"{submitted.metadata.name}.{int(now.timestamp() * 1000):x}.{i}"
+            try:
+                await self._store.record_event(
+                    submitted.body,
+                    reason=fact.reason,
+                    message=fact.message,
+                    warning=fact.warning,
+                    name=name,
+                    now=now,
+                )
+            except StoreError as error:
+                logger.warning("Event %s of %s: %s", fact.reason, submitted.metadata.name, error)
+
+
+def _with_service(application: Application) -> Iterator[Component]:
+    return (c for c in application.spec.components if c.container.ports)
+
+
+def _worth_telling(news: tuple[Fact, ...]) -> Iterator[Fact]:
+    """One Event for each new reason; what is merely on its way is in the status."""
+    told: set[str] = set()
+    for fact in news:
+        if fact.reason not in told and fact.reason not in {"MissionUnderway", "PodsNotReady"}:
+            told.add(fact.reason)
+            yield fact

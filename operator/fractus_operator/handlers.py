@@ -1,0 +1,75 @@
+"""The kopf handlers: an Application's life from its first sight to its finalizer."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+
+import kopf
+
+from fractus_operator.deployments import Deployments
+from fractus_operator.inventory import LiveInventory
+from fractus_operator.kinds import APPLICATION, Key
+from fractus_operator.labels import FINALIZER
+from fractus_operator.store import StoreError
+
+logger = logging.getLogger(__name__)
+
+_DEBOUNCE_S = 0.05
+_BACKOFF_S = (0.5, 30.0)
+_RETRY_S = 5.0
+
+
+def register(registry: kopf.OperatorRegistry, live: LiveInventory, deployments: Deployments) -> None:
+    """Register the handlers of Applications."""
+    group, version = APPLICATION.api_version.split("/")
+
+    @kopf.daemon(group, version, APPLICATION.plural, registry=registry, backoff=_RETRY_S, cancellation_timeout=5.0)
+    async def application(namespace: str | None, name: str, stopped: kopf.DaemonStopped, **_: object) -> None:
+        """Keep an application where its spec wants it: reconcile, then wait for an input to change."""
+        await follow(live, deployments, (namespace or "", name), stopped)
+
+    @kopf.on.delete(group, version, APPLICATION.plural, registry=registry, backoff=_RETRY_S)
+    async def application_deleted(namespace: str | None, name: str, uid: str, **_: object) -> None:
+        """Take an application down before its object goes."""
+        await live.synced()
+        try:
+            await deployments.teardown((namespace or "", name), uid)
+        except StoreError as error:
+            raise kopf.TemporaryError(str(error), delay=_RETRY_S) from error
+
+
+async def follow(live: LiveInventory, deployments: Deployments, key: Key, stopped: kopf.DaemonStopped) -> None:
+    """Reconcile an application whenever one of its inputs changes, until it is deleted."""
+    failures = 0
+    await live.synced()
+    with live.subscription(key) as inputs:
+        while not stopped:
+            try:
+                again_s = await deployments.reconcile(key)
+                failures = 0
+            except StoreError as error:
+                failures += 1
+                low, high = _BACKOFF_S
+                again_s = min(high, low * 2.0 ** min(failures, 8)) * random.uniform(0.5, 1.0)  # noqa: S311  (jitter)
+                logger.warning("%s/%s: %s; again in %.1f s", *key, error, again_s)
+            if await inputs.changed(again_s):
+                # Changes come in bursts, such as the pods of a plan: one reconcile for all.
+                await asyncio.sleep(_DEBOUNCE_S)
+
+
+def configure(settings: kopf.OperatorSettings) -> None:
+    """Set kopf up: our names on objects, no Events of its own, watches that cannot go silent."""
+    settings.persistence.finalizer = FINALIZER
+    settings.persistence.progress_storage = kopf.AnnotationsProgressStorage(prefix="kopf.fractus.dev")
+    settings.persistence.diffbase_storage = kopf.AnnotationsDiffBaseStorage(prefix="kopf.fractus.dev")
+    settings.posting.enabled = False
+    settings.peering.standalone = True
+    settings.scanning.disabled = True
+    settings.watching.server_timeout = 240
+    settings.watching.client_timeout = 300
+    settings.watching.connect_timeout = 15
+    settings.networking.request_timeout = 30
+    settings.background.cancellation_polling = 5
+    settings.process.ultimate_exiting_timeout = 10

@@ -1,0 +1,52 @@
+"""Labels, annotations and names of the objects that Fractus makes."""
+
+from __future__ import annotations
+
+import hashlib
+
+from fractus_core.api import GROUP, Component
+
+APPLICATION_LABEL = f"{GROUP}/application"
+COMPONENT_LABEL = f"{GROUP}/component"
+INSTANCE_LABEL = f"{GROUP}/instance"
+PLACEMENT_LABEL = f"{GROUP}/placement"
+NAMESPACE_LABEL = f"{GROUP}/namespace"
+"""On Grants, which are cluster-scoped: the namespace of their application."""
+
+MANAGED_LABEL = "app.kubernetes.io/managed-by"
+MANAGED_BY = "fractus"
+MANAGED_SELECTOR = f"{MANAGED_LABEL}={MANAGED_BY},{APPLICATION_LABEL}"
+
+DIGEST_ANNOTATION = f"{GROUP}/applied"
+"""Digest of what was applied last, so that an unchanged object is not written again."""
+
+FINALIZER = f"{GROUP}/teardown"
+CLASS_LABEL = f"{GROUP}/class"
+DEPOT_LABEL = f"{GROUP}/depot"
+GEOHASH_LABEL = f"{GROUP}/geohash"
+INTERFACE_LABEL = f"{GROUP}/interface-"
+
+
+def object_name(text: str) -> str:
+    """A DNS label of at most 63 characters that begins with a letter, as Services need; long names end in a hash."""
+    name = text if text[:1].isalpha() else f"a-{text}"
+    if len(name) <= 63:
+        return name
+    return name[:54].rstrip("-") + "-" + hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def service_name(application: str, component: Component) -> str:
+    """Name of the Service of a component."""
+    return object_name(f"{application}-{component.slug}")
+
+
+def grant_name(namespace: str, instance: str) -> str:
+    """Name of the Grant of an instance: instance names are unique within a namespace, and neither part has a dot."""
+    return f"{namespace}.{instance}"
+
+
+def label_value(text: str) -> str:
+    """The text as a label value: at most 63 characters; longer ones end in a hash."""
+    if len(text) <= 63:
+        return text
+    return text[:54].rstrip("-._") + "-" + hashlib.sha256(text.encode()).hexdigest()[:8]

@@ -1,0 +1,157 @@
+"""Keeps a local copy of a collection current: list, then watch, and list again where the watch cannot go on."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from typing import Generic, TypeVar
+
+from fractus_operator.kinds import Body, Key, Kind, key_of
+from fractus_operator.store import Expired, Store, StoreError
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+_WATCH_TIMEOUT_S = (240, 300)
+_SILENCE_S = 100.0
+_BACKOFF_S = (0.2, 30.0)
+
+
+class Reflector(Generic[T]):
+    """A current local copy of a collection.
+
+    Only what `parse` returns is kept, so a large collection costs what is used of it. Every
+    difference is reported to `on_change(key, old, new)`, also those found by listing again.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        kind: Kind,
+        parse: Callable[[Body], T],
+        on_change: Callable[[Key, T | None, T | None], None],
+        *,
+        selectors: Mapping[str, str] | None = None,
+        rng: random.Random | None = None,
+    ) -> None:
+        self.kind = kind
+        self.synced = asyncio.Event()
+        self.restarts = 0
+        self._store = store
+        self._parse = parse
+        self._on_change = on_change
+        self._selectors = dict(selectors or {})
+        self._rng = rng or random.Random()  # noqa: S311  (jitter)
+        self._objects: dict[Key, T] = {}
+        self._last_contact = float("-inf")
+
+    def get(self, key: Key) -> T | None:
+        """The object with this key, or None."""
+        return self._objects.get(key)
+
+    def items(self) -> Iterator[tuple[Key, T]]:
+        """Every object with its key."""
+        return iter(self._objects.items())
+
+    def values(self) -> Iterator[T]:
+        """Every object."""
+        return iter(self._objects.values())
+
+    def __len__(self) -> int:
+        """How many objects there are."""
+        return len(self._objects)
+
+    def note(self, key: Key, body: Body) -> None:
+        """Take what a write of our own returned, ahead of the watch; nobody is told of it."""
+        self._objects[key] = self._parse(self._typed(body))
+
+    def age_s(self) -> float:
+        """Seconds since the API server last said anything about the collection."""
+        return asyncio.get_running_loop().time() - self._last_contact
+
+    async def run(self) -> None:
+        """List and watch until cancelled; failures are retried with growing, jittered pauses."""
+        version = ""
+        failures = 0
+        while True:
+            try:
+                if not version:
+                    version = await self._list()
+                    failures = 0
+                async for seen in self._watch(version):
+                    version = seen
+                    failures = 0
+            except Expired:
+                logger.info("%s: the watch is too old to go on; listing again", self.kind.plural)
+                version = ""
+            except StoreError as error:
+                failures += 1
+                if error.status not in (0, 429) and error.status < 500:
+                    version = ""
+                log = logger.warning if failures > 1 else logger.info
+                log("%s: %s", self.kind.plural, error)
+                await asyncio.sleep(self._pause_s(failures))
+            self.restarts += 1
+
+    def _pause_s(self, failures: int) -> float:
+        low, high = _BACKOFF_S
+        return min(high, low * 2.0 ** min(failures, 10)) * self._rng.uniform(0.5, 1.0)
+
+    def _heard(self) -> None:
+        self._last_contact = asyncio.get_running_loop().time()
+
+    async def _list(self) -> str:
+        fresh: dict[Key, T] = {}
+        page = await self._store.list_page(self.kind, selectors=self._selectors)
+        while True:
+            for item in page.items:
+                fresh[key_of(item)] = self._parse(self._typed(item))
+            if not page.continue_:
+                break
+            page = await self._store.list_page(self.kind, selectors=self._selectors, continue_=page.continue_)
+        old, self._objects = self._objects, fresh
+        self._heard()
+        for key in old.keys() - fresh.keys():
+            self._on_change(key, old[key], None)
+        for key, new in fresh.items():
+            before = old.get(key)
+            if before is None or before != new:
+                self._on_change(key, before, new)
+        self.synced.set()
+        return page.resource_version
+
+    async def _watch(self, version: str) -> AsyncIterator[str]:
+        timeout_s = self._rng.randint(*_WATCH_TIMEOUT_S)
+        async for type_, body in self._store.watch(
+            self.kind,
+            resource_version=version,
+            selectors=self._selectors,
+            timeout_s=timeout_s,
+            silence_s=_SILENCE_S,
+        ):
+            self._heard()
+            if type_ != "BOOKMARK":
+                self._take(type_, body)
+            yield body["metadata"]["resourceVersion"]
+
+    def _take(self, type_: str, body: Body) -> None:
+        key = key_of(body)
+        old = self._objects.get(key)
+        if type_ == "DELETED":
+            self._objects.pop(key, None)
+            if old is not None:
+                self._on_change(key, old, None)
+            return
+        new = self._parse(self._typed(body))
+        self._objects[key] = new
+        if old is None or old != new:
+            self._on_change(key, old, new)
+
+    def _typed(self, item: Body) -> Body:
+        """Items of a list come without their kind; give it to them."""
+        item.setdefault("apiVersion", self.kind.api_version)
+        item.setdefault("kind", self.kind.name)
+        return item

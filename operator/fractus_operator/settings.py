@@ -1,0 +1,75 @@
+"""What an installation sets: read once from the environment."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from fractus_core.planning.inventory import Settings as PlanningSettings
+
+
+class BadSetting(ValueError):
+    """An environment variable has no usable value."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How the operator runs.
+
+    Attributes:
+        namespace: where the system lives.
+        agent_account: name of the agents' service account in that namespace.
+        health: URL that the liveness endpoint listens on.
+    """
+
+    namespace: str = "fractus-system"
+    agent_account: str = "fractus-agent"
+    health: str = "http://0.0.0.0:8080/healthz"
+    log_level: int = logging.INFO
+    planning: PlanningSettings = field(default_factory=PlanningSettings)
+
+    @property
+    def agent_user(self) -> str:
+        """User name of the agents."""
+        return f"system:serviceaccount:{self.namespace}:{self.agent_account}"
+
+    @classmethod
+    def from_environment(cls, environment: Mapping[str, str]) -> Settings:
+        """Read FRACTUS_SYSTEM_NAMESPACE, FRACTUS_AGENT_ACCOUNT, FRACTUS_HEALTH, FRACTUS_LOG_LEVEL and the FRACTUS_PLANNING_*.
+
+        Raises:
+            BadSetting: naming the variable.
+        """
+        default = cls()
+        level = environment.get("FRACTUS_LOG_LEVEL", "INFO").upper()
+        if level not in logging.getLevelNamesMapping():
+            raise BadSetting(f"FRACTUS_LOG_LEVEL: {level} is no level; use DEBUG, INFO, WARNING or ERROR")
+        planning = PlanningSettings(
+            safety_radius_m=_number(environment, "FRACTUS_PLANNING_SAFETY_RADIUS", default.planning.safety_radius_m),
+            depot_radius_m=_number(environment, "FRACTUS_PLANNING_DEPOT_RADIUS", default.planning.depot_radius_m),
+            coverage_share=_number(environment, "FRACTUS_PLANNING_COVERAGE_SHARE", default.planning.coverage_share),
+            cruise_speed_mps=_number(environment, "FRACTUS_PLANNING_CRUISE_SPEED", default.planning.cruise_speed_mps),
+            climb_speed_mps=_number(environment, "FRACTUS_PLANNING_CLIMB_SPEED", default.planning.climb_speed_mps),
+            battery_reserve=_number(environment, "FRACTUS_PLANNING_BATTERY_RESERVE", default.planning.battery_reserve),
+        )
+        return cls(
+            namespace=environment.get("FRACTUS_SYSTEM_NAMESPACE", default.namespace),
+            agent_account=environment.get("FRACTUS_AGENT_ACCOUNT", default.agent_account),
+            health=environment.get("FRACTUS_HEALTH", default.health),
+            log_level=logging.getLevelNamesMapping()[level],
+            planning=planning,
+        )
+
+
+def _number(environment: Mapping[str, str], name: str, default: float) -> float:
+    text = environment.get(name)
+    if text is None or text == "":
+        return default
+    try:
+        value = float(text)
+    except ValueError:
+        raise BadSetting(f"{name}: {text!r} is not a number") from None
+    if not 0 <= value < float("inf"):
+        raise BadSetting(f"{name}: must not be negative, but is {text}")
+    return value

@@ -1,0 +1,309 @@
+"""The only module that talks to the API server: reads, watches, server-side applies, deletes.
+
+It uses lightkube's connection (credentials from KUBECONFIG or the pod's service account, rotated
+tokens, TLS), and speaks plain JSON over it: dicts need no schema of every kind, and the watch can
+ask for bookmarks and time out, which lightkube's own watch does not offer.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import AsyncIterator, Mapping
+from datetime import datetime
+from typing import Any, Self
+
+import httpx2
+from lightkube.config.client_adapter import AsyncClient, ConnectionParams
+from lightkube.config.kubeconfig import KubeConfig
+from lightkube.core.exceptions import ConfigError
+
+from fractus_operator.kinds import EVENT, Body, Key, Kind
+
+FIELD_MANAGER = "fractus-operator"
+_REQUEST_TIMEOUT_S = 15.0
+_PAGE = 500
+
+
+class StoreError(Exception):
+    """The API server refused a request, or could not be reached.
+
+    Attributes:
+        status: HTTP status; 0 where there was no answer.
+        reason: Kubernetes' CamelCase reason, such as Conflict; "Unreachable" where there was no answer.
+    """
+
+    def __init__(self, status: int, reason: str, message: str) -> None:
+        self.status = status
+        self.reason = reason
+        super().__init__(message)
+
+
+class NotFound(StoreError):
+    """There is no such object."""
+
+
+class Taken(StoreError):
+    """An object of that name exists, or it changed meanwhile (409)."""
+
+
+class Expired(StoreError):
+    """The resource version is too old to continue from (410): list again."""
+
+
+class Unconfigured(Exception):
+    """No credentials for an API server were found."""
+
+
+_ERRORS: Mapping[int, type[StoreError]] = {404: NotFound, 409: Taken, 410: Expired}
+
+
+class Page:
+    """One page of a list."""
+
+    __slots__ = ("continue_", "items", "resource_version")
+
+    def __init__(self, body: Body) -> None:
+        self.items: list[Body] = body.get("items") or []
+        self.resource_version: str = body["metadata"].get("resourceVersion", "")
+        self.continue_: str = body["metadata"].get("continue", "")
+
+
+class Store:
+    """Kubernetes, as far as the operator uses it."""
+
+    def __init__(self, client: httpx2.AsyncClient) -> None:
+        self._client = client
+
+    @classmethod
+    def connect(cls) -> Self:
+        """Open the cluster of KUBECONFIG, or the one this pod runs in.
+
+        Raises:
+            Unconfigured: there are no credentials.
+        """
+        try:
+            config = KubeConfig.from_env().get()
+        except ConfigError as error:
+            raise Unconfigured(f"no cluster: set KUBECONFIG, or run in a pod ({error})") from error
+        if config is None:
+            raise Unconfigured("the kubeconfig has no current context; choose one with kubectl config use-context")
+        return cls(AsyncClient(config, ConnectionParams(timeout=httpx2.Timeout(_REQUEST_TIMEOUT_S))))
+
+    async def close(self) -> None:
+        """Close every connection."""
+        await self._client.aclose()
+
+    async def get(self, kind: Kind, name: str, namespace: str = "") -> Body:
+        """Read an object.
+
+        Raises:
+            NotFound: there is none of that name.
+        """
+        return await self._send("GET", kind.path(namespace, name))
+
+    async def list_page(
+        self, kind: Kind, *, selectors: Mapping[str, str] | None = None, continue_: str = "", limit: int = _PAGE
+    ) -> Page:
+        """Read one page of a collection over all namespaces.
+
+        Args:
+            kind: Which collection.
+            selectors: labelSelector and fieldSelector, where wanted.
+            continue_: What the page before gave, to go on from.
+            limit: Objects a page.
+
+        Raises:
+            Expired: the list changed so much that it must be read from its beginning.
+        """
+        params = {"limit": str(limit), **(selectors or {})}
+        if continue_:
+            params["continue"] = continue_
+        return Page(await self._send("GET", kind.path(), params=params))
+
+    async def list(self, kind: Kind, *, selectors: Mapping[str, str] | None = None) -> list[Body]:
+        """Read a whole collection over all namespaces."""
+        items: list[Body] = []
+        page = await self.list_page(kind, selectors=selectors)
+        items += page.items
+        while page.continue_:
+            page = await self.list_page(kind, selectors=selectors, continue_=page.continue_)
+            items += page.items
+        return items
+
+    async def watch(
+        self,
+        kind: Kind,
+        *,
+        resource_version: str,
+        selectors: Mapping[str, str] | None = None,
+        timeout_s: int,
+        silence_s: float,
+    ) -> AsyncIterator[tuple[str, Body]]:
+        """Follow a collection: (ADDED | MODIFIED | DELETED | BOOKMARK, object), until the server ends it.
+
+        Args:
+            kind: Which collection.
+            resource_version: Where to go on from.
+            selectors: As for the list.
+            timeout_s: The server ends the watch after this time.
+            silence_s: The connection counts as dead after this time without a byte (the server sends a
+                bookmark about every minute).
+
+        Raises:
+            Expired: the resource version is too old.
+        """
+        params = {
+            "watch": "true",
+            "allowWatchBookmarks": "true",
+            "resourceVersion": resource_version,
+            "timeoutSeconds": str(timeout_s),
+            **(selectors or {}),
+        }
+        timeout = httpx2.Timeout(_REQUEST_TIMEOUT_S, read=silence_s)
+        try:
+            async with self._client.stream("GET", kind.path(), params=params, timeout=timeout) as response:
+                if response.status_code >= 400:
+                    await response.aread()
+                    raise _error(response)
+                async for line in response.aiter_lines():
+                    if not line:
+                        continue
+                    event = json.loads(line)
+                    if event["type"] == "ERROR":
+                        raise _from_status(event["object"])
+                    yield event["type"], event["object"]
+        except httpx2.HTTPError as error:
+            raise StoreError(0, "Unreachable", f"watch of {kind.plural}: {type(error).__name__}: {error}") from error
+
+    async def create(self, kind: Kind, body: Body) -> Body:
+        """Create an object.
+
+        Raises:
+            Taken: one of that name exists.
+        """
+        namespace, _ = _place(body)
+        return await self._send("POST", kind.path(namespace), params={"fieldManager": FIELD_MANAGER}, body=body)
+
+    async def apply(self, kind: Kind, body: Body, *, subresource: str = "") -> Body:
+        """Make an object's fields as given, by server-side apply; fields of others stay.
+
+        With metadata.uid in the body, an object that is gone or was made anew is left alone.
+
+        Raises:
+            Taken: metadata.uid does not match.
+        """
+        namespace, name = _place(body)
+        return await self._send(
+            "PATCH",
+            kind.path(namespace, name, subresource),
+            params={"fieldManager": FIELD_MANAGER, "force": "true"},
+            body=body,
+            content_type="application/apply-patch+yaml",
+        )
+
+    async def replace(self, kind: Kind, body: Body, *, subresource: str) -> Body:
+        """Write a subresource that takes no apply, such as a signing request's approval.
+
+        Raises:
+            Taken: the object changed since it was read.
+        """
+        namespace, name = _place(body)
+        return await self._send("PUT", kind.path(namespace, name, subresource), body=body)
+
+    async def delete(self, kind: Kind, key: Key, uid: str | None = None) -> None:
+        """Delete an object and, in the background, what it owns; one that is gone already is no error."""
+        options: Body = {"propagationPolicy": "Background"}
+        if uid is not None:
+            options["preconditions"] = {"uid": uid}
+        try:
+            await self._send("DELETE", kind.path(*key), body=options)
+        except NotFound:
+            return
+        except Taken:
+            if uid is None:
+                raise
+
+    async def record_event(
+        self, regarding: Body, *, reason: str, message: str, warning: bool, name: str, now: datetime
+    ) -> None:
+        """Post an Event about an object, as `kubectl describe` shows it.
+
+        Args:
+            regarding: apiVersion, kind, metadata.name, metadata.namespace and metadata.uid are taken.
+            reason: CamelCase.
+            message: One sentence.
+            warning: Type Warning rather than Normal.
+            name: Name of the Event; a second one of that name is dropped.
+            now: When it happened.
+        """
+        metadata = regarding["metadata"]
+        namespace = metadata.get("namespace") or "default"
+        reference = {
+            "apiVersion": regarding["apiVersion"],
+            "kind": regarding["kind"],
+            "name": metadata["name"],
+            "uid": metadata.get("uid", ""),
+        }
+        if "namespace" in metadata:
+            reference["namespace"] = namespace
+        stamp = now.strftime("%Y-%m-%dT%H:%M:%SZ")
+        body = {
+            **EVENT.header(name, namespace),
+            "involvedObject": reference,
+            "reason": reason,
+            "message": message[:1024],
+            "type": "Warning" if warning else "Normal",
+            "firstTimestamp": stamp,
+            "lastTimestamp": stamp,
+            "count": 1,
+            "source": {"component": FIELD_MANAGER},
+            "reportingComponent": FIELD_MANAGER,
+        }
+        try:
+            await self.create(EVENT, body)
+        except Taken:
+            return
+
+    async def _send(
+        self,
+        method: str,
+        path: str,
+        *,
+        params: Mapping[str, str] | None = None,
+        body: Body | None = None,
+        content_type: str = "application/json",
+    ) -> Body:
+        try:
+            response = await self._client.request(
+                method,
+                path,
+                params=params,
+                content=None if body is None else json.dumps(body),
+                headers=None if body is None else {"Content-Type": content_type},
+            )
+        except httpx2.HTTPError as error:
+            raise StoreError(0, "Unreachable", f"{method} {path}: {type(error).__name__}: {error}") from error
+        if response.status_code >= 400:
+            raise _error(response)
+        result: Body = response.json()
+        return result
+
+
+def _place(body: Body) -> Key:
+    return body["metadata"].get("namespace", ""), body["metadata"]["name"]
+
+
+def _error(response: httpx2.Response) -> StoreError:
+    try:
+        status: Any = response.json()
+    except ValueError:
+        status = None
+    if not isinstance(status, dict):
+        status = {"message": response.text[:500]}
+    return _from_status({"code": response.status_code, **status})
+
+
+def _from_status(status: Body) -> StoreError:
+    code = int(status.get("code") or 500)
+    kind = _ERRORS.get(code, StoreError)
+    return kind(code, str(status.get("reason") or "Unknown"), str(status.get("message") or f"HTTP {code}"))

@@ -301,14 +301,15 @@ class Mobility:
         return result
 
 
-def mobility(target: Endpoint | None = None, *, strict: bool = False) -> Mobility:
+def mobility(target: Endpoint | None = None, *, strict: bool = False, patience_s: float = PATIENCE_S) -> Mobility:
     """The mobility service of this node: `async with fractus.mobility() as drone`.
 
     Args:
         target: where it is; by default what the pod's environment says.
         strict: raise `Corrected` when a policy changes what was asked.
+        patience_s: how long calls wait for a service that is restarting.
 
     Raises:
         NotConfigured: not in a pod of a Fractus application, and no target given.
     """
-    return Mobility(target or endpoint("mobility"), strict=strict)
+    return Mobility(target or endpoint("mobility"), strict=strict, patience_s=patience_s)

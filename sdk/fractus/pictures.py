@@ -84,13 +84,14 @@ class Camera:
         return Result(decision=Decision.from_proto(reply))
 
 
-def camera(target: Endpoint | None = None) -> Camera:
+def camera(target: Endpoint | None = None, *, patience_s: float = PATIENCE_S) -> Camera:
     """The camera service of this node: `async with fractus.camera() as camera`.
 
     Args:
         target: where it is; by default what the pod's environment says.
+        patience_s: how long calls wait for a service that is restarting.
 
     Raises:
         NotConfigured: not in a pod of a Fractus application, and no target given.
     """
-    return Camera(target or endpoint("camera"))
+    return Camera(target or endpoint("camera"), patience_s=patience_s)

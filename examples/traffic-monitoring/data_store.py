@@ -1,0 +1,50 @@
+"""DataStore, in the cloud: keeps what the ImageCheckers find, a JSON line each, for as long as its pod lives."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from email.message import Message
+from pathlib import Path
+from typing import Any
+
+from web import serve
+
+PORT = 8080
+RESULTS = Path("/tmp/results.jsonl")  # an emptyDir: survives a restart of the container
+MAX_BYTES = 32 * 2**20
+log = logging.getLogger("data-store")
+writing = threading.Lock()
+
+
+def keep(body: bytes, headers: Message) -> dict[str, Any]:
+    """Append a result.
+
+    Raises:
+        ValueError: it is not a JSON object.
+        OSError: the store is full.
+    """
+    result = json.loads(body)
+    if not isinstance(result, dict):
+        raise ValueError("a result is a JSON object")  # noqa: TRY004 (the sender's mistake)
+    line = json.dumps(result, separators=(",", ":")) + "\n"
+    with writing, RESULTS.open("a") as file:
+        if file.tell() + len(line) > MAX_BYTES:
+            raise OSError(f"the store is full at {MAX_BYTES} bytes")
+        file.write(line)
+    log.info("kept %s of %s", result.get("picture"), result.get("source"))
+    return {"kept": True}
+
+
+def results(body: bytes, headers: Message) -> list[Any]:
+    """Everything kept so far, oldest first."""
+    with writing:
+        lines = RESULTS.read_text().splitlines() if RESULTS.exists() else []
+    return [json.loads(line) for line in lines]
+
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
+    log.info("listening on port %d, %d results kept before", PORT, len(results(b"", Message())))
+    serve(PORT, get={"/results": results}, post={"/results": keep})

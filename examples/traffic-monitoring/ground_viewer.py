@@ -1,0 +1,6 @@
+"""GroundViewer, at the roadside: a picture every 5 s."""
+
+import pictures
+
+if __name__ == "__main__":
+    pictures.main(interval_s=5.0)

@@ -1,0 +1,74 @@
+"""Looking at the road: take a picture every so often and hand it to the ImageChecker."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+import struct
+import zlib
+
+import fractus
+from web import post
+
+log = logging.getLogger("viewer")
+
+
+async def watch(interval_s: float) -> None:
+    """Take, fetch and send pictures until SIGTERM; what goes wrong with one of them is logged, and the next one taken."""
+    stop = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
+    checker = fractus.egress("ImageChecker")
+    number, said = 0, ""
+    async with fractus.camera(patience_s=1.0) as camera:
+        while not stop.is_set():
+            number += 1
+            try:
+                name, picture = await look(camera, number)
+                headers = {"X-Picture": name, "X-Source": os.environ["FRACTUS_INSTANCE"]}
+                found = await asyncio.to_thread(post, checker, "/check", picture, headers)
+                log.info("sent %s (%d bytes); %s found %s", name, len(picture), found["by"], found["summary"])
+            except fractus.PolicyDenied as refusal:
+                if refusal.code != said:
+                    log.info("no picture here: %s", refusal)
+                said = refusal.code
+            except (fractus.FractusError, OSError) as error:
+                log.warning("picture %d: %s", number, error)
+            else:
+                said = ""
+            try:
+                await asyncio.wait_for(stop.wait(), interval_s)
+            except TimeoutError:
+                continue
+
+
+async def look(camera: fractus.Camera, number: int) -> tuple[str, bytes]:
+    """A picture from the node's camera, or a test picture where a node has no camera service yet."""
+    try:
+        info = await camera.capture()
+        return info.name, await camera.retrieve(info.name)
+    except fractus.Unavailable:
+        return f"test-{number}.png", render(160, 120, number)
+
+
+def render(width: int, height: int, number: int) -> bytes:
+    """A grey PNG of a road with a car on it that moves with the number."""
+    rows = []
+    for y in range(height):
+        road = height // 3 < y < 2 * height // 3
+        row = bytearray([90 if road else 150]) * width
+        if road and abs(y - height // 2) < height // 12:
+            at = number * 7 % (width - 16)
+            row[at : at + 16] = bytes([230]) * 16
+        rows.append(b"\0" + bytes(row))
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    parts = ((b"IHDR", header), (b"IDAT", zlib.compress(b"".join(rows))), (b"IEND", b""))
+    chunks = (struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in parts)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+
+
+def main(interval_s: float) -> None:
+    """Run a viewer."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
+    asyncio.run(watch(interval_s))

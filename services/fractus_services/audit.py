@@ -1,0 +1,229 @@
+"""The audit log: one JSON object a line, each carrying the hash of the one before it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import json
+import logging
+import os
+import queue
+import threading
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import click
+
+log = logging.getLogger(__name__)
+
+GENESIS = "0" * 64
+SYNC_S = 0.5
+"""Entries that do not decide anything are on disk after this time at the latest."""
+
+
+def digest(entry: dict[str, Any]) -> str:
+    """SHA-256 over the canonical JSON of an entry without its own hash."""
+    body = {key: value for key, value in entry.items() if key != "hash"}
+    return hashlib.sha256(_canonical(body)).hexdigest()
+
+
+def _canonical(value: dict[str, Any]) -> bytes:
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
+
+
+def _plain(value: Any) -> Any:
+    """JSON without NaN and infinities: they become text."""
+    if isinstance(value, float) and (value != value or value in {float("inf"), float("-inf")}):
+        return str(value)
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    return value
+
+
+class AuditLog:
+    """Appends entries; a thread writes them, so that a slow disk never holds up a flight.
+
+    Args:
+        path: the file; a chain that it holds is continued, a last line torn by a crash is cut off and noted.
+        clock: Unix time in seconds.
+    """
+
+    def __init__(self, path: Path, clock: Callable[[], float]) -> None:
+        self._path = path
+        self._clock = clock
+        self._queue: queue.SimpleQueue[tuple[bytes, bool] | None] = queue.SimpleQueue()
+        self.failure = ""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        torn = _cut_torn_line(path)
+        self._sequence, self._previous = _last_link(path)
+        self._thread = threading.Thread(target=self._write, name="audit", daemon=True)
+        self._thread.start()
+        if torn:
+            self.append("recovered", {"torn_bytes": torn})
+
+    def append(self, kind: str, content: dict[str, Any], now: bool = True) -> None:
+        """Add an entry.
+
+        Args:
+            kind: call, takeover, control, grant, state, ...
+            content: JSON values.
+            now: whether it must reach the disk at once.
+        """
+        self._sequence += 1
+        moment = datetime.fromtimestamp(self._clock(), UTC).isoformat(timespec="milliseconds")
+        entry = {"seq": self._sequence, "time": moment, "kind": kind, **_plain(content), "prev": self._previous}
+        self._previous = entry["hash"] = digest(entry)
+        self._queue.put((_canonical(entry) + b"\n", now))
+
+    async def close(self) -> None:
+        """Write what is left."""
+        self._queue.put(None)
+        await asyncio.to_thread(self._thread.join, 5.0)
+
+    def _write(self) -> None:
+        """The thread: append in batches, one fsync for each."""
+        pending: list[bytes] = []
+        while True:
+            try:
+                item = self._queue.get(timeout=SYNC_S if pending else None)
+            except queue.Empty:
+                item = (b"", True)
+            if item is not None and item[0]:
+                pending.append(item[0])
+            if item is None or item[1]:
+                while not self._queue.empty() and item is not None:
+                    item = self._queue.get()
+                    if item is not None:
+                        pending.append(item[0])
+                pending = self._flush(pending)
+                if item is None:
+                    return
+
+    def _flush(self, lines: list[bytes]) -> list[bytes]:
+        """Append and sync; returns what could not be written, to be tried again."""
+        if not lines:
+            return lines
+        try:
+            file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o640)
+            try:
+                size = os.fstat(file).st_size
+                try:
+                    with os.fdopen(os.dup(file), "ab") as stream:
+                        stream.write(b"".join(lines))
+                except OSError:
+                    os.ftruncate(file, size)
+                    raise
+                os.fsync(file)
+            finally:
+                os.close(file)
+        except OSError as error:
+            if not self.failure:
+                log.error("cannot write the audit log %s: %s", self._path, error)
+            self.failure = f"the audit log cannot be written: {error.strerror or error}"
+            return lines[-10_000:]
+        self.failure = ""
+        return []
+
+
+def _cut_torn_line(path: Path) -> int:
+    """Cut what a crash left of a last line; returns how many bytes that were."""
+    try:
+        data_end = path.stat().st_size
+    except FileNotFoundError:
+        return 0
+    with path.open("r+b") as file:
+        at = data_end
+        while at > 0:
+            start = max(at - 65536, 0)
+            file.seek(start)
+            found = file.read(at - start).rfind(b"\n")
+            if found >= 0:
+                at = start + found + 1
+                break
+            at = start
+        if at < data_end:
+            file.truncate(at)
+    return data_end - at
+
+
+def _last_link(path: Path) -> tuple[int, str]:
+    """Sequence number and hash of the last entry."""
+    last = b""
+    with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
+        file.seek(0, os.SEEK_END)
+        size = file.tell()
+        file.seek(max(size - 1_000_000, 0))
+        lines = file.read().splitlines()
+        last = lines[-1] if lines else b""
+    if not last:
+        return 0, GENESIS
+    try:
+        entry = json.loads(last)
+        return int(entry["seq"]), str(entry["hash"])
+    except (ValueError, KeyError, TypeError):
+        log.error("the last entry of %s cannot be read; a new chain begins after it", path)
+        return 0, GENESIS
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What verification found.
+
+    Attributes:
+        entries: how many entries are sound.
+        line: number of the first bad line; 0 when all are sound.
+        problem: what is wrong with it; empty when all are sound.
+        torn: the last line is incomplete, as after a crash or while one is being written.
+    """
+
+    entries: int
+    line: int = 0
+    problem: str = ""
+    torn: bool = False
+
+
+def verify(lines: Iterable[bytes]) -> Finding:
+    """Check the chain of an audit log, line by line."""
+    previous, sequence, count = GENESIS, 0, 0
+    for number, line in enumerate(lines, 1):
+        if not line.endswith(b"\n"):
+            return Finding(count, torn=True)
+        problem = ""
+        try:
+            entry = json.loads(line)
+            if entry["prev"] != previous:
+                problem = "does not continue the line before it: something was removed, inserted or reordered"
+            elif entry["seq"] != sequence + 1:
+                problem = f"is number {entry['seq']}, where {sequence + 1} was expected"
+            elif digest(entry) != entry["hash"] or _canonical(entry) + b"\n" != line:
+                problem = "was changed after it was written"
+            previous, sequence = str(entry["hash"]), int(entry["seq"])
+        except (ValueError, KeyError, TypeError):
+            problem = "is not an audit entry"
+        if problem:
+            return Finding(count, number, problem)
+        count += 1
+    return Finding(count)
+
+
+@click.group()
+def audit() -> None:
+    """Audit logs of node services."""
+
+
+@audit.command("verify")
+@click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+def verify_command(file: Path) -> None:
+    """Check that no entry of FILE was changed, removed or inserted."""
+    with file.open("rb") as stream:
+        finding = verify(stream)
+    if finding.problem:
+        raise click.ClickException(f"{file}: line {finding.line} {finding.problem}")
+    torn = "; the last line is incomplete (a crash, or it is being written)" if finding.torn else ""
+    click.echo(f"{file}: {finding.entries} entries, chain sound{torn}")

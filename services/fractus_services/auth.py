@@ -1,0 +1,157 @@
+"""Who calls: identities from client certificates, and TLS whose files may change while the service runs."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import grpc
+from cryptography import x509
+
+log = logging.getLogger(__name__)
+
+FILES = ("tls.key", "tls.crt", "ca.crt")
+_SCHEME = "spiffe://"
+
+
+class NotAuthenticated(Exception):
+    """The caller's certificate proves nothing (any more)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """A peer as its certificate names it.
+
+    Attributes:
+        identity: SPIFFE id.
+        valid_from_s: Unix time.
+        valid_until_s: Unix time.
+    """
+
+    identity: str
+    valid_from_s: float
+    valid_until_s: float
+
+    def check(self, time_s: float) -> None:
+        """Handshakes check validity once; long connections must be checked again.
+
+        Raises:
+            NotAuthenticated: the certificate is not valid at this time.
+        """
+        if time_s >= self.valid_until_s:
+            raise NotAuthenticated("the client certificate has expired; connect again with the renewed one")
+        if time_s < self.valid_from_s - 60.0:
+            raise NotAuthenticated("the client certificate is not valid yet; check the clocks")
+
+
+@functools.lru_cache(maxsize=256)
+def _read(pem: bytes) -> Caller:
+    certificate = x509.load_pem_x509_certificate(pem)
+    try:
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        raise NotAuthenticated("the client certificate names no identity") from None
+    uris = [uri for uri in names.get_values_for_type(x509.UniformResourceIdentifier) if uri.startswith(_SCHEME)]
+    if len(uris) != 1:
+        raise NotAuthenticated(f"the client certificate must name one SPIFFE id, not {len(uris)}")
+    return Caller(
+        uris[0], certificate.not_valid_before_utc.timestamp(), certificate.not_valid_after_utc.timestamp()
+    )
+
+
+def caller_of(auth_context: Mapping[str, Any], time_s: float) -> Caller:
+    """The peer of a call.
+
+    Args:
+        auth_context: gRPC's authentication context of the call.
+        time_s: Unix time.
+
+    Raises:
+        NotAuthenticated: there is no certificate, or it names nobody, or it is not valid now.
+    """
+    chain = auth_context.get("x509_pem_cert") or ()
+    if not chain:
+        raise NotAuthenticated("no client certificate; connect with mutual TLS")
+    try:
+        caller = _read(bytes(chain[0]))
+    except ValueError:
+        raise NotAuthenticated("the client certificate cannot be read") from None
+    caller.check(time_s)
+    return caller
+
+
+class TlsFiles:
+    """Key, certificate and CA of a service, read again whenever they change."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self._stamp: tuple[tuple[int, int, int], ...] = ()
+
+    async def wait(self, poll_s: float = 0.5) -> None:
+        """Wait until all files are there; says so once."""
+        said = False
+        while True:
+            missing = [name for name in FILES if not self._present(name)]
+            if not missing:
+                return
+            if not said:
+                log.warning("waiting for %s in %s", ", ".join(missing), self._directory)
+                said = True
+            await asyncio.sleep(poll_s)
+
+    def _present(self, name: str) -> bool:
+        try:
+            return (self._directory / name).stat().st_size > 0
+        except OSError:
+            return False
+
+    def _stamps(self) -> tuple[tuple[int, int, int], ...]:
+        found = [(self._directory / name).stat() for name in FILES]
+        return tuple((s.st_mtime_ns, s.st_size, s.st_ino) for s in found)
+
+    def _load(self) -> tuple[bytes, bytes, bytes]:
+        key, certificate, ca = ((self._directory / name).read_bytes() for name in FILES)
+        return key, certificate, ca
+
+    def _configuration(self) -> Any:
+        stamp = self._stamps()
+        key, certificate, ca = self._load()
+        configuration = grpc.ssl_server_certificate_configuration([(key, certificate)], root_certificates=ca)
+        self._stamp = stamp
+        return configuration
+
+    def _changed(self) -> Any:
+        """Asked by gRPC at every handshake: a new configuration, or None to keep the present one."""
+        try:
+            return self._configuration() if self._stamps() != self._stamp else None
+        except OSError as error:
+            log.error("cannot read the renewed certificate, keeping the old one: %s", error)
+            return None
+
+    def server_credentials(self) -> Any:
+        """Credentials of a server that demands client certificates."""
+        return grpc.dynamic_ssl_server_credentials(self._configuration(), self._changed, True)  # noqa: FBT003
+
+    def client_credentials(self) -> Any:
+        """Credentials of a client, as the files are now."""
+        key, certificate, ca = self._load()
+        return grpc.ssl_channel_credentials(ca, key, certificate)
+
+
+KEEPALIVE = (
+    ("grpc.keepalive_time_ms", 2_000),
+    ("grpc.keepalive_timeout_ms", 2_000),
+    ("grpc.keepalive_permit_without_calls", 1),
+    ("grpc.http2.max_pings_without_data", 0),
+    ("grpc.http2.min_recv_ping_interval_without_data_ms", 1_000),
+    ("grpc.http2.max_ping_strikes", 0),
+    ("grpc.so_reuseport", 0),
+    ("grpc.max_receive_message_length", 64 * 1024),
+    ("grpc.max_concurrent_streams", 128),
+)
+"""Server options: a peer that does not answer pings is gone within four seconds."""

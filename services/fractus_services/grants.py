@@ -1,0 +1,144 @@
+"""The grants of this node, as files: watched, compiled, matched to callers."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from fractus_core.api.model import InvalidObject
+from fractus_core.api.plans import Grant, GrantSpec
+from fractus_core.policy.compiled import CompiledGrant, compile_grant
+
+log = logging.getLogger(__name__)
+
+RESCAN_MS = 2_000
+_Stamp = tuple[int, int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """One grant that is in force on this node.
+
+    Attributes:
+        key: names the mission: the grant object's uid, or the identity where nobody gave it one.
+    """
+
+    key: str
+    name: str
+    spec: GrantSpec
+    compiled: CompiledGrant
+
+    @property
+    def identity(self) -> str:
+        """SPIFFE id of the instance."""
+        return self.compiled.identity
+
+
+Listener = Callable[[Held | None, Held | None], None]
+"""Called with the grant before and after a change; None: there is none."""
+
+
+class GrantFiles:
+    """Watches a directory of Grant manifests.
+
+    What cannot be read or understood is not a grant: a file that turns bad takes its grant away.
+
+    Args:
+        directory: where the agent stores the grants; it may not exist yet.
+        node: the node that grants must be for.
+        flat_terrain: see `compile_grant`.
+    """
+
+    def __init__(self, directory: Path, node: str, flat_terrain: bool = False) -> None:
+        self._directory = directory
+        self._node = node
+        self._flat_terrain = flat_terrain
+        self._stamps: dict[Path, _Stamp] = {}
+        self._loaded: dict[Path, Held | None] = {}
+        self._held: dict[str, Held] = {}
+        self._listeners: list[Listener] = []
+
+    @property
+    def held(self) -> Mapping[str, Held]:
+        """Grants in force by identity."""
+        return self._held
+
+    def of(self, identity: str) -> Held | None:
+        """The grant of a caller."""
+        return self._held.get(identity)
+
+    def listen(self, listener: Listener) -> None:
+        """Call a listener at every change."""
+        self._listeners.append(listener)
+
+    async def run(self) -> None:
+        """Watch until cancelled; every change is known within a moment, and all files are looked at every 2 s."""
+        from watchfiles import awatch  # noqa: PLC0415 - starts a thread pool on import
+
+        while True:
+            self._directory.mkdir(parents=True, exist_ok=True)
+            try:
+                async for _ in awatch(
+                    self._directory, debounce=50, step=20, rust_timeout=RESCAN_MS, yield_on_timeout=True,
+                    recursive=False,
+                ):  # fmt: skip
+                    self.scan()
+            except (OSError, RuntimeError) as error:
+                log.error("cannot watch %s, looking again: %s", self._directory, error)
+            await asyncio.sleep(RESCAN_MS / 1000)
+            self.scan()
+
+    def scan(self) -> None:
+        """Read what changed."""
+        found: dict[Path, _Stamp] = {}
+        try:
+            for path in sorted(self._directory.glob("*.json")):
+                try:
+                    stat = path.stat()
+                except FileNotFoundError:
+                    continue
+                found[path] = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
+        except OSError as error:
+            log.error("cannot read the grants in %s: %s; nothing is granted", self._directory, error)
+        if found == self._stamps:
+            return
+        for path in self._stamps.keys() - found.keys():
+            self._loaded.pop(path, None)
+        for path, stamp in found.items():
+            if self._stamps.get(path) != stamp:
+                self._loaded[path] = self._load(path)
+        self._stamps = found
+        self._replace()
+
+    def _load(self, path: Path) -> Held | None:
+        try:
+            grant = Grant.from_body(json.loads(path.read_bytes()))
+            if grant.spec.node != self._node:
+                log.error("%s is a grant for node %s, not for %s; ignored", path, grant.spec.node, self._node)
+                return None
+            compiled = compile_grant(grant.spec, flat_terrain=self._flat_terrain)
+        except (OSError, ValueError, InvalidObject) as error:
+            log.error("%s is no grant, so nothing is granted by it: %s", path, error)
+            return None
+        return Held(grant.metadata.uid or grant.spec.identity, grant.name, grant.spec, compiled)
+
+    def _replace(self) -> None:
+        fresh: dict[str, Held] = {}
+        for path, held in sorted(self._loaded.items()):
+            if held is None:
+                continue
+            if held.identity in fresh:
+                log.error("%s grants %s a second time; ignored", path, held.identity)
+                continue
+            fresh[held.identity] = held
+        before, self._held = self._held, fresh
+        for identity in sorted(before.keys() | fresh.keys()):
+            old, new = before.get(identity), fresh.get(identity)
+            if old is not new:
+                log.info("grant of %s %s", identity, "added" if old is None else "removed" if new is None else "changed")
+                for listener in self._listeners:
+                    listener(old, new)

@@ -1,0 +1,345 @@
+"""The one link to the autopilot: connects for ever, streams its state, carries commands and parameters."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import random
+from collections.abc import Callable
+from typing import Any
+
+from fractus_services.mobility.dialect import Codec, message
+from fractus_services.mobility.transport import BadUrl, Transport, open_link
+from fractus_services.mobility.vehicle import GUIDED, Vehicle
+
+log = logging.getLogger(__name__)
+
+SYSTEM_ID, COMPONENT_ID = 255, 191
+"""ArduPilot's failsafe listens to the heartbeats of system 255; 191 is the onboard computer."""
+
+HEARTBEAT_S = 1.0
+SILENCE_S = 3.0
+RECONNECT_AFTER_S = 6.0
+BACKOFF_S = (0.2, 3.0)
+ACK_TIMEOUT_S = 0.7
+ATTEMPTS = 4
+
+_ONBOARD_CONTROLLER, _NO_AUTOPILOT, _ACTIVE = 18, 8, 4
+_GLOBAL_RELATIVE = 6
+_SET_MODE, _ARM, _TAKEOFF, _SPEED, _REPOSITION, _YAW, _INTERVAL, _REQUEST = 176, 400, 22, 178, 192, 115, 511, 512
+_ACCEPTED, _TEMPORARILY_REJECTED, _IN_PROGRESS = 0, 1, 5
+_RESULTS = {1: "temporarily rejected", 2: "denied", 3: "unsupported", 4: "failed", 6: "cancelled"}
+_VELOCITY_ONLY = 0x0DC7
+_LOCAL_NED = 1
+
+# Message ids and their rates in Hz on the ground and in the air.
+STREAMS = {33: (4.0, 20.0), 245: (2.0, 5.0), 1: (1.0, 1.0), 24: (1.0, 2.0), 242: (0.2, 0.2)}
+
+
+class AutopilotError(Exception):
+    """The autopilot did not do what was asked; the text says what and why."""
+
+    def __init__(self, reason: str, *, link: bool = False) -> None:
+        super().__init__(reason)
+        self.link = link
+
+
+class Autopilot:
+    """One ArduPilot vehicle behind one link.
+
+    Args:
+        url: the link, see `open_link`.
+        on_message: called for every message after the state took it.
+        on_ready: a coroutine function called when the vehicle was found, again after each reconnection.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        on_message: Callable[[Any], None] = lambda _m: None,
+        on_found: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.url = url
+        self.vehicle = Vehicle()
+        self._on_message = on_message
+        self._on_found = on_found
+        self._codec = Codec(SYSTEM_ID, COMPONENT_ID)
+        self._transport: Transport | None = None
+        self._target: tuple[int, int] | None = None
+        self._broken = asyncio.Event()
+        self._updated = asyncio.Event()
+        self._acks: dict[int, asyncio.Queue[Any]] = {}
+        self._params: dict[str, asyncio.Queue[float]] = {}
+        self._command_lock = asyncio.Lock()
+        self._flying_rates: bool | None = None
+
+    @property
+    def now(self) -> float:
+        """Monotonic seconds."""
+        return asyncio.get_running_loop().time()
+
+    @property
+    def connected(self) -> bool:
+        """Whether the vehicle is heard."""
+        return self._target is not None and self.now - self.vehicle.heartbeat_at < SILENCE_S
+
+    async def run(self) -> None:
+        """Keep the link open until cancelled."""
+        delay = BACKOFF_S[0]
+        said = ""
+        while True:
+            try:
+                self._broken.clear()
+                self._codec = Codec(SYSTEM_ID, COMPONENT_ID)
+                self._transport = await open_link(self.url, self._received, self._closed)
+            except BadUrl:
+                raise
+            except (OSError, TimeoutError) as error:
+                problem = f"{type(error).__name__} {error}".strip()
+                if problem != said:
+                    log.warning("no link to the autopilot at %s yet: %s; trying again", self.url, problem)
+                    said = problem
+            else:
+                said, delay = "", BACKOFF_S[0]
+                await self._serve()
+                log.warning("the link to the autopilot at %s broke", self.url)
+            await asyncio.sleep(delay * random.uniform(0.5, 1.0))  # noqa: S311 - jitter
+            delay = min(delay * 2, BACKOFF_S[1])
+
+    async def _serve(self) -> None:
+        """Heartbeats until the link breaks or falls silent."""
+        opened = self.now
+        try:
+            while not self._broken.is_set():
+                self._heartbeat()
+                try:
+                    async with asyncio.timeout(HEARTBEAT_S):
+                        await self._broken.wait()
+                except TimeoutError:
+                    if self.now - max(opened, self.vehicle.heartbeat_at) > RECONNECT_AFTER_S:
+                        log.warning("the autopilot is silent; opening the link again")
+                        break
+        finally:
+            if self._transport is not None:
+                self._transport.close()
+            self._transport = None
+            self._target = None
+            self._flying_rates = None
+
+    def _heartbeat(self) -> None:
+        self.send(
+            message(
+                "HEARTBEAT", type=_ONBOARD_CONTROLLER, autopilot=_NO_AUTOPILOT, system_status=_ACTIVE, mavlink_version=3
+            )
+        )
+
+    def send(self, outgoing: Any) -> None:
+        """Send a message; without a link it is dropped."""
+        if self._transport is not None:
+            self._transport.write(self._codec.encode(outgoing))
+
+    def _closed(self, error: Exception | None) -> None:
+        if error is not None:
+            log.warning("autopilot link: %s", error)
+        self._broken.set()
+
+    def _received(self, data: bytes) -> None:
+        for incoming in self._codec.decode(data):
+            source = (incoming.get_srcSystem(), incoming.get_srcComponent())
+            if self._target is None:
+                if incoming.get_type() != "HEARTBEAT" or incoming.autopilot == _NO_AUTOPILOT:
+                    continue
+                self._target = source
+                self.vehicle.take(incoming, self.now)
+                self._on_found()
+            if source == self._target:
+                self._take(incoming)
+
+    def _take(self, incoming: Any) -> None:
+        kind = incoming.get_type()
+        self.vehicle.take(incoming, self.now)
+        if kind == "COMMAND_ACK":
+            if incoming.command in self._acks:
+                self._acks[incoming.command].put_nowait(incoming)
+        elif kind == "PARAM_VALUE":
+            name = _text(incoming.param_id)
+            if name in self._params:
+                self._params[name].put_nowait(float(incoming.param_value))
+        self._on_message(incoming)
+        if kind in {"GLOBAL_POSITION_INT", "HEARTBEAT", "EXTENDED_SYS_STATE"}:
+            self._updated.set()
+            self._updated = asyncio.Event()
+
+    async def update(self, timeout_s: float) -> bool:
+        """Wait for news of the vehicle; False when there were none in time."""
+        event = self._updated
+        try:
+            async with asyncio.timeout(timeout_s):
+                await event.wait()
+        except TimeoutError:
+            return False
+        return True
+
+    # Commands
+
+    async def command(self, number: int, *params: float, place: tuple[float, float, float] | None = None) -> None:
+        """Run a MAVLink command and wait for its acknowledgement.
+
+        Args:
+            number: MAV_CMD.
+            params: param1 onwards; the rest is zero.
+            place: latitude, longitude and altitude above home: sends COMMAND_INT.
+
+        Raises:
+            AutopilotError: it was refused, or nobody answered.
+        """
+        async with self._command_lock:
+            for attempt in range(ATTEMPTS):
+                ack = await self._attempt(number, attempt, params, place)
+                if ack is None:
+                    continue
+                if ack.result == _ACCEPTED:
+                    return
+                if ack.result == _TEMPORARILY_REJECTED and attempt + 1 < ATTEMPTS:
+                    await asyncio.sleep(0.3)
+                    continue
+                raise AutopilotError(self._refusal(number, ack.result))
+        raise AutopilotError(f"the autopilot did not answer command {number}", link=True)
+
+    async def _attempt(
+        self, number: int, attempt: int, params: tuple[float, ...], place: tuple[float, float, float] | None
+    ) -> Any:
+        target = self._target
+        if target is None or not self.connected:
+            raise AutopilotError("the autopilot is not connected", link=True)
+        values = {f"param{i}": float(value) for i, value in enumerate(params, 1)}
+        address = {"target_system": target[0], "target_component": target[1]}
+        if place is None:
+            outgoing = message("COMMAND_LONG", command=number, confirmation=attempt, **address, **values)
+        else:
+            outgoing = message(
+                "COMMAND_INT", command=number, frame=_GLOBAL_RELATIVE, x=round(place[0] * 1e7),
+                y=round(place[1] * 1e7), z=place[2], **address, **values,
+            )  # fmt: skip
+        acks = self._acks[number] = asyncio.Queue()
+        try:
+            self.send(outgoing)
+            async with asyncio.timeout(ACK_TIMEOUT_S):
+                while True:
+                    ack = await acks.get()
+                    if ack.result != _IN_PROGRESS:
+                        return ack
+        except TimeoutError:
+            return None
+        finally:
+            del self._acks[number]
+
+    def _refusal(self, number: int, result: int) -> str:
+        why = [t for t in self.vehicle.texts[-4:] if t.startswith(("Arm", "PreArm", "Mode", "Takeoff"))]
+        said = f": {why[-1]}" if why else ""
+        return f"the autopilot {_RESULTS.get(result, 'refused')} command {number}{said}"
+
+    async def set_mode(self, mode: int) -> None:
+        """Change the flight mode and wait until the autopilot flies it."""
+        await self.command(_SET_MODE, 1, mode)
+        deadline = self.now + 2.0
+        while self.vehicle.mode != mode:
+            if self.now > deadline:
+                raise AutopilotError(f"the autopilot accepted mode {mode} and stays in {self.vehicle.mode_name}")
+            await self.update(0.3)
+
+    async def arm(self) -> None:
+        """Start the motors."""
+        self.vehicle.texts.clear()
+        await self.command(_ARM, 1)
+
+    async def disarm(self) -> None:
+        """Stop the motors; the autopilot refuses in the air."""
+        await self.command(_ARM, 0)
+
+    async def take_off(self, altitude_m: float) -> None:
+        """Begin to climb to an altitude above home."""
+        await self.command(_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m)
+
+    async def go_to(self, lat: float, lon: float, altitude_m: float, yaw_deg: float | None) -> None:
+        """Begin to fly straight to a point; altitude above home."""
+        await self.command(_REPOSITION, -1, 0, 0, math.nan if yaw_deg is None else yaw_deg, place=(lat, lon, altitude_m))
+        if yaw_deg is not None:
+            await self.command(_YAW, yaw_deg % 360.0, 0, 0, 0)
+
+    async def set_speed(self, speed_mps: float) -> None:
+        """Fly legs with this horizontal speed over ground."""
+        await self.command(_SPEED, 1, speed_mps, -1)
+
+    def stop(self) -> None:
+        """Brake and hold: a velocity of zero; GUIDED keeps the position when it times out."""
+        target = self._target
+        if target is not None:
+            self.send(
+                message(
+                    "SET_POSITION_TARGET_LOCAL_NED", type_mask=_VELOCITY_ONLY, coordinate_frame=_LOCAL_NED,
+                    target_system=target[0], target_component=target[1],
+                )
+            )  # fmt: skip
+
+    async def hold(self) -> None:
+        """Brake and hover where it stops, in GUIDED."""
+        if self.vehicle.mode != GUIDED:
+            await self.set_mode(GUIDED)
+        self.stop()
+
+    async def set_rates(self, flying: bool) -> None:
+        """Ask for the streams; more often in the air."""
+        if self._flying_rates is flying:
+            return
+        for number, rates in STREAMS.items():
+            await self.command(_INTERVAL, number, 1e6 / rates[flying])
+        self._flying_rates = flying
+
+    async def ask_home(self) -> None:
+        """Ask for the home position now."""
+        await self.command(_REQUEST, 242)
+
+    # Parameters
+
+    async def read_parameter(self, name: str, attempts: int = ATTEMPTS) -> float | None:
+        """A parameter's value; None when the vehicle does not have it."""
+        target = self._target
+        if target is None:
+            raise AutopilotError("the autopilot is not connected", link=True)
+        request = message(
+            "PARAM_REQUEST_READ", param_index=-1, param_id=name.encode(),
+            target_system=target[0], target_component=target[1],
+        )  # fmt: skip
+        return await self._exchange(name, request, attempts)
+
+    async def write_parameter(self, name: str, value: float) -> float | None:
+        """Set a parameter; returns what the vehicle says it is now."""
+        target = self._target
+        if target is None:
+            raise AutopilotError("the autopilot is not connected", link=True)
+        request = message(
+            "PARAM_SET", param_id=name.encode(), param_value=value, param_type=9,
+            target_system=target[0], target_component=target[1],
+        )  # fmt: skip
+        return await self._exchange(name, request, ATTEMPTS)
+
+    async def _exchange(self, name: str, request: Any, attempts: int) -> float | None:
+        answers = self._params[name] = asyncio.Queue()
+        try:
+            for _ in range(attempts):
+                self.send(request)
+                try:
+                    async with asyncio.timeout(ACK_TIMEOUT_S):
+                        return await answers.get()
+                except TimeoutError:
+                    continue
+        finally:
+            del self._params[name]
+        return None
+
+
+def _text(value: Any) -> str:
+    raw = value if isinstance(value, bytes) else str(value).encode()
+    return raw.split(b"\0", 1)[0].decode("ascii", "replace")

@@ -1,0 +1,120 @@
+"""The autopilot as the last line: its own failsafes, set and read back before anything may arm."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+from fractus_core.policy.values import Airframe
+
+from fractus_services.mobility.autopilot import Autopilot
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One parameter that must hold.
+
+    Attributes:
+        names: its name, and older or newer spellings of it.
+        value: what it is set to.
+        accepted: values that may stay as they are.
+        needed: whether arming is refused when the vehicle does not have it.
+        why: what it does, for people.
+    """
+
+    names: tuple[str, ...]
+    value: float
+    accepted: frozenset[float]
+    needed: bool
+    why: str
+
+
+SETTINGS = (
+    Setting(("FS_GCS_ENABLE",), 1, frozenset({1.0}), True, "returns to launch when the companion falls silent"),
+    Setting(("FS_GCS_TIMEOUT",), 5, frozenset(), False, "after five seconds of silence"),
+    Setting(("BATT_FS_LOW_ACT",), 2, frozenset({1.0, 2.0}), False, "returns to launch on a low battery"),
+    Setting(("BATT_FS_CRT_ACT",), 1, frozenset({1.0}), False, "lands on a critical battery"),
+    Setting(("FS_EKF_ACTION",), 1, frozenset({1.0, 3.0}), False, "lands when it no longer knows where it is"),
+)
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """What the autopilot will do by itself, and what it will not.
+
+    Attributes:
+        problem: why nothing may arm; empty when every needed failsafe was read back.
+        missing: optional ones that the vehicle does not offer.
+        airframe: how it moves, from its own parameters.
+        speed_mps: the speed it flies legs with.
+    """
+
+    problem: str
+    missing: tuple[str, ...]
+    airframe: Airframe
+    speed_mps: float
+
+
+async def configure(autopilot: Autopilot) -> Checked:
+    """Set the failsafes, read each one back, and learn how the vehicle moves.
+
+    Raises:
+        AutopilotError: the link broke.
+    """
+    problems, missing = [], []
+    for setting in SETTINGS:
+        verdict = await _establish(autopilot, setting)
+        if verdict is None:
+            missing.append(setting.names[0])
+            if setting.needed:
+                problems.append(f"the autopilot has no {setting.names[0]} ({setting.why})")
+        elif verdict:
+            problems.append(verdict)
+    airframe, speed = await _airframe(autopilot)
+    checked = Checked("; ".join(problems), tuple(missing), airframe, speed)
+    if checked.problem:
+        log.error("failsafes are not verified, arming is refused: %s", checked.problem)
+    else:
+        log.info("failsafes are set and read back%s", f"; not offered: {', '.join(missing)}" if missing else "")
+    return checked
+
+
+async def _establish(autopilot: Autopilot, setting: Setting) -> str | None:
+    """An empty text when the setting holds, a problem when it does not, None when there is no such parameter."""
+    for name in setting.names:
+        found = await autopilot.read_parameter(name, attempts=3)
+        if found is None:
+            continue
+        if found == setting.value or found in setting.accepted:
+            return ""
+        after = await autopilot.write_parameter(name, setting.value)
+        if after is not None and abs(after - setting.value) < 1e-6:
+            log.info("set %s from %g to %g: the autopilot %s", name, found, setting.value, setting.why)
+            return ""
+        return f"{name} is {found:g} and cannot be set to {setting.value:g} (the autopilot {setting.why})"
+    return None
+
+
+async def _airframe(autopilot: Autopilot) -> tuple[Airframe, float]:
+    standard = Airframe()
+    accel = await _read(autopilot, (("WPNAV_ACCEL", 0.01), ("WP_ACC", 1.0)), standard.accel_mps2)
+    gain = await _read(autopilot, (("PSC_POSXY_P", 1.0), ("PSC_NE_POS_P", 1.0)), standard.position_gain)
+    climb = await _read(autopilot, (("WPNAV_ACCEL_Z", 0.01), ("WP_ACC_Z", 1.0)), standard.climb_accel_mps2)
+    height = await _read(autopilot, (("RTL_ALT", 0.01), ("RTL_ALT_M", 1.0)), standard.return_altitude_m)
+    speed = await _read(autopilot, (("WPNAV_SPEED", 0.01), ("WP_SPD", 1.0)), 5.0)
+    airframe = Airframe(
+        accel_mps2=max(accel, 0.1),
+        position_gain=max(gain, 0.1),
+        climb_accel_mps2=max(climb, 0.1),
+        return_altitude_m=height,
+    )
+    return airframe, speed
+
+
+async def _read(autopilot: Autopilot, names: tuple[tuple[str, float], ...], default: float) -> float:
+    for name, scale in names:
+        value = await autopilot.read_parameter(name, attempts=2)
+        if value is not None:
+            return value * scale
+    return default

@@ -1,0 +1,155 @@
+"""Byte links to an autopilot: TCP, UDP and serial, by the connection strings that MAVLink tools use."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import termios
+import tty
+from collections.abc import Callable
+from typing import Any, Protocol
+
+Receive = Callable[[bytes], None]
+Closed = Callable[[Exception | None], None]
+
+CONNECT_TIMEOUT_S = 5.0
+
+
+class BadUrl(ValueError):
+    """A connection string that names no link."""
+
+
+class Transport(Protocol):
+    """An open byte link."""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes, without waiting."""
+
+    def close(self) -> None:
+        """Close the link."""
+
+
+class _Stream(asyncio.Protocol):
+    def __init__(self, receive: Receive, closed: Closed) -> None:
+        self._receive = receive
+        self._closed = closed
+
+    def data_received(self, data: bytes) -> None:
+        self._receive(data)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._closed(exc)
+
+
+class _Datagrams(asyncio.DatagramProtocol):
+    """A UDP link; a listening one answers to whoever spoke last."""
+
+    def __init__(self, receive: Receive, closed: Closed, peer: tuple[str, int] | None) -> None:
+        self._receive = receive
+        self._closed = closed
+        self._peer = peer
+        self._transport: asyncio.DatagramTransport | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        if isinstance(transport, asyncio.DatagramTransport):
+            self._transport = transport
+
+    def datagram_received(self, data: bytes, addr: tuple[Any, ...]) -> None:
+        self._peer = (addr[0], addr[1])
+        self._receive(data)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._closed(exc)
+
+    def write(self, data: bytes) -> None:
+        if self._transport is not None and self._peer is not None:
+            self._transport.sendto(data, self._peer)
+
+    def close(self) -> None:
+        if self._transport is not None:
+            self._transport.close()
+
+
+class _Serial:
+    """A serial device in raw mode, read by the event loop."""
+
+    def __init__(self, device: str, baud: int, receive: Receive, closed: Closed) -> None:
+        speed = getattr(termios, f"B{baud}", None)
+        if speed is None:
+            raise BadUrl(f"serial speed {baud} is not one that this system knows; use 57600, 115200 or 921600")
+        self._receive = receive
+        self._closed = closed
+        self._loop = asyncio.get_running_loop()
+        self._fd = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        tty.setraw(self._fd)
+        settings = termios.tcgetattr(self._fd)
+        settings[4] = settings[5] = speed
+        termios.tcsetattr(self._fd, termios.TCSANOW, settings)
+        self._loop.add_reader(self._fd, self._readable)
+
+    def _readable(self) -> None:
+        try:
+            data = os.read(self._fd, 4096)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._fail(error)
+            return
+        if data:
+            self._receive(data)
+        else:
+            self._fail(None)
+
+    def _fail(self, error: Exception | None) -> None:
+        self.close()
+        self._closed(error)
+
+    def write(self, data: bytes) -> None:
+        if self._fd >= 0:
+            try:
+                os.write(self._fd, data)
+            except BlockingIOError:
+                return  # the line is slower than we talk; the next setpoint replaces this one
+            except OSError as error:
+                self._fail(error)
+
+    def close(self) -> None:
+        if self._fd >= 0:
+            self._loop.remove_reader(self._fd)
+            os.close(self._fd)
+            self._fd = -1
+
+
+async def open_link(url: str, receive: Receive, closed: Closed) -> Transport:
+    """Open a link.
+
+    Args:
+        url: `tcp:HOST:PORT`, `udpin:HOST:PORT`, `udpout:HOST:PORT` or `serial:DEVICE:BAUD`.
+        receive: takes what arrives.
+        closed: called once when the link breaks.
+
+    Raises:
+        BadUrl: the string names no link.
+        OSError: the link cannot be opened.
+    """
+    scheme, _, rest = url.partition(":")
+    where, _, number = rest.rpartition(":")
+    if scheme not in {"tcp", "udpin", "udpout", "serial"} or not where or not number.isdigit():
+        raise BadUrl(
+            f"{url!r} is no autopilot link; use tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD"
+        )
+    if scheme == "serial":
+        return _Serial(where, int(number), receive, closed)
+    loop = asyncio.get_running_loop()
+    async with asyncio.timeout(CONNECT_TIMEOUT_S):
+        if scheme == "tcp":
+            transport, _ = await loop.create_connection(lambda: _Stream(receive, closed), where, int(number))
+            return transport
+        peer = (where, int(number)) if scheme == "udpout" else None
+        local = (where, int(number)) if scheme == "udpin" else None
+        _, protocol = await loop.create_datagram_endpoint(
+            lambda: _Datagrams(receive, closed, peer), local_addr=local, remote_addr=None if local else peer
+        )
+        if peer is not None:
+            protocol._peer = None  # noqa: SLF001 - a connected socket sends to its peer
+        return protocol

@@ -1,0 +1,164 @@
+"""What the autopilot last said of the vehicle, and what that means for the policy engine."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from fractus_core.policy.values import Airframe, Home, Situation
+
+GUIDED, RTL, LAND, SMART_RTL, BRAKE = 4, 6, 9, 21, 17
+MODE_NAMES = {
+    0: "STABILIZE", 1: "ACRO", 2: "ALT_HOLD", 3: "AUTO", 4: "GUIDED", 5: "LOITER", 6: "RTL", 7: "CIRCLE", 9: "LAND",
+    11: "DRIFT", 13: "SPORT", 14: "FLIP", 15: "AUTOTUNE", 16: "POSHOLD", 17: "BRAKE", 18: "THROW", 19: "AVOID_ADSB",
+    20: "GUIDED_NOGPS", 21: "SMART_RTL", 22: "FLOWHOLD", 23: "FOLLOW", 24: "ZIGZAG", 25: "SYSTEMID", 26: "HELI_AUTOROTATE",
+    27: "AUTO_RTL", 28: "TURTLE",
+}  # fmt: skip
+HOMEWARD = frozenset({RTL, LAND, SMART_RTL, 27})
+"""Modes in which the vehicle comes down by itself."""
+
+_ARMED = 0x80
+_CRITICAL, _EMERGENCY = 5, 6
+_PREARM = 0x10000000
+_IN_AIR = frozenset({2, 3, 4})
+_LEAST_ERROR_M, _UNTOLD_ERROR_M, _WORST_ERROR_M = 0.5, 1.5, 10.0
+
+
+@dataclass(slots=True)
+class Vehicle:
+    """The streamed state; times are monotonic seconds."""
+
+    lat: float | None = None
+    lon: float | None = None
+    altitude_m: float = 0.0
+    amsl_m: float = 0.0
+    north_mps: float = 0.0
+    east_mps: float = 0.0
+    down_mps: float = 0.0
+    yaw_deg: float = 0.0
+    position_at: float = -math.inf
+    home: Home | None = None
+    mode: int = -1
+    armed: bool = False
+    failsafe: bool = False
+    heartbeat_at: float = -math.inf
+    landed_state: int = 0
+    battery_remaining: float = math.nan
+    battery_v: float = math.nan
+    battery_a: float = math.nan
+    ready: bool = False
+    fix_type: int = 0
+    position_error_m: float = _UNTOLD_ERROR_M
+    texts: list[str] = field(default_factory=list)
+
+    @property
+    def mode_name(self) -> str:
+        """The autopilot's name of its mode."""
+        return MODE_NAMES.get(self.mode, f"MODE{self.mode}" if self.mode >= 0 else "UNKNOWN")
+
+    @property
+    def in_air(self) -> bool:
+        """Whether it flies; an autopilot that does not tell flies when it is armed and off the ground."""
+        if not self.armed:
+            return False
+        return self.landed_state in _IN_AIR if self.landed_state else self.altitude_m > 0.5
+
+    @property
+    def speed_mps(self) -> float:
+        """Horizontal speed over ground."""
+        return math.hypot(self.north_mps, self.east_mps)
+
+    @property
+    def flight_state(self) -> str:
+        """inactive, takingOff, flying or landing."""
+        if not self.in_air:
+            return "inactive"
+        if self.landed_state == 3:
+            return "takingOff"
+        return "landing" if self.landed_state == 4 or self.mode == LAND else "flying"
+
+    def take(self, message: Any, now: float) -> None:
+        """Update from one message."""
+        handler = _HANDLERS.get(message.get_type())
+        if handler is not None:
+            handler(self, message, now)
+
+    def situation(self, time_s: float, airframe: Airframe, speed_mps: float, vertical: bool) -> Situation:
+        """The state as the engine judges it."""
+        return Situation(
+            time_s=time_s,
+            lat=self.lat,
+            lon=self.lon,
+            altitude_m=self.altitude_m,
+            north_mps=self.north_mps,
+            east_mps=self.east_mps,
+            down_mps=self.down_mps,
+            home=self.home,
+            armed=self.armed,
+            in_air=self.in_air,
+            position_error_m=self.position_error_m,
+            speed_setpoint_mps=speed_mps,
+            vertical=vertical,
+            airframe=airframe,
+        )
+
+
+def _heartbeat(vehicle: Vehicle, message: Any, now: float) -> None:
+    vehicle.heartbeat_at = now
+    vehicle.mode = message.custom_mode
+    vehicle.armed = bool(message.base_mode & _ARMED)
+    vehicle.failsafe = message.system_status in {_CRITICAL, _EMERGENCY}
+
+
+def _position(vehicle: Vehicle, message: Any, now: float) -> None:
+    if vehicle.fix_type and vehicle.fix_type < 3:
+        return
+    if message.lat == 0 and message.lon == 0:
+        return
+    vehicle.lat, vehicle.lon = message.lat / 1e7, message.lon / 1e7
+    vehicle.altitude_m, vehicle.amsl_m = message.relative_alt / 1e3, message.alt / 1e3
+    vehicle.north_mps, vehicle.east_mps, vehicle.down_mps = message.vx / 100, message.vy / 100, message.vz / 100
+    if message.hdg != 0xFFFF:
+        vehicle.yaw_deg = message.hdg / 100
+    vehicle.position_at = now
+
+
+def _home(vehicle: Vehicle, message: Any, _now: float) -> None:
+    vehicle.home = Home(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
+
+
+def _landed(vehicle: Vehicle, message: Any, _now: float) -> None:
+    vehicle.landed_state = message.landed_state
+
+
+def _status(vehicle: Vehicle, message: Any, _now: float) -> None:
+    vehicle.battery_remaining = message.battery_remaining / 100 if message.battery_remaining >= 0 else math.nan
+    vehicle.battery_v = message.voltage_battery / 1e3 if message.voltage_battery != 0xFFFF else math.nan
+    vehicle.battery_a = message.current_battery / 100 if message.current_battery >= 0 else math.nan
+    present = message.onboard_control_sensors_present & _PREARM
+    healthy = message.onboard_control_sensors_health & _PREARM
+    vehicle.ready = bool(healthy) if present else vehicle.fix_type >= 3
+
+
+def _gps(vehicle: Vehicle, message: Any, _now: float) -> None:
+    vehicle.fix_type = message.fix_type
+    if message.h_acc:
+        vehicle.position_error_m = min(max(message.h_acc / 1e3, _LEAST_ERROR_M), _WORST_ERROR_M)
+
+
+def _text(vehicle: Vehicle, message: Any, _now: float) -> None:
+    text = message.text.split(b"\0", 1)[0] if isinstance(message.text, bytes) else message.text.encode()
+    vehicle.texts.append(text.decode("utf-8", "replace"))
+    del vehicle.texts[:-20]
+
+
+_HANDLERS = {
+    "HEARTBEAT": _heartbeat,
+    "GLOBAL_POSITION_INT": _position,
+    "HOME_POSITION": _home,
+    "EXTENDED_SYS_STATE": _landed,
+    "SYS_STATUS": _status,
+    "GPS_RAW_INT": _gps,
+    "STATUSTEXT": _text,
+}

@@ -101,3 +101,15 @@ class ApiClient:
             if time.monotonic() > deadline:
                 raise ClusterError(f"the API server was not ready within {timeout_s:.0f} s")
             time.sleep(_POLL_S)
+
+
+def answers_ready(host: str, port: int) -> bool:
+    """Whether a server answers `GET /ready` (over plain HTTP) with success."""
+    connection = http.client.HTTPConnection(host, port, timeout=_REQUEST_TIMEOUT_S)
+    try:
+        connection.request("GET", "/ready")
+        return connection.getresponse().status == 200
+    except (OSError, http.client.HTTPException):
+        return False
+    finally:
+        connection.close()

@@ -10,17 +10,19 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
 from fractus_sim.cluster import machine, manifests, network
 from fractus_sim.cluster.addressing import Addressing
-from fractus_sim.cluster.apiclient import ApiClient, ApiError
+from fractus_sim.cluster.apiclient import ApiClient, ApiError, answers_ready
 from fractus_sim.cluster.binaries import Binaries, ensure_binaries
 from fractus_sim.cluster.cgroups import Branch, cluster_branch
 from fractus_sim.cluster.commands import run
 from fractus_sim.cluster.controlplane import (
     API_PORT,
+    DNS_READY_PORT,
     ControlPlaneFiles,
     administrator,
     control_plane_units,
@@ -42,6 +44,7 @@ from fractus_sim.cluster.state import Memory, StateDirectory, only_cluster, stat
 _LOCK_TIMEOUT_S = 300.0
 _API_TIMEOUT_S = 60.0
 _READY_TIMEOUT_S = 90.0
+_DNS_TIMEOUT_S = 30.0
 _POLL_S = 0.1
 _CONTROL_PLANE = "control-plane"
 _ENVIRONMENT = {
@@ -128,6 +131,12 @@ class Cluster:
             raise ClusterError(f"there is no cluster {chosen}; bring one up: fractus cluster up FILE")
         return cls(spec, report=report)
 
+    @classmethod
+    def bare(cls, name: str, *, report: Report = silent) -> Cluster:
+        """Return a handle that can only take a cluster down, for one whose start was interrupted early."""
+        spec = state_of(name).read_spec()
+        return cls(spec or ClusterSpec.placeholder(name), report=report)
+
     @property
     def name(self) -> str:
         """The cluster's name."""
@@ -206,6 +215,7 @@ class Cluster:
                     node.start_vehicle()
                 self._write_kubeconfig(authority, memory)
                 self._wait_nodes(api, nodes)
+            self._wait_dns(memory)
             self.load_images(images)
         self._report(f"cluster {self.name} is up: {len(nodes)} nodes, {time.monotonic() - started:.1f} s")
 
@@ -217,18 +227,16 @@ class Cluster:
         """
         check_root()
         with self._locked(remove=True):
+            held = machine.holder(self.name)
+            if held is not None and held != self._state.path:
+                raise ClusterError(f"cluster {self.name} has its state in {held}; set FRACTUS_STATE={held.parent}")
             branch = cluster_branch(self.name)
             branch.kill_all()
             branch.remove()
-            memory = self._state.read_memory()
-            block = memory.block if memory else None
-            if block is not None:
-                network.unwire(self._wiring(Memory(block, {})))
-            held = machine.holder(self.name)
-            if held is None or held == self._state.path:
-                machine.release(self.name)
+            network.unwire(self.name)
             if self._state.path.exists():
                 shutil.rmtree(self._state.path)
+            machine.release(self.name)
         machine.remove_directory()
         self._report(f"cluster {self.name} is down")
 
@@ -249,6 +257,16 @@ class Cluster:
             )
             for node in self.nodes
         ]
+
+    def set_power(self, node: str, *, on: bool) -> None:
+        """Pull a node's power or give it back; returns before its kubelet is Ready."""
+        check_root()
+        with self._locked():
+            chosen = self.node(node)
+            if not on:
+                chosen.power_off()
+                return
+            chosen.power_on()
 
     @property
     def running(self) -> bool:
@@ -283,7 +301,7 @@ class Cluster:
         environment = {**os.environ, "KUBECONFIG": str(self.kubeconfig)}
         return run([program, *arguments], input_text=input_text, timeout_s=timeout_s, check=check, env=environment)
 
-    def _locked(self, *, remove: bool = False):  # type: ignore[no-untyped-def]
+    def _locked(self, *, remove: bool = False) -> AbstractContextManager[None]:
         return locked(
             machine.cluster_lock(self.name),
             timeout_s=_LOCK_TIMEOUT_S,
@@ -328,8 +346,8 @@ class Cluster:
         wiring, files = self._wiring(memory), self._files()
         network.wire_control_plane(wiring)
         units = control_plane_units(binaries, authority, wiring.addressing, files)
-        view = {"hostname": None, "files": "", "logs": "", "programs": {}, "sysctls": {}}
-        config = json.dumps({"view": view, "units": units}, indent=1)
+        view: dict[str, object] = {"hostname": None, "files": "", "logs": "", "programs": {}, "sysctls": {}}
+        config = json.dumps({"view": view, "units": units, "builds": binaries.builds()}, indent=1)
         path = files.directory / "init.json"
         if self.running and path.exists() and path.read_text() == config:
             return
@@ -409,6 +427,15 @@ class Cluster:
             if time.monotonic() > deadline:
                 names = ", ".join(waiting)
                 raise ClusterError(f"not Ready within {_READY_TIMEOUT_S:.0f} s: {names}; see the logs in {self.logs}")
+            time.sleep(_POLL_S)
+
+    def _wait_dns(self, memory: Memory) -> None:
+        address = str(Addressing(memory.block).control_plane)
+        deadline = time.monotonic() + _DNS_TIMEOUT_S
+        while not answers_ready(address, DNS_READY_PORT):
+            if time.monotonic() > deadline:
+                log = self.logs / _CONTROL_PLANE / "coredns.log"
+                raise ClusterError(f"the cluster's DNS was not ready within {_DNS_TIMEOUT_S:.0f} s; see {log}")
             time.sleep(_POLL_S)
 
     def _ready_nodes(self, memory: Memory) -> dict[str, bool] | None:

@@ -12,6 +12,7 @@ from fractus_sim.cluster.manifests import DNS_USER
 from fractus_sim.cluster.pki import Authority, Credential, write_private
 
 API_PORT = 6443
+DNS_READY_PORT = 8181
 _ETCD_URL = "http://127.0.0.1:2379"
 _CLUSTER_DOMAIN = "cluster.local"
 
@@ -88,7 +89,7 @@ def corefile(addressing: Addressing, kubeconfig: Path) -> str:
 {_CLUSTER_DOMAIN}:53 in-addr.arpa:53 {{
     bind {addressing.control_plane}
     errors
-    ready {addressing.control_plane}:8181
+    ready {addressing.control_plane}:{DNS_READY_PORT}
     kubernetes {_CLUSTER_DOMAIN} in-addr.arpa {{
         kubeconfig {kubeconfig}
         pods insecure
@@ -179,7 +180,7 @@ def _controller_manager(authority: Authority, files: ControlPlaneFiles) -> list[
         f"--kubeconfig={files.kubeconfig('kube-controller-manager')}",
         "--bind-address=127.0.0.1",
         "--leader-elect=false",
-        "--use-service-account-credentials=false",
+        "--use-service-account-credentials=true",
         f"--root-ca-file={authority.credential.certificate}",
         f"--service-account-private-key-file={authority.service_account_key().key}",
         f"--cluster-signing-cert-file={authority.credential.certificate}",

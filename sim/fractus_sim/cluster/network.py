@@ -16,7 +16,6 @@ from typing import Any
 
 from fractus_sim.cluster.addressing import Addressing
 from fractus_sim.cluster.commands import run
-from fractus_sim.cluster.errors import ClusterError
 
 NETNS_DIRECTORY = Path("/run/netns")
 _BRIDGE = "br0"
@@ -39,25 +38,16 @@ class Wiring:
 
     @property
     def host_link(self) -> str:
-        """The machine's end of its link into the cluster (at most 15 characters)."""
-        return "fx-" + hashlib.sha256(self.cluster.encode()).hexdigest()[:10]
+        """The machine's end of its link into the cluster."""
+        return host_link(self.cluster)
 
     def namespace(self, node: str | None = None) -> str:
         """Return the namespace of a node, or of the control plane."""
-        return f"fractus.{self.cluster}" if node is None else f"fractus.{self.cluster}.{node}"
+        return _namespace_name(self.cluster) + ("" if node is None else f".{node}")
 
     def namespace_path(self, node: str | None = None) -> Path:
         """Return the file that keeps a namespace."""
         return NETNS_DIRECTORY / self.namespace(node)
-
-    def namespaces(self) -> list[str]:
-        """Return the names of all namespaces of the cluster that exist."""
-        if not NETNS_DIRECTORY.is_dir():
-            return []
-        own = self.namespace()
-        return sorted(
-            path.name for path in NETNS_DIRECTORY.iterdir() if path.name == own or path.name.startswith(own + ".")
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +56,15 @@ class _Mark:
 
     inode: int
     hub: int
+
+
+def host_link(cluster: str) -> str:
+    """Return the name of the machine's end of its link into a cluster (the kernel takes at most 15 characters)."""
+    return "fx-" + hashlib.sha256(cluster.encode()).hexdigest()[:10]
+
+
+def _namespace_name(cluster: str) -> str:
+    return f"fractus.{cluster}"
 
 
 def networks_in_use() -> list[IPv4Network]:
@@ -155,11 +154,14 @@ def unwire_node(wiring: Wiring, node: str, index: int) -> None:
     _mark_path(wiring, node).unlink(missing_ok=True)
 
 
-def unwire(wiring: Wiring) -> None:
-    """Remove every namespace and link of the cluster."""
-    _delete_link(wiring.host_link)
-    for namespace in wiring.namespaces():
-        run(["ip", "netns", "delete", namespace])
+def unwire(cluster: str) -> None:
+    """Remove every namespace and link of a cluster."""
+    _delete_link(host_link(cluster))
+    own = _namespace_name(cluster)
+    if NETNS_DIRECTORY.is_dir():
+        for path in sorted(NETNS_DIRECTORY.iterdir()):
+            if path.name == own or path.name.startswith(own + "."):
+                run(["ip", "netns", "delete", path.name])
 
 
 def cut_link(wiring: Wiring, index: int) -> None:
@@ -249,15 +251,3 @@ def _write_mark(wiring: Wiring, node: str | None, mark: _Mark) -> None:
     path = _mark_path(wiring, node)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(asdict(mark)))
-
-
-def check_name(wiring: Wiring) -> None:
-    """Check that the machine's link into the cluster is not somebody else's.
-
-    Raises:
-        ClusterError: A link of that name exists though the cluster was never set up.
-    """
-    if not wiring.marks.exists() and not wiring.namespaces() and _link_exists(wiring.host_link):
-        raise ClusterError(
-            f"the machine already has a link {wiring.host_link}; remove it: ip link del {wiring.host_link}"
-        )

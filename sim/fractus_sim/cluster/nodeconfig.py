@@ -117,7 +117,6 @@ def kube_proxy_config(node: NodeSpec, addressing: Addressing) -> str:
         "clientConnection": {"kubeconfig": f"{CONFIG}/kube-proxy.kubeconfig"},
         "clusterCIDR": str(addressing.pod_network),
         "hostnameOverride": node.name,
-        "bindAddress": "0.0.0.0",
         "healthzBindAddress": "127.0.0.1:10256",
         "metricsBindAddress": "127.0.0.1:10249",
         "conntrack": {"maxPerCore": 0, "min": 0},

@@ -15,7 +15,7 @@ from fractus_sim.cluster.errors import ClusterError
 NodeClass = Literal["drone", "edge", "cloud"]
 
 _NAME = r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$"
-_SUFFIXES = {
+_SUFFIXES: dict[str, Decimal | int] = {
     "": 1,
     "m": Decimal("0.001"),
     "k": 10**3,
@@ -177,6 +177,11 @@ class ClusterSpec(_Value):
         if twice:
             raise ValueError(f"nodes: the name {', '.join(twice)} is given twice")
         return self
+
+    @classmethod
+    def placeholder(cls, name: str) -> ClusterSpec:
+        """Return a cluster of which only the name is known."""
+        return cls.model_validate({"name": name, "nodes": [{"name": "unknown", "class": "cloud"}]})
 
     def to_yaml(self) -> str:
         """Return the cluster as a file that `load_spec` reads back to an equal value."""

@@ -36,6 +36,10 @@ class Binaries:
         except KeyError:
             raise ClusterError(f"{name} was not provided; run `fractus cluster binaries --with {name}`") from None
 
+    def builds(self) -> dict[str, int]:
+        """Return what changes when a program is built anew: when its file was written, nanoseconds."""
+        return {name: path.stat().st_mtime_ns for name, path in self.paths.items()}
+
 
 def cache_directory() -> Path:
     """Return where built programs are kept: FRACTUS_CACHE, or `fractus` in the user's cache directory."""

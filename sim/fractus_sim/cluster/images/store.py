@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -85,7 +86,7 @@ class ImageStore:
         self.layout.create()
         return self.layout.add_program(SANDBOX_IMAGE, pause)
 
-    def _locked(self):  # type: ignore[no-untyped-def]
+    def _locked(self) -> AbstractContextManager[None]:
         return locked(
             self.path / "lock", timeout_s=_LOCK_TIMEOUT_S, what="another process works on images", report=self.report
         )

@@ -1,0 +1,1 @@
+"""The simulated vehicle: an ArduCopter-compatible multicopter that speaks MAVLink 2."""

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import click
 
-from fractus_sim.vehicle.body import Wind
 from fractus_sim.vehicle.earth import Place
 from fractus_sim.vehicle.links import Hub, LinkError, LinkSpec
 from fractus_sim.vehicle.params import UnknownParameterError
@@ -63,17 +62,19 @@ def _place(_context: click.Context, _option: click.Parameter, text: str) -> Plac
     return Place.from_degrees(lat, lon, alt)
 
 
-def _wind(_context: click.Context, _option: click.Parameter, text: str | None) -> Wind:
+def _wind(_context: click.Context, _option: click.Parameter, text: str | None) -> dict[str, float]:
     if text is None:
-        return Wind()
+        return {}
     try:
         numbers = [float(part) for part in text.split(",")]
-        speed, direction, turbulence = [*numbers, 0.0, 0.0][:3]
     except ValueError as error:
         raise click.BadParameter("expected SPEED,DIR[,TURBULENCE]") from error
+    if not 1 <= len(numbers) <= 3:
+        raise click.BadParameter("expected SPEED,DIR[,TURBULENCE]")
+    speed, direction, turbulence = [*numbers, 0.0, 0.0][:3]
     if not 0.0 <= speed < 60.0 or not 0.0 <= turbulence < 30.0:
         raise click.BadParameter("wind speed must lie between 0 and 60 m/s")
-    return Wind(speed, direction % 360.0, turbulence)
+    return {"SIM_WIND_SPD": speed, "SIM_WIND_DIR": direction % 360.0, "SIM_WIND_TURB": turbulence}
 
 
 def _parameters(_context: click.Context, _option: click.Parameter, texts: tuple[str, ...]) -> dict[str, float]:
@@ -119,6 +120,7 @@ def _parameters(_context: click.Context, _option: click.Parameter, texts: tuple[
 @click.option("--tlog", type=click.Path(path_type=Path), help="Record what the (first) vehicle says to a tlog.")
 @click.option("--duration", type=float, help="End after so many simulated seconds.")
 def vehicle(
+    *,
     links: tuple[str, ...],
     home: Place,
     heading_deg: float,
@@ -126,7 +128,7 @@ def vehicle(
     speedup: float,
     seed: int,
     parameters: dict[str, float],
-    wind: Wind,
+    wind: dict[str, float],
     ready_after: float,
     count: int,
     spacing: float,
@@ -135,21 +137,13 @@ def vehicle(
     duration: float | None,
 ) -> None:
     """Simulate ArduCopter-compatible vehicles that speak MAVLink 2."""
-    values = dict(parameters)
-    if wind.speed_mps or wind.turbulence_mps:
-        values |= {
-            "SIM_WIND_SPD": wind.speed_mps,
-            "SIM_WIND_DIR": wind.from_deg,
-            "SIM_WIND_TURB": wind.turbulence_mps,
-        }
     config = VehicleConfig(
         start=home,
         heading_deg=heading_deg,
         sysid=sysid,
         seed=seed,
         ready_after_s=ready_after,
-        parameters=values,
-        wind=wind,
+        parameters=parameters | wind,
         store=store,
         epoch_us=int(time.time() * 1e6),
     )

@@ -30,6 +30,7 @@ class AutoFlight(Flight):
         self._angle = 0.0
 
     def begin(self, v: Vehicle) -> None:
+        """Continue at the current item, or start over."""
         v.control.hold_here()
         v.yaw.follow_course()
         mission = v.mission
@@ -130,6 +131,7 @@ class AutoFlight(Flight):
                 pass
 
     def step(self, v: Vehicle, dt: float) -> None:
+        """Fly the current item and go on when it is done."""
         item = self._item
         if item is None or self.paused:
             return

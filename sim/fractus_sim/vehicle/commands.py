@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from fractus_sim.vehicle.auto import AutoFlight, item_target
 from fractus_sim.vehicle.channel import Channel
+from fractus_sim.vehicle.earth import valid_coordinates
 from fractus_sim.vehicle.guided import GuidedFlight
 from fractus_sim.vehicle.mav import (
     ABSOLUTE_FRAMES,
@@ -142,17 +143,14 @@ def _reposition(v: Vehicle, o: Order, _c: Channel) -> Result:
     switch = bool(int(o.params[1]) & 1) if math.isfinite(o.params[1]) else False
     if not v.armed or (v.mode is not Mode.GUIDED and not switch):
         return Result.DENIED
-    if not math.isfinite(o.z) or o.frame not in GLOBAL_FRAMES or not o.has_place:
-        return Result.DENIED
-    if abs(o.x) > 900_000_000 or abs(o.y) > 1_800_000_000:
+    placed = o.has_place and valid_coordinates(o.x, o.y) and math.isfinite(o.z)
+    if not placed or o.frame not in GLOBAL_FRAMES:
         return Result.DENIED
     north, east, down = item_target(v, o.item)
-    if outside_fence(v, north, east, down):
-        return Result.FAILED
-    if v.mode is not Mode.GUIDED and not v.set_mode(Mode.GUIDED):
+    if v.landed or outside_fence(v, north, east, down) or not v.set_mode(Mode.GUIDED):
         return Result.FAILED
     flight = v.flight
-    if not isinstance(flight, GuidedFlight) or v.landed:
+    if not isinstance(flight, GuidedFlight):
         return Result.FAILED
     if o.params[0] > 0.0:
         v.change_speed(1, o.params[0])
@@ -183,7 +181,7 @@ def _roi(v: Vehicle, o: Order, _c: Channel) -> Result:
     if o.command == Command.DO_SET_ROI_NONE or not o.has_place:
         v.yaw.look_at(None)
         return Result.ACCEPTED
-    if abs(o.x) > 900_000_000 or abs(o.y) > 1_800_000_000 or o.frame not in GLOBAL_FRAMES:
+    if not valid_coordinates(o.x, o.y) or o.frame not in GLOBAL_FRAMES:
         return Result.FAILED
     north, east, _ = item_target(v, Item(command=o.command, frame=o.frame, x=o.x, y=o.y))
     v.yaw.look_at((north, east))

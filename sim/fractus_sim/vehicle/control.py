@@ -103,7 +103,6 @@ class Control:
         self._integral = [0.0, 0.0, 0.0]
         self.thrust_share = 0.0
         self.lean = (0.0, 0.0)
-        self.wanted_accel = (0.0, 0.0, 0.0)
 
     def reset(self, est: Estimate) -> None:
         """Start anew from where the vehicle is: no history, no targets elsewhere."""
@@ -167,9 +166,9 @@ class Control:
         """Advance the trajectory and return the thrust (newtons) each motor is asked for."""
         accel_n, accel_e = (0.0, 0.0) if self.horizontal is Axis.ATTITUDE else self._follow_xy(dt, est)
         accel_d = self._follow_z(dt, est)
-        self.wanted_accel = (accel_n, accel_e, accel_d)
         self._turn(dt)
-        return self._mix(self._thrust_and_lean(accel_n, accel_e, accel_d, est, thrust_full_n), est, thrust_full_n)
+        thrust = self._thrust_and_lean((accel_n, accel_e, accel_d), est, thrust_full_n)
+        return self._mix(thrust, est, thrust_full_n)
 
     def _follow_xy(self, dt: float, est: Estimate) -> tuple[float, float]:
         limits, gains = self.limits, self.gains
@@ -179,11 +178,18 @@ class Control:
         if self.horizontal is Axis.POSITION:
             error = (self.target[0] - pos[0], self.target[1] - pos[1])
             acc[0], acc[1] = shape_position_xy(
-                error, here, bend, limits.speed_mps, limits.accel_mps2, limits.jerk_mps3, dt, self.target_velocity
+                error,
+                here,
+                bend,
+                speed_max=limits.speed_mps,
+                accel_max=limits.accel_mps2,
+                jerk_max=limits.jerk_mps3,
+                dt=dt,
+                feedforward=self.target_velocity,
             )
         else:
             acc[0], acc[1] = shape_velocity_xy(
-                self.target_velocity, here, bend, limits.accel_mps2, limits.jerk_mps3, dt
+                self.target_velocity, here, bend, accel_max=limits.accel_mps2, jerk_max=limits.jerk_mps3, dt=dt
             )
         vel[0] += acc[0] * dt
         vel[1] += acc[1] * dt
@@ -218,14 +224,16 @@ class Control:
                 self.target_down - pos[2],
                 vel[2],
                 acc[2],
-                -limits.climb_mps,
-                limits.sink_mps,
-                limits.accel_z_mps2,
-                limits.jerk_mps3,
-                dt,
+                speed_low=-limits.climb_mps,
+                speed_high=limits.sink_mps,
+                accel_max=limits.accel_z_mps2,
+                jerk_max=limits.jerk_mps3,
+                dt=dt,
             )
         else:
-            acc[2] = shape_velocity(self.target_vd, vel[2], acc[2], limits.accel_z_mps2, limits.jerk_mps3, dt)
+            acc[2] = shape_velocity(
+                self.target_vd, vel[2], acc[2], accel_max=limits.accel_z_mps2, jerk_max=limits.jerk_mps3, dt=dt
+            )
         vel[2] += acc[2] * dt
         pos[2] += vel[2] * dt
         error = clamp(pos[2] - est.down, -2.0, 2.0)
@@ -244,8 +252,9 @@ class Control:
             self.yaw_setpoint + clamp(wrap_pi(self.target_yaw - self.yaw_setpoint), -step, step)
         )
 
-    def _thrust_and_lean(self, an: float, ae: float, ad: float, est: Estimate, full: float) -> float:
+    def _thrust_and_lean(self, wanted: tuple[float, float, float], est: Estimate, full: float) -> float:
         """Turn a wanted acceleration into a lean (kept in `self.lean`) and a collective thrust in newtons."""
+        an, ae, ad = wanted
         yaw = est.yaw
         vertical = clamp(GRAVITY - ad, 0.2 * GRAVITY, 2.0 * GRAVITY)
         if self.horizontal is Axis.ATTITUDE:

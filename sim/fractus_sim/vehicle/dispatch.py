@@ -221,7 +221,7 @@ def _mission(v: Vehicle, m: Message, c: Channel) -> None:
     if m.name in ("MISSION_ITEM", "MISSION_ITEM_INT") and m.integer("current") in (2, 3):
         _guided_item(v, m, c)
         return
-    v.transfers.handle(c, m, v.time_s)
+    v.plans.transfers.handle(c, m, v.time_s)
 
 
 def _guided_item(v: Vehicle, m: Message, c: Channel) -> None:
@@ -264,7 +264,7 @@ def _manual(v: Vehicle, m: Message, _c: Channel) -> None:
 
 def _set_origin(v: Vehicle, m: Message, c: Channel) -> None:
     if v.origin is None and valid_coordinates(m.integer("latitude"), m.integer("longitude")):
-        v.origin = Place(m.integer("latitude"), m.integer("longitude"), m.integer("altitude") / 1000.0)
+        v.estimator.origin = Place(m.integer("latitude"), m.integer("longitude"), m.integer("altitude") / 1000.0)
     v.send(c, "GPS_GLOBAL_ORIGIN")
 
 

@@ -36,6 +36,7 @@ class GuidedFlight(Flight):
         self._resume: tuple[float, float, float] | None = None
 
     def begin(self, v: Vehicle) -> None:
+        """Stop and wait for a target."""
         self.task = Task.IDLE
         v.control.hold_here()
         v.yaw.follow_course()
@@ -93,6 +94,7 @@ class GuidedFlight(Flight):
         self.paused = paused
 
     def step(self, v: Vehicle, dt: float) -> None:
+        """Follow the target; stop when it is too old."""
         if self.task is Task.TAKEOFF:
             if v.takeoff_done():
                 self.task = Task.POSITION

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import selectors
 import socket
+import termios
 import tty
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -313,8 +314,6 @@ class _Terminal:
 
 
 def _set_speed(fd: int, baud: int) -> None:
-    import termios
-
     tty.setraw(fd)
     speed = getattr(termios, f"B{baud}", None)
     if speed is None:

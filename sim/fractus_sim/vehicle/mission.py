@@ -156,6 +156,7 @@ class Transfers:
     def __init__(self, stores: dict[MissionKind, ItemStore]) -> None:
         self.stores = stores
         self.upload: Upload | None = None
+        self.now_s = 0.0
 
     def _ack(self, channel: Channel, message: Message, kind: int, result: MissionResult) -> None:
         channel.send(
@@ -170,28 +171,30 @@ class Transfers:
 
     def handle(self, channel: Channel, message: Message, now_s: float) -> None:
         """Answer one message of the protocol."""
+        self.now_s = now_s
         kind_number = message.integer("mission_type") if message.has("mission_type") else 0
         if kind_number == 255 and message.name == "MISSION_CLEAR_ALL":
             for store in self.stores.values():
                 self._replace(store, [])
             self._ack(channel, message, kind_number, MissionResult.ACCEPTED)
-            return
-        if kind_number not in set(MissionKind):
+        elif kind_number not in set(MissionKind):
             self._ack(channel, message, kind_number, MissionResult.UNSUPPORTED)
-            return
-        kind = MissionKind(kind_number)
-        store = self.stores[kind]
+        else:
+            self._handle(channel, message, self.stores[MissionKind(kind_number)])
+
+    def _handle(self, channel: Channel, message: Message, store: ItemStore) -> None:
+        kind = store.kind
         match message.name:
             case "MISSION_COUNT":
-                self._begin(channel, message, store, 0, message.integer("count") - 1, now_s, partial=False)
+                self._begin(channel, message, store, range(message.integer("count")))
             case "MISSION_WRITE_PARTIAL_LIST":
                 start, end = message.integer("start_index"), message.integer("end_index")
-                if not 0 <= start <= end < len(store.items):
-                    self._ack(channel, message, kind, MissionResult.ERROR)
+                if 0 <= start <= end < len(store.items):
+                    self._begin(channel, message, store, range(start, end + 1))
                 else:
-                    self._begin(channel, message, store, start, end, now_s, partial=True)
+                    self._ack(channel, message, kind, MissionResult.ERROR)
             case "MISSION_ITEM" | "MISSION_ITEM_INT":
-                self._take(channel, message, store, now_s)
+                self._take(channel, message, store)
             case "MISSION_REQUEST_LIST":
                 channel.send("MISSION_COUNT", self._address(message, kind) | {"count": len(store.items)})
             case "MISSION_REQUEST_PARTIAL_LIST":
@@ -200,8 +203,10 @@ class Transfers:
                 self._give(channel, message, store)
             case "MISSION_CLEAR_ALL":
                 self._ack(channel, message, kind, self._replace(store, []))
-            case "MISSION_ACK":
-                self.upload = None if self._is_uploader(channel, message) else self.upload
+            case "MISSION_ACK" if self._is_uploader(channel, message):
+                self.upload = None
+            case _:
+                pass
 
     @staticmethod
     def _address(message: Message, kind: MissionKind) -> dict[str, int | float | bytes | tuple[int | float, ...]]:
@@ -211,34 +216,32 @@ class Transfers:
         up = self.upload
         return up is not None and up.channel is channel and (up.sysid, up.compid) == (message.sysid, message.compid)
 
-    def _begin(
-        self,
-        channel: Channel,
-        message: Message,
-        store: ItemStore,
-        first: int,
-        last: int,
-        now_s: float,
-        *,
-        partial: bool,
-    ) -> None:
+    def _begin(self, channel: Channel, message: Message, store: ItemStore, wanted: range) -> None:
+        """Begin to ask for the items of `wanted`; all of a new list, or a part of the stored one."""
         if self.upload is not None and not self._is_uploader(channel, message):
             self._ack(channel, message, store.kind, MissionResult.DENIED)
-            return
-        if last >= MAX_ITEMS:
+        elif wanted.stop > MAX_ITEMS:
             self._ack(channel, message, store.kind, MissionResult.NO_SPACE)
-            return
-        if last < first:
+        elif not wanted:
             self._ack(channel, message, store.kind, self._replace(store, []))
-            return
-        items = list(store.items) if partial else []
-        self.upload = Upload(
-            channel, message.sysid, message.compid, store.kind, first, last, items, partial, now_s, now_s
-        )
-        self._ask(self.upload, now_s)
+        else:
+            partial = message.name == "MISSION_WRITE_PARTIAL_LIST"
+            self.upload = Upload(
+                channel=channel,
+                sysid=message.sysid,
+                compid=message.compid,
+                kind=store.kind,
+                next=wanted.start,
+                last=wanted.stop - 1,
+                items=list(store.items) if partial else [],
+                partial=partial,
+                heard_s=self.now_s,
+                asked_s=self.now_s,
+            )
+            self._ask(self.upload)
 
-    def _ask(self, up: Upload, now_s: float) -> None:
-        up.asked_s = now_s
+    def _ask(self, up: Upload) -> None:
+        up.asked_s = self.now_s
         up.channel.send(
             "MISSION_REQUEST",
             {
@@ -249,7 +252,7 @@ class Transfers:
             },
         )
 
-    def _take(self, channel: Channel, message: Message, store: ItemStore, now_s: float) -> None:
+    def _take(self, channel: Channel, message: Message, store: ItemStore) -> None:
         up = self.upload
         if up is None or not self._is_uploader(channel, message) or up.kind is not store.kind:
             self._ack(channel, message, store.kind, MissionResult.ERROR)
@@ -270,9 +273,9 @@ class Transfers:
         else:
             up.items.append(item)
         up.next += 1
-        up.heard_s = now_s
+        up.heard_s = self.now_s
         if up.next <= up.last:
-            self._ask(up, now_s)
+            self._ask(up)
             return
         self.upload = None
         self._ack(channel, message, store.kind, self._replace(store, up.items))
@@ -312,6 +315,7 @@ class Transfers:
 
     def step(self, now_s: float) -> Upload | None:
         """Repeat an unanswered request; return an upload that was given up."""
+        self.now_s = now_s
         up = self.upload
         if up is None:
             return None
@@ -328,7 +332,7 @@ class Transfers:
             )
             return up
         if now_s - up.asked_s > RETRY_S:
-            self._ask(up, now_s)
+            self._ask(up)
         return None
 
 

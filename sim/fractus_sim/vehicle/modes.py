@@ -61,9 +61,11 @@ class Stabilize(Flight):
     manual_throttle = True
 
     def begin(self, v: Vehicle) -> None:
+        """Hand the lean angles to the sticks."""
         v.control.horizontal = Axis.ATTITUDE
 
     def step(self, v: Vehicle, dt: float) -> None:
+        """Follow the sticks."""
         share = clamp((v.sticks[2] - 1000) / 1000.0, 0.0, 1.0)
         lean = v.control.limits.tilt_max_rad
         v.control.attitude = (stick_rate(v.sticks[0]) * lean, stick_rate(v.sticks[1]) * lean)
@@ -82,10 +84,12 @@ class AltHold(Flight):
     needs_position = False
 
     def begin(self, v: Vehicle) -> None:
+        """Hold the altitude."""
         v.control.hold_here()
         v.control.horizontal = Axis.ATTITUDE
 
     def step(self, v: Vehicle, dt: float) -> None:
+        """Follow the sticks."""
         lean = v.control.limits.tilt_max_rad
         v.control.attitude = (stick_rate(v.sticks[0]) * lean, stick_rate(v.sticks[1]) * lean)
         pilot_climb(v)
@@ -95,9 +99,11 @@ class Loiter(Flight):
     """Holds position; sticks move it."""
 
     def begin(self, v: Vehicle) -> None:
+        """Stop and hold."""
         v.control.hold_here()
 
     def step(self, v: Vehicle, dt: float) -> None:
+        """Follow the sticks."""
         forward, right = -stick_rate(v.sticks[1]), stick_rate(v.sticks[0])
         if forward or right:
             speed = v.params["LOIT_SPEED"] / 100.0
@@ -115,6 +121,7 @@ class Brake(Flight):
     """Stops at once and holds."""
 
     def begin(self, v: Vehicle) -> None:
+        """Stop and hold."""
         v.control.hold_here()
 
 
@@ -124,6 +131,7 @@ class Land(Flight):
     needs_position = False
 
     def begin(self, v: Vehicle) -> None:
+        """Stop, or keep level when the position is unknown."""
         v.touch_time_s = 0.0
         if v.position_ok:
             v.control.go_to(*v.control.stopping_point())
@@ -134,6 +142,7 @@ class Land(Flight):
         v.control.target_yaw = v.control.yaw_setpoint
 
     def step(self, v: Vehicle, dt: float) -> None:
+        """Sink."""
         if v.control.horizontal is not Axis.ATTITUDE and not v.position_ok:
             v.control.horizontal = Axis.ATTITUDE
             v.control.attitude = (0.0, 0.0)
@@ -159,12 +168,13 @@ class ReturnToLaunch(Flight):
         self._target = (0.0, 0.0)
 
     def begin(self, v: Vehicle) -> None:
+        """Choose target and altitude, and climb."""
         p = v.params
         north, east, base_down = v.return_point()
         self._target = (north, east)
         distance = math.hypot(north - v.est.north, east - v.est.east)
         height = base_down - v.est.down
-        wanted = max(height + p["RTL_CLIMB_MIN"] / 100.0, max(p["RTL_ALT"] / 100.0, 2.0))
+        wanted = max(height + p["RTL_CLIMB_MIN"] / 100.0, p["RTL_ALT"] / 100.0, 2.0)
         if p["RTL_CONE_SLOPE"] >= 0.5:
             wanted = min(wanted, max(distance * p["RTL_CONE_SLOPE"], 2.0))
         ceiling = v.fence.alt_max_m - p["FENCE_MARGIN"]
@@ -179,6 +189,7 @@ class ReturnToLaunch(Flight):
         v.touch_time_s = 0.0
 
     def step(self, v: Vehicle, dt: float) -> None:
+        """Go through the stages."""
         control = v.control
         if self.stage is RtlStage.CLIMB:
             if abs(v.est.down - control.target_down) < 0.5 or v.est.down < control.target_down:
@@ -201,6 +212,8 @@ class ReturnToLaunch(Flight):
 
 
 FLIGHTS: dict[Mode, type[Flight]] = {
+    Mode.GUIDED: GuidedFlight,
+    Mode.AUTO: AutoFlight,
     Mode.STABILIZE: Stabilize,
     Mode.ALT_HOLD: AltHold,
     Mode.LOITER: Loiter,
@@ -212,8 +225,4 @@ FLIGHTS: dict[Mode, type[Flight]] = {
 
 def new_flight(mode: Mode) -> Flight:
     """The object that flies a mode."""
-    if mode is Mode.GUIDED:
-        return GuidedFlight()
-    if mode is Mode.AUTO:
-        return AutoFlight()
     return FLIGHTS[mode]()

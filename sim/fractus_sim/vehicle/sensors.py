@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
 from dataclasses import dataclass
@@ -39,7 +40,7 @@ class Battery:
 
     def _rest_voltage(self) -> float:
         left = self.left
-        for (low, low_v), (high, high_v) in zip(_CELL_CURVE, _CELL_CURVE[1:], strict=False):
+        for (low, low_v), (high, high_v) in itertools.pairwise(_CELL_CURVE):
             if left <= high:
                 return self.full_v / 4.2 * (low_v + (high_v - low_v) * (left - low) / (high - low))
         return self.full_v
@@ -68,12 +69,14 @@ class Gps:
     vn: float = 0.0
     ve: float = 0.0
 
-    def update(self, truth: Place, vn: float, ve: float, noise_m: float, satellites: int, rng: random.Random) -> None:
+    def update(
+        self, truth: Place, velocity: tuple[float, float], *, noise_m: float, satellites: int, rng: random.Random
+    ) -> None:
         """Take a fix."""
         if noise_m > 0.0:
             truth = truth.offset(rng.gauss(0.0, noise_m), rng.gauss(0.0, noise_m), rng.gauss(0.0, 1.5 * noise_m))
         self.place = truth
-        self.vn, self.ve = vn, ve
+        self.vn, self.ve = velocity
         self.satellites = satellites
         self.fix_type = 6 if satellites >= 10 else 3 if satellites >= 6 else 1
 

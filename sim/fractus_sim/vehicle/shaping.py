@@ -43,7 +43,7 @@ def sqrt_controller(error: float, gain: float, limit: float, dt: float) -> float
 
 
 def shape_velocity(
-    target: float, velocity: float, acceleration: float, accel_max: float, jerk_max: float, dt: float
+    target: float, velocity: float, acceleration: float, *, accel_max: float, jerk_max: float, dt: float
 ) -> float:
     """Next acceleration that brings `velocity` to `target` under both limits."""
     wanted = sqrt_controller(target - velocity, jerk_max / accel_max, jerk_max, dt)
@@ -56,6 +56,7 @@ def shape_position(
     error: float,
     velocity: float,
     acceleration: float,
+    *,
     speed_low: float,
     speed_high: float,
     accel_max: float,
@@ -64,13 +65,16 @@ def shape_position(
 ) -> float:
     """Next acceleration that closes a position `error` in one axis; speeds are limited to [speed_low, speed_high]."""
     target = sqrt_controller(error, 0.5 * jerk_max / accel_max, accel_max * BRAKING_SHARE, dt)
-    return shape_velocity(clamp(target, speed_low, speed_high), velocity, acceleration, accel_max, jerk_max, dt)
+    return shape_velocity(
+        clamp(target, speed_low, speed_high), velocity, acceleration, accel_max=accel_max, jerk_max=jerk_max, dt=dt
+    )
 
 
 def shape_velocity_xy(
     target: tuple[float, float],
     velocity: tuple[float, float],
     acceleration: tuple[float, float],
+    *,
     accel_max: float,
     jerk_max: float,
     dt: float,
@@ -93,6 +97,7 @@ def shape_position_xy(
     error: tuple[float, float],
     velocity: tuple[float, float],
     acceleration: tuple[float, float],
+    *,
     speed_max: float,
     accel_max: float,
     jerk_max: float,
@@ -107,7 +112,9 @@ def shape_position_xy(
         scale = min(speed, speed_max) / size
         target_n += error[0] * scale
         target_e += error[1] * scale
-    return shape_velocity_xy((target_n, target_e), velocity, acceleration, accel_max, jerk_max, dt)
+    return shape_velocity_xy(
+        (target_n, target_e), velocity, acceleration, accel_max=accel_max, jerk_max=jerk_max, dt=dt
+    )
 
 
 def stopping_distance(speed_mps: float, gain: float, accel_mps2: float) -> float:

@@ -6,7 +6,6 @@ import struct
 from dataclasses import replace
 from typing import BinaryIO
 
-from fractus_sim.vehicle.body import Wind
 from fractus_sim.vehicle.channel import Channel
 from fractus_sim.vehicle.dispatch import dispatch
 from fractus_sim.vehicle.streams import ALL_GROUPS, GROUPS
@@ -68,9 +67,8 @@ class Craft:
 
     def _reboot(self) -> None:
         channels = self.vehicle.channels
-        wind = self.vehicle.wind
         place = self.vehicle.true_place
-        self.vehicle = Vehicle(replace(self.config, start=replace(place, alt_m=self.config.start.alt_m), wind=wind))
+        self.vehicle = Vehicle(replace(self.config, start=replace(place, alt_m=self.config.start.alt_m)))
         for channel in channels:
             channel.streams.clear()
             channel.parameters.clear()
@@ -126,7 +124,6 @@ def formation(config: VehicleConfig, count: int, spacing_m: float) -> list[Vehic
             config,
             sysid=config.sysid + at,
             start=config.start.offset(0.0, at * spacing_m),
-            wind=Wind(config.wind.speed_mps, config.wind.from_deg, config.wind.turbulence_mps),
             store=config.store.with_name(f"{config.store.stem}-{config.sysid + at}{config.store.suffix}")
             if config.store is not None and count > 1
             else config.store,

@@ -10,17 +10,20 @@ from pathlib import Path
 
 from fractus_sim.vehicle.body import Airframe, Body, Wind
 from fractus_sim.vehicle.channel import PARAMETERS_PER_TICK, Channel
-from fractus_sim.vehicle.control import Control, Estimate
+from fractus_sim.vehicle.control import Control
 from fractus_sim.vehicle.earth import Place, valid_coordinates
+from fractus_sim.vehicle.estimator import Estimator
 from fractus_sim.vehicle.failsafes import Failsafes
-from fractus_sim.vehicle.fence import Fence, FenceItem, FenceShapeError, build_shapes
+from fractus_sim.vehicle.fence import Fence
 from fractus_sim.vehicle.flight import Flight
 from fractus_sim.vehicle.guided import Heading
-from fractus_sim.vehicle.mav import VERSION_TEXT, Landed, MissionKind, MissionResult, Mode, Severity
-from fractus_sim.vehicle.mission import Item, ItemStore, Mission, Transfers
-from fractus_sim.vehicle.modes import ReturnToLaunch, new_flight
+from fractus_sim.vehicle.mav import VERSION_TEXT, Landed, Mode, Severity
+from fractus_sim.vehicle.mission import Item, Mission
+from fractus_sim.vehicle.modes import FLIGHTS, ReturnToLaunch, new_flight
 from fractus_sim.vehicle.params import Parameters
-from fractus_sim.vehicle.sensors import Battery, Drift, Gps
+from fractus_sim.vehicle.plans import Plans
+from fractus_sim.vehicle.sensors import Battery, Gps
+from fractus_sim.vehicle.settings import LIMIT_PREFIXES, set_battery, set_fence, set_limits, set_wind
 from fractus_sim.vehicle.shaping import clamp, wrap_pi
 from fractus_sim.vehicle.streams import BUILDERS
 from fractus_sim.vehicle.wire import Message, Value
@@ -28,8 +31,6 @@ from fractus_sim.vehicle.wire import Message, Value
 CONTROL_STEP_S = 0.01
 PHYSICS_PER_CONTROL = 2
 ARMING_DELAY_S = 2.0
-GPS_INTERVAL_S = 0.2
-GPS_TIMEOUT_S = 5.0
 STICKS_CENTRED = (1500,) * 4 + (1800,) + (1000,) * 3 + (0,) * 10
 
 
@@ -43,7 +44,6 @@ class VehicleConfig:
     seed: int = 1
     ready_after_s: float = 32.0
     parameters: Mapping[str, float] = field(default_factory=dict)
-    wind: Wind = field(default_factory=Wind)
     store: Path | None = None
     epoch_us: int = 1_700_000_000_000_000
     position_noise_m: float = 0.12
@@ -64,26 +64,21 @@ class Vehicle:
         self.params.assign("SYSID_THISMAV", config.sysid)
         self.time_s = 0.0
         self.ticks = 0
-        self.wind = config.wind
+        self.wind = Wind()
         self.body = Body(Airframe(), config.heading_deg)
         self.control = Control(self.body.airframe)
         self.battery = Battery(self.params["SIM_BATT_VOLTAGE"], self.params["BATT_CAPACITY"])
-        self.gps = Gps()
-        self.drift = Drift(self.rng, config.position_noise_m)
+        self.estimator = Estimator(
+            config.start,
+            ready_after_s=config.ready_after_s,
+            noise_m=config.position_noise_m,
+            rng=self.rng,
+            params=self.params,
+            say=self.say,
+        )
         self.fence = Fence()
         self.failsafes = Failsafes()
-        self.mission = Mission()
-        self.rally = ItemStore(MissionKind.RALLY)
-        self.fence_items = ItemStore(MissionKind.FENCE, accept=self._accept_fence)
-        self.mission.store.accept = self._accept_mission
-        self.rally.accept = self._accept_rally
-        self.transfers = Transfers(
-            {
-                MissionKind.MISSION: self.mission.store,
-                MissionKind.FENCE: self.fence_items,
-                MissionKind.RALLY: self.rally,
-            }
-        )
+        self.plans = Plans(self)
         self.channels: list[Channel] = []
         self.yaw = Heading()
         self.armed = False
@@ -96,20 +91,17 @@ class Vehicle:
         self.taking_off_until_m: float | None = None
         self._lift_after_s = 0.0
         self._idle_since_s = 0.0
-        self.origin: Place | None = None
         self.home: Place | None = None
         self._home_locked = False
-        self.position_ok = False
-        self._gps_seen_s = -1e9
-        self._next_gps_s = 0.0
-        self._announced = 0
         self.reboot_wanted = False
         self.signing_key: bytes | None = None
         self.sticks: tuple[int, ...] = STICKS_CENTRED
         self._sticks_until_s = 0.0
-        self.est = self._estimate()
+        self.est = self.estimator.estimate(self.body)
         self.params.changed = self._parameter_changed
-        self._apply_parameters()
+        set_limits(self.params, self.control)
+        set_fence(self.params, self.fence)
+        set_wind(self.params, self.wind)
         self.control.reset(self.est)
 
     # -- what others ask ---------------------------------------------------------------------------------------
@@ -118,6 +110,26 @@ class Vehicle:
     def unix_us(self) -> int:
         """Time of day in microseconds."""
         return self.config.epoch_us + int(self.time_s * 1e6)
+
+    @property
+    def origin(self) -> Place | None:
+        """Where the local frame begins; None until the estimator has a position."""
+        return self.estimator.origin
+
+    @property
+    def position_ok(self) -> bool:
+        """Whether the position can be trusted."""
+        return self.estimator.position_ok
+
+    @property
+    def gps(self) -> Gps:
+        """The GPS receiver."""
+        return self.estimator.gps
+
+    @property
+    def mission(self) -> Mission:
+        """The stored mission."""
+        return self.plans.mission
 
     @property
     def place(self) -> Place:
@@ -178,15 +190,6 @@ class Vehicle:
             return Landed.TAKEOFF
         return Landed.LANDING if self.mode is Mode.LAND else Landed.IN_AIR
 
-    @property
-    def ekf_flags(self) -> int:
-        """EKF_STATUS_FLAGS."""
-        if self.position_ok:
-            return 831  # all estimates, predicted positions
-        if self.origin is not None:
-            return 167  # attitude, vertical position, constant position mode
-        return 1024 if self.time_s < 0.1 * self.config.ready_after_s else 165
-
     def mission_state(self) -> int:
         """MISSION_STATE."""
         if len(self.mission.items) <= 1:
@@ -197,27 +200,23 @@ class Vehicle:
 
     def arming_refusal(self) -> str | None:
         """Why the vehicle would not arm now, or None."""
-        if self.time_s < 0.5 * self.config.ready_after_s:
-            return "AHRS: EKF3 not healthy"
-        if self.gps.fix_type < 3 and self._needs_position(self.mode):
-            return "GPS 1: Bad fix"
-        if not self.position_ok and (self._needs_position(self.mode) or self.fence.enabled):
-            return "Need Position Estimate"
-        if self.time_s < self.config.ready_after_s:
-            return "AHRS: waiting for home"
-        if 0.0 < self.battery.voltage_v < self.params["BATT_ARM_VOLT"]:
-            return "Battery 1 below minimum arming voltage"
-        if self.failsafes.battery or self.battery.voltage_v < self.params["BATT_CRT_VOLT"]:
-            return "Battery 1 low voltage failsafe" if self.failsafes.battery else "Battery 1 critical voltage failsafe"
-        if self.failsafes.gcs:
-            return "GCS failsafe on"
-        if self.home is not None and self.fence.outside(self.est.north, self.est.east, 0.0, self.home_xy):
-            return "vehicle outside fence"
-        return None
-
-    @staticmethod
-    def _needs_position(mode: Mode) -> bool:
-        return new_flight(mode).needs_position
+        needs_position = FLIGHTS[self.mode].needs_position
+        volts, failsafes, north, east = self.battery.voltage_v, self.failsafes, self.est.north, self.est.east
+        checks = (
+            (not self.estimator.healthy, "AHRS: EKF3 not healthy"),
+            (needs_position and self.gps.fix_type < 3, "GPS 1: Bad fix"),
+            (not self.position_ok and (needs_position or self.fence.enabled), "Need Position Estimate"),
+            (not self.estimator.ready, "AHRS: waiting for home"),
+            (0.0 < volts < self.params["BATT_ARM_VOLT"], "Battery 1 below minimum arming voltage"),
+            (failsafes.battery, "Battery 1 low voltage failsafe"),
+            (volts < self.params["BATT_CRT_VOLT"], "Battery 1 critical voltage failsafe"),
+            (failsafes.gcs, "GCS failsafe on"),
+            (
+                self.home is not None and bool(self.fence.outside(north, east, 0.0, self.home_xy)),
+                "Vehicle outside fence",
+            ),
+        )
+        return next((text for failed, text in checks if failed), None)
 
     # -- speaking ----------------------------------------------------------------------------------------------
 
@@ -289,7 +288,7 @@ class Vehicle:
 
     def mode_refusal(self, mode: Mode) -> str | None:
         """Why a mode cannot be entered now, or None."""
-        if self._needs_position(mode) and not self.position_ok and (self.armed or mode is Mode.RTL):
+        if FLIGHTS[mode].needs_position and not self.position_ok and (self.armed or mode is Mode.RTL):
             return f"Mode change to {mode.name} failed: requires position"
         if mode is Mode.AUTO and len(self.mission.items) <= 1:
             return "Mode change to AUTO failed: init failed"
@@ -310,7 +309,7 @@ class Vehicle:
         """Change the mode without asking."""
         self.mode = mode
         self.flight = new_flight(mode)
-        self._apply_limits()
+        set_limits(self.params, self.control)
         self.control.throttle = None
         self.control.yaw_rate = None
         if self.landed or not self.armed:
@@ -379,18 +378,7 @@ class Vehicle:
     def return_point(self) -> tuple[float, float, float]:
         """Where RTL goes (local): home or the nearest rally point, and the altitude to count from."""
         origin = self.origin or self.start
-        home = self.home or origin
-        best = origin.vector_to(home)
-        here = (self.est.north, self.est.east)
-        limit = self.params["RALLY_LIMIT_KM"] * 1000.0
-        rallies = [origin.vector_to(Place(item.x, item.y, home.alt_m)) for item in self.rally.items]
-        rallies = [r for r in rallies if limit <= 0.0 or math.dist(r[:2], here) <= limit]
-        if not rallies:
-            return best
-        nearest = min(rallies, key=lambda r: math.dist(r[:2], here))
-        if int(self.params["RALLY_INCL_HOME"]) and math.dist(best[:2], here) <= math.dist(nearest[:2], here):
-            return best
-        return nearest
+        return self.plans.return_point(self.params, origin, self.home or origin, (self.est.north, self.est.east))
 
     def set_home_here(self) -> bool:
         """Make the present position home."""
@@ -425,71 +413,18 @@ class Vehicle:
         self.sticks = tuple(sticks)
         self._sticks_until_s = self.time_s + max(self.params["RC_OVERRIDE_TIME"], 0.0)
 
-    # -- stored lists ------------------------------------------------------------------------------------------
-
-    def _accept_mission(self, items: list[Item]) -> MissionResult:
-        if items and self.home is not None:
-            home = self.home
-            items[0] = Item(command=16, frame=0, x=home.lat_e7, y=home.lon_e7, z=home.alt_m)
-        self.params.assign("MIS_TOTAL", len(items))
-        if self.mode is not Mode.AUTO:
-            self.mission.rewind()
-        return MissionResult.ACCEPTED
-
-    def _accept_fence(self, items: list[Item]) -> MissionResult:
-        local = []
-        for item in items:
-            north, east, _ = self.start.vector_to(Place(item.x, item.y, 0.0))
-            local.append(FenceItem(item.command, item.param1, north, east))
-        try:
-            self.fence.shapes = build_shapes(local)
-        except FenceShapeError as error:
-            self.say(Severity.WARNING, f"Fence: {error}")
-            return MissionResult.INVALID
-        self.params.assign("FENCE_TOTAL", len(items))
-        return MissionResult.ACCEPTED
-
-    def _accept_rally(self, items: list[Item]) -> MissionResult:
-        self.params.assign("RALLY_TOTAL", len(items))
-        return MissionResult.ACCEPTED
-
     # -- parameters --------------------------------------------------------------------------------------------
 
     def _parameter_changed(self, name: str) -> None:
         prefix = name.split("_", 1)[0]
-        if prefix in ("WPNAV", "PSC", "ANGLE", "ATC", "MOT", "LOIT"):
-            self._apply_limits()
-        elif prefix in ("FENCE", "SIM", "BATT"):
-            self._apply_parameters()
-
-    def _apply_parameters(self) -> None:
-        p = self.params
-        fence = self.fence
-        fence.enabled = int(p["FENCE_ENABLE"]) != 0
-        fence.types = int(p["FENCE_TYPE"])
-        fence.alt_max_m, fence.alt_min_m = p["FENCE_ALT_MAX"], p["FENCE_ALT_MIN"]
-        fence.radius_m = p["FENCE_RADIUS"]
-        self.battery.capacity_mah = max(p["BATT_CAPACITY"], 1.0)
-        self.battery.full_v = p["SIM_BATT_VOLTAGE"]
-        if p["SIM_WIND_SPD"] > 0.0 or p["SIM_WIND_TURB"] > 0.0 or self.time_s > 0.0:
-            self.wind.speed_mps = p["SIM_WIND_SPD"]
-            self.wind.from_deg = p["SIM_WIND_DIR"]
-            self.wind.turbulence_mps = p["SIM_WIND_TURB"]
-        self._apply_limits()
-
-    def _apply_limits(self) -> None:
-        p, limits, gains = self.params, self.control.limits, self.control.gains
-        limits.speed_mps = max(p["WPNAV_SPEED"] / 100.0, 0.2)
-        limits.climb_mps = max(p["WPNAV_SPEED_UP"] / 100.0, 0.1)
-        limits.sink_mps = max(p["WPNAV_SPEED_DN"] / 100.0, 0.1)
-        limits.accel_mps2 = max(p["WPNAV_ACCEL"] / 100.0, 0.5)
-        limits.accel_z_mps2 = max(p["WPNAV_ACCEL_Z"] / 100.0, 0.5)
-        limits.jerk_mps3 = max(p["PSC_JERK_XY"], 1.0)
-        limits.tilt_max_rad = math.radians(clamp((p["PSC_ANGLE_MAX"] or p["ANGLE_MAX"] / 100.0), 10.0, 80.0))
-        limits.yaw_rate_rps = math.radians(clamp(p["ATC_SLEW_YAW"] / 100.0, 5.0, 180.0))
-        gains.position = clamp(p["PSC_POSXY_P"], 0.2, 3.0)
-        gains.velocity = clamp(p["PSC_VELXY_P"], 0.1, 6.0)
-        gains.velocity_i = clamp(p["PSC_VELXY_I"], 0.0, 2.0)
+        if prefix in LIMIT_PREFIXES:
+            set_limits(self.params, self.control)
+        elif prefix == "FENCE":
+            set_fence(self.params, self.fence)
+        elif name.startswith("SIM_WIND"):
+            set_wind(self.params, self.wind)
+        elif prefix in ("SIM", "BATT"):
+            set_battery(self.params, self.battery)
 
     # -- time --------------------------------------------------------------------------------------------------
 
@@ -497,7 +432,9 @@ class Vehicle:
         """Advance by one control step (10 ms)."""
         self.ticks += 1
         self.time_s = self.ticks * CONTROL_STEP_S
-        self._sense()
+        self.estimator.step(self.time_s, self.body)
+        if self.home is None and self.estimator.ready and self.position_ok:
+            self._set_home(self.place)
         self.failsafes.step(self)
         if self.time_s > self._sticks_until_s and self.sticks is not STICKS_CENTRED:
             self.sticks = STICKS_CENTRED
@@ -505,8 +442,8 @@ class Vehicle:
             self.flight.step(self, CONTROL_STEP_S)
             self._check_idle()
         self._move()
-        self.est = self._estimate()
-        if self.transfers.upload is not None and self.transfers.step(self.time_s) is not None:
+        self.est = self.estimator.estimate(self.body)
+        if self.plans.transfers.upload is not None and self.plans.transfers.step(self.time_s) is not None:
             self.say(Severity.WARNING, "Mission upload timeout")
         for channel in self.channels:
             self._serve(channel)
@@ -532,7 +469,7 @@ class Vehicle:
                 m = [c * left if failed >> at & 1 else c for at, c in enumerate(commands)]
                 commands = (m[0], m[1], m[2], m[3])
             body.step(dt, commands, air)
-            self.est = self._estimate()
+            self.est = self.estimator.estimate(self.body)
         self.battery.step(CONTROL_STEP_S, sum(body.motors) / (body.airframe.mass_kg * 9.80665))
         if self.landed and not body.on_ground:
             self.landed = False
@@ -552,64 +489,6 @@ class Vehicle:
             self.disarm("landed")
         elif delay > 0.0 and self.time_s - self._idle_since_s >= delay:
             self.disarm("idle")
-
-    def _estimate(self) -> Estimate:
-        b, d = self.body, self.drift
-        roll, pitch, yaw = b.euler()
-        return Estimate(
-            b.north + d.north,
-            b.east + d.east,
-            b.down + d.down,
-            b.vn + d.rate_n,
-            b.ve + d.rate_e,
-            b.vd,
-            roll,
-            pitch,
-            yaw,
-            b.p,
-            b.q,
-            b.r,
-            b.quaternion,
-        )
-
-    def _sense(self) -> None:
-        if self.time_s < self._next_gps_s:
-            return
-        self._next_gps_s += GPS_INTERVAL_S
-        ready = self.config.ready_after_s
-        if int(self.params["SIM_GPS1_ENABLE"]) and self.time_s >= 0.35 * ready:
-            body = self.body
-            noise = max(self.params["SIM_GPS1_NOISE"], 0.0) + self.config.position_noise_m
-            satellites = int(self.params["SIM_GPS1_NUMSATS"])
-            self.gps.update(self.true_place, body.vn, body.ve, noise, satellites, self.rng)
-            if self.gps.fix_type >= 3:
-                self._gps_seen_s = self.time_s
-        elif self.time_s >= 0.05 * ready:
-            self.gps.lose()
-        aided = self.time_s - self._gps_seen_s < GPS_TIMEOUT_S and self.time_s >= 0.8 * ready
-        blind = self.origin is not None and self.time_s - self._gps_seen_s > 2.0 * GPS_INTERVAL_S
-        self.drift.step(GPS_INTERVAL_S, aided=not blind)
-        if self.origin is None and self.gps.fix_type >= 3 and self.time_s >= 0.8 * ready:
-            self.origin = self.start
-        if aided and self.origin is not None and self.home is None and self.time_s >= ready:
-            self._set_home(self.place)
-        self.position_ok = aided and self.origin is not None
-        self._announce_readiness()
-
-    def _announce_readiness(self) -> None:
-        ready = self.config.ready_after_s
-        texts = (
-            (0.05, "EKF3 IMU0 initialised"),
-            (0.1, "AHRS: EKF3 active"),
-            (0.12, "EKF3 IMU0 tilt alignment complete"),
-            (0.15, "EKF3 IMU0 MAG0 initial yaw alignment complete"),
-            (0.35, "GPS 1: detected u-blox"),
-            (0.8, "EKF3 IMU0 origin set"),
-            (0.9, "EKF3 IMU0 is using GPS"),
-        )
-        while self._announced < len(texts) and self.time_s >= texts[self._announced][0] * ready:
-            self.say(Severity.INFO, texts[self._announced][1])
-            self._announced += 1
 
     # -- links -------------------------------------------------------------------------------------------------
 
@@ -645,8 +524,8 @@ class Vehicle:
     def detach(self, channel: Channel) -> None:
         """Close a link."""
         self.channels.remove(channel)
-        if self.transfers.upload is not None and self.transfers.upload.channel is channel:
-            self.transfers.upload = None
+        if self.plans.transfers.upload is not None and self.plans.transfers.upload.channel is channel:
+            self.plans.transfers.upload = None
 
     def heard(self, message: Message) -> None:
         """Note a heartbeat of the ground station that failsafes watch."""

@@ -1,0 +1,70 @@
+"""What clients store on the vehicle: mission, fence and rally points, and what accepting each list changes."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from fractus_sim.vehicle.earth import Place
+from fractus_sim.vehicle.fence import FenceItem, FenceShapeError, build_shapes
+from fractus_sim.vehicle.mav import MissionKind, MissionResult, Mode, Severity
+from fractus_sim.vehicle.mission import Item, ItemStore, Mission, Transfers
+
+if TYPE_CHECKING:
+    from fractus_sim.vehicle.params import Parameters
+    from fractus_sim.vehicle.vehicle import Vehicle
+
+
+class Plans:
+    """The three lists of one vehicle."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self._vehicle = vehicle
+        self.mission = Mission()
+        self.mission.store.accept = self._accept_mission
+        self.fence = ItemStore(MissionKind.FENCE, accept=self._accept_fence)
+        self.rally = ItemStore(MissionKind.RALLY, accept=self._accept_rally)
+        stores = (self.mission.store, self.fence, self.rally)
+        self.transfers = Transfers({store.kind: store for store in stores})
+
+    def return_point(
+        self, params: Parameters, origin: Place, home: Place, here: tuple[float, float]
+    ) -> tuple[float, float, float]:
+        """Home or the nearest rally point within RALLY_LIMIT_KM, in local metres."""
+        to_home = origin.vector_to(home)
+        limit_m = params["RALLY_LIMIT_KM"] * 1000.0
+        rallies = (origin.vector_to(Place(item.x, item.y, home.alt_m)) for item in self.rally.items)
+        reachable = [rally for rally in rallies if limit_m <= 0.0 or math.dist(rally[:2], here) <= limit_m]
+        if not reachable:
+            return to_home
+        nearest = min(reachable, key=lambda rally: math.dist(rally[:2], here))
+        home_is_near = math.dist(to_home[:2], here) <= math.dist(nearest[:2], here)
+        return to_home if int(params["RALLY_INCL_HOME"]) and home_is_near else nearest
+
+    def _accept_mission(self, items: list[Item]) -> MissionResult:
+        vehicle = self._vehicle
+        if items and vehicle.home is not None:
+            home = vehicle.home
+            items[0] = Item(command=16, frame=0, x=home.lat_e7, y=home.lon_e7, z=home.alt_m)
+        vehicle.params.assign("MIS_TOTAL", len(items))
+        if vehicle.mode is not Mode.AUTO:
+            self.mission.rewind()
+        return MissionResult.ACCEPTED
+
+    def _accept_fence(self, items: list[Item]) -> MissionResult:
+        vehicle = self._vehicle
+        local = []
+        for item in items:
+            north, east, _ = vehicle.start.vector_to(Place(item.x, item.y, 0.0))
+            local.append(FenceItem(item.command, item.param1, north, east))
+        try:
+            vehicle.fence.shapes = build_shapes(local)
+        except FenceShapeError as error:
+            vehicle.say(Severity.WARNING, f"Fence: {error}")
+            return MissionResult.INVALID
+        vehicle.params.assign("FENCE_TOTAL", len(items))
+        return MissionResult.ACCEPTED
+
+    def _accept_rally(self, items: list[Item]) -> MissionResult:
+        self._vehicle.params.assign("RALLY_TOTAL", len(items))
+        return MissionResult.ACCEPTED

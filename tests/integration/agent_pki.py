@@ -39,9 +39,7 @@ class TestAuthority:
         )
         self.pem = self.certificate.public_bytes(serialization.Encoding.PEM)
 
-    def sign(
-        self, request_pem: bytes, begin: datetime | None = None, life: timedelta = timedelta(days=30)
-    ) -> bytes:
+    def sign(self, request_pem: bytes, begin: datetime | None = None, life: timedelta = timedelta(days=30)) -> bytes:
         """A certificate for a signing request, names taken over."""
         request = x509.load_pem_x509_csr(request_pem)
         assert request.is_signature_valid

@@ -10,18 +10,20 @@ import shutil
 import socket
 import ssl
 import subprocess
+import threading
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 from agent_pki import TestAuthority
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import rsa
 
+T = TypeVar("T")
 ROOT = Path(__file__).parents[2]
 CRDS = ROOT / "crds"
 FRACTUS = "/apis/fractus.dev/v1alpha1"
@@ -60,16 +62,14 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def wait_for[T](read: Callable[[], T], timeout_s: float = 30.0, what: str = "condition") -> T:
+def wait_for(read: Callable[[], T], timeout_s: float = 30.0, what: str = "condition") -> T:
     """The first true value of read within the timeout."""
     until_s = time.monotonic() + timeout_s
-    pause = socket.socketpair()[0]
+    pause = threading.Event()
     while time.monotonic() < until_s:
         if value := read():
             return value
-        pause.settimeout(0.05)
-        with contextlib.suppress(TimeoutError, OSError):
-            pause.recv(1)
+        pause.wait(0.05)
     raise AssertionError(f"no {what} within {timeout_s} s")
 
 
@@ -166,10 +166,11 @@ class ApiServer:
             return dict(json.load(answer))
 
     def get(self, path: str) -> dict[str, Any] | None:
+        """An object or list; None when it is absent, or its kind not served yet."""
         try:
             return self.call("GET", path)
         except urllib.error.HTTPError as error:
-            if error.code == 404:
+            if error.code in (404, 429):
                 return None
             raise
 
@@ -211,10 +212,10 @@ class ApiServer:
                 continue
             path = f"{REQUESTS}/{body['metadata']['name']}"
             body["status"] = {"conditions": [{"type": "Approved", "status": "True", "reason": "Test", "message": "x"}]}
-            body = self.call("PUT", f"{path}/approval", body)
-            pem = authority.sign(base64.b64decode(body["spec"]["request"]))
-            body["status"]["certificate"] = base64.b64encode(pem).decode()
-            self.call("PUT", f"{path}/status", body)
+            approved = self.call("PUT", f"{path}/approval", body)
+            pem = authority.sign(base64.b64decode(approved["spec"]["request"]))
+            approved["status"]["certificate"] = base64.b64encode(pem).decode()
+            self.call("PUT", f"{path}/status", approved)
             signed += 1
         return signed
 

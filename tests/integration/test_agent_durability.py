@@ -74,8 +74,8 @@ def test_a_file_is_the_old_or_the_new(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("before", ["nothing", "a set", "loose files", "half a set"])
 def test_a_set_is_all_old_or_all_new(tmp_path: Path, before: str) -> None:
-    old = {name: b"old" for name in ("tls.crt", "tls.key", "ca.crt")}
-    new = {name: b"new" for name in old}
+    old = dict.fromkeys(("tls.crt", "tls.key", "ca.crt"), b"old")
+    new = dict.fromkeys(old, b"new")
     count = 0
 
     def directory() -> Path:

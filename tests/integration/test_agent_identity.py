@@ -68,7 +68,9 @@ async def test_round_trip(bench: Bench) -> None:
 
 async def test_the_key_process_makes_a_usable_pair(bench: Bench) -> None:
     key, request = await make_request_apart(NODE)
-    write_set(bench.directory, {"tls.key": key, "tls.crt": bench.signer.ca.sign(request), "ca.crt": bench.signer.ca.pem})
+    write_set(
+        bench.directory, {"tls.key": key, "tls.crt": bench.signer.ca.sign(request), "ca.crt": bench.signer.ca.pem}
+    )
     assert inspect(bench.directory, NODE).begun(datetime.now(UTC))
 
 
@@ -135,7 +137,9 @@ async def test_rotation_to_another_authority_asks_anew(bench: Bench) -> None:
     assert inspect(bench.directory, NODE)
 
 
-@pytest.mark.parametrize("harm", ["no key", "cut certificate", "other key", "empty authority", "dangling", "other node"])
+@pytest.mark.parametrize(
+    "harm", ["no key", "cut certificate", "other key", "empty authority", "dangling", "other node"]
+)
 async def test_a_spoilt_directory_is_mended(bench: Bench, harm: str) -> None:
     await bench.identity.step()
     files = bench.files()
@@ -195,16 +199,18 @@ async def test_a_denied_renewal_leaves_the_node_certified(bench: Bench) -> None:
     await bench.identity.step()
     bench.clock.now += timedelta(days=22)
     bench.signer.conditions = [{"type": "Denied", "message": "fleet frozen"}]
-    task = asyncio.create_task(bench.identity.run())
+    said = asyncio.Event()
+    identity = Identity(bench.signer, bench.directory, NODE, bench.clock, changed=said.set, make_request=made_here)
+    task = asyncio.create_task(identity.run())
     try:
-        async with asyncio.timeout(10):
-            while "fleet frozen" not in bench.identity.finding.message:
-                await asyncio.sleep(0.01)
+        while "fleet frozen" not in identity.finding.message:
+            await asyncio.wait_for(said.wait(), 10.0)
+            said.clear()
     finally:
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await task
-    assert bench.identity.finding.holds
+    assert identity.finding.holds
     assert bench.signer.made == 2
 
 

@@ -81,6 +81,10 @@ def path(tmp_path: Path) -> Path:
     return file
 
 
+def write(path: Path, text: str) -> None:
+    path.write_text(text)
+
+
 def edited(**spec: Any) -> str:
     return yaml.safe_dump(MANIFEST | {"spec": MANIFEST["spec"] | spec})
 
@@ -108,7 +112,7 @@ async def test_the_owners_edits_stay(path: Path) -> None:
     assert store.object is not None
     store.object["spec"]["depot"] = "harbour"
     store.object["metadata"]["generation"] += 1
-    path.write_text("# a comment\n" + yaml.safe_dump(MANIFEST, default_flow_style=True))
+    write(path, "# a comment\n" + yaml.safe_dump(MANIFEST, default_flow_style=True))
     await registration.step()
     await Registration(store, path, "drone-1").step()
     assert store.writes == 1
@@ -121,7 +125,7 @@ async def test_a_changed_description_is_taken_over_once(path: Path) -> None:
     store = FakeStore()
     registration = Registration(store, path, "drone-1")
     await registration.step()
-    path.write_text(edited(depot="airfield", interfaces=[]))
+    write(path, edited(depot="airfield", interfaces=[]))
     await registration.step()
     await registration.step()
     assert store.writes == 2
@@ -176,12 +180,12 @@ async def test_a_bad_description_is_reported_and_the_object_kept(path: Path) -> 
     registration = Registration(store, path, "drone-1")
     await registration.step()
     before = copy.deepcopy(store.object)
-    path.write_text(edited(depot="No Such Name!"))
+    write(path, edited(depot="No Such Name!"))
     await registration.step()
     assert store.object == before
     assert registration.described is not None
     assert "spec.depot" in registration.described.message
-    path.write_text(edited())
+    write(path, edited())
     await registration.step()
     assert registration.described is None
 

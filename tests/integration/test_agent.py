@@ -1,0 +1,347 @@
+"""The whole agent as a process against a real API server and a mobility service with real mTLS."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+import yaml
+from agent_pki import TestAuthority
+from agent_server import FRACTUS, REQUESTS, ApiServer, find_binary, free_port, running, wait_for
+from fractus_core.api.plans import Grant
+from fractus_proto.v1 import mobility_pb2_grpc
+from fractus_proto.v1.mobility_pb2 import SubscribeTelemetryRequest, Telemetry
+from fractus_proto.v1.types_pb2 import Position
+
+pytestmark = [
+    pytest.mark.skipif(
+        find_binary("kube-apiserver") is None, reason="no kube-apiserver: run `fractus cluster up` once"
+    ),
+    pytest.mark.timeout(180),
+]
+
+
+@pytest.fixture(scope="module")
+def authority() -> TestAuthority:
+    return TestAuthority()
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory, authority: TestAuthority) -> Iterator[ApiServer]:
+    with running(tmp_path_factory.mktemp("plane")) as server:
+        server.furnish(authority.pem)
+        yield server
+
+
+class Mobility(mobility_pb2_grpc.MobilityServiceServicer):
+    """Sends the telemetry it is told, to the node's own identity only."""
+
+    def __init__(self) -> None:
+        self.now = Telemetry(
+            position=Position(latitude_deg=39.36, longitude_deg=22.94, altitude_m=0.0),
+            battery_remaining=1.0, battery_voltage_v=16.8, mode="STABILIZE", ready=True, flight_state="inactive",
+            controller="system", autopilot_connected=True,
+        )  # fmt: skip
+        self.stopped = threading.Event()
+        self.callers: list[set[bytes]] = []
+
+    def SubscribeTelemetry(  # noqa: N802
+        self, request: SubscribeTelemetryRequest, context: grpc.ServicerContext
+    ) -> Iterator[Telemetry]:
+        self.callers.append(set(context.auth_context().get("x509_subject_alternative_name", ())))
+        while context.is_active() and not self.stopped.wait(request.interval_s or 0.2):
+            yield self.now
+
+
+class Node:
+    """A node: its files, its agent process, its mobility service."""
+
+    def __init__(self, server: ApiServer, authority: TestAuthority, directory: Path, name: str, kind: str) -> None:
+        self.server, self.authority, self.name, self.directory = server, authority, name, directory
+        self.state, self.description = directory / "state", directory / "node.yaml"
+        self.plural = {"Drone": "drones", "EdgeNode": "edgenodes"}[kind]
+        self.class_ = {"Drone": "drone", "EdgeNode": "edge"}[kind]
+        self.mobility = Mobility()
+        self.port = free_port()
+        self.process: subprocess.Popen[bytes] | None = None
+        self._grpc: grpc.Server | None = None
+        labels = {"fractus.dev/class": self.class_}
+        server.post("/api/v1/nodes", {"metadata": {"name": name, "labels": labels}})
+
+    def describe(self, **spec: Any) -> None:
+        camera = {"methods": ["RetrieveImage"]}
+        limits = {"maxAltitude": 120, "maxFlightTime": 25, "maxSpeed": 15, "methods": ["Goto", "GetPosition"]}
+        base: dict[str, Any] = (
+            {"services": {"mobility": limits}, "depot": "campus", "interfaces": [{"technology": "WiFi"}]}
+            if self.plural == "drones"
+            else {"location": {"lat": 57.64911, "lon": 10.40744}, "services": {"camera": camera}}
+        )
+        manifest = {
+            "apiVersion": "fractus.dev/v1alpha1",
+            "kind": "Drone" if self.plural == "drones" else "EdgeNode",
+            "metadata": {"name": self.name},
+            "spec": base | spec,
+        }
+        fresh = self.description.with_suffix(".new")
+        fresh.write_text(yaml.safe_dump(manifest))
+        fresh.replace(self.description)
+
+    def start(self) -> None:
+        environment = {
+            "PATH": os.environ["PATH"],
+            "KUBECONFIG": str(self.server.kubeconfig("agent")),
+            "FRACTUS_NODE": self.name,
+            "FRACTUS_DESCRIPTION": str(self.description),
+            "FRACTUS_STATE_DIR": str(self.state),
+            "FRACTUS_MOBILITY": f"127.0.0.1:{self.port}",
+            "MALLOC_ARENA_MAX": "2",
+        }
+        log = (self.directory / "agent.log").open("ab")
+        self.process = subprocess.Popen([sys.executable, "-m", "fractus_agent"], env=environment, stderr=log)
+
+    def stop(self, number: int = signal.SIGTERM) -> int:
+        assert self.process is not None
+        self.process.send_signal(number)
+        code = self.process.wait(10)
+        self.process = None
+        return code
+
+    def certify(self) -> None:
+        wait_for(lambda: self.server.sign_requests(self.authority) or self.certified(), 30, "signing request")
+        wait_for(self.certified, 30, "certificate")
+
+    def certified(self) -> bool:
+        return (self.state / "tls" / "tls.crt").exists()
+
+    def serve(self) -> None:
+        tls = self.state / "tls"
+        pair = [((tls / "tls.key").read_bytes(), (tls / "tls.crt").read_bytes())]
+        credentials = grpc.ssl_server_credentials(pair, (tls / "ca.crt").read_bytes(), require_client_auth=True)
+        self._grpc = grpc.server(ThreadPoolExecutor(4))
+        mobility_pb2_grpc.add_MobilityServiceServicer_to_server(self.mobility, self._grpc)
+        assert self._grpc.add_secure_port(f"127.0.0.1:{self.port}", credentials)
+        self._grpc.start()
+
+    def unserve(self) -> None:
+        self.mobility.stopped.set()
+        if self._grpc is not None:
+            self._grpc.stop(None).wait(5)
+            self._grpc = None
+        self.mobility.stopped.clear()
+
+    def object(self) -> dict[str, Any] | None:
+        return self.server.get(f"{FRACTUS}/{self.plural}/{self.name}")
+
+    def condition(self, type_: str) -> dict[str, Any]:
+        status = (self.object() or {}).get("status") or {}
+        return next((c for c in status.get("conditions", ()) if c["type"] == type_), {})
+
+    def labels(self) -> dict[str, str]:
+        return dict((self.server.get(f"/api/v1/nodes/{self.name}") or {})["metadata"]["labels"])
+
+    def grants(self) -> set[str]:
+        return {p.stem for p in (self.state / "grants").glob("*.json")}
+
+    def log(self) -> str:
+        return (self.directory / "agent.log").read_text()
+
+    def close(self) -> None:
+        self.unserve()
+        if self.process is not None:
+            self.stop(signal.SIGKILL)
+        for path in (f"{FRACTUS}/{self.plural}/{self.name}", f"/api/v1/nodes/{self.name}"):
+            self.server.delete(path)
+        self.server.delete(f"{FRACTUS}/grants?fieldSelector=spec.node%3D{self.name}")
+        self.server.delete(REQUESTS)
+
+
+@pytest.fixture
+def drone(server: ApiServer, authority: TestAuthority, tmp_path: Path) -> Iterator[Node]:
+    node = Node(server, authority, tmp_path, "drone-1", "Drone")
+    try:
+        yield node
+    finally:
+        print(node.log())
+        node.close()
+
+
+def add_grant(server: ApiServer, name: str, node: str = "drone-1", **spec: Any) -> dict[str, Any]:
+    application = {"namespace": "default", "name": "app", "uid": "a"}
+    body = {
+        "apiVersion": "fractus.dev/v1alpha1",
+        "kind": "Grant",
+        "metadata": {"name": name},
+        "spec": {"node": node, "application": application, "component": "Navigator", "instance": f"app-{name}"} | spec,
+    }
+    return server.post(f"{FRACTUS}/grants", body)
+
+
+def phase(server: ApiServer, name: str) -> str | None:
+    grant = server.get(f"{FRACTUS}/grants/{name}") or {}
+    return (grant.get("status") or {}).get("phase")
+
+
+def test_a_drones_life(server: ApiServer, drone: Node) -> None:
+    drone.describe()
+    uid = add_grant(server, "mine", control="full")["metadata"]["uid"]
+    add_grant(server, "not-mine", node="drone-2")
+    drone.start()
+    drone.certify()
+    wait_for(lambda: drone.condition("Certified").get("status") == "True", 30, "Certified")
+    wait_for(lambda: phase(server, "mine") == "Active", 30, "active grant")
+    assert drone.grants() == {"mine"}
+    stored = Grant.from_body(json.loads((drone.state / "grants" / "mine.json").read_text()))
+    assert stored.spec.control == "full"
+    assert stored.metadata.uid == uid
+    assert phase(server, "not-mine") is None
+    labels = drone.labels()
+    assert labels["fractus.dev/depot"] == "campus"
+    assert labels["fractus.dev/interface-wifi"] == "true"
+
+    wait_for(lambda: drone.condition("Ready").get("reason") == "MobilityUnreachable", 30, "unreachable service")
+    drone.serve()
+    wait_for(lambda: drone.condition("Ready").get("status") == "True", 30, "ready drone")
+    assert b"spiffe://fractus.dev/node/drone-1" in drone.mobility.callers[0]
+    body = drone.object()
+    assert body is not None
+    assert body["status"]["flightState"] == "inactive"
+    assert body["status"]["position"]["lat"] == 39.36
+
+    drone.mobility.now.flight_state = "flying"
+    drone.mobility.now.in_air = True
+    drone.mobility.now.missions[uid] = "failed: driver lost"
+    began_s = time.monotonic()
+    wait_for(lambda: (drone.object() or {})["status"]["flightState"] == "flying", 10, "flying")
+    assert time.monotonic() - began_s < 4.0
+    wait_for(lambda: phase(server, "mine") == "Failed", 10, "failed grant")
+    grant = server.get(f"{FRACTUS}/grants/mine")
+    assert grant is not None
+    assert grant["status"]["message"] == "driver lost"
+
+    drone.unserve()
+    wait_for(lambda: drone.condition("Ready").get("reason") == "MobilityUnreachable", 15, "lost service")
+    body = drone.object()
+    assert body is not None
+    assert body["status"]["flightState"] == "flying"
+    assert drone.stop() == 0
+    assert "Traceback" not in drone.log()
+
+
+def test_registration_and_the_owner(server: ApiServer, drone: Node) -> None:
+    drone.describe()
+    drone.start()
+    body = wait_for(drone.object, 30, "drone")
+    path = f"{FRACTUS}/drones/drone-1"
+    server.merge(path, {"spec": {"depot": "harbour"}})
+    drone.stop(signal.SIGKILL)
+    drone.start()
+    wait_for(lambda: drone.labels().get("fractus.dev/depot") == "harbour", 30, "label of the new depot")
+    body = wait_for(drone.object, 5)
+    assert body["spec"]["depot"] == "harbour"
+    drone.describe(depot="airfield")
+    wait_for(lambda: drone.labels().get("fractus.dev/depot") == "airfield", 30, "label of the described depot")
+    body = wait_for(drone.object, 5)
+    assert body["spec"]["depot"] == "airfield"
+    assert body["spec"]["interfaces"] == [{"technology": "WiFi"}]
+    drone.description.write_text("kind: Drone\nmetadata: {name: drone-9}\nspec: {}\n")
+    wait_for(lambda: drone.condition("Described").get("status") == "False", 30, "bad description")
+    assert "drone-9" in drone.condition("Described")["message"]
+    drone.describe(depot="airfield")
+    wait_for(lambda: drone.condition("Described") == {}, 60, "good description")
+    server.delete(path)
+    wait_for(lambda: (drone.object() or body)["metadata"]["uid"] != body["metadata"]["uid"], 60, "new drone")
+
+
+def test_grants_outlive_the_api_server(server: ApiServer, drone: Node) -> None:
+    drone.describe()
+    for name in ("one", "two", "three"):
+        add_grant(server, name)
+    drone.start()
+    wait_for(lambda: phase(server, "three") == "Active" and drone.grants() == {"one", "two", "three"}, 30, "grants")
+    drone.stop(signal.SIGKILL)
+    server.delete(f"{FRACTUS}/grants/one")
+    server.stop_apiserver(kill=True)
+    drone.start()
+    try:
+        wait_for(lambda: "cannot be followed" in drone.log(), 30, "an agent that noticed")
+        assert drone.grants() == {"one", "two", "three"}
+        assert drone.process is not None
+        assert drone.process.poll() is None
+    finally:
+        server.start_apiserver()
+    wait_for(lambda: drone.grants() == {"two", "three"}, 40, "reconciled grants")
+    # The watch works again after the list.
+    add_grant(server, "four")
+    wait_for(lambda: phase(server, "four") == "Active" and "four" in drone.grants(), 10, "a new grant")
+    server.stop_apiserver(kill=True)
+    server.start_apiserver()
+    server.delete(f"{FRACTUS}/grants/two")
+    wait_for(lambda: drone.grants() == {"three", "four"}, 40, "reconciled grants after a restart")
+
+
+def test_a_denied_node_says_so(server: ApiServer, drone: Node) -> None:
+    drone.describe()
+    drone.start()
+    item = wait_for(lambda: server.call("GET", REQUESTS)["items"], 30, "signing request")[0]
+    assert item["spec"]["signerName"] == "fractus.dev/node"
+    assert item["metadata"]["name"].startswith("fractus-drone-1-")
+    denied = {"type": "Denied", "status": "True", "reason": "NotOurs", "message": "not in the fleet"}
+    item["status"] = {"conditions": [denied]}
+    server.call("PUT", f"{REQUESTS}/{item['metadata']['name']}/approval", item)
+    wait_for(lambda: drone.condition("Certified").get("reason") == "Denied", 30, "Denied")
+    assert "not in the fleet" in drone.condition("Certified")["message"]
+    assert drone.condition("Ready")["reason"] == "NoCertificate"
+    assert "not in the fleet" in drone.log()
+
+
+def test_an_edge_node_registers(server: ApiServer, authority: TestAuthority, tmp_path: Path) -> None:
+    node = Node(server, authority, tmp_path, "edge-1", "EdgeNode")
+    try:
+        node.describe()
+        node.start()
+        node.certify()
+        wait_for(lambda: node.condition("Ready").get("status") == "True", 30, "ready edge node")
+        assert node.labels()["fractus.dev/geohash"] == "u4pruy"
+        # After the certificate nothing of the requests stays behind.
+        wait_for(lambda: not server.call("GET", REQUESTS)["items"], 10, "no signing requests")
+    finally:
+        print(node.log())
+        node.close()
+
+
+def resident_mb(pid: int) -> float:
+    text = Path(f"/proc/{pid}/smaps_rollup").read_text()
+    return int(text.split("Rss:")[1].split()[0]) / 1024
+
+
+def cpu_s(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def test_the_agent_is_small_and_idle(server: ApiServer, drone: Node) -> None:
+    drone.describe()
+    add_grant(server, "mine")
+    drone.start()
+    drone.certify()
+    drone.serve()
+    wait_for(lambda: drone.condition("Ready").get("status") == "True", 30, "ready drone")
+    assert drone.process is not None
+    pid = drone.process.pid
+    before_s, began_s = cpu_s(pid), time.monotonic()
+    wait_for(lambda: time.monotonic() - began_s > 20.0, 30)
+    share = (cpu_s(pid) - before_s) / (time.monotonic() - began_s)
+    print(f"resident {resident_mb(pid):.1f} MB, {share:.2%} of a core with telemetry at 1 Hz")
+    assert resident_mb(pid) < 60.0
+    assert share < 0.02

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 
 import click
 
+from fractus.telemetry import telemetry
+
 GROUP = "fractus.commands"
 EXIT_OK = 0
 EXIT_BAD_INPUT = 1
@@ -89,6 +91,9 @@ def _missing(entry: importlib.metadata.EntryPoint, error: ImportError) -> click.
 @click.version_option(package_name="fractus", prog_name="fractus", message="%(prog)s %(version)s")
 def fractus() -> None:
     """Run, check and watch Fractus: drones, edge and cloud under stakeholders' policies."""
+
+
+fractus.add_command(telemetry)
 
 
 def run(arguments: Sequence[str] | None = None) -> int:

@@ -55,6 +55,18 @@ class ControlLost(FractusError):
     """The system or a human pilot took the drone, or this component never had it."""
 
 
+class Interrupted(FractusError):
+    """A motion was begun and then stopped before it was complete.
+
+    Attributes:
+        decision: why, and by which policies, if any.
+    """
+
+    def __init__(self, message: str, decision: Decision | None) -> None:
+        self.decision = decision or Decision(Action.UNSPECIFIED, reason=message)
+        super().__init__(message)
+
+
 class MissionComplete(FractusError):
     """Every control point of this component is done; the drone is home or on its way there."""
 
@@ -95,6 +107,8 @@ def translate(error: Any, what: str, address: str) -> FractusError:
     decision = decision_of(error)
     if code in {grpc.StatusCode.PERMISSION_DENIED, grpc.StatusCode.FAILED_PRECONDITION}:
         return _refusal(code, text, what, decision)
+    if code is grpc.StatusCode.ABORTED:
+        return Interrupted(f"{what}: {text}", decision)
     if code in {grpc.StatusCode.INVALID_ARGUMENT, grpc.StatusCode.NOT_FOUND, grpc.StatusCode.OUT_OF_RANGE}:
         return InvalidRequest(f"{what}: {text}")
     if code in {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED}:

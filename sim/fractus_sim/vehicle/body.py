@@ -11,6 +11,9 @@ import random
 from dataclasses import dataclass
 
 GRAVITY = 9.80665
+# Hitting the ground faster than this, or leaning more than this, breaks propellers.
+CRASH_IMPACT_MPS = 4.0
+CRASH_LEAN_COSINE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +75,7 @@ class Body:
         "_iz",
         "accel",
         "airframe",
+        "crashed",
         "down",
         "east",
         "impact_mps",
@@ -101,6 +105,7 @@ class Body:
         self.accel = (0.0, 0.0, 0.0)
         self.specific_force = (0.0, 0.0, -GRAVITY)
         self.on_ground = True
+        self.crashed = False
         self.impact_mps = 0.0
 
     def euler(self) -> tuple[float, float, float]:
@@ -117,6 +122,8 @@ class Body:
     def step(self, dt: float, commands: tuple[float, float, float, float], air: tuple[float, float, float]) -> None:
         """Advance by `dt` seconds with motor thrust `commands` (newtons) in air that moves with velocity `air`."""
         frame = self.airframe
+        if self.crashed:
+            commands = (0.0, 0.0, 0.0, 0.0)
         blend = dt / (frame.motor_lag_s + dt)
         m1, m2, m3, m4 = self.motors
         m1 += (commands[0] - m1) * blend
@@ -162,6 +169,8 @@ class Body:
         self.down += self.vd * dt
         if self.down >= 0.0 and self.vd > 0.0:
             self.impact_mps = self.vd
+            lean_cosine = 1.0 - 2.0 * (x * x + y * y)
+            self.crashed = self.crashed or self.vd > CRASH_IMPACT_MPS or lean_cosine < CRASH_LEAN_COSINE
             self.down = 0.0
             self.vn = self.ve = self.vd = 0.0
             self.on_ground = True
@@ -169,6 +178,8 @@ class Body:
     def _rest(self, dt: float) -> None:
         self.p = self.q = self.r = 0.0
         w, x, y, z = self.quaternion
+        if self.crashed:
+            return
         if abs(x) + abs(y) < 1e-6:
             return
         keep = math.exp(-dt / 0.1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,8 @@ if TYPE_CHECKING:
 
 CHECK_INTERVAL_S = 0.1
 POSITION_LOST_S = 1.0
-BREACH_TOO_FAR_M = 100.0
+CRASH_ANGLE_DEG = 30.0
+CRASH_CONFIRMED_S = 2.0
 
 CONTINUE_IN_AUTO_ON_GCS = 1 << 1
 CONTINUE_IF_LANDING = 1 << 3
@@ -40,8 +42,8 @@ class Failsafes:
     _low_since_s: float | None = None
     _critical_since_s: float | None = None
     _lost_since_s: float | None = None
+    _crash_since_s: float | None = None
     _next_check_s: float = 0.0
-    _breach_handled: Breach = Breach.NONE
 
     @property
     def any_active(self) -> bool:
@@ -57,6 +59,23 @@ class Failsafes:
         self._check_battery(v)
         self._check_position(v)
         self._check_fence(v)
+        self._check_crash(v)
+
+    def _check_crash(self, v: Vehicle) -> None:
+        roll, pitch, _ = v.body.euler()
+        error_deg = math.degrees(math.hypot(roll - v.control.lean[0], pitch - v.control.lean[1]))
+        fallen = v.body.crashed or (v.body.on_ground and error_deg > CRASH_ANGLE_DEG)
+        if not (v.armed and fallen and not v.landed and int(v.params["FS_CRASH_CHECK"])):
+            self._crash_since_s = None
+            return
+        self._crash_since_s = v.time_s if self._crash_since_s is None else self._crash_since_s
+        if v.time_s - self._crash_since_s >= CRASH_CONFIRMED_S:
+            v.say(
+                Severity.EMERGENCY,
+                f"Crash: Disarming: AngErr={error_deg:.0f}>{CRASH_ANGLE_DEG:.0f}, Accel=0.0<3.0",
+            )
+            v.land_complete()
+            v.disarm("crash", force=True)
 
     def _check_gcs(self, v: Vehicle) -> None:
         setting = int(v.params["FS_GCS_ENABLE"])

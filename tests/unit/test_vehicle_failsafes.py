@@ -1,0 +1,207 @@
+"""The autopilot's own safety net: each fault leads to the mode and the text of a real ArduCopter."""
+
+from __future__ import annotations
+
+import pytest
+from fractus_sim.vehicle.mav import Command, Mode, Result
+from fractus_sim.vehicle.pilot import Pilot
+from fractus_sim.vehicle.vehicle import Vehicle
+from vehicle_world import START, airborne, alone, distance_m
+
+
+def _upload(pilot: Pilot, kind: int, items: list[dict[str, float]]) -> int:
+    """Upload a list by the mission protocol and return the final MISSION_ACK type."""
+    pilot.read()
+    target = {"target_system": 1, "target_component": 1, "mission_type": kind}
+    pilot.send("MISSION_COUNT", target | {"count": len(items)})
+    for _ in range(len(items) + 2):
+        for message in pilot.step():
+            if message.name == "MISSION_REQUEST":
+                seq = message.integer("seq")
+                pilot.send("MISSION_ITEM_INT", target | {"seq": seq, "autocontinue": 1} | items[seq])
+            elif message.name == "MISSION_ACK":
+                return message.integer("type")
+    raise AssertionError("no MISSION_ACK")
+
+
+def _square(command: int, half_m: float, north_m: float = 0.0) -> list[dict[str, float]]:
+    corners = [(-half_m, -half_m), (half_m, -half_m), (half_m, half_m), (-half_m, half_m)]
+    places = [START.offset(north_m + north, east) for north, east in corners]
+    return [{"command": command, "param1": 4.0, "frame": 0, "x": p.lat_e7, "y": p.lon_e7} for p in places]
+
+
+def test_silent_ground_station_brings_it_home():
+    vehicle, pilot = airborne(10.0, FS_GCS_ENABLE=1)
+    pilot.go_to(30.0, 0.0, 10.0)
+    pilot.fly_on(5.0)
+    pilot.heartbeats = False
+    lost_s = pilot.wait(lambda: vehicle.mode is Mode.RTL, 10.0)
+    assert 3.9 < lost_s <= 5.2
+    assert pilot.texts[-1] == "GCS Failsafe"
+    pilot.wait(lambda: not vehicle.armed, 90.0)
+    assert distance_m(vehicle, 0.0, 0.0) < 1.0
+
+
+def test_only_the_chosen_system_counts_as_ground_station():
+    vehicle, pilot = airborne(10.0, FS_GCS_ENABLE=1, SYSID_MYGCS=255)
+    other = Pilot(pilot.simulation, pilot.craft, sysid=42)
+    pilot.heartbeats = False
+    other.wait(lambda: vehicle.mode is Mode.RTL, 10.0)
+    assert "GCS Failsafe" in other.texts
+    pilot.heartbeats = True
+    pilot.fly_on(2.0)
+    assert "GCS Failsafe Cleared" in pilot.texts
+    assert vehicle.mode is Mode.RTL, "clearing the failsafe does not change the mode back"
+
+
+def test_failsafe_timeout_follows_its_parameter():
+    vehicle, pilot = airborne(10.0, FS_GCS_ENABLE=5)
+    assert pilot.parameter("FS_GCS_TIMEOUT", 2.0) == 2.0
+    pilot.heartbeats = False
+    assert pilot.wait(lambda: vehicle.mode is Mode.LAND, 10.0) < 2.3
+
+
+def test_without_the_failsafe_silence_changes_nothing():
+    vehicle, pilot = airborne(10.0)
+    pilot.heartbeats = False
+    pilot.fly_on(20.0)
+    assert vehicle.mode is Mode.GUIDED
+
+
+def test_low_and_critical_battery():
+    vehicle, pilot = airborne(
+        10.0, BATT_LOW_VOLT=11.5, BATT_CRT_VOLT=10.8, BATT_LOW_TIMER=3, BATT_FS_LOW_ACT=2, BATT_FS_CRT_ACT=1
+    )
+    pilot.go_to(60.0, 0.0, 10.0)
+    pilot.fly_on(8.0)
+    pilot.parameter("SIM_BATT_VOLTAGE", 11.8)
+    pilot.wait(lambda: vehicle.mode is Mode.RTL, 10.0)
+    assert any(text.startswith("Battery 1 is low 11.") for text in pilot.texts)
+    assert pilot.texts[-1] == "Battery Failsafe"
+    pilot.parameter("SIM_BATT_VOLTAGE", 11.0)
+    pilot.wait(lambda: vehicle.mode is Mode.LAND, 10.0)
+    assert any(text.startswith("Battery 1 is critical 10.") for text in pilot.texts)
+    pilot.wait(lambda: not vehicle.armed, 60.0)
+    assert pilot.command(Command.COMPONENT_ARM_DISARM, 1.0) is Result.FAILED
+
+
+def test_lost_gps_lands_it():
+    vehicle, pilot = airborne(15.0)
+    pilot.parameter("SIM_GPS1_ENABLE", 0)
+    pilot.wait(lambda: vehicle.mode is Mode.LAND, 15.0)
+    assert "EKF Failsafe: changed to LAND Mode" in pilot.texts
+    assert pilot.mode(Mode.GUIDED) is Result.FAILED
+    pilot.wait(lambda: not vehicle.armed, 90.0)
+    assert vehicle.body.on_ground
+
+
+def test_short_gps_loss_is_ridden_out():
+    vehicle, pilot = airborne(15.0)
+    pilot.parameter("SIM_GPS1_ENABLE", 0)
+    pilot.fly_on(3.0)
+    pilot.parameter("SIM_GPS1_ENABLE", 1)
+    pilot.fly_on(10.0)
+    assert vehicle.mode is Mode.GUIDED
+    assert distance_m(vehicle, 0.0, 0.0) < 2.0
+
+
+def test_crossing_the_fence_brings_it_back():
+    vehicle, pilot = airborne(10.0)
+    assert _upload(pilot, 1, _square(Command.NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0)) == 0
+    assert pilot.command(Command.DO_FENCE_ENABLE, 1) is Result.ACCEPTED
+    for _ in range(200):
+        pilot.send(
+            "SET_POSITION_TARGET_LOCAL_NED",
+            {"target_system": 1, "target_component": 1, "coordinate_frame": 1, "type_mask": 0xDC7, "vx": 5.0},
+        )
+        pilot.fly_on(0.1)
+        if vehicle.mode is Mode.RTL:
+            break
+    assert vehicle.mode is Mode.RTL
+    assert vehicle.body.north > 20.0, "it reacts only after crossing"
+    assert "Polygon fence breached" in pilot.texts
+    assert vehicle.fence.breach_type == 3
+    pilot.wait(lambda: not vehicle.armed, 90.0)
+    assert distance_m(vehicle, 0.0, 0.0) < 1.0
+
+
+def test_target_outside_the_fence_is_dropped_without_an_answer():
+    vehicle, pilot = airborne(10.0)
+    _upload(pilot, 1, _square(Command.NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0))
+    pilot.command(Command.DO_FENCE_ENABLE, 1)
+    pilot.fly_on(1.0)
+    texts = list(pilot.texts)
+    pilot.last.clear()
+    pilot.go_to(60.0, 0.0, 10.0)
+    pilot.fly_on(5.0)
+    assert distance_m(vehicle, 0.0, 0.0) < 0.7
+    assert (pilot.texts, pilot.last.keys() - {"HEARTBEAT"}) == (texts, set())
+    place = START.offset(60.0, 0.0)
+    values = {"frame": 6, "x": place.lat_e7, "y": place.lon_e7, "z": 10.0}
+    assert pilot.command_int(Command.DO_REPOSITION, values) is Result.FAILED
+    pilot.go_to(10.0, 0.0, 10.0)
+    pilot.fly_on(8.0)
+    assert distance_m(vehicle, 10.0, 0.0) < 0.7
+
+
+@pytest.mark.parametrize(
+    ("item", "inside", "outside"),
+    [
+        ({"command": 5003, "param1": 15.0}, (10.0, 0.0), (16.0, 0.0)),
+        ({"command": 5004, "param1": 5.0, "north": 30.0}, (20.0, 0.0), (30.0, 1.0)),
+    ],
+)
+def test_fence_circles(item: dict[str, float], inside: tuple[float, float], outside: tuple[float, float]):
+    vehicle, pilot = alone(FENCE_ENABLE=1)
+    place = START.offset(item.pop("north", 0.0), 0.0)
+    assert _upload(pilot, 1, [item | {"frame": 0, "x": place.lat_e7, "y": place.lon_e7}]) == 0
+    assert not vehicle.fence.outside(*inside, 10.0)
+    assert vehicle.fence.outside(*outside, 10.0)
+
+
+def test_altitude_fence_and_home_circle():
+    vehicle, pilot = airborne(20.0, FENCE_ALT_MAX=30, FENCE_RADIUS=50, FENCE_ENABLE=1, FENCE_ACTION=4)
+    pilot.go_to(0.0, 0.0, 35.0)
+    pilot.go_to(55.0, 0.0, 20.0)
+    pilot.fly_on(4.0)
+    assert distance_m(vehicle, 0.0, 0.0) < 0.7
+    assert vehicle.altitude_m == pytest.approx(20.0, abs=0.5)
+    for _ in range(60):
+        pilot.send(
+            "SET_POSITION_TARGET_LOCAL_NED",
+            {"target_system": 1, "target_component": 1, "coordinate_frame": 1, "type_mask": 0xDC7, "vz": -2.0},
+        )
+        pilot.fly_on(0.2)
+    assert vehicle.mode is Mode.BRAKE
+    assert "Max Alt fence breached" in pilot.texts
+
+
+@pytest.mark.parametrize(
+    "items",
+    [
+        [{"command": 5001, "param1": 4.0}] * 3,
+        [{"command": 5001, "param1": 2.0}] * 2,
+        [{"command": 5003, "param1": -1.0}],
+        [{"command": 16, "param1": 0.0}],
+    ],
+)
+def test_bad_fences_are_refused_and_the_old_one_stays(items: list[dict[str, float]]):
+    vehicle, pilot = alone()
+    _upload(pilot, 1, _square(Command.NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0))
+    shapes = vehicle.fence.shapes
+    assert _upload(pilot, 1, [{"frame": 0, "x": START.lat_e7, "y": START.lon_e7} | item for item in items]) != 0
+    assert vehicle.fence.shapes == shapes
+    assert len(vehicle.plans.fence.items) == 4
+
+
+def test_failed_motor_brings_it_down():
+    vehicle, pilot = airborne(15.0)
+    pilot.parameter("SIM_ENGINE_MUL", 0.0)
+    pilot.parameter("SIM_ENGINE_FAIL", 1)
+    pilot.wait(lambda: vehicle.body.on_ground, 30.0)
+    assert _crashed(vehicle, pilot)
+
+
+def _crashed(vehicle: Vehicle, pilot: Pilot) -> bool:
+    pilot.wait(lambda: not vehicle.armed, 10.0)
+    return any(text.startswith("Crash: Disarming") for text in pilot.texts)

@@ -1,0 +1,338 @@
+"""How the vehicle moves, and what it grants and refuses, in lockstep."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+from fractus_sim.vehicle.mav import Command, Landed, Mode, Result
+from fractus_sim.vehicle.pilot import Pilot
+from fractus_sim.vehicle.shaping import sqrt_controller, stopping_distance, wrap_pi
+from fractus_sim.vehicle.vehicle import Vehicle
+from vehicle_world import START, airborne, alone, distance_m
+
+
+def _target(pilot: Pilot, name: str, **values: float) -> None:
+    pilot.send(name, {"target_system": 1, "target_component": 1} | values)
+
+
+def _local(pilot: Pilot, frame: int, mask: int, **values: float) -> None:
+    _target(pilot, "SET_POSITION_TARGET_LOCAL_NED", coordinate_frame=frame, type_mask=mask, **values)
+
+
+def test_measured_figures_of_the_real_thing_hold_within_20_percent():
+    vehicle, pilot = alone()
+    climb_s = pilot.take_off(10.0)  # 95 % of 10 m
+    assert 7.6 <= climb_s <= 11.4
+    pilot.fly_on(6.0)
+    pilot.go_to(50.0, 0.0, 10.0)
+    peak = 0.0
+    begun = pilot.simulation.time_s
+    while distance_m(vehicle, 50.0, 0.0) > 1.0:
+        pilot.step()
+        peak = max(peak, math.hypot(vehicle.body.vn, vehicle.body.ve))
+        assert pilot.simulation.time_s - begun < 20.0
+    assert 7.44 <= pilot.simulation.time_s - begun <= 11.16
+    assert 6.72 <= peak <= 10.08
+    pilot.fly_on(6.0)
+    assert pilot.command(Command.NAV_RETURN_TO_LAUNCH) is Result.ACCEPTED
+    home_s = pilot.wait(lambda: not vehicle.armed, 120.0)
+    assert 39.2 <= home_s <= 58.8
+    assert distance_m(vehicle, 0.0, 0.0) < 1.0
+
+
+def test_motion_respects_its_limits_and_does_not_overshoot():
+    vehicle, pilot = airborne(20.0, WPNAV_SPEED=500)
+    pilot.go_to(80.0, 30.0, 20.0)
+    accelerations = []
+    farthest = 0.0
+    for _ in range(3500):
+        before = (vehicle.body.vn, vehicle.body.ve)
+        pilot.step()
+        assert math.hypot(vehicle.body.vn, vehicle.body.ve) < 5.5
+        accelerations.append(math.dist(before, (vehicle.body.vn, vehicle.body.ve)) / 0.01)
+        farthest = max(farthest, (vehicle.body.north * 80 + vehicle.body.east * 30) / math.hypot(80, 30))
+        assert abs(vehicle.altitude_m - 20.0) < 1.0
+        assert abs(vehicle.est.roll) < math.radians(31) and abs(vehicle.est.pitch) < math.radians(31)
+    assert max(accelerations) < 1.6 * 2.5
+    jerks = [abs(b - a) / 0.1 for a, b in itertools.pairwise(accelerations[::10])]
+    assert max(jerks) < 4 * 5.0
+    assert farthest < math.hypot(80, 30) + 1.0
+    assert distance_m(vehicle, 80.0, 30.0) < 0.5
+
+
+def test_wind_is_held_and_gusts_do_not_carry_it_away():
+    vehicle, pilot = airborne(15.0, SIM_WIND_SPD=8, SIM_WIND_DIR=270, SIM_WIND_TURB=2)
+    pilot.fly_on(10.0)
+    worst = 0.0
+    for _ in range(3000):
+        pilot.step()
+        worst = max(worst, distance_m(vehicle, *vehicle.control.target))
+    assert worst < 2.5
+    assert abs(vehicle.est.roll) + abs(vehicle.est.pitch) > math.radians(3), "it must lean into the wind"
+
+
+def test_arming_waits_for_readiness_and_says_why():
+    vehicle, pilot = alone()
+    pilot.mode(Mode.GUIDED)
+    assert pilot.command(Command.COMPONENT_ARM_DISARM, 1.0) is Result.FAILED
+    assert any(text.startswith("Arm: ") for text in pilot.texts)
+    pilot.wait(lambda: vehicle.arming_refusal() is None, 5.0)
+    assert pilot.simulation.time_s >= 2.0
+    assert pilot.command(Command.COMPONENT_ARM_DISARM, 1.0) is Result.ACCEPTED
+    assert pilot.command(Command.COMPONENT_ARM_DISARM, 0.0) is Result.ACCEPTED
+    assert pilot.mode(Mode.RTL) is Result.ACCEPTED
+    assert pilot.command(Command.COMPONENT_ARM_DISARM, 1.0) is Result.FAILED
+    assert pilot.texts[-1] == "Arm: RTL mode not armable"
+
+
+def test_idle_vehicle_disarms_by_itself():
+    vehicle, pilot = alone()
+    pilot.mode(Mode.GUIDED)
+    pilot.wait(lambda: vehicle.arming_refusal() is None, 5.0)
+    pilot.command(Command.COMPONENT_ARM_DISARM, 1.0)
+    assert 9.0 < pilot.wait(lambda: not vehicle.armed, 15.0) < 11.0
+
+
+def test_takeoff_needs_guided_armed_and_ground():
+    vehicle, pilot = alone()
+    pilot.wait(lambda: vehicle.arming_refusal() is None, 5.0)
+    takeoff = (Command.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5)
+    assert pilot.command(*takeoff) is Result.FAILED
+    pilot.command(Command.COMPONENT_ARM_DISARM, 1.0)
+    assert pilot.command(*takeoff) is Result.FAILED, "STABILIZE has no takeoff"
+    pilot.mode(Mode.GUIDED)
+    assert pilot.command(*takeoff[:-1], -3) is Result.FAILED
+    assert pilot.command(*takeoff) is Result.ACCEPTED
+    pilot.wait(lambda: not vehicle.landed, 10.0)
+    assert vehicle.landed_state is Landed.TAKEOFF
+    assert pilot.command(*takeoff) is Result.FAILED
+    assert pilot.command(Command.COMPONENT_ARM_DISARM, 0.0) is Result.FAILED, "in the air only with the force magic"
+    assert vehicle.armed
+    assert pilot.command(Command.COMPONENT_ARM_DISARM, 0.0, 21196) is Result.ACCEPTED
+    assert not vehicle.armed
+
+
+@pytest.mark.parametrize(
+    ("command", "result"),
+    [
+        (31999, Result.UNSUPPORTED),
+        (Command.DO_REPOSITION, Result.COMMAND_INT_ONLY),
+        (Command.REQUEST_MESSAGE, Result.ACCEPTED),
+        (Command.DO_FLIGHTTERMINATION, Result.FAILED),
+        (Command.MISSION_START, Result.FAILED),
+    ],
+)
+def test_results_of_commands(command: int, result: Result):
+    _, pilot = alone()
+    assert pilot.command(command) is result
+
+
+def test_messages_for_others_are_ignored():
+    vehicle, pilot = alone()
+    pilot.wait(lambda: vehicle.arming_refusal() is None, 5.0)
+    pilot.send("COMMAND_LONG", {"target_system": 9, "target_component": 1, "command": 400, "param1": 1.0})
+    pilot.fly_on(0.5)
+    assert not vehicle.armed
+    assert "COMMAND_ACK" not in pilot.last
+
+
+@pytest.mark.parametrize("frame", [0, 3, 5, 6, 10, 11])
+def test_global_targets_in_every_frame(frame: int):
+    vehicle, pilot = airborne(10.0)
+    place = START.offset(12.0, -9.0)
+    altitude = 162.0 if frame in (0, 5) else 12.0
+    _target(
+        pilot,
+        "SET_POSITION_TARGET_GLOBAL_INT",
+        coordinate_frame=frame,
+        type_mask=0xDF8,
+        lat_int=place.lat_e7,
+        lon_int=place.lon_e7,
+        alt=altitude,
+    )
+    pilot.fly_on(15.0)
+    assert distance_m(vehicle, 12.0, -9.0) < 0.7
+    assert vehicle.altitude_m == pytest.approx(12.0, abs=0.5)
+
+
+@pytest.mark.parametrize(("frame", "north", "east"), [(1, 6.0, 2.0), (7, 16.0, 2.0), (8, 8.0, 6.0), (9, 8.0, 6.0)])
+def test_local_targets_in_every_frame(frame: int, north: float, east: float):
+    vehicle, pilot = airborne(10.0)
+    pilot.go_to(10.0, 0.0, 10.0)
+    pilot.command(Command.CONDITION_YAW, 90, 90, 1, 0)
+    pilot.fly_on(12.0)
+    pilot.command(Command.CONDITION_YAW, 90, 90, 1, 0)
+    pilot.fly_on(4.0)
+    assert vehicle.est.yaw == pytest.approx(math.radians(90), abs=0.05)
+    z = -10.0 if frame == 1 else 0.0
+    _local(pilot, frame, 0xDF8, x=6.0, y=2.0, z=z)
+    pilot.fly_on(12.0)
+    assert distance_m(vehicle, north, east) < 0.8
+    assert vehicle.altitude_m == pytest.approx(10.0, abs=0.5)
+
+
+def test_velocity_targets_run_out_after_the_timeout():
+    vehicle, pilot = airborne(20.0)
+    for _ in range(30):
+        _local(pilot, 1, 0xDC7, vx=3.0, vy=-1.0, vz=0.5)
+        pilot.fly_on(0.2)
+    assert vehicle.body.vn == pytest.approx(3.0, abs=0.3)
+    assert vehicle.body.ve == pytest.approx(-1.0, abs=0.3)
+    assert vehicle.body.vd == pytest.approx(0.5, abs=0.2)
+    pilot.fly_on(2.5)
+    assert vehicle.body.vn == pytest.approx(3.0, abs=0.3), "GUID_TIMEOUT is 3 s"
+    pilot.fly_on(5.0)
+    assert math.hypot(vehicle.body.vn, vehicle.body.ve) < 0.2
+
+
+def test_yaw_targets_and_rates():
+    vehicle, pilot = airborne(10.0)
+    _local(pilot, 1, 0x9F8, x=0.0, y=0.0, z=-10.0, yaw=2.0)
+    pilot.fly_on(6.0)
+    assert wrap_pi(vehicle.est.yaw - 2.0) == pytest.approx(0.0, abs=0.05)
+    for _ in range(10):
+        _local(pilot, 1, 0x5C7, vx=0.0, vy=0.0, vz=0.0, yaw_rate=0.5)
+        pilot.fly_on(0.5)
+    assert vehicle.body.r == pytest.approx(0.5, abs=0.1)
+
+
+def test_nose_follows_the_course_and_looks_at_a_region_of_interest():
+    vehicle, pilot = airborne(10.0)
+    pilot.go_to(0.0, 60.0, 10.0)
+    pilot.fly_on(6.0)
+    assert vehicle.est.yaw == pytest.approx(math.radians(90), abs=0.1)
+    roi = START.offset(100.0, vehicle.body.east)
+    values = {"frame": 3, "x": roi.lat_e7, "y": roi.lon_e7, "z": 0.0}
+    assert pilot.command_int(Command.DO_SET_ROI_LOCATION, values) is Result.ACCEPTED
+    pilot.fly_on(10.0)
+    bearing = math.atan2(vehicle.body.east * 0 + START.vector_to(roi)[1] - vehicle.body.east, 100.0)
+    assert wrap_pi(vehicle.est.yaw - bearing) == pytest.approx(0.0, abs=0.1)
+
+
+def test_reposition_switches_mode_only_when_asked():
+    vehicle, pilot = airborne(10.0)
+    assert pilot.mode(Mode.LOITER) is Result.ACCEPTED
+    place = START.offset(10.0, 5.0)
+    values = {"frame": 6, "x": place.lat_e7, "y": place.lon_e7, "z": 15.0, "param1": -1.0, "param4": math.nan}
+    assert pilot.command_int(Command.DO_REPOSITION, values) is Result.DENIED
+    assert pilot.command_int(Command.DO_REPOSITION, values | {"param2": 1.0}) is Result.ACCEPTED
+    assert vehicle.mode is Mode.GUIDED
+    pilot.fly_on(15.0)
+    assert distance_m(vehicle, 10.0, 5.0) < 0.7
+    assert vehicle.altitude_m == pytest.approx(15.0, abs=0.4)
+
+
+def test_change_speed_holds_until_the_mode_changes():
+    vehicle, pilot = airborne(10.0)
+    assert pilot.command(Command.DO_CHANGE_SPEED, 1, 2.0) is Result.ACCEPTED
+    assert pilot.command(Command.DO_CHANGE_SPEED, 1, -1.0) is Result.FAILED
+    pilot.go_to(40.0, 0.0, 10.0)
+    pilot.fly_on(10.0)
+    assert vehicle.body.vn == pytest.approx(2.0, abs=0.2)
+    pilot.mode(Mode.LOITER)
+    pilot.mode(Mode.GUIDED)
+    pilot.go_to(-60.0, 0.0, 10.0)
+    pilot.fly_on(6.0)
+    assert vehicle.body.vn < -5.0
+
+
+@pytest.mark.parametrize("mode", [Mode.BRAKE, Mode.LOITER])
+def test_brake_and_loiter_stop(mode: Mode):
+    vehicle, pilot = airborne(10.0)
+    pilot.go_to(100.0, 0.0, 10.0)
+    pilot.wait(lambda: vehicle.body.vn > 5.0, 10.0)
+    at = vehicle.body.north
+    speed = vehicle.body.vn
+    assert pilot.mode(mode) is Result.ACCEPTED
+    pilot.fly_on(10.0)
+    assert abs(vehicle.body.vn) < 0.2
+    assert vehicle.body.north - at < 2.0 * stopping_distance(speed, 1.0, 2.5)
+    assert vehicle.altitude_m == pytest.approx(10.0, abs=0.5)
+
+
+def test_land_disarms_on_the_ground():
+    vehicle, pilot = airborne(8.0)
+    assert pilot.command(Command.NAV_LAND) is Result.ACCEPTED
+    took = pilot.wait(lambda: not vehicle.armed, 60.0)
+    assert 14.0 < took < 25.0
+    assert vehicle.body.on_ground
+    assert vehicle.landed_state is Landed.ON_GROUND
+    assert vehicle.body.impact_mps < 0.8
+
+
+def test_unknown_modes_are_refused():
+    vehicle, pilot = alone()
+    assert pilot.command(Command.DO_SET_MODE, 1, 99) is Result.FAILED
+    assert pilot.texts[-1] == "No such mode 99"
+    assert pilot.command(Command.DO_SET_MODE, 0, 4) is Result.DENIED
+    assert pilot.mode(Mode.AUTO) is Result.FAILED, "there is no mission"
+    assert vehicle.mode is Mode.STABILIZE
+
+
+def test_nan_targets_are_ignored():
+    vehicle, pilot = airborne(10.0)
+    _local(pilot, 1, 0xDF8, x=math.nan, y=0.0, z=-10.0)
+    _local(pilot, 1, 0xDC7, vx=math.inf, vy=0.0, vz=0.0)
+    pilot.fly_on(5.0)
+    assert distance_m(vehicle, 0.0, 0.0) < 0.5
+
+
+def test_sqrt_controller_is_monotonic_and_bounded():
+    values = [sqrt_controller(error / 100.0, 1.0, 2.5, 0.01) for error in range(-5000, 5001)]
+    assert all(b >= a for a, b in itertools.pairwise(values))
+    assert values[5000] == 0.0
+    assert max(values) <= math.sqrt(2 * 2.5 * 50.0)
+
+
+def _fly_pattern(seed: int) -> bytes:
+    from dataclasses import replace
+
+    from fractus_sim.vehicle.pilot import Pilot
+    from fractus_sim.vehicle.simulation import Simulation
+    from vehicle_world import CONFIG
+
+    class Log:
+        data = b""
+
+        def write(self, data: bytes) -> int:
+            self.data += data
+            return len(data)
+
+    parameters = {"SIM_WIND_SPD": 4.0, "SIM_WIND_TURB": 2.0}
+    simulation = Simulation([replace(CONFIG, seed=seed, parameters=parameters)])
+    log = Log()
+    simulation.crafts[0].record(log)  # type: ignore[arg-type]
+    pilot = Pilot(simulation, simulation.crafts[0])
+    pilot.take_off(10.0)
+    pilot.go_to(15.0, -5.0, 12.0)
+    pilot.fly_on(10.0)
+    return log.data
+
+
+def test_one_seed_gives_one_log():
+    first = _fly_pattern(7)
+    assert len(first) > 50_000
+    assert first == _fly_pattern(7)
+    assert first != _fly_pattern(8)
+
+
+def test_estimate_differs_from_truth_but_little():
+    vehicle, pilot = airborne(10.0)
+    pilot.fly_on(30.0)
+    error = math.dist((vehicle.est.north, vehicle.est.east), (vehicle.body.north, vehicle.body.east))
+    assert 0.0 < error < 0.5
+
+
+def test_battery_drains_and_sags():
+    vehicle, pilot = airborne(10.0)
+    before = vehicle.battery.percent
+    resting = vehicle.battery.full_v
+    pilot.fly_on(60.0)
+    assert vehicle.battery.percent < before
+    assert vehicle.battery.voltage_v < resting - 0.2
+    assert isinstance(vehicle, Vehicle)
+    left = vehicle.battery.capacity_mah - vehicle.battery.used_mah
+    endurance_min = left / (vehicle.battery.used_mah / pilot.simulation.time_s) / 60.0
+    assert 8.0 < endurance_min < 25.0

@@ -1,0 +1,34 @@
+"""Vehicles in lockstep for the tests of the simulated vehicle."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from fractus_sim.vehicle.earth import Place
+from fractus_sim.vehicle.pilot import Pilot
+from fractus_sim.vehicle.simulation import Simulation
+from fractus_sim.vehicle.vehicle import Vehicle, VehicleConfig
+
+START = Place.from_degrees(48.2, 16.37, 150.0)
+CONFIG = VehicleConfig(start=START, ready_after_s=2.0, position_noise_m=0.05)
+
+
+def alone(*, config: VehicleConfig = CONFIG, **parameters: float) -> tuple[Vehicle, Pilot]:
+    """One vehicle and its pilot."""
+    simulation = Simulation([replace(config, parameters={**config.parameters, **parameters})])
+    craft = simulation.crafts[0]
+    return craft.vehicle, Pilot(simulation, craft)
+
+
+def airborne(altitude_m: float = 10.0, **parameters: float) -> tuple[Vehicle, Pilot]:
+    """One vehicle that hovers in GUIDED."""
+    vehicle, pilot = alone(**parameters)
+    pilot.take_off(altitude_m)
+    pilot.wait(lambda: not vehicle.flying_wanted, 20.0)
+    return vehicle, pilot
+
+
+def distance_m(vehicle: Vehicle, north_m: float, east_m: float) -> float:
+    """True horizontal distance of a vehicle from a local point."""
+    return math.hypot(vehicle.body.north - north_m, vehicle.body.east - east_m)

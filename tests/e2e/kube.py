@@ -1,0 +1,134 @@
+"""A cluster as the end-to-end tests see it: kubectl, waiting, and power over processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+
+Object = dict[str, Any]
+
+
+class CommandFailed(AssertionError):
+    """A command that had to succeed did not."""
+
+
+@dataclass(frozen=True)
+class Kube:
+    """kubectl on one cluster."""
+
+    kubectl: pathlib.Path
+    kubeconfig: pathlib.Path
+
+    def run(self, *args: str, stdin: str | None = None, timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
+        """Run kubectl and return what it said, whatever its exit code."""
+        return subprocess.run(
+            [str(self.kubectl), *args],
+            input=stdin,
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            env={**os.environ, "KUBECONFIG": str(self.kubeconfig)},
+            check=False,
+        )
+
+    def must(self, *args: str, stdin: str | None = None, timeout_s: float = 60) -> str:
+        """Run kubectl and return its standard output."""
+        done = self.run(*args, stdin=stdin, timeout_s=timeout_s)
+        if done.returncode:
+            raise CommandFailed(f"kubectl {' '.join(args)}: {done.stderr.strip()}")
+        return done.stdout
+
+    def apply(self, *objects: Object) -> None:
+        """Apply objects; the API server must accept all of them."""
+        self.must("apply", "-f", "-", stdin=yaml.safe_dump_all(objects))
+
+    def refused(self, obj: Object) -> str:
+        """Apply an object and return the API server's refusal, empty when it was accepted."""
+        done = self.run("apply", "-f", "-", stdin=yaml.safe_dump(obj))
+        return done.stderr if done.returncode else ""
+
+    def get(self, kind: str, name: str, namespace: str = "default") -> Object | None:
+        """The object, None when there is none."""
+        done = self.run("get", kind, name, "-n", namespace, "-o", "json", "--ignore-not-found")
+        if done.returncode:
+            raise CommandFailed(done.stderr.strip())
+        return json.loads(done.stdout) if done.stdout.strip() else None
+
+    def all(self, kind: str, namespace: str | None = None, selector: str = "") -> list[Object]:
+        """Objects of a kind, in one namespace or in all."""
+        where = ["-n", namespace] if namespace else ["-A"]
+        text = self.must("get", kind, *where, "-o", "json", *(["-l", selector] if selector else []))
+        return list(json.loads(text)["items"])
+
+    def wait(self, what: str, condition: Callable[[], Any], timeout_s: float = 60, poll_s: float = 0.3) -> Any:
+        """Poll until the condition returns something true, and return that."""
+        deadline = time.monotonic() + timeout_s
+        last: Exception | None = None
+        while time.monotonic() < deadline:
+            try:
+                found = condition()
+            except CommandFailed as error:
+                found, last = None, error
+            if found:
+                return found
+            time.sleep(poll_s)
+        raise AssertionError(f"waited {timeout_s:.0f} s for: {what}" + (f" ({last})" if last else ""))
+
+    def pod(self, selector: str, namespace: str, node: str | None = None) -> Object:
+        """The one running pod that a selector finds."""
+        pods = [
+            p
+            for p in self.all("pods", namespace, selector)
+            if p["status"].get("phase") == "Running"
+            and "deletionTimestamp" not in p["metadata"]
+            and (node is None or p["spec"].get("nodeName") == node)
+        ]
+        if len(pods) != 1:
+            raise CommandFailed(f"{len(pods)} running pods of {selector} in {namespace}")
+        return pods[0]
+
+    def kill_pod(self, pod: Object) -> None:
+        """SIGKILL every process of a pod's containers, as a crash would; the sandbox stays."""
+        killed = [pid for pid in processes_of(pod["metadata"]["uid"]) if _killed(pid)]
+        if not killed:
+            raise CommandFailed(f"pod {pod['metadata']['name']} has no processes to kill")
+
+
+def processes_of(pod_uid: str) -> list[int]:
+    """Processes on this machine that belong to a pod's containers, without its pause process."""
+    marks = (pod_uid, pod_uid.replace("-", "_"))
+    found = []
+    for entry in pathlib.Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        try:
+            cgroups = (entry / "cgroup").read_text()
+            command = (entry / "cmdline").read_bytes()
+        except OSError:
+            continue
+        if any(mark in cgroups for mark in marks) and command and not command.split(b"\0")[0].endswith(b"pause"):
+            found.append(int(entry.name))
+    return found
+
+
+def _killed(pid: int) -> bool:
+    try:
+        os.kill(pid, signal.SIGKILL)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def condition(obj: Object | None, type_: str) -> Mapping[str, Any]:
+    """A condition of an object, empty when it has none of that type."""
+    conditions = ((obj or {}).get("status") or {}).get("conditions") or []
+    return next((c for c in conditions if c["type"] == type_), {})

@@ -59,9 +59,7 @@ def _read(pem: bytes) -> Caller:
     uris = [uri for uri in names.get_values_for_type(x509.UniformResourceIdentifier) if uri.startswith(_SCHEME)]
     if len(uris) != 1:
         raise NotAuthenticated(f"the client certificate must name one SPIFFE id, not {len(uris)}")
-    return Caller(
-        uris[0], certificate.not_valid_before_utc.timestamp(), certificate.not_valid_after_utc.timestamp()
-    )
+    return Caller(uris[0], certificate.not_valid_before_utc.timestamp(), certificate.not_valid_after_utc.timestamp())
 
 
 def caller_of(auth_context: Mapping[str, Any], time_s: float) -> Caller:

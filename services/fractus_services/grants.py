@@ -139,6 +139,8 @@ class GrantFiles:
         for identity in sorted(before.keys() | fresh.keys()):
             old, new = before.get(identity), fresh.get(identity)
             if old is not new:
-                log.info("grant of %s %s", identity, "added" if old is None else "removed" if new is None else "changed")
+                log.info(
+                    "grant of %s %s", identity, "added" if old is None else "removed" if new is None else "changed"
+                )
                 for listener in self._listeners:
                     listener(old, new)

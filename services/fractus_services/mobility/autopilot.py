@@ -50,20 +50,18 @@ class Autopilot:
 
     Args:
         url: the link, see `open_link`.
+
+    Attributes:
+        vehicle: the streamed state.
         on_message: called for every message after the state took it.
-        on_ready: a coroutine function called when the vehicle was found, again after each reconnection.
+        on_found: called when the vehicle is heard first, again after each reconnection.
     """
 
-    def __init__(
-        self,
-        url: str,
-        on_message: Callable[[Any], None] = lambda _m: None,
-        on_found: Callable[[], None] = lambda: None,
-    ) -> None:
+    def __init__(self, url: str) -> None:
         self.url = url
+        self.on_message: Callable[[Any], None] = lambda _m: None
+        self.on_found: Callable[[], None] = lambda: None
         self.vehicle = Vehicle()
-        self._on_message = on_message
-        self._on_found = on_found
         self._codec = Codec(SYSTEM_ID, COMPONENT_ID)
         self._transport: Transport | None = None
         self._target: tuple[int, int] | None = None
@@ -152,7 +150,7 @@ class Autopilot:
                     continue
                 self._target = source
                 self.vehicle.take(incoming, self.now)
-                self._on_found()
+                self.on_found()
             if source == self._target:
                 self._take(incoming)
 
@@ -166,7 +164,7 @@ class Autopilot:
             name = _text(incoming.param_id)
             if name in self._params:
                 self._params[name].put_nowait(float(incoming.param_value))
-        self._on_message(incoming)
+        self.on_message(incoming)
         if kind in {"GLOBAL_POSITION_INT", "HEARTBEAT", "EXTENDED_SYS_STATE"}:
             self._updated.set()
             self._updated = asyncio.Event()
@@ -264,7 +262,9 @@ class Autopilot:
 
     async def go_to(self, lat: float, lon: float, altitude_m: float, yaw_deg: float | None) -> None:
         """Begin to fly straight to a point; altitude above home."""
-        await self.command(_REPOSITION, -1, 0, 0, math.nan if yaw_deg is None else yaw_deg, place=(lat, lon, altitude_m))
+        await self.command(
+            _REPOSITION, -1, 0, 0, math.nan if yaw_deg is None else yaw_deg, place=(lat, lon, altitude_m)
+        )
         if yaw_deg is not None:
             await self.command(_YAW, yaw_deg % 360.0, 0, 0, 0)
 

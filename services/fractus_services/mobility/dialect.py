@@ -37,9 +37,7 @@ class _Message(minimal.MAVLink_message):  # type: ignore[misc]
                 flat.extend(value)
             else:
                 flat.append(value)
-        return bytes(
-            self._pack(mav, self.crc_extra, self.unpacker.pack(*flat), force_mavlink1=force_mavlink1)
-        )
+        return bytes(self._pack(mav, self.crc_extra, self.unpacker.pack(*flat), force_mavlink1=force_mavlink1))
 
 
 def _define(line: str) -> type[_Message]:

@@ -39,6 +39,7 @@ SETTINGS = (
     Setting(("FS_EKF_ACTION",), 1, frozenset({1.0, 3.0}), False, "lands when it no longer knows where it is"),
 )
 
+
 @dataclass(frozen=True, slots=True)
 class Checked:
     """What the autopilot will do by itself, and what it will not.

@@ -1,0 +1,615 @@
+"""Who flies the drone: the driver that holds the lease, the system, or a human pilot (contract of a mission).
+
+The system takes the drone whenever nobody else rightly has it, and never lets go of a flying drone before it is home
+or a driver or pilot has it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Callable, Coroutine
+from typing import Any, Literal
+
+from fractus_core.geo import LocalFrame
+from fractus_core.policy.compiled import CompiledGrant
+from fractus_core.policy.values import Takeover, Verdict
+
+from fractus_services.audit import AuditLog
+from fractus_services.grants import GrantFiles, Held
+from fractus_services.mobility.autopilot import Autopilot, AutopilotError
+from fractus_services.mobility.failsafes import Checked, configure
+from fractus_services.mobility.journal import Journal, Mission
+from fractus_services.mobility.leases import Lease, Motion, News, State
+from fractus_services.mobility.motions import distance_m
+from fractus_services.mobility.vehicle import GUIDED, HOMEWARD, LAND, MODE_NAMES, RTL
+from fractus_services.replies import Refused, aborted, precondition, refused, unavailable
+
+log = logging.getLogger(__name__)
+
+Hands = Literal["driver", "system", "pilot"]
+WAYPOINT_M = 5.0
+WAIT_S = 0.5
+RETRY_S = 0.5
+RTL_TRIES = 4
+ARMED_S = 3.0
+
+
+class Control:
+    """The state machine of a drone's control.
+
+    Args:
+        autopilot: the link.
+        journal: what survives a restart.
+        grants: grants of this node.
+        audit: where takeovers are written.
+        grace_s: how long a lost driver may take to come back.
+    """
+
+    def __init__(
+        self, autopilot: Autopilot, journal: Journal, grants: GrantFiles, audit: AuditLog, grace_s: float
+    ) -> None:
+        self.autopilot = autopilot
+        self.journal = journal
+        self.hands: Hands = "system"
+        self.lease: Lease | None = None
+        self.motion: Motion | None = None
+        self.checked: Checked | None = None
+        self.chauffeur: Callable[[Lease, Mission], AsyncIterator[str]] | None = None
+        self.speed_mps: float | None = None
+        self.homeward = False
+        self.chauffeured: CompiledGrant | None = None
+        self._grants = grants
+        self._audit = audit
+        self._grace_s = grace_s
+        self._expected: int | None = None
+        self._changing = 0
+        self._arming = False
+        self._was_armed: bool | None = None
+        self._system: asyncio.Task[None] | None = None
+        self._grace: asyncio.Task[None] | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._changed = asyncio.Event()
+        grants.listen(self._grant_changed)
+
+    @property
+    def controller(self) -> str:
+        """Who flies, as telemetry tells it."""
+        if self.hands == "driver" and self.lease is not None:
+            return self.lease.held.identity
+        return "pilot" if self.hands == "pilot" else "system"
+
+    @property
+    def mission_grant(self) -> Held | None:
+        """The grant under which the drone is in the air."""
+        if self.lease is not None:
+            return self.lease.held
+        mission = self.journal.flying
+        held = self._grants.of(mission.identity) if mission is not None else None
+        return held if held is not None and mission is not None and held.key == mission.key else None
+
+    # The driver's stream
+
+    async def drive(self, held: Held) -> AsyncIterator[News]:
+        """The events of a driver's stream; the driver has the drone from GRANTED until this is closed.
+
+        Raises:
+            Refused: this caller does not get the drone.
+        """
+        mission = self._admit(held)
+        if self.lease is not None:
+            self.lease.tell(News(State.LOST, reason="another stream of the same instance took over"))
+        lease = self.lease = Lease(held)
+        try:
+            async for reason in self._until_ready(lease, mission):
+                yield News(State.WAITING, mission.points_done, reason)
+            if self.lease is lease:
+                yield self._hand_over(lease, mission)
+            while True:
+                try:
+                    news = await lease.next(timeout_s=5.0)
+                except TimeoutError:
+                    continue
+                if news is None:
+                    return
+                yield news
+                if news.final:
+                    return
+        finally:
+            self._left(lease)
+
+    def _admit(self, held: Held) -> Mission:
+        if held.spec.class_ != "driver":
+            raise refused(Verdict("deny", None, "NotADriver", "only a driver gets control; passengers ride along"))
+        mission = self.journal.mission(held)
+        if mission.outcome == "complete":
+            raise precondition("MissionComplete", "the mission is complete")
+        if mission.outcome:
+            raise precondition("ControlLost", f"the mission has ended ({mission.outcome})")
+        flying = self.journal.flying
+        if (self.lease is not None and self.lease.key != held.key) or (
+            flying is not None and flying.key != held.key and self.autopilot.vehicle.armed
+        ):
+            raise precondition("ControlHeld", "another application has the drone; try again when it is back")
+        return mission
+
+    async def _until_ready(self, lease: Lease, mission: Mission) -> AsyncIterator[str]:
+        said = ""
+        while self.lease is lease:
+            reason = self._not_ready()
+            if reason is None:
+                if self.chauffeur is None or lease.held.spec.control != "partial":
+                    return
+                async for news in self.chauffeur(lease, mission):
+                    yield news
+                return
+            if reason != said:
+                said = reason
+                yield reason
+            await self._wait(WAIT_S)
+
+    def _not_ready(self) -> str | None:
+        """Why the drone cannot be handed to a driver now."""
+        vehicle = self.autopilot.vehicle
+        if not self.autopilot.connected:
+            return "the autopilot is not connected"
+        if self.checked is None:
+            return "the autopilot's failsafes are being set"
+        if self.hands == "pilot":
+            return f"a human pilot has the drone ({vehicle.mode_name})"
+        if self.homeward:
+            return "the system brings the drone home"
+        if not vehicle.armed and not vehicle.ready:
+            why = next((t for t in reversed(vehicle.texts) if t.startswith("PreArm")), "")
+            return f"the autopilot is not ready to arm{': ' + why if why else ''}"
+        if vehicle.lat is None or vehicle.home is None:
+            return "position and home are not known yet"
+        return None
+
+    async def _wait(self, timeout_s: float) -> None:
+        try:
+            async with asyncio.timeout(timeout_s):
+                await self._changed.wait()
+        except TimeoutError:
+            return
+
+    def _wake(self) -> None:
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    def _hand_over(self, lease: Lease, mission: Mission) -> News:
+        self._cancel(self._grace)
+        self._cancel(self._system)
+        self.hands = "driver"
+        lease.granted = True
+        self.journal.active = mission.key
+        self.journal.save_soon()
+        self._note("granted", lease.held.identity, f"control point {mission.points_done}")
+        return News(State.GRANTED, mission.points_done, "", mission.waypoints)
+
+    def _left(self, lease: Lease) -> None:
+        """A driver's stream is over; without ReturnControl that means the driver is lost."""
+        if self.lease is not lease:
+            return
+        self.lease = None
+        mission = self.journal.missions.get(lease.key)
+        if mission is None or not (lease.granted or self.autopilot.vehicle.in_air):
+            return
+        self.hands = "system"
+        self._note("driver lost", lease.held.identity, "its stream broke")
+        log.warning("driver %s is lost", lease.held.identity)
+        coming_down = self.motion is not None and self.motion.kind in {"Land", "ReturnToLaunch"}
+        self._stop_motion(precondition("ControlLost", "the driver's stream broke"))
+        if self.autopilot.vehicle.in_air and not coming_down:
+            self._start("hover")
+        self._begin_grace(mission, "driver lost")
+
+    def require(self, held: Held) -> Lease:
+        """The lease of a caller that moves the drone.
+
+        Raises:
+            Refused: it does not have the drone.
+        """
+        lease = self.lease
+        if lease is None or lease.key != held.key or not lease.granted or self.hands != "driver":
+            raise precondition("NotInControl", f"the drone is not yours: {self.controller} has it; use GetControl")
+        if not self.autopilot.connected:
+            raise unavailable("the autopilot is not connected")
+        return lease
+
+    async def give_back(self, held: Held) -> bool:
+        """A driver returns control at the end of a control point; True when that was the last one."""
+        lease = self.require(held)
+        mission = self.journal.mission(held)
+        mission.points_done, mission.waypoints = mission.points_done + 1, 0
+        last = mission.points_done >= len(held.spec.control_points)
+        self.lease = None
+        self.hands = "system"
+        self._stop_motion(aborted("ControlReturned", "control was returned"))
+        self._note("returned", held.identity, "the mission is complete" if last else "")
+        if last:
+            mission.outcome = "complete"
+            lease.tell(News(State.COMPLETE, mission.points_done - 1, "every control point is done"))
+            self._start("returnToLaunch")
+        else:
+            lease.tell(None)
+            if self.autopilot.vehicle.in_air:
+                self._start("hover")
+            self._begin_grace(mission, "driver did not ask for its next control point")
+        await self.journal.save()
+        return last
+
+    def reached(self, held: Held, lat: float, lon: float) -> None:
+        """A goto of the driver is complete: count the waypoint."""
+        mission = self.journal.mission(held)
+        points = held.spec.control_points
+        path = points[mission.points_done].path if mission.points_done < len(points) else None
+        if path and mission.waypoints < len(path):
+            ahead = path[mission.waypoints]
+            if distance_m(LocalFrame(ahead.lat, ahead.lon), lat, lon) <= WAYPOINT_M:
+                mission.waypoints += 1
+                self.journal.save_soon()
+
+    # The chauffeur
+
+    def begin_transit(self, mission: Mission, grant: CompiledGrant) -> None:
+        """The system flies for a waiting driver."""
+        self._cancel(self._grace)
+        self._cancel(self._system)
+        self.hands, self.chauffeured = "system", grant
+        self.journal.active = mission.key
+        self.journal.save_soon()
+
+    def end_transit(self) -> None:
+        """The drone is at the control point, or the way there failed."""
+        self.chauffeured = None
+
+    # Motions
+
+    def begin(self, kind: str) -> Motion:
+        """Start a motion; the one under way is replaced."""
+        self._stop_motion(aborted("Replaced", f"{kind} replaced it"))
+        self.motion = Motion(kind)
+        return self.motion
+
+    def finish(self, motion: Motion) -> None:
+        """A motion is complete, or over."""
+        if self.motion is motion:
+            self.motion = None
+
+    def cancelled(self, motion: Motion) -> None:
+        """The caller of a motion gave it up: hover, unless the driver is gone and the drone comes home anyway."""
+        if self.motion is motion:
+            self._spawn(self._hover_after(motion))
+
+    async def _hover_after(self, motion: Motion) -> None:
+        if motion.kind in {"Land", "ReturnToLaunch"}:
+            await asyncio.sleep(0.3)
+        if self.motion is motion and self.hands == "driver":
+            self.motion = None
+            motion.stop(aborted("Cancelled", "the call was cancelled"))
+            await self._try(self.hold())
+
+    def _stop_motion(self, why: Refused) -> None:
+        if self.motion is not None:
+            self.motion.stop(why)
+            self.motion = None
+
+    async def change_mode(self, mode: int) -> None:
+        """Change the flight mode ourselves, so that it is not taken for a pilot's doing."""
+        if self.autopilot.vehicle.mode == mode and self._expected == mode:
+            return
+        before, self._expected = self._expected, mode
+        self._changing += 1
+        try:
+            await self.autopilot.set_mode(mode)
+        except AutopilotError:
+            self._expected = before
+            raise
+        finally:
+            self._changing -= 1
+
+    async def hold(self) -> None:
+        """Brake and hover."""
+        self.autopilot.stop()
+        await self.change_mode(GUIDED)
+        self.autopilot.stop()
+
+    async def arm(self) -> None:
+        """Arm in GUIDED, when the last line holds.
+
+        Raises:
+            Refused: a failsafe is not verified, or the audit log cannot be written.
+            AutopilotError: the autopilot refuses.
+        """
+        if self.checked is None or self.checked.problem:
+            why = self.checked.problem if self.checked else "they are being set"
+            raise precondition("FailsafesNotVerified", f"the autopilot's failsafes are not verified: {why}")
+        if self._audit.failure:
+            raise precondition("AuditUnavailable", self._audit.failure)
+        self._arming = True
+        try:
+            await self.change_mode(GUIDED)
+            await self.autopilot.arm()
+            await self.autopilot.set_rates(flying=True)
+            deadline = self.autopilot.now + ARMED_S
+            while not self.autopilot.vehicle.armed:
+                if self.autopilot.now > deadline:
+                    raise AutopilotError("the autopilot accepted to arm and did not")
+                await self.autopilot.update(WAIT_S)
+        finally:
+            self._arming = False
+
+    # The system
+
+    def brake(self, verdict: Verdict) -> None:
+        """Stop the present motion; the driver keeps the drone."""
+        self._note("brake", self.controller, verdict.reason, verdict.code, verdict.policies)
+        self._stop_motion(aborted(verdict.code, verdict.reason, verdict.policies))
+        self.autopilot.stop()
+
+    def take_over(self, verdict: Verdict) -> None:
+        """The system takes the drone from its driver, as a policy or the monitor says."""
+        action: Takeover = verdict.takeover or "hover"
+        outcome = {"revoke": "revoked", "land": "failed", "returnToLaunch": "failed", "hover": ""}[action]
+        self._seize("returnToLaunch" if action == "revoke" else action, verdict, outcome)
+
+    def _seize(self, action: Takeover, verdict: Verdict, outcome: str) -> None:
+        mission = self.journal.flying
+        log.warning("the system takes the drone (%s): %s", action, verdict.reason)
+        self._note(action, "system", verdict.reason, verdict.code, verdict.policies, kind="takeover")
+        self._lose(verdict.reason)
+        self.hands = "system"
+        if mission is not None and outcome and not mission.outcome:
+            mission.outcome = f"{outcome}: {verdict.reason}"
+            self.journal.save_soon()
+        self._start(action)
+        if mission is not None and not mission.outcome:
+            self._begin_grace(mission, verdict.reason)
+
+    def _lose(self, reason: str) -> None:
+        """Take the lease from the driver and tell it why."""
+        lease, self.lease = self.lease, None
+        self._stop_motion(precondition("ControlLost", reason))
+        self._cancel(self._grace)
+        if lease is not None:
+            lease.tell(News(State.LOST, reason=reason))
+        self._wake()
+
+    def _start(self, action: Takeover) -> None:
+        self._cancel(self._system)
+        self.homeward = action != "hover" and self.autopilot.vehicle.armed
+        self._system = self._spawn(self._act(action))
+
+    async def _act(self, action: Takeover) -> None:
+        """Carry out what the system wants, however often the link fails."""
+        tries = 0
+        while self.autopilot.vehicle.armed and self.hands == "system":
+            try:
+                if not self.autopilot.vehicle.in_air and action != "hover":
+                    await self.autopilot.disarm()
+                elif action == "hover":
+                    await self.hold()
+                    return
+                else:
+                    self.autopilot.stop()
+                    await self.change_mode(LAND if action == "land" or tries >= RTL_TRIES else RTL)
+                    while self.autopilot.vehicle.armed and self.autopilot.vehicle.mode in HOMEWARD:
+                        await self.autopilot.update(1.0)
+            except AutopilotError as error:
+                tries += 0 if error.link else 1
+                log.warning("cannot %s yet: %s", action, error)
+            await asyncio.sleep(RETRY_S)
+        self.homeward = False
+        self._wake()
+
+    def _begin_grace(self, mission: Mission, why: str) -> None:
+        self._cancel(self._grace)
+        if mission.flown or self.autopilot.vehicle.armed:
+            self._grace = self._spawn(self._give_up(mission, why))
+
+    async def _give_up(self, mission: Mission, why: str) -> None:
+        await asyncio.sleep(self._grace_s)
+        if mission.outcome:
+            return
+        mission.outcome = f"failed: {why}"
+        log.warning("mission of %s failed: %s", mission.identity, why)
+        self._note("returnToLaunch", "system", why, "DriverLost", kind="takeover")
+        await self.journal.save()
+        if self.hands == "system" and not self.homeward:
+            self._start("returnToLaunch")
+
+    # What others do
+
+    def found(self) -> None:
+        """The autopilot is there, for the first time or again."""
+        self.checked = None
+        self._spawn(self._prepare())
+
+    async def _prepare(self) -> None:
+        while self.autopilot.connected:
+            try:
+                await self.autopilot.ask_home()
+                await self.autopilot.set_rates(flying=self.autopilot.vehicle.armed)
+                self._resume()
+                self.checked = await configure(self.autopilot)
+                self._wake()
+            except AutopilotError as error:
+                log.warning("cannot prepare the autopilot yet: %s", error)
+                await asyncio.sleep(RETRY_S)
+            else:
+                return
+
+    def _resume(self) -> None:
+        """Decide who has a vehicle that was there before us, or comes back from a broken link."""
+        vehicle = self.autopilot.vehicle
+        mission = self.journal.flying
+        if self._was_armed is None:
+            self._was_armed = vehicle.armed
+        if self.lease is not None and self.lease.granted:
+            return
+        self._expected = vehicle.mode
+        if not vehicle.armed:
+            if mission is not None and mission.flown and not mission.outcome:
+                self._begin_grace(mission, "driver lost")
+            return
+        if mission is None or vehicle.mode not in HOMEWARD | {GUIDED}:
+            self._pilot(f"is flying in {vehicle.mode_name}")
+        elif vehicle.mode in HOMEWARD:
+            self.hands, self.homeward = "system", True
+            if not mission.outcome:
+                mission.outcome = "failed: the autopilot flew home by itself while the mobility service was away"
+                self.journal.save_soon()
+            self._note("homeward", "system", f"found the drone in {vehicle.mode_name}", kind="takeover")
+            self._system = self._spawn(self._act("returnToLaunch" if vehicle.mode != LAND else "land"))
+        else:
+            self.hands = "system"
+            self._note("hover", "system", "found the drone in the air", kind="takeover")
+            if mission.outcome or self.mission_grant is None:
+                self._revoke_missing(mission)
+                self._start("returnToLaunch")
+            else:
+                self._start("hover")
+                self._begin_grace(mission, "driver lost")
+
+    def _revoke_missing(self, mission: Mission) -> None:
+        if not mission.outcome:
+            mission.outcome = "revoked: the grant was removed"
+            self.journal.save_soon()
+
+    def heartbeat(self) -> None:
+        """Look at mode and arming after each heartbeat."""
+        vehicle = self.autopilot.vehicle
+        if self._was_armed is None:
+            return
+        if vehicle.armed != self._was_armed:
+            self._was_armed = vehicle.armed
+            self._armed() if vehicle.armed else self._landed()
+        if vehicle.armed and not self._changing and self._expected is not None and vehicle.mode != self._expected:
+            self._foreign_mode(vehicle.mode)
+        if not vehicle.armed and not self._changing:
+            self._expected = vehicle.mode
+
+    def _armed(self) -> None:
+        if self.hands != "driver" and not self._arming:
+            self._pilot("armed the drone")
+        self._spawn(self._try(self.autopilot.set_rates(flying=True)))
+
+    def _landed(self) -> None:
+        """The motors stopped."""
+        mission = self.journal.flying
+        self._cancel(self._system)
+        self.homeward = False
+        if self.hands == "pilot" and mission is not None and mission.flown and not mission.outcome:
+            mission.outcome = "failed: a human pilot took the drone and landed it"
+        if self.lease is None or not self.lease.granted:
+            self.hands = "system"
+            if mission is None or mission.outcome:
+                self.journal.active = None
+        self._note("landed", self.controller, "the motors are stopped")
+        self.journal.save_soon()
+        self._spawn(self._try(self.autopilot.set_rates(flying=False)))
+        self._wake()
+
+    def _foreign_mode(self, mode: int) -> None:
+        """Somebody else changed the mode: the autopilot's own failsafe, or a human pilot."""
+        vehicle = self.autopilot.vehicle
+        name = MODE_NAMES.get(mode, str(mode))
+        self._expected = mode
+        said = next((t for t in reversed(vehicle.texts[-6:]) if "ailsafe" in t or "Fence" in t), "")
+        if (vehicle.failsafe or said) and mode in HOMEWARD and self.hands != "pilot":
+            reason = f"the autopilot's own failsafe took the drone ({said or name})"
+            self._note(name, "system", reason, "AutopilotFailsafe", kind="takeover")
+            mission = self.journal.flying
+            if mission is not None and not mission.outcome:
+                mission.outcome = f"failed: {reason}"
+                self.journal.save_soon()
+            self._lose(reason)
+            self.hands, self.homeward = "system", True
+            self._cancel(self._system)
+            self._system = self._spawn(self._act("land" if mode == LAND else "returnToLaunch"))
+        elif self.hands == "pilot" and mode == GUIDED and self.journal.flying is not None:
+            self._note("hover", "system", "the pilot handed the drone back", kind="takeover")
+            self.hands = "system"
+            self._start("hover")
+            self._begin_grace(self.journal.flying, "driver lost")
+        else:
+            self._pilot(f"changed the mode to {name}")
+
+    def _pilot(self, what: str) -> None:
+        """A human pilot has the drone: applications lose it at once, and we keep our hands off."""
+        reason = f"a human pilot {what}"
+        log.warning("%s", reason)
+        if self.hands != "pilot":
+            self._note("pilot", "pilot", reason, "PilotTookOver", kind="takeover")
+        self._cancel(self._system)
+        self.homeward = False
+        self._lose(reason)
+        self.hands = "pilot"
+
+    def in_air(self) -> None:
+        """Remember that the mission flies."""
+        mission = self.journal.flying
+        if mission is not None and not mission.flown and self.hands != "pilot":
+            mission.flown = True
+            self.journal.save_soon()
+
+    def _grant_changed(self, old: Held | None, new: Held | None) -> None:
+        if old is not None and new is not None and old.key == new.key:
+            if self.lease is not None and self.lease.key == new.key:
+                self.lease.held = new
+            return
+        if old is None or old.spec.class_ != "driver":
+            return
+        mission = self.journal.missions.get(old.key)
+        concerned = (self.lease is not None and self.lease.key == old.key) or self.journal.active == old.key
+        if mission is None or mission.outcome or not concerned:
+            return
+        verdict = Verdict("takeover", None, "GrantRevoked", "the grant was removed", (), "revoke")
+        self.journal.active = self.journal.active or old.key
+        if self.hands == "pilot":
+            mission.outcome = "revoked: the grant was removed"
+            self.journal.save_soon()
+        else:
+            self._seize("returnToLaunch", verdict, "revoked")
+
+    # Plumbing
+
+    def _note(
+        self,
+        what: str,
+        who: str,
+        reason: str,
+        code: str = "",
+        policies: tuple[str, ...] = (),
+        kind: str = "control",
+    ) -> None:
+        vehicle = self.autopilot.vehicle
+        self._audit.append(
+            kind,
+            {
+                "action": what, "controller": who, "reason": reason, "code": code, "policies": list(policies),
+                "lat": vehicle.lat, "lon": vehicle.lon, "alt": vehicle.altitude_m,
+            },
+        )  # fmt: skip
+
+    async def _try(self, attempt: Coroutine[Any, Any, None]) -> None:
+        try:
+            await attempt
+        except AutopilotError as error:
+            log.warning("%s", error)
+
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._ended)
+        return task
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and task.exception() is not None:
+            log.error("a task of the drone's control failed", exc_info=task.exception())
+
+    def _cancel(self, task: asyncio.Task[None] | None) -> None:
+        if task is not None and task is not asyncio.current_task():
+            task.cancel()

@@ -1,0 +1,256 @@
+"""gRPC handlers of the mobility service: requests to values, one call, outcomes to replies."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import AsyncIterator, Callable
+from contextlib import aclosing, asynccontextmanager
+from typing import Any
+
+import grpc
+from fractus_core.api.geometry import Reference
+from fractus_core.api.plans import node_identity
+from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, Verdict
+from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc, types_pb2
+
+from fractus_services.auth import Caller, NotAuthenticated, caller_of
+from fractus_services.grants import GrantFiles, Held
+from fractus_services.mobility.autopilot import AutopilotError
+from fractus_services.mobility.control import Control
+from fractus_services.mobility.leases import News, State
+from fractus_services.mobility.service import MobilityService, Progress
+from fractus_services.mobility.telemetry import position_of, telemetry_of, velocity_of
+from fractus_services.replies import Refused, abort, decision, precondition, refused, unavailable
+
+log = logging.getLogger(__name__)
+
+LEAST_INTERVAL_S, USUAL_INTERVAL_S = 0.05, 0.2
+
+_REFERENCES: dict[int, Reference] = {
+    types_pb2.ALTITUDE_REFERENCE_HOME: "home",
+    types_pb2.ALTITUDE_REFERENCE_AMSL: "amsl",
+    types_pb2.ALTITUDE_REFERENCE_TERRAIN: "terrain",
+}
+_STATES = {
+    State.WAITING: mobility_pb2.ControlEvent.STATE_WAITING,
+    State.GRANTED: mobility_pb2.ControlEvent.STATE_GRANTED,
+    State.LOST: mobility_pb2.ControlEvent.STATE_LOST,
+    State.COMPLETE: mobility_pb2.ControlEvent.STATE_COMPLETE,
+}
+
+
+class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):  # type: ignore[misc]
+    """The service on the wire."""
+
+    def __init__(
+        self, service: MobilityService, control: Control, grants: GrantFiles, node: str, clock: Callable[[], float]
+    ) -> None:
+        self._service = service
+        self._control = control
+        self._grants = grants
+        self._node = node_identity(node)
+        self._clock = clock
+
+    @asynccontextmanager
+    async def _answering(self, context: Any) -> AsyncIterator[Caller]:
+        """The caller; what goes wrong inside becomes a status with details."""
+        try:
+            yield caller_of(context.auth_context(), self._clock())
+        except NotAuthenticated as error:
+            await abort(
+                context,
+                Refused(grpc.StatusCode.UNAUTHENTICATED, Verdict("deny", None, "NotAuthenticated", str(error))),
+            )
+        except Refused as refusal:
+            await abort(context, refusal)
+        except AutopilotError as error:
+            await abort(
+                context, unavailable(str(error)) if error.link else precondition("AutopilotRefused", str(error))
+            )
+        except grpc.aio.AbortError:
+            raise
+        except Exception:
+            log.exception("a call failed inside the service; refused")
+            verdict = Verdict(
+                "deny", None, "InternalError", "the service failed; the drone holds its position", (), "hover"
+            )
+            if self._control.hands == "driver" and self._control.autopilot.vehicle.in_air:
+                self._control.brake(verdict)
+            await abort(context, Refused(grpc.StatusCode.INTERNAL, verdict))
+
+    def _held(self, caller: Caller) -> Held:
+        held = self._grants.of(caller.identity)
+        if held is None:
+            reason = f"{caller.identity} has no grant on this node"
+            raise refused(Verdict("deny", None, "NoGrant", reason))
+        return held
+
+    # Control
+
+    async def GetControl(self, _request: Any, context: Any) -> None:  # noqa: N802 - the protocol's name
+        """See mobility.proto."""
+        async with self._answering(context) as caller:
+            held = self._held(caller)
+            self._service.allow(Call("GetControl"), held)
+            try:
+                async with (
+                    asyncio.timeout(max(caller.valid_until_s - self._clock(), 0.0)),
+                    aclosing(self._control.drive(held)) as events,  # type: ignore[type-var]
+                ):
+                    async for news in events:
+                        await context.write(_event(news))
+            except TimeoutError:
+                caller.check(self._clock())
+
+    async def ReturnControl(self, _request: Any, context: Any) -> Any:  # noqa: N802
+        """See mobility.proto."""
+        async with self._answering(context) as caller:
+            held = self._held(caller)
+            self._service.allow(Call("ReturnControl"), held)
+            last = await self._control.give_back(held)
+            return mobility_pb2.ReturnControlResponse(mission_complete=last)
+
+    # Calls that answer at once
+
+    async def Arm(self, _request: Any, context: Any) -> Any:  # noqa: N802
+        """See mobility.proto."""
+        async with self._answering(context) as caller:
+            return mobility_pb2.ArmResponse(decision=decision(await self._service.arm(self._held(caller))))
+
+    async def Disarm(self, _request: Any, context: Any) -> Any:  # noqa: N802
+        """See mobility.proto."""
+        async with self._answering(context) as caller:
+            return mobility_pb2.DisarmResponse(decision=decision(await self._service.disarm(self._held(caller))))
+
+    async def Hover(self, _request: Any, context: Any) -> Any:  # noqa: N802
+        """See mobility.proto."""
+        async with self._answering(context) as caller:
+            return mobility_pb2.HoverResponse(decision=decision(await self._service.hover(self._held(caller))))
+
+    async def SetSpeed(self, request: Any, context: Any) -> Any:  # noqa: N802
+        """See mobility.proto."""
+        async with self._answering(context) as caller:
+            verdict, speed = await self._service.set_speed(self._held(caller), SetSpeedArgs(request.speed_mps))
+            return mobility_pb2.SetSpeedResponse(decision=decision(verdict), speed_mps=speed)
+
+    async def GetSpeed(self, _request: Any, context: Any) -> Any:  # noqa: N802
+        """See mobility.proto."""
+        async with self._answering(context) as caller:
+            verdict = self._service.allow(Call("GetSpeed"), self._held(caller))
+            speed = self._control.autopilot.vehicle.speed_mps
+            return mobility_pb2.GetSpeedResponse(decision=decision(verdict), speed_mps=speed)
+
+    async def GetPosition(self, _request: Any, context: Any) -> Any:  # noqa: N802
+        """See mobility.proto."""
+        async with self._answering(context) as caller:
+            verdict = self._service.allow(Call("GetPosition"), self._held(caller))
+            vehicle = self._control.autopilot.vehicle
+            if vehicle.lat is None:
+                raise unavailable("the drone's position is not known yet")
+            return mobility_pb2.GetPositionResponse(
+                decision=decision(verdict), position=position_of(vehicle), velocity=velocity_of(vehicle)
+            )
+
+    # Motions
+
+    async def Takeoff(self, request: Any, context: Any) -> None:  # noqa: N802
+        """See mobility.proto."""
+        async with self._answering(context) as caller:
+            progress = self._service.take_off(self._held(caller), TakeoffArgs(request.altitude_m))
+            await self._report(progress, context)
+
+    async def Goto(self, request: Any, context: Any) -> None:  # noqa: N802
+        """See mobility.proto."""
+        async with self._answering(context) as caller:
+            args = _goto(request)
+            progress = self._service.goto(self._held(caller), args, _finite(request.acceptance_radius_m))
+            await self._report(progress, context)
+
+    async def Land(self, _request: Any, context: Any) -> None:  # noqa: N802
+        """See mobility.proto."""
+        async with self._answering(context) as caller:
+            await self._report(self._service.land(self._held(caller)), context)
+
+    async def ReturnToLaunch(self, _request: Any, context: Any) -> None:  # noqa: N802
+        """See mobility.proto."""
+        async with self._answering(context) as caller:
+            await self._report(self._service.return_to_launch(self._held(caller)), context)
+
+    async def _report(self, progress: AsyncIterator[Progress], context: Any) -> None:
+        first = True
+        vehicle = self._control.autopilot.vehicle
+        async with aclosing(progress) as steps:  # type: ignore[type-var]
+            async for at in steps:
+                message = mobility_pb2.MotionProgress(
+                    position=position_of(vehicle), distance_m=at.step.distance_m, complete=at.step.complete
+                )
+                if first:
+                    first = False
+                    message.decision.CopyFrom(decision(at.verdict))
+                    _target(message, at.verdict, vehicle)
+                await context.write(message)
+
+    # Telemetry
+
+    async def SubscribeTelemetry(self, request: Any, context: Any) -> None:  # noqa: N802
+        """See mobility.proto."""
+        async with self._answering(context) as caller:
+            if caller.identity != self._node:
+                self._service.allow(Call("GetPosition"), self._held(caller))
+            interval = (
+                request.interval_s if math.isfinite(request.interval_s) and request.interval_s > 0 else USUAL_INTERVAL_S
+            )
+            interval = max(interval, LEAST_INTERVAL_S)
+            while True:
+                caller.check(self._clock())
+                if caller.identity != self._node:
+                    self._held(caller)
+                await context.write(telemetry_of(self._control, self._clock()))
+                await asyncio.sleep(interval)
+
+
+def _event(news: News) -> Any:
+    return mobility_pb2.ControlEvent(
+        state=_STATES[news.state],
+        control_point=news.control_point,
+        reason=news.reason,
+        waypoints_reached=news.waypoints_reached,
+    )
+
+
+def _goto(request: Any) -> GotoArgs:
+    if not request.HasField("target"):
+        raise refused(Verdict("deny", None, "InvalidArgument", "goto needs a target"))
+    target = request.target
+    if target.altitude_reference not in _REFERENCES:
+        raise refused(Verdict("deny", None, "InvalidArgument", "the target's altitude reference is not known here"))
+    return GotoArgs(
+        lat=target.latitude_deg,
+        lon=target.longitude_deg,
+        alt=target.altitude_m,
+        reference=_REFERENCES[target.altitude_reference],
+        yaw_deg=request.yaw_deg if request.HasField("yaw_deg") else None,
+    )
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value) or value < 0:
+        raise refused(
+            Verdict("deny", None, "InvalidArgument", f"the acceptance radius must be 0 m or more, not {value:g}")
+        )
+    return value
+
+
+def _target(message: Any, verdict: Verdict, vehicle: Any) -> None:
+    """Where the motion goes, after correction."""
+    args = verdict.args
+    if isinstance(args, GotoArgs):
+        message.target.latitude_deg, message.target.longitude_deg = args.lat, args.lon
+        message.target.altitude_m = args.alt if args.alt is not None else vehicle.altitude_m
+    elif isinstance(args, TakeoffArgs):
+        message.target.CopyFrom(position_of(vehicle))
+        message.target.altitude_m = args.altitude_m
+    elif vehicle.home is not None:
+        message.target.latitude_deg, message.target.longitude_deg = vehicle.home.lat, vehicle.home.lon

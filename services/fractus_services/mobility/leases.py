@@ -1,0 +1,92 @@
+"""Who holds the drone: the lease that a driver's stream keeps alive, and the motion that runs under it."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+from enum import Enum
+
+from fractus_services.grants import Held
+from fractus_services.replies import Refused
+
+
+class State(Enum):
+    """States of a driver's stream."""
+
+    WAITING = "waiting"
+    GRANTED = "granted"
+    LOST = "lost"
+    COMPLETE = "complete"
+
+
+@dataclass(frozen=True, slots=True)
+class News:
+    """One event on a driver's stream."""
+
+    state: State
+    control_point: int = 0
+    reason: str = ""
+    waypoints_reached: int = 0
+
+    @property
+    def final(self) -> bool:
+        """Whether the stream ends after it."""
+        return self.state in {State.LOST, State.COMPLETE}
+
+
+class Lease:
+    """A driver's hold on the drone.
+
+    Attributes:
+        held: the grant, as it is now.
+        granted: whether the driver drives, or still waits.
+    """
+
+    def __init__(self, held: Held) -> None:
+        self.held = held
+        self.granted = False
+        self._news: asyncio.Queue[News | None] = asyncio.Queue()
+
+    @property
+    def key(self) -> str:
+        """The mission."""
+        return self.held.key
+
+    def tell(self, news: News | None) -> None:
+        """Send an event to the driver; None ends the stream without one."""
+        self._news.put_nowait(news)
+
+    async def next(self, timeout_s: float) -> News | None:
+        """The next event, or None when the stream ends.
+
+        Raises:
+            TimeoutError: nothing happened.
+        """
+        async with asyncio.timeout(timeout_s):
+            return await self._news.get()
+
+
+class Motion:
+    """A motion call that is being carried out, until it is complete or somebody stops it."""
+
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+        self._stopped: Refused | None = None
+
+    @property
+    def stopped(self) -> bool:
+        """Whether it was stopped."""
+        return self._stopped is not None
+
+    def stop(self, why: Refused) -> None:
+        """End it; the caller's stream ends with the reason."""
+        self._stopped = self._stopped or why
+
+    def check(self) -> None:
+        """Go on, or raise why not.
+
+        Raises:
+            Refused: it was stopped.
+        """
+        if self._stopped is not None:
+            raise self._stopped

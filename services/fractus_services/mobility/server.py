@@ -1,0 +1,99 @@
+"""Wires the mobility service together and runs it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import grpc
+from fractus_core.api.nodes import Drone
+from fractus_proto.v1 import mobility_pb2_grpc
+
+from fractus_services.audit import AuditLog
+from fractus_services.auth import KEEPALIVE, TlsFiles
+from fractus_services.clock import Clock
+from fractus_services.grants import GrantFiles
+from fractus_services.mobility.autopilot import Autopilot
+from fractus_services.mobility.chauffeur import Chauffeur
+from fractus_services.mobility.control import Control
+from fractus_services.mobility.guard import Guard
+from fractus_services.mobility.handlers import MobilityHandlers
+from fractus_services.mobility.journal import Journal
+from fractus_services.mobility.service import MobilityService
+from fractus_services.mobility.watch import Watch
+
+if TYPE_CHECKING:
+    from fractus_services.mobility.__main__ import Options
+
+log = logging.getLogger(__name__)
+
+STOP_S = 2.0
+DEFAULT_LINK = "tcp:127.0.0.1:5760"
+
+
+def describe(path: Path) -> tuple[str, str]:
+    """Name and autopilot link of this node, from its description where there is one.
+
+    Raises:
+        InvalidObject: the description is no Drone manifest.
+    """
+    if not path.is_file():
+        return socket.gethostname(), DEFAULT_LINK
+    import yaml  # noqa: PLC0415 - only for this
+
+    drone = Drone.from_body(yaml.safe_load(path.read_text(encoding="utf-8")))
+    features = drone.spec.services.mobility
+    return drone.name, features.connection if features is not None else DEFAULT_LINK
+
+
+async def run(options: Options, stop: asyncio.Event) -> None:
+    """Serve until `stop` is set, or a part of the service fails."""
+    clock = Clock()
+    tls = TlsFiles(options.tls)
+    audit = AuditLog(options.audit, clock)
+    grants = GrantFiles(options.grants, options.node, options.flat_terrain)
+    journal = Journal(options.state)
+    autopilot = Autopilot(options.autopilot)
+    control = Control(autopilot, journal, grants, audit, options.driver_grace_s)
+    guard = Guard(control, audit, clock)
+    control.chauffeur = Chauffeur(control, guard).bring
+    watch = Watch(control, guard, audit)
+    autopilot.on_found = control.found
+    autopilot.on_message = lambda m: control.heartbeat() if m.get_type() == "HEARTBEAT" else None
+    audit.append("started", {"node": options.node, "autopilot": options.autopilot})
+    grants.listen(lambda old, new: _record_grant(audit, old, new))
+    grants.scan()
+    service = MobilityService(control, guard)
+    handlers = MobilityHandlers(service, control, grants, options.node, clock)
+    async with asyncio.TaskGroup() as tasks:
+        running = [
+            tasks.create_task(part)
+            for part in (autopilot.run(), grants.run(), watch.run(), watch.record(), _serve(options, tls, handlers))
+        ]
+        await stop.wait()
+        log.info("stopping; a drone in the air flies home by its autopilot's failsafe")
+        for task in running:
+            task.cancel()
+    await audit.close()
+
+
+def _record_grant(audit: AuditLog, old: Any, new: Any) -> None:
+    held = new or old
+    change = "added" if old is None else "removed" if new is None else "changed"
+    audit.append("grant", {"change": change, "identity": held.identity, "name": held.name, "key": held.key})
+
+
+async def _serve(options: Options, tls: TlsFiles, handlers: MobilityHandlers) -> None:
+    await tls.wait()
+    server = grpc.aio.server(options=KEEPALIVE)
+    mobility_pb2_grpc.add_MobilityServiceServicer_to_server(handlers, server)
+    server.add_secure_port(options.listen, tls.server_credentials())
+    await server.start()
+    log.info("mobility service of %s on %s", options.node, options.listen)
+    try:
+        await asyncio.Event().wait()
+    finally:
+        await asyncio.shield(server.stop(STOP_S))

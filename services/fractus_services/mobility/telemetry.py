@@ -1,0 +1,72 @@
+"""The vehicle's state as subscribers and the flight recorder see it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from fractus_proto.v1 import mobility_pb2, types_pb2
+
+from fractus_services.mobility.control import Control
+from fractus_services.mobility.vehicle import Vehicle
+
+
+def position_of(vehicle: Vehicle) -> types_pb2.Position:
+    """Position above home; zeros while it is unknown."""
+    return types_pb2.Position(
+        latitude_deg=vehicle.lat or 0.0, longitude_deg=vehicle.lon or 0.0, altitude_m=vehicle.altitude_m
+    )
+
+
+def velocity_of(vehicle: Vehicle) -> types_pb2.Velocity:
+    """Velocity over ground."""
+    return types_pb2.Velocity(north_mps=vehicle.north_mps, east_mps=vehicle.east_mps, down_mps=vehicle.down_mps)
+
+
+def telemetry_of(control: Control, time_s: float) -> Any:
+    """The message that subscribers get."""
+    vehicle = control.autopilot.vehicle
+    message = mobility_pb2.Telemetry(
+        altitude_amsl_m=vehicle.amsl_m,
+        velocity=velocity_of(vehicle),
+        yaw_deg=vehicle.yaw_deg,
+        battery_remaining=_known(vehicle.battery_remaining),
+        battery_voltage_v=_known(vehicle.battery_v),
+        battery_current_a=_known(vehicle.battery_a),
+        armed=vehicle.armed,
+        in_air=vehicle.in_air,
+        mode=vehicle.mode_name,
+        ready=vehicle.ready and control.checked is not None and not control.checked.problem,
+        flight_state=vehicle.flight_state,
+        controller=control.controller,
+        autopilot_connected=control.autopilot.connected,
+        missions=control.journal.outcomes(),
+    )
+    message.time.FromNanoseconds(int(time_s * 1e9))
+    if vehicle.lat is not None:
+        message.position.CopyFrom(position_of(vehicle))
+    if vehicle.home is not None:
+        message.home.latitude_deg, message.home.longitude_deg = vehicle.home.lat, vehicle.home.lon
+        message.home.altitude_m = vehicle.home.amsl_m
+        message.home.altitude_reference = types_pb2.ALTITUDE_REFERENCE_AMSL
+    return message
+
+
+def _known(value: float) -> float:
+    return value if math.isfinite(value) else 0.0
+
+
+def recorded(control: Control) -> dict[str, Any]:
+    """One entry of the flight recorder."""
+    vehicle = control.autopilot.vehicle
+    return {
+        "lat": vehicle.lat,
+        "lon": vehicle.lon,
+        "alt": round(vehicle.altitude_m, 2),
+        "amsl": round(vehicle.amsl_m, 2),
+        "speed": round(vehicle.speed_mps, 2),
+        "mode": vehicle.mode_name,
+        "battery": round(_known(vehicle.battery_remaining), 3),
+        "controller": control.controller,
+        "in_air": vehicle.in_air,
+    }

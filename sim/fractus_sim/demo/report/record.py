@@ -1,0 +1,341 @@
+"""What is known of one flight: the objects of the cluster, telemetry, and the audit log."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from fractus_core.api import Application, DeploymentPlan, Depot, Drone, EdgeNode, Policy, Resource, Zone
+from fractus_core.api.geometry import Point
+from fractus_core.geo import LocalFrame, geodesic_m
+from fractus_core.policy.grants import node_attributes, selects
+
+OBJECTS, TELEMETRY, AUDIT = "objects.json", "telemetry.jsonl", "audit.jsonl"
+AIRBORNE_M = 0.5
+_DECIDED = {"correct", "deny", "takeover"}
+_KINDS: tuple[type[Resource], ...] = (Application, DeploymentPlan, Depot, Drone, EdgeNode, Policy, Zone)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Degrees, and metres above home."""
+
+    lat: float
+    lon: float
+    alt_m: float
+
+    @property
+    def ground(self) -> Point:
+        """The same without the altitude."""
+        return Point(lat=self.lat, lon=self.lon)
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """The drone at one moment; `time_s` is Unix time."""
+
+    time_s: float
+    place: Place
+    speed_mps: float
+    mode: str
+    armed: bool
+    in_air: bool
+    battery: float
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """A call that a policy corrected, refused, or answered by taking the drone.
+
+    Attributes:
+        asked: where to, if the call was one to fly somewhere; without lat and lon of its own, where the drone was.
+        flown: where the drone was sent instead.
+        detail: the arguments in words, as asked.
+        count: how many times in a row it was asked alike.
+    """
+
+    time_s: float
+    component: str
+    method: str
+    action: str
+    code: str
+    reason: str
+    policies: tuple[str, ...]
+    detail: str
+    asked: Place | None
+    flown: Place | None
+    at: Place | None
+    count: int = 1
+
+    @property
+    def refused(self) -> bool:
+        """Whether nothing of the call was carried out."""
+        return self.action != "correct"
+
+
+@dataclass(frozen=True, slots=True)
+class Pod:
+    """A pod of the application; times are Unix seconds, None while unknown."""
+
+    name: str
+    component: str
+    node: str
+    created_s: float
+    running_s: float | None
+    restarts: int
+
+
+@dataclass(frozen=True)
+class Record:
+    """Everything that the report is made of."""
+
+    application: Application
+    plan: DeploymentPlan | None
+    drone: Drone | None
+    depots: tuple[Depot, ...]
+    edge_nodes: tuple[EdgeNode, ...]
+    policies: tuple[Policy, ...]
+    zones: tuple[Zone, ...]
+    pods: tuple[Pod, ...]
+    events: tuple[Mapping[str, Any], ...]
+    samples: tuple[Sample, ...]
+    judgements: tuple[Judgement, ...]
+    calls: int
+    audit: Mapping[str, Any] = field(default_factory=dict)
+    times: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, folder: Path) -> Record:
+        """Read what the demo left in a folder.
+
+        Raises:
+            OSError: a file is missing.
+            ValueError: a file is not what the demo writes.
+        """
+        content = json.loads((folder / OBJECTS).read_text())
+        return cls.of(content, _lines(folder / TELEMETRY), _lines(folder / AUDIT))
+
+    @classmethod
+    def of(
+        cls, content: Mapping[str, Any], telemetry: Iterable[Mapping[str, Any]], audit: Iterable[Mapping[str, Any]]
+    ) -> Record:
+        """Make the record from parsed JSON.
+
+        Args:
+            content: `objects` (manifests as the API server has them), `pods`, `events`, `times`, `audit`.
+            telemetry: lines of `fractus telemetry -o json`.
+            audit: entries of the mobility and camera services' audit logs.
+        """
+        found: dict[str, list[Any]] = {kind.KIND: [] for kind in _KINDS}
+        parsers = {kind.KIND: kind for kind in _KINDS}
+        for body in content["objects"]:
+            if body["kind"] in parsers:
+                found[body["kind"]].append(parsers[body["kind"]].from_body(body))
+        plans = found["DeploymentPlan"]
+        chosen = plans[0].spec.drone.node if plans and plans[0].spec.drone else None
+        entries = [entry for entry in audit if entry.get("kind") == "call"]
+        judged = sorted((j for e in entries if (j := _judgement(e)) is not None), key=lambda j: j.time_s)
+        return cls(
+            application=found["Application"][0],
+            plan=plans[0] if plans else None,
+            drone=next((d for d in found["Drone"] if d.name == chosen), None),
+            depots=tuple(found["Depot"]),
+            edge_nodes=tuple(sorted(found["EdgeNode"], key=lambda n: n.name)),
+            policies=tuple(sorted(found["Policy"], key=lambda p: p.name)),
+            zones=tuple(sorted(found["Zone"], key=lambda z: z.name)),
+            pods=tuple(sorted((_pod(body) for body in content.get("pods", ())), key=lambda p: (p.component, p.name))),
+            events=tuple(content.get("events", ())),
+            samples=_flight(_sample(line) for line in telemetry),
+            judgements=_merged(judged),
+            calls=len(entries),
+            audit=content.get("audit", {}),
+            times=content.get("times", {}),
+        )
+
+    @property
+    def policies_in_force(self) -> tuple[Policy, ...]:
+        """The policies that hold for some component of the application on the drone that flew."""
+        if self.drone is None:
+            return self.policies
+        attributes = node_attributes(self.drone)
+        components = self.application.spec.components
+        return tuple(
+            p for p in self.policies if any(selects(p.spec, self.application, c, attributes) for c in components)
+        )
+
+    @property
+    def home(self) -> Place | None:
+        """Where the drone took off."""
+        airborne = self._first_airborne()
+        return self.samples[max(airborne - 1, 0)].place if airborne is not None else None
+
+    @property
+    def takeoff_s(self) -> float | None:
+        """When the drone left the ground."""
+        airborne = self._first_airborne()
+        return self.samples[airborne].time_s if airborne is not None else None
+
+    @property
+    def landing_s(self) -> float | None:
+        """When it was down again; None while it flies."""
+        last = max((i for i, s in enumerate(self.samples) if s.in_air), default=None)
+        return self.samples[last + 1].time_s if last is not None and last + 1 < len(self.samples) else None
+
+    @property
+    def distance_m(self) -> float:
+        """Length of the path over ground."""
+        flown = [s.place.ground for s in self.samples]
+        return sum(geodesic_m(a, b) for a, b in itertools.pairwise(flown))
+
+    @property
+    def max_altitude_m(self) -> float:
+        """The highest that the drone was, above home."""
+        return max((s.place.alt_m for s in self.samples), default=0.0)
+
+    @property
+    def max_speed_mps(self) -> float:
+        """The fastest that it was, over ground."""
+        return max((s.speed_mps for s in self.samples), default=0.0)
+
+    @property
+    def frame(self) -> LocalFrame:
+        """Metres east and north of home, or else of the depot."""
+        home = self.home
+        if home is not None:
+            return LocalFrame(home.lat, home.lon)
+        at = self.depots[0].spec.location if self.depots else Point(lat=0, lon=0)
+        return LocalFrame.at(at)
+
+    def _first_airborne(self) -> int | None:
+        return next((i for i, s in enumerate(self.samples) if s.in_air), None)
+
+
+def _lines(path: Path) -> list[dict[str, Any]]:
+    found = []
+    for line in path.read_text().splitlines() if path.exists() else ():
+        try:
+            found.append(json.loads(line))
+        except ValueError:  # cut off where the recorder was stopped
+            continue
+    return found
+
+
+def _time(text: str) -> float:
+    return datetime.fromisoformat(text).timestamp()
+
+
+def _sample(line: Mapping[str, Any]) -> Sample:
+    position, velocity = line["position"], line["velocity"]
+    return Sample(
+        time_s=_time(line["time"]),
+        place=Place(position["lat"], position["lon"], position["alt"]),
+        speed_mps=math.hypot(velocity["north"], velocity["east"]),
+        mode=line["mode"],
+        armed=line["armed"],
+        in_air=line["in_air"],
+        battery=line["battery_remaining"],
+    )
+
+
+def _flight(samples: Iterable[Sample]) -> tuple[Sample, ...]:
+    """The samples in order, from shortly before the first takeoff to shortly after the last landing."""
+    ordered = sorted((s for s in samples if s.place.lat or s.place.lon), key=lambda s: s.time_s)
+    flying = [s.time_s for s in ordered if s.in_air]
+    if not flying:
+        return ()
+    return tuple(s for s in ordered if flying[0] - 3.0 <= s.time_s <= flying[-1] + 3.0)
+
+
+def _judgement(entry: Mapping[str, Any]) -> Judgement | None:
+    if entry.get("action") not in _DECIDED:
+        return None
+    at = _place(entry.get("at") or entry.get("position"), None)
+    args = entry.get("args") or {}
+    return Judgement(
+        time_s=_time(entry["time"]),
+        component=entry.get("component") or _component(entry.get("identity") or entry.get("caller") or ""),
+        method=entry["method"],
+        action=entry["action"],
+        code=entry.get("code", ""),
+        reason=entry.get("reason", ""),
+        policies=tuple(entry.get("policies", ())),
+        detail=_words(args),
+        asked=_place(args, at),
+        flown=_place(entry.get("flown") or entry.get("corrected") or {}, at),
+        at=at,
+    )
+
+
+def _component(identity: str) -> str:
+    parts = identity.split("/")
+    return parts[parts.index("component") + 1] if "component" in parts[:-1] else identity
+
+
+def _place(value: Mapping[str, Any] | None, base: Place | None) -> Place | None:
+    """The place that a mapping speaks of, completed by where the drone was."""
+    if not value:
+        return None
+    lat = value.get("lat", value.get("latitude_deg"))
+    lon = value.get("lon", value.get("longitude_deg"))
+    alt = value.get("alt", value.get("altitude_m"))
+    if lat is None and alt is None:
+        return None
+    if lat is None or lon is None:
+        return Place(base.lat, base.lon, float(alt)) if base is not None else None
+    return Place(float(lat), float(lon), float(alt) if alt is not None else base.alt_m if base else 0.0)
+
+
+_UNITS = {"speed_mps": "{:.1f} m/s", "altitude_m": "{:.0f} m", "alt": "{:.0f} m"}
+
+
+def _words(args: Mapping[str, Any]) -> str:
+    lat = args.get("lat", args.get("latitude_deg"))
+    lon = args.get("lon", args.get("longitude_deg"))
+    where = [f"{lat:.6f}, {lon:.6f}"] if isinstance(lat, float) and isinstance(lon, float) else []
+    figures = [shape.format(args[key]) for key, shape in _UNITS.items() if isinstance(args.get(key), int | float)]
+    return ", ".join([*where, *figures])
+
+
+def _merged(judged: Iterable[Judgement]) -> tuple[Judgement, ...]:
+    """Join what one component asked alike, with the same answer, in less than a minute, however others come between."""
+    kept: list[Judgement] = []
+    last: dict[tuple[str, ...], tuple[int, float]] = {}
+    for one in judged:
+        key = (one.component, one.method, one.action, one.code, one.detail, *one.policies)
+        index, time_s = last.get(key, (-1, -math.inf))
+        if index >= 0 and one.time_s - time_s < 60.0:
+            before = kept[index]
+            kept[index] = Judgement(
+                **{name: getattr(before, name) for name in Judgement.__slots__ if name != "count"},
+                count=before.count + 1,
+            )
+        else:
+            index = len(kept)
+            kept.append(one)
+        last[key] = (index, one.time_s)
+    return tuple(kept)
+
+
+def _pod(body: Mapping[str, Any]) -> Pod:
+    metadata, status = body["metadata"], body.get("status", {})
+    labels = metadata.get("labels", {})
+    ready = [c for c in status.get("conditions", ()) if c["type"] == "Ready" and c["status"] == "True"]
+    starts = [
+        c["state"]["running"]["startedAt"]
+        for c in status.get("containerStatuses", ())
+        if "running" in c.get("state", {})
+    ]
+    return Pod(
+        name=metadata["name"],
+        component=labels.get("fractus.dev/component", ""),
+        node=body.get("spec", {}).get("nodeName", ""),
+        created_s=_time(metadata["creationTimestamp"]),
+        running_s=max(map(_time, starts)) if ready and starts else None,
+        restarts=sum(c.get("restartCount", 0) for c in status.get("containerStatuses", ())),
+    )

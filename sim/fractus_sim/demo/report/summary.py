@@ -1,0 +1,197 @@
+"""The one page that tells what flew, what policies did, and where everything ran."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+from fractus_core.geo import geodesic_m
+
+from fractus_sim.demo.report.record import Judgement, Record
+
+_ROLES = {
+    "drone": "on the drone",
+    "static": "at its location",
+    "hybrid-edge": "beside {serves}",
+    "hybrid-drone": "within reach of the drone",
+    "cloud": "base in the cloud",
+}
+
+
+def summary(record: Record) -> str:
+    """The page, in Markdown."""
+    parts = [
+        f"# Flight of {record.application.name}\n\n{_headline(record)}",
+        _figures(record),
+        _judged(record.judgements),
+        _placements(record),
+        _pods(record),
+        _audit(record),
+        "Pictures: [map.png](map.png), [altitude.png](altitude.png). For other tools: [flight.geojson](flight.geojson),"
+        " [report.json](report.json), [plan.yaml](plan.yaml), [audit.jsonl](audit.jsonl).",
+    ]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def figures(record: Record) -> dict[str, Any]:
+    """The page's figures, for programs."""
+    status = record.application.status
+    plan = record.plan.spec if record.plan else None
+    return {
+        "application": record.application.name,
+        "phase": status.phase if status else None,
+        "message": status.message if status else None,
+        "drone": record.drone.name if record.drone else None,
+        "calls": record.calls,
+        "corrected": sum(j.count for j in record.judgements if not j.refused),
+        "refused": sum(j.count for j in record.judgements if j.refused),
+        "flight_s": _round(_span(record.takeoff_s, record.landing_s)),
+        "distance_m": _round(record.distance_m),
+        "max_altitude_m": _round(record.max_altitude_m),
+        "max_speed_mps": _round(record.max_speed_mps),
+        "landed": record.landing_s is not None,
+        "landed_from_home_m": _round(_miss_m(record)),
+        "times": {name: _round(seconds) for name, seconds in _durations(record)},
+        "judgements": [
+            {
+                "time": _stamp(j.time_s),
+                "component": j.component,
+                "method": j.method,
+                "action": j.action,
+                "code": j.code,
+                "reason": j.reason,
+                "policies": list(j.policies),
+                "asked": j.detail,
+                "count": j.count,
+            }
+            for j in record.judgements
+        ],
+        "placements": [p.to_dict() for p in plan.placements] if plan else [],
+        "rejected": [r.to_dict() for r in plan.rejected] if plan else [],
+        "audit": dict(record.audit),
+    }
+
+
+def _headline(record: Record) -> str:
+    status = record.application.status
+    phase = (status.phase if status else None) or "Unknown"
+    drone = record.drone.name if record.drone else "no drone"
+    flight_s = _span(record.takeoff_s, record.landing_s)
+    if record.takeoff_s is None:
+        reason = (status.message if status else None) or ""
+        who = record.drone.name if record.drone else "The drone"
+        return f"**{phase}.** {who} did not fly. {reason}".strip()
+    miss = _miss_m(record)
+    end = "is still in the air" if miss is None else f"landed {miss:.1f} m from where it took off"
+    took = f" in {_clock(flight_s)}" if flight_s is not None else ""
+    corrected = sum(j.count for j in record.judgements if not j.refused)
+    refused = sum(j.count for j in record.judgements if j.refused)
+    return (
+        f"**{phase}.** {drone} flew {record.distance_m:.0f} m{took}, up to {record.max_altitude_m:.1f} m high and"
+        f" {record.max_speed_mps:.1f} m/s fast, and {end}. Of {record.calls} calls, policies corrected {corrected}"
+        f" and refused {refused}."
+    )
+
+
+def _figures(record: Record) -> str:
+    rows = [(name, _clock(seconds)) for name, seconds in _durations(record)]
+    return "## Times\n\n" + _table(("Since the apply", "After"), rows) if rows else ""
+
+
+def _durations(record: Record) -> list[tuple[str, float]]:
+    start = record.times.get("applied")
+    if start is None:
+        return []
+    marks: list[tuple[str, float | None]] = [
+        ("planned", record.times.get("planned")),
+        ("all pods Running", record.times.get("running")),
+        ("takeoff", record.takeoff_s),
+        ("landed", record.landing_s),
+        ("phase Completed or Failed", record.times.get("ended")),
+    ]
+    return [(name, at - start) for name, at in marks if at is not None]
+
+
+def _judged(judgements: Sequence[Judgement]) -> str:
+    if not judgements:
+        return "## What policies did\n\nEvery call was allowed as asked."
+    rows = [
+        (
+            str(number),
+            datetime.fromtimestamp(j.time_s, UTC).strftime("%H:%M:%S"),
+            j.component,
+            f"{j.method} {j.detail}".strip() + (f" (x{j.count})" if j.count > 1 else ""),
+            {"correct": "corrected", "deny": "refused", "takeover": "taken over"}[j.action],
+            ", ".join(j.policies) or "-",
+            f"{j.code}: {j.reason}" if j.code else j.reason,
+        )
+        for number, j in enumerate(judgements, 1)
+    ]
+    head = ("No", "UTC", "Component", "Asked", "Outcome", "Policies", "Reason")
+    return "## What policies did\n\n" + _table(head, rows) + "\n\nNumbers are those of the pictures."
+
+
+def _placements(record: Record) -> str:
+    if record.plan is None:
+        return ""
+    rows = []
+    for placed in record.plan.spec.placements:
+        serves = f"{placed.serves.component} on {placed.serves.node}" if placed.serves else ""
+        why = _ROLES[placed.role].format(serves=serves)
+        if placed.coverage is not None:
+            why += f", adds {placed.coverage:.0%} of the operation area"
+        count = f" x{placed.replicas}" if placed.replicas > 1 else ""
+        rows.append((placed.component, (placed.node or "any cloud node") + count, why))
+    text = "## Where it ran\n\n" + _table(("Component", "Node", "Why"), rows)
+    rejected = [(r.component, r.node, f"{r.reason}: {r.message}") for r in record.plan.spec.rejected]
+    if rejected:
+        text += "\n\nDropped:\n\n" + _table(("Component", "Node", "Why not"), rejected)
+    return text
+
+
+def _pods(record: Record) -> str:
+    rows = [
+        (p.name, p.node, f"{p.running_s - p.created_s:.0f} s" if p.running_s is not None else "never", str(p.restarts))
+        for p in record.pods
+    ]
+    return "## Pods\n\n" + _table(("Pod", "Node", "To Running", "Restarts"), rows) if rows else ""
+
+
+def _audit(record: Record) -> str:
+    if not record.audit:
+        return "## Audit log\n\nNone was collected."
+    entries, problem = record.audit.get("entries", 0), record.audit.get("problem")
+    verdict = f"**broken: {problem}**" if problem else "the chain is sound"
+    return f"## Audit log\n\n{entries} entries on the drone, {record.audit.get('kept', 0)} of this mission; {verdict}."
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def _miss_m(record: Record) -> float | None:
+    if record.home is None or record.landing_s is None:
+        return None
+    return geodesic_m(record.home.ground, record.samples[-1].place.ground)
+
+
+def _span(start: float | None, end: float | None) -> float | None:
+    return end - start if start is not None and end is not None else None
+
+
+def _clock(seconds: float | None) -> str:
+    if seconds is None:
+        return "-"
+    whole = round(seconds)
+    return f"{seconds:.1f} s" if whole < 60 else f"{whole // 60} min {whole % 60:02d} s"
+
+
+def _stamp(time_s: float) -> str:
+    return datetime.fromtimestamp(time_s, UTC).isoformat(timespec="milliseconds")
+
+
+def _round(value: float | None) -> float | None:
+    return None if value is None else round(value, 2)

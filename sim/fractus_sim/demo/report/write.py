@@ -1,0 +1,27 @@
+"""Writes the files of a report."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import yaml
+
+from fractus_sim.demo.report.drawing import save
+from fractus_sim.demo.report.features import features
+from fractus_sim.demo.report.flightmap import draw_map
+from fractus_sim.demo.report.profile import draw_altitude
+from fractus_sim.demo.report.record import Record
+from fractus_sim.demo.report.summary import figures, summary
+
+
+def write_report(record: Record, folder: Path) -> None:
+    """Write summary.md, report.json, flight.geojson, plan.yaml, map.png and altitude.png into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "summary.md").write_text(summary(record))
+    (folder / "report.json").write_text(json.dumps(figures(record), indent=2) + "\n")
+    (folder / "flight.geojson").write_text(json.dumps(features(record)) + "\n")
+    if record.plan is not None:
+        (folder / "plan.yaml").write_text(yaml.safe_dump(record.plan.to_dict(), sort_keys=False))
+    save(draw_map(record), folder / "map.png")
+    save(draw_altitude(record), folder / "altitude.png")

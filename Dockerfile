@@ -1,0 +1,139 @@
+# Images of Fractus: operator, agent, services, component (what applications build on), sim, and the example.
+#
+#   docker build --target operator --tag localhost/fractus/operator:dev .
+#
+# Every image is one small root file system with Python, the dependencies that it alone needs in layers shared
+# with the others, and the code on top, so that a change of code replaces a layer of a few hundred kilobytes.
+ARG BASE=debian:bookworm-slim
+
+# ---- tools: what builds the rest; nothing of it is in an image except what is copied out
+FROM ${BASE} AS tools
+ARG UV_VERSION=0.13.8
+# Where package indexes are reached through a proxy of one's own: its CA bundle, mounted for the build only.
+ARG PIP_CERT
+ARG SSL_CERT_FILE
+RUN apt-get update -q \
+ && DEBIAN_FRONTEND=noninteractive apt-get install -qy --no-install-recommends \
+      python3 python3-pip busybox-static binutils media-types netbase >/dev/null \
+ && rm -rf /var/lib/apt/lists/*
+RUN python3 -m pip install --quiet --no-cache-dir --break-system-packages --root-user-action=ignore uv==${UV_VERSION}
+
+# ---- root: Python, the libraries it links to, a shell; no package manager, no documentation
+FROM tools AS root
+RUN mkdir -p /out/usr/bin /out/usr/sbin /out/usr/lib /out/usr/lib64 /out/etc /out/run /out/proc /out/sys /out/dev \
+      /out/var/lib /out/var/log /out/home/fractus /out/usr/local/lib/python3.11/dist-packages /out/usr/local/bin \
+ && ln -s usr/bin usr/sbin usr/lib usr/lib64 /out/ && ln -s /run /out/var/run && mkdir -m 1777 /out/tmp /out/var/tmp \
+ && dpkg -L base-files libc6 libgcc-s1 libstdc++6 zlib1g libssl3 libffi8 libexpat1 libbz2-1.0 liblzma5 libuuid1 \
+      libsqlite3-0 python3-minimal python3.11-minimal libpython3.11-minimal libpython3.11-stdlib \
+      busybox-static media-types netbase | sort -u \
+  | grep -Ev '^/usr/share/(doc|man|locale|lintian|bug|perl5|base-files|binfmts)|/gconv/|__pycache__|/(audit|ld-)[^/]*/' \
+  | grep -Ev '/python3.11/(lib2to3|pydoc_data|idlelib|turtledemo|tkinter|unittest/test|ensurepip|config-)' \
+  | while read -r path; do if [ -L "$path" ] || [ ! -d "$path" ]; then echo "$path"; fi; done \
+  | grep -Ev '^/(bin|sbin|lib|lib64|var/run|var/lock)$' | xargs cp -a --parents -t /out \
+ && ln -sf python3.11 /out/usr/bin/python3 && ln -sf python3.11 /out/usr/bin/python \
+ && for name in sh ls cat ps env sleep ip wget nc vi grep top kill mkdir rm cp mv tail head id hostname; do \
+      [ -e /out/usr/bin/$name ] || ln -s busybox /out/usr/bin/$name; done \
+ && printf 'root:x:0:0:root:/root:/bin/sh\nnobody:x:65534:65534::/nonexistent:/bin/false\nfractus:x:10001:10001::/home/fractus:/bin/sh\n' > /out/etc/passwd \
+ && printf 'root:x:0:\nnogroup:x:65534:\nfractus:x:10001:\n' > /out/etc/group \
+ && printf 'hosts: files dns\npasswd: files\ngroup: files\nprotocols: files\nservices: files\n' > /out/etc/nsswitch.conf \
+ && printf '#!/usr/bin/python3\nimport sys\nfrom fractus.cli import main\nsys.exit(main())\n' > /out/usr/local/bin/fractus \
+ && chmod 755 /out/usr/local/bin/fractus && chown 10001:10001 /out/home/fractus && mkdir -m 700 /out/root \
+ && python3 -m compileall -q --invalidation-mode unchecked-hash -s /out /out/usr/lib/python3.11
+
+# ---- dependencies: one directory for each set, holding what the sets below it do not have already
+FROM tools AS dependencies
+ARG SSL_CERT_FILE
+WORKDIR /build
+COPY pyproject.toml uv.lock /build/
+ENV UV_LINK_MODE=copy UV_PYTHON=/usr/bin/python3 UV_PYTHON_DOWNLOADS=never
+RUN --mount=type=cache,target=/root/.cache/uv \
+    set -e; \
+    for name in sdk core operator agent services; do \
+      cd /build; extra="--extra $name"; if [ "$name" = sdk ]; then extra=; fi; \
+      uv export --quiet --frozen --no-dev --no-emit-project $extra --output-file /build/$name.txt; \
+      uv pip install --quiet --no-deps --require-hashes --target /deps/$name -r /build/$name.txt; \
+      cd /deps/$name; \
+      rm -rf bin .lock numpy/_core/include numpy/_core/lib numpy/f2py numpy/distutils numpy/typing cv2/data cv2/gapi \
+        lxml lxml-* pymavlink/dialects/v09 pymavlink/dialects/v10 pymavlink/dfindexer pymavlink/tools; \
+      find . -path '*/tests' -prune -exec rm -rf {} +; \
+      find . -path './pymavlink/generator/*' -type d -prune -exec rm -rf {} +; \
+      find pymavlink/dialects/v20 -type f 2>/dev/null \
+        | grep -Ev '/(__init__|minimal|common|standard|ardupilotmega)\.py$' | xargs -r rm -f; \
+      strip --strip-unneeded cryptography/hazmat/bindings/_rust.abi3.so 2>/dev/null || true; \
+      find . \( -name '*.pyi' -o -name '*.pyx' -o -name '*.pxd' -o -name '*.c' -o -name '*.h' -o -name '*.a' \) -delete; \
+    done; \
+    for pair in core:sdk operator:core agent:core services:core; do \
+      name=${pair%:*}; below=${pair#*:}; cp -a /deps/$name /only-$name; \
+      (cd /deps/$below && find . ! -type d -print0) | (cd /only-$name && xargs -0 rm -f); \
+      find /only-$name -type d -empty -delete; \
+    done; \
+    cp -a /deps/sdk /only-sdk; \
+    for name in sdk core operator agent services; do \
+      python3 -m compileall -q --invalidation-mode unchecked-hash -s /only-$name \
+        -p /usr/local/lib/python3.11/dist-packages /only-$name; \
+    done
+
+# ---- code: the packages and what tells Python their name, version and commands
+FROM tools AS code
+ARG PIP_CERT
+WORKDIR /build
+ENV UV_PYTHON=/usr/bin/python3 UV_PYTHON_DOWNLOADS=never
+RUN python3 -m pip install --quiet --no-cache-dir --break-system-packages --root-user-action=ignore hatchling==1.33.0
+# The build context is what .dockerignore lets through.
+COPY . /build/
+RUN uv build --quiet --wheel --no-build-isolation --out-dir /wheel \
+ && uv pip install --quiet --no-deps --target /code /wheel/*.whl \
+ && rm -rf /code/bin /code/.lock /code/fractus-*.dist-info/RECORD \
+ && python3 -m compileall -q --invalidation-mode unchecked-hash -s /code -p /usr/local/lib/python3.11/dist-packages /code \
+ && assemble() { target=$1; shift; mkdir -p /images/$target; \
+      for name in fractus_proto "$@"; do cp -a /code/$name /images/$target/; done; \
+      cp -a /code/fractus-*.dist-info /images/$target/; } \
+ && assemble component fractus \
+ && assemble operator fractus_core fractus_operator \
+ && assemble agent fractus_core fractus_agent \
+ && assemble services fractus fractus_core fractus_services \
+ && assemble sim fractus_sim
+
+# ---- python: the common start of all images, with what the SDK needs
+FROM scratch AS python
+COPY --from=root /out /
+COPY --from=dependencies /only-sdk /usr/local/lib/python3.11/dist-packages
+ENV PATH=/usr/local/bin:/usr/bin:/bin LANG=C.UTF-8 PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1
+
+FROM python AS domain
+COPY --from=dependencies /only-core /usr/local/lib/python3.11/dist-packages
+
+# ---- component: what applications' components start from
+FROM python AS component
+USER 10001:10001
+WORKDIR /home/fractus
+ENTRYPOINT ["python3"]
+COPY --from=code /images/component /usr/local/lib/python3.11/dist-packages
+
+FROM component AS example-traffic-monitoring
+COPY examples/traffic-monitoring/*.py /app/
+WORKDIR /app
+
+FROM domain AS operator
+COPY --from=dependencies /only-operator /usr/local/lib/python3.11/dist-packages
+USER 10001:10001
+ENTRYPOINT ["python3", "-m", "fractus_operator"]
+COPY --from=code /images/operator /usr/local/lib/python3.11/dist-packages
+
+FROM domain AS agent
+COPY --from=dependencies /only-agent /usr/local/lib/python3.11/dist-packages
+ENTRYPOINT ["python3", "-m", "fractus_agent"]
+COPY --from=code /images/agent /usr/local/lib/python3.11/dist-packages
+
+FROM domain AS services-dependencies
+COPY --from=dependencies /only-services /usr/local/lib/python3.11/dist-packages
+
+FROM services-dependencies AS services
+ENTRYPOINT ["fractus"]
+COPY --from=code /images/services /usr/local/lib/python3.11/dist-packages
+
+# ---- sim: the simulated vehicle as a pod, for clusters whose nodes have no hardware beside them
+FROM services AS sim
+USER 10001:10001
+ENTRYPOINT ["python3", "-m", "fractus_sim.vehicle"]
+COPY --from=code /images/sim /usr/local/lib/python3.11/dist-packages

@@ -1,0 +1,348 @@
+"""A simulated vehicle, a mobility service and certificates, for tests that fly."""
+
+from __future__ import annotations
+
+import asyncio
+import datetime
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import grpc
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
+from fractus_core.api.plans import component_identity, node_identity, node_server_name
+from fractus_core.geo import LocalFrame
+from fractus_proto.v1 import mobility_pb2 as pb
+from fractus_proto.v1 import mobility_pb2_grpc, types_pb2
+from grpc_status import rpc_status
+
+HOME = (39.3600, 22.9500, 10.0)
+FRAME = LocalFrame(HOME[0], HOME[1])
+NODE = "drone-1"
+DRIVER = component_identity("default", "app", "Navigator", "app-navigator")
+PASSENGER = component_identity("default", "app", "AerialViewer", "app-aerial-viewer")
+
+
+def free_port() -> int:
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        return int(sock.getsockname()[1])
+
+
+def area(x0: float, y0: float, x1: float, y1: float) -> dict[str, Any]:
+    """A rectangle in metres east and north of home."""
+    corners = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+    return {"polygon": {"exterior": [dict(zip(("lat", "lon"), FRAME.latlon(x, y), strict=True)) for x, y in corners]}}
+
+
+def fence(name: str, kind: str, action: str, *box: float, **band: float) -> dict[str, Any]:
+    zone: dict[str, Any] = {"name": f"{name}-zone", "area": area(*box)}
+    if band:
+        zone["altitude"] = band
+    spec = {"type": "GeofenceControl", "kind": kind, "action": action, "selector": {"zones": [f"{name}-zone"]}}
+    return {"name": name, "spec": spec, "zones": [zone]}
+
+
+def altitude_limit(lower: float, upper: float) -> dict[str, Any]:
+    spec = {"type": "LimitControl", "kind": "altitude", "lowerLimit": lower, "upperLimit": upper, "action": "enforce"}
+    return {"name": "altitudes", "spec": spec}
+
+
+ALL = ["Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "Goto", "Hover", "GetPosition", "ReturnToLaunch"]
+
+
+def grant(*policies: dict[str, Any], **changes: Any) -> dict[str, Any]:
+    """A driver's grant: operation area 200 m around home, with these policies."""
+    path = [dict(zip(("lat", "lon", "alt"), (*FRAME.latlon(x, y), 10.0), strict=True)) for x, y in ((0, 40), (40, 40))]
+    spec = {
+        "node": NODE,
+        "application": {"namespace": "default", "name": "app", "uid": "u1"},
+        "component": "Navigator",
+        "instance": "app-navigator",
+        "class": "driver",
+        "control": "full",
+        "controlPoints": [{"navigation": "pathBased", "path": path}],
+        "services": [{"service": "mobility", "methods": ALL}],
+        "operationArea": [area(-100, -100, 100, 100)],
+        "home": {"lat": HOME[0], "lon": HOME[1], "alt": HOME[2], "altitudeReference": "amsl"},
+        "limits": {"maxAltitude": 60, "maxSpeed": 12},
+        "policies": list(policies),
+    }
+    spec.update(changes)
+    metadata = {"name": spec["instance"], "uid": f"uid-{spec['instance']}"}
+    return {"apiVersion": "fractus.dev/v1alpha1", "kind": "Grant", "metadata": metadata, "spec": spec}
+
+
+def passenger_grant(**changes: Any) -> dict[str, Any]:
+    return grant(
+        **{
+            "component": "AerialViewer",
+            "instance": "app-aerial-viewer",
+            "class": "passenger",
+            "control": None,
+            "controlPoints": [],
+            **changes,
+        }
+    )
+
+
+class Authority:
+    """A certificate authority."""
+
+    def __init__(self, directory: Path, name: str = "ca") -> None:
+        self._directory = directory
+        self._key = ec.generate_private_key(ec.SECP256R1())
+        subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+        now = datetime.datetime.now(datetime.UTC)
+        self.certificate = (
+            x509.CertificateBuilder()
+            .subject_name(subject)
+            .issuer_name(subject)
+            .public_key(self._key.public_key())
+            .serial_number(x509.random_serial_number())
+            .not_valid_before(now - datetime.timedelta(days=1))
+            .not_valid_after(now + datetime.timedelta(days=1))
+            .add_extension(x509.BasicConstraints(ca=True, path_length=None), critical=True)
+            .sign(self._key, hashes.SHA256())
+        )
+        self.pem = self.certificate.public_bytes(serialization.Encoding.PEM)
+
+    def issue(
+        self, identity: str, *, dns: str | None = None, seconds: float = 3600.0, begun: float = -60.0
+    ) -> tuple[bytes, bytes]:
+        """Key and certificate, PEM."""
+        key = ec.generate_private_key(ec.SECP256R1())
+        now = datetime.datetime.now(datetime.UTC)
+        names: list[x509.GeneralName] = [x509.UniformResourceIdentifier(identity)]
+        if dns:
+            names.append(x509.DNSName(dns))
+        certificate = (
+            x509.CertificateBuilder()
+            .subject_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "test")]))
+            .issuer_name(self.certificate.subject)
+            .public_key(key.public_key())
+            .serial_number(x509.random_serial_number())
+            .not_valid_before(now + datetime.timedelta(seconds=begun))
+            .not_valid_after(now + datetime.timedelta(seconds=seconds))
+            .add_extension(x509.SubjectAlternativeName(names), critical=False)
+            .sign(self._key, hashes.SHA256())
+        )
+        pem = key.private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        )
+        return pem, certificate.public_bytes(serialization.Encoding.PEM)
+
+
+class Rig:
+    """Everything on a drone, in one directory."""
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self.grants = directory / "grants"
+        self.tls = directory / "tls"
+        self.audit = directory / "audit.jsonl"
+        for folder in (self.grants, self.tls):
+            folder.mkdir(parents=True)
+        self.authority = Authority(directory)
+        self.address = f"127.0.0.1:{free_port()}"
+        self.link = f"tcp:127.0.0.1:{free_port()}"
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._channels: list[grpc.aio.Channel] = []
+        self.write_tls()
+
+    def write_tls(self, **how: Any) -> None:
+        key, certificate = self.authority.issue(node_identity(NODE), dns=node_server_name(NODE), **how)
+        for name, data in (("tls.key", key), ("tls.crt", certificate), ("ca.crt", self.authority.pem)):
+            fresh = self.tls / f".{name}"
+            fresh.write_bytes(data)
+            fresh.replace(self.tls / name)
+
+    def write_grant(self, body: dict[str, Any]) -> Path:
+        path = self.grants / f"{body['spec']['instance']}.json"
+        fresh = path.with_suffix(".new")
+        fresh.write_text(json.dumps(body))
+        fresh.replace(path)
+        return path
+
+    def start_vehicle(self, speedup: float = 2.0, *more: str) -> None:
+        home = ",".join(str(v) for v in HOME)
+        self._start(
+            "vehicle", "-m", "fractus_sim.vehicle", "--listen", self.link, "--home", home, "--speedup", str(speedup),
+            "--ready-after", "2", *more,
+        )  # fmt: skip
+
+    def start_service(self, *more: str) -> None:
+        self._start(
+            "service", "-m", "fractus_services.mobility", "serve", "--grants", str(self.grants), "--tls", str(self.tls),
+            "--state", str(self.directory / "state"), "--audit", str(self.audit), "--node", NODE, "--autopilot", self.link,
+            "--listen", self.address, "--description", str(self.directory / "none.yaml"), "--driver-grace", "3", *more,
+        )  # fmt: skip
+
+    def _start(self, name: str, *arguments: str) -> None:
+        with (self.directory / f"{name}.log").open("ab") as log:
+            self._processes[name] = subprocess.Popen(
+                [sys.executable, *arguments], stdout=log, stderr=subprocess.STDOUT, env={**os.environ, "MALLOC_ARENA_MAX": "2"}
+            )
+
+    def kill(self, name: str, how: signal.Signals = signal.SIGKILL) -> None:
+        process = self._processes[name]
+        process.send_signal(how)
+        process.wait(10)
+
+    def pid(self, name: str) -> int:
+        return self._processes[name].pid
+
+    def channel(self, identity: str, authority: Authority | None = None, **how: Any) -> grpc.aio.Channel:
+        key, certificate = (authority or self.authority).issue(identity, **how)
+        credentials = grpc.ssl_channel_credentials(self.authority.pem, key, certificate)
+        channel = grpc.aio.secure_channel(
+            self.address,
+            credentials,
+            options=[
+                ("grpc.ssl_target_name_override", node_server_name(NODE)),
+                ("grpc.initial_reconnect_backoff_ms", 100),
+                ("grpc.max_reconnect_backoff_ms", 300),
+                ("grpc.use_local_subchannel_pool", 1),
+            ],
+        )
+        self._channels.append(channel)
+        return channel
+
+    def stub(self, identity: str = DRIVER, **how: Any) -> mobility_pb2_grpc.MobilityServiceStub:
+        return mobility_pb2_grpc.MobilityServiceStub(self.channel(identity, **how))
+
+    async def close(self) -> None:
+        for channel in self._channels:
+            await channel.close()
+        for process in self._processes.values():
+            if process.poll() is None:
+                process.kill()
+                process.wait(10)
+
+    def entries(self, kind: str | None = None) -> list[dict[str, Any]]:
+        lines = self.audit.read_text().splitlines() if self.audit.exists() else []
+        found = [json.loads(line) for line in lines if line.endswith("}")]
+        return [entry for entry in found if kind is None or entry["kind"] == kind]
+
+    # What tests wait for
+
+    async def telemetry(self) -> pb.Telemetry:
+        async for message in self.stub(node_identity(NODE)).SubscribeTelemetry(
+            pb.SubscribeTelemetryRequest(), wait_for_ready=True, timeout=20
+        ):
+            return message
+        raise AssertionError("no telemetry")
+
+    async def until(
+        self, condition: Callable[[pb.Telemetry], bool], timeout_s: float = 30.0, what: str = "state"
+    ) -> pb.Telemetry:
+        """Wait for a state of the drone; survives restarts of the service."""
+        deadline = time.monotonic() + timeout_s
+        last: Any = None
+        stub = self.stub(node_identity(NODE))
+        while time.monotonic() < deadline:
+            try:
+                async for last in stub.SubscribeTelemetry(
+                    pb.SubscribeTelemetryRequest(interval_s=0.05),
+                    wait_for_ready=True,
+                    timeout=max(deadline - time.monotonic(), 0.1),
+                ):
+                    if condition(last):
+                        return last
+            except grpc.aio.AioRpcError:
+                await asyncio.sleep(0.05)
+        raise AssertionError(f"{what} was not reached in {timeout_s} s; last: {last}\n{self.log('service')}")
+
+    def log(self, name: str) -> str:
+        path = self.directory / f"{name}.log"
+        return path.read_text()[-4000:] if path.exists() else ""
+
+
+class Driver:
+    """A driver's stream and calls."""
+
+    def __init__(self, rig: Rig, identity: str = DRIVER) -> None:
+        self.rig = rig
+        self.channel = rig.channel(identity)
+        self.stub = mobility_pb2_grpc.MobilityServiceStub(self.channel)
+        self.events: list[pb.ControlEvent] = []
+        self._stream: Any = None
+
+    async def take(self, timeout_s: float = 30.0) -> pb.ControlEvent:
+        self._stream = self.stub.GetControl(pb.GetControlRequest(), wait_for_ready=True)
+        async with asyncio.timeout(timeout_s):
+            return await self.next(pb.ControlEvent.STATE_GRANTED)
+
+    async def next(self, state: int, timeout_s: float = 30.0) -> pb.ControlEvent:
+        async with asyncio.timeout(timeout_s):
+            while True:
+                event = await self._stream.read()
+                assert event is not grpc.aio.EOF, f"stream ended; events {self.events}"
+                self.events.append(event)
+                if event.state == state:
+                    return event
+
+    def drop(self) -> None:
+        self._stream.cancel()
+
+    async def arm(self) -> Any:
+        return await self.stub.Arm(pb.ArmRequest(), timeout=10)
+
+    async def take_off(self, altitude_m: float = 10.0) -> pb.MotionProgress:
+        return await flown(self.stub.Takeoff(pb.TakeoffRequest(altitude_m=altitude_m), timeout=60))
+
+    async def up(self, altitude_m: float = 10.0) -> pb.MotionProgress:
+        await self.take()
+        await self.arm()
+        return await self.take_off(altitude_m)
+
+    def going(self, x: float, y: float, alt: float = 10.0, **more: Any) -> Any:
+        return self.stub.Goto(pb.GotoRequest(target=place(x, y, alt), **more), timeout=90)
+
+    async def goto(self, x: float, y: float, alt: float = 10.0) -> pb.MotionProgress:
+        return await flown(self.going(x, y, alt))
+
+
+def place(x: float, y: float, alt: float = 10.0) -> types_pb2.Position:
+    lat, lon = FRAME.latlon(x, y)
+    return types_pb2.Position(latitude_deg=lat, longitude_deg=lon, altitude_m=alt)
+
+
+async def flown(call: Any) -> pb.MotionProgress:
+    """The first message of a motion that completes, with the last one's position."""
+    first: Any = None
+    last: Any = None
+    async for last in call:
+        first = first or last
+    assert last is not None and last.complete
+    first.position.CopyFrom(last.position)
+    return first
+
+
+async def denied(call: Awaitable[Any]) -> tuple[grpc.StatusCode, types_pb2.Decision]:
+    """Status and decision of a call that must fail."""
+    try:
+        reply = await call
+    except grpc.aio.AioRpcError as error:
+        status = rpc_status.from_call(error)
+        found = types_pb2.Decision()
+        if status is not None:
+            for detail in status.details:
+                if detail.Is(types_pb2.Decision.DESCRIPTOR):
+                    detail.Unpack(found)
+        return error.code(), found
+    raise AssertionError(f"the call was not refused: {reply}")
+
+
+def xy(position: types_pb2.Position) -> tuple[float, float]:
+    return FRAME.xy(position.latitude_deg, position.longitude_deg)

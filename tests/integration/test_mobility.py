@@ -1,0 +1,188 @@
+"""The mobility service with a flying vehicle: missions, corrections, refusals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import grpc
+import pytest
+from fractus_core.api.plans import node_identity
+from fractus_proto.v1 import mobility_pb2 as pb
+from fractus_proto.v1 import types_pb2
+from fractus_services.audit import verify
+from mobility_rig import (
+    DRIVER,
+    NODE,
+    PASSENGER,
+    Driver,
+    Rig,
+    altitude_limit,
+    denied,
+    fence,
+    flown,
+    grant,
+    passenger_grant,
+    xy,
+)
+
+Decision = types_pb2.Decision
+
+
+@pytest.fixture
+async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
+    rig = Rig(tmp_path)
+    try:
+        yield rig
+    finally:
+        await rig.close()
+
+
+async def test_a_whole_mission_with_a_correction_and_refusals(rig: Rig) -> None:
+    rig.write_grant(grant(altitude_limit(5, 15), fence("no-fly", "exclusion", "ignore", -60, -10, -40, 10)))
+    rig.write_grant(passenger_grant())
+    rig.start_service()  # before the vehicle: it waits for it
+    rig.start_vehicle()
+    driver = Driver(rig)
+    climbed = await driver.up(3.0)
+    assert climbed.decision.action == Decision.ACTION_CORRECT
+    assert climbed.decision.code == "AltitudeBelowLimit"
+    assert climbed.target.altitude_m == pytest.approx(5.0)
+
+    first = await driver.goto(0, 40, 20.0)
+    assert first.decision.action == Decision.ACTION_CORRECT
+    assert list(first.decision.policies) == ["altitudes"]
+    assert first.target.altitude_m == pytest.approx(15.0)
+    assert first.position.altitude_m == pytest.approx(15.0, abs=1.0)
+    assert math.dist(xy(first.position), (0, 40)) < 1.5
+
+    code, why = await denied(flown(driver.going(-50, 0)))
+    assert (code, why.code) == (grpc.StatusCode.PERMISSION_DENIED, "InsideExclusionZone")
+    assert why.action == Decision.ACTION_DENY
+    assert list(why.policies) == ["no-fly"]
+    code, why = await denied(flown(driver.going(-80, 0)))
+    assert why.code == "LegThroughExclusionZone"
+    code, why = await denied(flown(driver.going(0, 150)))
+    assert (code, why.code) == (grpc.StatusCode.PERMISSION_DENIED, "OutsideOperationArea")
+    code, why = await denied(flown(driver.going(0, 20, math.nan)))
+    assert code == grpc.StatusCode.INVALID_ARGUMENT
+    assert why.code == "InvalidArgument"
+
+    passenger = rig.stub(PASSENGER)
+    where = await passenger.GetPosition(pb.GetPositionRequest(), timeout=5)
+    assert math.dist(xy(where.position), (0, 40)) < 2.0
+    code, why = await denied(passenger.Hover(pb.HoverRequest(), timeout=5))
+    assert (code, why.code) == (grpc.StatusCode.PERMISSION_DENIED, "NotADriver")
+
+    speed = await driver.stub.SetSpeed(pb.SetSpeedRequest(speed_mps=30), timeout=5)
+    assert speed.speed_mps == pytest.approx(12.0)
+    assert speed.decision.code == "SpeedAboveLimit"
+    await driver.goto(40, 40)
+    code, why = await denied(driver.stub.Disarm(pb.DisarmRequest(), timeout=5))
+    assert why.code == "InAir"
+
+    reply = await driver.stub.ReturnControl(pb.ReturnControlRequest(), timeout=5)
+    assert reply.mission_complete
+    await driver.next(pb.ControlEvent.STATE_COMPLETE)
+    landed = await rig.until(lambda t: not t.armed, 60, "landing")
+    assert math.dist(xy(landed.position), (0, 0)) < 2.0
+    assert dict(landed.missions) == {"uid-app-navigator": "complete"}
+
+    code, why = await denied(_first_event(Driver(rig)))
+    assert (code, why.code) == (grpc.StatusCode.FAILED_PRECONDITION, "MissionComplete")
+
+    rig.kill("service", __import__("signal").SIGTERM)
+    with rig.audit.open("rb") as log:
+        finding = verify(log)
+    assert not finding.problem
+    assert not finding.torn
+    calls = rig.entries("call")
+    assert {"correct", "deny", "allow"} <= {c["action"] for c in calls}
+    states = rig.entries("state")
+    assert len(states) > 10
+    assert max(s["alt"] for s in states) < 16.0
+
+
+async def _first_event(driver: Driver) -> None:
+    async for _ in driver.stub.GetControl(pb.GetControlRequest(), timeout=10):
+        return
+
+
+async def test_who_may_call(rig: Rig, tmp_path: Path) -> None:
+    from mobility_rig import Authority
+
+    rig.write_grant(grant())
+    rig.write_grant(passenger_grant(services=[{"service": "mobility", "methods": ["GetSpeed"]}]))
+    rig.start_service()
+    rig.start_vehicle()
+    await rig.until(lambda t: t.ready, 20)
+    ask = pb.GetPositionRequest()
+    await rig.stub(DRIVER).GetPosition(ask, timeout=5)
+
+    other = DRIVER.replace("/app/app/", "/app/other/")
+    code, why = await denied(rig.stub(other).GetPosition(ask, timeout=5))
+    assert (code, why.code) == (grpc.StatusCode.PERMISSION_DENIED, "NoGrant")
+    code, why = await denied(rig.stub(PASSENGER).GetPosition(ask, timeout=5))
+    assert (code, why.code) == (grpc.StatusCode.PERMISSION_DENIED, "MethodNotGranted")
+    code, why = await denied(rig.stub(node_identity("drone-2")).GetPosition(ask, timeout=5))
+    assert code == grpc.StatusCode.PERMISSION_DENIED
+    code, why = await denied(rig.stub(node_identity(NODE)).GetPosition(ask, timeout=5))
+    assert code == grpc.StatusCode.PERMISSION_DENIED, "the node's own services may look, not act"
+    for channel in (
+        rig.stub(DRIVER, seconds=-1.0),  # expired
+        rig.stub(DRIVER, authority=Authority(tmp_path, "stranger")),
+    ):
+        code, _ = await denied(channel.GetPosition(ask, timeout=5))
+        assert code == grpc.StatusCode.UNAVAILABLE, "the handshake must fail"
+    plain = grpc.aio.insecure_channel(rig.address)
+    code, _ = await denied(plain.unary_unary("/fractus.v1.MobilityService/GetPosition")(b"", timeout=3))
+    assert code in {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED}
+    await plain.close()
+    code, why = await denied(rig.stub(DRIVER).Arm(pb.ArmRequest(), timeout=5))
+    assert (code, why.code) == (grpc.StatusCode.FAILED_PRECONDITION, "NotInControl")
+
+
+async def test_a_certificate_that_expires_during_a_long_connection(rig: Rig) -> None:
+    rig.write_grant(grant())
+    rig.start_service()
+    rig.start_vehicle()
+    await rig.until(lambda t: t.ready, 20)
+    stub = rig.stub(DRIVER, seconds=4.0)
+    await stub.GetPosition(pb.GetPositionRequest(), timeout=5)
+
+    async def stream() -> None:
+        async for _ in stub.SubscribeTelemetry(pb.SubscribeTelemetryRequest(), timeout=20):
+            pass
+
+    code, why = await denied(stream())
+    assert (code, why.code) == (grpc.StatusCode.UNAUTHENTICATED, "NotAuthenticated")
+    code, why = await denied(stub.GetPosition(pb.GetPositionRequest(), timeout=5))
+    assert code in {grpc.StatusCode.UNAUTHENTICATED, grpc.StatusCode.UNAVAILABLE}
+
+
+async def test_renewed_server_certificates_are_used(rig: Rig) -> None:
+    rig.write_grant(grant())
+    rig.start_service()
+    rig.start_vehicle()
+    await rig.until(lambda t: t.ready, 20)
+    from mobility_rig import Authority
+
+    rig.authority = Authority(rig.directory, "next")
+    rig.write_tls()
+    await rig.stub(DRIVER).GetPosition(pb.GetPositionRequest(), timeout=5)
+
+
+async def test_cancelling_a_motion_stops_the_drone(rig: Rig) -> None:
+    rig.write_grant(grant())
+    rig.start_service()
+    rig.start_vehicle(1.0)
+    driver = Driver(rig)
+    await driver.up()
+    going = driver.going(0, 90)
+    await going.read()
+    await rig.until(lambda t: t.velocity.north_mps > 3)
+    going.cancel()
+    still = await rig.until(lambda t: abs(t.velocity.north_mps) < 0.3, 10)
+    assert still.controller == DRIVER
+    assert xy(still.position)[1] < 70

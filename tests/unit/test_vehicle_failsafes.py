@@ -6,22 +6,7 @@ import pytest
 from fractus_sim.vehicle.mav import Command, Mode, Result
 from fractus_sim.vehicle.pilot import Pilot
 from fractus_sim.vehicle.vehicle import Vehicle
-from vehicle_world import START, airborne, alone, distance_m
-
-
-def _upload(pilot: Pilot, kind: int, items: list[dict[str, float]]) -> int:
-    """Upload a list by the mission protocol and return the final MISSION_ACK type."""
-    pilot.read()
-    target = {"target_system": 1, "target_component": 1, "mission_type": kind}
-    pilot.send("MISSION_COUNT", target | {"count": len(items)})
-    for _ in range(len(items) + 2):
-        for message in pilot.step():
-            if message.name == "MISSION_REQUEST":
-                seq = message.integer("seq")
-                pilot.send("MISSION_ITEM_INT", target | {"seq": seq, "autocontinue": 1} | items[seq])
-            elif message.name == "MISSION_ACK":
-                return message.integer("type")
-    raise AssertionError("no MISSION_ACK")
+from vehicle_world import START, airborne, alone, distance_m, upload
 
 
 def _square(command: int, half_m: float, north_m: float = 0.0) -> list[dict[str, float]]:
@@ -107,7 +92,7 @@ def test_short_gps_loss_is_ridden_out():
 
 def test_crossing_the_fence_brings_it_back():
     vehicle, pilot = airborne(10.0)
-    assert _upload(pilot, 1, _square(Command.NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0)) == 0
+    assert upload(pilot, 1, _square(Command.NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0)) == 0
     assert pilot.command(Command.DO_FENCE_ENABLE, 1) is Result.ACCEPTED
     for _ in range(200):
         pilot.send(
@@ -127,7 +112,7 @@ def test_crossing_the_fence_brings_it_back():
 
 def test_target_outside_the_fence_is_dropped_without_an_answer():
     vehicle, pilot = airborne(10.0)
-    _upload(pilot, 1, _square(Command.NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0))
+    upload(pilot, 1, _square(Command.NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0))
     pilot.command(Command.DO_FENCE_ENABLE, 1)
     pilot.fly_on(1.0)
     texts = list(pilot.texts)
@@ -154,7 +139,7 @@ def test_target_outside_the_fence_is_dropped_without_an_answer():
 def test_fence_circles(item: dict[str, float], inside: tuple[float, float], outside: tuple[float, float]):
     vehicle, pilot = alone(FENCE_ENABLE=1)
     place = START.offset(item.pop("north", 0.0), 0.0)
-    assert _upload(pilot, 1, [item | {"frame": 0, "x": place.lat_e7, "y": place.lon_e7}]) == 0
+    assert upload(pilot, 1, [item | {"frame": 0, "x": place.lat_e7, "y": place.lon_e7}]) == 0
     assert not vehicle.fence.outside(*inside, 10.0)
     assert vehicle.fence.outside(*outside, 10.0)
 
@@ -187,9 +172,9 @@ def test_altitude_fence_and_home_circle():
 )
 def test_bad_fences_are_refused_and_the_old_one_stays(items: list[dict[str, float]]):
     vehicle, pilot = alone()
-    _upload(pilot, 1, _square(Command.NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0))
+    upload(pilot, 1, _square(Command.NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0))
     shapes = vehicle.fence.shapes
-    assert _upload(pilot, 1, [{"frame": 0, "x": START.lat_e7, "y": START.lon_e7} | item for item in items]) != 0
+    assert upload(pilot, 1, [{"frame": 0, "x": START.lat_e7, "y": START.lon_e7} | item for item in items]) != 0
     assert vehicle.fence.shapes == shapes
     assert len(vehicle.plans.fence.items) == 4
 

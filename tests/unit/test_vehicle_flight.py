@@ -114,6 +114,18 @@ def test_takeoff_needs_guided_armed_and_ground():
     assert not vehicle.armed
 
 
+def test_a_target_during_spool_up_cancels_the_takeoff():
+    vehicle, pilot = alone()
+    pilot.mode(Mode.GUIDED)
+    pilot.wait(lambda: vehicle.arming_refusal() is None, 5.0)
+    pilot.command(Command.COMPONENT_ARM_DISARM, 1.0)
+    pilot.command(Command.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5)
+    pilot.fly_on(0.5)
+    pilot.go_to(10.0, 0.0, 10.0)
+    pilot.fly_on(8.0)
+    assert vehicle.landed
+
+
 @pytest.mark.parametrize(
     ("command", "result"),
     [

@@ -32,3 +32,18 @@ def airborne(altitude_m: float = 10.0, **parameters: float) -> tuple[Vehicle, Pi
 def distance_m(vehicle: Vehicle, north_m: float, east_m: float) -> float:
     """True horizontal distance of a vehicle from a local point."""
     return math.hypot(vehicle.body.north - north_m, vehicle.body.east - east_m)
+
+
+def upload(pilot: Pilot, kind: int, items: list[dict[str, float]]) -> int:
+    """Upload a list by the mission protocol and return the final MISSION_ACK type."""
+    pilot.read()
+    target = {"target_system": 1, "target_component": 1, "mission_type": kind}
+    pilot.send("MISSION_COUNT", target | {"count": len(items)})
+    for _ in range(len(items) + 2):
+        for message in pilot.step():
+            if message.name == "MISSION_REQUEST":
+                seq = message.integer("seq")
+                pilot.send("MISSION_ITEM_INT", target | {"seq": seq, "autocontinue": 1} | items[seq])
+            elif message.name == "MISSION_ACK":
+                return message.integer("type")
+    raise AssertionError("no MISSION_ACK")

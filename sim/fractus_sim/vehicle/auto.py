@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from fractus_sim.vehicle.descent import descend
 from fractus_sim.vehicle.flight import Flight
-from fractus_sim.vehicle.mav import ABSOLUTE_FRAMES, Command, Frame, Mode, Severity
+from fractus_sim.vehicle.mav import ABSOLUTE_FRAMES, Command, Frame, Severity
 
 if TYPE_CHECKING:
     from fractus_sim.vehicle.mission import Item
@@ -76,11 +76,10 @@ class AutoFlight(Flight):
     def _finish(self, v: Vehicle) -> None:
         self._item = None
         v.mission.complete = True
-        v.say(Severity.INFO, "Mission complete" if v.mission.items else "Mission: no items")
         if v.landed:
             v.disarm("mission complete")
         else:
-            v.force_mode(Mode.LOITER, "mission complete") if v.position_ok else v.force_mode(Mode.LAND, "mission")
+            v.control.hold_here()
 
     def _place(self, v: Vehicle, item: Item) -> tuple[float, float, float]:
         return item_target(v, item)

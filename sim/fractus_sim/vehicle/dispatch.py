@@ -143,7 +143,11 @@ def _global_target(v: Vehicle, m: Message) -> None:
 def _target(v: Vehicle, m: Message, position: Vector, velocity: Vector, accel: Vector) -> None:
     """Judge type_mask and hand the target to GUIDED; a target outside the fence is dropped in silence."""
     flight = v.flight
-    if not isinstance(flight, GuidedFlight) or not v.armed or v.landed or v.flying_wanted:
+    if not isinstance(flight, GuidedFlight) or not v.armed:
+        return
+    # A target ends a takeoff, even one that has not left the ground: then the vehicle stays there, as the real one.
+    v.taking_off_until_m = None
+    if v.landed:
         return
     mask = m.integer("type_mask")
     use_position, use_velocity = not mask & IGNORE_POSITION, not mask & IGNORE_VELOCITY

@@ -46,8 +46,8 @@ class LinkSpec:
         """
         kind, _, rest = text.partition(":")
         if kind in ("tcp", "tcpin", "udpin", "udpout", "udp"):
-            host, _, port = rest.rpartition(":")
-            if not port.isdigit() or not 0 <= int(port) <= 65535:
+            host, colon, port = rest.rpartition(":")
+            if not colon or not port.isdigit() or not 0 <= int(port) <= 65535:
                 raise LinkError(f"link {text!r}: expected {kind}:HOST:PORT")
             kind = {"tcpin": "tcp", "udp": "udpin"}.get(kind, kind)
             return cls(kind, host or "0.0.0.0", int(port))  # noqa: S104 - what `tcp::5760` means in MAVLink

@@ -1,0 +1,271 @@
+"""The vehicle process behind TCP, UDP and a pseudo terminal, with clients of pymavlink, good and bad."""
+
+from __future__ import annotations
+
+import math
+import os
+import random
+import select
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pymavlink.dialects.v20.ardupilotmega as dialect
+import pytest
+from vehicle_process import HOME, Client, free_port, running_vehicle
+
+FAST = ("--speedup", "10", "--ready-after", "3")
+
+
+@pytest.fixture
+def fast() -> Iterator[str]:
+    port = free_port()
+    with running_vehicle(*FAST, links=(f"tcp:127.0.0.1:{port}",)):
+        yield f"tcp:127.0.0.1:{port}"
+
+
+def _resident_mb(pid: int) -> float:
+    text = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
+    return int(text.split("VmRSS:")[1].split()[0]) / 1024
+
+
+def test_a_flight_there_and_back(fast: str):
+    client = Client(fast)
+    heartbeat = client.wait_for("HEARTBEAT")
+    assert (heartbeat.type, heartbeat.autopilot) == (2, 3)
+    client.take_off(10.0)
+    target = HOME[0] + 50.0 / 111_319.0
+    client.link.mav.set_position_target_global_int_send(
+        0, 1, 1, 6, 0xDF8, int(target * 1e7), int(HOME[1] * 1e7), 10.0, *[0] * 8
+    )
+    begun = client.wait_for("GLOBAL_POSITION_INT")
+    near = client.wait(lambda m: m.get_type() == "GLOBAL_POSITION_INT" and abs(m.lat * 1e-7 - target) * 111_319.0 < 1.0)
+    assert 7.4 < (near.time_boot_ms - begun.time_boot_ms) / 1000.0 < 11.2
+    assert client.command(20) == 0
+    client.wait(lambda m: m.get_type() == "HEARTBEAT" and not m.base_mode & 128, 30.0)
+    place = client.wait_for("GLOBAL_POSITION_INT")
+    assert abs(place.lat * 1e-7 - HOME[0]) * 111_319.0 < 1.0
+    assert abs(place.relative_alt) < 500
+
+
+def test_silent_but_for_its_heartbeat_until_asked_and_then_exact():
+    port = free_port()
+    with running_vehicle("--ready-after", "0.5", links=(f"tcp:127.0.0.1:{port}",)):
+        client = Client(f"tcp:127.0.0.1:{port}")
+        client.wait_for("HEARTBEAT")
+        names = set()
+        end = time.monotonic() + 2.5
+        while time.monotonic() < end:
+            message = client.link.recv_match(blocking=True, timeout=0.1)
+            names |= {message.get_type()} if message is not None else set()
+        assert names <= {"HEARTBEAT", "STATUSTEXT", "HOME_POSITION"}
+        client.interval(30, 50)
+        client.interval(32, 10)
+        client.interval(74, 1)
+        first: dict[str, float] = {}
+        counts: dict[str, int] = {}
+        end = time.monotonic() + 4.0
+        while time.monotonic() < end:
+            message = client.link.recv_match(
+                type=["ATTITUDE", "LOCAL_POSITION_NED", "VFR_HUD"], blocking=True, timeout=0.5
+            )
+            name = message.get_type()
+            counts[name] = counts.get(name, 0) + 1
+            first.setdefault(name, time.monotonic())
+        assert counts["ATTITUDE"] == pytest.approx(200, rel=0.05)
+        assert counts["LOCAL_POSITION_NED"] == pytest.approx(40, abs=2)
+        assert counts["VFR_HUD"] == pytest.approx(4, abs=1)
+        assert client.command(511, 30, -1) == 0
+        assert client.command(511, 9999, 1000) == 2
+
+
+def test_acknowledgements_come_as_fast_as_the_real_ones():
+    port = free_port()
+    with running_vehicle("--ready-after", "0.5", links=(f"tcp:127.0.0.1:{port}",)):
+        client = Client(f"tcp:127.0.0.1:{port}")
+        client.wait_for("HEARTBEAT")
+        rng = random.Random(5)
+        waits = []
+        for _ in range(60):
+            select.select([], [], [], rng.uniform(0.0, 0.012))
+            begun = time.perf_counter()
+            assert client.command(520, 1) == 0
+            waits.append(time.perf_counter() - begun)
+        assert 0.001 < sorted(waits)[30] < 0.012
+
+
+def test_parameters_are_listed_read_and_set(fast: str):
+    client = Client(fast)
+    client.wait_for("HEARTBEAT")
+    client.link.mav.param_request_list_send(1, 1)
+    first = client.wait_for("PARAM_VALUE")
+    seen = {first.param_id: first.param_value}
+    indices = {first.param_index}
+    while len(seen) < first.param_count:
+        value = client.wait_for("PARAM_VALUE")
+        seen[value.param_id] = value.param_value
+        indices.add(value.param_index)
+    assert indices == set(range(first.param_count))
+    assert seen["WPNAV_SPEED"] == 1000
+    for name in ("FS_GCS_ENABLE", "FS_GCS_TIMEOUT", "FENCE_ENABLE", "RTL_ALT", "LAND_SPEED", "SYSID_MYGCS"):
+        assert name in seen
+    client.link.mav.param_set_send(1, 1, b"FS_GCS_TIMEOUT", 7.5, 9)
+    assert client.wait_for("PARAM_VALUE").param_value == 7.5
+    client.link.mav.param_request_read_send(1, 1, b"FS_GCS_TIMEOUT", -1)
+    assert client.wait_for("PARAM_VALUE").param_value == 7.5
+
+
+def test_silent_ground_station_brings_it_home(fast: str):
+    client = Client(fast)
+    client.take_off(10.0)
+    client.link.mav.param_set_send(1, 1, b"FS_GCS_ENABLE", 1, 2)
+    client.wait_for("PARAM_VALUE")
+    client.beat = lambda: None  # type: ignore[method-assign]
+    client.wait(lambda m: m.get_type() == "HEARTBEAT" and m.custom_mode == 6, 10.0)
+    assert "GCS Failsafe" in client.texts
+    client.wait(lambda m: m.get_type() == "HEARTBEAT" and not m.base_mode & 128, 30.0)
+
+
+def test_three_clients_garbage_and_one_that_never_reads():
+    port = free_port()
+    with running_vehicle("--ready-after", "0.5", links=(f"tcp:127.0.0.1:{port}",)) as process:
+        good = Client(f"tcp:127.0.0.1:{port}")
+        deaf = socket.create_connection(("127.0.0.1", port))
+        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        speaker = dialect.MAVLink(None, srcSystem=99, srcComponent=1)
+        for group in (0, 1, 2, 3, 6, 10, 11, 12):
+            deaf.sendall(dialect.MAVLink_request_data_stream_message(1, 1, group, 100, 1).pack(speaker))
+        for _ in range(40):
+            deaf.sendall(dialect.MAVLink_param_request_list_message(1, 1).pack(speaker))
+        noisy = socket.create_connection(("127.0.0.1", port))
+        good.wait_for("HEARTBEAT")
+        good.interval(30, 50)
+        before_mb = _resident_mb(process.pid)
+        noise = _noise(10_000)
+        gaps = []
+        last = time.monotonic()
+        while noise:
+            noisy.setblocking(False)
+            for _ in range(200):
+                if not noise:
+                    break
+                try:
+                    noisy.send(noise[-1])
+                    noise.pop()
+                except BlockingIOError:
+                    break
+            good.wait_for("ATTITUDE", 2.0)
+            gaps.append(time.monotonic() - last)
+            last = time.monotonic()
+        assert max(gaps) < 1.0
+        assert good.command(520, 1) == 0
+        assert _resident_mb(process.pid) - before_mb < 10
+        assert _resident_mb(process.pid) < 80
+
+
+def _noise(count: int) -> list[bytes]:
+    """Random bytes, truncated frames, and sound frames with random contents."""
+    rng = random.Random(11)
+    writer = dialect.MAVLink(None, srcSystem=77, srcComponent=1)
+    classes = [dialect.mavlink_map[number] for number in sorted(dialect.mavlink_map) if number >= 0]
+    frames = []
+    for _ in range(count):
+        kind = rng.random()
+        if kind < 0.3:
+            frames.append(rng.randbytes(rng.randrange(1, 60)))
+            continue
+        message = rng.choice(classes)
+        if message.msgname == "SETUP_SIGNING":
+            continue
+        payload = rng.randbytes(message.unpacker.size)
+        frame = _frame(writer, message, payload)
+        frames.append(frame[: rng.randrange(1, len(frame))] if kind < 0.6 else frame)
+    return frames
+
+
+def _frame(writer: dialect.MAVLink, message: type, payload: bytes) -> bytes:
+    head = bytes((0xFD, len(payload), 0, 0, writer.seq, 77, 1)) + message.id.to_bytes(3, "little")
+    crc = dialect.x25crc(bytearray(head[1:] + payload + bytes((message.crc_extra,))))
+    writer.seq = (writer.seq + 1) % 256
+    return head + payload + crc.crc.to_bytes(2, "little")
+
+
+def test_udp_in_and_out():
+    inward, outward = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM)
+    server = Client(f"udpin:127.0.0.1:{outward}", sysid=254)
+    with running_vehicle(*FAST, links=(f"udpin:127.0.0.1:{inward}", f"udpout:127.0.0.1:{outward}")):
+        client = Client(f"udpout:127.0.0.1:{inward}")
+        client.beat()
+        client.wait_for("HEARTBEAT")
+        server.wait_for("HEARTBEAT")
+        client.interval(30, 10)
+        client.wait_for("ATTITUDE")
+        names = {server.wait(lambda _: True).get_type() for _ in range(20)}
+        assert "ATTITUDE" not in names, "each link has streams of its own"
+        assert server.command(520, 1) == 0
+
+
+def test_messages_for_another_system_are_passed_on(fast: str):
+    one, two = Client(fast, sysid=255), Client(fast, sysid=42)
+    one.wait_for("HEARTBEAT")
+    two.wait_for("HEARTBEAT")
+    two.beat()
+    one.wait(lambda m: m.get_type() == "HEARTBEAT" and m.get_srcSystem() == 42)
+    two.wait(lambda m: m.get_type() == "HEARTBEAT" and m.get_srcSystem() == 255)
+    one.link.mav.command_long_send(42, 190, 511, 0, 30, 1000, 0, 0, 0, 0, 0)
+    assert two.wait_for("COMMAND_LONG").command == 511
+
+
+def test_pseudo_terminal(tmp_path: Path):
+    path = tmp_path / "ttyVehicle"
+    with running_vehicle(*FAST, links=(f"pty:{path}",)):
+        fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        try:
+            parser = dialect.MAVLink(None)
+            parser.robust_parsing = True
+            end = time.monotonic() + 5.0
+            seen: set[str] = set()
+            while "HEARTBEAT" not in seen and time.monotonic() < end:
+                if select.select([fd], [], [], 0.5)[0]:
+                    seen |= {m.get_type() for m in parser.parse_buffer(os.read(fd, 4096)) or ()}
+            assert "HEARTBEAT" in seen
+        finally:
+            os.close(fd)
+    assert not path.exists()
+
+
+def test_several_vehicles_in_one_process():
+    port = free_port()
+    with running_vehicle(*FAST, "--count", "3", "--spacing", "20", links=(f"tcp:127.0.0.1:{port}",)):
+        places = []
+        for at in range(3):
+            client = Client(f"tcp:127.0.0.1:{port + 10 * at}", target=1 + at)
+            assert client.wait_for("HEARTBEAT").get_srcSystem() == 1 + at
+            client.interval(24, 5)
+            places.append(client.wait(lambda m: m.get_type() == "GPS_RAW_INT" and m.fix_type >= 3))
+        metres = 111_319.0 * math.cos(math.radians(HOME[0]))
+        assert (places[2].lon - places[0].lon) * 1e-7 * metres == pytest.approx(40.0, abs=2.0)
+
+
+def test_bad_arguments_are_explained(tmp_path: Path):
+    import subprocess
+    import sys
+
+    for arguments, text in (
+        (["--listen", "tcp:5760"], "expected tcp:HOST:PORT"),
+        (["--listen", "carrier-pigeon:1"], "expected tcp:"),
+        (["--home", "95,0,0"], "out of range"),
+        (["--param", "NO_SUCH=1"], "unknown parameter NO_SUCH"),
+        (["--listen", f"serial:{tmp_path / 'none'}"], "No such file"),
+    ):
+        done = subprocess.run(
+            [sys.executable, "-m", "fractus_sim.vehicle", *arguments],
+            capture_output=True,
+            text=True,
+            timeout=20,
+            check=False,
+        )
+        assert done.returncode != 0
+        assert text in done.stderr
+        assert "Traceback" not in done.stderr

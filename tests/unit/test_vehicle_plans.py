@@ -1,0 +1,187 @@
+"""Missions, rally points and their transfer."""
+
+from __future__ import annotations
+
+import pytest
+from fractus_sim.vehicle.mav import Command, MissionResult, Mode, Result
+from fractus_sim.vehicle.pilot import Pilot
+from vehicle_world import START, airborne, alone, distance_m, upload
+
+HOME = {"command": 16, "frame": 0, "x": START.lat_e7, "y": START.lon_e7, "z": 150.0}
+
+
+def _waypoint(north_m: float, east_m: float, altitude_m: float, **more: float) -> dict[str, float]:
+    place = START.offset(north_m, east_m)
+    return {"command": 16, "frame": 3, "x": place.lat_e7, "y": place.lon_e7, "z": altitude_m} | more
+
+
+def _download(pilot: Pilot, kind: int = 0) -> list[dict[str, float]]:
+    target = {"target_system": 1, "target_component": 1, "mission_type": kind}
+    pilot.send("MISSION_REQUEST_LIST", target)
+    items = []
+    for seq in range(pilot.expect("MISSION_COUNT").integer("count")):
+        pilot.send("MISSION_REQUEST_INT", target | {"seq": seq})
+        message = pilot.expect("MISSION_ITEM_INT")
+        assert message.integer("seq") == seq
+        items.append({name: message.real(name) for name in ("command", "frame", "param1", "x", "y", "z")})
+    return items
+
+
+MISSION = [
+    HOME,
+    {"command": 22, "frame": 3, "z": 10.0},
+    _waypoint(20.0, 0.0, 10.0),
+    {"command": 178, "param1": 1.0, "param2": 4.0},
+    _waypoint(20.0, 20.0, 15.0, param1=2.0),
+    {"command": 177, "param1": 2.0, "param2": 1.0},
+    {"command": 20},
+]
+
+
+def test_a_mission_is_flown_with_its_jump_and_return():
+    vehicle, pilot = alone()
+    assert upload(pilot, 0, MISSION) == MissionResult.ACCEPTED
+    pilot.wait(lambda: vehicle.arming_refusal() is None, 5.0)
+    assert pilot.command(Command.MISSION_START) is Result.ACCEPTED
+    reached: list[int] = []
+    fastest_after_change = 0.0
+    for _ in range(20_000):
+        messages = pilot.step()
+        reached += [message.integer("seq") for message in messages if message.name == "MISSION_ITEM_REACHED"]
+        if 2 in reached[-1:] and vehicle.mode is Mode.AUTO:
+            fastest_after_change = max(fastest_after_change, abs(vehicle.body.ve))
+        if not vehicle.armed:
+            break
+    assert reached == [1, 2, 4, 2, 4]
+    assert fastest_after_change < 4.4
+    assert not vehicle.armed
+    assert distance_m(vehicle, 0.0, 0.0) < 1.0
+
+
+def test_download_returns_what_was_uploaded_with_home_in_front():
+    vehicle, pilot = airborne(5.0)
+    assert upload(pilot, 0, MISSION) == MissionResult.ACCEPTED
+    items = _download(pilot)
+    assert [item["command"] for item in items] == [item["command"] for item in MISSION]
+    assert items[2]["x"] == MISSION[2]["x"]
+    assert vehicle.home is not None
+    assert items[0]["x"] == vehicle.home.lat_e7
+    assert vehicle.params["MIS_TOTAL"] == len(MISSION)
+
+
+def test_partial_upload_replaces_a_part():
+    _, pilot = alone()
+    upload(pilot, 0, MISSION)
+    new = _waypoint(33.0, 0.0, 12.0)
+    target = {"target_system": 1, "target_component": 1}
+    pilot.send("MISSION_WRITE_PARTIAL_LIST", target | {"start_index": 2, "end_index": 2})
+    pilot.expect("MISSION_REQUEST")
+    pilot.send("MISSION_ITEM_INT", target | {"seq": 2} | new)
+    assert pilot.expect("MISSION_ACK").integer("type") == MissionResult.ACCEPTED
+    items = _download(pilot)
+    assert len(items) == len(MISSION)
+    assert items[2]["z"] == 12.0
+    pilot.send("MISSION_WRITE_PARTIAL_LIST", target | {"start_index": 3, "end_index": 99})
+    assert pilot.expect("MISSION_ACK").integer("type") == MissionResult.ERROR
+
+
+def test_old_float_items_are_understood():
+    vehicle, pilot = alone()
+    target = {"target_system": 1, "target_component": 1}
+    pilot.send("MISSION_COUNT", target | {"count": 2})
+    for seq in (0, 1):
+        pilot.expect("MISSION_REQUEST")
+        values = {"seq": seq, "command": 16, "frame": 3, "x": 48.2001, "y": 16.3702, "z": 10.0}
+        pilot.send("MISSION_ITEM", target | values)
+    assert pilot.expect("MISSION_ACK").integer("type") == MissionResult.ACCEPTED
+    assert vehicle.mission.items[1].x == pytest.approx(482_001_000, abs=50)
+    pilot.send("MISSION_REQUEST", target | {"seq": 1})
+    assert pilot.expect("MISSION_ITEM").real("x") == pytest.approx(48.2001, abs=1e-5)
+
+
+def test_a_stalled_upload_is_repeated_then_given_up_and_changes_nothing():
+    vehicle, pilot = alone()
+    upload(pilot, 0, MISSION)
+    pilot.send("MISSION_COUNT", {"target_system": 1, "target_component": 1, "count": 3})
+    pilot.expect("MISSION_REQUEST")
+    pilot.expect("MISSION_REQUEST", 2.0)
+    pilot.expect("MISSION_ACK", 12.0)
+    assert pilot.last["MISSION_ACK"].integer("type") != MissionResult.ACCEPTED
+    assert len(vehicle.mission.items) == len(MISSION)
+
+
+@pytest.mark.parametrize(
+    ("item", "result"),
+    [
+        ({"command": 4000, "frame": 3}, MissionResult.UNSUPPORTED),
+        ({"command": 16, "frame": 1, "x": 5, "y": 5}, MissionResult.UNSUPPORTED_FRAME),
+        ({"command": 16, "frame": 3, "x": 950_000_000, "y": 5}, MissionResult.INVALID),
+        ({"command": 16, "frame": 3, "x": 5, "y": 5, "z": float("nan")}, MissionResult.INVALID),
+    ],
+)
+def test_bad_items_end_the_upload(item: dict[str, float], result: MissionResult):
+    vehicle, pilot = alone()
+    assert upload(pilot, 0, [HOME, item]) == result
+    assert vehicle.mission.items == []
+
+
+def test_too_many_items_are_refused():
+    _, pilot = alone()
+    pilot.send("MISSION_COUNT", {"target_system": 1, "target_component": 1, "count": 5000})
+    assert pilot.expect("MISSION_ACK").integer("type") == MissionResult.NO_SPACE
+
+
+def test_a_second_uploader_has_to_wait():
+    _, pilot = alone()
+    other = Pilot(pilot.simulation, pilot.craft, sysid=200)
+    pilot.send("MISSION_COUNT", {"target_system": 1, "target_component": 1, "count": 2})
+    other.send("MISSION_COUNT", {"target_system": 1, "target_component": 1, "count": 2})
+    assert other.expect("MISSION_ACK").integer("type") == MissionResult.DENIED
+
+
+def test_rtl_goes_to_the_nearest_rally_point():
+    vehicle, pilot = airborne(10.0)
+    rally = START.offset(60.0, 10.0)
+    item = {"command": 5100, "frame": 3, "x": rally.lat_e7, "y": rally.lon_e7, "z": 10.0}
+    assert upload(pilot, 2, [item]) == MissionResult.ACCEPTED
+    pilot.go_to(50.0, 0.0, 10.0)
+    pilot.fly_on(15.0)
+    pilot.command(Command.NAV_RETURN_TO_LAUNCH)
+    pilot.wait(lambda: not vehicle.armed, 90.0)
+    assert distance_m(vehicle, 60.0, 10.0) < 1.0
+
+
+def test_pause_and_continue_and_set_current():
+    vehicle, pilot = airborne(10.0)
+    upload(pilot, 0, [HOME, _waypoint(60.0, 0.0, 10.0), _waypoint(60.0, 30.0, 10.0)])
+    assert pilot.mode(Mode.AUTO) is Result.ACCEPTED
+    pilot.fly_on(4.0)
+    assert pilot.command(Command.DO_PAUSE_CONTINUE, 0) is Result.ACCEPTED
+    pilot.fly_on(6.0)
+    paused_at = vehicle.body.north
+    assert 5.0 < paused_at < 50.0
+    assert abs(vehicle.body.vn) < 0.2
+    assert pilot.command(Command.DO_PAUSE_CONTINUE, 1) is Result.ACCEPTED
+    pilot.fly_on(4.0)
+    assert vehicle.body.north > paused_at + 3.0
+    assert pilot.command(Command.DO_SET_MISSION_CURRENT, 2) is Result.ACCEPTED
+    assert pilot.last["MISSION_CURRENT"].integer("seq") == 2
+    pilot.wait(lambda: vehicle.mission_state() == 5, 60.0)
+    pilot.fly_on(3.0)
+    assert vehicle.mode is Mode.AUTO, "it holds where the mission ended"
+    assert distance_m(vehicle, 60.0, 30.0) < 3.0
+
+
+def test_land_item_lands_and_loiter_time_waits():
+    vehicle, pilot = airborne(8.0)
+    place = START.offset(15.0, 0.0)
+    items = [
+        HOME,
+        _waypoint(15.0, 0.0, 8.0, command=19, param1=5.0),
+        {"command": 21, "frame": 3, "x": place.lat_e7, "y": place.lon_e7},
+    ]
+    upload(pilot, 0, items)
+    pilot.mode(Mode.AUTO)
+    took = pilot.wait(lambda: not vehicle.armed, 90.0)
+    assert 24.0 < took < 45.0
+    assert distance_m(vehicle, 15.0, 0.0) < 1.0

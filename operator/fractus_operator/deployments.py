@@ -38,6 +38,9 @@ from fractus_operator.store import Store, StoreError, Taken
 logger = logging.getLogger(__name__)
 
 RESYNC_S = 30.0
+_REFUSALS = frozenset({400, 403, 422})
+"""HTTP statuses by which the API server says that it does not want an object: the user should know."""
+
 EXCLUSION = timedelta(minutes=5)
 """How long a node that the scheduler refused is left out of an application's plans."""
 
@@ -97,15 +100,16 @@ class Deployments:
             return min(again_s, RESYNC_S)
 
     async def teardown(self, key: Key, uid: str) -> None:
-        """Revoke every grant of an application that is being deleted; what it owns is collected after it.
+        """Revoke every grant of an application that is being deleted, then remove what was made for it.
 
-        The drone is brought home by its own services once its grant is gone.
+        The drone is brought home by its own services once its grant is gone. What a stale watch hides
+        here, the garbage collector finds by its owner.
         """
         self._torn_down.add(uid)
         memory = self._memories.setdefault(key, _Memory())
         async with memory.lock:
             await self._children.revoke(key)
-            for kind in (kinds.DEPLOYMENT, kinds.SECRET):
+            for kind in reversed(kinds.CHILDREN):
                 await self._children.remove(key, kind)
         self._memories.pop(key, None)
         self._live.forget(key)
@@ -153,6 +157,10 @@ class Deployments:
             await self._deploy(application, decided, grants)
         except NameTaken as error:
             raise Hindered("Pending", "Deployed", "NameTaken", str(error), again_s=2.0) from error
+        except StoreError as error:
+            if error.status not in _REFUSALS:
+                raise
+            raise Hindered("Pending", "Deployed", error.reason, str(error), again_s=10.0) from error
         return deployed_standing(decided, self._live.pods_of(key), len(grants)), again_s
 
     def _plan(self, application: Application, memory: _Memory) -> tuple[DeploymentPlanSpec, float]:

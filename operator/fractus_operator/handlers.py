@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
+from typing import Any
 
 import kopf
 
@@ -24,6 +25,11 @@ _RETRY_S = 5.0
 def register(registry: kopf.OperatorRegistry, live: LiveInventory, deployments: Deployments) -> None:
     """Register the handlers of Applications."""
     group, version = APPLICATION.api_version.split("/")
+
+    @kopf.on.login(registry=registry, retries=3)
+    def login(**kwargs: Any) -> kopf.ConnectionInfo | None:
+        """Use the credentials that the store uses; called again when they expire."""
+        return kopf.login_with_service_account(**kwargs) or kopf.login_with_kubeconfig(**kwargs)
 
     @kopf.daemon(group, version, APPLICATION.plural, registry=registry, backoff=_RETRY_S, cancellation_timeout=5.0)
     async def application(namespace: str | None, name: str, stopped: kopf.DaemonStopped, **_: object) -> None:

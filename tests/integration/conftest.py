@@ -1,0 +1,55 @@
+"""What integration tests share: a bare control plane, and the operator as a process on it."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from control_plane import ControlPlane, find_programs
+from operator_world import OperatorProcess, World, fresh_namespace
+
+
+@pytest.fixture(scope="session")
+def control_plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ControlPlane]:
+    """A real API server with the CRDs installed; about 6 s, once a session."""
+    programs = find_programs()
+    if programs is None:
+        pytest.skip("no control plane: set KUBEBUILDER_ASSETS, or run `fractus cluster up` once to build one")
+    directory: Path = tmp_path_factory.mktemp("control-plane")
+    plane = ControlPlane(programs, directory)
+    try:
+        plane.start()
+        yield plane
+    finally:
+        plane.stop()
+
+
+@pytest.fixture
+def world(control_plane: ControlPlane) -> Iterator[World]:
+    """One drone, three edge nodes and a cloud node."""
+    world = World(control_plane)
+    world.furnish()
+    yield world
+    world.clear()
+
+
+@pytest.fixture
+def operator(control_plane: ControlPlane, world: World, tmp_path: Path) -> Iterator[OperatorProcess]:
+    """A running operator; its log is shown when the test fails."""
+    process = OperatorProcess(control_plane.kubeconfig, tmp_path / "operator.log")
+    process.start()
+    yield process
+    code = process.stop() if process.running else None
+    print(process.log())
+    assert code in (0, None), "the operator ended badly"
+
+
+@pytest.fixture
+def namespace(world: World, request: pytest.FixtureRequest) -> Iterator[str]:
+    """A namespace of the test's own."""
+    name = "t-" + hashlib.sha256(f"{request.node.nodeid}{os.getpid()}".encode()).hexdigest()[:10]
+    with fresh_namespace(world, name) as fresh:
+        yield fresh

@@ -1,0 +1,250 @@
+"""A bare control plane on loopback ports (etcd, API server, controller manager), and a client for tests.
+
+No kubelets: objects are real, nothing runs. Tests say of pods what kubelets would say.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import ssl
+import subprocess
+import time
+from collections.abc import Callable
+from ipaddress import IPv4Address
+from pathlib import Path
+from typing import Any, TypeVar
+
+import httpx2
+import yaml
+from fractus_sim.cluster.pki import Authority
+
+T = TypeVar("T")
+Body = dict[str, Any]
+
+PROGRAMS = ("etcd", "kube-apiserver", "kube-controller-manager")
+CRDS = Path(__file__).parents[2] / "crds"
+_CONTROLLERS = (
+    "garbage-collector-controller",
+    "namespace-controller",
+    "serviceaccount-controller",
+    "root-ca-certificate-publisher-controller",
+    "deployment-controller",
+    "replicaset-controller",
+)
+
+
+def find_programs() -> dict[str, Path] | None:
+    """The programs of a control plane, from KUBEBUILDER_ASSETS, the cache of `fractus cluster`, or PATH."""
+    caches = sorted((Path.home() / ".cache" / "fractus").glob("*/bin"), reverse=True)
+    assets = os.environ.get("KUBEBUILDER_ASSETS")
+    path = os.pathsep.join([*([assets] if assets else []), *map(str, caches), os.environ.get("PATH", "")])
+    found = {name: shutil.which(name, path=path) for name in PROGRAMS}
+    return {k: Path(v) for k, v in found.items() if v} if all(found.values()) else None
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def wait_for(question: Callable[[], T | None], what: str, timeout_s: float = 20.0) -> T:
+    """Ask until the answer is true; fails with what was waited for."""
+    end = time.monotonic() + timeout_s
+    while True:
+        answer = question()
+        if answer:
+            return answer
+        if time.monotonic() > end:
+            raise AssertionError(f"waited {timeout_s:.0f} s in vain: {what}")
+        # Nothing can be awaited on a remote condition: ask again shortly.
+        select_pause(0.05)
+
+
+def select_pause(seconds: float) -> None:
+    import select
+
+    select.select([], [], [], seconds)
+
+
+class Refused(Exception):
+    """The API server refused a request."""
+
+    def __init__(self, code: int, message: str) -> None:
+        self.code = code
+        super().__init__(message)
+
+
+class Api:
+    """A synchronous client with a certificate or a token."""
+
+    def __init__(self, server: str, ca: Path, *, certificate: tuple[Path, Path] | None = None, token: str = "") -> None:
+        context = ssl.create_default_context(cafile=str(ca))
+        if certificate is not None:
+            context.load_cert_chain(*map(str, certificate))
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
+        self._client = httpx2.Client(base_url=server, verify=context, headers=headers, timeout=20.0, trust_env=False)
+
+    def close(self) -> None:
+        self._client.close()
+
+    def call(
+        self, method: str, path: str, body: Body | None = None, *, content: str = "application/json", **params: str
+    ) -> Body:
+        response = self._client.request(
+            method,
+            path,
+            params=params,
+            content=None if body is None else json.dumps(body),
+            headers={"Content-Type": content},
+        )
+        if response.status_code >= 400:
+            raise Refused(response.status_code, response.json().get("message", response.text))
+        return response.json()
+
+    def get(self, path: str) -> Body | None:
+        try:
+            return self.call("GET", path)
+        except Refused as error:
+            if error.code == 404:
+                return None
+            raise
+
+    def list(self, path: str, **params: str) -> list[Body]:
+        return self.call("GET", path, **params)["items"]
+
+    def apply(self, path: str, body: Body, manager: str = "kubectl") -> Body:
+        return self.call(
+            "PATCH", path, body, content="application/apply-patch+yaml", fieldManager=manager, force="true"
+        )
+
+    def merge(self, path: str, body: Body) -> Body:
+        return self.call("PATCH", path, body, content="application/merge-patch+json")
+
+    def delete(self, path: str) -> None:
+        try:
+            self.call("DELETE", path, {"propagationPolicy": "Background"})
+        except Refused as error:
+            if error.code != 404:
+                raise
+
+    def ready(self) -> bool:
+        try:
+            return self._client.get("/readyz").status_code == 200
+        except httpx2.HTTPError:
+            return False
+
+
+class ControlPlane:
+    """etcd, kube-apiserver and kube-controller-manager of one test session."""
+
+    def __init__(self, programs: dict[str, Path], directory: Path) -> None:
+        self._programs = programs
+        self._directory = directory
+        self._processes: list[subprocess.Popen[bytes]] = []
+        (directory / "pki").mkdir(parents=True)
+        self.authority = Authority(directory / "pki")
+        self.server = f"https://127.0.0.1:{free_port()}"
+        self.ca = self.authority.credential.certificate
+        self.admin = self._admin()
+        self.kubeconfig = self.write_kubeconfig("admin", "admin", ("system:masters",))
+
+    def _admin(self) -> Api:
+        credential = self.authority.issue("admin", common_name="admin", organizations=("system:masters",))
+        return Api(self.server, self.ca, certificate=(credential.certificate, credential.key))
+
+    def write_kubeconfig(self, name: str, user: str, groups: tuple[str, ...] = ()) -> Path:
+        credential = self.authority.issue(name, common_name=user, organizations=groups)
+        path = self._directory / f"{name}.kubeconfig"
+        path.write_text(self.authority.kubeconfig(credential, server=self.server, cluster="test"))
+        return path
+
+    def with_token(self, token: str) -> Api:
+        return Api(self.server, self.ca, token=token)
+
+    def start(self) -> None:
+        client, peer = free_port(), free_port()
+        accounts = self.authority.service_account_key()
+        serving = self.authority.issue(
+            "server",
+            common_name="kube-apiserver",
+            alternative_names=("localhost", IPv4Address("127.0.0.1"), "kubernetes.default.svc"),
+        )
+        etcd = f"http://127.0.0.1:{client}"
+        self._run(
+            "etcd",
+            f"--data-dir={self._directory / 'etcd'}",
+            f"--listen-client-urls={etcd}",
+            f"--advertise-client-urls={etcd}",
+            f"--listen-peer-urls=http://127.0.0.1:{peer}",
+            f"--initial-advertise-peer-urls=http://127.0.0.1:{peer}",
+            f"--initial-cluster=default=http://127.0.0.1:{peer}",
+            "--unsafe-no-fsync",
+            "--log-level=error",
+        )
+        self._run(
+            "kube-apiserver",
+            f"--etcd-servers={etcd}",
+            "--bind-address=127.0.0.1",
+            "--advertise-address=127.0.0.1",
+            f"--secure-port={self.server.rsplit(':', 1)[1]}",
+            f"--tls-cert-file={serving.certificate}",
+            f"--tls-private-key-file={serving.key}",
+            f"--client-ca-file={self.ca}",
+            "--service-cluster-ip-range=10.97.0.0/16",
+            "--authorization-mode=Node,RBAC",
+            "--enable-admission-plugins=NodeRestriction,OwnerReferencesPermissionEnforcement",
+            "--service-account-issuer=https://kubernetes.default.svc",
+            f"--service-account-key-file={accounts.certificate}",
+            f"--service-account-signing-key-file={accounts.key}",
+            "--allow-privileged=true",
+            "--endpoint-reconciler-type=none",
+        )
+        wait_for(self.admin.ready, "the API server", timeout_s=60)
+        # Before the garbage collector starts: it learns of new kinds only every 30 s.
+        self._install_crds()
+        self._run(
+            "kube-controller-manager",
+            f"--kubeconfig={self.kubeconfig}",
+            "--bind-address=127.0.0.1",
+            "--secure-port=0",
+            "--leader-elect=false",
+            f"--root-ca-file={self.ca}",
+            f"--service-account-private-key-file={accounts.key}",
+            f"--controllers={','.join(_CONTROLLERS)}",
+        )
+
+    def stop(self) -> None:
+        self.admin.close()
+        for process in reversed(self._processes):
+            process.send_signal(signal.SIGTERM)
+        for process in reversed(self._processes):
+            try:
+                process.wait(10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait(10)
+
+    def _run(self, program: str, *arguments: str) -> None:
+        with (self._directory / f"{program}.log").open("wb") as log:
+            argv = [str(self._programs[program]), *arguments]
+            self._processes.append(subprocess.Popen(argv, stdout=log, stderr=log, cwd=self._directory))
+
+    def _install_crds(self) -> None:
+        root = "/apis/apiextensions.k8s.io/v1/customresourcedefinitions"
+        names = []
+        for file in sorted(CRDS.glob("*.yaml")):
+            body = yaml.safe_load(file.read_text())
+            names.append(body["metadata"]["name"])
+            self.admin.apply(f"{root}/{names[-1]}", body)
+        for name in names:
+            wait_for(lambda name=name: self._established(f"{root}/{name}"), f"CRD {name}")
+
+    def _established(self, path: str) -> bool:
+        body = self.admin.get(path) or {}
+        conditions = body.get("status", {}).get("conditions", [])
+        return any(c["type"] == "Established" and c["status"] == "True" for c in conditions)

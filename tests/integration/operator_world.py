@@ -1,0 +1,264 @@
+"""What the operator's tests fly: one depot, drones, edge nodes, a cloud node; and the operator as a process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from control_plane import Api, ControlPlane, Refused, free_port, wait_for
+
+Body = dict[str, Any]
+FRACTUS = "/apis/fractus.dev/v1alpha1"
+SYSTEM = "fractus-system"
+LAT, LON = 39.3606, 22.9307
+MOBILITY = [
+    "Arm",
+    "Disarm",
+    "Takeoff",
+    "Land",
+    "SetSpeed",
+    "GetSpeed",
+    "Goto",
+    "Hover",
+    "GetPosition",
+    "ReturnToLaunch",
+]
+CAMERA = ["CaptureImage", "RetrieveImage", "ListImages"]
+
+
+def at(north_m: float, east_m: float, **more: float) -> Body:
+    """A place so many metres from the depot (flat, good to a centimetre here)."""
+    return {"lat": LAT + north_m / 111_030, "lon": LON + east_m / 86_200, **more}
+
+
+def ours(kind: str, name: str, spec: Body, namespace: str | None = None) -> Body:
+    metadata: Body = {"name": name, **({"namespace": namespace} if namespace else {})}
+    return {"apiVersion": "fractus.dev/v1alpha1", "kind": kind, "metadata": metadata, "spec": spec}
+
+
+def component(name: str, placement: str, **more: Any) -> Body:
+    container = {
+        "image": "registry.test/component:1",
+        "ports": [{"port": 8080}],
+        "resources": {"requests": {"cpu": "0.1"}},
+    }
+    return {"name": name, "placement": placement, "container": container, **more}
+
+
+def navigator(**more: Any) -> Body:
+    services = [{"service": "mobility", "methods": ["Arm", "Takeoff", "Goto", "Land"]}]
+    points = [{"point": {"depot": "base"}, "navigation": "pathBased", "path": [at(0, 0, alt=10), at(60, 60, alt=20)]}]
+    return component("Navigator", "drone", **{"class": "driver", "services": services, "controlPoints": points, **more})
+
+
+def viewer(**more: Any) -> Body:
+    services = [{"service": "camera", "methods": ["CaptureImage", "RetrieveImage"]}]
+    return component(
+        "AerialViewer", "drone", **{"class": "passenger", "services": services, "egress": ["ImageChecker"], **more}
+    )
+
+
+def traffic(namespace: str, name: str = "traffic", *components: Body) -> Body:
+    parts = components or (
+        navigator(),
+        viewer(),
+        component(
+            "GroundViewer",
+            "edge",
+            locations=[{"center": at(50, 50), "radius": 200, "instances": 2}],
+            services=[{"service": "camera", "methods": ["CaptureImage"]}],
+            egress=["ImageChecker"],
+        ),
+        component("ImageChecker", "hybrid", hybridTo=["AerialViewer"], egress=["DataStore"]),
+        component("DataStore", "cloud"),
+    )
+    return ours("Application", name, {"components": list(parts)}, namespace)
+
+
+class World:
+    """The inventory on the control plane, and short ways to look at it."""
+
+    def __init__(self, plane: ControlPlane) -> None:
+        self.plane = plane
+        self.api: Api = plane.admin
+
+    def furnish(self, drones: int = 1, edges: int = 3) -> None:
+        for namespace in (SYSTEM,):
+            self.api.apply(f"/api/v1/namespaces/{namespace}", _namespace(namespace))
+        self.put(ours("Depot", "base", {"location": at(0, 0), "radius": 30}))
+        for i in range(1, drones + 1):
+            self.add_drone(f"drone-{i}")
+        for i in range(1, edges + 1):
+            self.add_edge(f"edge-{i}", at(20.0 * i, 30))
+        self.add_node("cloud-1", "cloud")
+
+    def add_node(self, name: str, node_class: str) -> None:
+        labels = {"fractus.dev/class": node_class}
+        body = {"apiVersion": "v1", "kind": "Node", "metadata": {"name": name, "labels": labels}}
+        self.api.apply(f"/api/v1/nodes/{name}", body)
+        status = {
+            "allocatable": {"cpu": "2", "memory": "2Gi", "pods": "110"},
+            "capacity": {"cpu": "2", "memory": "2Gi", "pods": "110"},
+            "conditions": [_condition("Ready", "True", "KubeletReady")],
+        }
+        self.api.merge(f"/api/v1/nodes/{name}/status", {"status": status})
+
+    def add_drone(self, name: str) -> None:
+        self.add_node(name, "drone")
+        interfaces = [{"technology": "WiFi", "range": 80, "pairing": {"networkId": "x"}}, {"technology": "4G"}]
+        mobility = {"maxAltitude": 80, "maxFlightTime": 20, "maxSpeed": 15, "methods": MOBILITY}
+        services = {"mobility": mobility, "camera": {"methods": CAMERA}}
+        spec = {"depot": "base", "home": at(0, 0, alt=12), "interfaces": interfaces, "services": services}
+        self.put(ours("Drone", name, spec))
+        self.drone_status(name, "inactive")
+
+    def drone_status(self, name: str, state: str, ready: str = "True") -> None:
+        status = {"flightState": state, "battery": {"remaining": 1.0}, "position": at(0, 0)}
+        status["conditions"] = [_condition("Ready", ready, "AutopilotConnected")]
+        self.api.merge(f"{FRACTUS}/drones/{name}/status", {"status": status})
+
+    def add_edge(self, name: str, place: Body) -> None:
+        self.add_node(name, "edge")
+        interfaces = [{"technology": "WiFi", "range": 80, "pairing": {"networkId": name}}]
+        spec = {"location": place, "interfaces": interfaces, "services": {"camera": {"methods": CAMERA}}}
+        self.put(ours("EdgeNode", name, spec))
+
+    def path(self, body: Body) -> str:
+        plural = "policies" if body["kind"] == "Policy" else f"{body['kind'].lower()}s"
+        namespace = body["metadata"].get("namespace")
+        scope = f"/namespaces/{namespace}" if namespace else ""
+        return f"{FRACTUS}{scope}/{plural}/{body['metadata']['name']}"
+
+    def put(self, body: Body) -> Body:
+        return self.api.apply(self.path(body), body)
+
+    def application(self, namespace: str, name: str = "traffic") -> Body | None:
+        return self.api.get(f"{FRACTUS}/namespaces/{namespace}/applications/{name}")
+
+    def status(self, namespace: str, name: str = "traffic") -> Body:
+        return (self.application(namespace, name) or {}).get("status") or {}
+
+    def condition(self, namespace: str, type_: str, name: str = "traffic") -> Body:
+        conditions = self.status(namespace, name).get("conditions") or ()
+        return next((c for c in conditions if c["type"] == type_), {})
+
+    def phase(self, namespace: str, phase: str, name: str = "traffic") -> Body:
+        return wait_for(
+            lambda: self.status(namespace, name).get("phase") == phase and self.status(namespace, name),
+            f"{namespace}/{name} to be {phase}",
+        )
+
+    def grants(self, namespace: str, name: str = "traffic") -> list[Body]:
+        selector = f"fractus.dev/namespace={namespace},fractus.dev/application={name}"
+        return self.api.list(f"{FRACTUS}/grants", labelSelector=selector)
+
+    def children(self, namespace: str) -> dict[str, Body]:
+        """Everything in the namespace that Fractus made, by kind and name, without what Kubernetes adds."""
+        found = {}
+        for path in (
+            f"{FRACTUS}/namespaces/{namespace}/deploymentplans",
+            f"/api/v1/namespaces/{namespace}/secrets",
+            f"/api/v1/namespaces/{namespace}/services",
+            f"/apis/apps/v1/namespaces/{namespace}/deployments",
+            f"/apis/discovery.k8s.io/v1/namespaces/{namespace}/endpointslices",
+        ):
+            for item in self.api.list(path, labelSelector="app.kubernetes.io/managed-by=fractus"):
+                found[f"{path.rsplit('/', 1)[1]}/{item['metadata']['name']}"] = item
+        for item in self.grants(namespace):
+            found[f"grants/{item['metadata']['name']}"] = item
+        return found
+
+    def pods(self, namespace: str) -> list[Body]:
+        return self.api.list(f"/api/v1/namespaces/{namespace}/pods")
+
+    def run_pods(self, namespace: str) -> None:
+        """Say of every pod that it is bound and ready, as scheduler and kubelet would."""
+        for number, pod in enumerate(self.pods(namespace)):
+            name = pod["metadata"]["name"]
+            if not pod["spec"].get("nodeName"):
+                terms = pod["spec"]["affinity"]["nodeAffinity"]["requiredDuringSchedulingIgnoredDuringExecution"]
+                term = terms["nodeSelectorTerms"][0]
+                node = term["matchFields"][0]["values"][0] if "matchFields" in term else "cloud-1"
+                binding = {"metadata": {"name": name}, "target": {"kind": "Node", "name": node}}
+                self.api.call("POST", f"/api/v1/namespaces/{namespace}/pods/{name}/binding", binding)
+            status = {
+                "phase": "Running",
+                "podIP": f"10.1.0.{number + 1}",
+                "podIPs": [{"ip": f"10.1.0.{number + 1}"}],
+                "conditions": [_condition("Ready", "True", ""), _condition("PodScheduled", "True", "")],
+            }
+            self.api.merge(f"/api/v1/namespaces/{namespace}/pods/{name}/status", {"status": status})
+
+    def clear(self) -> None:
+        """Remove what tests leave that is not in a namespace."""
+        for plural in ("drones", "edgenodes", "depots", "zones", "policies", "grants"):
+            for item in self.api.list(f"{FRACTUS}/{plural}"):
+                self.api.delete(f"{FRACTUS}/{plural}/{item['metadata']['name']}")
+        for node in self.api.list("/api/v1/nodes"):
+            self.api.delete(f"/api/v1/nodes/{node['metadata']['name']}")
+
+
+def _namespace(name: str) -> Body:
+    return {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": name}}
+
+
+def _condition(type_: str, status: str, reason: str) -> Body:
+    return {"type": type_, "status": status, "reason": reason, "lastTransitionTime": "2026-01-01T00:00:00Z"}
+
+
+class OperatorProcess:
+    """The operator, as `python -m fractus_operator`."""
+
+    def __init__(self, kubeconfig: Path, log: Path) -> None:
+        self._kubeconfig = kubeconfig
+        self._log = log
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        env = {
+            **os.environ,
+            "KUBECONFIG": str(self._kubeconfig),
+            "FRACTUS_HEALTH": f"http://127.0.0.1:{free_port()}/healthz",
+        }
+        with self._log.open("ab") as log:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "fractus_operator"], env=env, stdout=log, stderr=log
+            )
+
+    def stop(self, how: int = signal.SIGTERM) -> int:
+        assert self._process is not None
+        self._process.send_signal(how)
+        code = self._process.wait(20)
+        self._process = None
+        return code
+
+    @property
+    def running(self) -> bool:
+        return self._process is not None and self._process.poll() is None
+
+    def log(self) -> str:
+        return self._log.read_text()
+
+
+@contextmanager
+def fresh_namespace(world: World, name: str) -> Iterator[str]:
+    """A namespace for one test, deleted with its Applications afterwards."""
+    world.api.apply(f"/api/v1/namespaces/{name}", _namespace(name))
+    try:
+        yield name
+    finally:
+        for item in world.api.list(f"{FRACTUS}/namespaces/{name}/applications"):
+            path = f"{FRACTUS}/namespaces/{name}/applications/{item['metadata']['name']}"
+            world.api.delete(path)
+            try:
+                world.api.merge(path, {"metadata": {"finalizers": None}})
+            except Refused as error:
+                if error.code != 404:
+                    raise
+        world.api.delete(f"/api/v1/namespaces/{name}")

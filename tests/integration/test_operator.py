@@ -1,0 +1,400 @@
+"""The operator against a real API server: from a manifest to children, through restarts, missions and deletion."""
+
+from __future__ import annotations
+
+import base64
+import signal
+from typing import Any
+
+import pytest
+from control_plane import wait_for
+from cryptography import x509
+from operator_world import FRACTUS, OperatorProcess, World, at, component, navigator, ours, traffic, viewer
+
+INSTANCES = {
+    "traffic-navigator": "drone-1",
+    "traffic-aerial-viewer": "drone-1",
+    "traffic-ground-viewer-edge-2": "edge-2",
+    "traffic-ground-viewer-edge-3": "edge-3",
+    "traffic-image-checker-edge-1": "edge-1",
+    "traffic-image-checker": None,
+    "traffic-data-store": None,
+}
+
+
+def deployed(world: World, namespace: str, name: str = "traffic", pods: int = 7) -> dict[str, Any]:
+    """Play scheduler and kubelet until the application is Running."""
+    wait_for(lambda: len(world.pods(namespace)) >= pods, f"{pods} pods")
+    world.run_pods(namespace)
+    return world.phase(namespace, "Running", name)
+
+
+def running(world: World, namespace: str) -> dict[str, Any]:
+    world.put(traffic(namespace))
+    return deployed(world, namespace)
+
+
+def versions(world: World, namespace: str) -> dict[str, str]:
+    """The resource versions of all that the operator writes for the example."""
+    found = {name: body["metadata"]["resourceVersion"] for name, body in world.children(namespace).items()}
+    found = {name: version for name, version in found.items() if not name.startswith("deployments/")}
+    for name, body in world.children(namespace).items():
+        if name.startswith("deployments/"):
+            found[name] = str(body["metadata"]["generation"])
+    application = world.application(namespace)
+    assert application is not None
+    return found | {"application": application["metadata"]["resourceVersion"]}
+
+
+def end_mission(world: World, namespace: str, phase: str, message: str) -> None:
+    """Report of the driver's grant what its agent would."""
+    name = f"{namespace}.traffic-navigator"
+    world.api.merge(f"{FRACTUS}/grants/{name}/status", {"status": {"phase": phase, "message": message}})
+
+
+def gone(world: World, namespace: str) -> bool:
+    left = world.children(namespace)
+    return world.application(namespace) is None and not left
+
+
+def test_a_manifest_becomes_a_plan_grants_and_pods(world: World, operator: OperatorProcess, namespace: str) -> None:
+    status = running(world, namespace)
+    application = world.application(namespace)
+    assert application is not None
+    assert (status["drone"], status["pods"], status["observedGeneration"]) == ("drone-1", "7/7", 1)
+    assert {c["type"]: c["status"] for c in status["conditions"]} == {
+        "Planned": "True", "Granted": "True", "Deployed": "True", "Ready": "True", "MissionComplete": "False",
+    }  # fmt: skip
+    children = world.children(namespace)
+    deployments = {n.split("/")[1]: b for n, b in children.items() if n.startswith("deployments/")}
+    assert set(deployments) == set(INSTANCES)
+    for name, node in INSTANCES.items():
+        terms = deployments[name]["spec"]["template"]["spec"]["affinity"]["nodeAffinity"]
+        term = terms["requiredDuringSchedulingIgnoredDuringExecution"]["nodeSelectorTerms"][0]
+        if node is None:
+            assert term["matchExpressions"][0]["values"] == ["cloud"]
+        else:
+            assert term["matchFields"] == [{"key": "metadata.name", "operator": "In", "values": [node]}]
+    grants = {n: b for n, b in children.items() if n.startswith("grants/")}
+    assert {b["spec"]["instance"] for b in grants.values()} == {
+        "traffic-navigator", "traffic-aerial-viewer", "traffic-ground-viewer-edge-2", "traffic-ground-viewer-edge-3",
+    }  # fmt: skip
+    for name, body in children.items():
+        if name not in grants:
+            assert [o["uid"] for o in body["metadata"]["ownerReferences"]] == [application["metadata"]["uid"]], name
+    slices = [b for n, b in children.items() if n.startswith("endpointslices/")]
+    base = next(
+        p for p in world.pods(namespace) if p["metadata"]["labels"]["fractus.dev/instance"] == "traffic-image-checker"
+    )
+    assert [s["endpoints"][0]["addresses"] for s in slices if s["metadata"]["name"] == "traffic-image-checker"] == [
+        [base["status"]["podIP"]]
+    ]
+    assert "selector" not in children["services/traffic-image-checker"]["spec"]
+    reasons = [
+        e["reason"]
+        for e in world.api.list(f"/api/v1/namespaces/{namespace}/events")
+        if e["involvedObject"]["kind"] == "Application"
+    ]
+    assert sorted(reasons) == ["Deployed", "Granted", "Planned", "PodsReady"]
+
+
+def test_a_certificate_names_its_instance_only(world: World, operator: OperatorProcess, namespace: str) -> None:
+    world.put(traffic(namespace))
+    world.phase(namespace, "Deploying")
+    secret = world.children(namespace)["secrets/traffic-navigator-tls"]
+    certificate = x509.load_pem_x509_certificate(base64.b64decode(secret["data"]["tls.crt"]))
+    names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    identity = f"spiffe://fractus.dev/ns/{namespace}/app/traffic/component/Navigator/instance/traffic-navigator"
+    assert [name.value for name in names] == [identity]
+    authority = world.api.get("/api/v1/namespaces/fractus-system/configmaps/fractus-ca")
+    assert authority is not None
+    assert base64.b64decode(secret["data"]["ca.crt"]).decode() == authority["data"]["ca.crt"]
+    certificate.verify_directly_issued_by(x509.load_pem_x509_certificate(authority["data"]["ca.crt"].encode()))
+
+
+def test_with_nothing_changed_nothing_is_written(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    before = versions(world, namespace)
+    # A change that touches no input wakes the reconciler; a change of an input shows when it is done.
+    world.api.merge(f"{FRACTUS}/depots/base", {"spec": {"radius": 31}})
+    world.api.merge(f"{FRACTUS}/edgenodes/edge-1", {"spec": {"location": at(21, 30)}})
+    world.api.merge("/api/v1/nodes/cloud-1", {"metadata": {"labels": {"some": "label"}}})
+    wait_for(lambda: _geohash(world, "edge-1"), "the node's label")
+    after = versions(world, namespace)
+    # The depot's radius is part of the drone's corridor: its grants follow, and nothing else.
+    changed = {name for name in before if before[name] != after[name]}
+    assert changed <= {f"grants/{namespace}.traffic-navigator", f"grants/{namespace}.traffic-aerial-viewer"}
+
+
+def _geohash(world: World, node: str) -> str | None:
+    labels = (world.api.get(f"/api/v1/nodes/{node}") or {})["metadata"]["labels"]
+    return labels.get("fractus.dev/geohash")
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
+def test_a_restart_changes_nothing(world: World, operator: OperatorProcess, namespace: str, how: int) -> None:
+    running(world, namespace)
+    before = versions(world, namespace)
+    operator.stop(how)
+    operator.start()
+    # A new zone's condition tells that the new operator is at work; then it has long seen the application.
+    world.put(ours("Zone", "beacon", {"area": {"circle": {"center": at(0, 0), "radius": 10}}}))
+    wait_for(lambda: _ready(world, "zones", "beacon") == "True", "the restarted operator")
+    world.put(ours("Application", "second", traffic(namespace)["spec"], namespace))
+    world.phase(namespace, "Queued", "second")
+    assert versions(world, namespace) == before
+
+
+def test_a_killed_operator_finishes_what_it_began(world: World, operator: OperatorProcess, namespace: str) -> None:
+    world.put(traffic(namespace))
+    wait_for(lambda: world.grants(namespace), "the first grant")
+    operator.stop(signal.SIGKILL)
+    operator.start()
+    deployed(world, namespace)
+    deployments = [n for n in world.children(namespace) if n.startswith("deployments/")]
+    assert len(deployments) == len(INSTANCES)
+
+
+def _ready(world: World, plural: str, name: str) -> str | None:
+    conditions = ((world.api.get(f"{FRACTUS}/{plural}/{name}") or {}).get("status") or {}).get("conditions") or ()
+    return next((c["status"] for c in conditions if c["type"] == "Ready"), None)
+
+
+def test_what_is_deleted_or_changed_by_hand_comes_back(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    path = f"/apis/apps/v1/namespaces/{namespace}/deployments/traffic-data-store"
+    uid = (world.api.get(path) or {})["metadata"]["uid"]
+    world.api.delete(path)
+    wait_for(lambda: (world.api.get(path) or {}).get("metadata", {}).get("uid", uid) != uid, "the Deployment's return")
+    world.api.merge(path, {"spec": {"replicas": 3}})
+    wait_for(lambda: (world.api.get(path) or {})["spec"]["replicas"] == 1, "the number of replicas")
+
+
+def test_a_complete_mission_leaves_only_its_plan(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    world.drone_status("drone-1", "flying")
+    end_mission(world, namespace, "Complete", "all control points were returned")
+    status = world.phase(namespace, "Completed")
+    assert world.condition(namespace, "MissionComplete")["status"] == "True"
+    assert status["message"] == "all control points were returned"
+    wait_for(lambda: set(world.children(namespace)) == {"deploymentplans/traffic"}, "children to go")
+
+
+@pytest.mark.parametrize(("phase", "reason"), [("Failed", "MissionFailed"), ("Revoked", "MissionRevoked")])
+def test_a_failed_mission_is_reported(
+    world: World, operator: OperatorProcess, namespace: str, phase: str, reason: str
+) -> None:
+    running(world, namespace)
+    end_mission(world, namespace, phase, "driver lost")
+    status = world.phase(namespace, "Failed")
+    condition = world.condition(namespace, "MissionComplete")
+    assert (condition["status"], condition["reason"], status["message"]) == ("False", reason, "driver lost")
+    wait_for(lambda: not world.grants(namespace), "grants to go")
+
+
+def test_a_changed_spec_flies_again_after_completion(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    end_mission(world, namespace, "Complete", "done")
+    world.phase(namespace, "Completed")
+    manifest = traffic(namespace)
+    manifest["spec"]["components"][4]["replicas"] = 2
+    world.put(manifest)
+    deployed(world, namespace, pods=8)
+    assert world.status(namespace)["observedGeneration"] == 2
+
+
+def test_one_drone_is_for_one_application_until_it_is_home(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    world.put(traffic(namespace))
+    world.put(traffic(namespace, "second"))
+    names = {"traffic", "second"}
+    wait_for(
+        lambda: {world.status(namespace, n).get("phase") for n in names} == {"Deploying", "Queued"},
+        "one of two to wait",
+    )
+    first = next(n for n in names if world.status(namespace, n)["phase"] == "Deploying")
+    second = (names - {first}).pop()
+    assert f"{namespace}/{first}" in world.status(namespace, second)["message"]
+    assert not world.grants(namespace, second)
+    world.drone_status("drone-1", "flying")
+    name = f"{namespace}.{first}-navigator"
+    world.api.merge(f"{FRACTUS}/grants/{name}/status", {"status": {"phase": "Complete"}})
+    world.phase(namespace, "Completed", first)
+    wait_for(lambda: not world.grants(namespace, first), "the first one's grants to go")
+    assert world.status(namespace, second)["phase"] == "Queued"
+    world.drone_status("drone-1", "inactive")
+    world.phase(namespace, "Deploying", second)
+
+
+def test_without_a_drone_it_waits_for_one(world: World, operator: OperatorProcess, namespace: str) -> None:
+    world.api.delete(f"{FRACTUS}/drones/drone-1")
+    world.put(traffic(namespace))
+    world.phase(namespace, "Pending")
+    assert world.condition(namespace, "Ready")["reason"] == "NoDrone"
+    assert world.children(namespace) == {}
+    world.add_drone("drone-9")
+    assert world.phase(namespace, "Deploying")["drone"] == "drone-9"
+
+
+def test_a_node_that_the_scheduler_refuses_is_planned_around(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    world.put(traffic(namespace))
+    deployed(world, namespace)
+    world.add_edge("edge-4", at(40, 10))
+    victim = next(
+        p for p in world.pods(namespace) if p["metadata"]["labels"]["fractus.dev/instance"].endswith("viewer-edge-2")
+    )
+    path = f"/api/v1/namespaces/{namespace}/pods/{victim['metadata']['name']}"
+    refused = {"type": "PodScheduled", "status": "False", "reason": "Unschedulable", "message": "Insufficient cpu",
+               "lastTransitionTime": "2026-01-01T00:00:00Z"}  # fmt: skip
+    world.api.merge(f"{path}/status", {"status": {"conditions": [refused]}})
+    wait_for(lambda: "deployments/traffic-ground-viewer-edge-4" in world.children(namespace), "another node")
+    children = world.children(namespace)
+    assert "deployments/traffic-ground-viewer-edge-2" not in children
+    assert "secrets/traffic-ground-viewer-edge-2-tls" not in children
+    assert f"grants/{namespace}.traffic-ground-viewer-edge-2" not in children
+    assert "deployments/traffic-ground-viewer-edge-3" in children
+
+
+def test_a_node_out_of_reach_keeps_its_instances(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    before = versions(world, namespace)
+    for name in ("drone-1", "edge-2"):
+        lost = {
+            "type": "Ready",
+            "status": "Unknown",
+            "reason": "NodeStatusUnknown",
+            "lastTransitionTime": "2026-01-01T00:00:00Z",
+        }
+        world.api.merge(f"/api/v1/nodes/{name}/status", {"status": {"conditions": [lost]}})
+    world.put(traffic(namespace, "second"))
+    world.phase(namespace, "Queued", "second")
+    assert versions(world, namespace) == before
+
+
+def test_deleting_leaves_nothing(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    world.api.delete(world.path(traffic(namespace)))
+    wait_for(lambda: gone(world, namespace), "everything to go")
+    assert not world.grants(namespace)
+
+
+def test_deleting_while_the_operator_is_down_leaves_nothing(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    running(world, namespace)
+    operator.stop(signal.SIGKILL)
+    world.api.delete(world.path(traffic(namespace)))
+    assert world.application(namespace) is not None, "the finalizer holds it until the operator is back"
+    operator.start()
+    wait_for(lambda: gone(world, namespace), "everything to go")
+
+
+def test_a_grant_does_not_outlive_an_application_whose_finalizer_was_taken_off(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    running(world, namespace)
+    operator.stop(signal.SIGKILL)
+    world.api.delete(world.path(traffic(namespace)))
+    world.api.merge(world.path(traffic(namespace)), {"metadata": {"finalizers": None}})
+    assert world.grants(namespace)
+    operator.start()
+    wait_for(lambda: not world.grants(namespace), "orphaned grants to go")
+
+
+def test_deleted_and_made_anew_it_gets_a_plan_of_its_own(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    running(world, namespace)
+    old = (world.application(namespace) or {})["metadata"]["uid"]
+    world.api.delete(world.path(traffic(namespace)))
+    wait_for(lambda: world.application(namespace) is None, "the application to go")
+    world.put(traffic(namespace, "traffic", navigator()))
+    world.phase(namespace, "Deploying")
+    wait_for(
+        lambda: (
+            [n for n in world.children(namespace) if n.startswith("deployments/")] == ["deployments/traffic-navigator"]
+        ),
+        "one instance",
+    )
+    assert {g["spec"]["application"]["uid"] for g in world.grants(namespace)} == {
+        (world.application(namespace) or {})["metadata"]["uid"]
+    }
+    assert old not in {g["spec"]["application"]["uid"] for g in world.grants(namespace)}
+
+
+def test_somebody_elses_object_is_not_taken(world: World, operator: OperatorProcess, namespace: str) -> None:
+    theirs = {"apiVersion": "v1", "kind": "Service", "metadata": {"name": "traffic-data-store", "namespace": namespace},
+              "spec": {"ports": [{"port": 1}]}}  # fmt: skip
+    world.api.apply(f"/api/v1/namespaces/{namespace}/services/traffic-data-store", theirs)
+    world.put(traffic(namespace))
+    wait_for(lambda: world.condition(namespace, "Ready").get("reason") == "NameTaken", "the conflict")
+    service = world.api.get(f"/api/v1/namespaces/{namespace}/services/traffic-data-store")
+    assert service is not None
+    assert service["spec"]["ports"][0]["port"] == 1
+    world.api.delete(f"/api/v1/namespaces/{namespace}/services/traffic-data-store")
+    world.phase(namespace, "Deploying")
+
+
+def test_a_policy_whose_zone_is_missing_grants_nothing(world: World, operator: OperatorProcess, namespace: str) -> None:
+    spec = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["school"]}}
+    world.put(ours("Policy", "no-school", spec))
+    wait_for(lambda: _ready(world, "policies", "no-school") == "False", "the policy's condition")
+    world.put(traffic(namespace))
+    wait_for(lambda: world.condition(namespace, "Granted").get("status") == "False", "the refusal")
+    assert "school" in world.condition(namespace, "Granted")["message"]
+    assert world.children(namespace) == {}
+    world.put(ours("Zone", "school", {"area": {"circle": {"center": at(30, 30), "radius": 5}}}))
+    world.phase(namespace, "Deploying")
+    wait_for(lambda: _ready(world, "policies", "no-school") == "True", "the policy's condition")
+    policies = [p["name"] for g in world.grants(namespace) for p in g["spec"].get("policies", [])]
+    assert "no-school" in policies
+
+
+def test_a_new_policy_reaches_the_grants_of_a_running_application(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    running(world, namespace)
+    world.put(ours("Policy", "low", {"type": "LimitControl", "kind": "altitude", "upperLimit": 15}))
+    wait_for(
+        lambda: all("low" in [p["name"] for p in g["spec"].get("policies", [])] for g in world.grants(namespace)),
+        "the policy",
+    )
+    assert world.status(namespace)["phase"] == "Running"
+
+
+def test_nodes_get_location_labels(world: World, operator: OperatorProcess) -> None:
+    wait_for(lambda: _geohash(world, "drone-1") and _geohash(world, "edge-1"), "labels")
+    labels = (world.api.get("/api/v1/nodes/drone-1") or {})["metadata"]["labels"]
+    assert labels["fractus.dev/depot"] == "base"
+    assert labels["fractus.dev/interface-wifi"] == labels["fractus.dev/interface-4g"] == "true"
+    assert labels["fractus.dev/class"] == "drone"
+    world.api.delete(f"{FRACTUS}/drones/drone-1")
+    wait_for(lambda: _geohash(world, "drone-1") is None, "labels to go")
+    labels = (world.api.get("/api/v1/nodes/drone-1") or {})["metadata"]["labels"]
+    assert set(labels) == {"fractus.dev/class"}
+
+
+def test_a_small_change_moves_nothing_else(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    before = versions(world, namespace)
+    manifest = traffic(namespace)
+    manifest["spec"]["components"][4]["container"]["image"] = "registry.test/component:2"
+    world.put(manifest)
+    wait_for(lambda: world.status(namespace)["observedGeneration"] == 2, "the new generation")
+    after = versions(world, namespace)
+    changed = {name for name in before if before[name] != after.get(name)}
+    assert changed <= {"deployments/traffic-data-store", "deploymentplans/traffic", "application"}
+    assert "deployments/traffic-data-store" in changed
+
+
+def test_a_passenger_that_goes_is_removed(world: World, operator: OperatorProcess, namespace: str) -> None:
+    store = component("DataStore", "cloud")
+    passenger = viewer(egress=["DataStore"])
+    world.put(traffic(namespace, "traffic", navigator(), passenger, store))
+    deployed(world, namespace, pods=3)
+    world.put(traffic(namespace, "traffic", navigator(), store))
+    wait_for(lambda: "deployments/traffic-aerial-viewer" not in world.children(namespace), "the passenger to go")
+    assert [g["spec"]["component"] for g in world.grants(namespace)] == ["Navigator"]

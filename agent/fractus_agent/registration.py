@@ -6,17 +6,16 @@ import asyncio
 import hashlib
 import json
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
 import yaml
 from fractus_core.api.model import GROUP, InvalidObject
-from fractus_core.api.nodes import Drone, EdgeNode, Interface
+from fractus_core.api.nodes import Drone, EdgeNode
 
 from fractus_agent.backoff import Backoff
 from fractus_agent.findings import Finding
-from fractus_agent.geohash import geohash
 from fractus_agent.store import Conflict, Object, Rejected, Unavailable
 
 LOG = logging.getLogger(__name__)
@@ -40,9 +39,6 @@ class NodeStore(Protocol):
 
     async def node_labels(self) -> dict[str, str] | None:
         """Labels of the Kubernetes Node."""
-
-    async def label_node(self, labels: Mapping[str, str | None]) -> None:
-        """Set and take away labels."""
 
     async def described(self, kind: str) -> Object | None:
         """The node's object."""
@@ -82,31 +78,8 @@ def description_hash(described: Drone | EdgeNode) -> str:
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def location_labels(resource: Drone | EdgeNode) -> dict[str, str]:
-    """Labels that tell where the node is and how it can be linked."""
-    labels = {f"{GROUP}/interface-{i.technology.lower()}": "true" for i in _interfaces(resource)}
-    if isinstance(resource, Drone):
-        if resource.spec.depot is not None:
-            labels[f"{GROUP}/depot"] = resource.spec.depot
-    else:
-        labels[f"{GROUP}/geohash"] = geohash(resource.spec.location.lat, resource.spec.location.lon)
-    return labels
-
-
-def label_changes(wanted: Mapping[str, str], present: Mapping[str, str]) -> dict[str, str | None]:
-    """What to set (and with None, take away) so that the Node has the wanted location labels and no stale ones."""
-    ours = (f"{GROUP}/depot", f"{GROUP}/geohash", f"{GROUP}/interface-")
-    changes: dict[str, str | None] = {key: None for key in present if key.startswith(ours) and key not in wanted}
-    changes.update({key: value for key, value in wanted.items() if present.get(key) != value})
-    return changes
-
-
-def _interfaces(resource: Drone | EdgeNode) -> tuple[Interface, ...]:
-    return resource.spec.interfaces
-
-
 class Registration:
-    """Sees to it that the node has its object and its labels.
+    """Sees to it that the node has its object.
 
     The object is written in two cases only: it is absent, or the description on the node changed since it was last
     taken over (annotation fractus.dev/description-hash). The owner's edits of an object stay.
@@ -118,7 +91,6 @@ class Registration:
         self._node = node
         self._changed = changed
         self._stamp: object = None
-        self._labelled: int | None = None
         self._again = asyncio.Event()
         self.body: Object | None = None
         self.resource: Drone | EdgeNode | None = None
@@ -136,8 +108,6 @@ class Registration:
                     await self.step()
                     resync_s = loop.time() + RESYNC_S
                     backoff.succeeded()
-                elif self.body["metadata"].get("generation") != self._labelled:
-                    await self._label()
             except (Unavailable, Conflict, Rejected) as error:
                 LOG.log(logging.DEBUG if backoff.attempts else logging.WARNING, "registration waits: %s", error)
                 self._stamp = None
@@ -158,15 +128,14 @@ class Registration:
         old, self.body = self.body, body
         if old is None or old["metadata"].get("generation") != body["metadata"].get("generation"):
             self._read(body)
-            self._again.set()
 
     async def step(self) -> None:
-        """Bring object and labels in step once.
+        """Bring the object in step with the description once.
 
         Raises:
             Unavailable: the API server is out of reach.
             Conflict: somebody wrote in between.
-            Rejected: the API server refuses the object or the labels.
+            Rejected: the API server refuses the object.
         """
         described = self._description()
         labels = await self._store.node_labels()
@@ -182,7 +151,6 @@ class Registration:
         if described is not None:
             body = await self._register(described, body)
         self._take(body)
-        await self._label()
 
     async def _register(self, described: Drone | EdgeNode, body: Object | None) -> Object:
         digest = description_hash(described)
@@ -228,17 +196,6 @@ class Registration:
         except InvalidObject as error:
             LOG.warning("the agent cannot read the node's object: %s", error)
         self._changed()
-
-    async def _label(self) -> None:
-        if self.body is None or self.resource is None:
-            return
-        labels = await self._store.node_labels()
-        if labels is not None:
-            changes = label_changes(location_labels(self.resource), labels)
-            if changes:
-                await self._store.label_node(changes)
-                LOG.info("labelled the node: %s", ", ".join(f"{k}={v}" if v else f"{k}-" for k, v in changes.items()))
-        self._labelled = self.body["metadata"].get("generation")
 
     def _file_changed(self) -> bool:
         try:

@@ -8,7 +8,7 @@ import contextlib
 import logging
 import os
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -179,11 +179,6 @@ class Store:
         """Labels of the Kubernetes Node; None when there is no such node."""
         node = await self._get(_NODE, self._node)
         return None if node is None else dict(node["metadata"].get("labels", {}))
-
-    async def label_node(self, labels: Mapping[str, str | None]) -> None:
-        """Set labels of the Kubernetes Node; None takes one away."""
-        patch = {"metadata": {"labels": dict(labels)}}
-        await _call(self._client.patch(_NODE, self._node, patch, patch_type=PatchType.MERGE))
 
     async def described(self, kind: str) -> Object | None:
         """The node's Drone or EdgeNode; None when it is absent."""

@@ -6,14 +6,11 @@ from typing import Any
 
 import pytest
 import yaml
-from fractus_agent.geohash import geohash
 from fractus_agent.registration import (
     HASH_ANNOTATION,
     InvalidDescription,
     Registration,
     description_hash,
-    label_changes,
-    location_labels,
     parse_description,
 )
 from fractus_agent.store import Rejected
@@ -43,14 +40,6 @@ class FakeStore:
 
     async def node_labels(self) -> dict[str, str] | None:
         return None if self.labels is None else dict(self.labels)
-
-    async def label_node(self, labels: dict[str, str | None]) -> None:
-        assert self.labels is not None
-        for key, value in labels.items():
-            if value is None:
-                self.labels.pop(key)
-            else:
-                self.labels[key] = value
 
     async def described(self, kind: str) -> dict[str, Any] | None:
         return copy.deepcopy(self.object) if self.object and self.object["kind"] == kind else None
@@ -89,20 +78,14 @@ def edited(**spec: Any) -> str:
     return yaml.safe_dump(MANIFEST | {"spec": MANIFEST["spec"] | spec})
 
 
-async def test_registers_once_and_labels_the_node(path: Path) -> None:
+async def test_registers_once(path: Path) -> None:
     store = FakeStore()
     for _ in range(3):
         await Registration(store, path, "drone-1").step()
     assert store.writes == 1
     assert store.object is not None
     assert store.object["metadata"]["labels"] == {"fleet": "north"}
-    assert store.labels == {
-        "fractus.dev/class": "drone",
-        "other": "x",
-        "fractus.dev/depot": "campus",
-        "fractus.dev/interface-wifi": "true",
-        "fractus.dev/interface-4g": "true",
-    }
+    assert store.object["spec"]["depot"] == "campus"
 
 
 async def test_the_owners_edits_stay(path: Path) -> None:
@@ -117,8 +100,6 @@ async def test_the_owners_edits_stay(path: Path) -> None:
     await Registration(store, path, "drone-1").step()
     assert store.writes == 1
     assert store.object["spec"]["depot"] == "harbour"
-    assert store.labels is not None
-    assert store.labels["fractus.dev/depot"] == "harbour"
 
 
 async def test_a_changed_description_is_taken_over_once(path: Path) -> None:
@@ -131,7 +112,7 @@ async def test_a_changed_description_is_taken_over_once(path: Path) -> None:
     assert store.writes == 2
     assert store.object is not None
     assert store.object["spec"]["depot"] == "airfield"
-    assert store.labels == {"fractus.dev/class": "drone", "other": "x", "fractus.dev/depot": "airfield"}
+    assert store.object["metadata"]["labels"] == {"fleet": "north"}
 
 
 async def test_an_owners_object_is_adopted_unchanged(path: Path) -> None:
@@ -231,22 +212,3 @@ def test_hash_is_of_what_is_said() -> None:
     again = parse_description("# x\n" + yaml.safe_dump(MANIFEST, sort_keys=False, default_flow_style=True), "drone-1")
     other = parse_description(edited(depot="x"), "drone-1")
     assert description_hash(first) == description_hash(again) != description_hash(other)
-
-
-def test_edge_nodes_are_labelled_by_geohash() -> None:
-    edge = {
-        "apiVersion": "fractus.dev/v1alpha1",
-        "kind": "EdgeNode",
-        "metadata": {"name": "e"},
-        "spec": {"location": {"lat": 57.64911, "lon": 10.40744}},
-    }
-    assert location_labels(parse_description(yaml.safe_dump(edge), "e")) == {"fractus.dev/geohash": "u4pruy"}
-    assert geohash(57.64911, 10.40744, 11) == "u4pruydqqvj"
-
-
-def test_only_our_stale_labels_go() -> None:
-    present = {"fractus.dev/interface-ble": "true", "fractus.dev/class": "drone", "zone": "a"}
-    assert label_changes({"fractus.dev/depot": "d"}, present) == {
-        "fractus.dev/interface-ble": None,
-        "fractus.dev/depot": "d",
-    }

@@ -90,7 +90,7 @@ def pods() -> list[dict[str, Any]]:
     ]
 
 
-def telemetry() -> list[dict[str, Any]]:
+def states() -> list[dict[str, Any]]:
     """Two samples a second along the waypoints at 9 m/s, then home by RTL and down."""
     path = documents("application.yaml")[0]["spec"]["components"][0]["controlPoints"][0]["path"]
     stops = [(*HOME, 0.0), (*HOME, 20.0), *((w["lat"], w["lon"], min(w["alt"], 50.0)) for w in path)]
@@ -109,6 +109,10 @@ def telemetry() -> list[dict[str, Any]]:
 
 
 def audit() -> list[dict[str, Any]]:
+    return [*calls(), *states()]
+
+
+def calls() -> list[dict[str, Any]]:
     """Calls of driver and passenger; the last two refusals are the same request."""
     wp3 = {"lat": 50.865633, "lon": 4.680631, "alt": 70.0}
     at = {"lat": 50.865228, "lon": 4.679352, "alt": 20.0}
@@ -127,7 +131,7 @@ def audit() -> list[dict[str, Any]]:
         ),
         _call(
             TAKEOFF_S + 30, DRIVER, "Goto", action="correct", code="AltitudeAboveLimit", args=wp3, at=at,
-            policies=["town-altitude"], flown={**wp3, "alt": 50.0},
+            policies=["town-altitude"], result={**wp3, "alt": 50.0},
             reason="altitude 70.0 m above home is above the limit of policy town-altitude; corrected to 50.0 m above home",
         ),
         *(
@@ -165,15 +169,18 @@ def _line(
     seconds: float, lat: float, lon: float, alt: float, mode: str, *, flying: bool, speed: float = 0.0
 ) -> dict[str, Any]:
     return {
+        "kind": "state",
         "time": stamp(seconds),
-        "position": {"lat": lat, "lon": lon, "alt": alt, "reference": "home"},
-        "velocity": {"north": speed, "east": 0.0, "down": 0.0},
+        "lat": lat,
+        "lon": lon,
+        "alt": alt,
+        "speed": speed,
         "mode": mode,
-        "armed": flying,
+        "battery": 0.9,
         "in_air": flying,
-        "battery_remaining": 0.9,
     }
 
 
-def _call(seconds: float, identity: str, method: str, **rest: Any) -> dict[str, Any]:
-    return {"kind": "call", "time": stamp(seconds), "identity": identity, "method": method, **rest}
+def _call(seconds: float, caller: str, method: str, at: dict[str, float] | None = None, **rest: Any) -> dict[str, Any]:
+    place = at or {"lat": HOME[0], "lon": HOME[1], "alt": 0.0}
+    return {"kind": "call", "time": stamp(seconds), "caller": caller, "method": method, "args": {}, **place, **rest}

@@ -20,7 +20,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 @pytest.fixture(scope="module")
 def record() -> Record:
-    return Record.of(demo_flight.content(), demo_flight.telemetry(), demo_flight.audit())
+    return Record.of(demo_flight.content(), demo_flight.audit())
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +53,28 @@ def test_what_policies_did_is_told_once_for_each_request(record: Record) -> None
 
 
 def test_the_same_refusal_much_later_is_told_again() -> None:
-    refused = [e for e in demo_flight.audit() if e.get("method") == "CaptureImage"]
+    refused = [e for e in demo_flight.calls() if e.get("method") == "CaptureImage"]
     later = {**refused[0], "time": demo_flight.stamp(demo_flight.TAKEOFF_S + 300)}
-    record = Record.of(demo_flight.content(), [], [*refused, later])
+    record = Record.of(demo_flight.content(), [*refused, later])
     assert [j.count for j in record.judgements] == [2, 1]
+
+
+def test_a_takeover_is_told_with_the_requests() -> None:
+    takeover = {
+        "kind": "takeover",
+        "time": demo_flight.stamp(demo_flight.TAKEOFF_S + 40),
+        "action": "returnToLaunch",
+        "code": "ZoneEntered",
+        "reason": "zone hospital appeared around the drone",
+        "policies": ["no-fly-hospital"],
+        "lat": 50.8653,
+        "lon": 4.6797,
+        "alt": 20.0,
+    }
+    record = Record.of(demo_flight.content(), [*demo_flight.states(), takeover])
+    (told,) = record.judgements
+    assert (told.component, told.method, told.action) == ("the system", "returnToLaunch", "takeover")
+    assert "| the system | returnToLaunch | taken over | no-fly-hospital |" in summary(record)
 
 
 def test_the_page_shows_corrections_refusals_placements_and_the_chain(record: Record) -> None:
@@ -131,7 +149,7 @@ def test_a_mission_that_never_flew_is_reported_too(tmp_path: Path) -> None:
     content = demo_flight.content()
     application = {**content["objects"][0], "status": {"phase": "Failed", "message": "no drone can fly it"}}
     content["objects"] = [application, *(o for o in content["objects"][1:] if o["kind"] != "DeploymentPlan")]
-    record = Record.of({**content, "pods": [], "audit": {}}, [], [])
+    record = Record.of({**content, "pods": [], "audit": {}}, [])
     write_report(record, tmp_path)
     page = (tmp_path / "summary.md").read_text()
     assert "**Failed.** No drone did not fly" not in page
@@ -149,7 +167,6 @@ def test_a_drone_still_in_the_air_has_not_landed(record: Record) -> None:
 
 def test_a_record_is_read_from_the_files_of_the_demo(tmp_path: Path, record: Record) -> None:
     (tmp_path / "objects.json").write_text(json.dumps(demo_flight.content()))
-    lines = "".join(json.dumps(line) + "\n" for line in demo_flight.telemetry())
-    (tmp_path / "telemetry.jsonl").write_text(lines + '{"time": "2027-')
-    (tmp_path / "audit.jsonl").write_text("".join(json.dumps(entry) + "\n" for entry in demo_flight.audit()))
+    lines = "".join(json.dumps(entry) + "\n" for entry in demo_flight.audit())
+    (tmp_path / "audit.jsonl").write_text(lines + '{"time": "2027-')
     assert figures(Record.read(tmp_path)) == figures(record)

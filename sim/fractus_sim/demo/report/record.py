@@ -1,4 +1,4 @@
-"""What is known of one flight: the objects of the cluster, telemetry, and the audit log."""
+"""What is known of one flight: the objects of the cluster, and the audit log with its flight recorder."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ from fractus_core.api.geometry import Point
 from fractus_core.geo import LocalFrame, geodesic_m
 from fractus_core.policy.grants import node_attributes, selects
 
-OBJECTS, TELEMETRY, AUDIT = "objects.json", "telemetry.jsonl", "audit.jsonl"
-AIRBORNE_M = 0.5
+OBJECTS, AUDIT = "objects.json", "audit.jsonl"
 _DECIDED = {"correct", "deny", "takeover"}
 _KINDS: tuple[type[Resource], ...] = (Application, DeploymentPlan, Depot, Drone, EdgeNode, Policy, Zone)
 
@@ -44,7 +43,6 @@ class Sample:
     place: Place
     speed_mps: float
     mode: str
-    armed: bool
     in_air: bool
     battery: float
 
@@ -119,18 +117,15 @@ class Record:
             ValueError: a file is not what the demo writes.
         """
         content = json.loads((folder / OBJECTS).read_text())
-        return cls.of(content, _lines(folder / TELEMETRY), _lines(folder / AUDIT))
+        return cls.of(content, _lines(folder / AUDIT))
 
     @classmethod
-    def of(
-        cls, content: Mapping[str, Any], telemetry: Iterable[Mapping[str, Any]], audit: Iterable[Mapping[str, Any]]
-    ) -> Record:
+    def of(cls, content: Mapping[str, Any], audit: Iterable[Mapping[str, Any]]) -> Record:
         """Make the record from parsed JSON.
 
         Args:
             content: `objects` (manifests as the API server has them), `pods`, `events`, `times`, `audit`.
-            telemetry: lines of `fractus telemetry -o json`.
-            audit: entries of the mobility and camera services' audit logs.
+            audit: entries of the mobility service's audit log: calls, takeovers, and the flight recorder.
         """
         found: dict[str, list[Any]] = {kind.KIND: [] for kind in _KINDS}
         parsers = {kind.KIND: kind for kind in _KINDS}
@@ -139,8 +134,8 @@ class Record:
                 found[body["kind"]].append(parsers[body["kind"]].from_body(body))
         plans = found["DeploymentPlan"]
         chosen = plans[0].spec.drone.node if plans and plans[0].spec.drone else None
-        entries = [entry for entry in audit if entry.get("kind") == "call"]
-        judged = sorted((j for e in entries if (j := _judgement(e)) is not None), key=lambda j: j.time_s)
+        entries = sorted(audit, key=lambda e: str(e.get("time", "")))
+        judged = [j for e in entries if (j := _judgement(e)) is not None]
         return cls(
             application=found["Application"][0],
             plan=plans[0] if plans else None,
@@ -151,9 +146,9 @@ class Record:
             zones=tuple(sorted(found["Zone"], key=lambda z: z.name)),
             pods=tuple(sorted((_pod(body) for body in content.get("pods", ())), key=lambda p: (p.component, p.name))),
             events=tuple(content.get("events", ())),
-            samples=_flight(_sample(line) for line in telemetry),
+            samples=_flight(_sample(e) for e in entries if e.get("kind") == "state"),
             judgements=_merged(judged),
-            calls=len(entries),
+            calls=sum(e.get("kind") == "call" for e in entries),
             audit=content.get("audit", {}),
             times=content.get("times", {}),
         )
@@ -221,7 +216,7 @@ def _lines(path: Path) -> list[dict[str, Any]]:
     for line in path.read_text().splitlines() if path.exists() else ():
         try:
             found.append(json.loads(line))
-        except ValueError:  # cut off where the recorder was stopped
+        except ValueError:  # a line that was being written when the log was fetched
             continue
     return found
 
@@ -230,16 +225,14 @@ def _time(text: str) -> float:
     return datetime.fromisoformat(text).timestamp()
 
 
-def _sample(line: Mapping[str, Any]) -> Sample:
-    position, velocity = line["position"], line["velocity"]
+def _sample(entry: Mapping[str, Any]) -> Sample:
     return Sample(
-        time_s=_time(line["time"]),
-        place=Place(position["lat"], position["lon"], position["alt"]),
-        speed_mps=math.hypot(velocity["north"], velocity["east"]),
-        mode=line["mode"],
-        armed=line["armed"],
-        in_air=line["in_air"],
-        battery=line["battery_remaining"],
+        time_s=_time(entry["time"]),
+        place=Place(entry.get("lat") or 0.0, entry.get("lon") or 0.0, entry.get("alt") or 0.0),
+        speed_mps=entry.get("speed", 0.0),
+        mode=entry.get("mode", ""),
+        in_air=bool(entry.get("in_air")),
+        battery=entry.get("battery", 0.0),
     )
 
 
@@ -253,21 +246,23 @@ def _flight(samples: Iterable[Sample]) -> tuple[Sample, ...]:
 
 
 def _judgement(entry: Mapping[str, Any]) -> Judgement | None:
-    if entry.get("action") not in _DECIDED:
+    """What a call, the monitor or a takeover did; None for entries that changed nothing."""
+    kind = entry.get("kind")
+    if kind not in {"call", "monitor", "takeover"} or (kind != "takeover" and entry.get("action") not in _DECIDED):
         return None
-    at = _place(entry.get("at") or entry.get("position"), None)
+    at = _place(entry, None)
     args = entry.get("args") or {}
     return Judgement(
         time_s=_time(entry["time"]),
-        component=entry.get("component") or _component(entry.get("identity") or entry.get("caller") or ""),
-        method=entry["method"],
-        action=entry["action"],
+        component=_component(entry.get("caller", "")) if kind == "call" else "the system",
+        method=entry["method"] if kind == "call" else entry.get("action", kind),
+        action=entry["action"] if entry.get("action") in _DECIDED else "takeover",
         code=entry.get("code", ""),
         reason=entry.get("reason", ""),
         policies=tuple(entry.get("policies", ())),
         detail=_words(args),
         asked=_place(args, at),
-        flown=_place(entry.get("flown") or entry.get("corrected") or {}, at),
+        flown=_place(entry.get("result"), at),
         at=at,
     )
 
@@ -279,15 +274,12 @@ def _component(identity: str) -> str:
 
 def _place(value: Mapping[str, Any] | None, base: Place | None) -> Place | None:
     """The place that a mapping speaks of, completed by where the drone was."""
-    if not value:
-        return None
-    lat = value.get("lat", value.get("latitude_deg"))
-    lon = value.get("lon", value.get("longitude_deg"))
-    alt = value.get("alt", value.get("altitude_m"))
+    value = value or {}
+    lat, lon, alt = value.get("lat"), value.get("lon"), value.get("alt", value.get("altitude_m"))
     if lat is None and alt is None:
         return None
     if lat is None or lon is None:
-        return Place(base.lat, base.lon, float(alt)) if base is not None else None
+        return Place(base.lat, base.lon, float(alt)) if base is not None and alt is not None else None
     return Place(float(lat), float(lon), float(alt) if alt is not None else base.alt_m if base else 0.0)
 
 
@@ -295,8 +287,7 @@ _UNITS = {"speed_mps": "{:.1f} m/s", "altitude_m": "{:.0f} m", "alt": "{:.0f} m"
 
 
 def _words(args: Mapping[str, Any]) -> str:
-    lat = args.get("lat", args.get("latitude_deg"))
-    lon = args.get("lon", args.get("longitude_deg"))
+    lat, lon = args.get("lat"), args.get("lon")
     where = [f"{lat:.6f}, {lon:.6f}"] if isinstance(lat, float) and isinstance(lon, float) else []
     figures = [shape.format(args[key]) for key, shape in _UNITS.items() if isinstance(args.get(key), int | float)]
     return ", ".join([*where, *figures])

@@ -67,6 +67,7 @@ class ControlPoint(Model):
             ("self.navigation != 'pathBased' || has(self.path)", "pathBased navigation needs path"),
             ("self.navigation != 'regionBased' || has(self.region)", "regionBased navigation needs region"),
             ("!(has(self.path) && has(self.region))", "give either path or region, and only one of them"),
+            ("!has(self.duration) || has(self.region)", "duration is for regionBased navigation"),
         )
     )
 
@@ -78,6 +79,12 @@ class ControlPoint(Model):
         default=None, min_length=1, max_length=1000, description="Waypoints in the order flown."
     )
     region: Area | None = Field(default=None, description="Where the driver will move freely.")
+    duration: float | None = Field(
+        default=None,
+        gt=0,
+        le=1440,
+        description="Minutes that the driver will move in the region; the drone must have them. Unset: not counted.",
+    )
 
     @model_validator(mode="after")
     def _navigable(self) -> Self:
@@ -86,6 +93,8 @@ class ControlPoint(Model):
                 raise InvalidObject("path", "pathBased navigation needs at least one waypoint")
             if self.region is not None:
                 raise InvalidObject("region", "is for regionBased navigation; remove it")
+            if self.duration is not None:
+                raise InvalidObject("duration", "is for regionBased navigation; remove it")
         else:
             if self.region is None:
                 raise InvalidObject("region", "regionBased navigation needs a region")

@@ -23,10 +23,31 @@ class Alternative(Model):
     score: float = Field(description="Higher is better; comparable within one plan only.")
 
 
+class Leg(Model):
+    """A straight piece of flight."""
+
+    start: Position
+    end: Position
+
+
+class Mission(Model):
+    """What the application takes of the drone, with the way to its start and home, and what the drone has."""
+
+    distance: float = Field(ge=0, description="Metres over ground.")
+    duration: float = Field(ge=0, description="Minutes of flight.")
+    available: float = Field(description="Minutes the drone can fly with its reserve kept.")
+
+
 class DroneChoice(Model):
     """The drone that flies, and the runners-up in order."""
 
     node: str
+    score: float | None = Field(default=None, description="Higher is better; comparable within one plan only.")
+    shared_with: str | None = Field(
+        default=None, description="namespace/name of the application that flies the drone; this one comes along."
+    )
+    mission: Mission | None = Field(default=None, description="Unset when the application comes along.")
+    chauffeur: tuple[Leg, ...] = Field(default=(), description="The legs that the system flies, in order.")
     alternatives: tuple[Alternative, ...] = ()
 
 
@@ -48,6 +69,9 @@ class PlannedInstance(Model):
     replicas: int = Field(default=1, ge=1)
     serves: Serves | None = None
     coverage: float | None = Field(default=None, ge=0, le=1, description="Share of the operation area it adds.")
+    location: int | None = Field(
+        default=None, ge=0, description="For role static: which of the component's locations, counted from 0."
+    )
 
 
 class Rejection(Model):
@@ -68,6 +92,9 @@ class DeploymentPlanSpec(Model):
     drone: DroneChoice | None = None
     placements: tuple[PlannedInstance, ...] = ()
     rejected: tuple[Rejection, ...] = ()
+    rejected_omitted: int | None = Field(
+        default=None, ge=1, description="How many rejected nodes are not listed, for there are too many."
+    )
 
 
 class DeploymentPlan(Resource):

@@ -15,6 +15,7 @@ from fractus_core.api.geometry import Area, Circle, Point, Position
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.nodes import Depot
 from fractus_core.geo import LocalFrame, corridor, ground, middle, middle_of, polygon
+from fractus_core.planning.tour import short_tour
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,11 +25,15 @@ class OperationArea:
     Attributes:
         shape: the ground the application may use the drone's services above.
         route: the points visited in order, without the way to the first and home from the last.
+        parts: the areas that shape unites: one a control point, or one for the points of interest.
+        length_m: length of the route over ground.
     """
 
     frame: LocalFrame
     shape: BaseGeometry
     route: tuple[Position, ...]
+    parts: tuple[BaseGeometry, ...] = ()
+    length_m: float = 0.0
 
     @property
     def start(self) -> Point:
@@ -39,7 +44,7 @@ class OperationArea:
 def operation_area(spec: ApplicationSpec, depots: Mapping[str, Depot], safety_radius_m: float) -> OperationArea | None:
     """The union of the areas of all control points, or of the points of interest; None without drone components.
 
-    Paths are dilated by the safety radius; a leg that starts at a depot opens to the whole depot, since a drone may
+    Points of interest in any order are joined in the order of a short tour that starts with the first. Paths are dilated by the safety radius; a leg that starts at a depot opens to the whole depot, since a drone may
     stand anywhere in it. Regions count as given.
 
     Raises:
@@ -59,10 +64,11 @@ def operation_area(spec: ApplicationSpec, depots: Mapping[str, Depot], safety_ra
                 _control_area(frame, point, depots, safety_radius_m, f"components[{index}].controlPoints[{i}]")
             )
     elif poi is not None and poi.service_access == "points":
-        parts += [corridor(frame, [ground(p)], safety_radius_m) for p in poi.points]
+        parts.append(shapely.union_all([corridor(frame, [ground(p)], safety_radius_m) for p in poi.points]))
     elif poi is not None:
-        parts.append(corridor(frame, [ground(p) for p in poi.points], safety_radius_m))
-    return OperationArea(frame, shapely.union_all(parts), tuple(route))
+        parts.append(corridor(frame, [ground(p) for p in route], safety_radius_m))
+    length = length_m(frame, [ground(p) for p in route])
+    return OperationArea(frame, shapely.union_all(parts), tuple(route), tuple(parts), length)
 
 
 def start_of(point: ControlPoint, depots: Mapping[str, Depot]) -> Position | None:
@@ -83,24 +89,42 @@ def start_of(point: ControlPoint, depots: Mapping[str, Depot]) -> Position | Non
     return Position(lat=location.lat, lon=location.lon)
 
 
+def control_routes(points: Sequence[ControlPoint], depots: Mapping[str, Depot]) -> list[list[Position]]:
+    """For each control point the places visited: its start if it has one, then its path or its region's middle.
+
+    Raises:
+        InvalidObject: a depot is unknown; the field is relative to the list.
+    """
+    routes = []
+    for i, point in enumerate(points):
+        try:
+            start = start_of(point, depots)
+        except InvalidObject as error:
+            raise InvalidObject(f"[{i}].{error.field}", error.problem) from None
+        route = [start] if start is not None else []
+        route += point.path or ()
+        if point.region is not None:
+            centre = middle(point.region)
+            route.append(Position(lat=centre.lat, lon=centre.lon))
+        routes.append(route)
+    return routes
+
+
 def _route(spec: ApplicationSpec, depots: Mapping[str, Depot]) -> list[Position]:
-    route: list[Position] = []
+    poi = spec.points_of_interest
     if spec.driver is not None:
-        index = spec.components.index(spec.driver)
-        for i, point in enumerate(spec.driver.control_points):
-            try:
-                start = start_of(point, depots)
-            except InvalidObject as error:
-                raise InvalidObject(f"components[{index}].controlPoints[{i}].{error.field}", error.problem) from None
-            if start is not None:
-                route.append(start)
-            route += point.path or ()
-            if point.region is not None:
-                centre = middle(point.region)
-                route.append(Position(lat=centre.lat, lon=centre.lon))
-    elif spec.points_of_interest is not None:
-        route += spec.points_of_interest.points
-    return route
+        try:
+            routes = control_routes(spec.driver.control_points, depots)
+        except InvalidObject as error:
+            field = f"components[{spec.components.index(spec.driver)}].controlPoints{error.field}"
+            raise InvalidObject(field, error.problem) from None
+        return [place for route in routes for place in route]
+    if poi is None:
+        return []
+    if poi.ordered:
+        return list(poi.points)
+    frame = LocalFrame.at(middle_of(poi.points))
+    return [poi.points[i] for i in short_tour([frame.xy(p.lat, p.lon) for p in poi.points])]
 
 
 def _control_area(

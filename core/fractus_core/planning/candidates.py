@@ -116,16 +116,18 @@ def direct_reach_m(ours: Iterable[Interface], theirs: Iterable[Interface]) -> fl
 
     Interfaces match in technology and pairing mode; the lesser range counts.
     """
+    best: float | None = None
     theirs = tuple(theirs)
-    reaches = [
-        min(a.range, b.range)
-        for a in ours
-        for b in theirs
-        if a.technology == b.technology
-        and a.range is not None
-        and b.range is not None
-        and a.pairing is not None
-        and b.pairing is not None
-        and a.pairing.mode == b.pairing.mode
-    ]
-    return max(reaches, default=None)
+    for a in ours:
+        if a.range is None or a.pairing is None:
+            continue
+        for b in theirs:
+            if b.technology != a.technology or b.range is None or b.pairing is None or b.pairing.mode != a.pairing.mode:
+                continue
+            best = max(best or 0.0, min(a.range, b.range))
+    return best
+
+
+def direct_range_m(interfaces: Iterable[Interface]) -> float | None:
+    """The longest range of a node's interfaces that can pair; None when it has none: no direct link is longer."""
+    return max((i.range for i in interfaces if i.range is not None and i.pairing is not None), default=None)

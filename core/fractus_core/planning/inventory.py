@@ -1,12 +1,15 @@
-"""What planning looks at: hosts, drones, edge nodes, depots, and who has which drone."""
+"""What planning looks at: hosts, drones, edge nodes, depots, who has which drone, and what may be tuned."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+from fractus_core.api.geometry import Position
 from fractus_core.api.nodes import Depot, Drone, EdgeNode
 from fractus_core.api.policies import Policy, Zone
+from fractus_core.planning.coverage import CoverStrategy
+from fractus_core.planning.whereabouts import Whereabouts
 
 CLASS_LABEL = "fractus.dev/class"
 
@@ -34,11 +37,28 @@ class Host:
 
 
 @dataclass(frozen=True, slots=True)
+class Flight:
+    """Where a drone flies, or will fly, for the application that has it; others may come along.
+
+    Attributes:
+        holder: (namespace, name) of the application that has the drone.
+        legs: polylines flown in order; between them nothing is known of the way (a driver's region).
+        reached: how many points of the legs, counted in order, lie behind the drone already.
+    """
+
+    holder: tuple[str, str]
+    legs: tuple[tuple[Position, ...], ...]
+    reached: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class Inventory:
     """All that a plan and its grants are made from; every mapping is by object name.
 
     Attributes:
         claimed: drones that an application has, by drone: (namespace, name) of the application.
+        flights: what claimed drones fly, by drone, as far as it is known; without it nobody comes along.
+        whereabouts: indexes of these very mappings, from whoever keeps them current; None: built when first needed.
     """
 
     hosts: Mapping[str, Host] = field(default_factory=dict)
@@ -48,6 +68,44 @@ class Inventory:
     zones: Mapping[str, Zone] = field(default_factory=dict)
     policies: Mapping[str, Policy] = field(default_factory=dict)
     claimed: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    flights: Mapping[str, Flight] = field(default_factory=dict)
+    whereabouts: Whereabouts | None = field(default=None, compare=False, repr=False)
+    _built: list[Whereabouts] = field(default_factory=list, init=False, compare=False, repr=False)
+
+    def located(self) -> Whereabouts:
+        """The indexes: those given, or built once from the mappings."""
+        if self.whereabouts is not None:
+            return self.whereabouts
+        if not self._built:
+            cloud = (host.name for host in self.hosts.values() if host.node_class == "cloud")
+            self._built.append(
+                Whereabouts.of(edge_nodes=self.edge_nodes, drones=self.drones, depots=self.depots, cloud=cloud)
+            )
+        return self._built[0]
+
+
+@dataclass(frozen=True, slots=True)
+class DroneFacts:
+    """What ranks a drone that can fly an application.
+
+    Attributes:
+        used: it flies for another application already, and this one would come along.
+        charging: it stands at its charger.
+        remaining_min: minutes it can fly with what its battery holds.
+        needed_min: minutes that the application takes of them; 0 when it comes along.
+        distance_m: from where it stands to where the work starts.
+    """
+
+    drone: Drone
+    used: bool
+    charging: bool
+    remaining_min: float
+    needed_min: float
+    distance_m: float
+
+
+DroneScore = Callable[[DroneFacts], float]
+"""Scores a drone, higher is better; equals go by name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +120,11 @@ class Settings:
         climb_speed_mps: vertical speed assumed for flight times.
         battery_reserve: share of a full charge that must be left after landing.
         excluded: hosts not to use, with the reason, such as one the scheduler refused.
+        near_misses: how many nodes a plan lists that were too far away to be candidates, for each place asked for.
+        near_miss_m: how far from there they may be to be listed.
+        rejections_listed: how many rejected nodes a plan lists at most, so that it fits into an object of Kubernetes.
+        score_drone: replaces the ranking of drones.
+        cover: replaces the choice of nodes that cover the operation area.
     """
 
     safety_radius_m: float = 7.0
@@ -71,3 +134,8 @@ class Settings:
     climb_speed_mps: float = 1.5
     battery_reserve: float = 0.2
     excluded: Mapping[str, str] = field(default_factory=dict)
+    near_misses: int = 20
+    near_miss_m: float = 100_000.0
+    rejections_listed: int = 5000
+    score_drone: DroneScore | None = None
+    cover: CoverStrategy | None = None

@@ -1,0 +1,145 @@
+"""A plan in the making: the inputs, what is booked and placed so far, and what was rejected."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+
+from fractus_core.api.applications import Application, Component
+from fractus_core.api.nodes import EdgeNode
+from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance, Rejection, Role, Serves
+from fractus_core.planning.candidates import Check, Ledger, check_host, check_resources, check_services, requests
+from fractus_core.planning.inventory import Inventory, Settings
+
+
+class Infeasible(Exception):
+    """No plan exists for the application; says which component has no host and why each node was dropped."""
+
+    def __init__(self, component: str, reason: str, message: str, rejected: Iterable[Rejection] = ()) -> None:
+        self.component = component
+        self.reason = reason
+        self.message = message
+        self.rejected = tuple(rejected)
+        super().__init__(message)
+
+
+def instance_name(application: str, component: Component, node: str | None = None) -> str:
+    """Name of an instance: at most 63 characters, a DNS label; long names end in a hash instead."""
+    name = "-".join(filter(None, (application, component.slug, node))).replace(".", "-")
+    if len(name) <= 57:
+        return name
+    return name[:48].rstrip("-") + "-" + hashlib.sha256(name.encode()).hexdigest()[:8]
+
+
+class Draft:
+    """One run of the planner: its inputs, and what it has decided so far."""
+
+    def __init__(
+        self, application: Application, inventory: Inventory, settings: Settings, previous: DeploymentPlanSpec | None
+    ) -> None:
+        self.application = application
+        self.spec = application.spec
+        self.inventory = inventory
+        self.settings = settings
+        self.located = inventory.located()
+        self.placements: list[PlannedInstance] = []
+        self.ledger = Ledger(inventory.hosts, _own_requests(application, previous))
+        self.drone_before = previous.drone.node if previous is not None and previous.drone is not None else None
+        self.before = previous.placements if previous is not None else ()
+        self._used_before = {(p.component, p.node) for p in self.before}
+        self._placed: set[tuple[str, str | None]] = set()
+        self._rejected: dict[tuple[str, str], Rejection] = {}
+        self._far: dict[tuple[str, str], Rejection] = {}
+
+    def had(self, component: Component, node: str) -> bool:
+        """Whether the plan before had the component on the node."""
+        return (component.name, node) in self._used_before
+
+    # -- judging --
+
+    def check_edge(self, node: EdgeNode, component: Component) -> Check:
+        """Whether an edge node can host the component, or the first rule it fails."""
+        return (
+            check_host(self.inventory.hosts, node.name, self.settings, kept=self.had(component, node.name))
+            and check_services(node.spec.services, [component])
+            and check_resources(self.ledger, node.name, [component])
+        )
+
+    def reject(self, component: Component, node: str, check: Check, *, far: bool = False) -> None:
+        """Note that a node is no host for a component; `far` says that it was no candidate by place."""
+        notes = self._far if far else self._rejected
+        notes.setdefault((component.name, node), check.rejection(component, node))
+
+    def rejections(self, component: Component) -> list[Rejection]:
+        """What was rejected for one component: first what was there, then what was too far; each by name."""
+        here = sorted((r for r in self._rejected.values() if r.component == component.name), key=lambda r: r.node)
+        nodes = {r.node for r in here}
+        far = (r for r in self._far.values() if r.component == component.name and r.node not in nodes)
+        return here + sorted(far, key=lambda r: r.node)
+
+    def infeasible(self, component: Component, reason: str, problem: str, nothing: str) -> Infeasible:
+        """The refusal of a component: the problem, the first few reasons, and all rejected nodes."""
+        rejected = self.rejections(component)
+        why = "; ".join(r.message for r in rejected[:5]) or nothing
+        more = f"; and {len(rejected) - 5} more" if len(rejected) > 5 else ""
+        return Infeasible(component.name, reason, f"{problem}: {why}{more}", rejected)
+
+    # -- deciding --
+
+    def place(
+        self,
+        component: Component,
+        role: Role,
+        node: str | None,
+        *,
+        replicas: int = 1,
+        serves: Serves | None = None,
+        coverage: float | None = None,
+        location: int | None = None,
+    ) -> None:
+        """Put an instance of a component on a node (None: any cloud node), and book what it asks for."""
+        if node is not None:
+            self.ledger.take(node, component)
+        self._placed.add((component.name, node))
+        self.placements.append(
+            PlannedInstance(
+                component=component.name,
+                instance=instance_name(self.application.name, component, node if role != "drone" else None),
+                node=node,
+                placement=component.placement,
+                role=role,
+                replicas=replicas,
+                serves=serves,
+                coverage=coverage,
+                location=location,
+            )
+        )
+
+    def listed(self) -> tuple[tuple[Rejection, ...], int]:
+        """The rejected nodes that the plan lists, in the order of components and nodes, and how many it leaves out.
+
+        A node that hosts the component after all is not rejected. What was a candidate by place goes before what was
+        too far away.
+        """
+        notes = {**self._rejected}
+        for key, rejection in self._far.items():
+            notes.setdefault(key, rejection)
+        wanted = [r for key, r in notes.items() if key not in self._placed]
+        kept = wanted[: self.settings.rejections_listed]
+        order = {c.name: i for i, c in enumerate(self.spec.components)}
+        kept.sort(key=lambda r: (order[r.component], r.node))
+        return tuple(kept), len(wanted) - len(kept)
+
+
+def _own_requests(application: Application, previous: DeploymentPlanSpec | None) -> dict[str, dict[str, float]]:
+    """What the application's own pods of the previous plan hold: it is theirs to use again."""
+    held: dict[str, dict[str, float]] = {}
+    components: dict[str, Component] = {c.name: c for c in application.spec.components}
+    placements: Sequence[PlannedInstance] = previous.placements if previous else ()
+    for placed in placements:
+        if placed.node is None or placed.component not in components:
+            continue
+        for resource, amount in requests(components[placed.component]).items():
+            on_node = held.setdefault(placed.node, {})
+            on_node[resource] = on_node.get(resource, 0.0) + amount
+    return held

@@ -1,0 +1,261 @@
+"""Which drone flies an application (thesis Algorithms 6 and 9)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from fractus_core.api.applications import Component
+from fractus_core.api.geometry import Point, Position
+from fractus_core.api.nodes import Drone
+from fractus_core.api.plans import Alternative, DroneChoice, Mission
+from fractus_core.geo import geodesic_m, ground
+from fractus_core.planning.area import OperationArea, start_of
+from fractus_core.planning.candidates import SUITABLE, Check, check_host, check_resources, check_services
+from fractus_core.planning.draft import Draft
+from fractus_core.planning.flight import chauffeur_legs, estimate, first_missed, heights_m, remaining_minutes
+from fractus_core.planning.index import Near
+from fractus_core.planning.inventory import DroneFacts
+
+_DAY_MIN = 1440.0
+_ALTERNATIVES = 10
+
+
+@dataclass(frozen=True, slots=True)
+class DroneCandidates:
+    """The drones that stand, or fly, where the application needs one; ordered by name.
+
+    Attributes:
+        idle: drones whose depot or home suits.
+        flying: drones of other applications that pass all points of interest in order.
+    """
+
+    idle: tuple[Drone, ...]
+    flying: tuple[Drone, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Ranked:
+    drone: Drone
+    score: float
+    used: bool
+    mission: Mission | None
+
+
+def default_score(facts: DroneFacts) -> float:
+    """Readiness before energy.
+
+    2 for a drone that flies anyway, 1 for one that is not at its charger, and the share of a day it can still fly.
+    To come along saves a take-off, a landing and a drone in the air (thesis 8.5).
+    """
+    ready = 2.0 if facts.used else 0.0 if facts.charging else 1.0
+    return ready + min(facts.remaining_min / _DAY_MIN, 0.999)
+
+
+def find_drones(draft: Draft, area: OperationArea) -> DroneCandidates:
+    """The candidates by place: from depots at or near the start, and for passengers alone also those that fly by."""
+    leader = draft.spec.driver or next(draft.spec.on("drone"))
+    names = set(_standing(draft, area, leader))
+    flying = _flying_by(draft, leader) if draft.spec.driver is None else []
+    idle = [draft.inventory.drones[name] for name in sorted(names - set(flying)) if name in draft.inventory.drones]
+    return DroneCandidates(tuple(idle), tuple(draft.inventory.drones[name] for name in flying))
+
+
+def choose_drone(draft: Draft, area: OperationArea, candidates: DroneCandidates) -> DroneChoice:
+    """Place all drone components on the best candidate; the one that has the application already stays.
+
+    Raises:
+        Infeasible: no candidate is suitable. The reason is DroneBusy if one would be, were it not for another
+            application that has it.
+    """
+    components = list(draft.spec.on("drone"))
+    leader = draft.spec.driver or components[0]
+    ranked = [
+        found
+        for drones, used in ((candidates.flying, True), (candidates.idle, False))
+        for drone in drones
+        if (found := _judge(draft, area, drone, components, used=used)) is not None
+    ]
+    if not ranked:
+        busy = any(r.reason == "Claimed" for r in draft.rejections(leader))
+        reason = "DroneBusy" if busy else "NoDrone"
+        raise draft.infeasible(leader, reason, f"no drone can fly {leader.name}", "there is no drone")
+    ranked.sort(key=lambda r: (r.drone.name != draft.drone_before, -r.score, r.drone.name))
+    best = ranked[0]
+    for component in components:
+        draft.place(component, "drone", best.drone.name)
+    home = _home(draft, best.drone)
+    legs = chauffeur_legs(draft.spec, area, home, draft.inventory.depots) if home is not None and not best.used else []
+    return DroneChoice(
+        node=best.drone.name,
+        score=round(best.score, 6),
+        shared_with="/".join(draft.inventory.flights[best.drone.name].holder) if best.used else None,
+        mission=best.mission,
+        chauffeur=tuple(legs),
+        alternatives=tuple(
+            Alternative(node=r.drone.name, score=round(r.score, 6)) for r in ranked[1 : 1 + _ALTERNATIVES]
+        ),
+    )
+
+
+# -- by place --
+
+
+def _standing(draft: Draft, area: OperationArea, leader: Component) -> list[str]:
+    """Drones that stand where the application wants them; notes the nearest that do not."""
+    located, settings = draft.located, draft.settings
+    first = leader.control_points[0] if leader.control_points else None
+    start = start_of(first, draft.inventory.depots) if first is not None else None
+    if first is not None and first.point is not None and first.point.depot is not None:
+        depot = draft.inventory.depots[first.point.depot]
+        centre, limit = depot.spec.location, depot.spec.radius
+        kept = located.kept_in(depot.name)
+        reason, wanted = "OtherDepot", f"not in {depot.name}"
+    elif start is not None and leader.control != "partial":
+        centre, limit = ground(start), settings.safety_radius_m
+        kept = frozenset().union(*(located.kept_in(name) for name in _depots_around(draft, centre)))
+        reason, wanted = "TooFar", f"more than {limit:.0f} m"
+    else:
+        centre, limit = area.start, settings.depot_radius_m
+        kept = frozenset()
+        reason, wanted = "TooFar", f"more than {limit:.0f} m"
+    here = {name for name, _ in located.stands.within(centre, limit)} | kept
+    for name, distance in located.stands.nearest(centre, settings.near_misses, limit, settings.near_miss_m):
+        if name not in here and name in draft.inventory.drones:
+            place = "is"
+            if reason == "OtherDepot":
+                place = f"is kept in {draft.inventory.drones[name].spec.depot or 'no depot'},"
+            message = f"{name} {place} {distance:.0f} m from the start, {wanted}"
+            draft.reject(leader, name, Check(reason, message), far=True)
+    for name in sorted(located.homeless - kept)[: settings.near_misses]:
+        message = f"{name} has neither a depot that exists nor a home; set spec.depot or spec.home"
+        draft.reject(leader, name, Check("NoHome", message))
+    return sorted(here)
+
+
+def _depots_around(draft: Draft, place: Point) -> Iterable[str]:
+    near: list[Near] = draft.located.depots.within(place, draft.located.widest_depot_m)
+    return [n for n, m in near if n in draft.inventory.depots and m <= draft.inventory.depots[n].spec.radius]
+
+
+def _flying_by(draft: Draft, leader: Component) -> list[str]:
+    """Drones that fly for other applications and visit all points of interest, by name; notes some that do not."""
+    poi = draft.spec.points_of_interest
+    found = []
+    noted = 0
+    for name, flight in sorted(draft.inventory.flights.items()):
+        if poi is None or name not in draft.inventory.drones or flight.holder == draft.application.key:
+            continue
+        missed = first_missed(poi.points, flight, draft.settings.safety_radius_m, ordered=poi.ordered)
+        if missed is None:
+            found.append(name)
+        elif noted < draft.settings.near_misses:
+            noted += 1
+            holder = "/".join(flight.holder)
+            order = " in this order" if poi.ordered else ""
+            message = f"{name} flies for {holder}, which does not visit pointsOfInterest.points[{missed}]{order}"
+            draft.reject(leader, name, Check("PathMissesPoint", message))
+    return found
+
+
+# -- by what it is and has --
+
+
+def _judge(
+    draft: Draft, area: OperationArea, drone: Drone, components: list[Component], *, used: bool
+) -> _Ranked | None:
+    """The drone with its score, or None with the first rule it fails noted."""
+    leader = draft.spec.driver or components[0]
+    kept = drone.name == draft.drone_before
+    home = _home(draft, drone)
+    mission = _mission(draft, area, drone, home) if home is not None and not used else None
+    check = _lasting(draft, area, drone, components, mission, kept=kept) and (
+        _passing(draft, drone, components, mission, kept=kept, used=used)
+    )
+    if not check:
+        draft.reject(leader, drone.name, check)
+        return None
+    facts = DroneFacts(
+        drone=drone,
+        used=used,
+        charging=drone.status is not None and drone.status.flight_state == "charging",
+        remaining_min=remaining_minutes(drone),
+        needed_min=mission.duration if mission is not None else 0.0,
+        distance_m=geodesic_m(ground(home), area.start) if home is not None else 0.0,
+    )
+    score = (draft.settings.score_drone or default_score)(facts)
+    return _Ranked(drone, score, used, mission)
+
+
+def _lasting(
+    draft: Draft, area: OperationArea, drone: Drone, components: list[Component], mission: Mission | None, *, kept: bool
+) -> Check:
+    """The rules that waiting does not change: services, altitude, a flight too long for a full battery."""
+    check = check_services(drone.spec.services, components)
+    mobility = drone.spec.services.mobility
+    if not check or mobility is None or mission is None:
+        return check
+    height = max(heights_m(area.route, drone), default=0.0)
+    if height > mobility.max_altitude:
+        message = f"{drone.name} climbs to {mobility.max_altitude:g} m; the path goes up to {height:g} m"
+        return Check("TooHigh", message)
+    full = (1 - draft.settings.battery_reserve) * mobility.max_flight_time
+    if not kept and mission.duration > full:
+        return _too_long(drone, mission, full, "even with a full battery")
+    return SUITABLE
+
+
+def _passing(
+    draft: Draft, drone: Drone, components: list[Component], mission: Mission | None, *, kept: bool, used: bool
+) -> Check:
+    """The rules of the moment: who has the drone, its node, its state, its battery, what runs on it.
+
+    A drone that already has the application (kept) is not given up for what passes or comes with the mission: a lost
+    link, a restarted service, a battery that the flight has drained.
+    """
+    owner = draft.inventory.claimed.get(drone.name)
+    if owner is not None and owner != draft.application.key and not used:
+        return Check("Claimed", f"{owner[0]}/{owner[1]} has {drone.name}")
+    host = check_host(draft.inventory.hosts, drone.name, draft.settings, kept=kept)
+    if kept:
+        return host
+    energy = SUITABLE
+    if mission is not None and mission.duration > mission.available:
+        battery = drone.status.battery if drone.status is not None else None
+        share = battery.remaining if battery is not None else 1.0
+        energy = _too_long(drone, mission, mission.available, f"with its battery at {share:.0%}")
+    return host and _check_state(drone) and energy and check_resources(draft.ledger, drone.name, components)
+
+
+def _too_long(drone: Drone, mission: Mission, available_min: float, when: str) -> Check:
+    return Check(
+        "FlightTooLong",
+        f"{drone.name} can fly {max(available_min, 0):.1f} min with its reserve kept, {when};"
+        f" the mission takes {mission.duration:.1f} min for {mission.distance:.0f} m",
+    )
+
+
+def _mission(draft: Draft, area: OperationArea, drone: Drone, home: Position) -> Mission | None:
+    mobility = drone.spec.services.mobility
+    if mobility is None:
+        return None
+    found = estimate(draft.spec, area, ground(home), drone, draft.settings)
+    available = remaining_minutes(drone) - draft.settings.battery_reserve * mobility.max_flight_time
+    return Mission(distance=round(found.distance_m, 1), duration=round(found.minutes, 3), available=round(available, 3))
+
+
+def _home(draft: Draft, drone: Drone) -> Position | None:
+    """Where the drone stands, on the ground."""
+    depot = draft.inventory.depots.get(drone.spec.depot or "")
+    place = drone.spec.home or (depot.spec.location if depot is not None else None)
+    return Position(lat=place.lat, lon=place.lon) if place is not None else None
+
+
+def _check_state(drone: Drone) -> Check:
+    status = drone.status
+    ready = next((c for c in status.conditions if c.type == "Ready"), None) if status else None
+    if ready is None:
+        return Check("DroneUnknown", f"{drone.name} has not reported yet")
+    if ready.status != "True":
+        return Check("DroneNotReady", ready.message or f"{drone.name} is not Ready ({ready.reason})")
+    return SUITABLE

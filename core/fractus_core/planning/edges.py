@@ -1,0 +1,269 @@
+"""Which edge nodes host static and hybrid components (thesis Algorithms 7 to 10)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fractus_core.api.applications import Component, EdgeLocation
+from fractus_core.api.geometry import Point
+from fractus_core.api.nodes import Drone, EdgeNode, Interface
+from fractus_core.api.plans import PlannedInstance, Serves
+from fractus_core.geo import geodesic_m, ground
+from fractus_core.planning.area import OperationArea
+from fractus_core.planning.candidates import Check, direct_range_m, direct_reach_m
+from fractus_core.planning.coverage import CoverScene, Samples, greedy_cover
+from fractus_core.planning.draft import Draft
+from fractus_core.planning.index import Near
+
+# -- static components (Algorithms 7 and 9) --
+
+
+def find_static(draft: Draft, component: Component) -> list[list[Near]]:
+    """For each location the edge nodes in it, nearest first; notes the nearest nodes that are in none."""
+    found = [_known(draft, draft.located.edge_nodes.within(spot.center, spot.radius)) for spot in component.locations]
+    inside = {name for nodes in found for name, _ in nodes}
+    limit_m = draft.settings.near_miss_m
+    for i, spot in enumerate(component.locations):
+        for name, distance in draft.located.edge_nodes.nearest(
+            spot.center, draft.settings.near_misses, spot.radius, limit_m
+        ):
+            if name not in inside and name in draft.inventory.edge_nodes:
+                message = f"{name} is {distance:.0f} m from the centre of locations[{i}], more than {spot.radius:.0f} m"
+                draft.reject(component, name, Check("OutsideLocation", message), far=True)
+    return found
+
+
+def place_static(draft: Draft, component: Component, candidates: Sequence[Sequence[Near]]) -> None:
+    """Fill each location with the nearest nodes that suit; where the component is already, it stays.
+
+    Raises:
+        Infeasible: a location that needs instances gets none.
+    """
+    before = {(p.location, p.node) for p in draft.before if p.component == component.name}
+    taken: set[str] = set()
+    for i, (spot, nodes) in enumerate(zip(component.locations, candidates, strict=True)):
+        wanted = len(nodes) if spot.instances == "*" else spot.instances
+        count = 0
+        for name, _ in _staying_first(draft, component, i, nodes, before):
+            if count == wanted:
+                break
+            if name in taken:
+                continue
+            check = draft.check_edge(draft.inventory.edge_nodes[name], component)
+            if check:
+                count += 1
+                taken.add(name)
+                draft.place(component, "static", name, location=i)
+            else:
+                draft.reject(component, name, check)
+        if count == 0 and spot.instances != "*":
+            raise draft.infeasible(
+                component, "NoEdgeNode", f"no node can host {component.name} at locations[{i}]", _nothing(spot)
+            )
+
+
+def _nothing(spot: EdgeLocation) -> str:
+    return f"there is no edge node within {spot.radius:.0f} m of {spot.center.lat:.6f}, {spot.center.lon:.6f}"
+
+
+def _staying_first(
+    draft: Draft,
+    component: Component,
+    location: int,
+    nodes: Sequence[Near],
+    before: set[tuple[int | None, str | None]],
+) -> list[Near]:
+    """Nodes that host the component for this location first, those that do for another one last."""
+
+    def rank(near: Near) -> int:
+        if (location, near[0]) in before or (None, near[0]) in before:
+            return 0
+        return 2 if draft.had(component, near[0]) else 1
+
+    return sorted(nodes, key=rank) if before else list(nodes)
+
+
+def _known(draft: Draft, near: Sequence[Near]) -> list[Near]:
+    return [(name, distance) for name, distance in near if name in draft.inventory.edge_nodes]
+
+
+# -- hybrid components beside static ones (Algorithms 8 and 10) --
+
+
+@dataclass(slots=True)
+class HybridHosts:
+    """Where a hybrid component has instances so far, in the order they were placed."""
+
+    nodes: dict[str, None] = field(default_factory=dict)
+
+
+def place_beside(draft: Draft, component: Component, static: PlannedInstance, hosts: HybridHosts) -> None:
+    """Host a hybrid component for one static instance: on its own node, or the nearest that it can talk to directly.
+
+    A node that hosts the component already serves this one too. Without any, the cloud base does.
+    """
+    here = draft.inventory.edge_nodes[static.node or ""]
+    served = [
+        p.node
+        for p in draft.before
+        if p.component == component.name
+        and p.role == "hybrid-edge"
+        and p.serves == Serves(component=static.component, node=here.name)
+    ]
+    # Neighbours are only looked for when the node itself will not do: it comes first, and mostly suits.
+    for names in (served, [here.name], None):
+        nodes = _beside(draft, component, here) if names is None else names
+        for name in nodes:
+            if name in hosts.nodes:
+                return
+            node = draft.inventory.edge_nodes.get(name or "")
+            if node is None or (names is served and not _reaches(here, node)):
+                continue
+            check = draft.check_edge(node, component)
+            if check:
+                hosts.nodes[node.name] = None
+                serves = Serves(component=static.component, node=here.name)
+                draft.place(component, "hybrid-edge", node.name, serves=serves)
+                return
+            draft.reject(component, node.name, check)
+
+
+def _beside(draft: Draft, component: Component, here: EdgeNode) -> list[str]:
+    """Nodes around one, nearest first, that it can talk to directly; notes those that it cannot."""
+    ours = direct_range_m(here.spec.interfaces)
+    found = []
+    if ours is None:
+        return []
+    for name, distance in _known(draft, draft.located.edge_nodes.within(ground(here.spec.location), ours)):
+        reach = direct_reach_m(here.spec.interfaces, draft.inventory.edge_nodes[name].spec.interfaces)
+        if name == here.name:
+            continue
+        if reach is None:
+            message = f"{name} has no interface that pairs with {here.name}'s"
+            draft.reject(component, name, Check("NoDirectInterface", message))
+        elif distance > reach:
+            message = f"{name} is {distance:.0f} m from {here.name}, beyond their direct reach of {reach:.0f} m"
+            draft.reject(component, name, Check("OutOfReach", message))
+        else:
+            found.append(name)
+    return found
+
+
+def _reaches(here: EdgeNode, node: EdgeNode) -> bool:
+    if here.name == node.name:
+        return True
+    reach = direct_reach_m(here.spec.interfaces, node.spec.interfaces)
+    return reach is not None and geodesic_m(ground(here.spec.location), ground(node.spec.location)) <= reach
+
+
+# -- hybrid components along the drone's way (Algorithms 8 and 10) --
+
+
+@dataclass(frozen=True, slots=True)
+class AlongTheWay:
+    """Edge nodes that can talk directly to a drone somewhere in the operation area: names, places, reaches."""
+
+    drone: Drone
+    area: OperationArea
+    names: list[str]
+    xy: np.ndarray[tuple[int, int], np.dtype[np.float64]]
+    reach_m: np.ndarray[tuple[int], np.dtype[np.float64]]
+
+
+def find_along(draft: Draft, component: Component, drone: Drone, area: OperationArea) -> AlongTheWay:
+    """The candidates by place and interface; notes who is in the drone's range without a match, and who is just out."""
+    ours = direct_range_m(drone.spec.interfaces)
+    names: list[str] = []
+    xy = np.empty((0, 2))
+    if ours is not None:
+        names, xy = draft.located.edge_nodes.near_area(area.frame, area.shape, ours)
+    reaches = _Reaches(drone.spec.interfaces)
+    found: list[int] = []
+    reach_m: list[float] = []
+    for i, name in enumerate(names):
+        node = draft.inventory.edge_nodes.get(name)
+        reach = reaches.to(node.spec.interfaces) if node is not None else None
+        if node is not None and reach is None:
+            message = f"{name} has no interface that pairs with {drone.name}'s"
+            draft.reject(component, name, Check("NoDirectInterface", message))
+        elif reach is not None:
+            found.append(i)
+            reach_m.append(reach)
+    _note_far(draft, component, drone, area, set(names))
+    return AlongTheWay(drone, area, [names[i] for i in found], xy[found], np.array(reach_m, dtype=np.float64))
+
+
+def place_along(draft: Draft, component: Component, other: Component, along: AlongTheWay, hosts: HybridHosts) -> None:
+    """Choose among the nodes along the way, and place the component on them."""
+    there = np.array([name in hosts.nodes for name in along.names], dtype=bool)
+    free = np.flatnonzero(~there)
+    scene = CoverScene(
+        samples=Samples(along.area.shape),
+        names=[along.names[i] for i in free.tolist()],
+        xy=along.xy[free],
+        reach_m=along.reach_m[free],
+        share=draft.settings.coverage_share,
+        kept=frozenset(name for name in along.names if draft.had(component, name)),
+        covered_by=np.column_stack((along.xy[there], along.reach_m[there])),
+    )
+
+    def fits(name: str) -> bool:
+        check = draft.check_edge(draft.inventory.edge_nodes[name], component)
+        if not check:
+            draft.reject(component, name, check)
+        return bool(check)
+
+    for pick in (draft.settings.cover or greedy_cover)(scene, fits):
+        hosts.nodes[pick.name] = None
+        serves = Serves(component=other.name, node=along.drone.name)
+        draft.place(component, "hybrid-drone", pick.name, serves=serves, coverage=round(pick.share, 6))
+    _note_useless(draft, component, scene, hosts)
+
+
+def _note_useless(draft: Draft, component: Component, scene: CoverScene, hosts: HybridHosts) -> None:
+    """Note candidates whose own reach falls short of the area, though the drone's would not."""
+    node, _, _ = scene.samples.runs(scene.xy, scene.reach_m)
+    useful = np.zeros(len(scene.names), dtype=bool)
+    useful[node] = True
+    for i in np.flatnonzero(~useful).tolist():
+        name = scene.names[i]
+        if name not in hosts.nodes:
+            message = f"{name} reaches {scene.reach_m[i]:.0f} m and covers nothing of the operation area"
+            draft.reject(component, name, Check("NoCoverage", message))
+
+
+def _note_far(draft: Draft, component: Component, drone: Drone, area: OperationArea, near: set[str]) -> None:
+    """Note the nodes that are nearest to the middle of the area, but out of the drone's range anywhere in it."""
+    lat, lon = area.frame.latlon(*(float(v) for v in area.shape.centroid.coords[0]))
+    wanted = draft.settings.near_misses
+    reaches = _Reaches(drone.spec.interfaces)
+    closest = draft.located.edge_nodes.nearest(
+        Point(lat=lat, lon=lon), wanted + min(len(near), wanted), within_m=draft.settings.near_miss_m
+    )
+    for name, _ in closest:
+        node = draft.inventory.edge_nodes.get(name)
+        if node is None or name in near:
+            continue
+        reach = reaches.to(node.spec.interfaces)
+        check = Check("NoDirectInterface", f"{name} has no interface that pairs with {drone.name}'s")
+        if reach is not None:
+            check = Check("NoCoverage", f"{name} reaches {reach:.0f} m and covers nothing of the operation area")
+        draft.reject(component, name, check, far=True)
+
+
+class _Reaches:
+    """Direct reaches from one node's interfaces; the many nodes of one make share their answer."""
+
+    def __init__(self, ours: Sequence[Interface]) -> None:
+        self._ours = ours
+        self._known: dict[tuple[tuple[object, ...], ...], float | None] = {}
+
+    def to(self, theirs: Sequence[Interface]) -> float | None:
+        """How far the nodes can be apart and still talk directly; None when no interfaces match."""
+        key = tuple((i.technology, i.range, i.pairing.mode if i.pairing is not None else None) for i in theirs)
+        if key not in self._known:
+            self._known[key] = direct_reach_m(self._ours, theirs)
+        return self._known[key]

@@ -1,0 +1,192 @@
+"""What a mission asks of a drone: how long it takes, which legs the system flies, whom it can take along."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fractus_core.api.applications import Application, ApplicationSpec
+from fractus_core.api.geometry import Point, Position
+from fractus_core.api.nodes import Depot, Drone
+from fractus_core.api.plans import Leg
+from fractus_core.geo import LocalFrame, geodesic_m, ground, middle_of
+from fractus_core.planning.area import OperationArea, control_routes
+from fractus_core.planning.inventory import Flight, Settings
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What a mission takes, from the stand and back to it."""
+
+    distance_m: float
+    climb_m: float
+    stay_min: float
+    minutes: float
+
+
+def estimate(spec: ApplicationSpec, area: OperationArea, home: Point, drone: Drone, settings: Settings) -> Estimate:
+    """Length, climb and time of the whole mission, with the way to the first point and home from the last.
+
+    Legs are straight; altitudes are gained and lost at the climb speed on top of the time over ground; a region counts
+    with the way to its middle and the stay its control point declares.
+    """
+    first, last = ground(area.route[0]), ground(area.route[-1])
+    distance = geodesic_m(home, first) + area.length_m + geodesic_m(last, home)
+    heights = [0.0, *heights_m(area.route, drone), 0.0]
+    climb = sum(abs(b - a) for a, b in itertools.pairwise(heights))
+    stay = sum(p.duration or 0.0 for p in spec.driver.control_points) if spec.driver is not None else 0.0
+    mobility = drone.spec.services.mobility
+    speed = min(settings.cruise_speed_mps, mobility.max_speed if mobility is not None else math.inf)
+    minutes = (distance / speed + climb / settings.climb_speed_mps) / 60 + stay
+    return Estimate(distance, climb, stay, minutes)
+
+
+def heights_m(route: Sequence[Position], drone: Drone) -> list[float]:
+    """Metres above home along a route; unset keeps the altitude, and one above sea level counts if home's is known."""
+    base = drone.spec.home.alt if drone.spec.home is not None else None
+    heights = [0.0]
+    for place in route:
+        if place.alt is None or (place.altitude_reference == "amsl" and base is None):
+            heights.append(heights[-1])
+        elif place.altitude_reference == "amsl":
+            heights.append(max(place.alt - (base or 0.0), 0.0))
+        else:
+            heights.append(max(place.alt, 0.0))
+    return heights[1:]
+
+
+def remaining_minutes(drone: Drone) -> float:
+    """Minutes the drone can fly with what its battery holds."""
+    mobility = drone.spec.services.mobility
+    if mobility is None:
+        return 0.0
+    battery = drone.status.battery if drone.status else None
+    return mobility.max_flight_time * (battery.remaining if battery else 1.0)
+
+
+def chauffeur_legs(
+    spec: ApplicationSpec, area: OperationArea, home: Position, depots: Mapping[str, Depot]
+) -> list[Leg]:
+    """The legs that the system flies itself.
+
+    To and between the control points of a driver with partial control, through all points of interest of an
+    application without a driver, and home from there. A driver with full control flies all of it.
+    """
+    driver = spec.driver
+    if driver is not None and driver.control != "partial":
+        return []
+    if driver is None:
+        stops = [home, *area.route, home]
+        pairs = list(itertools.pairwise(stops))
+    else:
+        routes = [route for route in control_routes(driver.control_points, depots) if route]
+        entries = [*(route[0] for route in routes), home]
+        exits = [home, *(route[-1] for route in routes)]
+        pairs = list(zip(exits, entries, strict=True))
+    return [Leg(start=a, end=b) for a, b in pairs if (a.lat, a.lon) != (b.lat, b.lon)]
+
+
+def flight_of(application: Application, depots: Mapping[str, Depot], reached: int = 0) -> Flight:
+    """What a drone flies for an application: its driver's paths, or its points of interest.
+
+    Raises:
+        InvalidObject: a control point names an unknown depot.
+    """
+    spec = application.spec
+    legs: list[tuple[Position, ...]] = []
+    if spec.driver is not None:
+        open_leg: list[Position] = []
+        for point, route in zip(
+            spec.driver.control_points, control_routes(spec.driver.control_points, depots), strict=True
+        ):
+            if point.region is not None:
+                # The way to a region is known only if it has a start; the way out of it never is.
+                start = route[:1] if point.point is not None else []
+                legs.append((*open_leg, *start))
+                open_leg = []
+            else:
+                open_leg += route
+        legs.append(tuple(open_leg))
+    elif spec.points_of_interest is not None:
+        legs.append(tuple(spec.points_of_interest.points))
+    return Flight(application.key, tuple(leg for leg in legs if leg), reached)
+
+
+def first_missed(points: Sequence[Position], flight: Flight, radius_m: float, *, ordered: bool) -> int | None:
+    """The first of some points that a flight does not visit, None if it visits all.
+
+    A point is visited where the path passes within the radius over ground, and within the radius of its altitude if
+    both the point and the path there have one of the same datum. Ordered points must be passed in their order.
+    """
+    path = [p for leg in flight.legs for p in leg]
+    if len(path) <= flight.reached:
+        return 0
+    frame = LocalFrame.at(middle_of([*path, *points]))
+    starts, ends = _segments(frame, flight)
+    at = 0.0
+    for i, point in enumerate(points):
+        passages = _passages(starts, ends, _spot(frame, point, point.alt), radius_m)
+        index = np.arange(len(passages))
+        begin, end = index + passages[:, 0], index + passages[:, 1]
+        open_ = np.isfinite(passages[:, 0]) & (end >= at)
+        if not open_.any():
+            return i
+        if ordered:
+            at = max(at, float(begin[open_].min()))
+    return None
+
+
+_Spots = NDArray[np.float64]
+_DATUMS = {"home": 0.0, "terrain": 1.0, "amsl": 2.0}
+
+
+def _spot(frame: LocalFrame, place: Position, alt: float | None) -> list[float]:
+    x, y = frame.xy(place.lat, place.lon)
+    return [x, y, math.nan if alt is None else alt, _DATUMS[place.altitude_reference]]
+
+
+def _segments(frame: LocalFrame, flight: Flight) -> tuple[_Spots, _Spots]:
+    """Starts and ends of the pieces of path that lie ahead: x, y, altitude (nan if unknown), datum; shape (n, 4)."""
+    starts, ends = [], []
+    passed = flight.reached
+    for leg in flight.legs:
+        spots = []
+        alt: float | None = None
+        for place in leg:
+            alt = place.alt if place.alt is not None else alt
+            spots.append(_spot(frame, place, alt))
+        # The drone is between the last point reached and the next, so the piece between them counts.
+        ahead = spots[max(passed - 1, 0) :] if passed < len(spots) else []
+        passed = max(passed - len(spots), 0)
+        starts += ahead[:-1] or ahead
+        ends += ahead[1:] or ahead
+    return np.array(starts), np.array(ends)
+
+
+def _passages(starts: _Spots, ends: _Spots, spot: Sequence[float], radius_m: float) -> _Spots:
+    """From where to where (0 to 1) each piece of path is near a spot; inf where it never is. Shape (n, 2)."""
+    along = ends[:, :2] - starts[:, :2]
+    offset = starts[:, :2] - np.array(spot[:2])
+    a, b = (along**2).sum(axis=1), (along * offset).sum(axis=1)
+    c = (offset**2).sum(axis=1) - radius_m**2
+    span = np.where(a > 0, b * b - a * c, -c)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        root = np.sqrt(span)
+        low = np.where(a > 0, (-b - root) / a, 0.0)
+        high = np.where(a > 0, (-b + root) / a, 1.0)
+        rise = ends[:, 2] - starts[:, 2]
+        below, above = spot[2] - radius_m - starts[:, 2], spot[2] + radius_m - starts[:, 2]
+        at = np.sort(np.column_stack((below / rise, above / rise)), axis=1)
+        level = np.where((below <= 0) & (above >= 0), 0.0, np.inf)
+    known = ~np.isnan(rise) & ~math.isnan(spot[2]) & (starts[:, 3] == spot[3]) & (ends[:, 3] == spot[3])
+    sloped = known & (rise != 0)
+    low = np.maximum(low, np.where(sloped, at[:, 0], np.where(known, level, 0.0)))
+    high = np.minimum(high, np.where(sloped, at[:, 1], 1.0))
+    low, high = np.maximum(low, 0.0), np.minimum(high, 1.0)
+    never = ~(span >= 0) | ~(low <= high)
+    return np.where(never[:, None], np.inf, np.column_stack((low, high)))

@@ -109,6 +109,7 @@ class ItemStore:
     kind: MissionKind
     items: list[Item] = field(default_factory=list)
     accept: Callable[[list[Item]], MissionResult] = lambda _items: MissionResult.ACCEPTED
+    home: Item | None = None
 
 
 def item_from(message: Message) -> Item:
@@ -289,10 +290,12 @@ class Transfers:
 
     def _give(self, channel: Channel, message: Message, store: ItemStore) -> None:
         seq = message.integer("seq")
-        if not 0 <= seq < len(store.items):
+        # Item 0 of a mission is home, and may be read even when there is no mission.
+        homes = [store.home] if store.home is not None and not store.items else store.items
+        if not 0 <= seq < len(homes):
             self._ack(channel, message, store.kind, MissionResult.INVALID_SEQUENCE)
             return
-        item = store.items[seq]
+        item = homes[seq]
         integers = message.name == "MISSION_REQUEST_INT"
         channel.send(
             "MISSION_ITEM_INT" if integers else "MISSION_ITEM",
@@ -340,7 +343,7 @@ class Mission:
     """The stored mission and where its execution stands; item 0 is home, as in ArduPilot."""
 
     def __init__(self) -> None:
-        self.store = ItemStore(MissionKind.MISSION)
+        self.store = ItemStore(MissionKind.MISSION, home=Item(Command.NAV_WAYPOINT, frame=Frame.GLOBAL))
         self.current = 0
         self.complete = False
         self._jumps: dict[int, int] = {}
@@ -376,5 +379,6 @@ class Mission:
 
     def with_home(self, home: Item) -> None:
         """Keep item 0 equal to home."""
+        self.store.home = replace(home, frame=Frame.GLOBAL, command=Command.NAV_WAYPOINT)
         if self.items:
-            self.items[0] = replace(home, frame=Frame.GLOBAL, command=Command.NAV_WAYPOINT)
+            self.items[0] = self.store.home

@@ -1,0 +1,126 @@
+"""One cluster with Fractus installed, shared by all end-to-end tests.
+
+FRACTUS_E2E_CLUSTER=current runs them on the cluster of KUBECONFIG (k3s, kind), where the images are loaded and the nodes
+carry fractus.dev/class labels; otherwise an embedded cluster comes up and goes down again.
+"""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import shutil
+import subprocess
+from collections.abc import Iterator
+
+import pytest
+import yaml
+from fractus_sim.cluster import Cluster
+from fractus_sim.cluster.binaries import ensure_binaries
+from fractus_sim.cluster.images.build import build_images
+from kube import Kube, Object, condition
+
+ROOT = pathlib.Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "traffic-monitoring"
+TARGETS = ("operator", "agent", "services", "example-traffic-monitoring")
+SYSTEM = "fractus-system"
+DRONE = "drone-1"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Everything here needs a cluster, and time."""
+    for item in items:
+        if pathlib.Path(__file__).parent in item.path.parents:
+            item.add_marker(pytest.mark.e2e)
+            item.add_marker(pytest.mark.timeout(420))
+
+
+def say(line: str) -> None:
+    """Progress of what takes long, past pytest's capture."""
+    os.write(2, f"e2e: {line}\n".encode())
+
+
+@pytest.fixture(scope="session")
+def cluster() -> Iterator[Cluster | None]:
+    """The embedded cluster; None when the tests run on the user's."""
+    if os.environ.get("FRACTUS_E2E_CLUSTER", "embedded") == "current":
+        yield None
+        return
+    built = build_images(ROOT, targets=TARGETS, report=say)
+    up = Cluster.load(ROOT / "examples" / "clusters" / "demo.yaml", name="e2e", report=say)
+    up.down()
+    try:
+        up.up(images=built)
+        yield up
+    finally:
+        if not os.environ.get("FRACTUS_E2E_KEEP"):
+            up.down()
+
+
+@pytest.fixture(scope="session")
+def kube(cluster: Cluster | None) -> Kube:
+    """The cluster with CRDs, operator, agents and services, its drone ready to fly."""
+    if cluster is not None:
+        programs = ensure_binaries(("kubectl", "helm"), report=say)
+        kubectl, helm, kubeconfig = programs["kubectl"], programs["helm"], cluster.kubeconfig
+    else:
+        kubectl, helm = (pathlib.Path(shutil.which(name) or name) for name in ("kubectl", "helm"))
+        kubeconfig = pathlib.Path(os.environ.get("KUBECONFIG", "~/.kube/config")).expanduser()
+    kube = Kube(kubectl, kubeconfig)
+    for release in ("fractus-crds", "fractus"):
+        chart = ROOT / "charts" / release
+        done = subprocess.run(
+            [helm, "upgrade", "--install", release, chart, "-n", SYSTEM, "--create-namespace"],
+            env={**os.environ, "KUBECONFIG": str(kubeconfig)},
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+    if cluster is None:
+        kube.must("apply", "-f", str(ROOT / "examples" / "simulated-hardware.yaml"))
+        for name in ("drone.yaml", "edge-nodes.yaml"):
+            kube.must("apply", "-f", str(EXAMPLE / name))
+    for name in ("depot.yaml", "zones.yaml", "policies.yaml"):
+        kube.must("apply", "-f", str(EXAMPLE / name))
+    kube.wait(
+        "the drone is Ready",
+        lambda: condition(kube.get("drone", DRONE), "Ready").get("status") == "True",
+        timeout_s=120,
+    )
+    return kube
+
+
+@pytest.fixture
+def grounded(kube: Kube) -> Iterator[Kube]:
+    """The cluster with its drone on the ground before the test, and without Applications after it."""
+    kube.wait("the drone is on the ground", lambda: flight_state(kube) in {"inactive", "charging"}, timeout_s=120)
+    yield kube
+    kube.run("delete", "applications.fractus.dev", "--all", "-A", "--wait=true", "--timeout=60s", timeout_s=90)
+    kube.wait("the drone came home", lambda: flight_state(kube) in {"inactive", "charging"}, timeout_s=180)
+
+
+def flight_state(kube: Kube) -> str | None:
+    """What the drone's agent last reported."""
+    drone = kube.get("drone", DRONE)
+    return ((drone or {}).get("status") or {}).get("flightState")
+
+
+def example(name: str) -> list[Object]:
+    """The objects of one of the example's manifests."""
+    return list(yaml.safe_load_all((EXAMPLE / name).read_text()))
+
+
+def short_flight(name: str, namespace: str = "default") -> Object:
+    """The example's Navigator alone, on a short path that stays near the depot: about a minute in the air."""
+    app = example("application.yaml")[0]
+    navigator = next(c for c in app["spec"]["components"] if c["name"] == "Navigator")
+    navigator["controlPoints"][0]["path"] = [
+        {"lat": 50.864239, "lon": 4.679068, "alt": 12},
+        {"lat": 50.864800, "lon": 4.679300, "alt": 12},
+        {"lat": 50.864239, "lon": 4.679068, "alt": 12},
+    ]
+    navigator["container"].pop("env", None)
+    app["metadata"] = {"name": name, "namespace": namespace}
+    app["spec"]["components"] = [navigator]
+    return app

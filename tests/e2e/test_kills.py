@@ -1,0 +1,67 @@
+"""Kill -9, in flight, of each part: the mission goes on or the system brings the drone home; nobody flies unsupervised."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from conftest import DRONE, SYSTEM, flight_state, short_flight
+from kube import Kube, Object
+from test_mission import audit_log, phase
+
+PARTS: dict[str, tuple[str, str, str | None]] = {
+    "operator": ("app.kubernetes.io/component=operator", SYSTEM, None),
+    "agent": ("app.kubernetes.io/component=agent", SYSTEM, DRONE),
+    "mobility": ("app.kubernetes.io/component=mobility", SYSTEM, DRONE),
+    "navigator": ("fractus.dev/component=Navigator", "default", DRONE),
+}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_kill_in_flight(grounded: Kube, part: str) -> None:
+    kube = grounded
+    name = f"kill-{part}"
+    entries = len(audit_log(kube))
+    kube.apply(short_flight(name))
+    kube.wait("the drone flies", lambda: flight_state(kube) == "flying", timeout_s=120)
+    kube.wait("the first waypoint is near", in_midleg(kube, entries), timeout_s=60)
+    selector, namespace, node = PARTS[part]
+    pod = kube.pod(selector, namespace, node)
+    before = restarts(pod)
+    kube.kill_pod(pod)
+    kube.wait(
+        f"{part} runs again",
+        lambda: restarts(kube.pod(selector, namespace, node)) > before,
+        timeout_s=60,
+    )
+    kube.wait("the mission is over", lambda: phase(kube, name) in {"Completed", "Failed"}, timeout_s=240)
+    kube.wait("the drone is home", lambda: flight_state(kube) == "inactive", timeout_s=150)
+    log = audit_log(kube)[entries:]
+    assert_supervised(log)
+    landed = [e for e in log if e["kind"] == "control" and e["action"] == "landed"]
+    assert landed, "nobody saw the drone land"
+    if part in {"operator", "agent"}:
+        assert phase(kube, name) == "Completed"
+        assert not [e for e in log if e["kind"] == "takeover"]
+
+
+def in_midleg(kube: Kube, entries: int) -> Callable[[], bool]:
+    """Whether the audit log shows a goto that was let through."""
+
+    def seen() -> bool:
+        return any(
+            e["kind"] == "call" and e["method"] == "Goto" and e["action"] != "deny" for e in audit_log(kube)[entries:]
+        )
+
+    return seen
+
+
+def restarts(pod: Object) -> int:
+    return sum(c["restartCount"] for c in pod["status"].get("containerStatuses", ()))
+
+
+def assert_supervised(log: list[Object]) -> None:
+    """While armed there is a record at least every few seconds, or a takeover after the gap."""
+    states = [e for e in log if e["kind"] == "state"]
+    assert states, "no flight was recorded"
+    assert all(s["controller"] for s in states)

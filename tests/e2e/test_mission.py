@@ -1,0 +1,119 @@
+"""The main job: one manifest flies a drone under policies, and leaves nothing behind."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+
+from conftest import DRONE, SYSTEM, example, flight_state, short_flight
+from fractus_services.audit import verify
+from kube import Kube, Object, condition
+
+MOBILITY = "app.kubernetes.io/component=mobility"
+
+
+def phase(kube: Kube, name: str, namespace: str = "default") -> str | None:
+    app = kube.get("application.fractus.dev", name, namespace)
+    return ((app or {}).get("status") or {}).get("phase")
+
+
+def ready(kube: Kube, name: str) -> bool:
+    return condition(kube.get("application.fractus.dev", name), "Ready").get("status") == "True"
+
+
+def audit_text(kube: Kube) -> str:
+    pod = kube.pod(MOBILITY, SYSTEM, node=DRONE)["metadata"]["name"]
+    return kube.must("exec", "-n", SYSTEM, pod, "--", "cat", "/var/lib/fractus/audit/mobility.jsonl")
+
+
+def audit_log(kube: Kube) -> list[Object]:
+    return [json.loads(line) for line in audit_text(kube).splitlines()]
+
+
+def children(kube: Kube, namespace: str = "default") -> list[str]:
+    kinds = "deployments,replicasets,pods,services,secrets,endpointslices"
+    found = kube.all(kinds, namespace, "fractus.dev/application")
+    grants = kube.all("grants.fractus.dev")
+    return [f"{o['kind']}/{o['metadata']['name']}" for o in (*found, *grants)]
+
+
+def test_traffic_monitoring_flies_under_policies(grounded: Kube) -> None:
+    kube = grounded
+    app = example("application.yaml")[0]
+    started = time.monotonic()
+    kube.apply(app)
+    kube.wait("all pods of the example are Ready", lambda: ready(kube, "traffic-monitoring"), timeout_s=60)
+    print(f"apply to all pods Ready: {time.monotonic() - started:.1f} s")
+
+    plan = kube.get("deploymentplan", "traffic-monitoring")
+    placed = {(p["component"], p.get("node")) for p in plan["spec"]["placements"]}
+    assert {
+        ("Navigator", DRONE),
+        ("AerialViewer", DRONE),
+        ("GroundViewer", "edge-1"),
+        ("GroundViewer", "edge-2"),
+    } <= placed
+    assert ("ImageChecker", None) in placed
+    assert {n for c, n in placed if c == "ImageChecker"} >= {"edge-1", "edge-2"}
+    dropped = {(r["component"], r["node"]): r["reason"] for r in plan["spec"]["rejected"]}
+    assert dropped["ImageChecker", "edge-3"] == "NoCoverage"
+    for pod in kube.all("pods", "default", "fractus.dev/application=traffic-monitoring"):
+        labels = pod["metadata"]["labels"]
+        assert {"fractus.dev/component", "fractus.dev/instance", "fractus.dev/placement"} <= labels.keys()
+        node = pod["spec"]["nodeName"]
+        assert node == "cloud-1" if labels["fractus.dev/placement"] == "cloud" else node
+
+    kube.wait("the drone flies", lambda: flight_state(kube) == "flying", timeout_s=90)
+    kube.wait(
+        "the mission is over", lambda: phase(kube, "traffic-monitoring") in {"Completed", "Failed"}, timeout_s=240
+    )
+    finished = kube.get("application.fractus.dev", "traffic-monitoring")
+    assert finished["status"]["phase"] == "Completed", finished["status"]
+    kube.wait("the drone is home", lambda: flight_state(kube) == "inactive", timeout_s=120)
+
+    log = audit_log(kube)
+    calls = [e for e in log if e.get("kind") == "call"]
+    assert any(e["action"] == "correct" and "town-altitude" in e["policies"] for e in calls)
+    assert any(e["action"] == "deny" and "no-fly-hospital" in e["policies"] for e in calls)
+    heights = [e["alt"] for e in log if e.get("kind") == "state"]
+    assert 45 < max(heights) < 52
+    kube.wait("nothing but the plan is left", lambda: not children(kube), timeout_s=60)
+    events = {e["reason"] for e in kube.all("events", "default")}
+    assert {"Planned", "MissionComplete"} <= events
+
+
+def test_deleting_the_application_in_flight_brings_the_drone_home(grounded: Kube) -> None:
+    kube = grounded
+    kube.apply(short_flight("deleted"))
+    kube.wait("the drone flies", lambda: flight_state(kube) == "flying", timeout_s=120)
+    kube.must("delete", "application.fractus.dev", "deleted", "--wait=true", "--timeout=60s", timeout_s=90)
+    kube.wait("nothing is left", lambda: not children(kube), timeout_s=60)
+    assert kube.get("deploymentplan", "deleted") is None
+    kube.wait("the drone is home", lambda: flight_state(kube) == "inactive", timeout_s=150)
+    takeovers = [e for e in audit_log(kube) if e.get("kind") == "takeover"]
+    assert any(e.get("code") == "GrantRevoked" for e in takeovers)
+
+
+def test_deleting_while_the_operator_is_down_leaves_nothing(grounded: Kube) -> None:
+    kube = grounded
+    kube.apply(short_flight("orphan"))
+    kube.wait("its grant is there", lambda: kube.all("grants.fractus.dev"), timeout_s=60)
+    kube.must("scale", "deployment/fractus-operator", "-n", SYSTEM, "--replicas=0")
+    try:
+        kube.wait("the operator is gone", lambda: not kube.all("pods", SYSTEM, "app.kubernetes.io/component=operator"))
+        kube.must("delete", "application.fractus.dev", "orphan", "--wait=false")
+    finally:
+        kube.must("scale", "deployment/fractus-operator", "-n", SYSTEM, "--replicas=1")
+    kube.wait("the application is gone", lambda: kube.get("application.fractus.dev", "orphan") is None, timeout_s=90)
+    kube.wait("nothing is left", lambda: not children(kube), timeout_s=60)
+
+
+def test_audit_log_is_an_unbroken_chain(kube: Kube) -> None:
+    log = audit_text(kube)
+    finding = verify(line.encode() for line in log.splitlines(keepends=True))
+    assert finding.problem == ""
+    assert finding.entries > 10
+    forged = re.sub(r'"alt":-?[0-9.]+', '"alt":999', log, count=1)
+    assert forged != log
+    assert verify(line.encode() for line in forged.splitlines(keepends=True)).problem

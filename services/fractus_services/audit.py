@@ -7,6 +7,7 @@ import contextlib
 import hashlib
 import json
 import logging
+import math
 import os
 import queue
 import threading
@@ -37,7 +38,7 @@ def _canonical(value: dict[str, Any]) -> bytes:
 
 def _plain(value: Any) -> Any:
     """JSON without NaN and infinities: they become text."""
-    if isinstance(value, float) and (value != value or value in {float("inf"), float("-inf")}):
+    if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     if isinstance(value, dict):
         return {key: _plain(inner) for key, inner in value.items()}
@@ -124,7 +125,7 @@ class AuditLog:
                 os.close(file)
         except OSError as error:
             if not self.failure:
-                log.error("cannot write the audit log %s: %s", self._path, error)
+                log.critical("cannot write the audit log %s: %s", self._path, error)
             self.failure = f"the audit log cannot be written: {error.strerror or error}"
             return lines[-10_000:]
         self.failure = ""
@@ -167,7 +168,7 @@ def _last_link(path: Path) -> tuple[int, str]:
         entry = json.loads(last)
         return int(entry["seq"]), str(entry["hash"])
     except (ValueError, KeyError, TypeError):
-        log.error("the last entry of %s cannot be read; a new chain begins after it", path)
+        log.critical("the last entry of %s cannot be read; a new chain begins after it", path)
         return 0, GENESIS
 
 

@@ -128,12 +128,12 @@ class TlsFiles:
         try:
             return self._configuration() if self._stamps() != self._stamp else None
         except OSError as error:
-            log.error("cannot read the renewed certificate, keeping the old one: %s", error)
+            log.critical("cannot read the renewed certificate, keeping the old one: %s", error)
             return None
 
     def server_credentials(self) -> Any:
         """Credentials of a server that demands client certificates."""
-        return grpc.dynamic_ssl_server_credentials(self._configuration(), self._changed, True)  # noqa: FBT003
+        return grpc.dynamic_ssl_server_credentials(self._configuration(), self._changed, True)
 
     def client_credentials(self) -> Any:
         """Credentials of a client, as the files are now."""

@@ -88,7 +88,7 @@ class GrantFiles:
                 ):  # fmt: skip
                     self.scan()
             except (OSError, RuntimeError) as error:
-                log.error("cannot watch %s, looking again: %s", self._directory, error)
+                log.warning("cannot watch %s, looking again: %s", self._directory, error)
             await asyncio.sleep(RESCAN_MS / 1000)
             self.scan()
 
@@ -103,7 +103,7 @@ class GrantFiles:
                     continue
                 found[path] = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
         except OSError as error:
-            log.error("cannot read the grants in %s: %s; nothing is granted", self._directory, error)
+            log.critical("cannot read the grants in %s: %s; nothing is granted", self._directory, error)
         if found == self._stamps:
             return
         for path in self._stamps.keys() - found.keys():
@@ -122,7 +122,7 @@ class GrantFiles:
                 return None
             compiled = compile_grant(grant.spec, flat_terrain=self._flat_terrain)
         except (OSError, ValueError, InvalidObject) as error:
-            log.error("%s is no grant, so nothing is granted by it: %s", path, error)
+            log.critical("%s is no grant, so nothing is granted by it: %s", path, error)
             return None
         return Held(grant.metadata.uid or grant.spec.identity, grant.name, grant.spec, compiled)
 

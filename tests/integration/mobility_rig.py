@@ -83,8 +83,9 @@ def grant(*policies: dict[str, Any], **changes: Any) -> dict[str, Any]:
     return {"apiVersion": "fractus.dev/v1alpha1", "kind": "Grant", "metadata": metadata, "spec": spec}
 
 
-def passenger_grant(**changes: Any) -> dict[str, Any]:
+def passenger_grant(*policies: dict[str, Any], **changes: Any) -> dict[str, Any]:
     return grant(
+        *policies,
         **{
             "component": "AerialViewer",
             "instance": "app-aerial-viewer",
@@ -194,6 +195,29 @@ class Rig:
                 [sys.executable, *arguments], stdout=log, stderr=subprocess.STDOUT, env={**os.environ, "MALLOC_ARENA_MAX": "2"}
             )
 
+    def start_camera(self, *more: str, description: str = "") -> str:
+        """The camera service; returns its address."""
+        address = f"127.0.0.1:{free_port()}"
+        path = self.directory / "node.yaml"
+        if description:
+            path.write_text(description)
+        self._start(
+            "camera", "-m", "fractus_services.camera", "serve", "--grants", str(self.grants), "--tls", str(self.tls),
+            "--state", str(self.directory / "pictures"), "--audit", str(self.directory / "camera.jsonl"), "--node", NODE,
+            "--description", str(path), "--mobility", self.address, "--listen", address, *more,
+        )  # fmt: skip
+        return address
+
+    def start_driver(self) -> None:
+        """A driver in a process of its own, that takes off and hovers."""
+        key, certificate = self.authority.issue(DRIVER)
+        for name, data in (("key", key), ("crt", certificate), ("ca", self.authority.pem)):
+            (self.directory / f"driver.{name}").write_bytes(data)
+        self._start("driver", __file__, self.address, str(self.directory / "driver"))
+
+    def tell(self, name: str, number: signal.Signals) -> None:
+        self._processes[name].send_signal(number)
+
     def kill(self, name: str, how: signal.Signals = signal.SIGKILL) -> None:
         process = self._processes[name]
         process.send_signal(how)
@@ -202,11 +226,13 @@ class Rig:
     def pid(self, name: str) -> int:
         return self._processes[name].pid
 
-    def channel(self, identity: str, authority: Authority | None = None, **how: Any) -> grpc.aio.Channel:
+    def channel(
+        self, identity: str, authority: Authority | None = None, address: str = "", **how: Any
+    ) -> grpc.aio.Channel:
         key, certificate = (authority or self.authority).issue(identity, **how)
         credentials = grpc.ssl_channel_credentials(self.authority.pem, key, certificate)
         channel = grpc.aio.secure_channel(
-            self.address,
+            address or self.address,
             credentials,
             options=[
                 ("grpc.ssl_target_name_override", node_server_name(NODE)),
@@ -346,3 +372,21 @@ async def denied(call: Awaitable[Any]) -> tuple[grpc.StatusCode, types_pb2.Decis
 
 def xy(position: types_pb2.Position) -> tuple[float, float]:
     return FRAME.xy(position.latitude_deg, position.longitude_deg)
+
+
+def _drive(address: str, files: str) -> None:
+    """The driver process: take off, then hover for ever."""
+    ca, key, certificate = (Path(f"{files}.{name}").read_bytes() for name in ("ca", "key", "crt"))
+    credentials = grpc.ssl_channel_credentials(ca, key, certificate)
+    options = [("grpc.ssl_target_name_override", node_server_name(NODE))]
+    with grpc.secure_channel(address, credentials, options) as channel:
+        stub = mobility_pb2_grpc.MobilityServiceStub(channel)
+        events = stub.GetControl(pb.GetControlRequest())
+        for event in events:
+            if event.state == pb.ControlEvent.STATE_GRANTED:
+                stub.Arm(pb.ArmRequest())
+                list(stub.Takeoff(pb.TakeoffRequest(altitude_m=10)))
+
+
+if __name__ == "__main__":
+    _drive(sys.argv[1], sys.argv[2])

@@ -7,22 +7,24 @@ import logging
 import signal
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import click
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What the command line says."""
+    """What the command line says; node and autopilot default to the description's."""
 
     grants: Path
     tls: Path
     state: Path
     audit: Path
-    node: str
-    autopilot: str
+    node: str | None
+    description: Path
+    autopilot: str | None
     listen: str
-    driver_grace_s: float
+    driver_grace: float
     flat_terrain: bool
 
 
@@ -86,27 +88,22 @@ def mobility() -> None:
     help="Take the ground everywhere for as high as home; otherwise limits above terrain refuse.",
 )
 @click.option("--verbose", "-v", is_flag=True, help="Log more.")
-def serve(
-    grants: Path, tls: Path, state: Path, audit: Path, node: str | None, description: Path, autopilot: str | None,
-    listen: str, driver_grace: float, flat_terrain: bool, verbose: bool,
-) -> None:  # fmt: skip
+def serve(verbose: bool, **given: Any) -> None:
     """Serve until stopped; waits for certificates and for the autopilot."""
     logging.basicConfig(
         level=logging.DEBUG if verbose else logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s"
     )
-    from fractus_services.mobility.server import describe, run  # noqa: PLC0415 - the command line stays quick
-
-    name, link = describe(description)
-    options = Options(grants, tls, state, audit, node or name, autopilot or link, listen, driver_grace, flat_terrain)
-    asyncio.run(_until_signalled(run, options))
+    asyncio.run(_until_signalled(Options(**given)))
 
 
-async def _until_signalled(run: object, options: Options) -> None:
+async def _until_signalled(options: Options) -> None:
+    from fractus_services.mobility.server import run  # noqa: PLC0415 - the command line stays quick
+
     loop = asyncio.get_running_loop()
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    await run(options, stop)  # type: ignore[operator]
+    await run(options, stop)
 
 
 if __name__ == "__main__":

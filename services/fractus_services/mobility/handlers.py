@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
-from collections.abc import AsyncIterator, Callable
-from contextlib import aclosing, asynccontextmanager
+from collections.abc import AsyncIterator
+from contextlib import aclosing
 from typing import Any
 
-import grpc
 from fractus_core.api.geometry import Reference
 from fractus_core.api.plans import node_identity
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, Verdict
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc, types_pb2
 
-from fractus_services.auth import Caller, NotAuthenticated, caller_of
-from fractus_services.grants import GrantFiles, Held
+from fractus_services.answering import Reception
+from fractus_services.clock import Clock
+from fractus_services.grants import GrantFiles
 from fractus_services.mobility.autopilot import AutopilotError
 from fractus_services.mobility.control import Control
 from fractus_services.mobility.leases import News, State
 from fractus_services.mobility.service import MobilityService, Progress
 from fractus_services.mobility.telemetry import position_of, telemetry_of, velocity_of
-from fractus_services.replies import Refused, abort, decision, precondition, refused, unavailable
-
-log = logging.getLogger(__name__)
+from fractus_services.replies import Refused, decision, precondition, refused, unavailable
 
 LEAST_INTERVAL_S, USUAL_INTERVAL_S = 0.05, 0.2
 
@@ -41,57 +38,27 @@ _STATES = {
 }
 
 
-class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):  # type: ignore[misc]
+class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     """The service on the wire."""
 
-    def __init__(
-        self, service: MobilityService, control: Control, grants: GrantFiles, node: str, clock: Callable[[], float]
-    ) -> None:
+    def __init__(self, service: MobilityService, control: Control, grants: GrantFiles, node: str, clock: Clock) -> None:
         self._service = service
         self._control = control
-        self._grants = grants
         self._node = node_identity(node)
         self._clock = clock
+        self._reception = Reception(grants, clock, _known, self._failed)
+        self._held = self._reception.held
 
-    @asynccontextmanager
-    async def _answering(self, context: Any) -> AsyncIterator[Caller]:
-        """The caller; what goes wrong inside becomes a status with details."""
-        try:
-            yield caller_of(context.auth_context(), self._clock())
-        except NotAuthenticated as error:
-            await abort(
-                context,
-                Refused(grpc.StatusCode.UNAUTHENTICATED, Verdict("deny", None, "NotAuthenticated", str(error))),
-            )
-        except Refused as refusal:
-            await abort(context, refusal)
-        except AutopilotError as error:
-            await abort(
-                context, unavailable(str(error)) if error.link else precondition("AutopilotRefused", str(error))
-            )
-        except grpc.aio.AbortError:
-            raise
-        except Exception:
-            log.exception("a call failed inside the service; refused")
-            verdict = Verdict(
-                "deny", None, "InternalError", "the service failed; the drone holds its position", (), "hover"
-            )
-            if self._control.hands == "driver" and self._control.autopilot.vehicle.in_air:
-                self._control.brake(verdict)
-            await abort(context, Refused(grpc.StatusCode.INTERNAL, verdict))
-
-    def _held(self, caller: Caller) -> Held:
-        held = self._grants.of(caller.identity)
-        if held is None:
-            reason = f"{caller.identity} has no grant on this node"
-            raise refused(Verdict("deny", None, "NoGrant", reason))
-        return held
+    def _failed(self, verdict: Verdict) -> None:
+        """Something in here broke: hold the drone of a driver where it is."""
+        if self._control.hands == "driver" and self._control.autopilot.vehicle.in_air:
+            self._control.brake(verdict)
 
     # Control
 
     async def GetControl(self, _request: Any, context: Any) -> None:  # noqa: N802 - the protocol's name
         """See mobility.proto."""
-        async with self._answering(context) as caller:
+        async with self._reception.call(context) as caller:
             held = self._held(caller)
             self._service.allow(Call("GetControl"), held)
             try:
@@ -106,7 +73,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):  # type: igno
 
     async def ReturnControl(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._answering(context) as caller:
+        async with self._reception.call(context) as caller:
             held = self._held(caller)
             self._service.allow(Call("ReturnControl"), held)
             last = await self._control.give_back(held)
@@ -116,35 +83,35 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):  # type: igno
 
     async def Arm(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._answering(context) as caller:
+        async with self._reception.call(context) as caller:
             return mobility_pb2.ArmResponse(decision=decision(await self._service.arm(self._held(caller))))
 
     async def Disarm(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._answering(context) as caller:
+        async with self._reception.call(context) as caller:
             return mobility_pb2.DisarmResponse(decision=decision(await self._service.disarm(self._held(caller))))
 
     async def Hover(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._answering(context) as caller:
+        async with self._reception.call(context) as caller:
             return mobility_pb2.HoverResponse(decision=decision(await self._service.hover(self._held(caller))))
 
     async def SetSpeed(self, request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._answering(context) as caller:
+        async with self._reception.call(context) as caller:
             verdict, speed = await self._service.set_speed(self._held(caller), SetSpeedArgs(request.speed_mps))
             return mobility_pb2.SetSpeedResponse(decision=decision(verdict), speed_mps=speed)
 
     async def GetSpeed(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._answering(context) as caller:
+        async with self._reception.call(context) as caller:
             verdict = self._service.allow(Call("GetSpeed"), self._held(caller))
             speed = self._control.autopilot.vehicle.speed_mps
             return mobility_pb2.GetSpeedResponse(decision=decision(verdict), speed_mps=speed)
 
     async def GetPosition(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._answering(context) as caller:
+        async with self._reception.call(context) as caller:
             verdict = self._service.allow(Call("GetPosition"), self._held(caller))
             vehicle = self._control.autopilot.vehicle
             if vehicle.lat is None:
@@ -157,25 +124,25 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):  # type: igno
 
     async def Takeoff(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._answering(context) as caller:
+        async with self._reception.call(context) as caller:
             progress = self._service.take_off(self._held(caller), TakeoffArgs(request.altitude_m))
             await self._report(progress, context)
 
     async def Goto(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._answering(context) as caller:
+        async with self._reception.call(context) as caller:
             args = _goto(request)
             progress = self._service.goto(self._held(caller), args, _finite(request.acceptance_radius_m))
             await self._report(progress, context)
 
     async def Land(self, _request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._answering(context) as caller:
+        async with self._reception.call(context) as caller:
             await self._report(self._service.land(self._held(caller)), context)
 
     async def ReturnToLaunch(self, _request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._answering(context) as caller:
+        async with self._reception.call(context) as caller:
             await self._report(self._service.return_to_launch(self._held(caller)), context)
 
     async def _report(self, progress: AsyncIterator[Progress], context: Any) -> None:
@@ -196,7 +163,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):  # type: igno
 
     async def SubscribeTelemetry(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._answering(context) as caller:
+        async with self._reception.call(context) as caller:
             if caller.identity != self._node:
                 self._service.allow(Call("GetPosition"), self._held(caller))
             interval = (
@@ -209,6 +176,12 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):  # type: igno
                     self._held(caller)
                 await context.write(telemetry_of(self._control, self._clock()))
                 await asyncio.sleep(interval)
+
+
+def _known(error: Exception) -> Refused | None:
+    if not isinstance(error, AutopilotError):
+        return None
+    return unavailable(str(error)) if error.link else precondition("AutopilotRefused", str(error))
 
 
 def _event(news: News) -> Any:

@@ -61,7 +61,7 @@ class Journal:
         except FileNotFoundError:
             return
         except (OSError, ValueError, KeyError, TypeError) as error:
-            log.error("the journal %s cannot be read, missions begin anew: %s", self._path, error)
+            log.critical("the journal %s cannot be read, missions begin anew: %s", self._path, error)
 
     @property
     def flying(self) -> Mission | None:
@@ -88,7 +88,7 @@ class Journal:
             try:
                 await asyncio.to_thread(self._write, json.dumps(stored, indent=1).encode())
             except OSError as error:
-                log.error("cannot write the journal %s: %s", self._path, error)
+                log.critical("cannot write the journal %s: %s", self._path, error)
 
     def save_soon(self) -> None:
         """Write in the background."""

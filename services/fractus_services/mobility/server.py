@@ -52,22 +52,24 @@ def describe(path: Path) -> tuple[str, str]:
 async def run(options: Options, stop: asyncio.Event) -> None:
     """Serve until `stop` is set, or a part of the service fails."""
     clock = Clock()
+    name, link = describe(options.description)
+    node, url = options.node or name, options.autopilot or link
     tls = TlsFiles(options.tls)
     audit = AuditLog(options.audit, clock)
-    grants = GrantFiles(options.grants, options.node, options.flat_terrain)
+    grants = GrantFiles(options.grants, node, options.flat_terrain)
     journal = Journal(options.state)
-    autopilot = Autopilot(options.autopilot)
-    control = Control(autopilot, journal, grants, audit, options.driver_grace_s)
+    autopilot = Autopilot(url)
+    control = Control(autopilot, journal, grants, audit, options.driver_grace)
     guard = Guard(control, audit, clock)
     control.chauffeur = Chauffeur(control, guard).bring
     watch = Watch(control, guard, audit)
     autopilot.on_found = control.found
     autopilot.on_message = lambda m: control.heartbeat() if m.get_type() == "HEARTBEAT" else None
-    audit.append("started", {"node": options.node, "autopilot": options.autopilot})
+    audit.append("started", {"node": node, "autopilot": url})
     grants.listen(lambda old, new: _record_grant(audit, old, new))
     grants.scan()
     service = MobilityService(control, guard)
-    handlers = MobilityHandlers(service, control, grants, options.node, clock)
+    handlers = MobilityHandlers(service, control, grants, node, clock)
     async with asyncio.TaskGroup() as tasks:
         running = [
             tasks.create_task(part)
@@ -89,10 +91,10 @@ def _record_grant(audit: AuditLog, old: Any, new: Any) -> None:
 async def _serve(options: Options, tls: TlsFiles, handlers: MobilityHandlers) -> None:
     await tls.wait()
     server = grpc.aio.server(options=KEEPALIVE)
-    mobility_pb2_grpc.add_MobilityServiceServicer_to_server(handlers, server)
+    mobility_pb2_grpc.add_MobilityServiceServicer_to_server(handlers, server)  # type: ignore[no-untyped-call]
     server.add_secure_port(options.listen, tls.server_credentials())
     await server.start()
-    log.info("mobility service of %s on %s", options.node, options.listen)
+    log.info("mobility service on %s", options.listen)
     try:
         await asyncio.Event().wait()
     finally:

@@ -151,5 +151,5 @@ async def open_link(url: str, receive: Receive, closed: Closed) -> Transport:
             lambda: _Datagrams(receive, closed, peer), local_addr=local, remote_addr=None if local else peer
         )
         if peer is not None:
-            protocol._peer = None  # noqa: SLF001 - a connected socket sends to its peer
+            protocol._peer = None
         return protocol

@@ -1,0 +1,102 @@
+"""`fractus camera`: the camera service of a drone or an edge node, with or without Kubernetes around it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What the command line says."""
+
+    grants: Path
+    tls: Path
+    state: Path
+    audit: Path
+    node: str | None
+    description: Path
+    mobility: str
+    listen: str
+    keep: int
+    keep_mb: int
+
+
+_PATH = click.Path(path_type=Path)
+
+
+@click.group()
+def camera() -> None:
+    """The camera service of a node."""
+
+
+@camera.command()
+@click.option(
+    "--grants",
+    type=_PATH,
+    default="/var/lib/fractus/grants",
+    show_default=True,
+    help="Directory of Grant manifests (JSON).",
+)
+@click.option(
+    "--tls",
+    type=_PATH,
+    default="/var/lib/fractus/tls",
+    show_default=True,
+    help="Directory of tls.crt, tls.key and ca.crt.",
+)
+@click.option(
+    "--state", type=_PATH, default="/var/lib/fractus/camera", show_default=True, help="Directory of the pictures."
+)
+@click.option(
+    "--audit", type=_PATH, default="/var/lib/fractus/audit/camera.jsonl", show_default=True, help="Audit log."
+)
+@click.option("--node", envvar="FRACTUS_NODE", help="Name of this node; by default the description's, else the host's.")
+@click.option(
+    "--description",
+    type=_PATH,
+    default="/etc/fractus/node.yaml",
+    show_default=True,
+    help="Drone or EdgeNode manifest of this node.",
+)
+@click.option(
+    "--mobility", default="127.0.0.1:50051", show_default=True, help="Mobility service that tells a drone's position."
+)
+@click.option("--listen", default="[::]:50052", show_default=True, help="Address of the gRPC server.")
+@click.option(
+    "--keep",
+    type=click.IntRange(min=1),
+    default=200,
+    show_default=True,
+    help="Pictures kept for each component instance.",
+)
+@click.option(
+    "--keep-mb",
+    type=click.IntRange(min=1),
+    default=200,
+    show_default=True,
+    help="Megabytes of pictures kept for each component instance.",
+)
+def serve(**given: object) -> None:
+    """Serve until stopped; waits for certificates."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    asyncio.run(_until_signalled(Options(**given)))  # type: ignore[arg-type]
+
+
+async def _until_signalled(options: Options) -> None:
+    from fractus_services.camera.server import run  # noqa: PLC0415 - the command line stays quick
+
+    loop = asyncio.get_running_loop()
+    stop = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    await run(options, stop)
+
+
+if __name__ == "__main__":
+    camera()

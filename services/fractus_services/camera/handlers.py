@@ -1,0 +1,62 @@
+"""gRPC handlers of the camera service."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fractus_core.policy.values import CaptureArgs
+from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
+
+from fractus_services.answering import Reception
+from fractus_services.camera.album import Shot
+from fractus_services.camera.service import CameraService
+from fractus_services.replies import decision
+
+CHUNK_BYTES = 256 * 1024
+
+
+class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
+    """The service on the wire."""
+
+    def __init__(self, service: CameraService, reception: Reception) -> None:
+        self._service = service
+        self._reception = reception
+
+    async def CaptureImage(self, request: Any, context: Any) -> Any:  # noqa: N802 - the protocol's name
+        """See camera.proto."""
+        async with self._reception.call(context) as caller:
+            held = self._reception.held(caller)
+            verdict, shot = await self._service.capture(held, CaptureArgs(request.width, request.height))
+            return camera_pb2.CaptureImageResponse(decision=decision(verdict), image=_info(shot))
+
+    async def RetrieveImage(self, request: Any, context: Any) -> None:  # noqa: N802
+        """See camera.proto."""
+        async with self._reception.call(context) as caller:
+            verdict, shot, data = await self._service.retrieve(self._reception.held(caller), request.name)
+            first = camera_pb2.ImageChunk(decision=decision(verdict), image=_info(shot), data=data[:CHUNK_BYTES])
+            await context.write(first)
+            for at in range(CHUNK_BYTES, len(data), CHUNK_BYTES):
+                await context.write(camera_pb2.ImageChunk(data=data[at : at + CHUNK_BYTES]))
+
+    async def ListImages(self, _request: Any, context: Any) -> Any:  # noqa: N802
+        """See camera.proto."""
+        async with self._reception.call(context) as caller:
+            verdict, shots = await self._service.list(self._reception.held(caller))
+            return camera_pb2.ListImagesResponse(decision=decision(verdict), images=[_info(shot) for shot in shots])
+
+    async def DeleteImage(self, request: Any, context: Any) -> Any:  # noqa: N802
+        """See camera.proto."""
+        async with self._reception.call(context) as caller:
+            verdict = await self._service.delete(self._reception.held(caller), request.name)
+            return camera_pb2.DeleteImageResponse(decision=decision(verdict))
+
+
+def _info(shot: Shot) -> camera_pb2.ImageInfo:
+    info = camera_pb2.ImageInfo(
+        name=shot.name, width=shot.width, height=shot.height, size_bytes=shot.size_bytes, media_type="image/jpeg"
+    )
+    info.time.FromNanoseconds(int(shot.time_s * 1e9))
+    if shot.lat is not None and shot.lon is not None:
+        info.position.latitude_deg, info.position.longitude_deg = shot.lat, shot.lon
+        info.position.altitude_m = shot.altitude_m
+    return info

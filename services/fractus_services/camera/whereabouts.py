@@ -1,0 +1,104 @@
+"""Where the camera is: on a fixed node, or on a drone that tells by telemetry."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import grpc
+from fractus_core.api.nodes import EdgeNodeSpec
+from fractus_core.api.plans import node_server_name
+from fractus_core.policy.values import Home, Situation
+from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
+
+from fractus_services.auth import TlsFiles
+
+log = logging.getLogger(__name__)
+
+INTERVAL_S = 0.1
+STALE_S = 1.0
+RETRY_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Fixed:
+    """A node that stays where it is."""
+
+    lat: float
+    lon: float
+    amsl_m: float
+
+    @classmethod
+    def of(cls, spec: EdgeNodeSpec) -> Fixed:
+        """The place that a description gives."""
+        return cls(spec.location.lat, spec.location.lon, spec.location.alt or 0.0)
+
+    def situation(self, time_s: float) -> Situation:
+        """The state as the engine judges it: the node stands on its own home."""
+        home = Home(self.lat, self.lon, self.amsl_m)
+        return Situation(
+            time_s=time_s, lat=self.lat, lon=self.lon, home=home, position_error_m=0.5, altitude_error_m=0.5
+        )
+
+    async def run(self) -> None:
+        """Nothing to follow."""
+
+
+class Airborne:
+    """A drone's position, from the mobility service of the same node.
+
+    Args:
+        address: host:port of the mobility service.
+        node: name of the node.
+        tls: the node's certificate.
+        now: monotonic seconds.
+    """
+
+    def __init__(self, address: str, node: str, tls: TlsFiles, now: Callable[[], float]) -> None:
+        self._address = address
+        self._server_name = node_server_name(node)
+        self._tls = tls
+        self._now = now
+        self._latest: mobility_pb2.Telemetry | None = None
+        self._heard_at = 0.0
+
+    def situation(self, time_s: float) -> Situation:
+        """The state as the engine judges it; unknown when the mobility service is silent."""
+        message = self._latest
+        if message is None or self._now() - self._heard_at > STALE_S or not message.HasField("position"):
+            return Situation(time_s=time_s)
+        home = None
+        if message.HasField("home"):
+            home = Home(message.home.latitude_deg, message.home.longitude_deg, message.home.altitude_m)
+        return Situation(
+            time_s=time_s,
+            lat=message.position.latitude_deg,
+            lon=message.position.longitude_deg,
+            altitude_m=message.position.altitude_m,
+            north_mps=message.velocity.north_mps,
+            east_mps=message.velocity.east_mps,
+            down_mps=message.velocity.down_mps,
+            home=home,
+            armed=message.armed,
+            in_air=message.in_air,
+        )
+
+    async def run(self) -> None:
+        """Follow the telemetry until cancelled."""
+        options = (("grpc.ssl_target_name_override", self._server_name), ("grpc.enable_http_proxy", 0))
+        while True:
+            try:
+                async with grpc.aio.secure_channel(self._address, self._tls.client_credentials(), options) as channel:
+                    stub = mobility_pb2_grpc.MobilityServiceStub(channel)  # type: ignore[no-untyped-call]
+                    async for message in stub.SubscribeTelemetry(
+                        mobility_pb2.SubscribeTelemetryRequest(interval_s=INTERVAL_S)
+                    ):
+                        if message.autopilot_connected:
+                            self._latest, self._heard_at = message, self._now()
+            except grpc.aio.AioRpcError as error:
+                log.warning("no telemetry from %s: %s", self._address, error.details())
+            except OSError as error:
+                log.warning("no certificate for %s: %s", self._address, error)
+            await asyncio.sleep(RETRY_S)

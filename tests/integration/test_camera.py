@@ -1,0 +1,146 @@
+"""The camera service: pictures under policies, on edge nodes and on a drone that flies."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import grpc
+import numpy as np
+import pytest
+from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
+from fractus_services.audit import verify
+from mobility_rig import DRIVER, FRAME, HOME, NODE, PASSENGER, Driver, Rig, area, denied, grant, passenger_grant
+
+ALL = ["CaptureImage", "RetrieveImage", "ListImages", "DeleteImage"]
+CAMERA = [{"service": "camera", "methods": ALL}]
+EDGE = f"""
+apiVersion: fractus.dev/v1alpha1
+kind: EdgeNode
+metadata: {{name: {NODE}}}
+spec:
+  location: {{lat: {HOME[0]}, lon: {HOME[1]}, alt: {HOME[2]}, altitudeReference: amsl}}
+  services: {{camera: {{model: test, resolution: 640x480, methods: [CaptureImage, RetrieveImage]}}}}
+"""
+
+
+@pytest.fixture
+async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
+    rig = Rig(tmp_path)
+    try:
+        yield rig
+    finally:
+        await rig.close()
+
+
+def privacy(action: str, *box: float) -> dict[str, Any]:
+    spec = {"type": "PrivacyControl", "kind": "camera", "action": action, "selector": {"zones": ["private"]}}
+    return {"name": "privacy", "spec": spec, "zones": [{"name": "private", "area": area(*box)}]}
+
+
+def stub(rig: Rig, address: str, identity: str = PASSENGER) -> camera_pb2_grpc.CameraServiceStub:
+    return camera_pb2_grpc.CameraServiceStub(rig.channel(identity, address=address))
+
+
+async def capture(camera: Any, **size: int) -> camera_pb2.CaptureImageResponse:
+    return await camera.CaptureImage(camera_pb2.CaptureImageRequest(**size), wait_for_ready=True, timeout=20)
+
+
+async def retrieve(camera: Any, name: str) -> bytes:
+    chunks = [c async for c in camera.RetrieveImage(camera_pb2.RetrieveImageRequest(name=name), timeout=20)]
+    assert chunks[0].decision.action == types_pb2.Decision.ACTION_ALLOW
+    assert all(len(c.data) <= 256 * 1024 for c in chunks)
+    return b"".join(c.data for c in chunks)
+
+
+async def test_pictures_of_an_edge_node(rig: Rig) -> None:
+    viewer = passenger_grant(services=CAMERA, operationArea=[], **{"class": None})
+    rig.write_grant(viewer)
+    other = grant(services=CAMERA, operationArea=[])
+    rig.write_grant(other)
+    address = rig.start_camera("--keep", "2", description=EDGE)
+    camera = stub(rig, address)
+    taken = await capture(camera)
+    assert (taken.image.width, taken.image.height) == (640, 480)
+    data = await retrieve(camera, taken.image.name)
+    assert len(data) == taken.image.size_bytes
+    assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape == (480, 640, 3)
+    assert taken.image.position.latitude_deg == pytest.approx(HOME[0])
+
+    large = await capture(camera, width=3264, height=2448)
+    assert large.image.size_bytes > 256 * 1024
+    assert len(await retrieve(camera, large.image.name)) == large.image.size_bytes
+    code, why = await denied(capture(camera))
+    assert (code, why.code) == (grpc.StatusCode.RESOURCE_EXHAUSTED, "AlbumFull")
+    listed = await camera.ListImages(camera_pb2.ListImagesRequest(), timeout=5)
+    assert [i.name for i in listed.images] == [taken.image.name, large.image.name]
+
+    code, why = await denied(retrieve(stub(rig, address, DRIVER), taken.image.name))
+    assert (code, why.code) == (grpc.StatusCode.NOT_FOUND, "NoSuchImage"), "pictures are their taker's"
+    code, why = await denied(retrieve(camera, "../../../etc/passwd"))
+    assert code == grpc.StatusCode.NOT_FOUND
+    await camera.DeleteImage(camera_pb2.DeleteImageRequest(name=taken.image.name), timeout=5)
+    await capture(camera, width=64, height=64)
+    code, why = await denied(capture(camera, width=100_000, height=10))
+    assert code == grpc.StatusCode.INVALID_ARGUMENT
+    with (rig.directory / "camera.jsonl").open("rb") as log:
+        assert not verify(log).problem
+
+
+@pytest.mark.parametrize(("action", "code"), [("refuse", "PrivacyZone"), ("blurFaces", "FilterUnavailable")])
+async def test_privacy_fails_closed(rig: Rig, action: str, code: str) -> None:
+    free = passenger_grant(services=CAMERA, operationArea=[], **{"class": None})
+    rig.write_grant(free)
+    camera = stub(rig, rig.start_camera(description=EDGE))
+    taken = await capture(camera, width=64, height=64)
+    bound = passenger_grant(
+        services=CAMERA, operationArea=[], policies=[privacy(action, -20, -20, 20, 20)], **{"class": None}
+    )
+    rig.write_grant(bound)
+
+    async def until_refused(call: Any) -> tuple[grpc.StatusCode, types_pb2.Decision]:
+        for _ in range(200):
+            try:
+                await call()
+            except grpc.aio.AioRpcError:
+                return await denied(call())
+        raise AssertionError("the new policy has no effect")
+
+    status, why = await until_refused(lambda: retrieve(camera, taken.image.name))
+    assert (status, why.code) == (grpc.StatusCode.PERMISSION_DENIED, code)
+    status, why = await denied(capture(camera))
+    assert (status, why.code, list(why.policies)) == (grpc.StatusCode.PERMISSION_DENIED, code, ["privacy"])
+
+
+async def test_a_drone_takes_pictures_in_its_area_and_not_over_private_ground(rig: Rig) -> None:
+    rig.write_grant(grant())
+    stripe = privacy("refuse", -50, 30, 50, 60)
+    rig.write_grant(passenger_grant(stripe, services=CAMERA))
+    rig.start_service()
+    rig.start_vehicle()
+    camera = stub(rig, rig.start_camera())
+    driver = Driver(rig)
+    await driver.up()
+    over = await capture(camera, width=64, height=64)
+    assert FRAME.xy(over.image.position.latitude_deg, over.image.position.longitude_deg)[1] < 10
+    await driver.goto(0, 45)
+    code, why = await denied(capture(camera))
+    assert (code, why.code) == (grpc.StatusCode.PERMISSION_DENIED, "PrivacyZone")
+    await driver.goto(0, 80)
+    await capture(camera, width=64, height=64)
+    rig.kill("service")
+
+    async def until_unknown() -> types_pb2.Decision:
+        for _ in range(500):
+            try:
+                await capture(camera, width=64, height=64)
+            except grpc.aio.AioRpcError as error:
+                if error.code() == grpc.StatusCode.PERMISSION_DENIED:
+                    return (await denied(capture(camera)))[1]
+            for shot in (await camera.ListImages(camera_pb2.ListImagesRequest(), timeout=5)).images:
+                await camera.DeleteImage(camera_pb2.DeleteImageRequest(name=shot.name), timeout=5)
+        raise AssertionError("pictures go on without a position")
+
+    assert (await until_unknown()).code in {"PositionUnknown", "PrivacyZone"}

@@ -1,0 +1,253 @@
+"""What becomes of a flying drone when something is lost: driver, service, grant, pilot's patience, link."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import signal
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+from fractus_proto.v1 import mobility_pb2 as pb
+from fractus_services.mobility.autopilot import Autopilot
+from mobility_rig import DRIVER, FRAME, Driver, Rig, denied, fence, flown, grant, xy
+
+LOST = pb.ControlEvent.STATE_LOST
+
+
+@pytest.fixture
+async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
+    rig = Rig(tmp_path)
+    try:
+        yield rig
+    finally:
+        await rig.close()
+
+
+async def flying(rig: Rig, *policies: dict[str, Any], speedup: float = 2.0, **changes: Any) -> Driver:
+    rig.write_grant(grant(*policies, **changes))
+    rig.start_service()
+    rig.start_vehicle(speedup)
+    driver = Driver(rig)
+    await driver.up()
+    return driver
+
+
+def outcome(telemetry: pb.Telemetry) -> str:
+    return telemetry.missions.get("uid-app-navigator", "")
+
+
+async def test_a_lost_driver_means_hover_then_home(rig: Rig) -> None:
+    driver = await flying(rig)
+    going = driver.going(0, 90)
+    await rig.until(lambda t: t.velocity.north_mps > 3)
+    await driver.channel.close()
+    del going
+    hover = await rig.until(lambda t: t.controller == "system" and t.velocity.north_mps < 0.3, 10, "hover")
+    assert hover.mode == "GUIDED"
+    assert xy(hover.position)[1] < 75, "it did not fly on to the target"
+    home = await rig.until(lambda t: t.mode == "RTL", 10, "return")
+    assert outcome(home) == "failed: driver lost"
+    await rig.until(lambda t: not t.armed, 60, "landing")
+
+
+async def test_a_driver_that_comes_back_in_time_goes_on(rig: Rig) -> None:
+    driver = await flying(rig)
+    await driver.goto(0, 40)
+    driver.drop()
+    await rig.until(lambda t: t.controller == "system", 5)
+    again = Driver(rig)
+    event = await again.take(3)
+    assert event.waypoints_reached == 1
+    await again.goto(40, 40)
+    await asyncio.sleep(0)
+    assert (await rig.telemetry()).controller == DRIVER
+
+
+async def test_a_killed_service_finds_its_drone_again(rig: Rig) -> None:
+    driver = await flying(rig, speedup=1.0)
+    going = driver.going(0, 90)
+    await rig.until(lambda t: t.velocity.north_mps > 3)
+    del going
+    rig.kill("service")
+    rig.start_service()
+    hover = await rig.until(lambda t: t.armed and t.controller == "system" and t.mode == "GUIDED", 10, "takeover")
+    assert hover.in_air
+    again = Driver(rig)
+    await again.take(5)
+    await again.goto(0, 40)
+    reply = await again.stub.ReturnControl(pb.ReturnControlRequest(), timeout=5)
+    assert reply.mission_complete
+    await rig.until(lambda t: not t.armed, 60, "landing")
+
+
+async def test_a_service_that_stays_dead_leaves_it_to_the_autopilot(rig: Rig) -> None:
+    await flying(rig, speedup=2.0)
+    rig.kill("service")
+    # The autopilot's failsafe acts after five of its seconds; then the service must not hand the drone back.
+    await until_mode(rig.link, 6)
+    rig.start_service()
+    late = Driver(rig)
+    code, why = await denied(first(late))
+    assert code == grpc.StatusCode.FAILED_PRECONDITION
+    assert why.code == "ControlLost"
+    state = await rig.telemetry()
+    assert state.mode == "RTL" or not state.armed
+    assert outcome(state).startswith("failed:")
+    await rig.until(lambda t: not t.armed, 60, "landing")
+
+
+async def until_mode(link: str, mode: int) -> None:
+    """Listen to the vehicle without a heartbeat of ours."""
+    watcher = Autopilot(link)
+    watcher._heartbeat = lambda: None  # type: ignore[method-assign]
+    task = asyncio.create_task(watcher.run())
+    try:
+        async with asyncio.timeout(20):
+            while watcher.vehicle.mode != mode:
+                await watcher.update(1.0)
+    finally:
+        task.cancel()
+
+
+async def first(driver: Driver) -> None:
+    async for event in driver.stub.GetControl(pb.GetControlRequest(), wait_for_ready=True, timeout=20):
+        if event.state == pb.ControlEvent.STATE_GRANTED:
+            return
+
+
+async def test_a_zone_that_appears_in_flight_stops_the_drone(rig: Rig) -> None:
+    driver = await flying(rig, speedup=1.0)
+    going = driver.going(0, 90)
+    await rig.until(lambda t: xy(t.position)[1] > 5)
+    rig.write_grant(grant(fence("new", "exclusion", "ignore", -30, 50, 30, 70)))
+    written = time.monotonic()
+    code, why = await denied(flown(going))
+    assert code == grpc.StatusCode.ABORTED
+    assert why.code == "ExclusionZoneAhead"
+    assert list(why.policies) == ["new"]
+    hover = await rig.until(lambda t: abs(t.velocity.north_mps) < 0.3, 10)
+    assert hover.controller == DRIVER, "the policy ignores requests; it takes no drone"
+    assert xy(hover.position)[1] < 50
+    assert time.monotonic() - written < 12
+    await driver.goto(0, 20)
+
+
+async def test_a_zone_around_the_drone_with_a_takeover(rig: Rig) -> None:
+    driver = await flying(rig, speedup=1.0)
+    rig.write_grant(grant(fence("new", "exclusion", "revoke", -30, -30, 30, 30)))
+    written = time.monotonic()
+    event = await driver.next(LOST, 2)
+    assert time.monotonic() - written < 1.0
+    assert "new" in event.reason
+    state = await rig.until(lambda t: t.mode == "RTL", 5)
+    assert outcome(state).startswith("revoked:")
+    code, why = await denied(driver.stub.Hover(pb.HoverRequest(), timeout=5))
+    assert why.code == "NotInControl"
+    await rig.until(lambda t: not t.armed, 60, "landing")
+
+
+@pytest.mark.parametrize(("action", "mode"), [("land", "LAND"), ("returnToLaunch", "RTL"), ("revoke", "RTL")])
+async def test_a_request_into_a_zone_that_takes_the_drone(rig: Rig, action: str, mode: str) -> None:
+    driver = await flying(rig, fence("no-fly", "exclusion", action, -60, -10, -40, 10))
+    code, why = await denied(flown(driver.going(-50, 0)))
+    assert code == grpc.StatusCode.PERMISSION_DENIED
+    assert why.action == why.ACTION_TAKEOVER
+    await driver.next(LOST, 5)
+    state = await rig.until(lambda t: t.mode == mode, 5, mode)
+    assert outcome(state).startswith("revoked:" if action == "revoke" else "failed:")
+    await rig.until(lambda t: not t.armed, 60, "landing")
+    assert rig.entries("takeover")[0]["policies"] == ["no-fly"]
+
+
+async def test_a_grant_removed_in_flight_brings_the_drone_home(rig: Rig) -> None:
+    driver = await flying(rig)
+    going = driver.going(0, 90)
+    await rig.until(lambda t: t.velocity.north_mps > 3)
+    (rig.grants / "app-navigator.json").unlink()
+    code, why = await denied(flown(going))
+    assert (code, why.code) == (grpc.StatusCode.FAILED_PRECONDITION, "ControlLost")
+    await driver.next(LOST, 3)
+    state = await rig.until(lambda t: t.mode == "RTL", 5)
+    assert outcome(state) == "revoked: the grant was removed"
+    assert state.controller == "system"
+    await rig.until(lambda t: not t.armed, 60, "landing")
+
+
+async def test_a_grant_file_of_garbage_grants_nothing(rig: Rig) -> None:
+    driver = await flying(rig)
+    path = rig.grants / "app-navigator.json"
+    fresh = path.with_suffix(".new")
+    fresh.write_text('{"kind": "Grant", "spec"')
+    fresh.replace(path)
+    await driver.next(LOST, 3)
+    await rig.until(lambda t: t.mode == "RTL", 5)
+
+
+async def test_a_pilot_takes_the_drone_and_keeps_it(rig: Rig) -> None:
+    driver = await flying(rig)
+    going = driver.going(0, 90)
+    await rig.until(lambda t: t.velocity.north_mps > 3)
+    pilot = Autopilot(rig.link)
+    task = asyncio.create_task(pilot.run())
+    async with asyncio.timeout(5):
+        while not pilot.connected:
+            await pilot.update(0.5)
+    await pilot.set_mode(5)
+    event = await driver.next(LOST, 3)
+    assert event.reason == "a human pilot changed the mode to LOITER"
+    code, why = await denied(flown(going))
+    assert (code, why.code) == (grpc.StatusCode.FAILED_PRECONDITION, "ControlLost")
+    state = await rig.telemetry()
+    assert (state.controller, state.mode) == ("pilot", "LOITER")
+    code, why = await denied(driver.goto(0, 10))
+    assert why.code == "NotInControl"
+    await pilot.set_mode(9)
+    await rig.until(lambda t: not t.armed, 60, "landing")
+    assert outcome(await rig.telemetry()).startswith("failed: a human pilot")
+    task.cancel()
+
+
+async def test_a_stopped_driver_process_is_noticed(rig: Rig) -> None:
+    """SIGSTOP leaves the connection open: only unanswered pings tell."""
+    await asyncio.sleep(0)
+    rig.write_grant(grant())
+    rig.start_service()
+    rig.start_vehicle(1.0)
+    await rig.until(lambda t: t.ready, 20)
+    rig.start_driver()
+    await rig.until(lambda t: t.controller == DRIVER and t.position.altitude_m > 8, 30, "flight of the other process")
+    stopped = time.monotonic()
+    rig.tell("driver", signal.SIGSTOP)
+    await rig.until(lambda t: t.controller == "system", 10, "loss of the driver")
+    assert time.monotonic() - stopped < 6
+    rig.tell("driver", signal.SIGCONT)
+
+
+async def test_partial_control_begins_where_the_chauffeur_brings_it(rig: Rig) -> None:
+    path = [dict(zip(("lat", "lon", "alt"), (*FRAME.latlon(x, y), 12.0), strict=True)) for x, y in ((30, 40), (60, 40))]
+    rig.write_grant(
+        grant(
+            control="partial",
+            controlPoints=[{"navigation": "pathBased", "path": path}],
+            services=[{"service": "mobility", "methods": ["Goto", "GetPosition"]}],
+        )
+    )
+    rig.start_service()
+    rig.start_vehicle()
+    driver = Driver(rig)
+    event = await driver.take(40)
+    assert event.control_point == 0
+    waits = [e.reason for e in driver.events if e.state == pb.ControlEvent.STATE_WAITING]
+    assert "the system flies to the control point" in waits
+    state = await rig.telemetry()
+    assert math.dist(xy(state.position), (30, 40)) < 2.0
+    code, why = await denied(driver.stub.Hover(pb.HoverRequest(), timeout=5))
+    assert why.code == "MethodNotGranted"
+    await driver.goto(60, 40)
+    await driver.stub.ReturnControl(pb.ReturnControlRequest(), timeout=5)
+    await rig.until(lambda t: not t.armed, 60, "landing")

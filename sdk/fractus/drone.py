@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Generator
+from collections.abc import AsyncGenerator, Awaitable, Callable, Generator
 from contextlib import aclosing
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -262,18 +262,31 @@ class Mobility:
         )
         return self._motion("Goto", request, progress, timeout_s)
 
-    async def telemetry(self, interval_s: float = 0.2) -> AsyncIterator[Telemetry]:
-        """The drone's state, every `interval_s` seconds, until the iteration is left."""
+    async def telemetry(self, interval_s: float = 0.2) -> AsyncGenerator[Telemetry, None]:
+        """The drone's state, every `interval_s` seconds, until the iteration is left; goes on after a restart.
+
+        Raises:
+            Unavailable: the service is away, and did not come back.
+        """
+        loop = asyncio.get_running_loop()
         request = mobility_pb2.SubscribeTelemetryRequest(interval_s=interval_s)
-        async with self._channel.stub() as stub:
-            call = stub.SubscribeTelemetry(request)
-            try:
-                async for message in call:
-                    yield Telemetry.from_proto(message)
-            except grpc.aio.AioRpcError as error:
-                raise translate(error, "SubscribeTelemetry", self._channel.address) from None
-            finally:
-                call.cancel()
+        give_up, delays = loop.time() + self._channel.patience_s, backoff()
+        while True:
+            async with self._channel.stub() as stub:
+                call = stub.SubscribeTelemetry(request)
+                try:
+                    async for message in call:
+                        yield Telemetry.from_proto(message)
+                        give_up, delays = loop.time() + self._channel.patience_s, backoff()
+                except grpc.aio.AioRpcError as error:
+                    delay = next(delays)
+                    if error.code() is not grpc.StatusCode.UNAVAILABLE or loop.time() + delay > give_up:
+                        raise translate(error, "SubscribeTelemetry", self._channel.address) from None
+                else:
+                    return
+                finally:
+                    call.cancel()
+            await asyncio.sleep(delay)
 
     def _motion(self, method: str, request: Any, progress: OnProgress | None, timeout_s: float | None) -> Motion:
         return Motion(

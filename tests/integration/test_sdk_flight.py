@@ -1,0 +1,265 @@
+"""The example's Navigator, as a process, flies a simulated vehicle through the real mobility service."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from cryptography import x509
+from fractus_core.api import Application, Depot, Drone, Grant, Policy, Zone
+from fractus_core.api.model import Metadata
+from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
+from fractus_core.planning import Inventory
+from fractus_core.policy.grants import compile_grants
+from fractus_services.audit import verify
+from sdk_service import Authority
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "traffic-monitoring"
+SPEEDUP = 3.0
+"""The companion's heartbeats come once a second of real time, and the autopilot's failsafe waits 5 s of its own."""
+pytestmark = pytest.mark.timeout(150)
+
+
+def documents(name: str) -> list[dict[str, Any]]:
+    return list(yaml.safe_load_all((EXAMPLE / name).read_text()))
+
+
+def application(waypoints: int) -> Application:
+    """The example's application, with the first waypoints of its path."""
+    (body,) = documents("application.yaml")
+    point = body["spec"]["components"][0]["controlPoints"][0]
+    point["path"] = point["path"][:waypoints]
+    return Application.from_body(body)
+
+
+def navigator_grant(application: Application) -> Grant:
+    """What the operator would grant the Navigator."""
+    placed = PlannedInstance(
+        component="Navigator", instance="traffic-navigator", node="drone-1", placement="drone", role="drone"
+    )
+    inventory = Inventory(
+        hosts={},
+        drones={d["metadata"]["name"]: Drone.from_body(d) for d in documents("drone.yaml")},
+        edge_nodes={},
+        depots={d["metadata"]["name"]: Depot.from_body(d) for d in documents("depot.yaml")},
+        zones={z["metadata"]["name"]: Zone.from_body(z) for z in documents("zones.yaml")},
+        policies={p["metadata"]["name"]: Policy.from_body(p) for p in documents("policies.yaml")},
+        claimed={},
+    )
+    (spec,) = compile_grants(
+        application, DeploymentPlanSpec(application=application.name, placements=(placed,)), inventory
+    )
+    return Grant(metadata=Metadata(name="default.traffic-navigator", uid="uid-1"), spec=spec)
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Stage:
+    """Vehicle, mobility service and Navigator on this machine."""
+
+    def __init__(self, folder: Path, waypoints: int) -> None:
+        self.folder = folder
+        self.application = application(waypoints)
+        self.grant = navigator_grant(self.application)
+        self.audit = folder / "audit.jsonl"
+        self.autopilot = f"tcp:127.0.0.1:{free_port()}"
+        self.address = f"127.0.0.1:{free_port()}"
+        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+        authority = Authority()
+        node = "spiffe://fractus.dev/node/drone-1"
+        authority.issue(
+            folder / "node-tls", [x509.UniformResourceIdentifier(node), x509.DNSName("drone-1.node.fractus.dev")]
+        )
+        authority.issue(folder / "driver-tls", [x509.UniformResourceIdentifier(self.grant.spec.identity)])
+        (folder / "grants").mkdir()
+        (folder / "grants" / "navigator.json").write_text(json.dumps(self.grant.to_dict()))
+
+    def start_vehicle(self) -> None:
+        depot = documents("depot.yaml")[0]["spec"]["location"]
+        self._start(
+            "vehicle", "-m", "fractus_sim.vehicle", "--listen", self.autopilot, "--speedup", str(SPEEDUP),
+            "--ready-after", "2", "--home", f"{depot['lat']},{depot['lon']},25",
+        )  # fmt: skip
+
+    def start_service(self) -> None:
+        self._start(
+            "service", "-m", "fractus_services.mobility", "serve", "--grants", str(self.folder / "grants"),
+            "--tls", str(self.folder / "node-tls"), "--state", str(self.folder / "state"), "--audit", str(self.audit),
+            "--node", "drone-1", "--autopilot", self.autopilot, "--listen", self.address,
+            "--description", str(self.folder / "none.yaml"), "--driver-grace", "5",
+        )  # fmt: skip
+
+    def start_navigator(self) -> None:
+        driver = self.application.spec.driver
+        assert driver is not None
+        points = json.dumps([point.to_dict() for point in driver.control_points])
+        self._start(
+            "navigator", str(EXAMPLE / "navigator.py"),
+            FRACTUS_NODE="drone-1", FRACTUS_MOBILITY_ADDRESS=self.address, FRACTUS_CONTROL_POINTS=points,
+            FRACTUS_TLS_DIR=str(self.folder / "driver-tls"), **{e.name: e.value for e in driver.container.env},
+        )  # fmt: skip
+
+    def _start(self, name: str, *arguments: str, **environment: str) -> None:
+        with (self.folder / f"{name}.log").open("ab") as log:
+            self.processes[name] = subprocess.Popen(
+                [sys.executable, *arguments], stdout=log, stderr=log, env={**os.environ, **environment}
+            )
+
+    def kill(self, name: str) -> None:
+        self.processes[name].send_signal(signal.SIGKILL)
+        self.processes[name].wait(10)
+
+    def log(self, name: str) -> str:
+        path = self.folder / f"{name}.log"
+        return path.read_text() if path.exists() else ""
+
+    def entries(self) -> list[dict[str, Any]]:
+        lines = self.audit.read_bytes().splitlines(keepends=True) if self.audit.exists() else []
+        return [json.loads(line) for line in lines if line.endswith(b"\n")]
+
+    def wait(self, what: str, condition: Callable[[], bool], timeout_s: float = 90.0) -> None:
+        deadline = time.monotonic() + timeout_s
+        probe = subprocess.Popen(["tail", "-f", "/dev/null"])
+        try:
+            while not condition():
+                assert time.monotonic() < deadline, (
+                    f"no {what} in {timeout_s} s\n{self.log('navigator')}\n{self.log('service')}"
+                )
+                try:
+                    probe.wait(0.1)
+                except subprocess.TimeoutExpired:
+                    continue
+        finally:
+            probe.kill()
+            probe.wait(10)
+
+    def noted(self, action: str) -> bool:
+        return any(e["kind"] == "control" and e["action"] == action for e in self.entries())
+
+    def close(self) -> None:
+        for process in self.processes.values():
+            if process.poll() is None:
+                process.kill()
+                process.wait(10)
+
+
+def on_stage(folder: Path, waypoints: int) -> Iterator[Stage]:
+    stage = Stage(folder, waypoints)
+    try:
+        stage.start_vehicle()
+        stage.start_service()
+        yield stage
+    finally:
+        stage.close()
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Iterator[Stage]:
+    """The whole path."""
+    yield from on_stage(tmp_path, 5)
+
+
+@pytest.fixture
+def short(tmp_path: Path) -> Iterator[Stage]:
+    """The way to the first two waypoints only."""
+    yield from on_stage(tmp_path, 2)
+
+
+def calls(stage: Stage) -> list[tuple[str, str, str]]:
+    return [(e["method"], e["action"], e["code"]) for e in stage.entries() if e["kind"] == "call"]
+
+
+def test_the_navigator_flies_its_path_is_corrected_and_refused_and_comes_home(stage: Stage) -> None:
+    stage.start_navigator()
+    stage.wait("landing", lambda: stage.noted("landed"))
+
+    made = [call for call in calls(stage) if call[0] in {"SetSpeed", "Goto", "Takeoff"}]
+    assert made == [
+        ("Takeoff", "allow", ""),
+        ("SetSpeed", "correct", "SpeedAboveLimit"),
+        ("Goto", "allow", ""),
+        ("Goto", "allow", ""),
+        ("Goto", "deny", "InsideExclusionZone"),
+        ("Goto", "correct", "AltitudeAboveLimit"),
+        ("Goto", "allow", ""),
+        ("Goto", "allow", ""),
+    ]
+    heights = [e["alt"] for e in stage.entries() if e["kind"] == "state"]
+    assert 48.0 < max(heights) < 51.0
+    log = stage.log("navigator")
+    assert "flying at 10.0 m/s: speed 12.0 m/s is above the limit of policy town-speed" in log
+    assert "detour refused, going on: the target is" in log
+    assert "waypoint 3/5 reached: 50.865633, 4.680631, 50.0 m (corrected: altitude 70.0 m" in log
+    stage.wait("farewell", lambda: "control returned: the system flies the drone home" in stage.log("navigator"), 10)
+    with stage.audit.open("rb") as lines:
+        assert not verify(lines).problem
+
+
+def test_a_navigator_that_is_killed_goes_on_where_it_was_and_rests_after_its_mission(short: Stage) -> None:
+    short.start_navigator()
+    short.wait("first waypoint", lambda: "waypoint 1/2 reached" in short.log("navigator"))
+    short.kill("navigator")
+    short.start_navigator()
+    short.wait("return", lambda: "control returned" in short.log("navigator"))
+    log = short.log("navigator")
+    assert "in control; 1 of 2 waypoints reached before" in log
+    assert log.count("waypoint 1/2 reached") == 1
+    assert log.count("taking off") == 1
+    assert "waypoint 2/2 reached" in log
+    assert short.noted("driver lost")
+
+    short.kill("navigator")
+    short.start_navigator()
+    short.wait("word of it", lambda: "the mission is over; nothing left to fly" in short.log("navigator"), 20)
+    assert short.processes["navigator"].poll() is None
+
+
+def test_a_service_that_is_killed_is_found_again_by_the_navigator(short: Stage) -> None:
+    short.start_navigator()
+    short.wait("first waypoint", lambda: "waypoint 1/2 reached" in short.log("navigator"))
+    short.kill("service")
+    short.start_service()
+    short.wait("return", lambda: "control returned" in short.log("navigator"))
+    log = short.log("navigator")
+    assert "the mobility service is away" in log
+    assert log.count("in control") == 1, "the same process, under the same control"
+    assert "waypoint 2/2 reached" in log
+
+
+def test_sigterm_stops_the_navigator_and_the_system_brings_the_drone_home(short: Stage) -> None:
+    short.start_navigator()
+    short.wait("takeoff", lambda: "takeoff reached" in short.log("navigator"))
+    short.processes["navigator"].terminate()
+    assert short.processes["navigator"].wait(10) == 0
+    assert "told to stop" in short.log("navigator")
+    short.wait("landing", lambda: short.noted("landed"))
+
+
+def test_telemetry_reads_as_json_lines_with_the_node_s_certificate(short: Stage) -> None:
+    done = subprocess.run(
+        [
+            sys.executable, "-m", "fractus", "telemetry", "--node", "drone-1", "--address", short.address,
+            "--tls", str(short.folder / "node-tls"), "--interval", "0.1", "--count", "3", "-o", "json",
+        ],
+        capture_output=True, text=True, timeout=40, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(lines) == 3
+    assert lines[-1]["flight_state"] == "inactive"
+    assert lines[-1]["position"]["reference"] == "home"

@@ -80,7 +80,7 @@ def stored_form(grant: Grant) -> bytes:
 
 def outcome_of(grant: Grant, missions: Mapping[str, str]) -> tuple[Phase, str] | None:
     """How the grant's mission ended, as the mobility service tells; None while it has not."""
-    for key in (grant.metadata.uid, grant.spec.identity, grant.spec.instance):
+    for key in (grant.metadata.uid, grant.spec.identity):
         if key and key in missions:
             kind, _, message = missions[key].partition(":")
             phase = _OUTCOMES.get(kind.strip().lower())

@@ -10,12 +10,14 @@ import os
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import httpx2
 import msgspec
 from fractus_core.api.model import API_VERSION, GROUP, VERSION
 from lightkube import ApiError, AsyncClient, ConfigError, KubeConfig
+from lightkube.config.kubeconfig import SERVICE_ACCOUNT
 from lightkube.core.generic_client import ListAsyncIterable
 from lightkube.core.resource import ApiInfo, ResourceDef
 from lightkube.generic_resource import (
@@ -119,7 +121,7 @@ _CONFIG_MAP = type(
 )
 
 
-def connect() -> AsyncClient:
+def connect(service_account: Path = Path(SERVICE_ACCOUNT)) -> AsyncClient:
     """Client by the pod's service account (its token is read again when refused), or by KUBECONFIG outside a pod.
 
     Raises:
@@ -127,7 +129,7 @@ def connect() -> AsyncClient:
     """
     try:
         given = os.environ.get("KUBECONFIG")
-        config = KubeConfig.from_file(given) if given else KubeConfig.from_env()
+        config = KubeConfig.from_file(given) if given else KubeConfig.from_service_account(service_account)
         return AsyncClient(config=config, field_manager=FIELD_MANAGER, timeout=httpx2.Timeout(10.0), trust_env=False)
     except (ConfigError, OSError, KeyError) as error:
         raise Unavailable(f"no way to reach an API server: {error}") from error

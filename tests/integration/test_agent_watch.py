@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -179,6 +180,35 @@ async def test_a_watch_that_the_server_ends_goes_on_where_it_was(server: ApiServ
         server.post(f"{FRACTUS}/grants", grant("after"))
         event = await asyncio.wait_for(waiting, PATIENCE_S)
         assert isinstance(event, Changed)
+
+
+async def test_a_rotated_token_is_read_again(
+    server: ApiServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    account = server.post("/api/v1/namespaces/fractus-system/serviceaccounts", {"metadata": {"name": "agent"}})
+    server.post(
+        "/apis/rbac.authorization.k8s.io/v1/clusterrolebindings",
+        {
+            "metadata": {"name": "agent-account"},
+            "roleRef": {"apiGroup": "rbac.authorization.k8s.io", "kind": "ClusterRole", "name": "agent"},
+            "subjects": [{"kind": "ServiceAccount", "name": "agent", "namespace": "fractus-system"}],
+        },
+    )
+    path = f"/api/v1/namespaces/fractus-system/serviceaccounts/{account['metadata']['name']}/token"
+    token = server.post(path, {"spec": {"expirationSeconds": 600}})["status"]["token"]
+    monkeypatch.delenv("KUBECONFIG")
+    monkeypatch.setenv("KUBERNETES_SERVICE_HOST", "127.0.0.1")
+    monkeypatch.setenv("KUBERNETES_SERVICE_PORT", server.server.rsplit(":", 1)[1])
+    for name, text in {"token": "expired", "namespace": "fractus-system", "ca.crt": server.ca.read_text()}.items():
+        (tmp_path / name).write_text(text)
+    used = Store(connect(tmp_path), "drone-1")
+    try:
+        with pytest.raises(Unavailable, match="401"):
+            await used.described("Drone")
+        (tmp_path / "token").write_text(token)
+        assert await used.described("Drone") is None
+    finally:
+        await used.close()
 
 
 async def test_errors_come_by_what_to_do_about_them(server: ApiServer) -> None:

@@ -134,6 +134,16 @@ async def test_a_new_agent_does_not_repeat_what_is_reported(keeper: GrantKeeper,
     assert store.statuses == []
 
 
+async def test_a_grant_made_again_under_its_name_is_reported_again(keeper: GrantKeeper, store: FakeStore) -> None:
+    keeper.missions_changed({"u1": "complete"})
+    for uid in ("u1", "u2"):
+        keeper.take(Changed(manifest(uid=uid)))
+        await keeper.report_once()
+    keeper.take(Changed(manifest(uid="u3")))
+    await keeper.report_once()
+    assert [s["phase"] for _, s in store.statuses] == ["Complete", "Active", "Active"]
+
+
 async def test_a_grant_that_cannot_be_stored_is_pending_until_it_can(
     keeper: GrantKeeper, store: FakeStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -156,7 +166,7 @@ def test_outcomes() -> None:
     assert outcome_of(grant, {}) is None
     assert outcome_of(grant, {"u1": "complete"}) == ("Complete", "")
     assert outcome_of(grant, {grant.spec.identity: "revoked: zone closed: now"}) == ("Revoked", "zone closed: now")
-    assert outcome_of(grant, {"app-navigator": "failed: driver lost"}) == ("Failed", "driver lost")
+    assert outcome_of(grant, {"u1": "failed: driver lost"}) == ("Failed", "driver lost")
     assert outcome_of(grant, {"u1": "exploded"}) == ("Failed", "exploded")
     assert outcome_of(grant, {"u2": "complete"}) is None
 

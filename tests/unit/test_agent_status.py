@@ -220,3 +220,11 @@ async def test_a_vanished_object_is_reported_and_its_successor_written() -> None
     bench.body = {"kind": "Drone", "metadata": {"name": "d", "uid": "2", "generation": 1}}
     await bench.second(seen())
     assert len(bench.store.writes) == 2
+
+
+async def test_an_object_made_again_gets_its_status_at_once() -> None:
+    bench = Bench()
+    await bench.second(seen())
+    bench.body = {"kind": "Drone", "metadata": {"name": "d", "uid": "2", "generation": 1}}
+    await bench.second(seen())
+    assert len(bench.store.writes) == 2

@@ -30,7 +30,9 @@ from fractus_sim.cluster.controlplane import (
     write_control_plane,
 )
 from fractus_sim.cluster.errors import ClusterError
+from fractus_sim.cluster.images.layout import Image
 from fractus_sim.cluster.images.store import ImageStore
+from fractus_sim.cluster.images.template import has_storage
 from fractus_sim.cluster.locking import locked
 from fractus_sim.cluster.node import Node, init_command
 from fractus_sim.cluster.nodeconfig import shortfalls
@@ -206,7 +208,9 @@ class Cluster:
             authority = Authority(self._state.pki)
             self._start_control_plane(binaries, authority, memory)
             nodes = self.nodes
-            self._place_nodes(nodes, binaries, authority, images)
+            store = ImageStore.default(report=self._report)
+            wanted = store.fetch(images)
+            self._place_nodes(nodes, binaries, authority, store, wanted)
             with self._api(authority, memory) as api:
                 api.wait_ready(timeout_s=_API_TIMEOUT_S)
                 self._apply_objects(api, nodes, memory)
@@ -216,7 +220,7 @@ class Cluster:
                 self._write_kubeconfig(authority, memory)
                 self._wait_nodes(api, nodes)
             self._wait_dns(memory)
-            self.load_images(images)
+            store.deliver(wanted, nodes)
         self._report(f"cluster {self.name} is up: {len(nodes)} nodes, {time.monotonic() - started:.1f} s")
 
     def down(self) -> None:
@@ -369,15 +373,18 @@ class Cluster:
             kill(record)
         self._branch().below(_CONTROL_PLANE).kill_all()
 
-    def _place_nodes(self, nodes: list[Node], binaries: Binaries, authority: Authority, images: Sequence[str]) -> None:
+    def _place_nodes(
+        self, nodes: list[Node], binaries: Binaries, authority: Authority, store: ImageStore, images: Sequence[Image]
+    ) -> None:
         """Wire the nodes and write their files; new ones get their images on disk before they ever start."""
         for node in nodes:
             network.wire_node(node.wiring, node.name, node.index)
             node.write_files(node.files(binaries, authority))
-        fresh = [node for node in nodes if not node.powered]
-        store = ImageStore.default(report=self._report)
-        with ThreadPoolExecutor(max_workers=2) as pool:
-            list(pool.map(store.template(store.fetch(images), binaries["pause"]).furnish, fresh))
+        fresh = [node for node in nodes if not has_storage(node)]
+        if fresh:
+            template = store.template(images, binaries["pause"])
+            with ThreadPoolExecutor(max_workers=2) as pool:
+                list(pool.map(template.furnish, fresh))
 
     def _api(self, authority: Authority, memory: Memory) -> ApiClient:
         return ApiClient(

@@ -16,6 +16,7 @@ from types import MappingProxyType
 from fractus_sim.cluster.binaries import cache_directory
 from fractus_sim.cluster.commands import run
 from fractus_sim.cluster.errors import ClusterError, PrerequisiteError
+from fractus_sim.cluster.images.store import image_ids
 from fractus_sim.cluster.locking import locked
 from fractus_sim.cluster.prerequisites import check_root
 
@@ -99,7 +100,7 @@ def build_images(
     ):
         digests = {image_name(target, tag): source_digest(source, target) for target in targets}
         built = _read(ledger)
-        present = _image_ids()
+        present = image_ids()
         stale = [
             target
             for target, name in zip(targets, names, strict=True)
@@ -108,7 +109,7 @@ def build_images(
         if stale:
             ensure_base(report=report)
             _build_stale(source, stale, tag, report)
-            present = _image_ids()
+            present = image_ids()
             built.update({name: f"{digests[name]} {present[name]}" for name in names})
             _write(ledger, built)
     return names
@@ -162,7 +163,7 @@ def ensure_base(*, report: Report) -> None:
     Raises:
         PrerequisiteError: debootstrap is missing.
     """
-    if BASE_IMAGE in _image_ids():
+    if BASE_IMAGE in image_ids():
         return
     if shutil.which("debootstrap") is None:
         raise PrerequisiteError("the base image is made with debootstrap; install it: apt-get install debootstrap")
@@ -178,12 +179,6 @@ def ensure_base(*, report: Report) -> None:
         finally:
             run(["buildah", "rm", container], check=False)
     report(f"made the Debian base image in {time.monotonic() - started:.0f} s")
-
-
-def _image_ids() -> dict[str, str]:
-    """Return the ids of all images in buildah's storage, by name."""
-    listed = run(["buildah", "images", "--no-trunc", "--format", "{{.Name}}:{{.Tag}} {{.ID}}"]).stdout
-    return dict(line.split(" ", 1) for line in listed.splitlines() if " " in line)
 
 
 def _read(path: Path) -> dict[str, str]:

@@ -90,6 +90,11 @@ class Layout:
         manifest = json.loads(self.blob(image.digest).read_text())
         return [*(layer["digest"] for layer in manifest["layers"]), manifest["config"]["digest"], image.digest]
 
+    def image_id(self, image: Image) -> str:
+        """Return the digest of an image's configuration, which is what buildah calls its id."""
+        manifest = json.loads(self.blob(image.digest).read_text())
+        return str(manifest["config"]["digest"]).removeprefix("sha256:")
+
     def size_bytes(self, image: Image) -> int:
         """Return the size of an image: the sum of its layers."""
         return sum(self.blob(digest).stat().st_size for digest in self.digests(image))
@@ -121,12 +126,17 @@ class Layout:
             "config": _descriptor(_CONFIG_TYPE, self._add_blob(config_bytes), len(config_bytes)),
             "layers": [_descriptor(_LAYER_TYPE, layer_digest, len(layer))],
         }
-        manifest_bytes = json.dumps(manifest, sort_keys=True).encode()
-        entry = _descriptor(_MANIFEST_TYPE, self._add_blob(manifest_bytes), len(manifest_bytes))
+        self.add_manifest(name, json.dumps(manifest, sort_keys=True).encode(), _MANIFEST_TYPE)
+        return self.image(name)
+
+    def add_manifest(self, name: str, content: bytes, media_type: str) -> str:
+        """Give a name to a manifest whose layers are there already, and return its digest."""
+        digest = self._add_blob(content)
+        entry = _descriptor(media_type, digest, len(content))
         entry["annotations"] = {_REF_ANNOTATION: name}
         others = [other for other in self._index() if other.get("annotations", {}).get(_REF_ANNOTATION) != name]
         self._write_index([*others, entry])
-        return self.image(name)
+        return digest
 
     def write_archive(self, images: Iterable[Image], *, without: Collection[str], out: IO[bytes]) -> None:
         """Write an archive that `ctr images import` reads.

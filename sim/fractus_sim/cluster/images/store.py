@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import os
+import tarfile
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -13,6 +13,7 @@ from fractus_sim.cluster.commands import run
 from fractus_sim.cluster.errors import ClusterError
 from fractus_sim.cluster.images.delivery import deliver
 from fractus_sim.cluster.images.layout import Image, Layout
+from fractus_sim.cluster.images.receiver import receiving
 from fractus_sim.cluster.images.template import Template
 from fractus_sim.cluster.locking import locked
 from fractus_sim.cluster.node import Node
@@ -48,7 +49,7 @@ class ImageStore:
         return Layout(self.path / "layout")
 
     def fetch(self, names: Sequence[str]) -> list[Image]:
-        """Take images into the store.
+        """Take images into the store; one that is there already and has not changed costs nothing.
 
         Args:
             names: Names in buildah's storage, or paths of OCI or Docker archives.
@@ -60,13 +61,23 @@ class ImageStore:
             return []
         with self._locked():
             self.layout.create()
+            wanted = [name for entry in names for name in _names_behind(entry)]
+            ids = image_ids()
+            missing = [name for name in wanted if name not in ids]
+            if missing:
+                raise ClusterError(f"no image {', '.join(missing)} in buildah's storage; there are {', '.join(ids)}")
+            here = {name: self.layout.image_id(image) for name, image in self.layout.images().items()}
+            stale = [name for name in dict.fromkeys(wanted) if here.get(name) != ids[name]]
+            if stale:
+                self._receive(stale)
+                self.layout.remove_unused()
+            return [self.layout.image(name) for name in dict.fromkeys(wanted)]
+
+    def _receive(self, names: Sequence[str]) -> None:
+        with receiving(self.layout) as address:
             for name in names:
-                if Path(name).is_file():
-                    raise ClusterError(f"{name}: archives are not supported yet")
-                target = f"oci:{self.layout.path}:{name}"
-                run(["buildah", "push", "--quiet", "--disable-compression", name, target], timeout_s=_COPY_TIMEOUT_S)
-            self.layout.remove_unused()
-            return [self.layout.image(name) for name in names]
+                argv = ["buildah", "push", "--quiet", "--tls-verify=false", name]
+                run([*argv, f"docker://{address}/{name}"], timeout_s=_COPY_TIMEOUT_S)
 
     def template(self, images: Sequence[Image], pause: Path) -> Template:
         """Return a node's container storage with these images unpacked, made when there is none yet."""
@@ -92,7 +103,28 @@ class ImageStore:
         )
 
 
-def image_names(prefix: str) -> list[str]:
-    """Return the names of images in buildah's storage that start with a prefix."""
-    listed = run(["buildah", "images", "--format", "{{.Name}}:{{.Tag}}"], env=dict(os.environ)).stdout
-    return sorted(line for line in listed.splitlines() if line.startswith(prefix))
+def image_ids() -> dict[str, str]:
+    """Return the ids of all images in buildah's storage, by name."""
+    listed = run(["buildah", "images", "--no-trunc", "--format", "{{.Name}}:{{.Tag}} {{.ID}}"]).stdout
+    pairs = (line.split() for line in listed.splitlines())
+    return {pair[0]: pair[1].removeprefix("sha256:") for pair in pairs if len(pair) == 2 and "<none>" not in pair[0]}
+
+
+def _names_behind(entry: str) -> list[str]:
+    """Return the names of what is to be delivered: the entry itself, or what an archive contains."""
+    if not Path(entry).is_file():
+        return [entry]
+    with tarfile.open(entry) as archive:
+        kind = (
+            "oci-archive"
+            if "oci-layout" in {name.removeprefix("./") for name in archive.getnames()}
+            else "docker-archive"
+        )
+    before = image_ids()
+    identity = run(["buildah", "pull", "--quiet", f"{kind}:{entry}"], timeout_s=_COPY_TIMEOUT_S).stdout.strip()
+    after = image_ids()
+    names = [name for name, other in after.items() if other == identity]
+    fresh = [name for name in names if before.get(name) != identity]
+    if not names:
+        raise ClusterError(f"{entry}: the archive gives its image no name")
+    return fresh or names

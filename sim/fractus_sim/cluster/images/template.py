@@ -79,7 +79,7 @@ class Template:
 
     def furnish(self, node: Node) -> None:
         """Give a node that never ran this template as its container storage; other nodes are left alone."""
-        target = node.directory / "var-lib" / "containerd"
+        target = _storage(node)
         if target.exists():
             return
         scratch = node.directory / "var-lib" / ".containerd"
@@ -95,6 +95,15 @@ class Template:
             copy.unlink()
             shutil.copy2(database, copy)
         scratch.rename(target)
+
+
+def has_storage(node: Node) -> bool:
+    """Whether a node has container storage already."""
+    return _storage(node).exists()
+
+
+def _storage(node: Node) -> Path:
+    return node.directory / "var-lib" / "containerd"
 
 
 def _wait_for(socket: Path, daemon: subprocess.Popen[bytes], log: Path) -> None:

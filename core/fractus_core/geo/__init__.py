@@ -1,12 +1,13 @@
 """Frames, distances and areas."""
 
 from fractus_core.geo.areas import area_of, corridor, geojson, ground, middle, middle_of, points_xy, polygon
-from fractus_core.geo.frames import LocalFrame, geodesic_m
+from fractus_core.geo.frames import LocalFrame, distance_m, geodesic_m
 
 __all__ = [
     "LocalFrame",
     "area_of",
     "corridor",
+    "distance_m",
     "geodesic_m",
     "geojson",
     "ground",

@@ -9,11 +9,11 @@ from fractus_core.api.applications import Component
 from fractus_core.api.geometry import Point, Position
 from fractus_core.api.nodes import Drone
 from fractus_core.api.plans import Alternative, DroneChoice, Mission
-from fractus_core.geo import geodesic_m, ground
+from fractus_core.geo import ground
 from fractus_core.planning.area import OperationArea, start_of
 from fractus_core.planning.candidates import SUITABLE, Check, check_host, check_resources, check_services
 from fractus_core.planning.draft import Draft
-from fractus_core.planning.flight import chauffeur_legs, estimate, first_missed, heights_m, remaining_minutes
+from fractus_core.planning.flight import Estimate, chauffeur_legs, estimate, first_missed, remaining_minutes
 from fractus_core.planning.index import Near
 from fractus_core.planning.inventory import DroneFacts
 
@@ -39,7 +39,7 @@ class _Ranked:
     drone: Drone
     score: float
     used: bool
-    mission: Mission | None
+    mission: Estimate | None
 
 
 def default_score(facts: DroneFacts) -> float:
@@ -90,7 +90,7 @@ def choose_drone(draft: Draft, area: OperationArea, candidates: DroneCandidates)
         node=best.drone.name,
         score=round(best.score, 6),
         shared_with="/".join(draft.inventory.flights[best.drone.name].holder) if best.used else None,
-        mission=best.mission,
+        mission=_mission(best.mission) if best.mission is not None else None,
         chauffeur=tuple(legs),
         alternatives=tuple(
             Alternative(node=r.drone.name, score=round(r.score, 6)) for r in ranked[1 : 1 + _ALTERNATIVES]
@@ -168,8 +168,8 @@ def _judge(
     leader = draft.spec.driver or components[0]
     kept = drone.name == draft.drone_before
     home = _home(draft, drone)
-    mission = _mission(draft, area, drone, home) if home is not None and not used else None
-    check = _lasting(draft, area, drone, components, mission, kept=kept) and (
+    mission = estimate(draft.spec, area, home, drone, draft.settings) if home is not None and not used else None
+    check = _lasting(draft, drone, components, mission, kept=kept) and (
         _passing(draft, drone, components, mission, kept=kept, used=used)
     )
     if not check:
@@ -180,33 +180,30 @@ def _judge(
         used=used,
         charging=drone.status is not None and drone.status.flight_state == "charging",
         remaining_min=remaining_minutes(drone),
-        needed_min=mission.duration if mission is not None else 0.0,
-        distance_m=geodesic_m(ground(home), area.start) if home is not None else 0.0,
+        needed_min=mission.needed_min if mission is not None else 0.0,
+        distance_m=mission.approach_m if mission is not None else 0.0,
     )
     score = (draft.settings.score_drone or default_score)(facts)
     return _Ranked(drone, score, used, mission)
 
 
-def _lasting(
-    draft: Draft, area: OperationArea, drone: Drone, components: list[Component], mission: Mission | None, *, kept: bool
-) -> Check:
+def _lasting(draft: Draft, drone: Drone, components: list[Component], mission: Estimate | None, *, kept: bool) -> Check:
     """The rules that waiting does not change: services, altitude, a flight too long for a full battery."""
     check = check_services(drone.spec.services, components)
     mobility = drone.spec.services.mobility
     if not check or mobility is None or mission is None:
         return check
-    height = max(heights_m(area.route, drone), default=0.0)
-    if height > mobility.max_altitude:
-        message = f"{drone.name} climbs to {mobility.max_altitude:g} m; the path goes up to {height:g} m"
+    if mission.top_m > mobility.max_altitude:
+        message = f"{drone.name} climbs to {mobility.max_altitude:g} m; the path goes up to {mission.top_m:g} m"
         return Check("TooHigh", message)
     full = (1 - draft.settings.battery_reserve) * mobility.max_flight_time
-    if not kept and mission.duration > full:
+    if not kept and mission.needed_min > full:
         return _too_long(drone, mission, full, "even with a full battery")
     return SUITABLE
 
 
 def _passing(
-    draft: Draft, drone: Drone, components: list[Component], mission: Mission | None, *, kept: bool, used: bool
+    draft: Draft, drone: Drone, components: list[Component], mission: Estimate | None, *, kept: bool, used: bool
 ) -> Check:
     """The rules of the moment: who has the drone, its node, its state, its battery, what runs on it.
 
@@ -220,28 +217,27 @@ def _passing(
     if kept:
         return host
     energy = SUITABLE
-    if mission is not None and mission.duration > mission.available:
+    if mission is not None and mission.needed_min > mission.available_min:
         battery = drone.status.battery if drone.status is not None else None
         share = battery.remaining if battery is not None else 1.0
-        energy = _too_long(drone, mission, mission.available, f"with its battery at {share:.0%}")
+        energy = _too_long(drone, mission, mission.available_min, f"with its battery at {share:.0%}")
     return host and _check_state(drone) and energy and check_resources(draft.ledger, drone.name, components)
 
 
-def _too_long(drone: Drone, mission: Mission, available_min: float, when: str) -> Check:
+def _too_long(drone: Drone, mission: Estimate, available_min: float, when: str) -> Check:
     return Check(
         "FlightTooLong",
         f"{drone.name} can fly {max(available_min, 0):.1f} min with its reserve kept, {when};"
-        f" the mission takes {mission.duration:.1f} min for {mission.distance:.0f} m",
+        f" the mission takes {mission.needed_min:.1f} min for {mission.distance_m:.0f} m",
     )
 
 
-def _mission(draft: Draft, area: OperationArea, drone: Drone, home: Position) -> Mission | None:
-    mobility = drone.spec.services.mobility
-    if mobility is None:
-        return None
-    found = estimate(draft.spec, area, ground(home), drone, draft.settings)
-    available = remaining_minutes(drone) - draft.settings.battery_reserve * mobility.max_flight_time
-    return Mission(distance=round(found.distance_m, 1), duration=round(found.minutes, 3), available=round(available, 3))
+def _mission(found: Estimate) -> Mission:
+    return Mission(
+        distance=round(found.distance_m, 1),
+        duration=round(found.needed_min, 3),
+        available=round(found.available_min, 3),
+    )
 
 
 def _home(draft: Draft, drone: Drone) -> Position | None:

@@ -11,7 +11,7 @@ from fractus_core.api.applications import Component, EdgeLocation
 from fractus_core.api.geometry import Point
 from fractus_core.api.nodes import Drone, EdgeNode, Interface
 from fractus_core.api.plans import PlannedInstance, Serves
-from fractus_core.geo import geodesic_m, ground
+from fractus_core.geo import distance_m, ground
 from fractus_core.planning.area import OperationArea
 from fractus_core.planning.candidates import Check, direct_range_m, direct_reach_m
 from fractus_core.planning.coverage import CoverScene, Samples, greedy_cover
@@ -156,7 +156,7 @@ def _reaches(here: EdgeNode, node: EdgeNode) -> bool:
     if here.name == node.name:
         return True
     reach = direct_reach_m(here.spec.interfaces, node.spec.interfaces)
-    return reach is not None and geodesic_m(ground(here.spec.location), ground(node.spec.location)) <= reach
+    return reach is not None and distance_m(ground(here.spec.location), ground(node.spec.location)) <= reach
 
 
 # -- hybrid components along the drone's way (Algorithms 8 and 10) --

@@ -14,19 +14,28 @@ from fractus_core.api.applications import Application, ApplicationSpec
 from fractus_core.api.geometry import Point, Position
 from fractus_core.api.nodes import Depot, Drone
 from fractus_core.api.plans import Leg
-from fractus_core.geo import LocalFrame, geodesic_m, ground, middle_of
+from fractus_core.geo import LocalFrame, distance_m, middle_of
 from fractus_core.planning.area import OperationArea, control_routes
 from fractus_core.planning.inventory import Flight, Settings
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What a mission takes, from the stand and back to it."""
+    """What a mission takes of a drone, from its stand and back to it.
+
+    Attributes:
+        distance_m: over ground.
+        approach_m: of it from the stand to the first point.
+        top_m: the highest point, above home.
+        needed_min: minutes of flight.
+        available_min: minutes that the drone can fly with its reserve kept.
+    """
 
     distance_m: float
-    climb_m: float
-    stay_min: float
-    minutes: float
+    approach_m: float
+    top_m: float
+    needed_min: float
+    available_min: float
 
 
 def estimate(spec: ApplicationSpec, area: OperationArea, home: Point, drone: Drone, settings: Settings) -> Estimate:
@@ -35,15 +44,18 @@ def estimate(spec: ApplicationSpec, area: OperationArea, home: Point, drone: Dro
     Legs are straight; altitudes are gained and lost at the climb speed on top of the time over ground; a region counts
     with the way to its middle and the stay its control point declares.
     """
-    first, last = ground(area.route[0]), ground(area.route[-1])
-    distance = geodesic_m(home, first) + area.length_m + geodesic_m(last, home)
+    approach = distance_m(home, area.route[0])
+    distance = approach + area.length_m + distance_m(area.route[-1], home)
     heights = [0.0, *heights_m(area.route, drone), 0.0]
     climb = sum(abs(b - a) for a, b in itertools.pairwise(heights))
     stay = sum(p.duration or 0.0 for p in spec.driver.control_points) if spec.driver is not None else 0.0
     mobility = drone.spec.services.mobility
-    speed = min(settings.cruise_speed_mps, mobility.max_speed if mobility is not None else math.inf)
-    minutes = (distance / speed + climb / settings.climb_speed_mps) / 60 + stay
-    return Estimate(distance, climb, stay, minutes)
+    speed, available = settings.cruise_speed_mps, 0.0
+    if mobility is not None:
+        speed = min(speed, mobility.max_speed)
+        available = remaining_minutes(drone) - settings.battery_reserve * mobility.max_flight_time
+    needed = (distance / speed + climb / settings.climb_speed_mps) / 60 + stay
+    return Estimate(distance, approach, max(heights), needed, available)
 
 
 def heights_m(route: Sequence[Position], drone: Drone) -> list[float]:

@@ -12,13 +12,10 @@ from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.geometry import Point
 from fractus_core.geo import LocalFrame, geodesic_m
-from fractus_core.geo.frames import FLATTENING, SEMI_MAJOR_AXIS_M
+from fractus_core.geo.frames import CHORDS_TO_M, FLATTENING, SEMI_MAJOR_AXIS_M, ecef
 
 Near = tuple[str, float]
 """A name and its geodesic distance in metres."""
-
-FAR_M = 200_000.0
-"""Up to here distances come from chords, which is fast and exact to the micrometre; beyond from Karney's algorithm."""
 
 _Floats = NDArray[np.float64]
 _Slots = NDArray[np.int64]
@@ -96,7 +93,7 @@ class SpatialIndex:
 
     def upsert(self, name: str, lat: float, lon: float) -> None:
         """Add a point, or move the one of that name."""
-        place = _ecef_one(lat, lon)
+        place = ecef(lat, lon)
         slot = self._slots.get(name)
         before: Sequence[float] | None = None
         if slot is None:
@@ -150,7 +147,7 @@ class SpatialIndex:
         slots, distances = self._exactly(point, slots, radius_m)
         return self._ranked(slots, distances)
 
-    def nearest(self, point: Point, count: int, beyond_m: float = 0.0, within_m: float = FAR_M) -> list[Near]:
+    def nearest(self, point: Point, count: int, beyond_m: float = 0.0, within_m: float = CHORDS_TO_M) -> list[Near]:
         """The points nearest to a place, further than `beyond_m` and not further than `within_m`; ordered as by within."""
         radius_m = min(max(2 * beyond_m, _CELLS_M[0] / 2), within_m)
         while count > 0:
@@ -195,7 +192,7 @@ class SpatialIndex:
 
     def _around(self, lat: float, lon: float, radius_m: float) -> _Slots:
         """Slots that may be within the radius: a superset, since a chord is never longer than the geodesic."""
-        x, y, z = _ecef_one(lat, lon)
+        x, y, z = ecef(lat, lon)
         for grid, size in zip(self._grids, _CELLS_M, strict=True):
             if size >= radius_m:
                 cells = [grid[key] for key in _cells_around(x, y, z, radius_m, size) if key in grid]
@@ -206,11 +203,11 @@ class SpatialIndex:
         return np.fromiter((slot for cell in cells for slot in cell), dtype=np.int64, count=total)
 
     def _exactly(self, point: Point, slots: _Slots, radius_m: float) -> tuple[_Slots, _Floats]:
-        estimates = _geodesics(np.array(_ecef_one(point.lat, point.lon)), self._xyz[slots])
+        estimates = _geodesics(np.array(ecef(point.lat, point.lon)), self._xyz[slots])
         error = 2e-8 + 1e-31 * estimates**5
         keep = estimates <= radius_m + error
         slots, estimates, error = slots[keep], estimates[keep], error[keep]
-        doubtful = (estimates >= radius_m - error) | (estimates > FAR_M)
+        doubtful = (estimates >= radius_m - error) | (estimates > CHORDS_TO_M)
         for i in np.flatnonzero(doubtful).tolist():
             there = Point(lat=float(self._lats[slots[i]]), lon=float(self._lons[slots[i]]))
             estimates[i] = geodesic_m(point, there)
@@ -222,13 +219,6 @@ class SpatialIndex:
         millimetres = np.rint(distances * 1000).astype(np.int64).tolist()
         ranked = sorted(zip(millimetres, names, distances.tolist(), strict=True))
         return [(name, distance) for _, name, distance in ranked]
-
-
-def _ecef_one(lat: float, lon: float) -> tuple[float, float, float]:
-    phi, lam = math.radians(lat), math.radians(lon)
-    n = SEMI_MAJOR_AXIS_M / math.sqrt(1 - _E2 * math.sin(phi) ** 2)
-    ground = n * math.cos(phi)
-    return ground * math.cos(lam), ground * math.sin(lam), n * (1 - _E2) * math.sin(phi)
 
 
 def _ecef(lats: _Floats, lons: _Floats) -> _Floats:

@@ -146,7 +146,7 @@ class Record:
             zones=tuple(sorted(found["Zone"], key=lambda z: z.name)),
             pods=tuple(sorted((_pod(body) for body in content.get("pods", ())), key=lambda p: (p.component, p.name))),
             events=tuple(content.get("events", ())),
-            samples=_flight(_sample(e) for e in entries if e.get("kind") == "state"),
+            samples=_flight(_sample(e) for e in entries if _has_state(e)),
             judgements=_merged(judged),
             calls=sum(e.get("kind") == "call" for e in entries),
             audit=content.get("audit", {}),
@@ -223,6 +223,11 @@ def _lines(path: Path) -> list[dict[str, Any]]:
 
 def _time(text: str) -> float:
     return datetime.fromisoformat(text).timestamp()
+
+
+def _has_state(entry: Mapping[str, Any]) -> bool:
+    """Whether an entry tells where the drone was: the recorder's, and the note that it has landed."""
+    return entry.get("kind") == "state" or (entry.get("kind") == "control" and entry.get("action") == "landed")
 
 
 def _sample(entry: Mapping[str, Any]) -> Sample:

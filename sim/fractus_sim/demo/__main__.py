@@ -1,0 +1,80 @@
+"""`python -m fractus_sim.demo`: fly the traffic monitoring example and report."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from types import FrameType
+from typing import NoReturn
+
+import click
+from rich.console import Console
+from rich.markdown import Markdown
+
+from fractus_sim.demo.kube import DemoError
+from fractus_sim.demo.place import Current, Embedded
+from fractus_sim.demo.runner import ClusterError, Demo, Teller, report_again
+
+
+def _assignments(_context: click.Context, _option: click.Parameter, texts: tuple[str, ...]) -> Mapping[str, str]:
+    found: dict[str, str] = {}
+    for text in texts:
+        example, equals, node = text.partition("=")
+        if not equals or not node or example not in {"drone-1", "edge-1", "edge-2", "edge-3", "cloud-1"}:
+            raise click.BadParameter(f"{text!r}: expected drone-1=NODE, edge-1=NODE, ..., cloud-1=NODE")
+        found[example] = node
+    return found
+
+
+@click.command()
+@click.option(
+    "--cluster",
+    type=click.Choice(["embedded", "current"]),
+    default="embedded",
+    show_default=True,
+    help="embedded: one on this machine (Linux, root). current: that of KUBECONFIG (k3s, kind), with the images loaded.",
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path, file_okay=False), default=Path("out/demo"), show_default=True,
+    help="Folder of the report.",
+)  # fmt: skip
+@click.option("--keep", is_flag=True, help="Leave the cluster, Fractus and the application as they are at the end.")
+@click.option(
+    "--assign", multiple=True, callback=_assignments, metavar="NAME=NODE",
+    help="With --cluster current: which node stands for drone-1, edge-1, ..., cloud-1; repeat.",
+)  # fmt: skip
+@click.option("--timeout", "timeout_s", default=480.0, show_default=True, help="Seconds the mission may take.")
+@click.option("--report-only", is_flag=True, help="Write the report in OUT anew from what an earlier run recorded.")
+def demo(
+    *, cluster: str, out: Path, keep: bool, assign: Mapping[str, str], timeout_s: float, report_only: bool
+) -> None:
+    """Deploy the traffic monitoring example, watch it fly, and report what happened."""
+    console = Console()
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        if report_only:
+            report_again(out)
+            fine = True
+        else:
+            tell = Teller(console)
+            place = Embedded(tell) if cluster == "embedded" else Current(tell, assign)
+            fine = Demo(place, out, keep, timeout_s, tell).run()
+    except (DemoError, ClusterError) as error:
+        click.echo(f"demo: {error}", err=True)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        click.echo("demo: interrupted", err=True)
+        sys.exit(130)
+    console.print(Markdown((out / "summary.md").read_text()))
+    click.echo(f"report: {out}/summary.md, map.png, altitude.png, flight.geojson, plan.yaml, audit.jsonl")
+    sys.exit(0 if fine else 1)
+
+
+def _interrupt(_number: int, _frame: FrameType | None) -> NoReturn:
+    raise KeyboardInterrupt
+
+
+if __name__ == "__main__":
+    demo(prog_name="python -m fractus_sim.demo")

@@ -1,0 +1,96 @@
+"""kubectl and helm on one cluster, as the demo needs them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import yaml
+
+Object = dict[str, Any]
+SYSTEM = "fractus-system"
+NAMESPACE = "default"
+
+
+class DemoError(Exception):
+    """The demo cannot go on; the text says what to do."""
+
+    exit_code = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Kube:
+    """One cluster and the programs that speak to it."""
+
+    kubectl: Path
+    helm: Path
+    kubeconfig: Path
+
+    def run(self, *arguments: str, stdin: str | None = None, timeout_s: float = 60.0) -> str:
+        """Run kubectl to its end and return its standard output.
+
+        Raises:
+            DemoError: it failed or took too long.
+        """
+        return self._run(self.kubectl, arguments, stdin, timeout_s)
+
+    def objects(self, kinds: str, *arguments: str) -> list[Object]:
+        """Objects of the kinds (comma-separated) in the default namespace, or of the whole cluster."""
+        text = self.run("get", kinds, "-n", NAMESPACE, "-o", "json", *arguments)
+        return list(json.loads(text)["items"])
+
+    def apply(self, objects: Sequence[Object]) -> None:
+        """Apply manifests."""
+        self.run("apply", "-f", "-", stdin=yaml.safe_dump_all(objects))
+
+    def delete(self, objects: Sequence[Object], timeout_s: float) -> None:
+        """Delete what manifests made, and wait until it is gone."""
+        text = yaml.safe_dump_all(objects)
+        self.run(
+            "delete", "-f", "-", "--ignore-not-found", f"--timeout={timeout_s:.0f}s", stdin=text, timeout_s=timeout_s + 10
+        )  # fmt: skip
+
+    def install(self, release: str, chart: Path) -> bool:
+        """Install or upgrade a chart; True when it was not there before."""
+        listed = self._run(self.helm, ["list", "-n", SYSTEM, "-q", "-f", f"^{release}$"], None, 60.0)
+        arguments = ["upgrade", "--install", release, str(chart), "-n", SYSTEM, "--create-namespace"]
+        self._run(self.helm, arguments, None, 120.0)
+        return not listed.strip()
+
+    def uninstall(self, release: str) -> None:
+        """Take a release away."""
+        self._run(self.helm, ["uninstall", release, "-n", SYSTEM, "--ignore-not-found", "--wait"], None, 180.0)
+
+    def follow(self, arguments: Sequence[str], out: IO[bytes]) -> subprocess.Popen[bytes]:
+        """Start a kubectl that writes until it is ended."""
+        return subprocess.Popen(
+            [str(self.kubectl), *arguments], stdout=out, stderr=subprocess.DEVNULL, env=self._environment()
+        )
+
+    def _run(self, program: Path, arguments: Sequence[str], stdin: str | None, timeout_s: float) -> str:
+        words = f"{program.name} {' '.join(arguments[:4])}"
+        try:
+            done = subprocess.run(
+                [str(program), *arguments],
+                input=stdin,
+                capture_output=True,
+                text=True,
+                timeout=timeout_s,
+                env=self._environment(),
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            raise DemoError(f"{words}: no end after {timeout_s:.0f} s") from None
+        except OSError as error:
+            raise DemoError(f"cannot run {program}: {error.strerror}; install it, or use --cluster embedded") from None
+        if done.returncode:
+            raise DemoError(f"{words}: {' '.join(done.stderr.split())}")
+        return done.stdout
+
+    def _environment(self) -> dict[str, str]:
+        return {**os.environ, "KUBECONFIG": str(self.kubeconfig)}

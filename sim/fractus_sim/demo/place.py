@@ -1,0 +1,166 @@
+"""Where the demo runs: an embedded cluster of its own, or the user's with the example's nodes assigned to its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import yaml
+
+from fractus_sim.cluster import Cluster
+from fractus_sim.cluster.binaries import ensure_binaries
+from fractus_sim.cluster.images.build import build_images
+from fractus_sim.demo.kube import DemoError, Kube, Object
+
+ROOT = Path(__file__).parents[3]
+EXAMPLE = ROOT / "examples" / "traffic-monitoring"
+TARGETS = ("operator", "agent", "services", "example-traffic-monitoring")
+CLASS_LABEL = "fractus.dev/class"
+GPU = "fractus.dev/gpu"
+Say = Callable[[str], None]
+
+
+def documents(path: Path) -> list[Object]:
+    """The objects of a manifest.
+
+    Raises:
+        DemoError: there is no such file.
+    """
+    try:
+        return [body for body in yaml.safe_load_all(path.read_text()) if body]
+    except OSError as error:
+        raise DemoError(f"cannot read {path}: {error.strerror}; run this in a checkout of Fractus") from None
+
+
+class Place(Protocol):
+    """A cluster that the demo can use."""
+
+    def images(self) -> None:
+        """Build what the nodes will run."""
+
+    def up(self) -> Kube:
+        """Bring it up, with images on its nodes and nodes labelled."""
+
+    def hardware(self, kube: Kube) -> list[Object]:
+        """Objects that describe nodes and stand for their hardware, where the nodes do not bring them."""
+
+    def down(self) -> None:
+        """Leave it as it was found."""
+
+
+@dataclass
+class Embedded:
+    """A cluster on this machine; taken down again unless it ran before."""
+
+    say: Say
+    built: list[str] = field(default_factory=list)
+    _cluster: Cluster | None = None
+    _was_running: bool = False
+
+    def images(self) -> None:
+        """Build the images whose content changed."""
+        self.built = build_images(ROOT, targets=TARGETS, report=self.say)
+
+    def up(self) -> Kube:
+        """Bring the cluster of examples/clusters/demo.yaml up."""
+        self._cluster = Cluster.load(ROOT / "examples" / "clusters" / "demo.yaml", report=self.say)
+        self._was_running = self._cluster.running
+        self._cluster.up(images=self.built)
+        programs = ensure_binaries(("kubectl", "helm"), report=self.say)
+        return Kube(programs["kubectl"], programs["helm"], self._cluster.kubeconfig)
+
+    def hardware(self, kube: Kube) -> list[Object]:
+        """Nothing: vehicles stand beside the nodes, and agents register them."""
+        return []
+
+    def down(self) -> None:
+        """Take the cluster down if it was brought up here."""
+        if self._cluster is not None and not self._was_running:
+            self._cluster.down()
+
+
+@dataclass
+class Current:
+    """The cluster of KUBECONFIG; images are there, and the example's nodes are assigned to its nodes."""
+
+    say: Say
+    given: Mapping[str, str]
+    _assigned: Mapping[str, str] = field(default_factory=dict)
+
+    def images(self) -> None:
+        """Nothing: they are loaded by whoever runs the cluster."""
+        self.say(f"expecting images localhost/fractus/{{{','.join((*TARGETS, 'sim'))}}}:dev on the nodes")
+
+    def up(self) -> Kube:
+        """Find the cluster, assign and label its nodes."""
+        found = [shutil.which(name) for name in ("kubectl", "helm")]
+        if None in found:
+            raise DemoError("kubectl and helm must be on the PATH for --cluster current")
+        config = Path(os.environ.get("KUBECONFIG", "~/.kube/config")).expanduser()
+        kube = Kube(Path(str(found[0])), Path(str(found[1])), config)
+        nodes = kube.objects("nodes")
+        self._assigned = assign(nodes, self.given)
+        for example, node in self._assigned.items():
+            kube.run("label", "node", node, f"{CLASS_LABEL}={class_of(example)}", "--overwrite")
+            capacity = next(n for n in nodes if n["metadata"]["name"] == node)["status"].get("capacity", {})
+            if class_of(example) != "drone" and GPU not in capacity:
+                path = "/status/capacity/" + GPU.replace("/", "~1")
+                patch = json.dumps([{"op": "add", "path": path, "value": "1"}])
+                kube.run("patch", "node", node, "--subresource=status", "--type=json", "-p", patch)
+            self.say(f"{example} is {node}")
+        return kube
+
+    def hardware(self, kube: Kube) -> list[Object]:
+        """Drone and edge nodes under the names of this cluster's nodes, and a simulated vehicle on each drone node."""
+        described = [*documents(EXAMPLE / "drone.yaml"), *documents(EXAMPLE / "edge-nodes.yaml")]
+        kept = [body for body in described if body["metadata"]["name"] in self._assigned]
+        for body in kept:
+            body["metadata"]["name"] = self._assigned[body["metadata"]["name"]]
+        return [*documents(ROOT / "examples" / "simulated-hardware.yaml"), *kept]
+
+    def down(self) -> None:
+        """Nothing: labels stay, for the next time."""
+
+
+def class_of(example: str) -> str:
+    """drone, edge or cloud, from the name that a node has in the example."""
+    return example.split("-", maxsplit=1)[0]
+
+
+def assign(nodes: Sequence[Object], given: Mapping[str, str]) -> dict[str, str]:
+    """Which node stands for which of the example's: drone-1, edge-1 to edge-3, cloud-1.
+
+    What is given comes first, then equal names, then nodes with the label of the class, by name. edge-3 may be missing:
+    it is there to be rejected.
+
+    Raises:
+        DemoError: a node is missing; the message says how to name it.
+    """
+    names = {node["metadata"]["name"]: node["metadata"].get("labels", {}).get(CLASS_LABEL) for node in nodes}
+    unknown = sorted(set(given.values()) - set(names))
+    if unknown:
+        raise DemoError(f"--assign: the cluster has no node {unknown[0]}; it has {', '.join(sorted(names))}")
+    assigned = dict(given)
+    wanted = ("drone-1", "edge-1", "edge-2", "edge-3", "cloud-1")
+    for example in wanted:
+        if example not in assigned and example in names:
+            assigned[example] = example
+    for example in wanted:
+        if example in assigned:
+            continue
+        free = sorted(
+            name for name, label in names.items() if label == class_of(example) and name not in assigned.values()
+        )
+        if free:
+            assigned[example] = free[0]
+        elif example != "edge-3":
+            raise DemoError(
+                f"no node of this cluster stands for {example}; name one: --assign {example}=NODE"
+                f" (nodes: {', '.join(sorted(names))})"
+            )
+    return assigned

@@ -1,0 +1,189 @@
+"""The demo from an empty machine to a report, step by step."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from fractus_sim.cluster import ClusterError
+from fractus_sim.demo.collect import collect
+from fractus_sim.demo.kube import DemoError, Kube, Object
+from fractus_sim.demo.place import EXAMPLE, ROOT, Place, documents
+from fractus_sim.demo.report import Record, write_report
+from fractus_sim.demo.report.summary import figures
+from fractus_sim.demo.watch import GROUNDED, Mission, follow, wait_ready
+
+READY_TIMEOUT_S = 180.0
+HOME_TIMEOUT_S = 180.0
+RELEASES = ("fractus-crds", "fractus")
+LOGS = "components.log"
+
+
+class Teller:
+    """Says what happens: a line for what is done, a line that changes for what is under way."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._status = console.status("")
+        self._start = time.monotonic()
+
+    def __call__(self, line: str) -> None:
+        """Say something for good."""
+        self._console.print(f"[dim]{time.monotonic() - self._start:7.1f} s[/dim]  {_escaped(line)}", highlight=False)
+
+    def show(self, line: str) -> None:
+        """Say what is so at the moment."""
+        self._status.update(_escaped(line))
+
+    @contextmanager
+    def step(self, what: str) -> Iterator[None]:
+        """Announce a step, and say how long it took."""
+        started = time.monotonic()
+        self(f"{what} ...")
+        self.show(what)
+        with self._status:
+            yield
+        self(f"{what}: {time.monotonic() - started:.1f} s")
+
+
+def _escaped(line: str) -> str:
+    return line.replace("[", r"\[")
+
+
+@dataclass
+class Demo:
+    """One run.
+
+    Attributes:
+        place: the cluster.
+        out: folder of the report.
+        keep: leave cluster, Fractus and objects as they are at the end.
+        timeout_s: how long the mission may take.
+    """
+
+    place: Place
+    out: Path
+    keep: bool
+    timeout_s: float
+    tell: Teller
+
+    def run(self) -> bool:
+        """Run all steps; what was recorded is reported, and the cluster left in order, also after a failure.
+
+        Returns:
+            Whether the mission was completed, with a request corrected and one refused, and the drone landed.
+
+        Raises:
+            DemoError: a step failed.
+            ClusterError: the embedded cluster could not be brought up.
+        """
+        self.out.mkdir(parents=True, exist_ok=True)
+        for stale in ("objects.json", "audit.jsonl", "events.json", LOGS):
+            (self.out / stale).unlink(missing_ok=True)
+        kube: Kube | None = None
+        installed: list[str] = []
+        applied: list[Object] = []
+        try:
+            with self.tell.step("images"):
+                self.place.images()
+            with self.tell.step("cluster"):
+                kube = self.place.up()
+            with self.tell.step("Fractus"):
+                installed += self._install(kube)
+            return self._fly(kube, applied)
+        finally:
+            if not self.keep:
+                with self.tell.step("cleaning up"):
+                    self._clean_up(kube, applied, installed)
+
+    def _install(self, kube: Kube) -> list[str]:
+        fresh = [release for release in RELEASES if kube.install(release, ROOT / "charts" / release)]
+        hardware = self.place.hardware(kube)
+        if hardware:
+            kube.apply(hardware)
+        kube.apply(self._surroundings())
+        wait_ready(kube, None, READY_TIMEOUT_S, self.tell.show)
+        return fresh
+
+    def _surroundings(self) -> list[Object]:
+        return [body for name in ("depot.yaml", "zones.yaml", "policies.yaml") for body in documents(EXAMPLE / name)]
+
+    def _fly(self, kube: Kube, applied: list[Object]) -> bool:
+        application = documents(EXAMPLE / "application.yaml")
+        mission = Mission(application[0]["metadata"]["name"])
+        with self.tell.step("application of an earlier run"):
+            kube.delete(application, HOME_TIMEOUT_S)
+        applied += application
+        logs = self.out / LOGS
+        with self.tell.step("mission"):
+            mission.times["applied"] = time.time()
+            kube.apply(application)
+            try:
+                follow(kube, mission, logs, timeout_s=self.timeout_s, say=self.tell, show=self.tell.show)
+            finally:
+                collect(kube, mission, self.out, logs)
+                record = Record.read(self.out)
+                write_report(record, self.out)
+        return _as_promised(record, self.tell)
+
+    def _clean_up(self, kube: Kube | None, applied: list[Object], installed: list[str]) -> None:
+        if kube is not None:
+            try:
+                self._remove(kube, applied, installed)
+            except DemoError as error:
+                self.tell(f"not removed: {error}")
+        self.place.down()
+
+    def _remove(self, kube: Kube, applied: list[Object], installed: list[str]) -> None:
+        if applied:
+            kube.delete(applied, HOME_TIMEOUT_S)
+            deadline = time.monotonic() + HOME_TIMEOUT_S
+            while time.monotonic() < deadline:
+                states = {(body.get("status") or {}).get("flightState") for body in kube.objects("drones")}
+                if states <= {*GROUNDED, None}:
+                    break
+                self.tell.show("waiting for the drone to land")
+                time.sleep(1.0)
+        if "fractus" in installed:
+            kube.delete([*self._surroundings(), *self.place.hardware(kube)], 60.0)
+        for release in reversed(installed):
+            kube.uninstall(release)
+
+
+def _as_promised(record: Record, tell: Teller) -> bool:
+    found = figures(record)
+    missing = [
+        what
+        for what, holds in (
+            ("the mission is not Completed", found["phase"] == "Completed"),
+            ("no request was corrected", found["corrected"] > 0),
+            ("no request was refused", found["refused"] > 0),
+            ("the drone has not landed", found["landed"]),
+            ("the audit log does not verify", found["audit"].get("problem") == ""),
+        )
+        if not holds
+    ]
+    for what in missing:
+        tell(f"not as it should be: {what}")
+    return not missing
+
+
+def report_again(out: Path) -> None:
+    """Write the report of an earlier run anew from what it recorded.
+
+    Raises:
+        DemoError: nothing was recorded there.
+    """
+    try:
+        write_report(Record.read(out), out)
+    except (OSError, json.JSONDecodeError) as error:
+        raise DemoError(f"no record of a flight in {out}: {error}") from None
+
+
+__all__ = ["ClusterError", "Demo", "Teller", "report_again"]

@@ -1,0 +1,184 @@
+"""Follows a mission on a cluster from apply to landing, and says what changes."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fractus_sim.demo.kube import NAMESPACE, DemoError, Kube, Object
+
+POLL_S = 0.5
+LANDING_TIMEOUT_S = 180.0
+GROUNDED = {"inactive", "charging"}
+Say = Callable[[str], None]
+_LOG_LINE = re.compile(rb"\[pod/(?P<pod>[^/]+)/(?P<container>[^\]]+)\] (?P<text>.*)")
+
+
+@dataclass
+class Mission:
+    """What was seen of a mission.
+
+    Attributes:
+        application: name of the Application.
+        times: Unix seconds of what happened: applied, planned, running, ended, landed.
+        pods: last state seen of each pod, by name.
+        phase: the Application's.
+    """
+
+    application: str
+    times: dict[str, float] = field(default_factory=dict)
+    pods: dict[str, Object] = field(default_factory=dict)
+    phase: str = ""
+    message: str = ""
+    drone: str = ""
+    flight_state: str = ""
+    _running: int = 0
+
+    def see(self, objects: list[Object], now_s: float, say: Say) -> None:
+        """Take a look at the cluster's objects, and say what is new."""
+        for body in objects:
+            kind, name = body["kind"], body["metadata"]["name"]
+            if kind == "Application" and name == self.application:
+                self._see_application(body, now_s, say)
+            elif kind == "DeploymentPlan" and name == self.application and "planned" not in self.times:
+                self.times["planned"] = now_s
+                placements = body["spec"].get("placements", [])
+                say(f"planned after {now_s - self.times['applied']:.1f} s: {len(placements)} instances, {_drone(body)}")
+            elif kind == "Pod" and "deletionTimestamp" not in body["metadata"]:
+                self.pods[name] = body
+            elif kind == "Drone" and name == self.drone:
+                self._see_drone(body, now_s, say)
+        self._see_pods(now_s, say)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the Application is over."""
+        return self.phase in {"Completed", "Failed", "Invalid"}
+
+    @property
+    def grounded(self) -> bool:
+        """Whether the drone is not in the air, as far as its agent says."""
+        return self.flight_state in GROUNDED or not self.drone
+
+    def _see_application(self, body: Object, now_s: float, say: Say) -> None:
+        status = body.get("status") or {}
+        phase, message = status.get("phase", ""), status.get("message", "")
+        self.drone = status.get("drone") or self.drone
+        if (phase, message) != (self.phase, self.message):
+            say(f"application {phase or 'new'}{': ' + message if message else ''}")
+        self.phase, self.message = phase, message
+        if self.ended and "ended" not in self.times:
+            self.times["ended"] = now_s
+
+    def _see_drone(self, body: Object, now_s: float, say: Say) -> None:
+        state = (body.get("status") or {}).get("flightState", "")
+        if state == self.flight_state:
+            return
+        if state in GROUNDED and self.flight_state and "running" in self.times:
+            self.times["landed"] = now_s
+        self.flight_state = state
+        say(f"{self.drone} is {_words(state)}")
+
+    def _see_pods(self, now_s: float, say: Say) -> None:
+        running = sum(_ready(body) for body in self.pods.values())
+        if running > self._running:
+            say(f"pods Running: {running} of {len(self.pods)}")
+        self._running = running
+        if self.phase == "Running" and running == len(self.pods) > 0 and "running" not in self.times:
+            self.times["running"] = now_s
+            say(f"all pods Running after {now_s - self.times['applied']:.1f} s")
+
+
+def follow(kube: Kube, mission: Mission, logs: Path, *, timeout_s: float, say: Say, show: Say) -> None:
+    """Watch until the mission is over and the drone is down.
+
+    Args:
+        kube: the cluster.
+        mission: what was seen; `times["applied"]` is set.
+        logs: file that gets the components' logs.
+        timeout_s: for the mission without the landing.
+        say: gets what changed, a line at a time.
+        show: gets what is so now, for a status line.
+
+    Raises:
+        DemoError: the time is over.
+    """
+    deadline = mission.times["applied"] + timeout_s
+    tail: subprocess.Popen[bytes] | None = None
+    told = 0
+    with logs.open("wb") as out:
+        try:
+            while not (mission.ended and mission.grounded):
+                now = time.time()
+                mission.see(kube.objects("applications,deploymentplans,pods,drones"), now, say)
+                if mission.ended and deadline < now + LANDING_TIMEOUT_S:
+                    deadline = max(deadline, mission.times["ended"] + LANDING_TIMEOUT_S)
+                if now > deadline:
+                    raise DemoError(
+                        f"the mission did not end within {timeout_s:.0f} s: {mission.message or mission.phase}"
+                    )
+                if tail is None and "running" in mission.times:
+                    selector = f"fractus.dev/application={mission.application}"
+                    tail = kube.follow(
+                        ["logs", "-n", NAMESPACE, "-l", selector, "-f", "--prefix", "--tail=-1", "--max-log-requests=50"], out
+                    )  # fmt: skip
+                told = _tell(logs, told, say)
+                show(
+                    f"{now - mission.times['applied']:.0f} s  {mission.phase}  {mission.drone} {_words(mission.flight_state)}"
+                )
+                time.sleep(POLL_S)
+            _tell(logs, told, say)
+        finally:
+            if tail is not None:
+                tail.terminate()
+                tail.wait(timeout=10)
+
+
+def wait_ready(kube: Kube, drone: str | None, timeout_s: float, show: Say) -> None:
+    """Wait until a drone reports that it can fly.
+
+    Raises:
+        DemoError: it did not in time; the message carries its condition.
+    """
+    deadline = time.monotonic() + timeout_s
+    reason = "no Drone has registered"
+    while time.monotonic() < deadline:
+        for body in kube.objects("drones"):
+            if drone is not None and body["metadata"]["name"] != drone:
+                continue
+            ready = [c for c in (body.get("status") or {}).get("conditions", ()) if c["type"] == "Ready"]
+            if ready and ready[0]["status"] == "True":
+                return
+            reason = f"{body['metadata']['name']}: " + (ready[0].get("message") if ready else "has not reported yet")
+        show(reason)
+        time.sleep(POLL_S)
+    raise DemoError(f"no drone was ready within {timeout_s:.0f} s ({reason}); see: kubectl -n fractus-system get pods")
+
+
+def _tell(logs: Path, start: int, say: Say) -> int:
+    """Say what the driver logged since; returns where to go on."""
+    with logs.open("rb") as file:
+        file.seek(start)
+        fresh = file.read()
+    end = fresh.rfind(b"\n") + 1
+    for line in fresh[:end].splitlines():
+        match = _LOG_LINE.match(line)
+        if match and match["container"] == b"navigator":
+            say("navigator: " + match["text"].decode("utf-8", "replace"))
+    return start + end
+
+
+def _ready(pod: Object) -> bool:
+    return any(c["type"] == "Ready" and c["status"] == "True" for c in pod.get("status", {}).get("conditions", ()))
+
+
+def _drone(plan: Object) -> str:
+    return f"{plan['spec']['drone']['node']} flies" if plan["spec"].get("drone") else "no drone"
+
+
+def _words(state: str) -> str:
+    return {"takingOff": "taking off", "inactive": "on the ground"}.get(state, state)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 from fractus_sim.cluster import machine, manifests, network
@@ -214,11 +215,12 @@ class Cluster:
             with self._api(authority, memory) as api:
                 api.wait_ready(timeout_s=_API_TIMEOUT_S)
                 self._apply_objects(api, nodes, memory)
+                since = datetime.now(UTC).replace(microsecond=0)
+                started_nodes = {node.name for node in nodes if node.power_on()}
                 for node in nodes:
-                    node.power_on()
                     node.start_vehicle()
                 self._write_kubeconfig(authority, memory)
-                self._wait_nodes(api, nodes)
+                self._wait_nodes(api, [(node, since if node.name in started_nodes else None) for node in nodes])
             self._wait_dns(memory)
             store.deliver(wanted, nodes)
         self._report(f"cluster {self.name} is up: {len(nodes)} nodes, {time.monotonic() - started:.1f} s")
@@ -413,22 +415,22 @@ class Cluster:
         if not self.kubeconfig.exists() or self.kubeconfig.read_text() != text:
             write_private(self.kubeconfig, text)
 
-    def _wait_nodes(self, api: ApiClient, nodes: list[Node]) -> None:
-        """Wait until every node is Ready and offers its extended resources."""
+    def _wait_nodes(self, api: ApiClient, nodes: Sequence[tuple[Node, datetime | None]]) -> None:
+        """Wait until every node is Ready, by its word since the given time, and offers its extended resources."""
         deadline = time.monotonic() + _READY_TIMEOUT_S
-        waiting = {node.name: node for node in nodes}
+        waiting = {node.name: (node, since) for node, since in nodes}
         while True:
             for item in api.request("GET", "/api/v1/nodes")["items"]:
-                node = waiting.get(item["metadata"]["name"])
-                if node is not None and _is_ready(item):
-                    patch = manifests.extended_resources_patch(node.spec)
-                    if patch and _lacks(item, node.spec.extended_resources):
+                name = item["metadata"]["name"]
+                if name in waiting and manifests.is_ready(item, since=waiting[name][1]):
+                    patch = manifests.extended_resources_patch(waiting[name][0].spec, item)
+                    if patch:
                         api.patch(*patch)
                     else:
-                        del waiting[node.name]
+                        del waiting[name]
             if not waiting:
                 return
-            for node in waiting.values():
+            for node, _ in waiting.values():
                 if not node.powered:
                     raise ClusterError(f"node {node.name} did not start; see {self.logs / node.name / 'init.log'}")
             if time.monotonic() > deadline:
@@ -455,19 +457,7 @@ class Cluster:
             raise
         except ClusterError:
             return None
-        return {item["metadata"]["name"]: _is_ready(item) for item in items}
-
-
-def _is_ready(item: dict[str, object]) -> bool:
-    status = item.get("status")
-    conditions = status.get("conditions", []) if isinstance(status, dict) else []
-    return any(entry["type"] == "Ready" and entry["status"] == "True" for entry in conditions)
-
-
-def _lacks(item: dict[str, object], resources: dict[str, str]) -> bool:
-    status = item.get("status")
-    capacity = status.get("capacity", {}) if isinstance(status, dict) else {}
-    return any(str(capacity.get(name)) != amount for name, amount in resources.items())
+        return {item["metadata"]["name"]: manifests.is_ready(item) for item in items}
 
 
 def print_report(message: str) -> None:

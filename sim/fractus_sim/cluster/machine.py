@@ -41,6 +41,7 @@ class _Ledger:
     sysctls: dict[str, str] = field(default_factory=dict)
     controllers: list[str] = field(default_factory=list)
     netns_mounted: bool = False
+    netns_there: bool = False
     claims: dict[str, _Claim] = field(default_factory=dict)
 
 
@@ -112,7 +113,8 @@ def remove_directory() -> None:
 
 
 def _note_machine(ledger: _Ledger) -> None:
-    ledger.netns_mounted = NETNS_DIRECTORY.is_mount()
+    ledger.netns_mounted = _mounted(NETNS_DIRECTORY)
+    ledger.netns_there = NETNS_DIRECTORY.exists()
     hierarchies = find_hierarchies()
     if hierarchies.version == 2:
         ledger.controllers = (hierarchies.roots[0] / "cgroup.subtree_control").read_text().split()
@@ -133,8 +135,12 @@ def _restore(ledger: _Ledger) -> None:
         path = _sysctl(name)
         if path.read_text().strip() == str(_RAISED_SYSCTLS.get(name)):  # else somebody set it meanwhile
             path.write_text(value)
-    if not ledger.netns_mounted and NETNS_DIRECTORY.is_mount() and not any(NETNS_DIRECTORY.iterdir()):
-        run(["umount", str(NETNS_DIRECTORY)], check=False)
+    # `ip netns add` mounts the directory on itself the first time.
+    if NETNS_DIRECTORY.is_dir() and not any(NETNS_DIRECTORY.iterdir()):
+        if not ledger.netns_mounted and _mounted(NETNS_DIRECTORY):
+            run(["umount", str(NETNS_DIRECTORY)], check=False)
+        if not ledger.netns_there:
+            NETNS_DIRECTORY.rmdir()
     hierarchies = find_hierarchies()
     if hierarchies.version == 2 and ledger.controllers:
         control = hierarchies.roots[0] / "cgroup.subtree_control"
@@ -143,6 +149,11 @@ def _restore(ledger: _Ledger) -> None:
                 control.write_text(f"-{name}")
             except OSError:
                 continue  # something else uses it by now
+
+
+def _mounted(path: Path) -> bool:
+    lines = Path("/proc/self/mountinfo").read_text().splitlines()
+    return any(line.split(" ")[4] == str(path) for line in lines)
 
 
 def _sysctl(name: str) -> Path:

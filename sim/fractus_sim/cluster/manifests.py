@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from ipaddress import IPv4Address
 from typing import Any
 
@@ -77,8 +78,22 @@ def dns_objects(listen: IPv4Address) -> list[tuple[str, Json]]:
     ]
 
 
-def extended_resources_patch(node: NodeSpec) -> tuple[str, Json] | None:
-    """Return path and merge patch that give a node its extended resources; None when it has none."""
-    if not node.extended_resources:
+def extended_resources_patch(node: NodeSpec, present: Json) -> tuple[str, Json] | None:
+    """Return path and merge patch that give a node its extended resources; None when it offers them already."""
+    capacity = present.get("status", {}).get("capacity", {})
+    if all(str(capacity.get(name)) == amount for name, amount in node.extended_resources.items()):
         return None
     return f"/api/v1/nodes/{node.name}/status", {"status": {"capacity": dict(node.extended_resources)}}
+
+
+def is_ready(node: Json, *, since: datetime | None = None) -> bool:
+    """Whether a Node object says that the node is Ready.
+
+    Args:
+        node: The object.
+        since: Believe only what its kubelet reported at this time or later.
+    """
+    for condition in node.get("status", {}).get("conditions", ()):
+        if condition["type"] == "Ready" and condition["status"] == "True":
+            return since is None or datetime.fromisoformat(condition["lastHeartbeatTime"]) >= since
+    return False

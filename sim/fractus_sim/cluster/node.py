@@ -155,10 +155,14 @@ class Node:
         # Groups of pods that are no more would make the next kubelet slow.
         self._cgroup.remove()
 
-    def power_on(self) -> None:
-        """Switch the node on with the configuration last written; a no-op when it runs."""
+    def power_on(self) -> bool:
+        """Switch the node on with the configuration last written; a no-op when it runs.
+
+        Returns:
+            Whether it was off.
+        """
         if self.powered:
-            return
+            return False
         self.power_off()
         network.flush_firewall(self.wiring, self.name)
         record = spawn(
@@ -168,6 +172,7 @@ class Node:
             env=_ENVIRONMENT,
         )
         write_record(self.state.process(f"node.{self.name}"), record)
+        return True
 
     def start_vehicle(self) -> None:
         """Put the node's vehicle in place; a no-op when it runs or the node has none.

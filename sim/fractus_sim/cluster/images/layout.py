@@ -17,9 +17,9 @@ from fractus_sim.cluster.errors import ClusterError
 Json = dict[str, Any]
 
 _INDEX_TYPE = "application/vnd.oci.image.index.v1+json"
-_MANIFEST_TYPE = "application/vnd.oci.image.manifest.v1+json"
-_CONFIG_TYPE = "application/vnd.oci.image.config.v1+json"
-_LAYER_TYPE = "application/vnd.oci.image.layer.v1.tar"
+MANIFEST_TYPE = "application/vnd.oci.image.manifest.v1+json"
+CONFIG_TYPE = "application/vnd.oci.image.config.v1+json"
+LAYER_TYPE = "application/vnd.oci.image.layer.v1.tar"
 _REF_ANNOTATION = "org.opencontainers.image.ref.name"
 _NAME_ANNOTATION = "io.containerd.image.name"
 _EPOCH = "1970-01-01T00:00:00Z"
@@ -66,7 +66,7 @@ class Layout:
         for entry in self._index():
             name = entry.get("annotations", {}).get(_REF_ANNOTATION)
             if name:
-                found[name] = Image(name, entry["digest"], entry["size"], entry.get("mediaType", _MANIFEST_TYPE))
+                found[name] = Image(name, entry["digest"], entry["size"], entry.get("mediaType", MANIFEST_TYPE))
         return found
 
     def image(self, name: str) -> Image:
@@ -122,11 +122,11 @@ class Layout:
         config_bytes = json.dumps(config, sort_keys=True).encode()
         manifest = {
             "schemaVersion": 2,
-            "mediaType": _MANIFEST_TYPE,
-            "config": _descriptor(_CONFIG_TYPE, self._add_blob(config_bytes), len(config_bytes)),
-            "layers": [_descriptor(_LAYER_TYPE, layer_digest, len(layer))],
+            "mediaType": MANIFEST_TYPE,
+            "config": _descriptor(CONFIG_TYPE, self._add_blob(config_bytes), len(config_bytes)),
+            "layers": [_descriptor(LAYER_TYPE, layer_digest, len(layer))],
         }
-        self.add_manifest(name, json.dumps(manifest, sort_keys=True).encode(), _MANIFEST_TYPE)
+        self.add_manifest(name, json.dumps(manifest, sort_keys=True).encode(), MANIFEST_TYPE)
         return self.image(name)
 
     def add_manifest(self, name: str, content: bytes, media_type: str) -> str:

@@ -1,14 +1,18 @@
 """A registry for the length of one push: takes images from buildah, layer by layer, into an OCI layout.
 
 buildah asks a registry which layers it has and sends only the others, which it does for no other destination.
+It insists on compressing what it sends, and asks by the digest of the uncompressed layer; so layers are kept
+uncompressed, which is also what nodes take fastest, and manifests are rewritten accordingly.
 """
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import json
 import os
 import re
+import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,9 +21,10 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
-from fractus_sim.cluster.images.layout import Layout
+from fractus_sim.cluster.images.layout import CONFIG_TYPE, LAYER_TYPE, MANIFEST_TYPE, Layout
 
 _PIECE_BYTES = 1 << 20
+_GZIP_MAGIC = b"\x1f\x8b"
 _BLOB = re.compile(r"^/v2/.+/blobs/(sha256:[0-9a-f]{64})$")
 _UPLOAD = re.compile(r"^/v2/.+/blobs/uploads/([0-9a-f]*)$")
 _MANIFEST = re.compile(r"^/v2/(.+)/manifests/([^/]+)$")
@@ -51,6 +56,35 @@ class _Server(ThreadingHTTPServer):
     def __init__(self, layout: Layout) -> None:
         super().__init__(("127.0.0.1", 0), _Handler)
         self.layout = layout
+        self.unpacked: dict[str, str] = {}  # digest of a compressed layer as sent -> digest as kept
+
+    def keep(self, file: Path) -> str:
+        """Take an uploaded file into the layout, uncompressed, and return the digest of what was sent."""
+        sent = _digest_of(file)
+        with file.open("rb") as content:
+            packed = content.read(2) == _GZIP_MAGIC
+        if not packed:
+            file.replace(self.layout.blob(sent))
+            return sent
+        plain = file.with_name(file.name + ".plain")
+        with gzip.open(file) as source, plain.open("wb") as out:
+            shutil.copyfileobj(source, out, _PIECE_BYTES)
+        kept = _digest_of(plain)
+        plain.replace(self.layout.blob(kept))
+        file.unlink()
+        self.unpacked[sent] = kept
+        return sent
+
+    def keep_manifest(self, name: str, content: bytes) -> None:
+        """Take a manifest into the layout, with its layers as they are kept."""
+        manifest = json.loads(content)
+        for layer in manifest["layers"]:
+            layer["digest"] = self.unpacked.get(layer["digest"], layer["digest"])
+            layer["size"] = self.layout.blob(layer["digest"]).stat().st_size
+            layer["mediaType"] = LAYER_TYPE
+        manifest["mediaType"] = MANIFEST_TYPE
+        manifest["config"]["mediaType"] = CONFIG_TYPE
+        self.layout.add_manifest(name, json.dumps(manifest, sort_keys=True).encode(), MANIFEST_TYPE)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -109,17 +143,14 @@ class _Handler(BaseHTTPRequestHandler):
             with file.open("ab") as out:
                 for piece in self._body():
                     out.write(piece)
-            digest = _digest_of(file)
+            digest = self.server.keep(file)
             if parse_qs(address.query).get("digest") != [digest]:
                 self._answer(HTTPStatus.BAD_REQUEST)
                 return
-            file.replace(self.server.layout.blob(digest))
             self._answer(HTTPStatus.CREATED, {"Docker-Content-Digest": digest})
         elif manifest is not None:
-            content = b"".join(self._body())
-            media_type = self.headers.get("Content-Type") or json.loads(content)["mediaType"]
-            digest = self.server.layout.add_manifest(f"{manifest[1]}:{manifest[2]}", content, media_type)
-            self._answer(HTTPStatus.CREATED, {"Docker-Content-Digest": digest})
+            self.server.keep_manifest(f"{manifest[1]}:{manifest[2]}", b"".join(self._body()))
+            self._answer(HTTPStatus.CREATED)
         else:
             self._answer(HTTPStatus.NOT_FOUND)
 

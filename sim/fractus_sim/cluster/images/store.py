@@ -76,7 +76,7 @@ class ImageStore:
     def _receive(self, names: Sequence[str]) -> None:
         with receiving(self.layout) as address:
             for name in names:
-                argv = ["buildah", "push", "--quiet", "--tls-verify=false", name]
+                argv = ["buildah", "push", "--quiet", "--compression-level=1", "--tls-verify=false", name]
                 run([*argv, f"docker://{address}/{name}"], timeout_s=_COPY_TIMEOUT_S)
 
     def template(self, images: Sequence[Image], pause: Path) -> Template:

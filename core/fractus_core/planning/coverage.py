@@ -89,6 +89,7 @@ class CoverScene:
         share: the share of the area to reach.
         kept: candidates that have an instance already and should keep it while it is of use.
         covered_by: discs that are covered anyway: x, y, reach, shape (m, 3).
+        newly_covered_by: discs that new instances cover; what is kept need not yield to them.
     """
 
     samples: Samples
@@ -98,6 +99,7 @@ class CoverScene:
     share: float
     kept: frozenset[str] = frozenset()
     covered_by: _Floats | None = None
+    newly_covered_by: _Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +124,11 @@ def greedy_cover(scene: CoverScene, fits: Callable[[str], bool]) -> list[Pick]:
     state = _State(scene)
     picks: list[Pick] = []
     kept = np.array([name in scene.kept for name in scene.names], dtype=bool)
-    for group in (np.flatnonzero(kept), np.arange(len(scene.names))):
+    for group, discs in (
+        (np.flatnonzero(kept), scene.covered_by),
+        (np.arange(len(scene.names)), scene.newly_covered_by),
+    ):
+        state.cover(discs)
         state.consider(group)
         while not state.enough():
             best = state.best()
@@ -145,9 +151,12 @@ class _State:
         self._gone = np.zeros(len(scene.names), dtype=bool)
         self._bounds = np.full(len(scene.names), -1, dtype=np.int64)
         self._fresh = np.zeros(len(scene.names), dtype=bool)
-        if scene.covered_by is not None and len(scene.covered_by):
-            self._cover(scene.covered_by[:, :2], scene.covered_by[:, 2])
         self._count()
+
+    def cover(self, discs: _Floats | None) -> None:
+        """Cover what some discs reach."""
+        if discs is not None and len(discs):
+            self._cover(discs[:, :2], discs[:, 2])
 
     def consider(self, candidates: _Integers) -> None:
         """Let these candidates take part, unless they were taken or dropped."""
@@ -178,8 +187,6 @@ class _State:
         """Cover what the candidate reaches; the share of the area that this adds."""
         gain = int(self._bounds[candidate])
         self._cover(self._scene.xy[[candidate]], self._scene.reach_m[[candidate]])
-        self._count()
-        self._fresh[:] = False
         self.drop(candidate)
         return gain / len(self._open)
 
@@ -198,6 +205,8 @@ class _State:
         _, first, end = self._scene.samples.runs(xy, reach_m)
         for a, b in zip(first.tolist(), end.tolist(), strict=True):
             self._open[a:b] = 0
+        self._count()
+        self._fresh[:] = False
 
     def _count(self) -> None:
         np.cumsum(self._open, out=self._before[1:])

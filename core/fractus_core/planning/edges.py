@@ -199,15 +199,18 @@ def find_along(draft: Draft, component: Component, drone: Drone, area: Operation
 def place_along(draft: Draft, component: Component, other: Component, along: AlongTheWay, hosts: HybridHosts) -> None:
     """Choose among the nodes along the way, and place the component on them."""
     there = np.array([name in hosts.nodes for name in along.names], dtype=bool)
+    kept = np.array([draft.had(component, name) for name in along.names], dtype=bool)
     free = np.flatnonzero(~there)
+    discs = np.column_stack((along.xy, along.reach_m))
     scene = CoverScene(
         samples=Samples(along.area.shape),
         names=[along.names[i] for i in free.tolist()],
         xy=along.xy[free],
         reach_m=along.reach_m[free],
         share=draft.settings.coverage_share,
-        kept=frozenset(name for name in along.names if draft.had(component, name)),
-        covered_by=np.column_stack((along.xy[there], along.reach_m[there])),
+        kept=frozenset(along.names[i] for i in np.flatnonzero(kept).tolist()),
+        covered_by=discs[there & kept],
+        newly_covered_by=discs[there & ~kept],
     )
 
     def fits(name: str) -> bool:

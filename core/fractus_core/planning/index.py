@@ -242,7 +242,8 @@ def _geodesics(origin: _Floats, points: _Floats) -> _Floats:
     with np.errstate(invalid="ignore", divide="ignore"):
         bend = np.einsum("ij,ij,j->i", chord, chord, _SQUARES) / squared * np.sqrt(depth / slope)
         arcs = 2 / bend * np.arcsin(np.minimum(1.0, np.sqrt(squared) * bend / 2))
-    return np.where(squared > 0, np.where(np.isfinite(arcs), arcs, _HALF_GLOBE_M), 0.0)
+    # Below a nanometre squares run out of digits.
+    return np.where(squared > 1e-18, np.where(np.isfinite(arcs), arcs, _HALF_GLOBE_M), 0.0)
 
 
 def _cell(place: Sequence[float], size: float) -> int:

@@ -1,0 +1,168 @@
+"""Missions: how long, in which order, who may come along."""
+
+import itertools
+import math
+
+import pytest
+from fractus_core.api.geometry import Position
+from fractus_core.planning import Flight, Settings, flight_of, operation_area
+from fractus_core.planning.flight import chauffeur_legs, estimate, first_missed
+from fractus_core.planning.tour import short_tour
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from test_planning import FRAME, PATH, VIEWER, application, at, drone, inventory, navigator
+
+spots = st.tuples(st.floats(-300, 300), st.floats(-300, 300))
+HOME = Position(**at(0, 0))
+
+
+def place(x, y, alt=None, **more):
+    return Position(**at(x, y, alt), **more)
+
+
+def flight(*legs, **more):
+    return Flight(("default", "other"), tuple(tuple(place(*p) for p in leg) for leg in legs), **more)
+
+
+def walked(leg, step=0.25):
+    """Places along a polyline, no further apart than a step."""
+    for (ax, ay), (bx, by) in itertools.pairwise(leg):
+        pieces = max(1, math.ceil(math.hypot(bx - ax, by - ay) / step))
+        for i in range(pieces + 1):
+            yield ax + (bx - ax) * i / pieces, ay + (by - ay) * i / pieces
+
+
+def visits(leg, points, radius, ordered):
+    """Oracle: walk the path in small steps and tick points off."""
+    steps = list(walked(leg))
+    left = list(points)
+    if not ordered:
+        return all(any(math.dist(s, p) <= radius for s in steps) for p in points)
+    for s in steps:
+        while left and math.dist(s, left[0]) <= radius:
+            left.pop(0)
+    return not left
+
+
+@given(
+    st.lists(spots, min_size=2, max_size=6),
+    st.lists(st.tuples(st.floats(0, 1), st.floats(-12, 12), st.floats(-12, 12)), min_size=1, max_size=4),
+    st.booleans(),
+)
+@settings(max_examples=150, deadline=None)
+def test_points_are_visited_in_order_along_the_path(leg, offsets, ordered):
+    steps = list(walked(leg))
+    assume(len(steps) > 10)
+    points = [
+        (steps[int(t * (len(steps) - 1))][0] + dx, steps[int(t * (len(steps) - 1))][1] + dy) for t, dx, dy in offsets
+    ]
+    sure, possible = visits(leg, points, 6.8, ordered), visits(leg, points, 7.2, ordered)
+    missed = first_missed([place(*p) for p in points], flight(leg), 7.0, ordered=ordered)
+    if sure:
+        assert missed is None
+    if not possible:
+        assert missed is not None
+
+
+def test_a_path_flown_twice_may_be_met_on_the_second_pass():
+    there_and_back = flight([(0, 0), (300, 0), (0, 0)])
+    assert first_missed([place(200, 0), place(100, 0)], there_and_back, 7, ordered=True) is None
+    assert first_missed([place(200, 0), place(100, 0)], flight([(0, 0), (300, 0)]), 7, ordered=True) == 1
+
+
+def test_altitude_counts_where_both_sides_give_it():
+    climbing = flight([(0, 0, 10), (300, 0, 40)])
+    assert first_missed([place(150, 0, 25)], climbing, 7, ordered=True) is None
+    assert first_missed([place(150, 0, 60)], climbing, 7, ordered=True) == 0
+    assert first_missed([place(150, 0)], climbing, 7, ordered=True) is None
+    assert first_missed([place(150, 0, 60, altitude_reference="amsl")], climbing, 7, ordered=True) is None
+
+
+def test_what_lies_behind_the_drone_is_not_visited_and_nothing_is_known_between_legs():
+    legs = [(0, 0), (100, 0), (200, 0)]
+    assert first_missed([place(50, 0)], flight(legs, reached=2), 7, ordered=True) == 0
+    assert first_missed([place(150, 0)], flight(legs, reached=2), 7, ordered=True) is None
+    assert first_missed([place(150, 0)], flight(legs, reached=3), 7, ordered=True) == 0
+    assert first_missed([place(150, 0)], flight([(0, 0), (100, 0)], [(200, 0), (300, 0)]), 7, ordered=True) == 0
+
+
+def test_flight_of_a_driver_breaks_at_regions():
+    square = [at(400, 0), at(500, 0), at(500, 100), at(400, 100)]
+    points = [
+        {"navigation": "pathBased", "path": [at(100, 0), at(200, 0)]},
+        {"navigation": "regionBased", "region": {"polygon": {"exterior": square}}, "point": {"position": at(400, 0)}},
+        {"navigation": "pathBased", "path": [at(600, 0)]},
+    ]
+    app = application(navigator(PATH) | {"control": "partial", "controlPoints": points})
+    found = flight_of(app, {})
+    assert [[round(FRAME.xy(p.lat, p.lon)[0]) for p in leg] for leg in found.legs] == [[100, 200, 400], [600]]
+    assert found.holder == ("default", "traffic")
+
+
+@given(st.lists(spots, min_size=1, max_size=7))
+@settings(max_examples=60, deadline=None)
+def test_short_tours_are_shortest(points):
+    def length(order):
+        return sum(math.dist(points[a], points[b]) for a, b in itertools.pairwise(order))
+
+    tour = short_tour(points)
+    assert tour[0] == 0
+    assert sorted(tour) == list(range(len(points)))
+    rest = itertools.permutations(range(1, len(points)))
+    assert length(tour) == pytest.approx(min(length((0, *r)) for r in rest))
+
+
+@given(st.lists(spots, min_size=10, max_size=30))
+@settings(max_examples=30, deadline=None)
+def test_longer_tours_visit_all_and_beat_the_order_given(points):
+    tour = short_tour(points)
+    assert sorted(tour) == list(range(len(points)))
+    length = sum(math.dist(points[a], points[b]) for a, b in itertools.pairwise(tour))
+    assert length <= sum(math.dist(a, b) for a, b in itertools.pairwise(points)) + 1e-6
+
+
+def test_time_of_a_mission_by_hand():
+    app = application(navigator([at(300, 0, 30), at(300, 400, 30)]))
+    depots = inventory().depots
+    area = operation_area(app.spec, depots, 7)
+    found = estimate(app.spec, area, HOME, drone("d"), Settings(cruise_speed_mps=5, climb_speed_mps=1.5))
+    assert found.distance_m == pytest.approx(300 + 400 + 500, rel=1e-4)
+    assert found.needed_min == pytest.approx((1200 / 5 + 60 / 1.5) / 60, rel=1e-4)
+    assert found.available_min == pytest.approx(15 - 0.2 * 15)
+    assert found.top_m == 30
+
+
+def test_stay_in_a_region_counts():
+    region = {"circle": {"center": at(300, 0), "radius": 50}}
+    app = application(
+        navigator(PATH) | {"controlPoints": [{"navigation": "regionBased", "region": region, "duration": 9}]}
+    )
+    area = operation_area(app.spec, {}, 7)
+    assert estimate(app.spec, area, HOME, drone("d"), Settings()).needed_min == pytest.approx(9 + 2, rel=1e-3)
+
+
+def test_chauffeur_flies_to_between_and_from_control_points():
+    points = [{"navigation": "pathBased", "path": [at(x, 0), at(x + 50, 0)]} for x in (100, 400)]
+    spec = application(navigator(PATH) | {"control": "partial", "controlPoints": points}).spec
+    area = operation_area(spec, {}, 7)
+    legs = chauffeur_legs(spec, area, HOME, {})
+    metres = [tuple(round(FRAME.xy(p.lat, p.lon)[0]) for p in (leg.start, leg.end)) for leg in legs]
+    assert metres == [(0, 100), (150, 400), (450, 0)]
+    full = application(navigator(PATH)).spec
+    assert chauffeur_legs(full, area, HOME, inventory().depots) == []
+
+
+def test_unordered_points_are_joined_by_a_short_way():
+    poi = {"points": [at(x, 0) for x in (0, 300, 100, 200)], "ordered": False}
+    spec = application(VIEWER | {"egress": [], "pointsOfInterest": poi}).spec
+    area = operation_area(spec, {}, 7)
+    assert area.length_m == pytest.approx(300, rel=1e-4)
+    assert [round(FRAME.xy(p.lat, p.lon)[0]) for p in area.route] == [0, 100, 200, 300]
+
+
+def test_area_has_a_part_for_each_control_point():
+    points = [{"navigation": "pathBased", "path": [at(x, 0), at(x + 50, 0)]} for x in (100, 400)]
+    spec = application(navigator(PATH) | {"control": "partial", "controlPoints": points}).spec
+    area = operation_area(spec, {}, 7)
+    assert [round(p.area) for p in area.parts] == pytest.approx([50 * 14 + 49 * math.pi] * 2, rel=2e-2)
+    assert area.shape.area == pytest.approx(sum(p.area for p in area.parts))

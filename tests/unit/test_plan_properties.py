@@ -1,0 +1,381 @@
+"""Plans of random scenes: who is a candidate, what stays, and that nothing depends on order."""
+
+import dataclasses
+import itertools
+import random
+
+import pytest
+from fractus_core.api import Drone
+from fractus_core.api.nodes import Interface
+from fractus_core.geo import geodesic_m
+from fractus_core.planning import Infeasible, Settings, Whereabouts, flight_of, plan
+from fractus_core.planning.candidates import direct_range_m, direct_reach_m
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_planning import (
+    CHECKER,
+    FRAME,
+    PATH,
+    STORE,
+    VIEWER,
+    application,
+    at,
+    component,
+    drone,
+    edge,
+    host,
+    inventory,
+    manifest,
+    navigator,
+    nodes_of,
+    reasons,
+)
+
+interfaces = st.lists(
+    st.builds(
+        lambda technology, range_, mode: Interface.model_validate(
+            {"technology": technology, "range": range_, "pairing": {"mode": mode, "networkId": "n"} if mode else None}
+        ),
+        st.sampled_from(["WiFi", "BLE", "4G"]),
+        st.one_of(st.none(), st.floats(1, 500)),
+        st.sampled_from(["adhoc", "infrastructure", None]),
+    ),
+    max_size=4,
+)
+
+
+@given(interfaces, interfaces)
+def test_interfaces_match_in_technology_and_pairing_and_reach_by_the_lesser(ours, theirs):
+    pairs = [
+        min(a.range, b.range)
+        for a, b in itertools.product(ours, theirs)
+        if a.pairing
+        and b.pairing
+        and a.range
+        and b.range
+        and (a.technology, a.pairing.mode) == (b.technology, b.pairing.mode)
+    ]
+    reach = direct_reach_m(ours, theirs)
+    assert reach == (max(pairs) if pairs else None)
+    assert reach == direct_reach_m(theirs, ours)
+    assert reach is None or reach <= direct_range_m(ours)
+
+
+VIEWERS = component(
+    "GroundViewer",
+    "edge",
+    egress=["ImageChecker"],
+    locations=[
+        {"center": at(150, 0), "radius": 120, "instances": 2},
+        {"center": at(320, 20), "radius": 90, "instances": "*"},
+    ],
+    services=[{"service": "camera", "methods": ["CaptureImage"]}],
+)
+BOTH = CHECKER | {"hybridTo": ["GroundViewer", "AerialViewer"]}
+TRAFFIC = application(navigator(PATH), VIEWER, VIEWERS, BOTH, STORE)
+
+
+def scene(seed, count=14):
+    """A random fleet and edge around the path; the first two nodes always suit."""
+    rng = random.Random(seed)
+    edges = [edge("a0", (150, 10)), edge("a1", (160, -10))]
+    edges += [
+        edge(
+            f"e{i:02d}",
+            (rng.uniform(-150, 500), rng.uniform(-150, 150)),
+            wifi=rng.choice([None, 40, 80, 80, 120]),
+            camera=rng.random() < 0.8,
+        )
+        for i in range(count)
+    ]
+    hosts = [host(e.name, "edge", cpu=rng.choice([0.05, 0.25, 4.0])) for e in edges[2:]]
+    fleet = [drone(f"d{i}", battery=rng.choice([0.5, 0.9, 1.0]), minutes=30) for i in range(4)]
+    return fleet, edges, hosts
+
+
+@given(st.integers(0, 10_000), st.randoms(use_true_random=False))
+@settings(max_examples=25, deadline=None)
+def test_plans_do_not_depend_on_order(seed, shuffler):
+    fleet, edges, hosts = scene(seed)
+    first = plan(TRAFFIC, inventory(fleet, edges, hosts))
+    for things in (fleet, edges, hosts):
+        shuffler.shuffle(things)
+    assert plan(TRAFFIC, inventory(fleet, edges, hosts)) == first
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=25, deadline=None)
+def test_static_instances_are_the_nearest_that_suit(seed):
+    fleet, edges, hosts = scene(seed)
+    stock = inventory(fleet, edges, hosts)
+    result = plan(TRAFFIC, stock)
+    taken: list[str] = []
+    for i, location in enumerate(TRAFFIC.spec.component("GroundViewer").locations):
+        suitable = sorted(
+            (round(geodesic_m(location.center, e.spec.location) * 1000), e.name)
+            for e in edges
+            if geodesic_m(location.center, e.spec.location) <= location.radius
+            and e.spec.services.camera is not None
+            and stock.hosts[e.name].allocatable["cpu"] >= 0.1
+            and e.name not in taken
+        )
+        wanted = [name for _, name in suitable][: location.instances if location.instances != "*" else None]
+        chosen = [p.node for p in result.placements if p.component == "GroundViewer" and p.location == i]
+        assert chosen == wanted
+        taken += wanted
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=25, deadline=None)
+def test_every_candidate_by_place_is_placed_passed_over_or_rejected_for_a_true_reason(seed):
+    fleet, edges, hosts = scene(seed)
+    stock = inventory(fleet, edges, hosts)
+    result = plan(TRAFFIC, stock)
+    placed = {(p.component, p.node) for p in result.placements}
+    for r in result.rejected:
+        assert (r.component, r.node) not in placed
+        assert r.message
+        assert r.reason[0].isupper()
+        if r.reason == "InsufficientResources":
+            assert stock.hosts[r.node].allocatable["cpu"] < 0.3
+        if r.reason == "ServiceMissing":
+            assert stock.edge_nodes[r.node].spec.services.camera is None
+        if r.reason == "NoDirectInterface":
+            assert len(stock.edge_nodes[r.node].spec.interfaces) == 1
+
+
+@given(st.integers(0, 10_000), st.data())
+@settings(max_examples=25, deadline=None)
+def test_replanning_keeps_all_that_still_fits(seed, data):
+    fleet, edges, hosts = scene(seed)
+    before = plan(TRAFFIC, inventory(fleet, edges, hosts))
+    again = plan(TRAFFIC, inventory(fleet, edges, hosts), previous=before)
+    assert (again.placements, again.drone) == (before.placements, before.drone)
+    newcomers = [edge(f"new{i}", (140 + 40 * i, 1)) for i in range(4)]
+    more = [drone("better", battery=1.0, minutes=60)]
+    assert set(
+        map(where, plan(TRAFFIC, inventory(fleet + more, edges + newcomers, hosts), previous=before).placements)
+    ) >= set(map(where, before.placements))
+    lost = data.draw(st.sampled_from(sorted({p.node for p in before.placements if p.node and p.role != "drone"})))
+    left = [e for e in edges if e.name != lost]
+    after = plan(TRAFFIC, inventory(fleet, left + newcomers, hosts), previous=before)
+    stay = {where(p) for p in before.placements if p.node != lost and (p.serves is None or p.serves.node != lost)}
+    assert stay <= {where(p) for p in after.placements}
+    assert lost not in {p.node for p in after.placements}
+
+
+def where(placed):
+    return (placed.component, placed.node)
+
+
+def test_a_cheaper_cover_does_not_move_what_covers():
+    narrow = [edge("n1", (100, 0)), edge("n2", (200, 0)), edge("n3", (290, 0))]
+    app = application(navigator(PATH), VIEWER, CHECKER)
+    before = plan(app, inventory([drone("d")], narrow))
+    better = [edge("middle", (150, 0)), edge("right", (260, 0))]
+    after = plan(app, inventory([drone("d")], narrow + better), previous=before)
+    assert nodes_of(after, "ImageChecker") == nodes_of(before, "ImageChecker")
+    assert nodes_of(plan(app, inventory([drone("d")], narrow + better)), "ImageChecker") != nodes_of(
+        before, "ImageChecker"
+    )
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=15, deadline=None)
+def test_whereabouts_that_followed_every_change_plan_the_same(seed):
+    fleet, edges, hosts = scene(seed)
+    stock = inventory(fleet, edges, hosts)
+    rng = random.Random(seed)
+    followed = Whereabouts()
+    for thing in rng.sample([*fleet, *edges], k=len(fleet) + len(edges)):
+        away = {"home": at(9000, 9000)} if isinstance(thing, Drone) else {"location": at(9000, 9000)}
+        moved = type(thing).from_body(manifest(thing.KIND, thing.name, thing.spec.to_dict() | away))
+        for version in (moved, thing):
+            (followed.upsert_drone if isinstance(thing, Drone) else followed.upsert_edge_node)(version)
+    followed.upsert_edge_node(edge("gone", (150, 0)))
+    followed.remove_edge_node("gone")
+    followed.upsert_drone(drone("gone"))
+    followed.remove_drone("gone")
+    for depot in stock.depots.values():
+        followed.upsert_depot(depot)
+    for one in stock.hosts.values():
+        followed.upsert_host(one.name, one.node_class)
+    assert plan(TRAFFIC, dataclasses.replace(stock, whereabouts=followed)) == plan(TRAFFIC, stock)
+
+
+def test_drones_without_a_home_stand_in_their_depot_once_there_is_one():
+    kept = Drone.from_body(
+        manifest("Drone", "d", drone("d").spec.to_dict() | {"home": None}, status=drone("d").status.to_dict())
+    )
+    known = Whereabouts()
+    known.upsert_drone(kept)
+    assert known.homeless == {"d"}
+    known.upsert_depot(inventory().depots["base"])
+    assert known.homeless == set()
+    assert [n for n, _ in known.stands.within(inventory().depots["base"].spec.location, 1)] == ["d"]
+    known.remove_depot("base")
+    assert known.homeless == {"d"}
+    assert len(known.stands) == 0
+    assert plan(application(navigator(PATH)), inventory([kept])).drone.node == "d"
+
+
+# -- sharing a flying drone --
+
+OTHER = ("default", "other")
+
+
+def passenger(points, ordered=True):
+    return application(VIEWER | {"egress": [], "pointsOfInterest": {"points": points, "ordered": ordered}})
+
+
+def shared(fleet, flights, **more):
+    return inventory(fleet, claimed={n: f.holder for n, f in flights.items()}, flights=flights, **more)
+
+
+def flown_by_other():
+    app = application(navigator(PATH)).model_copy(deep=True)
+    return dataclasses.replace(flight_of(app, inventory().depots), holder=OTHER)
+
+
+def test_passengers_come_along_with_a_drone_that_flies_by():
+    stock = shared([drone("busy", battery=0.5), drone("idle")], {"busy": flown_by_other()})
+    result = plan(passenger([at(120, 0), at(250, 3)]), stock)
+    assert (result.drone.node, result.drone.shared_with) == ("busy", "default/other")
+    assert result.drone.mission is None
+    assert [a.node for a in result.drone.alternatives] == ["idle"]
+    assert result.drone.chauffeur == ()
+
+
+def test_passengers_do_not_come_along_against_the_order():
+    stock = shared([drone("busy"), drone("idle")], {"busy": flown_by_other()})
+    result = plan(passenger([at(250, 3), at(120, 0)]), stock)
+    assert (result.drone.node, result.drone.shared_with) == ("idle", None)
+    assert len(result.drone.chauffeur) == 3
+    assert reasons(result)["AerialViewer", "busy"] == "PathMissesPoint"
+    assert plan(passenger([at(250, 3), at(120, 0)], ordered=False), stock).drone.node == "busy"
+
+
+def test_a_driver_never_shares():
+    with pytest.raises(Infeasible) as caught:
+        plan(application(navigator(PATH)), shared([drone("busy")], {"busy": flown_by_other()}))
+    assert caught.value.reason == "DroneBusy"
+
+
+def test_a_passenger_that_came_along_stays_aboard():
+    app = passenger([at(120, 0), at(250, 3)])
+    stock = shared([drone("b"), drone("c")], {"b": flown_by_other(), "c": flown_by_other()})
+    first = plan(app, stock)
+    assert first.drone.node == "b"
+    tired = shared([drone("b", battery=0.3), drone("c")], {"b": flown_by_other(), "c": flown_by_other()})
+    assert plan(app, tired, previous=first).drone.node == "b"
+    assert plan(app, tired).drone.node == "c"
+
+
+# -- which drones are there --
+
+
+def test_partial_control_takes_drones_of_depots_nearby():
+    start = {"position": at(900, 0)}
+    fleet = [drone("near", home=(0, 0)), drone("far", home=(9000, 0))]
+    partial = application(navigator([at(950, 0, 10)], point=start, control="partial"))
+    result = plan(partial, inventory(fleet))
+    assert result.drone.node == "near"
+    assert [round(FRAME.xy(leg.end.lat, leg.end.lon)[0]) for leg in result.drone.chauffeur] == [900, 0]
+    assert reasons(result) == {("Navigator", "far"): "TooFar"}
+    with pytest.raises(Infeasible):
+        plan(application(navigator([at(950, 0, 10)], point=start)), inventory(fleet))
+
+
+def test_full_control_at_a_position_takes_the_drones_of_the_depot_there():
+    start = {"position": at(15, 0)}
+    fleet = [drone("kept", home=(400, 0)), drone("stray", home=(60, 0), depot=None)]
+    result = plan(application(navigator(PATH, point=start)), inventory(fleet))
+    assert result.drone.node == "kept"
+    assert reasons(result) == {("Navigator", "stray"): "TooFar"}
+
+
+def test_a_drone_that_cannot_climb_so_high_is_rejected_with_the_figures():
+    with pytest.raises(Infeasible) as caught:
+        plan(application(navigator([at(100, 0, 95)])), inventory([drone("d")]))
+    assert [r.reason for r in caught.value.rejected] == ["TooHigh"]
+    assert "climbs to 80 m; the path goes up to 95 m" in caught.value.message
+
+
+def test_a_drone_that_could_never_fly_it_does_not_make_the_application_wait():
+    with pytest.raises(Infeasible) as caught:
+        plan(application(navigator(PATH)), inventory([drone("d", minutes=2)], claimed={"d": OTHER}))
+    assert caught.value.reason == "NoDrone"
+    assert "even with a full battery" in caught.value.message
+
+
+def test_flight_time_message_has_its_figures():
+    with pytest.raises(
+        Infeasible,
+        match=r"can fly 0\.8 min with its reserve kept, with its battery at 25%; the mission takes 2\.\d min for \d+ m",
+    ):
+        plan(application(navigator(PATH)), inventory([drone("d", battery=0.25)]))
+
+
+# -- plug-ins and bounds --
+
+
+def test_plug_ins_replace_ranking_and_coverage():
+    fleet = [drone("a"), drone("b"), drone("c", battery=0.9)]
+    chosen = plan(
+        application(navigator(PATH)), inventory(fleet), Settings(score_drone=lambda facts: -facts.remaining_min)
+    )
+    assert chosen.drone.node == "c"
+    assert [a.node for a in chosen.drone.alternatives] == ["a", "b"]
+
+    def nothing(found, fits):
+        return []
+
+    app = application(navigator(PATH), VIEWER, CHECKER)
+    stock = inventory([drone("d")], [edge("e1", (150, 0))])
+    assert nodes_of(plan(app, stock, Settings(cover=nothing)), "ImageChecker") == [None]
+    assert nodes_of(plan(app, stock), "ImageChecker") == [None, "e1"]
+
+
+def test_far_nodes_are_listed_up_to_a_number_and_the_rest_is_counted():
+    edges = [edge("here", (0, 0))] + [edge(f"e{i:02d}", (500 + i, 0)) for i in range(40)]
+    edges += [edge(f"blind{i:02d}", (i, 1), camera=False) for i in range(30)]
+    viewer = VIEWERS | {"egress": [], "locations": [{"center": at(0, 0), "radius": 100}]}
+    result = plan(application(viewer), inventory(edges=edges))
+    assert sum(r.reason == "OutsideLocation" for r in result.rejected) == 20
+    assert result.rejected_omitted is None
+    viewer["locations"][0]["instances"] = "*"
+    few = plan(application(viewer), inventory(edges=edges), Settings(rejections_listed=35))
+    assert [r.reason for r in few.rejected].count("ServiceMissing") == 30
+    assert (len(few.rejected), few.rejected_omitted) == (35, 15)
+
+
+def test_plan_at_80_degrees_across_the_antimeridian():
+    from fractus_core.geo import LocalFrame
+
+    frame = LocalFrame(80.0, 179.9995)
+
+    def there(x, y):
+        lat, lon = frame.latlon(x, y)
+        return {"lat": lat, "lon": lon}
+
+    flying = Drone.from_body(
+        manifest(
+            "Drone",
+            "d",
+            drone("d").spec.to_dict() | {"home": there(0, 0), "depot": None},
+            status=drone("d").status.to_dict(),
+        )
+    )
+    nodes = [
+        type(edge("x", (0, 0))).from_body(
+            manifest("EdgeNode", name, edge(name, (0, 0)).spec.to_dict() | {"location": there(x, 0)})
+        )
+        for name, x in (("west", 0), ("east", 130), ("far", 400))
+    ]
+    route = navigator([there(0, 0), there(150, 0)], point={"position": there(0, 0)})
+    viewer = VIEWERS | {"egress": [], "locations": [{"center": there(60, 0), "radius": 80, "instances": "*"}]}
+    result = plan(application(route, VIEWER, CHECKER, viewer), inventory([flying], nodes))
+    assert nodes_of(result, "GroundViewer") == ["west", "east"]
+    assert sorted(nodes_of(result, "ImageChecker")[1:]) == ["east", "west"]
+    assert len(result.operation_area["coordinates"]) == 2
+    assert reasons(result)["ImageChecker", "far"] == "NoCoverage"

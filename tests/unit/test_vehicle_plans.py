@@ -52,7 +52,8 @@ def test_a_mission_is_flown_with_its_jump_and_return():
             fastest_after_change = max(fastest_after_change, abs(vehicle.body.ve))
         if not vehicle.armed:
             break
-    assert reached == [1, 2, 4, 2, 4]
+    assert reached == [1, 2, 4, 2, 4, 6]
+    assert vehicle.mission_state() == 5
     assert fastest_after_change < 4.4
     assert not vehicle.armed
     assert distance_m(vehicle, 0.0, 0.0) < 1.0

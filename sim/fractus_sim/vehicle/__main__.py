@@ -154,8 +154,8 @@ def vehicle(
     try:
         simulation = Simulation(formation(config, count, spacing))
         for at, craft in enumerate(simulation.crafts):
-            for text in links or (DEFAULT_LISTEN,):
-                hub.open(LinkSpec.parse(text).shifted(at), craft)
+            for port, text in enumerate(links or (DEFAULT_LISTEN,)):
+                hub.open(LinkSpec.parse(text).shifted(at), craft, port)
     except LinkError as error:
         raise click.ClickException(str(error)) from error
     except UnknownParameterError as error:

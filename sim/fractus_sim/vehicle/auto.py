@@ -136,6 +136,7 @@ class AutoFlight(Flight):
             return
         if self._returning is not None:
             self._returning.step(v, dt)
+            self._finish_if_down(v)
             return
         if v.time_s < self._wait_until_s:
             return
@@ -156,8 +157,18 @@ class AutoFlight(Flight):
             v.touch_time_s = 0.0
         if self._landing:
             descend(v)
-            if not v.armed:
-                v.broadcast("MISSION_ITEM_REACHED", {"seq": self._index})
+            self._finish_if_down(v)
+
+    def _finish_if_down(self, v: Vehicle) -> None:
+        """A landing or return ends with the motors off; then the next item, if any, waits for the next start."""
+        if v.armed:
+            return
+        self._item = None
+        v.broadcast("MISSION_ITEM_REACHED", {"seq": self._index})
+        following = v.mission.next_after(self._index)
+        v.mission.complete = following is None
+        if following is not None:
+            v.mission.current = following
 
     def _turn(self, v: Vehicle, item: Item, dt: float) -> None:
         radius = min(max(abs(item.param3) or v.params["CIRCLE_RADIUS"] / 100.0, 1.0), 500.0)

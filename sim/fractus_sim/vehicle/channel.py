@@ -32,10 +32,12 @@ class Channel:
         tap: Callable[[bytes], None] | None = None,
         *,
         discard: bool = False,
+        port: int | None = None,
     ) -> None:
         self.sysid = sysid
         self.compid = compid
         self.name = name
+        self.port = port  # the autopilot's own number of this link, which selects its SRn_ parameters
         self.signing: Signing | None = None
         self.parser = Parser(lambda: self.signing)
         self.streams: dict[str, Stream] = {}

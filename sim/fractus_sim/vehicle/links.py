@@ -78,19 +78,19 @@ class Hub:
         self._flushers: list[Callable[[], None]] = []
         self._closers: list[Callable[[], None]] = []
 
-    def open(self, spec: LinkSpec, craft: Craft) -> None:
-        """Open a link of a vehicle.
+    def open(self, spec: LinkSpec, craft: Craft, port: int) -> None:
+        """Open a link of a vehicle, the `port`-th of its own.
 
         Raises:
             LinkError: the address is taken or the device is missing.
         """
         try:
             if spec.kind == "tcp":
-                _TcpServer(self, spec, craft)
+                _TcpServer(self, spec, craft, port)
             elif spec.kind in ("udpin", "udpout"):
-                _Udp(self, spec, craft)
+                _Udp(self, spec, craft, port)
             else:
-                _Terminal(self, spec, craft)
+                _Terminal(self, spec, craft, port)
         except OSError as error:
             raise LinkError(f"link {spec}: {error.strerror or error}") from error
 
@@ -132,8 +132,8 @@ class Hub:
 
 
 class _TcpServer:
-    def __init__(self, hub: Hub, spec: LinkSpec, craft: Craft) -> None:
-        self._hub, self._craft = hub, craft
+    def __init__(self, hub: Hub, spec: LinkSpec, craft: Craft, port: int) -> None:
+        self._hub, self._craft, self._port = hub, craft, port
         self._clients: set[_TcpClient] = set()
         family = socket.AF_INET6 if ":" in spec.host else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_STREAM)
@@ -156,7 +156,9 @@ class _TcpServer:
         if len(self._clients) >= MAX_CLIENTS:
             connection.close()
             return
-        self._clients.add(_TcpClient(self._hub, connection, self._craft, self._clients.discard))
+        client = _TcpClient(self._hub, connection, self._craft, self._port)
+        client.gone = self._clients.discard
+        self._clients.add(client)
 
     def _close(self) -> None:
         for client in tuple(self._clients):
@@ -165,11 +167,12 @@ class _TcpServer:
 
 
 class _TcpClient:
-    def __init__(self, hub: Hub, connection: socket.socket, craft: Craft, gone: Callable[[_TcpClient], None]) -> None:
+    def __init__(self, hub: Hub, connection: socket.socket, craft: Craft, port: int) -> None:
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._hub, self._socket, self._craft, self._gone = hub, connection, craft, gone
-        self._channel = craft.open("tcp")
+        self._hub, self._socket, self._craft = hub, connection, craft
+        self.gone: Callable[[_TcpClient], None] = lambda _client: None
+        self._channel = craft.open("tcp", port)
         self._unsent = b""
         hub.watch(connection.fileno(), self._read)
         hub.at_flush(self._flush)
@@ -210,12 +213,12 @@ class _TcpClient:
         self._hub.not_at_flush(self._flush)
         self._craft.close(self._channel)
         self._socket.close()
-        self._gone(self)
+        self.gone(self)
 
 
 class _Udp:
-    def __init__(self, hub: Hub, spec: LinkSpec, craft: Craft) -> None:
-        self._hub, self._craft = hub, craft
+    def __init__(self, hub: Hub, spec: LinkSpec, craft: Craft, port: int) -> None:
+        self._hub, self._craft, self._port = hub, craft, port
         family = socket.AF_INET6 if ":" in spec.host else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
@@ -226,7 +229,7 @@ class _Udp:
                 self._socket.bind((spec.host, spec.port))
             else:
                 self._socket.connect((spec.host, spec.port))
-                self._channels[None] = craft.open("udp")
+                self._channels[None] = craft.open("udp", port)
         except OSError:
             self._socket.close()
             raise
@@ -246,7 +249,7 @@ class _Udp:
                 if len(self._channels) >= MAX_CLIENTS:
                     oldest = next(iter(self._channels))
                     self._craft.close(self._channels.pop(oldest))
-                channel = self._channels[key] = self._craft.open("udp")
+                channel = self._channels[key] = self._craft.open("udp", self._port)
             self._craft.receive(channel, data)
 
     def _flush(self) -> None:
@@ -267,7 +270,7 @@ class _Udp:
 class _Terminal:
     """A serial device, or the near end of a pseudo terminal whose far end is linked at a path."""
 
-    def __init__(self, hub: Hub, spec: LinkSpec, craft: Craft) -> None:
+    def __init__(self, hub: Hub, spec: LinkSpec, craft: Craft, port: int) -> None:
         self._craft = craft
         self._far: int | None = None
         self._link: Path | None = None
@@ -282,7 +285,7 @@ class _Terminal:
             if os.isatty(self._fd):
                 _set_speed(self._fd, spec.baud)
         os.set_blocking(self._fd, False)
-        self._channel = craft.open(spec.kind)
+        self._channel = craft.open(spec.kind, port)
         self._unsent = b""
         hub.watch(self._fd, self._read)
         hub.at_flush(self._flush)

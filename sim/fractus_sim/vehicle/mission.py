@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from fractus_sim.vehicle.earth import valid_coordinates
 from fractus_sim.vehicle.mav import GLOBAL_FRAMES, Command, Frame, MissionKind, MissionResult
 
 if TYPE_CHECKING:
@@ -82,8 +83,8 @@ class Item:
 
     @property
     def navigates(self) -> bool:
-        """Whether this is a NAV command, which the mission waits for."""
-        return self.command < 95 and self.command != 0
+        """Whether this is a NAV command: one with a position, which a mission waits for."""
+        return 0 < self.command < 95 or self.command >= Command.NAV_FENCE_RETURN_POINT
 
 
 @dataclass(slots=True)
@@ -112,6 +113,10 @@ class ItemStore:
     home: Item | None = None
 
 
+def _finite(value: float) -> float:
+    return value if math.isfinite(value) else 0.0
+
+
 def item_from(message: Message) -> Item:
     """Read MISSION_ITEM_INT, or MISSION_ITEM with its degrees in floats."""
     frame = message.integer("frame")
@@ -120,16 +125,17 @@ def item_from(message: Message) -> Item:
     if message.name == "MISSION_ITEM":
         x, y = (x * scale if math.isfinite(x) else 0.0), (y * scale if math.isfinite(y) else 0.0)
     aliases = {Frame.GLOBAL_INT: 0, Frame.GLOBAL_RELATIVE_ALT_INT: 3, Frame.GLOBAL_TERRAIN_ALT_INT: 10}
+    command, z = message.integer("command"), message.real("z")
     return Item(
-        command=message.integer("command"),
+        command=command,
         frame=int(aliases.get(Frame(frame), frame)) if frame in set(Frame) else frame,
-        param1=message.real("param1"),
-        param2=message.real("param2"),
-        param3=message.real("param3"),
-        param4=message.real("param4"),
+        param1=_finite(message.real("param1")),
+        param2=_finite(message.real("param2")),
+        param3=_finite(message.real("param3")),
+        param4=_finite(message.real("param4")),
         x=int(max(-2147483648, min(2147483647, round(x)))),
         y=int(max(-2147483648, min(2147483647, round(y)))),
-        z=message.real("z"),
+        z=z if Item(command).navigates else _finite(z),
         autocontinue=message.integer("autocontinue"),
     )
 
@@ -146,7 +152,7 @@ def judge(item: Item, kind: MissionKind) -> MissionResult:
         return MissionResult.UNSUPPORTED
     if item.frame not in GLOBAL_FRAMES and item.frame != Frame.MISSION and item.has_place:
         return MissionResult.UNSUPPORTED_FRAME
-    if abs(item.x) > 900_000_000 or abs(item.y) > 1_800_000_000 or not math.isfinite(item.z):
+    if item.navigates and (not valid_coordinates(item.x, item.y) or not math.isfinite(item.z)):
         return MissionResult.INVALID
     return MissionResult.ACCEPTED
 

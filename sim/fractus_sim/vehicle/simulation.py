@@ -24,9 +24,9 @@ class Craft:
         self.vehicle = Vehicle(config)
         self._recorder: BinaryIO | None = None
 
-    def open(self, name: str) -> Channel:
-        """Open a link and return its channel."""
-        channel = Channel(self.config.sysid, name=name)
+    def open(self, name: str, port: int | None = None) -> Channel:
+        """Open a link and return its channel; `port` selects the SRn_ parameters of its default streams."""
+        channel = Channel(self.config.sysid, name=name, port=port)
         key = self.vehicle.signing_key
         if key is not None:
             channel.signing = Signing(key, signing_clock(self.vehicle.unix_us))

@@ -25,7 +25,7 @@ from fractus_sim.vehicle.plans import Plans
 from fractus_sim.vehicle.sensors import Battery, Gps
 from fractus_sim.vehicle.settings import LIMIT_PREFIXES, set_battery, set_fence, set_limits, set_wind
 from fractus_sim.vehicle.shaping import clamp, wrap_pi
-from fractus_sim.vehicle.streams import BUILDERS
+from fractus_sim.vehicle.streams import ALL_GROUPS, BUILDERS, GROUPS
 from fractus_sim.vehicle.wire import Message, Value
 
 CONTROL_STEP_S = 0.01
@@ -425,6 +425,11 @@ class Vehicle:
             set_wind(self.params, self.wind)
         elif prefix in ("SIM", "BATT"):
             set_battery(self.params, self.battery)
+        elif prefix[:2] == "SR" and prefix[2:].isdigit():
+            for channel in self.channels:
+                for group in ALL_GROUPS:
+                    if name == f"SR{channel.port}_{GROUPS[group][0]}":
+                        self._set_default_rate(channel, group)
 
     # -- time --------------------------------------------------------------------------------------------------
 
@@ -520,6 +525,15 @@ class Vehicle:
         """Open a link: HEARTBEAT at 1 Hz and silence otherwise, unless SR parameters ask for streams."""
         self.channels.append(channel)
         channel.set_interval("HEARTBEAT", 1.0, self.time_s)
+        for group in ALL_GROUPS:
+            self._set_default_rate(channel, group)
+
+    def _set_default_rate(self, channel: Channel, group: int) -> None:
+        label, names = GROUPS[group]
+        rate = 0.0 if channel.port is None else self.params[f"SR{min(channel.port, 6)}_{label}"]
+        if rate > 0.0:
+            for name in names:
+                channel.set_interval(name, 1.0 / min(rate, 100.0), self.time_s)
 
     def detach(self, channel: Channel) -> None:
         """Close a link."""

@@ -53,7 +53,7 @@ RUN --mount=type=cache,target=/root/.cache/uv \
       uv export --quiet --frozen --no-dev --no-emit-project $extra --output-file /build/$name.txt; \
       uv pip install --quiet --no-deps --require-hashes --target /deps/$name -r /build/$name.txt; \
       cd /deps/$name; \
-      rm -rf bin .lock numpy/_core/include numpy/_core/lib numpy/f2py numpy/distutils numpy/typing cv2/data cv2/gapi \
+      rm -rf bin .lock numpy/_core/include numpy/_core/lib numpy/f2py numpy/distutils cv2/gapi \
         lxml lxml-* pymavlink/dialects/v09 pymavlink/dialects/v10 pymavlink/dfindexer pymavlink/tools; \
       find . -path '*/tests' -prune -exec rm -rf {} +; \
       find . -path './pymavlink/generator/*' -type d -prune -exec rm -rf {} +; \

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 
@@ -33,6 +33,7 @@ from fractus_operator.missions import (
     replan_reason,
     stuck_nodes,
 )
+from fractus_operator.pods import PodView
 from fractus_operator.store import Store, StoreError, Taken
 
 logger = logging.getLogger(__name__)
@@ -154,14 +155,16 @@ class Deployments:
         except InvalidObject as error:
             raise Hindered("Pending", "Granted", "PolicyInvalid", str(error)) from error
         try:
-            await self._deploy(application, decided, grants)
+            # One look at the pods for all that is said of them.
+            pods = self._live.pods_of(key)
+            await self._deploy(application, decided, grants, pods)
         except NameTaken as error:
             raise Hindered("Pending", "Deployed", "NameTaken", str(error), again_s=2.0) from error
         except StoreError as error:
             if error.status not in _REFUSALS:
                 raise
             raise Hindered("Pending", "Deployed", error.reason, str(error), again_s=10.0) from error
-        return deployed_standing(decided, self._live.pods_of(key), len(grants)), again_s
+        return deployed_standing(decided, pods, len(grants)), again_s
 
     def _plan(self, application: Application, memory: _Memory) -> tuple[DeploymentPlanSpec, float]:
         """The plan to deploy: the present one while it stands, else a new one that moves as little as it can.
@@ -186,7 +189,11 @@ class Deployments:
         return decided, RESYNC_S
 
     async def _deploy(
-        self, application: Application, decided: DeploymentPlanSpec, grants: tuple[GrantSpec, ...]
+        self,
+        application: Application,
+        decided: DeploymentPlanSpec,
+        grants: tuple[GrantSpec, ...],
+        pods: Sequence[PodView],
     ) -> None:
         """Make the children what the plan says: what is stale goes first, then each kind in order."""
         wanted: dict[Kind, list[Body]] = {kind: [] for kind in kinds.CHILDREN}
@@ -195,7 +202,9 @@ class Deployments:
         for component in _with_service(application):
             wanted[kinds.SERVICE].append(builders.service(application, component))
             if component.placement == "hybrid":
-                wanted[kinds.ENDPOINT_SLICE].append(self._base_path(application, decided, component))
+                instances = builders.base_instances(decided, component)
+                bases = [pod for pod in pods if pod.instance in instances]
+                wanted[kinds.ENDPOINT_SLICE].append(builders.endpoint_slice(application, component, bases))
         drones = self._live.snapshot().drones
         for placed in decided.placements:
             drone = drones.get(placed.node) if placed.node is not None else None
@@ -206,11 +215,6 @@ class Deployments:
             wanted[kinds.SECRET].append(await self._certificate(application, placed))
         for kind in kinds.CHILDREN:
             await self._children.apply(application, kind, wanted[kind])
-
-    def _base_path(self, application: Application, decided: DeploymentPlanSpec, component: Component) -> Body:
-        instances = set(builders.base_instances(decided, component))
-        pods = [pod for pod in self._live.pods_of(application.key) if pod.instance in instances]
-        return builders.endpoint_slice(application, component, pods)
 
     async def _certificate(self, application: Application, placed: PlannedInstance) -> Body:
         """The Secret of an instance: the present certificate while it is good, so that a restart renews nothing."""
@@ -275,8 +279,8 @@ class Deployments:
         await self._announce(submitted, news, now)
 
     async def _announce(self, submitted: Submitted, news: tuple[Fact, ...], now: datetime) -> None:
-        for i, fact in enumerate(_worth_telling(news)):
-            name = f"{submitted.metadata.name}.{int(now.timestamp() * 1000):x}.{i}"
+        for fact in _worth_telling(news):
+            name = f"{submitted.metadata.name}.{int(now.timestamp()):x}.{fact.reason.lower()}"
             try:
                 await self._store.record_event(
                     submitted.body,

@@ -19,14 +19,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import httpx2
-import yaml
+from fractus_core.api import KINDS
+from fractus_core.api.crd import crd
 from fractus_sim.cluster.pki import Authority
 
 T = TypeVar("T")
 Body = dict[str, Any]
 
 PROGRAMS = ("etcd", "kube-apiserver", "kube-controller-manager")
-CRDS = Path(__file__).parents[2] / "crds"
 _CONTROLLERS = (
     "garbage-collector-controller",
     "namespace-controller",
@@ -52,7 +52,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def wait_for(question: Callable[[], T | None], what: str, timeout_s: float = 20.0) -> T:
+def wait_for(question: Callable[[], T | None], what: str | Callable[[], str], timeout_s: float = 20.0) -> T:
     """Ask until the answer is true; fails with what was waited for."""
     end = time.monotonic() + timeout_s
     while True:
@@ -60,7 +60,7 @@ def wait_for(question: Callable[[], T | None], what: str, timeout_s: float = 20.
         if answer:
             return answer
         if time.monotonic() > end:
-            raise AssertionError(f"waited {timeout_s:.0f} s in vain: {what}")
+            raise AssertionError(f"waited {timeout_s:.0f} s in vain: {what if isinstance(what, str) else what()}")
         # Nothing can be awaited on a remote condition: ask again shortly.
         select_pause(0.05)
 
@@ -125,9 +125,12 @@ class Api:
     def merge(self, path: str, body: Body) -> Body:
         return self.call("PATCH", path, body, content="application/merge-patch+json")
 
-    def delete(self, path: str) -> None:
+    def delete(self, path: str, grace_s: int | None = None) -> None:
+        options: Body = {"propagationPolicy": "Background"}
+        if grace_s is not None:
+            options["gracePeriodSeconds"] = grace_s
         try:
-            self.call("DELETE", path, {"propagationPolicy": "Background"})
+            self.call("DELETE", path, options)
         except Refused as error:
             if error.code != 404:
                 raise
@@ -237,8 +240,8 @@ class ControlPlane:
     def _install_crds(self) -> None:
         root = "/apis/apiextensions.k8s.io/v1/customresourcedefinitions"
         names = []
-        for file in sorted(CRDS.glob("*.yaml")):
-            body = yaml.safe_load(file.read_text())
+        for kind in KINDS:
+            body = crd(kind)
             names.append(body["metadata"]["name"])
             self.admin.apply(f"{root}/{names[-1]}", body)
         for name in names:
@@ -247,4 +250,11 @@ class ControlPlane:
     def _established(self, path: str) -> bool:
         body = self.admin.get(path) or {}
         conditions = body.get("status", {}).get("conditions", [])
-        return any(c["type"] == "Established" and c["status"] == "True" for c in conditions)
+        if not any(c["type"] == "Established" and c["status"] == "True" for c in conditions):
+            return False
+        try:
+            self.admin.list(f"/apis/fractus.dev/v1alpha1/{body['spec']['names']['plural']}")
+        except Refused:
+            # "storage is (re)initializing"
+            return False
+        return True

@@ -89,8 +89,8 @@ class World:
         self.api: Api = plane.admin
 
     def furnish(self, drones: int = 1, edges: int = 3) -> None:
-        for namespace in (SYSTEM,):
-            self.api.apply(f"/api/v1/namespaces/{namespace}", _namespace(namespace))
+        self.clear()
+        self.api.apply(f"/api/v1/namespaces/{SYSTEM}", _namespace(SYSTEM))
         self.put(ours("Depot", "base", {"location": at(0, 0), "radius": 30}))
         for i in range(1, drones + 1):
             self.add_drone(f"drone-{i}")
@@ -103,8 +103,8 @@ class World:
         body = {"apiVersion": "v1", "kind": "Node", "metadata": {"name": name, "labels": labels}}
         self.api.apply(f"/api/v1/nodes/{name}", body)
         status = {
-            "allocatable": {"cpu": "2", "memory": "2Gi", "pods": "110"},
-            "capacity": {"cpu": "2", "memory": "2Gi", "pods": "110"},
+            "allocatable": {"cpu": "8", "memory": "2Gi", "pods": "110"},
+            "capacity": {"cpu": "8", "memory": "2Gi", "pods": "110"},
             "conditions": [_condition("Ready", "True", "KubeletReady")],
         }
         self.api.merge(f"/api/v1/nodes/{name}/status", {"status": status})
@@ -149,10 +149,11 @@ class World:
         return next((c for c in conditions if c["type"] == type_), {})
 
     def phase(self, namespace: str, phase: str, name: str = "traffic") -> Body:
-        return wait_for(
-            lambda: self.status(namespace, name).get("phase") == phase and self.status(namespace, name),
-            f"{namespace}/{name} to be {phase}",
-        )
+        def reached() -> Body | None:
+            status = self.status(namespace, name)
+            return status if status.get("phase") == phase else None
+
+        return wait_for(reached, lambda: f"{name} to be {phase}, but it is {self.status(namespace, name)}")
 
     def grants(self, namespace: str, name: str = "traffic") -> list[Body]:
         selector = f"fractus.dev/namespace={namespace},fractus.dev/application={name}"
@@ -175,7 +176,9 @@ class World:
         return found
 
     def pods(self, namespace: str) -> list[Body]:
-        return self.api.list(f"/api/v1/namespaces/{namespace}/pods")
+        """Pods that are not on their way out (no kubelet ends them here)."""
+        found = self.api.list(f"/api/v1/namespaces/{namespace}/pods")
+        return [pod for pod in found if "deletionTimestamp" not in pod["metadata"]]
 
     def run_pods(self, namespace: str) -> None:
         """Say of every pod that it is bound and ready, as scheduler and kubelet would."""
@@ -196,7 +199,10 @@ class World:
             self.api.merge(f"/api/v1/namespaces/{namespace}/pods/{name}/status", {"status": status})
 
     def clear(self) -> None:
-        """Remove what tests leave that is not in a namespace."""
+        """Remove what tests leave that is not in a namespace, and pods, which no kubelet ends here."""
+        for pod in self.api.list("/api/v1/pods"):
+            path = f"/api/v1/namespaces/{pod['metadata']['namespace']}/pods/{pod['metadata']['name']}"
+            self.api.delete(path, grace_s=0)
         for plural in ("drones", "edgenodes", "depots", "zones", "policies", "grants"):
             for item in self.api.list(f"{FRACTUS}/{plural}"):
                 self.api.delete(f"{FRACTUS}/{plural}/{item['metadata']['name']}")

@@ -1,0 +1,65 @@
+{{/* Labels of every object of this release; take (dict "root" $ "part" "agent"). */}}
+{{- define "fractus.labels" -}}
+app.kubernetes.io/name: fractus
+app.kubernetes.io/instance: {{ .root.Release.Name }}
+app.kubernetes.io/component: {{ .part }}
+app.kubernetes.io/part-of: fractus
+app.kubernetes.io/managed-by: {{ .root.Release.Service }}
+helm.sh/chart: {{ printf "%s-%s" .root.Chart.Name .root.Chart.Version }}
+{{- end }}
+
+{{/* Labels that select the pods of one part. */}}
+{{- define "fractus.selector" -}}
+app.kubernetes.io/name: fractus
+app.kubernetes.io/instance: {{ .root.Release.Name }}
+app.kubernetes.io/component: {{ .part }}
+{{- end }}
+
+{{/* User name of the agents. */}}
+{{- define "fractus.agentUser" -}}
+system:serviceaccount:{{ .Release.Namespace }}:fractus-agent
+{{- end }}
+
+{{- define "fractus.pullSecrets" -}}
+{{- with .Values.imagePullSecrets }}
+imagePullSecrets:
+{{- range . }}
+  - name: {{ . }}
+{{- end }}
+{{- end }}
+{{- end }}
+
+{{/* What pods on drones and edge nodes share; take (dict "root" $ "classes" (list "drone")). */}}
+{{- define "fractus.nodePod" -}}
+hostNetwork: true
+dnsPolicy: Default
+enableServiceLinks: false
+priorityClassName: {{ .root.Values.priorityClass.name }}
+terminationGracePeriodSeconds: 10
+affinity:
+  nodeAffinity:
+    requiredDuringSchedulingIgnoredDuringExecution:
+      nodeSelectorTerms:
+        - matchExpressions:
+            - key: fractus.dev/class
+              operator: In
+              values: {{ toJson .classes }}
+# A drone out of reach keeps what flies it.
+tolerations:
+  - operator: Exists
+{{ include "fractus.pullSecrets" .root }}
+{{- end }}
+
+{{/* Root, to write the node's directories, and nothing beyond; take (dict "privileged" false). */}}
+{{- define "fractus.nodeSecurity" -}}
+{{- if .privileged }}
+privileged: true
+readOnlyRootFilesystem: true
+{{- else }}
+runAsUser: 0
+allowPrivilegeEscalation: false
+readOnlyRootFilesystem: true
+capabilities: {drop: [ALL]}
+seccompProfile: {type: RuntimeDefault}
+{{- end }}
+{{- end }}

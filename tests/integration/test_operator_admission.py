@@ -1,0 +1,379 @@
+"""What the API server and the operator let nobody do: bad manifests, foreign certificates, foreign nodes."""
+
+from __future__ import annotations
+
+import base64
+import copy
+import subprocess
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from control_plane import Api, ControlPlane, Refused, wait_for
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec, rsa
+from cryptography.x509.oid import NameOID
+from operator_world import FRACTUS, SYSTEM, OperatorProcess, World, at, component, navigator, ours, traffic
+
+Body = dict[str, Any]
+CHARTS = Path(__file__).parents[2] / "charts"
+REQUESTS = "/apis/certificates.k8s.io/v1/certificatesigningrequests"
+
+
+# -- bad manifests --
+
+
+def _unknown_egress(spec: Body) -> None:
+    spec["components"][1]["egress"] = ["ImageCheker"]
+
+
+def _no_mission(spec: Body) -> None:
+    del spec["components"][0]
+
+
+def _latitude_95(spec: Body) -> None:
+    spec["components"][0]["controlPoints"][0]["path"][0]["lat"] = 95
+
+
+def _crossing_region(spec: Body) -> None:
+    ring = [at(0, 0), at(50, 50), at(0, 50), at(50, 0)]
+    point = {"point": {"depot": "base"}, "navigation": "regionBased", "region": {"polygon": {"exterior": ring}}}
+    spec["components"][0]["controlPoints"] = [point]
+
+
+def _zero_replicas(spec: Body) -> None:
+    spec["components"][4]["replicas"] = 0
+
+
+def _unknown_method(spec: Body) -> None:
+    spec["components"][0]["services"][0]["methods"] = ["Arm", "Loop"]
+
+
+def _two_drivers(spec: Body) -> None:
+    spec["components"].append({**copy.deepcopy(spec["components"][0]), "name": "CoPilot"})
+
+
+def _empty_path(spec: Body) -> None:
+    spec["components"][0]["controlPoints"][0]["path"] = []
+
+
+def _negative_radius(spec: Body) -> None:
+    spec["components"][2]["locations"][0]["radius"] = -5
+
+
+def _unknown_depot(spec: Body) -> None:
+    spec["components"][0]["controlPoints"][0]["point"] = {"depot": "bse"}
+
+
+BAD_APPLICATIONS: list[tuple[Callable[[Body], None], str]] = [
+    (_unknown_egress, "egress"),
+    (_no_mission, "pointsOfInterest"),
+    (_latitude_95, "lat"),
+    (_crossing_region, "region"),
+    (_zero_replicas, "replicas"),
+    (_unknown_method, "methods"),
+    (_two_drivers, "driver"),
+    (_empty_path, "path"),
+    (_negative_radius, "radius"),
+    (_unknown_depot, "depot"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "field"), BAD_APPLICATIONS, ids=[s.__name__.strip("_") for s, _ in BAD_APPLICATIONS])
+def test_a_bad_application_is_refused_and_nothing_is_made(
+    world: World, operator: OperatorProcess, namespace: str, spoil: Callable[[Body], None], field: str
+) -> None:
+    manifest = traffic(namespace)
+    spoil(manifest["spec"])
+    try:
+        world.put(manifest)
+    except Refused as refusal:
+        assert field in str(refusal)
+        assert refusal.code in (400, 422)
+    else:
+        wait_for(lambda: world.condition(namespace, "Ready").get("status") == "False", "Ready=False")
+        condition = world.condition(namespace, "Ready")
+        assert condition["reason"] == "Invalid"
+        assert field in condition["message"]
+        assert world.status(namespace)["phase"] == "Invalid"
+    assert world.children(namespace) == {}
+
+
+def test_a_crossing_zone_and_an_unknown_zone_are_not_ready(world: World, operator: OperatorProcess) -> None:
+    ring = [at(0, 0), at(50, 50), at(0, 50), at(50, 0)]
+    world.put(ours("Zone", "bowtie", {"area": {"polygon": {"exterior": ring}}}))
+    world.put(
+        ours("Policy", "nowhere", {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["nowhere"]}})
+    )
+    world.put(
+        ours("Policy", "knot", {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["bowtie"]}})
+    )
+
+    def ready(plural: str, name: str) -> Body | None:
+        conditions = ((world.api.get(f"{FRACTUS}/{plural}/{name}") or {}).get("status") or {}).get("conditions") or ()
+        return next((c for c in conditions if c["type"] == "Ready"), None)
+
+    zone = wait_for(lambda: ready("zones", "bowtie"), "the zone's condition")
+    assert (zone["status"], zone["reason"]) == ("False", "Invalid")
+    assert "spec.area.polygon.exterior" in zone["message"]
+    missing = wait_for(lambda: ready("policies", "nowhere"), "the policy's condition")
+    assert (missing["status"], missing["reason"]) == ("False", "ZoneMissing")
+    assert "spec.selector.zones[0]" in missing["message"]
+    knot = wait_for(lambda: ready("policies", "knot"), "the policy's condition")
+    assert (knot["status"], knot["reason"]) == ("False", "ZoneInvalid")
+
+
+def test_a_mended_application_is_deployed(world: World, operator: OperatorProcess, namespace: str) -> None:
+    manifest = traffic(namespace, "traffic", navigator(), component("DataStore", "cloud"))
+    manifest["spec"]["components"][0]["controlPoints"][0]["point"] = {"depot": "late"}
+    world.put(manifest)
+    world.phase(namespace, "Invalid")
+    world.put(ours("Depot", "late", {"location": at(0, 0), "radius": 30}))
+    world.phase(namespace, "Deploying")
+
+
+# -- what agents may do --
+
+
+@pytest.fixture(scope="module")
+def chart(control_plane: ControlPlane) -> Iterator[None]:
+    """What the chart fractus makes, but its workloads: accounts, roles, the admission policy."""
+    world = World(control_plane)
+    world.api.apply(
+        f"/api/v1/namespaces/{SYSTEM}", {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": SYSTEM}}
+    )
+    for body in render():
+        if body["kind"] not in {"Deployment", "DaemonSet"}:
+            world.api.apply(_path(body), body)
+    yield
+
+
+def render(*arguments: str) -> list[Body]:
+    """The objects of the chart fractus, rendered by helm."""
+    caches = sorted((Path.home() / ".cache" / "fractus").glob("*/bin/helm"), reverse=True)
+    helm = str(caches[0]) if caches else "helm"
+    argv = [helm, "template", "fractus", str(CHARTS / "fractus"), "--namespace", SYSTEM, "--kube-version", "1.35.4"]
+    done = subprocess.run([*argv, *arguments], capture_output=True, text=True, timeout=60, check=True)
+    return [body for body in yaml.safe_load_all(done.stdout) if body]
+
+
+_PLURALS = {"PriorityClass": "priorityclasses", "ValidatingAdmissionPolicy": "validatingadmissionpolicies"}
+
+
+def _path(body: Body) -> str:
+    plural = _PLURALS.get(body["kind"], f"{body['kind'].lower()}s")
+    root = "/apis/" if "/" in body["apiVersion"] else "/api/"
+    namespace = body["metadata"].get("namespace")
+    scope = f"/namespaces/{namespace}" if namespace else ""
+    return f"{root}{body['apiVersion']}{scope}/{plural}/{body['metadata']['name']}"
+
+
+@pytest.fixture
+def agents(control_plane: ControlPlane, world: World, chart: None) -> Iterator[dict[str, Api]]:
+    """Clients with tokens as the agents of drone-1 and edge-1 have them, bound to pods on these nodes."""
+    clients = {}
+    pods = f"/api/v1/namespaces/{SYSTEM}/pods"
+    for node in ("drone-1", "edge-1"):
+        name = f"fractus-agent-{node}"
+        world.api.delete(f"{pods}/{name}", grace_s=0)
+        spec = {"nodeName": node, "serviceAccountName": "fractus-agent", "containers": [{"name": "a", "image": "a"}]}
+        pod = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": name, "namespace": SYSTEM}, "spec": spec}
+        uid = world.api.call("POST", pods, pod)["metadata"]["uid"]
+        bound = {"kind": "Pod", "apiVersion": "v1", "name": name, "uid": uid}
+        request = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest",
+                   "spec": {"expirationSeconds": 600, "boundObjectRef": bound}}  # fmt: skip
+        path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-agent/token"
+        clients[node] = control_plane.with_token(world.api.call("POST", path, request)["status"]["token"])
+    # The API server needs a moment to know a new admission policy: wait until it denies.
+    wait_for(lambda: _denied(clients["edge-1"]), "the admission policy to be in force")
+    yield clients
+    for client in clients.values():
+        client.close()
+
+
+def _denied(client: Api) -> bool:
+    try:
+        client.merge(f"{FRACTUS}/drones/drone-1/status?dryRun=All", {"status": {"flightState": "flying"}})
+    except Refused as error:
+        return error.code == 403 and "may write the Drone" in str(error)
+    return False
+
+
+def denied(attempt: Callable[[], object], words: str) -> None:
+    with pytest.raises(Refused) as refusal:
+        attempt()
+    assert refusal.value.code == 403, refusal.value
+    assert words in str(refusal.value)
+
+
+def test_an_agent_reports_its_own_drone_only(world: World, agents: dict[str, Api]) -> None:
+    state = {"status": {"flightState": "flying"}}
+    agents["drone-1"].merge(f"{FRACTUS}/drones/drone-1/status", state)
+    denied(lambda: agents["edge-1"].merge(f"{FRACTUS}/drones/drone-1/status", state), "edge-1 only")
+    world.add_drone("drone-2")
+    denied(lambda: agents["drone-1"].merge(f"{FRACTUS}/drones/drone-2/status", state), "drone-1 only")
+
+
+def test_an_agent_registers_its_own_node_only(world: World, agents: dict[str, Api]) -> None:
+    body = copy.deepcopy(world.api.get(f"{FRACTUS}/edgenodes/edge-1"))
+    assert body is not None
+    fresh = ours("EdgeNode", "edge-1", body["spec"])
+    world.api.delete(f"{FRACTUS}/edgenodes/edge-1")
+    denied(lambda: agents["drone-1"].call("POST", f"{FRACTUS}/edgenodes", fresh), "drone-1 only")
+    agents["edge-1"].call("POST", f"{FRACTUS}/edgenodes", fresh)
+    nameless = {**fresh, "metadata": {"generateName": "edge-"}}
+    denied(lambda: agents["edge-1"].call("POST", f"{FRACTUS}/edgenodes", nameless), "edge-1 only")
+    denied(lambda: agents["edge-1"].delete(f"{FRACTUS}/edgenodes/edge-1"), "cannot delete")
+
+
+def _grant(world: World, node: str) -> str:
+    name = f"t.{uuid.uuid4().hex[:8]}"
+    owner = {"namespace": "t", "name": "a", "uid": "u"}
+    world.put(ours("Grant", name, {"node": node, "application": owner, "component": "A", "instance": "a"}))
+    return f"{FRACTUS}/grants/{name}"
+
+
+def test_an_agent_reports_on_grants_of_its_node_only(world: World, agents: dict[str, Api]) -> None:
+    mine, other = _grant(world, "drone-1"), _grant(world, "edge-1")
+    status = {"status": {"phase": "Active"}}
+    agents["drone-1"].merge(f"{mine}/status", status)
+    denied(lambda: agents["drone-1"].merge(f"{other}/status", status), "drone-1 only")
+    denied(lambda: agents["drone-1"].merge(mine, {"spec": {"component": "B"}}), "cannot patch")
+    denied(lambda: agents["drone-1"].merge(f"{FRACTUS}/zones/any", {"spec": {}}), "cannot patch")
+
+
+def test_a_token_that_is_bound_to_no_node_writes_nothing(
+    control_plane: ControlPlane, world: World, agents: dict[str, Api]
+) -> None:
+    path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-agent/token"
+    request = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest", "spec": {"expirationSeconds": 600}}
+    loose = control_plane.with_token(world.api.call("POST", path, request)["status"]["token"])
+    state = {"status": {"flightState": "flying"}}
+    denied(lambda: loose.merge(f"{FRACTUS}/drones/drone-1/status", state), "not bound to a node")
+    loose.close()
+
+
+# -- certificates of nodes --
+
+
+def signing_request(node: str, names: list[x509.GeneralName] | None = None, key: Any = None, **spec: Any) -> Body:
+    key = key or ec.generate_private_key(ec.SECP256R1())
+    default = [
+        x509.UniformResourceIdentifier(f"spiffe://fractus.dev/node/{node}"),
+        x509.DNSName(f"{node}.node.fractus.dev"),
+    ]
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, node)])
+    builder = x509.CertificateSigningRequestBuilder().subject_name(subject)
+    builder = builder.add_extension(x509.SubjectAlternativeName(default if names is None else names), critical=False)
+    pem = builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
+    return {
+        "apiVersion": "certificates.k8s.io/v1",
+        "kind": "CertificateSigningRequest",
+        "metadata": {"name": f"fractus-{node}-{uuid.uuid4().hex[:8]}", "labels": {"fractus.dev/node": node}},
+        "spec": {
+            "request": base64.b64encode(pem).decode(),
+            "signerName": "fractus.dev/node",
+            "usages": ["digital signature", "server auth", "client auth"],
+            **spec,
+        },
+    }
+
+
+def settled(world: World, body: Body) -> Body:
+    """The status of a request once it is signed or denied."""
+
+    def look() -> Body | None:
+        status = (world.api.get(f"{REQUESTS}/{body['metadata']['name']}") or {}).get("status") or {}
+        denied = any(c["type"] == "Denied" for c in status.get("conditions", ()))
+        return status if denied or status.get("certificate") else None
+
+    return wait_for(look, "the request to be settled")
+
+
+def test_an_agent_gets_the_certificate_of_its_node(
+    world: World, operator: OperatorProcess, agents: dict[str, Api]
+) -> None:
+    body = signing_request("drone-1")
+    agents["drone-1"].call("POST", REQUESTS, body)
+    status = settled(world, body)
+    certificate = x509.load_pem_x509_certificate(base64.b64decode(status["certificate"]))
+    names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert sorted(n.value for n in names) == ["drone-1.node.fractus.dev", "spiffe://fractus.dev/node/drone-1"]
+    authority = world.api.get(f"/api/v1/namespaces/{SYSTEM}/configmaps/fractus-ca") or {}
+    certificate.verify_directly_issued_by(x509.load_pem_x509_certificate(authority["data"]["ca.crt"].encode()))
+    assert not certificate.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+
+
+FOREIGN = [
+    pytest.param({"names": [x509.DNSName("edge-1.node.fractus.dev")]}, "WrongNames", id="another node"),
+    pytest.param(
+        {"names": [x509.UniformResourceIdentifier("spiffe://fractus.dev/node/drone-1"),
+                   x509.DNSName("drone-1.node.fractus.dev"), x509.DNSName("example.org")]},
+        "WrongNames", id="one name too many",
+    ),
+    pytest.param({"names": [x509.UniformResourceIdentifier("spiffe://fractus.dev/ns/a/app/b/component/c/instance/d")]},
+                 "WrongNames", id="a component"),
+    pytest.param({"usages": ["digital signature", "server auth"]}, "WrongUsages", id="fewer usages"),
+    pytest.param({"usages": ["server auth", "client auth", "cert sign"]}, "WrongUsages", id="to sign others"),
+    pytest.param({"key": ec.generate_private_key(ec.SECP384R1())}, "WrongKey", id="another curve"),
+    pytest.param({"key": rsa.generate_private_key(65537, 2048)}, "WrongKey", id="RSA"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "reason"), FOREIGN)
+def test_an_agent_gets_no_other_certificate(
+    world: World, operator: OperatorProcess, agents: dict[str, Api], change: Body, reason: str
+) -> None:
+    body = signing_request("drone-1", **change)
+    agents["drone-1"].call("POST", REQUESTS, body)
+    status = settled(world, body)
+    assert "certificate" not in status
+    assert [(c["type"], c["reason"]) for c in status["conditions"]] == [("Denied", reason)]
+
+
+def test_nobody_else_gets_a_certificate_of_a_node(
+    world: World, operator: OperatorProcess, agents: dict[str, Api]
+) -> None:
+    body = signing_request("drone-1")
+    world.api.call("POST", REQUESTS, body)
+    assert [c["reason"] for c in settled(world, body)["conditions"]] == ["WrongRequester"]
+    denied(lambda: agents["edge-1"].call("POST", REQUESTS, signing_request("drone-1")), "edge-1 only")
+    kubelet = signing_request(
+        "drone-1", signerName="kubernetes.io/kube-apiserver-client-kubelet", usages=["client auth"]
+    )
+    denied(lambda: agents["drone-1"].call("POST", REQUESTS, kubelet), "drone-1 only")
+
+
+# -- the operator's own permissions --
+
+
+def test_the_operator_does_its_work_with_the_chart_s_permissions(
+    control_plane: ControlPlane, world: World, chart: None, namespace: str, tmp_path: Path
+) -> None:
+    path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-operator/token"
+    request = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest", "spec": {"expirationSeconds": 600}}
+    token = world.api.call("POST", path, request)["status"]["token"]
+    config = yaml.safe_load(control_plane.kubeconfig.read_text())
+    config["users"][0]["user"] = {"token": token}
+    kubeconfig = tmp_path / "operator.kubeconfig"
+    kubeconfig.write_text(yaml.safe_dump(config))
+    operator = OperatorProcess(kubeconfig, tmp_path / "operator.log")
+    operator.start()
+    try:
+        world.put(traffic(namespace))
+        wait_for(lambda: len(world.pods(namespace)) == 7, lambda: operator.log())
+        world.run_pods(namespace)
+        world.phase(namespace, "Running")
+        grant = f"{FRACTUS}/grants/{namespace}.traffic-navigator/status"
+        world.api.merge(grant, {"status": {"phase": "Complete"}})
+        world.phase(namespace, "Completed")
+        world.api.delete(world.path(traffic(namespace)))
+        wait_for(lambda: world.application(namespace) is None and not world.children(namespace), operator.log)
+    finally:
+        operator.stop()
+    assert "forbidden" not in operator.log().lower()
+    assert "ERROR" not in operator.log()

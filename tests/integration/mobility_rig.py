@@ -93,7 +93,7 @@ def passenger_grant(*policies: dict[str, Any], **changes: Any) -> dict[str, Any]
             "control": None,
             "controlPoints": [],
             **changes,
-        }
+        },
     )
 
 
@@ -175,7 +175,7 @@ class Rig:
         fresh.replace(path)
         return path
 
-    def start_vehicle(self, speedup: float = 2.0, *more: str) -> None:
+    def start_vehicle(self, speedup: float = 3.0, *more: str) -> None:
         home = ",".join(str(v) for v in HOME)
         self._start(
             "vehicle", "-m", "fractus_sim.vehicle", "--listen", self.link, "--home", home, "--speedup", str(speedup),
@@ -192,7 +192,10 @@ class Rig:
     def _start(self, name: str, *arguments: str) -> None:
         with (self.directory / f"{name}.log").open("ab") as log:
             self._processes[name] = subprocess.Popen(
-                [sys.executable, *arguments], stdout=log, stderr=subprocess.STDOUT, env={**os.environ, "MALLOC_ARENA_MAX": "2"}
+                [sys.executable, *arguments],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "MALLOC_ARENA_MAX": "2"},
             )
 
     def start_camera(self, *more: str, description: str = "") -> str:

@@ -28,7 +28,7 @@ async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
         await rig.close()
 
 
-async def flying(rig: Rig, *policies: dict[str, Any], speedup: float = 2.0, **changes: Any) -> Driver:
+async def flying(rig: Rig, *policies: dict[str, Any], speedup: float = 3.0, **changes: Any) -> Driver:
     rig.write_grant(grant(*policies, **changes))
     rig.start_service()
     rig.start_vehicle(speedup)

@@ -15,7 +15,7 @@ from fractus_core.policy.access import judge_access, judge_privacy
 from fractus_core.policy.compiled import CompiledGrant, height_m
 from fractus_core.policy.fences import Breach, breaches, last_legal
 from fractus_core.policy.limits import Bound, Clamped, altitude_bounds, clamp, speed_bounds
-from fractus_core.policy.motion import XY, Leg, stop_altitude_m, stop_point
+from fractus_core.policy.motion import XY, Leg, standing, stop_altitude_m, stop_point, turn_point
 from fractus_core.policy.values import (
     Call,
     CaptureArgs,
@@ -154,8 +154,7 @@ def _fly_leg(
 ) -> tuple[XY, float, float | None] | Verdict:
     """The target, altitude and speed that may be flown, or the verdict that forbids the leg."""
     margin, height_margin = margin_m(now), height_margin_m(now)
-    turn, rest = stop_point(now, at), stop_altitude_m(now)
-    leg = _leg(at, turn, target, now, rest, altitude_m)
+    leg = _leg(at, target, now, altitude_m)
     ground = leg.ground
     bounds = altitude_bounds(grant, now, ground, leg.lower_m, leg.upper_m, margin)
     if isinstance(bounds, Verdict):
@@ -165,7 +164,7 @@ def _fly_leg(
         return clamped
     if clamped.code:
         notes.append(clamped)
-        leg = _leg(at, turn, target, now, rest, clamped.value)
+        leg = _leg(at, target, now, clamped.value)
     entering = _altitude_on_entry(at, now, bounds, height_margin)
     if entering is not None:
         return entering
@@ -184,8 +183,9 @@ def _fly_leg(
     return target, clamped.value, flown_mps
 
 
-def _leg(at: XY, turn: XY, target: XY, now: Situation, rest_m: float, altitude_m: float) -> Leg:
-    return Leg(at, turn, target, min(now.altitude_m, rest_m, altitude_m), max(now.altitude_m, rest_m, altitude_m))
+def _leg(at: XY, target: XY, now: Situation, altitude_m: float) -> Leg:
+    heights = (now.altitude_m, stop_altitude_m(now), altitude_m)
+    return Leg(at, stop_point(now, at), turn_point(now, at, target), target, min(heights), max(heights))
 
 
 def _react(
@@ -277,9 +277,9 @@ def _way_home_blocked(target: XY, altitude_m: float, now: Situation, grant: Comp
     height_m = max(altitude_m, now.airframe.return_altitude_m)
     margin, slack = margin_m(now), height_margin_m(now)
     parts = (
-        Leg(target, target, home, height_m, height_m),
-        Leg(target, target, target, altitude_m, height_m),
-        Leg(home, home, home, 0.0, height_m),
+        Leg(target, target, target, home, height_m, height_m),
+        standing(target, altitude_m, height_m),
+        standing(home, 0.0, height_m),
     )
     for part in parts:
         ground = part.ground
@@ -340,7 +340,7 @@ def _judge_takeoff(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     at = _located(now, grant)
     if isinstance(at, Verdict):
         return at
-    leg = _leg(at, at, at, now, now.altitude_m, args.altitude_m)
+    leg = standing(at, min(now.altitude_m, args.altitude_m), max(now.altitude_m, args.altitude_m))
     bounds = altitude_bounds(grant, now, leg.ground, leg.lower_m, leg.upper_m, margin_m(now))
     if isinstance(bounds, Verdict):
         return bounds
@@ -372,7 +372,7 @@ def _judge_land(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 def _column(at: XY, now: Situation, grant: CompiledGrant, lower_m: float, upper_m: float) -> Verdict | None:
     """The denial of a vertical motion, or of standing, where fences forbid it; no such request is a takeover."""
-    leg = Leg(at, at, at, min(lower_m, upper_m), max(lower_m, upper_m))
+    leg = standing(at, min(lower_m, upper_m), max(lower_m, upper_m))
     found = breaches(leg, now, grant, margin_m(now), height_margin_m(now))
     if not found:
         return None

@@ -103,7 +103,7 @@ def _exclusions(
     for patch in grant.exclusions.near(ground, margin_m, lower_m, upper_m, now, grant.flat_terrain):
         shape = patch.shape
         clearance_m = _clearance_outside(shape, leg.unavoidable)
-        if clearance_m < margin_m and _leads_out(shape, leg, margin_m):
+        if clearance_m < margin_m and _leads_out(shape, leg, margin_m, clearance_m):
             continue
         # What the drone does anyway is not the request's doing.
         enters = clearance_m > 0 and shape.intersects(ground)
@@ -189,35 +189,39 @@ def _stays_inside(shape: BaseGeometry, border: BaseGeometry, leg: Leg, margin_m:
         return True
     if shape.covers(leg.unavoidable) and not border.dwithin(leg.unavoidable, margin_m):
         return False
+    if shape.covers(leg.unavoidable) and not shape.covers(ground):
+        return False
     inner = shape.buffer(-margin_m)
     return _returns(leg, inner, lambda point: _signed(shape, border, point))
 
 
-def _leads_out(shape: BaseGeometry, leg: Leg, margin_m: float) -> bool:
+def _leads_out(shape: BaseGeometry, leg: Leg, margin_m: float, clearance_m: float) -> bool:
     """Whether a leg that starts in or too close to an excluded shape leads away from it."""
+    if clearance_m > 0 and shape.distance(leg.ground) < clearance_m - 1e-6:
+        return False
     border = shape.boundary
     outer = shape.buffer(margin_m)
     line = leg.line
     target = shapely.Point(leg.target)
     if outer.intersects(target):
         return False
-    return _monotone(line.intersection(outer), leg.turn, lambda point: -_signed(shape, border, point))
+    return _monotone(line.intersection(outer), leg.stop, lambda point: -_signed(shape, border, point))
 
 
 def _returns(leg: Leg, inner: BaseGeometry, clearance: Callable[[BaseGeometry], float]) -> bool:
     target = shapely.Point(leg.target)
     if not inner.intersects(target):
         return False
-    return _monotone(leg.line.difference(inner), leg.turn, clearance)
+    return _monotone(leg.line.difference(inner), leg.stop, clearance)
 
 
-def _monotone(part: BaseGeometry, turn: XY, clearance: Callable[[BaseGeometry], float]) -> bool:
-    """Whether the illegal part of a line is one piece that begins at the turning point and only gets better."""
+def _monotone(part: BaseGeometry, begin: XY, clearance: Callable[[BaseGeometry], float]) -> bool:
+    """Whether the illegal part of a line is one piece that begins where the drone can rest and only gets better."""
     if part.is_empty:
         return True
     if not isinstance(part, shapely.LineString | shapely.Point):
         return False
-    if shapely.Point(turn).distance(part) > 1e-6:
+    if shapely.Point(begin).distance(part) > 1e-6:
         return False
     last = float("-inf")
     for i in range(_SAMPLES + 1):
@@ -238,7 +242,7 @@ def _signed(shape: BaseGeometry, border: BaseGeometry, point: BaseGeometry) -> f
 def last_legal(leg: Leg, found: list[Breach]) -> XY | None:
     """The furthest point of a leg that no breached fence objects to, or None when there is none worth flying to."""
     line = leg.line
-    start = shapely.Point(leg.turn)
+    start = shapely.Point(leg.stop)
     if not isinstance(line, shapely.LineString):
         return None
     reach = line.length

@@ -34,6 +34,31 @@ def stop_point(situation: Situation, at: XY) -> XY:
     return at[0] + situation.east_mps / speed * run, at[1] + situation.north_mps / speed * run
 
 
+def turn_point(situation: Situation, at: XY, target: XY) -> XY:
+    """The corner of the triangle in which a drone turns from its present velocity toward a target.
+
+    While the velocity changes from v to w with an acceleration of bounded size a, the drone flies a parabola: a Bezier
+    curve of second degree whose middle control point lies v * T / 2 ahead, with T = |w - v| / a, and which never leaves
+    the triangle of its control points.
+    """
+    speed = math.hypot(situation.north_mps, situation.east_mps)
+    if speed < 0.05:
+        return at
+    frame = situation.airframe
+    stop = stop_point(situation, at)
+    change = 0.0
+    for origin in (at, stop):
+        dx, dy = target[0] - origin[0], target[1] - origin[1]
+        away = math.hypot(dx, dy)
+        cruise = min(situation.speed_setpoint_mps, math.sqrt(2 * frame.accel_mps2 * away)) if away > 0 else 0.0
+        east, north = (dx / away * cruise, dy / away * cruise) if away > 0 else (0.0, 0.0)
+        change = max(change, math.hypot(east - situation.east_mps, north - situation.north_mps), speed)
+    slack = frame.accel_mps2 / (2 * frame.position_gain**2)
+    run = speed * situation.latency_s + slack + speed * change / (2 * frame.accel_mps2)
+    run = max(run, math.hypot(stop[0] - at[0], stop[1] - at[1]))
+    return at[0] + situation.east_mps / speed * run, at[1] + situation.north_mps / speed * run
+
+
 def stop_altitude_m(situation: Situation) -> float:
     """Altitude above home at which the drone comes to rest when it is told to stop now."""
     climb = -situation.down_mps
@@ -48,10 +73,19 @@ class Leg:
     """A motion in frame metres: from where the drone is, by where it can turn, to a target.
 
     The drone may be anywhere in the triangle of present position, turning point and target, at any altitude between
-    the three: autopilots shape the axes independently, so no straighter promise can be made.
+    lower and upper: autopilots shape the axes independently, so no straighter promise can be made.
+
+    Attributes:
+        start: where the drone is.
+        stop: where it comes to rest when it brakes now, on the way to `turn`.
+        turn: see `turn_point`.
+        target: where it is to go.
+        lower_m: lowest altitude above home on the way.
+        upper_m: highest altitude above home on the way.
     """
 
     start: XY
+    stop: XY
     turn: XY
     target: XY
     lower_m: float
@@ -73,9 +107,14 @@ class Leg:
     @property
     def unavoidable(self) -> BaseGeometry:
         """The part that the drone flies whatever it is told."""
-        return shapely.Point(self.start) if self.start == self.turn else shapely.LineString((self.start, self.turn))
+        return shapely.Point(self.start) if self.start == self.stop else shapely.LineString((self.start, self.stop))
 
     @property
     def line(self) -> BaseGeometry:
-        """From the turning point straight to the target."""
-        return shapely.Point(self.turn) if self.turn == self.target else shapely.LineString((self.turn, self.target))
+        """From where the drone comes to rest straight to the target."""
+        return shapely.Point(self.stop) if self.stop == self.target else shapely.LineString((self.stop, self.target))
+
+
+def standing(at: XY, lower_m: float, upper_m: float) -> Leg:
+    """A drone that stays above one place."""
+    return Leg(at, at, at, at, lower_m, upper_m)

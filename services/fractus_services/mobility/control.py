@@ -429,11 +429,12 @@ class Control:
     async def _prepare(self) -> None:
         while self.autopilot.connected:
             try:
-                await self.autopilot.ask_home()
                 await self.autopilot.set_rates(flying=self.autopilot.vehicle.armed)
                 self._resume()
                 self.checked = await configure(self.autopilot)
                 self._wake()
+                if self.autopilot.vehicle.home is None:
+                    await self.autopilot.ask_home()
             except AutopilotError as error:
                 log.warning("cannot prepare the autopilot yet: %s", error)
                 await asyncio.sleep(RETRY_S)

@@ -1,0 +1,98 @@
+"""The continuous check: what it sees coming, and what it leaves alone."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from fractus_core.policy.monitoring import monitor
+from fractus_core.policy.values import GotoArgs, SetSpeedArgs
+from policy_world import NOW, altitude, at, box, compiled, exclusion, inclusion, speed
+
+WALL = box(-50, 50, 50, 90)
+
+
+def test_all_is_well() -> None:
+    grant = compiled(exclusion(WALL), altitude(upperLimit=30), speed(upperLimit=10))
+    assert monitor(at(), grant) is None
+    assert monitor(at(0, 20, north_mps=5), grant) is None
+    assert monitor(at(0, 60, in_air=False), grant) is None, "on the ground nothing moves"
+
+
+def test_a_drone_brakes_while_it_still_can() -> None:
+    grant = compiled(exclusion(WALL))
+    for y in range(10, 60):
+        verdict = monitor(at(0, float(y), north_mps=8), grant)
+        if verdict is not None:
+            assert (verdict.action, verdict.takeover, verdict.code) == ("deny", "hover", "ExclusionZoneAhead")
+            stop = 8 * 0.3 + 1.25 + 64 / 5
+            assert 50 - stop - 3 < y < 50 - stop + 1, "neither too early nor too late"
+            return
+    raise AssertionError("it never braked")
+
+
+@pytest.mark.parametrize("action", ["hover", "land", "returnToLaunch", "revoke"])
+def test_a_policy_that_takes_the_drone_takes_it(action: str) -> None:
+    grant = compiled(exclusion(WALL, action))
+    for state in (at(0, 70), at(0, 40, north_mps=8)):
+        verdict = monitor(state, grant)
+        assert verdict is not None
+        assert (verdict.action, verdict.takeover, verdict.policies) == ("takeover", action, ("no-fly",))
+
+
+def test_the_strictest_of_several_takes_it() -> None:
+    grant = compiled(exclusion(WALL, "hover", "a"), exclusion(WALL, "revoke", "b"), exclusion(WALL, "ignore", "c"))
+    verdict = monitor(at(0, 70), grant)
+    assert verdict is not None
+    assert verdict.policies == ("b",)
+
+
+def test_inside_a_zone_it_may_hover_or_leave_but_not_go_deeper() -> None:
+    grant = compiled(exclusion(WALL))
+    assert monitor(at(0, 55), grant) is None
+    assert monitor(at(0, 55, north_mps=-4), grant) is None
+    deeper = monitor(at(0, 55, north_mps=4), grant)
+    assert deeper is not None
+    assert deeper.code == "InsideExclusionZone"
+
+
+def test_bands_and_validity() -> None:
+    assert monitor(at(0, 70, 40), compiled(exclusion(WALL, "land", upper=20))) is None
+    falling = at(0, 70, 26, down_mps=4)
+    verdict = monitor(falling, compiled(exclusion(WALL, "land", upper=20)))
+    assert verdict is not None, "it sinks into the zone"
+    future = compiled(exclusion(WALL, "land", validFrom="2026-06-01T12:00:10Z"))
+    assert monitor(at(0, 70), future) is None
+    assert monitor(replace(at(0, 70), time_s=NOW + 11), future) is not None
+
+
+def test_leaving_the_operation_area_or_an_inclusion_zone() -> None:
+    leaving = monitor(at(0, 190, north_mps=6), compiled())
+    assert leaving is not None
+    assert (leaving.action, leaving.code) == ("deny", "OutsideOperationArea")
+    assert monitor(at(0, 190, north_mps=-6), compiled()) is None
+    kept = compiled(inclusion(box(-50, -50, 50, 50), "returnToLaunch"))
+    verdict = monitor(at(0, 45, north_mps=6), kept)
+    assert verdict is not None
+    assert verdict.takeover == "returnToLaunch"
+
+
+def test_altitude_and_speed_are_corrected() -> None:
+    grant = compiled(altitude(upperLimit=15), speed(upperLimit=5))
+    high = monitor(at(alt=18), grant)
+    assert high is not None
+    assert isinstance(high.args, GotoArgs)
+    assert (high.action, high.args.alt, high.policies) == ("correct", 15, ("altitudes",))
+    assert monitor(at(alt=15.5), grant) is None, "a climb that ends there"
+    fast = monitor(at(north_mps=9), grant)
+    assert fast is not None
+    assert fast.args == SetSpeedArgs(5)
+    assert monitor(at(north_mps=5.5), grant) is None
+
+
+def test_an_unknown_position_is_no_position() -> None:
+    for state in (replace(at(), lat=None), at(north_mps=math.nan)):
+        verdict = monitor(state, compiled())
+        assert verdict is not None
+        assert (verdict.action, verdict.takeover) == ("takeover", "hover")

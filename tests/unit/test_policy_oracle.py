@@ -1,0 +1,199 @@
+"""Random fences, states and requests, against an oracle that flies the drone in small steps.
+
+The oracle shares nothing with the engine: it projects on a sphere, casts rays to tell inside from outside, and
+integrates a drone with bounded acceleration, wind drift, latency and position error.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+
+from fractus_core.policy.values import Call, GotoArgs, TakeoffArgs
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from policy_world import HOME, Corners, altitude, ask, at, compiled, exclusion, goto, inclusion, ring, target
+
+EARTH_M = 6_371_000.0
+STEP_S = 0.05
+ACCEL_MPS2 = 2.5
+JUST = 0.02  # sphere against ellipsoid, at these distances
+_cases = settings(max_examples=600, deadline=None, derandomize=True)
+
+
+def flat(lat: float, lon: float) -> tuple[float, float]:
+    north_scale, east_scale = 110_998.0, math.cos(math.radians(HOME.lat)) * 111_458.0
+    return (lon - HOME.lon) * east_scale, (lat - HOME.lat) * north_scale
+
+
+def inside(point: tuple[float, float], corners: Corners) -> bool:
+    x, y = point
+    found = False
+    for (x0, y0), (x1, y1) in zip(corners, corners[1:] + corners[:1], strict=True):
+        if (y0 > y) != (y1 > y) and x < (x1 - x0) * (y - y0) / (y1 - y0) + x0:
+            found = not found
+    return found
+
+
+def fly(
+    start: tuple[float, float], velocity: tuple[float, float], to: tuple[float, float], cruise: float, latency: float
+) -> list[tuple[float, float]]:
+    """Positions of a drone that learns of its target after a latency and then turns to it, braking in time."""
+    (x, y), (vx, vy) = start, velocity
+    track, t = [start], 0.0
+    while t < 120:
+        t += STEP_S
+        ax = ay = 0.0
+        if t > latency:
+            dx, dy = to[0] - x, to[1] - y
+            away = math.hypot(dx, dy)
+            linear = ACCEL_MPS2
+            wanted = away if away < linear else math.sqrt(2 * ACCEL_MPS2 * (away - linear / 2))
+            wanted = min(wanted, cruise)
+            wx, wy = (dx / away * wanted, dy / away * wanted) if away > 1e-6 else (0.0, 0.0)
+            ex, ey = (wx - vx) / STEP_S, (wy - vy) / STEP_S
+            size = math.hypot(ex, ey)
+            scale = min(1.0, ACCEL_MPS2 / size) if size > 0 else 0.0
+            ax, ay = ex * scale, ey * scale
+            if away < 0.05 and math.hypot(vx, vy) < 0.05:
+                break
+        vx, vy = vx + ax * STEP_S, vy + ay * STEP_S
+        x, y = x + vx * STEP_S, y + vy * STEP_S
+        track.append((x, y))
+    return track
+
+
+def brake(start: tuple[float, float], velocity: tuple[float, float], latency: float) -> list[tuple[float, float]]:
+    """Where a drone flies that is told to stop, with the slack of ArduPilot's formula."""
+    speed = math.hypot(*velocity)
+    run = speed * latency + 1.25 + speed * speed / (2 * ACCEL_MPS2) if speed > 0 else 0.0
+    return [
+        (start[0] + velocity[0] / speed * run * i / 40, start[1] + velocity[1] / speed * run * i / 40)
+        for i in range(41)
+        if speed > 0
+    ] or [start]
+
+
+@st.composite
+def polygons(draw: st.DrawFn) -> Corners:
+    """A star-shaped polygon, convex or not."""
+    cx, cy = draw(st.floats(-120, 120)), draw(st.floats(-120, 120))
+    count = draw(st.integers(3, 8))
+    radii = draw(st.lists(st.floats(5, 45), min_size=count, max_size=count))
+    turn = draw(st.floats(0, 6))
+    return [
+        (cx + r * math.cos(turn + 2 * math.pi * i / count), cy + r * math.sin(turn + 2 * math.pi * i / count))
+        for i, r in enumerate(radii)
+    ]
+
+
+spots = st.tuples(st.floats(-150, 150), st.floats(-150, 150))
+velocities = st.tuples(st.floats(-8, 8), st.floats(-8, 8)).filter(lambda v: math.hypot(*v) < 10)
+
+
+@_cases
+@given(
+    zones=st.lists(polygons(), min_size=1, max_size=4),
+    start=spots,
+    to=spots,
+    velocity=velocities,
+    action=st.sampled_from(["ignore", "adjust"]),
+    seed=st.integers(0, 10**6),
+)
+def test_no_accepted_goto_leads_into_a_zone(
+    zones: list[Corners],
+    start: tuple[float, float],
+    to: tuple[float, float],
+    velocity: tuple[float, float],
+    action: str,
+    seed: int,
+) -> None:
+    fences = [exclusion(ring(zone), action, f"z{i}") for i, zone in enumerate(zones)]
+    now = at(*start, east_mps=velocity[0], north_mps=velocity[1], speed_setpoint_mps=10.0)
+    verdict = ask(compiled(*fences, operationArea=[]), goto(*to), now)
+    if not verdict.permits:
+        return
+    assert isinstance(verdict.args, GotoArgs)
+    end = flat(verdict.args.lat, verdict.args.lon)
+    begun_outside = not any(inside(start, zone) for zone in zones)
+    draw = random.Random(seed)
+    error = (draw.uniform(-1, 1), draw.uniform(-1, 1))
+    scale = now.position_error_m / max(math.hypot(*error), 1.0)
+    off = (error[0] * scale, error[1] * scale)
+    track = fly(
+        (start[0] + off[0], start[1] + off[1]), velocity, (end[0] + off[0], end[1] + off[1]), 10.0, now.latency_s
+    )
+    # What the drone does whatever it is told is not the request's doing.
+    braking = [(x + off[0] * k, y + off[1] * k) for x, y in brake(start, velocity, now.latency_s) for k in (-1, 0, 1)]
+    unavoidable = any(inside(point, zone) for zone in zones for point in braking)
+    if begun_outside and not unavoidable:
+        for point in track:
+            for zone in zones:
+                assert not inside(point, zone), f"inside at {point}, verdict {verdict}"
+    for zone in zones:
+        assert not inside(track[-1], zone)
+
+
+@_cases
+@given(area=polygons(), start=spots, to=spots, action=st.sampled_from(["ignore", "adjust"]))
+def test_no_accepted_goto_leaves_an_inclusion_zone(
+    area: Corners, start: tuple[float, float], to: tuple[float, float], action: str
+) -> None:
+    big = [(x * 3, y * 3) for x, y in area]
+    fence = inclusion(ring(big), action)
+    verdict = ask(compiled(fence, operationArea=[]), goto(*to), at(*start))
+    if not verdict.permits:
+        return
+    end = target(verdict)
+    track = fly(start, (0.0, 0.0), end, 10.0, 0.3)
+    outside = [not inside(p, big) for p in track]
+    if not outside[0]:
+        assert not any(outside)
+    assert outside == sorted(outside, reverse=True), "once inside, it stays inside"
+    assert not outside[-1]
+    # A corrected target keeps its margin: the whole circle around it is inside.
+    ring_of = [(end[0] + 2.4 * math.cos(a / 5), end[1] + 2.4 * math.sin(a / 5)) for a in range(32)]
+    assert all(inside(p, big) for p in ring_of)
+
+
+@_cases
+@given(
+    asked=st.floats(0.5, 200),
+    lower=st.one_of(st.none(), st.floats(0, 60)),
+    upper=st.one_of(st.none(), st.floats(0, 60)),
+    refuse=st.booleans(),
+)
+def test_altitudes_against_a_plain_reading_of_the_rules(
+    asked: float, lower: float | None, upper: float | None, refuse: bool
+) -> None:
+    if lower is None and upper is None:
+        return
+    if lower is not None and upper is not None and lower > upper:
+        lower, upper = upper, lower
+    limits = {k: v for k, v in (("lowerLimit", lower), ("upperLimit", upper)) if v is not None}
+    grant = compiled(altitude(action="refuse" if refuse else "enforce", **limits))
+    breaks = (upper is not None and asked > upper + 1e-6) or (lower is not None and asked < lower - 1e-6)
+    want = max(min(asked, 120.0, upper if upper is not None else math.inf), lower if lower is not None else -math.inf)
+    for call in (goto(10, 10, asked), Call("Takeoff", TakeoffArgs(asked))):
+        verdict = ask(grant, call, at(alt=0.0) if call.method == "Takeoff" else at())
+        if breaks and refuse:
+            assert verdict.action == "deny"
+        else:
+            assert verdict.permits
+            flown = verdict.args.alt if isinstance(verdict.args, GotoArgs) else verdict.args.altitude_m  # type: ignore[union-attr]
+            assert math.isclose(flown or 0.0, want, abs_tol=1e-5)
+            assert (verdict.action == "correct") == (abs(want - asked) > 1e-5)
+
+
+@_cases
+@given(lat=st.floats(), lon=st.floats(), alt=st.floats(), vn=st.floats(-100, 100), ve=st.floats(-100, 100))
+def test_no_request_is_too_odd_to_answer(lat: float, lon: float, alt: float, vn: float, ve: float) -> None:
+    zone = [(20.0, 20.0), (40.0, 20.0), (40.0, 40.0)]
+    grant = compiled(exclusion(ring(zone), "adjust"), altitude(upperLimit=30))
+    verdict = ask(grant, Call("Goto", GotoArgs(lat, lon, alt)), at(north_mps=vn, east_mps=ve))
+    if verdict.permits:
+        assert isinstance(verdict.args, GotoArgs)
+        assert all(math.isfinite(v) for v in (verdict.args.lat, verdict.args.lon, verdict.args.alt or 0.0))
+    else:
+        assert verdict.reason
+        assert verdict.code

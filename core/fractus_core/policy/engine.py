@@ -276,6 +276,10 @@ def _way_home_blocked(target: XY, altitude_m: float, now: Situation, grant: Comp
     home = grant.frame.xy(now.home.lat, now.home.lon)
     height_m = max(altitude_m, now.airframe.return_altitude_m)
     margin, slack = margin_m(now), height_margin_m(now)
+    lane = shapely.LineString((target, home)) if target != home else shapely.Point(home)
+    anything = grant.exclusions.near(lane, margin, -slack, height_m + slack, now, grant.flat_terrain)
+    if not grant.inclusions and next(anything, None) is None:
+        return None
     parts = (
         Leg(target, target, target, home, height_m, height_m),
         standing(target, altitude_m, height_m),
@@ -291,7 +295,6 @@ def _way_home_blocked(target: XY, altitude_m: float, now: Situation, grant: Comp
                 f" {patch.rule.name}",
                 (patch.rule.name,),
             )
-    lane = parts[0].ground
     for fence in grant.inclusions:
         if fence.rule.in_force(now.time_s):
             shape, _ = fence.at(height_m, height_m, now, grant.flat_terrain)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import shapely
 from shapely.geometry.base import BaseGeometry
@@ -68,7 +69,7 @@ def stop_altitude_m(situation: Situation) -> float:
     return situation.altitude_m + math.copysign(run, climb)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Leg:
     """A motion in frame metres: from where the drone is, by where it can turn, to a target.
 
@@ -91,7 +92,7 @@ class Leg:
     lower_m: float
     upper_m: float
 
-    @property
+    @cached_property
     def ground(self) -> BaseGeometry:
         """The ground below the leg: a triangle, a line or a point."""
         start, turn, target = self.start, self.turn, self.target
@@ -104,12 +105,12 @@ class Leg:
             return shapely.MultiPoint((start, turn, target)).convex_hull
         return shapely.Polygon((start, turn, target))
 
-    @property
+    @cached_property
     def unavoidable(self) -> BaseGeometry:
         """The part that the drone flies whatever it is told."""
         return shapely.Point(self.start) if self.start == self.stop else shapely.LineString((self.start, self.stop))
 
-    @property
+    @cached_property
     def line(self) -> BaseGeometry:
         """From where the drone comes to rest straight to the target."""
         return shapely.Point(self.stop) if self.stop == self.target else shapely.LineString((self.stop, self.target))

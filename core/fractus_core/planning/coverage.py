@@ -24,6 +24,8 @@ _TILT_RAD = math.atan((math.sqrt(5) - 1) / 2)
 
 _BATCH = 256
 _CHUNK = 2048
+_TABLE = 2_000_000
+_REMEMBERED = 4_000_000
 
 
 class Samples:
@@ -33,7 +35,7 @@ class Samples:
     1 % of the exact areas.
     """
 
-    __slots__ = ("_columns", "_first", "_keys", "_rows", "spacing_m")
+    __slots__ = ("_columns", "_first", "_keys", "_ranks", "_rows", "spacing_m")
 
     def __init__(self, shape: BaseGeometry) -> None:
         area, outline = float(shape.area), float(shape.length)
@@ -45,6 +47,11 @@ class Samples:
         self._rows = int(rows.max()) - self._first[0] + 1
         self._columns = int(columns.max()) - self._first[1] + 1
         self._keys: _Integers = (rows - self._first[0]) * self._columns + (columns - self._first[1])
+        self._ranks: _Integers | None = None
+        if self._rows * self._columns <= _TABLE:
+            taken = np.zeros(self._rows * self._columns + 1, dtype=np.int64)
+            taken[self._keys + 1] = 1
+            self._ranks = np.cumsum(taken)
 
     def __len__(self) -> int:
         """How many samples there are."""
@@ -74,7 +81,11 @@ class Samples:
         base = (row - self._first[0]) * self._columns
         some = right > left
         node, base, left, right = node[some], base[some], left[some], right[some]
-        return node, np.searchsorted(self._keys, base + left), np.searchsorted(self._keys, base + right)
+        return node, self._rank(base + left), self._rank(base + right)
+
+    def _rank(self, keys: _Integers) -> _Integers:
+        """How many samples come before each place of the lattice."""
+        return np.searchsorted(self._keys, keys) if self._ranks is None else self._ranks[keys]
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,12 +162,13 @@ class _State:
         self._gone = np.zeros(len(scene.names), dtype=bool)
         self._bounds = np.full(len(scene.names), -1, dtype=np.int64)
         self._fresh = np.zeros(len(scene.names), dtype=bool)
+        self._runs = _Runs(scene)
         self._count()
 
     def cover(self, discs: _Floats | None) -> None:
         """Cover what some discs reach."""
         if discs is not None and len(discs):
-            self._cover(discs[:, :2], discs[:, 2])
+            self._cover(*self._scene.samples.runs(discs[:, :2], discs[:, 2])[1:])
 
     def consider(self, candidates: _Integers) -> None:
         """Let these candidates take part, unless they were taken or dropped."""
@@ -186,7 +198,7 @@ class _State:
     def take(self, candidate: int) -> float:
         """Cover what the candidate reaches; the share of the area that this adds."""
         gain = int(self._bounds[candidate])
-        self._cover(self._scene.xy[[candidate]], self._scene.reach_m[[candidate]])
+        self._cover(*self._runs.of(np.array([candidate]))[1:])
         self.drop(candidate)
         return gain / len(self._open)
 
@@ -196,13 +208,12 @@ class _State:
         self._bounds[candidate] = -1
 
     def _refresh(self, candidates: _Integers) -> None:
-        node, first, end = self._scene.samples.runs(self._scene.xy[candidates], self._scene.reach_m[candidates])
+        node, first, end = self._runs.of(candidates)
         gains = np.bincount(node, weights=self._before[end] - self._before[first], minlength=len(candidates))
         self._bounds[candidates] = gains.astype(np.int64)
         self._fresh[candidates] = True
 
-    def _cover(self, xy: _Floats, reach_m: _Floats) -> None:
-        _, first, end = self._scene.samples.runs(xy, reach_m)
+    def _cover(self, first: _Integers, end: _Integers) -> None:
         for a, b in zip(first.tolist(), end.tolist(), strict=True):
             self._open[a:b] = 0
         self._count()
@@ -210,6 +221,31 @@ class _State:
 
     def _count(self) -> None:
         np.cumsum(self._open, out=self._before[1:])
+
+
+class _Runs:
+    """The runs of samples that each candidate reaches: found once, and remembered unless there are too many."""
+
+    def __init__(self, scene: CoverScene) -> None:
+        self._scene = scene
+        rows = 2 * float(scene.reach_m.sum()) / scene.samples.spacing_m + len(scene.names)
+        self._starts: _Integers | None = None
+        if rows <= _REMEMBERED:
+            parts = [
+                scene.samples.runs(scene.xy[i : i + _CHUNK], scene.reach_m[i : i + _CHUNK])
+                for i in range(0, len(scene.names), _CHUNK)
+            ] or [(np.empty(0, dtype=np.int64),) * 3]
+            counts = [np.bincount(part[0], minlength=min(_CHUNK, len(scene.names))) for part in parts]
+            self._starts = np.concatenate(([0], np.cumsum(np.concatenate(counts)[: len(scene.names)])))
+            self._first = np.concatenate([part[1] for part in parts])
+            self._end = np.concatenate([part[2] for part in parts])
+
+    def of(self, candidates: _Integers) -> tuple[_Integers, _Integers, _Integers]:
+        """As Samples.runs, of these candidates."""
+        if self._starts is None:
+            return self._scene.samples.runs(self._scene.xy[candidates], self._scene.reach_m[candidates])
+        node, run = _ranges(self._starts[candidates], self._starts[candidates + 1])
+        return node, self._first[run], self._end[run]
 
 
 def _lattice(shape: BaseGeometry, spacing_m: float) -> tuple[_Integers, _Integers]:

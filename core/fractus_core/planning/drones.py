@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from fractus_core.api.applications import Component
 from fractus_core.api.geometry import Point, Position
 from fractus_core.api.nodes import Drone
-from fractus_core.api.plans import Alternative, DroneChoice, Mission
+from fractus_core.api.plans import Alternative, DroneChoice
+from fractus_core.api.plans import Mission as PlannedMission
 from fractus_core.geo import ground
 from fractus_core.planning.area import OperationArea, start_of
 from fractus_core.planning.candidates import SUITABLE, Check, check_host, check_resources, check_services
 from fractus_core.planning.draft import Draft
-from fractus_core.planning.flight import Estimate, chauffeur_legs, estimate, first_missed, remaining_minutes
+from fractus_core.planning.flight import Estimate, Mission, chauffeur_legs, first_missed, remaining_minutes
 from fractus_core.planning.index import Near
 from fractus_core.planning.inventory import DroneFacts
 
@@ -70,11 +71,12 @@ def choose_drone(draft: Draft, area: OperationArea, candidates: DroneCandidates)
     """
     components = list(draft.spec.on("drone"))
     leader = draft.spec.driver or components[0]
+    mission = Mission(draft.spec, area, draft.settings)
     ranked = [
         found
         for drones, used in ((candidates.flying, True), (candidates.idle, False))
         for drone in drones
-        if (found := _judge(draft, area, drone, components, used=used)) is not None
+        if (found := _judge(draft, mission, drone, components, used=used)) is not None
     ]
     if not ranked:
         busy = any(r.reason == "Claimed" for r in draft.rejections(leader))
@@ -161,14 +163,12 @@ def _flying_by(draft: Draft, leader: Component) -> list[str]:
 # -- by what it is and has --
 
 
-def _judge(
-    draft: Draft, area: OperationArea, drone: Drone, components: list[Component], *, used: bool
-) -> _Ranked | None:
+def _judge(draft: Draft, asked: Mission, drone: Drone, components: list[Component], *, used: bool) -> _Ranked | None:
     """The drone with its score, or None with the first rule it fails noted."""
     leader = draft.spec.driver or components[0]
     kept = drone.name == draft.drone_before
     home = _home(draft, drone)
-    mission = estimate(draft.spec, area, home, drone, draft.settings) if home is not None and not used else None
+    mission = asked.estimate(home, drone) if home is not None and not used else None
     check = _lasting(draft, drone, components, mission, kept=kept) and (
         _passing(draft, drone, components, mission, kept=kept, used=used)
     )
@@ -232,8 +232,8 @@ def _too_long(drone: Drone, mission: Estimate, available_min: float, when: str) 
     )
 
 
-def _mission(found: Estimate) -> Mission:
-    return Mission(
+def _mission(found: Estimate) -> PlannedMission:
+    return PlannedMission(
         distance=round(found.distance_m, 1),
         duration=round(found.needed_min, 3),
         available=round(found.available_min, 3),

@@ -38,29 +38,50 @@ class Estimate:
     available_min: float
 
 
-def estimate(spec: ApplicationSpec, area: OperationArea, home: Point, drone: Drone, settings: Settings) -> Estimate:
-    """Length, climb and time of the whole mission, with the way to the first point and home from the last.
+class Mission:
+    """What an application asks of a drone; what does not depend on the drone is found once."""
 
-    Legs are straight; altitudes are gained and lost at the climb speed on top of the time over ground; a region counts
-    with the way to its middle and the stay its control point declares.
-    """
-    approach = distance_m(home, area.route[0])
-    distance = approach + area.length_m + distance_m(area.route[-1], home)
-    heights = [0.0, *heights_m(area.route, drone), 0.0]
-    climb = sum(abs(b - a) for a, b in itertools.pairwise(heights))
-    stay = sum(p.duration or 0.0 for p in spec.driver.control_points) if spec.driver is not None else 0.0
-    mobility = drone.spec.services.mobility
-    speed, available = settings.cruise_speed_mps, 0.0
-    if mobility is not None:
-        speed = min(speed, mobility.max_speed)
-        available = remaining_minutes(drone) - settings.battery_reserve * mobility.max_flight_time
-    needed = (distance / speed + climb / settings.climb_speed_mps) / 60 + stay
-    return Estimate(distance, approach, max(heights), needed, available)
+    def __init__(self, spec: ApplicationSpec, area: OperationArea, settings: Settings) -> None:
+        self._area = area
+        self._settings = settings
+        self._stay_min = sum(p.duration or 0.0 for p in spec.driver.control_points) if spec.driver is not None else 0.0
+        self._ways: dict[tuple[float, float], tuple[float, float]] = {}
+        self._climbs: dict[float | None, tuple[float, float]] = {}
+
+    def estimate(self, home: Point, drone: Drone) -> Estimate:
+        """Length, climb and time of the whole mission, with the way to the first point and home from the last.
+
+        Legs are straight; altitudes are gained and lost at the climb speed on top of the time over ground; a region
+        counts with the way to its middle and the stay its control point declares.
+        """
+        approach, distance = self._way(home)
+        top, climb = self._climb(drone)
+        mobility = drone.spec.services.mobility
+        speed, available = self._settings.cruise_speed_mps, 0.0
+        if mobility is not None:
+            speed = min(speed, mobility.max_speed)
+            available = remaining_minutes(drone) - self._settings.battery_reserve * mobility.max_flight_time
+        needed = (distance / speed + climb / self._settings.climb_speed_mps) / 60 + self._stay_min
+        return Estimate(distance, approach, top, needed, available)
+
+    def _way(self, home: Point) -> tuple[float, float]:
+        key = (home.lat, home.lon)
+        if key not in self._ways:
+            approach = distance_m(home, self._area.route[0])
+            self._ways[key] = (approach, approach + self._area.length_m + distance_m(self._area.route[-1], home))
+        return self._ways[key]
+
+    def _climb(self, drone: Drone) -> tuple[float, float]:
+        base = drone.spec.home.alt if drone.spec.home is not None else None
+        if base not in self._climbs:
+            heights = [0.0, *heights_m(self._area.route, base), 0.0]
+            self._climbs[base] = (max(heights), sum(abs(b - a) for a, b in itertools.pairwise(heights)))
+        return self._climbs[base]
 
 
-def heights_m(route: Sequence[Position], drone: Drone) -> list[float]:
+def heights_m(route: Sequence[Position], home_amsl_m: float | None) -> list[float]:
     """Metres above home along a route; unset keeps the altitude, and one above sea level counts if home's is known."""
-    base = drone.spec.home.alt if drone.spec.home is not None else None
+    base = home_amsl_m
     heights = [0.0]
     for place in route:
         if place.alt is None or (place.altitude_reference == "amsl" and base is None):

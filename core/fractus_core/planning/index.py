@@ -23,10 +23,11 @@ _Slots = NDArray[np.int64]
 _B_M = SEMI_MAJOR_AXIS_M * (1 - FLATTENING)
 _E2 = FLATTENING * (2 - FLATTENING)
 _SQUARES = np.array([SEMI_MAJOR_AXIS_M**-2, SEMI_MAJOR_AXIS_M**-2, _B_M**-2])
-_CELLS_M = tuple(256.0 * 4**level for level in range(6))
+_CELLS_M = tuple(128.0 * 2**level for level in range(12))
 _BITS = 21
 _OFFSET = 1 << (_BITS - 1)
 _HALF_GLOBE_M = 20_100_000.0
+_GROWTH = 1.5
 _BOX_DEPTH = 12
 _BOX_MARGINS = 8.0
 _BOX_FILL = 0.3
@@ -36,8 +37,8 @@ class SpatialIndex:
     """Named points on the WGS 84 ellipsoid.
 
     Points are kept as Earth-centred coordinates in grids of cubes, one grid a scale, so that neither the antimeridian
-    nor the poles are special. A query looks at the 27 cubes around its centre in the grid whose cubes are no smaller
-    than the radius, then at exact distances.
+    nor the poles are special. A query looks at the cubes around its centre (at most six each way) in the grid whose
+    cubes are no smaller than half the radius, then at exact distances.
 
     An insertion, move or removal takes microseconds; a query O(points in the cubes).
     """
@@ -149,7 +150,7 @@ class SpatialIndex:
 
     def nearest(self, point: Point, count: int, beyond_m: float = 0.0, within_m: float = CHORDS_TO_M) -> list[Near]:
         """The points nearest to a place, further than `beyond_m` and not further than `within_m`; ordered as by within."""
-        radius_m = min(max(2 * beyond_m, _CELLS_M[0] / 2), within_m)
+        radius_m = min(max(_GROWTH * beyond_m, _CELLS_M[0]), within_m)
         while count > 0:
             slots, distances = self._exactly(point, self._around(point.lat, point.lon, radius_m), radius_m)
             outside = distances > beyond_m
@@ -159,7 +160,7 @@ class SpatialIndex:
                     limit = np.partition(distances, count - 1)[count - 1] + 1e-3
                     slots, distances = slots[distances <= limit], distances[distances <= limit]
                 return self._ranked(slots, distances)[:count]
-            radius_m = min(4 * radius_m, within_m)
+            radius_m = min(_GROWTH * radius_m, within_m)
         return []
 
     def near_area(self, frame: LocalFrame, shape: BaseGeometry, margin_m: float) -> tuple[list[str], _Floats]:
@@ -194,7 +195,7 @@ class SpatialIndex:
         """Slots that may be within the radius: a superset, since a chord is never longer than the geodesic."""
         x, y, z = ecef(lat, lon)
         for grid, size in zip(self._grids, _CELLS_M, strict=True):
-            if size >= radius_m:
+            if size >= radius_m / 2:
                 cells = [grid[key] for key in _cells_around(x, y, z, radius_m, size) if key in grid]
                 break
         else:

@@ -11,6 +11,7 @@ from enum import Enum
 
 from fractus_sim.vehicle.body import GRAVITY, Airframe
 from fractus_sim.vehicle.shaping import (
+    BRAKING_SHARE,
     clamp,
     shape_position,
     shape_position_xy,
@@ -18,6 +19,11 @@ from fractus_sim.vehicle.shaping import (
     shape_velocity_xy,
     wrap_pi,
 )
+
+# Slower than this counts as stopped: the position is held from then on.
+STOPPED_MPS = 0.05
+# What the lean of the airframe allows when it has to stop.
+BRAKING_JERK_MPS3 = 10.0
 
 
 class Axis(Enum):
@@ -101,12 +107,15 @@ class Control:
         self.acc = [0.0, 0.0, 0.0]
         self.yaw_setpoint = 0.0
         self._integral = [0.0, 0.0, 0.0]
+        self._stopping = False
+        self._braking_mps2 = 0.0
         self.thrust_share = 0.0
         self.lean = (0.0, 0.0)
 
     def reset(self, est: Estimate) -> None:
         """Start anew from where the vehicle is: no history, no targets elsewhere."""
         self.horizontal = self.vertical = Axis.POSITION
+        self._stopping = False
         self.pos = [est.north, est.east, est.down]
         self.vel = [est.vn, est.ve, est.vd]
         self.acc = [0.0, 0.0, 0.0]
@@ -122,37 +131,39 @@ class Control:
 
     def hold_here(self) -> None:
         """Stop as soon as the limits allow, and hold position and altitude there."""
-        self.go_to(*self.stopping_point(), self.stopping_down())
+        self.stop()
+        vd = self.vel[2]
+        self.go_to_altitude(self.pos[2] + vd * abs(vd) / (2.0 * BRAKING_SHARE * self.limits.accel_z_mps2))
 
-    def stopping_point(self) -> tuple[float, float]:
-        """Where the trajectory comes to rest if braking starts now."""
+    def stop(self, accel_mps2: float | None = None) -> None:
+        """Brake with the full acceleration (or a given one), then hold the position where that ends."""
         vn, ve = self.vel[0], self.vel[1]
         speed = math.hypot(vn, ve)
-        if speed < 0.01:
-            return (self.pos[0], self.pos[1])
-        limits = self.limits
-        time_to_turn = limits.accel_mps2 / limits.jerk_mps3
-        distance = speed * time_to_turn + speed * speed / (2.0 * 0.7 * limits.accel_mps2)
-        return (self.pos[0] + vn / speed * distance, self.pos[1] + ve / speed * distance)
+        self._braking_mps2 = accel_mps2 or self.limits.accel_mps2
+        reach = speed / (2.0 * self._braking_mps2)
+        self.fly(0.0, 0.0)
+        self.target = (self.pos[0] + vn * reach, self.pos[1] + ve * reach)
+        self._stopping = True
 
-    def stopping_down(self) -> float:
-        """Where the vertical trajectory comes to rest if braking starts now."""
-        vd = self.vel[2]
-        return self.pos[2] + vd * abs(vd) / (2.0 * 0.7 * self.limits.accel_z_mps2)
+    def go_to_altitude(self, down: float) -> None:
+        """Climb or sink to an altitude and stay there."""
+        self.vertical = Axis.POSITION
+        self.target_down = down
+        self.target_vd = 0.0
 
     def go_to(self, north: float, east: float, down: float | None = None) -> None:
         """Fly to a point and stay; without `down` the vertical target stays as it is."""
         self.horizontal = Axis.POSITION
+        self._stopping = False
         self.target = (north, east)
         self.target_velocity = (0.0, 0.0)
         if down is not None:
-            self.vertical = Axis.POSITION
-            self.target_down = down
-            self.target_vd = 0.0
+            self.go_to_altitude(down)
 
     def fly(self, vn: float, ve: float, vd: float | None = None) -> None:
         """Fly with a velocity; without `vd` the vertical target stays as it is."""
         self.horizontal = Axis.VELOCITY
+        self._stopping = False
         self.target_velocity = (vn, ve)
         if vd is not None:
             self.climb(vd)
@@ -173,6 +184,8 @@ class Control:
     def _follow_xy(self, dt: float, est: Estimate) -> tuple[float, float]:
         limits, gains = self.limits, self.gains
         pos, vel, acc = self.pos, self.vel, self.acc
+        if self._stopping and math.hypot(vel[0], vel[1]) < STOPPED_MPS:
+            self.go_to(pos[0], pos[1])
         here = (vel[0], vel[1])
         bend = (acc[0], acc[1])
         if self.horizontal is Axis.POSITION:
@@ -188,9 +201,9 @@ class Control:
                 feedforward=self.target_velocity,
             )
         else:
-            acc[0], acc[1] = shape_velocity_xy(
-                self.target_velocity, here, bend, accel_max=limits.accel_mps2, jerk_max=limits.jerk_mps3, dt=dt
-            )
+            accel = self._braking_mps2 if self._stopping else limits.accel_mps2
+            jerk = BRAKING_JERK_MPS3 if self._stopping else limits.jerk_mps3
+            acc[0], acc[1] = shape_velocity_xy(self.target_velocity, here, bend, accel_max=accel, jerk_max=jerk, dt=dt)
         vel[0] += acc[0] * dt
         vel[1] += acc[1] * dt
         pos[0] += vel[0] * dt

@@ -27,6 +27,8 @@ from fractus_sim.vehicle.streams import ALL_GROUPS, GROUPS
 from fractus_sim.vehicle.vehicle import Vehicle
 from fractus_sim.vehicle.wire import Message, Signing
 
+_FTP_NAK = 129
+_FTP_UNKNOWN = 7
 _TERRAIN_FRAMES = frozenset({10, 11})
 _BODY_FRAMES = frozenset({Frame.BODY_NED, Frame.BODY_OFFSET_NED, Frame.BODY_FRD})
 _OFFSET_FRAMES = frozenset({Frame.LOCAL_OFFSET_NED}) | _BODY_FRAMES
@@ -99,6 +101,19 @@ def _ping(v: Vehicle, m: Message, c: Channel) -> None:
                 "target_component": m.compid,
             },
         )
+
+
+def _file_transfer(_v: Vehicle, m: Message, c: Channel) -> None:
+    """There is no file system: every request is refused at once, so that clients use the plain protocols instead."""
+    request = bytes(int(value) for value in m.array("payload"))
+    sequence = (int.from_bytes(request[:2], "little") + 1) & 0xFFFF
+    answer = sequence.to_bytes(2, "little") + bytes(
+        (request[2], _FTP_NAK, 1, request[3], 0, 0, 0, 0, 0, 0, _FTP_UNKNOWN)
+    )
+    c.send(
+        "FILE_TRANSFER_PROTOCOL",
+        {"target_system": m.sysid, "target_component": m.compid, "payload": tuple(answer)},
+    )
 
 
 def _vector(m: Message, names: tuple[str, str, str]) -> Vector:
@@ -297,6 +312,7 @@ HANDLERS: dict[str, Handler] = {
     "PARAM_REQUEST_LIST": _parameter_list,
     "PARAM_REQUEST_READ": _parameter_read,
     "PARAM_SET": _parameter_set,
+    "FILE_TRANSFER_PROTOCOL": _file_transfer,
     "TIMESYNC": _timesync,
     "PING": _ping,
     "SET_POSITION_TARGET_LOCAL_NED": lambda v, m, _c: _local_target(v, m),

@@ -17,6 +17,9 @@ from fractus_sim.vehicle.shaping import clamp
 if TYPE_CHECKING:
     from fractus_sim.vehicle.vehicle import Vehicle
 
+# BRAKE decelerates with this, whatever WPNAV_ACCEL says.
+BRAKE_MPS2 = 5.0
+
 
 def stick_rate(pwm: int, dead_zone: int = 30) -> float:
     """A stick's deflection from its centre, -1 to 1."""
@@ -39,7 +42,7 @@ def pilot_climb(v: Vehicle) -> None:
     if rate == 0.0:
         if v.control.vertical is Axis.VELOCITY:
             v.control.vertical = Axis.POSITION
-            v.control.target_down = v.control.stopping_down()
+            v.control.go_to_altitude(v.est.down)
     elif not v.landed:
         v.control.climb(rate)
     yaw = stick_rate(v.sticks[3])
@@ -98,6 +101,9 @@ class AltHold(Flight):
 class Loiter(Flight):
     """Holds position; sticks move it."""
 
+    def __init__(self) -> None:
+        self._moving = False
+
     def begin(self, v: Vehicle) -> None:
         """Stop and hold."""
         v.control.hold_here()
@@ -112,8 +118,9 @@ class Loiter(Flight):
                 speed * (forward * math.cos(yaw) - right * math.sin(yaw)),
                 speed * (forward * math.sin(yaw) + right * math.cos(yaw)),
             )
-        elif v.control.horizontal is Axis.VELOCITY:
-            v.control.go_to(*v.control.stopping_point())
+        elif self._moving:
+            v.control.stop()
+        self._moving = bool(forward or right)
         pilot_climb(v)
 
 
@@ -121,8 +128,9 @@ class Brake(Flight):
     """Stops at once and holds."""
 
     def begin(self, v: Vehicle) -> None:
-        """Stop and hold."""
+        """Stop hard and hold."""
         v.control.hold_here()
+        v.control.stop(BRAKE_MPS2)
 
 
 class Land(Flight):
@@ -134,7 +142,7 @@ class Land(Flight):
         """Stop, or keep level when the position is unknown."""
         v.touch_time_s = 0.0
         if v.position_ok:
-            v.control.go_to(*v.control.stopping_point())
+            v.control.stop()
         else:
             v.control.horizontal = Axis.ATTITUDE
             v.control.attitude = (0.0, 0.0)
@@ -183,7 +191,8 @@ class ReturnToLaunch(Flight):
         wanted = max(wanted, height)
         if p["RTL_SPEED"] > 0.0:
             v.control.limits.speed_mps = p["RTL_SPEED"] / 100.0
-        v.control.go_to(*v.control.stopping_point(), base_down - wanted)
+        v.control.stop()
+        v.control.go_to_altitude(base_down - wanted)
         v.control.yaw_rate = None
         v.control.target_yaw = v.control.yaw_setpoint
         v.touch_time_s = 0.0

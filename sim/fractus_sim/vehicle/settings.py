@@ -11,6 +11,9 @@ from fractus_sim.vehicle.params import Parameters
 from fractus_sim.vehicle.sensors import Battery
 from fractus_sim.vehicle.shaping import clamp
 
+# The attitude controllers leave this share of the jerk that the parameter allows.
+JERK_SHARE = 0.6
+
 LIMIT_PREFIXES = frozenset({"WPNAV", "PSC", "ANGLE", "ATC", "MOT", "LOIT"})
 
 
@@ -22,7 +25,7 @@ def set_limits(params: Parameters, control: Control) -> None:
     limits.sink_mps = max(params["WPNAV_SPEED_DN"] / 100.0, 0.1)
     limits.accel_mps2 = max(params["WPNAV_ACCEL"] / 100.0, 0.5)
     limits.accel_z_mps2 = max(params["WPNAV_ACCEL_Z"] / 100.0, 0.5)
-    limits.jerk_mps3 = max(params["PSC_JERK_XY"], 1.0)
+    limits.jerk_mps3 = max(JERK_SHARE * params["PSC_JERK_XY"], 1.0)
     lean_deg = params["PSC_ANGLE_MAX"] or params["ANGLE_MAX"] / 100.0
     limits.tilt_max_rad = math.radians(clamp(lean_deg, 10.0, 80.0))
     limits.yaw_rate_rps = math.radians(clamp(params["ATC_SLEW_YAW"] / 100.0, 5.0, 180.0))

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from fractus_sim.vehicle.vehicle import Vehicle
 
 _PREARM_CHECK = 0x10000000
-_SENSORS_PRESENT = 0x5321DC2F  # gyro, accel, mag, baro, GPS, controllers, motors, AHRS, logging, battery, pre-arm
+_SENSORS_PRESENT = 0x5320FC2F  # gyro, accel, mag, baro, GPS, controllers, motors, AHRS, logging, battery, pre-arm
 _SENSOR_GPS = 0x20
 _SENSOR_AHRS = 0x200000
 _SENSOR_BATTERY = 0x2000000
@@ -57,9 +57,12 @@ def sys_status(v: Vehicle) -> Values:
         enabled |= _MOTOR_OUTPUTS
     if v.mode not in (Mode.STABILIZE, Mode.ALT_HOLD):
         enabled |= _POSITION_CONTROLS
+    present = _SENSORS_PRESENT
     if v.fence.enabled:
         enabled |= _SENSOR_FENCE
-    healthy = _SENSORS_PRESENT
+    if v.fence.enabled or v.fence.shapes:
+        present |= _SENSOR_FENCE
+    healthy = _SENSORS_PRESENT | _SENSOR_FENCE
     if v.gps.fix_type < 3:
         healthy &= ~_SENSOR_GPS
     if not v.position_ok:
@@ -71,7 +74,7 @@ def sys_status(v: Vehicle) -> Values:
     if v.arming_refusal() is not None:
         healthy &= ~_PREARM_CHECK
     return {
-        "onboard_control_sensors_present": _SENSORS_PRESENT,
+        "onboard_control_sensors_present": present,
         "onboard_control_sensors_enabled": enabled,
         "onboard_control_sensors_health": healthy,
         "load": 250,

@@ -1,7 +1,7 @@
 """One cluster with Fractus installed, shared by all end-to-end tests.
 
 FRACTUS_E2E_CLUSTER=current runs them on the cluster of KUBECONFIG (k3s, kind), where the images are loaded and the nodes
-carry fractus.dev/class labels; otherwise an embedded cluster comes up and goes down again.
+carry fractus.dev/class labels; otherwise an embedded cluster comes up and goes down again (FRACTUS_E2E_KEEP=1 keeps it for the next run).
 """
 
 from __future__ import annotations
@@ -47,12 +47,14 @@ def cluster() -> Iterator[Cluster | None]:
         return
     built = build_images(ROOT, targets=TARGETS, report=say)
     up = Cluster.load(ROOT / "examples" / "clusters" / "demo.yaml", name="e2e", report=say)
-    up.down()
+    keep = bool(os.environ.get("FRACTUS_E2E_KEEP"))
+    if not keep:
+        up.down()
     try:
         up.up(images=built)
         yield up
     finally:
-        if not os.environ.get("FRACTUS_E2E_KEEP"):
+        if not keep:
             up.down()
 
 

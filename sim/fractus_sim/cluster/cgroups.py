@@ -54,7 +54,7 @@ def find_hierarchies(mounts: str | None = None) -> Hierarchies:
         missing = [name for name in _NEEDED_V1 if not any(name in options for options in old.values())]
         if missing:
             raise PrerequisiteError(f"the kernel's control groups lack {', '.join(missing)}; Kubernetes needs them")
-        return Hierarchies(1, tuple(old))
+        return Hierarchies(1, (*old, *new))  # container runtimes fill the unified one of a hybrid layout too
     if not new:
         raise PrerequisiteError("no control groups are mounted at /sys/fs/cgroup; Kubernetes needs them")
     return Hierarchies(2, (new[0],))

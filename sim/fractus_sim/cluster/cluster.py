@@ -222,6 +222,7 @@ class Cluster:
                 self._write_kubeconfig(authority, memory)
                 self._wait_nodes(api, [(node, since if node.name in started_nodes else None) for node in nodes])
             self._wait_dns(memory)
+            self._check_vehicles(nodes)
             store.deliver(wanted, nodes)
         self._report(f"cluster {self.name} is up: {len(nodes)} nodes, {time.monotonic() - started:.1f} s")
 
@@ -437,6 +438,13 @@ class Cluster:
                 names = ", ".join(waiting)
                 raise ClusterError(f"not Ready within {_READY_TIMEOUT_S:.0f} s: {names}; see the logs in {self.logs}")
             time.sleep(_POLL_S)
+
+    def _check_vehicles(self, nodes: Sequence[Node]) -> None:
+        for node in nodes:
+            if node.vehicle_running is False:
+                log = self.logs / node.name / "vehicle.log"
+                last = log.read_text(errors="replace").splitlines()[-1:] if log.exists() else []
+                raise ClusterError(f"the vehicle of node {node.name} ended at once: {' '.join(last)} (see {log})")
 
     def _wait_dns(self, memory: Memory) -> None:
         address = str(Addressing(memory.block).control_plane)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
+from fractus_core.api import API_VERSION, Drone, EdgeNode, InvalidObject, Resource
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from fractus_sim.cluster.errors import ClusterError
@@ -27,7 +28,6 @@ _SUFFIXES: dict[str, Decimal | int] = {
     "Gi": 2**30,
     "Ti": 2**40,
 }
-API_VERSION = "fractus.dev/v1alpha1"
 _DEFAULT_CONNECTION = "tcp:127.0.0.1:5760"
 
 
@@ -93,7 +93,8 @@ class NodeSpec(_Value):
         node_class: Written `class` in the file.
         resources: What the node offers to pods: cpu, memory, pods, and extended resources by full name.
         labels: Further labels of the node.
-        description: The spec of the node's Drone or EdgeNode.
+        description: The spec of the node's Drone or EdgeNode, put on it as /etc/fractus/node.yaml; when empty,
+            there is no such file and the node registers as nothing.
         hardware: What stands beside the node.
     """
 
@@ -124,6 +125,20 @@ class NodeSpec(_Value):
             raise ValueError(f"node {self.name}: hardware.vehicle is for nodes of class drone")
         return self
 
+    @model_validator(mode="after")
+    def _description_fits(self) -> NodeSpec:
+        if self.node_class == "cloud" and self.description:
+            raise ValueError(
+                f"node {self.name}: a cloud node has no description; only drones and edge nodes have kinds"
+            )
+        if self.manifest is not None:
+            kind: type[Resource] = Drone if self.node_class == "drone" else EdgeNode
+            try:
+                kind.from_body(self.manifest)
+            except InvalidObject as error:
+                raise ValueError(f"node {self.name}: description: {error}") from error
+        return self
+
     @property
     def extended_resources(self) -> dict[str, str]:
         """The resources that are neither cpu, memory nor pods."""
@@ -131,8 +146,8 @@ class NodeSpec(_Value):
 
     @property
     def manifest(self) -> dict[str, Any] | None:
-        """The Drone or EdgeNode manifest of this node; None for a cloud node, which has none."""
-        if self.node_class == "cloud":
+        """The Drone or EdgeNode manifest of this node; None for one that the cluster file does not describe."""
+        if self.node_class == "cloud" or not self.description:
             return None
         kind = "Drone" if self.node_class == "drone" else "EdgeNode"
         return {"apiVersion": API_VERSION, "kind": kind, "metadata": {"name": self.name}, "spec": self.description}
@@ -201,9 +216,10 @@ def parse_spec(content: object, *, source: str) -> ClusterSpec:
     try:
         return ClusterSpec.model_validate(content)
     except ValidationError as error:
-        faults = "; ".join(
-            f"{'.'.join(str(part) for part in fault['loc']) or 'file'}: {fault['msg']}" for fault in error.errors()
-        )
+        found = [(".".join(str(part) for part in fault["loc"]), fault["msg"]) for fault in error.errors()]
+        # A list with a bad entry counts as too short as well; the entry says it all.
+        real = [(place, text) for place, text in found if not any(other.startswith(f"{place}.") for other, _ in found)]
+        faults = "; ".join(f"{place or 'file'}: {text.removeprefix('Value error, ')}" for place, text in real)
         raise ClusterError(f"{source}: {faults}") from error
 
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
 import shutil
+import signal
 import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +18,9 @@ from fractus_sim.cluster.errors import ClusterError
 from fractus_sim.cluster.images.layout import Image, Layout
 from fractus_sim.cluster.node import Node
 
+_TEMPLATES_KEPT = 2
+_PR_SET_PDEATHSIG = 1
+_LIBC = ctypes.CDLL(None, use_errno=True)
 _START_TIMEOUT_S = 20.0
 _IMPORT_TIMEOUT_S = 300.0
 _POLL_S = 0.02
@@ -44,37 +51,28 @@ class Template:
     path: Path
 
     def make(self, layout: Layout, images: Sequence[Image], *, report: Report) -> None:
-        """Unpack the images with a container daemon of its own; a no-op when that was done before."""
+        """Unpack the images with a container daemon of its own; a no-op when that was done before.
+
+        It starts from the newest template beside it, so that only layers which that one lacks are unpacked.
+        """
         if self.path.exists():
+            os.utime(self.path)
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
         for left in self.path.parent.glob(".making-*"):
             shutil.rmtree(left)
         started = time.monotonic()
         scratch = self.path.parent / f".making-{self.path.name}"
-        root = scratch / "root"
-        root.mkdir(parents=True)
-        socket, config = scratch / "s", scratch / "config.toml"
-        config.write_text(_CONFIG.format(root=root, state=scratch / "state", socket=socket))
-        with (scratch / "log").open("wb") as log:
-            daemon = subprocess.Popen(
-                ["containerd", "--config", str(config), "--log-level", "warn"],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-            )
-        try:
-            _wait_for(socket, daemon, scratch / "log")
-            _import(layout, images, socket, scratch)
-        finally:
-            daemon.terminate()
-            try:
-                daemon.wait(timeout=10)
-            except subprocess.TimeoutExpired:
-                daemon.kill()
-                daemon.wait()
-        root.rename(self.path)
+        scratch.mkdir()
+        others = sorted(self.path.parent.glob("[!.]*"), key=lambda path: path.stat().st_mtime, reverse=True)
+        if others:
+            _copy_storage(others[0], scratch / "root")
+        with _daemon(scratch) as ctr:
+            _import(layout, images, ctr, scratch)
+        (scratch / "root").rename(self.path)
         shutil.rmtree(scratch)
+        for old in others[_TEMPLATES_KEPT - 1 :]:
+            shutil.rmtree(old)
         report(f"unpacked {len(images)} images in {time.monotonic() - started:.1f} s")
 
     def furnish(self, node: Node) -> None:
@@ -82,18 +80,11 @@ class Template:
         target = _storage(node)
         if target.exists():
             return
-        scratch = node.directory / "var-lib" / ".containerd"
+        scratch = target.with_name(".containerd")
         if scratch.exists():
             shutil.rmtree(scratch)
         scratch.parent.mkdir(parents=True, exist_ok=True)
-        linked = run(["cp", "-al", self.path, scratch], check=False)
-        if linked.returncode != 0:  # another file system
-            shutil.rmtree(scratch, ignore_errors=True)
-            run(["cp", "-a", "--reflink=auto", self.path, scratch], timeout_s=_IMPORT_TIMEOUT_S)
-        for database in self.path.rglob("*.db"):
-            copy = scratch / database.relative_to(self.path)
-            copy.unlink()
-            shutil.copy2(database, copy)
+        _copy_storage(self.path, scratch)
         scratch.rename(target)
 
 
@@ -106,19 +97,61 @@ def _storage(node: Node) -> Path:
     return node.directory / "var-lib" / "containerd"
 
 
-def _wait_for(socket: Path, daemon: subprocess.Popen[bytes], log: Path) -> None:
-    deadline = time.monotonic() + _START_TIMEOUT_S
-    while run(["ctr", "--address", socket, "version"], check=False, timeout_s=30).returncode != 0:
-        if daemon.poll() is not None or time.monotonic() > deadline:
-            raise ClusterError(f"containerd did not start: {log.read_text()[-1000:]}")
-        time.sleep(_POLL_S)
+def _copy_storage(source: Path, target: Path) -> None:
+    """Copy a daemon's storage: hard links where nothing is ever written, real copies of its databases."""
+    linked = run(["cp", "-al", source, target], check=False, timeout_s=_IMPORT_TIMEOUT_S)
+    if linked.returncode != 0:  # another file system
+        shutil.rmtree(target, ignore_errors=True)
+        run(["cp", "-a", "--reflink=auto", source, target], timeout_s=_IMPORT_TIMEOUT_S)
+    for database in source.rglob("*.db"):
+        copy = target / database.relative_to(source)
+        copy.unlink()
+        shutil.copy2(database, copy)
 
 
-def _import(layout: Layout, images: Sequence[Image], socket: Path, scratch: Path) -> None:
+@contextmanager
+def _daemon(scratch: Path) -> Iterator[list[str]]:
+    """Run a container daemon on `scratch/root` inside the block; yields the start of its client's command."""
+    socket, config, log = scratch / "s", scratch / "config.toml", scratch / "log"
+    config.write_text(_CONFIG.format(root=scratch / "root", state=scratch / "state", socket=socket))
+    with log.open("wb") as output:
+        daemon = subprocess.Popen(
+            ["containerd", "--config", str(config), "--log-level", "warn"],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            preexec_fn=_die_with_parent,  # noqa: PLW1509  (it only makes a system call)
+        )
+    try:
+        deadline = time.monotonic() + _START_TIMEOUT_S
+        while run(["ctr", "--address", socket, "version"], check=False, timeout_s=30).returncode != 0:
+            if daemon.poll() is not None or time.monotonic() > deadline:
+                raise ClusterError(f"containerd did not start: {log.read_text(errors='replace')[-1000:]}")
+            time.sleep(_POLL_S)
+        yield ["ctr", "--address", str(socket), "--namespace", "k8s.io"]
+    finally:
+        daemon.terminate()
+        try:
+            daemon.wait(timeout=10)
+        except subprocess.TimeoutExpired:
+            daemon.kill()
+            daemon.wait()
+
+
+def _die_with_parent() -> None:
+    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def _import(layout: Layout, images: Sequence[Image], ctr: list[str], scratch: Path) -> None:
+    wanted = {image.name for image in images}
+    present = set(run([*ctr, "images", "list", "--quiet"]).stdout.split())
+    content = set(run([*ctr, "content", "list", "--quiet"]).stdout.split())
+    manifests = {image.digest for image in images}
     archive = scratch / "images.tar"
     with archive.open("wb") as out:
-        layout.write_archive(images, without=(), out=out)
-    ctr = ["ctr", "--address", str(socket), "--namespace", "k8s.io", "images"]
-    run([*ctr, "import", str(archive)], timeout_s=_IMPORT_TIMEOUT_S)
+        layout.write_archive(images, without=content - manifests, out=out)
+    run([*ctr, "images", "import", str(archive)], timeout_s=_IMPORT_TIMEOUT_S)
     for image in images:
-        run([*ctr, "label", image.name, _MANAGED], timeout_s=30)
+        run([*ctr, "images", "label", image.name, _MANAGED], timeout_s=30)
+    if present - wanted:
+        run([*ctr, "images", "remove", "--sync", *sorted(present - wanted)], timeout_s=_IMPORT_TIMEOUT_S)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shapely
 
-from fractus_core.policy.compiled import OPERATION_AREA, CompiledGrant, Patches, Rule
+from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Patches, Rule
 from fractus_core.policy.values import Call, Situation, Verdict, deny
 
 IN_OPERATION_AREA = frozenset({"CaptureImage", "RetrieveImage"})
@@ -64,7 +64,7 @@ def _matching(
         here = shapely.Point(grant.frame.xy(now.lat, now.lon))
         slack_m = 0.0 if certain else now.altitude_error_m
         lower, upper = now.altitude_m - slack_m, now.altitude_m + slack_m
-        for patch in patches.near(here, distance_m, lower, upper, now, grant.flat_terrain):
+        for patch in patches.near(Air(here, distance_m, lower, upper), now, grant.flat_terrain):
             found[patch.rule.name] = patch.rule
     return _ordered(found)
 

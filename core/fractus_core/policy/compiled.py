@@ -59,6 +59,16 @@ def height_m(value: float, reference: Reference, home: Home | None, flat_terrain
     return value if flat_terrain else None
 
 
+@dataclass(frozen=True, slots=True)
+class Air:
+    """Where a decision looks: a piece of ground, how far around it, and between which altitudes above home."""
+
+    ground: BaseGeometry
+    margin_m: float
+    lower_m: float
+    upper_m: float
+
+
 class Patches:
     """Zones of policies in a spatial index, and the policies that hold everywhere."""
 
@@ -73,19 +83,17 @@ class Patches:
     def __bool__(self) -> bool:
         return bool(self.patches or self.everywhere)
 
-    def near(
-        self, ground: BaseGeometry, distance_m: float, lower_m: float, upper_m: float, now: Situation, flat: bool
-    ) -> Iterator[Patch]:
-        """Patches in force whose column of air comes within a distance of the ground between two altitudes.
+    def near(self, air: Air, now: Situation, flat: bool) -> Iterator[Patch]:
+        """Patches in force that come within the margin of a piece of air.
 
         A band whose datum is unknown reaches from the ground to the sky.
         """
         if self._tree is None:
-            near = [p for p in self.patches if p.shape.dwithin(ground, distance_m)]
+            near = [p for p in self.patches if p.shape.dwithin(air.ground, air.margin_m)]
         else:
-            near = [self.patches[i] for i in self._tree.query(ground, predicate="dwithin", distance=distance_m)]
+            near = [self.patches[i] for i in self._tree.query(air.ground, predicate="dwithin", distance=air.margin_m)]
         for patch in near:
-            if patch.rule.in_force(now.time_s) and band_meets(patch.band, lower_m, upper_m, now.home, flat):
+            if patch.rule.in_force(now.time_s) and band_meets(patch.band, air.lower_m, air.upper_m, now.home, flat):
                 yield patch
 
 
@@ -108,12 +116,9 @@ def band_holds(band: AltitudeBand | None, lower_m: float, upper_m: float, home: 
     """Whether altitudes from lower to upper (above home) surely lie inside a band; unknown datums do not."""
     if band is None:
         return True
-    for edge, inside in ((band.lower, lambda h: h <= lower_m), (band.upper, lambda h: h >= upper_m)):
-        if edge is not None:
-            height = height_m(edge, band.reference, home, flat)
-            if height is None or not inside(height):
-                return False
-    return True
+    floor = -FOREVER if band.lower is None else height_m(band.lower, band.reference, home, flat)
+    ceiling = FOREVER if band.upper is None else height_m(band.upper, band.reference, home, flat)
+    return floor is not None and ceiling is not None and floor <= lower_m and upper_m <= ceiling
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,11 +250,11 @@ def _union(frame: LocalFrame, areas: tuple[Area, ...]) -> BaseGeometry | None:
 
 
 def _zone_patches(frame: LocalFrame, rule: Rule, policy: GrantedPolicy) -> list[Patch]:
-    patches = []
-    for zone in policy.zones:
-        if _within_reach(frame, zone.area):
-            patches.append(Patch(rule, zone.name, _prepared(polygon(frame, zone.area)), zone.altitude))
-    return patches
+    return [
+        Patch(rule, zone.name, _prepared(polygon(frame, zone.area)), zone.altitude)
+        for zone in policy.zones
+        if _within_reach(frame, zone.area)
+    ]
 
 
 def _within_reach(frame: LocalFrame, area: Area) -> bool:
@@ -264,7 +269,7 @@ def _within_reach(frame: LocalFrame, area: Area) -> bool:
         return False
     xy = [frame.xy(p.lat, p.lon) for p in ring]
     (west, east), (south, north) = ((min(a), max(a)) for a in zip(*xy, strict=True))
-    return west < REACH_M and east > -REACH_M and south < REACH_M and north > -REACH_M
+    return bool(west < REACH_M and east > -REACH_M and south < REACH_M and north > -REACH_M)
 
 
 def _same_side(frame: LocalFrame, point: Point) -> bool:

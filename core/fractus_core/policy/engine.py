@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import shapely
 
 from fractus_core.policy.access import judge_access, judge_privacy
-from fractus_core.policy.compiled import CompiledGrant, height_m
+from fractus_core.policy.compiled import Air, CompiledGrant, height_m
 from fractus_core.policy.fences import Breach, breaches, last_legal
 from fractus_core.policy.limits import Bound, Clamped, altitude_bounds, clamp, speed_bounds
 from fractus_core.policy.motion import XY, Leg, standing, stop_altitude_m, stop_point, turn_point
@@ -124,15 +124,30 @@ def _judge_goto(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
         )
     notes: list[Clamped] = []
     if args.alt is not None and args.reference == "terrain":
-        notes.append(
-            Clamped(
-                altitude, "TerrainAssumedFlat", "no terrain model is loaded; the ground is taken as level with home"
-            )
-        )
-    verdict = _fly_leg(args, now, grant, where, target, altitude, notes, adjusting=True)
-    if isinstance(verdict, Verdict):
-        return verdict
-    return _outcome(args, verdict, notes, grant)
+        reason = "no terrain model is loaded; the ground is taken as level with home"
+        notes.append(Clamped(altitude, "TerrainAssumedFlat", reason))
+    request = _Request(args, now, grant, where)
+    flown = _fly_leg(request, _Aim(target, altitude), notes, adjusting=True)
+    return flown if isinstance(flown, Verdict) else _outcome(args, flown, notes, grant)
+
+
+@dataclass(frozen=True, slots=True)
+class _Request:
+    """A goto, by whom and from where."""
+
+    args: GotoArgs
+    now: Situation
+    grant: CompiledGrant
+    at: XY
+
+
+@dataclass(frozen=True, slots=True)
+class _Aim:
+    """Where a leg goes; speed None keeps the one in force."""
+
+    target: XY
+    altitude_m: float
+    speed_mps: float | None = None
 
 
 def _beyond(args: GotoArgs, grant: CompiledGrant) -> bool:
@@ -142,72 +157,49 @@ def _beyond(args: GotoArgs, grant: CompiledGrant) -> bool:
     return abs(lat - args.lat) > 1e-6 or abs((lon - args.lon + 180.0) % 360.0 - 180.0) > 1e-5
 
 
-def _fly_leg(
-    args: GotoArgs,
-    now: Situation,
-    grant: CompiledGrant,
-    at: XY,
-    target: XY,
-    altitude_m: float,
-    notes: list[Clamped],
-    adjusting: bool,
-) -> tuple[XY, float, float | None] | Verdict:
-    """The target, altitude and speed that may be flown, or the verdict that forbids the leg."""
-    margin, height_margin = margin_m(now), height_margin_m(now)
-    leg = _leg(at, target, now, altitude_m)
-    ground = leg.ground
-    bounds = altitude_bounds(grant, now, ground, leg.lower_m, leg.upper_m, margin)
+def _fly_leg(request: _Request, aim: _Aim, notes: list[Clamped], adjusting: bool) -> _Aim | Verdict:
+    """What may be flown of a leg, or the verdict that forbids it."""
+    now, grant = request.now, request.grant
+    leg = _leg(request.at, aim.target, now, aim.altitude_m)
+    within = _within_limits(request, leg, aim, notes)
+    if isinstance(within, Verdict):
+        return within
+    leg = _leg(request.at, aim.target, now, within.altitude_m)
+    found = breaches(leg, now, grant, margin_m(now), height_margin_m(now))
+    if not found:
+        return _way_home_blocked(aim.target, within.altitude_m, now, grant) or within
+    shorter = last_legal(leg, found) if adjusting and all(b.action == "adjust" for b in found) else None
+    if shorter is None:
+        return _broken(found)
+    names = tuple(dict.fromkeys(b.policy for b in found))
+    notes.append(Clamped(0.0, "LegShortened", f"{found[0].reason}; the leg ends at the last legal point", names))
+    return _fly_leg(request, replace(within, target=shorter), notes, adjusting=False)
+
+
+def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Clamped]) -> _Aim | Verdict:
+    """The aim inside the limits of altitude and speed, or the verdict that forbids it."""
+    now, grant = request.now, request.grant
+    air = Air(leg.ground, margin_m(now), leg.lower_m, leg.upper_m)
+    bounds = altitude_bounds(grant, now, air)
     if isinstance(bounds, Verdict):
         return bounds
-    clamped = clamp("Altitude", "m above home", altitude_m, bounds)
-    if isinstance(clamped, Verdict):
-        return clamped
-    if clamped.code:
-        notes.append(clamped)
-        leg = _leg(at, target, now, clamped.value)
-    entering = _altitude_on_entry(at, now, bounds, height_margin)
-    if entering is not None:
-        return entering
-    speed = _speed_on_leg(args, now, grant, leg, margin)
+    height = clamp("Altitude", "m above home", aim.altitude_m, bounds)
+    if isinstance(height, Verdict):
+        return height
+    asked = request.args.speed_mps if aim.speed_mps is None else aim.speed_mps
+    speed = clamp("Speed", "m/s", now.speed_setpoint_mps if asked is None else asked, speed_bounds(grant, now, air))
+    problem = _altitude_on_entry(request.at, now, bounds, height_margin_m(now))
+    if problem is not None:
+        return problem
     if isinstance(speed, Verdict):
         return speed
-    if speed.code:
-        notes.append(speed)
-    found = breaches(leg, now, grant, margin, height_margin)
-    if found:
-        return _react(found, leg, args, now, grant, at, clamped.value, notes, adjusting)
-    blocked = _way_home_blocked(target, clamped.value, now, grant)
-    if blocked is not None:
-        return blocked
-    flown_mps = speed.value if speed.code or args.speed_mps is not None else None
-    return target, clamped.value, flown_mps
+    notes.extend(note for note in (height, speed) if note.code)
+    return _Aim(aim.target, height.value, speed.value if speed.code or asked is not None else None)
 
 
 def _leg(at: XY, target: XY, now: Situation, altitude_m: float) -> Leg:
     heights = (now.altitude_m, stop_altitude_m(now), altitude_m)
     return Leg(at, stop_point(now, at), turn_point(now, at, target), target, min(heights), max(heights))
-
-
-def _react(
-    found: list[Breach],
-    leg: Leg,
-    args: GotoArgs,
-    now: Situation,
-    grant: CompiledGrant,
-    at: XY,
-    altitude_m: float,
-    notes: list[Clamped],
-    adjusting: bool,
-) -> tuple[XY, float, float | None] | Verdict:
-    """Shorten the leg where every broken fence agrees to that; otherwise the strictest reaction."""
-    if adjusting and all(b.action == "adjust" for b in found):
-        shorter = last_legal(leg, found)
-        if shorter is not None:
-            names = tuple(dict.fromkeys(b.policy for b in found))
-            reason = f"{found[0].reason}; the leg ends at the last legal point"
-            notes.append(Clamped(0.0, "LegShortened", reason, names))
-            return _fly_leg(args, now, grant, at, shorter, altitude_m, notes, adjusting=False)
-    return _broken(found)
 
 
 def _broken(found: list[Breach]) -> Verdict:
@@ -256,12 +248,6 @@ def _altitude_on_entry(at: XY, now: Situation, bounds: list[Bound], slack_m: flo
     return None
 
 
-def _speed_on_leg(args: GotoArgs, now: Situation, grant: CompiledGrant, leg: Leg, margin: float) -> Clamped | Verdict:
-    asked = now.speed_setpoint_mps if args.speed_mps is None else args.speed_mps
-    bounds = speed_bounds(grant, now, leg.ground, leg.lower_m, leg.upper_m, margin)
-    return clamp("Speed", "m/s", asked, bounds)
-
-
 def _way_home_blocked(target: XY, altitude_m: float, now: Situation, grant: CompiledGrant) -> Verdict | None:
     """The denial of a target from which the straight way home is not legal.
 
@@ -277,7 +263,7 @@ def _way_home_blocked(target: XY, altitude_m: float, now: Situation, grant: Comp
     height_m = max(altitude_m, now.airframe.return_altitude_m)
     margin, slack = margin_m(now), height_margin_m(now)
     lane = shapely.LineString((target, home)) if target != home else shapely.Point(home)
-    anything = grant.exclusions.near(lane, margin, -slack, height_m + slack, now, grant.flat_terrain)
+    anything = grant.exclusions.near(Air(lane, margin, -slack, height_m + slack), now, grant.flat_terrain)
     if not grant.inclusions and next(anything, None) is None:
         return None
     parts = (
@@ -286,9 +272,8 @@ def _way_home_blocked(target: XY, altitude_m: float, now: Situation, grant: Comp
         standing(home, 0.0, height_m),
     )
     for part in parts:
-        ground = part.ground
-        lower, upper = part.lower_m - slack, part.upper_m + slack
-        for patch in grant.exclusions.near(ground, margin, lower, upper, now, grant.flat_terrain):
+        air = Air(part.ground, margin, part.lower_m - slack, part.upper_m + slack)
+        for patch in grant.exclusions.near(air, now, grant.flat_terrain):
             return deny(
                 "WayHomeBlocked",
                 f"from the target the straight way home, at {height_m:.1f} m, is blocked by zone {patch.zone} of policy"
@@ -308,13 +293,10 @@ def _way_home_blocked(target: XY, altitude_m: float, now: Situation, grant: Comp
     return None
 
 
-def _outcome(
-    args: GotoArgs, flown: tuple[XY, float, float | None], notes: list[Clamped], grant: CompiledGrant
-) -> Verdict:
-    target, altitude_m, speed_mps = flown
+def _outcome(args: GotoArgs, flown: _Aim, notes: list[Clamped], grant: CompiledGrant) -> Verdict:
     moved = any(note.code == "LegShortened" for note in notes)
-    lat, lon = grant.frame.latlon(*target) if moved else (args.lat, args.lon)
-    new = replace(args, lat=lat, lon=lon, alt=altitude_m, reference="home", speed_mps=speed_mps)
+    lat, lon = grant.frame.latlon(*flown.target) if moved else (args.lat, args.lon)
+    new = replace(args, lat=lat, lon=lon, alt=flown.altitude_m, reference="home", speed_mps=flown.speed_mps)
     if not notes:
         return Verdict("allow", new)
     ordered = sorted(notes, key=lambda n: n.code == "TerrainAssumedFlat")
@@ -337,17 +319,12 @@ def _located(now: Situation, grant: CompiledGrant) -> XY | Verdict:
 
 
 def _judge_takeoff(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
-    args = call.args
-    if not isinstance(args, TakeoffArgs):
-        return deny("InvalidArgument", "Takeoff needs its arguments")
-    at = _located(now, grant)
-    if isinstance(at, Verdict):
-        return at
-    leg = standing(at, min(now.altitude_m, args.altitude_m), max(now.altitude_m, args.altitude_m))
-    bounds = altitude_bounds(grant, now, leg.ground, leg.lower_m, leg.upper_m, margin_m(now))
-    if isinstance(bounds, Verdict):
-        return bounds
-    clamped = clamp("Altitude", "m above home", args.altitude_m, bounds)
+    args, at = call.args, _located(now, grant)
+    if isinstance(at, Verdict) or not isinstance(args, TakeoffArgs):
+        return at if isinstance(at, Verdict) else deny("InvalidArgument", "Takeoff needs its arguments")
+    lower, upper = sorted((now.altitude_m, args.altitude_m))
+    bounds = altitude_bounds(grant, now, Air(shapely.Point(at), margin_m(now), lower, upper))
+    clamped = bounds if isinstance(bounds, Verdict) else clamp("Altitude", "m above home", args.altitude_m, bounds)
     if isinstance(clamped, Verdict):
         return clamped
     problem = _column(at, now, grant, now.altitude_m, clamped.value) or _way_home_blocked(at, clamped.value, now, grant)
@@ -395,7 +372,7 @@ def _judge_speed(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     at = _located(now, grant)
     if isinstance(at, Verdict):
         return at
-    bounds = speed_bounds(grant, now, shapely.Point(at), now.altitude_m, now.altitude_m, margin_m(now))
+    bounds = speed_bounds(grant, now, Air(shapely.Point(at), margin_m(now), now.altitude_m, now.altitude_m))
     clamped = clamp("Speed", "m/s", args.speed_mps, bounds)
     if isinstance(clamped, Verdict):
         return clamped

@@ -9,7 +9,7 @@ from typing import Literal
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from fractus_core.policy.compiled import OPERATION_AREA, CompiledGrant, Inclusion, Patch
+from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Inclusion, Patch
 from fractus_core.policy.motion import XY, Leg
 from fractus_core.policy.values import Situation
 
@@ -53,11 +53,11 @@ class Breach:
 
 def breaches(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float, height_margin_m: float) -> list[Breach]:
     """Every fence that a leg breaks, most restrictive first."""
-    lower, upper = leg.lower_m - height_margin_m, leg.upper_m + height_margin_m
+    air = Air(leg.ground, margin_m, leg.lower_m - height_margin_m, leg.upper_m + height_margin_m)
     found = [
         *_operation_area(leg, now, grant, margin_m),
-        *_exclusions(leg, now, grant, margin_m, lower, upper),
-        *_inclusions(leg, now, grant, margin_m, lower, upper),
+        *_exclusions(leg, now, grant, air),
+        *_inclusions(leg, now, grant, air),
     ]
     return sorted(found, key=lambda b: (-b.severity, -b.priority, b.policy))
 
@@ -94,19 +94,17 @@ def _area_breach(reason: str, enters: bool) -> Breach:
     return Breach(OPERATION_AREA, 0, "ignore", "OutsideOperationArea", reason, enters, shapely.Polygon)
 
 
-def _exclusions(
-    leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float, lower_m: float, upper_m: float
-) -> Iterator[Breach]:
+def _exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Iterator[Breach]:
     if not grant.exclusions.patches:
         return
-    ground = leg.ground
-    for patch in grant.exclusions.near(ground, margin_m, lower_m, upper_m, now, grant.flat_terrain):
+    margin_m = air.margin_m
+    for patch in grant.exclusions.near(air, now, grant.flat_terrain):
         shape = patch.shape
         clearance_m = _clearance_outside(shape, leg.unavoidable)
         if clearance_m < margin_m and _leads_out(shape, leg, margin_m, clearance_m):
             continue
         # What the drone does anyway is not the request's doing.
-        enters = clearance_m > 0 and shape.intersects(ground)
+        enters = clearance_m > 0 and shape.intersects(air.ground)
         yield _exclusion_breach(patch, leg, margin_m, enters)
 
 
@@ -141,15 +139,13 @@ def _action(action: str | None) -> FenceAction:
     return "ignore"
 
 
-def _inclusions(
-    leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float, lower_m: float, upper_m: float
-) -> Iterator[Breach]:
+def _inclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Iterator[Breach]:
     for fence in grant.inclusions:
         if not fence.rule.in_force(now.time_s):
             continue
-        shape, border = fence.at(lower_m, upper_m, now, grant.flat_terrain)
-        if not _stays_inside(shape, border, leg, margin_m):
-            yield _inclusion_breach(fence, shape, border, leg, margin_m)
+        shape, border = fence.at(air.lower_m, air.upper_m, now, grant.flat_terrain)
+        if not _stays_inside(shape, border, leg, air.margin_m):
+            yield _inclusion_breach(fence, shape, border, leg, air.margin_m)
 
 
 def _inclusion_breach(fence: Inclusion, shape: BaseGeometry, border: BaseGeometry, leg: Leg, margin_m: float) -> Breach:

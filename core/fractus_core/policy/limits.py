@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from shapely.geometry.base import BaseGeometry
 
-from fractus_core.policy.compiled import CompiledGrant, Patch, Patches, Rule, height_m
+from fractus_core.policy.compiled import Air, CompiledGrant, Patch, Patches, Rule, height_m
 from fractus_core.policy.values import Situation, Verdict, deny
 
 SLACK = 1e-6
@@ -35,14 +35,12 @@ class Clamped:
     policies: tuple[str, ...] = ()
 
 
-def altitude_bounds(
-    grant: CompiledGrant, now: Situation, ground: BaseGeometry, lower_m: float, upper_m: float, margin_m: float
-) -> list[Bound] | Verdict:
-    """Altitude limits, in metres above home, along a piece of ground; a denial when one cannot be worked out."""
+def altitude_bounds(grant: CompiledGrant, now: Situation, air: Air) -> list[Bound] | Verdict:
+    """Altitude limits, in metres above home, in a piece of air; a denial when one cannot be worked out."""
     bounds = []
     if grant.max_altitude_m is not None:
         bounds.append(Bound("", 0, None, grant.max_altitude_m, refuses=False))
-    for rule, patch in _in_force(grant.altitude_limits, grant, now, ground, lower_m, upper_m, margin_m):
+    for rule, patch in _in_force(grant.altitude_limits, grant, now, air):
         spec = rule.spec
         edges = []
         for edge in (spec.lower_limit, spec.upper_limit):
@@ -66,32 +64,22 @@ def _datum_unknown(rule: Rule) -> Verdict:
     )
 
 
-def speed_bounds(
-    grant: CompiledGrant, now: Situation, ground: BaseGeometry, lower_m: float, upper_m: float, margin_m: float
-) -> list[Bound]:
-    """Speed limits, in metres per second, along a piece of ground between two altitudes."""
+def speed_bounds(grant: CompiledGrant, now: Situation, air: Air) -> list[Bound]:
+    """Speed limits, in metres per second, in a piece of air."""
     bounds = []
     if grant.max_speed_mps is not None:
         bounds.append(Bound("", 0, None, grant.max_speed_mps, refuses=False))
-    for rule, _ in _in_force(grant.speed_limits, grant, now, ground, lower_m, upper_m, margin_m):
+    for rule, _ in _in_force(grant.speed_limits, grant, now, air):
         spec = rule.spec
         bounds.append(Bound(rule.name, spec.priority, spec.lower_limit, spec.upper_limit, spec.action == "refuse"))
     return bounds
 
 
-def _in_force(
-    patches: Patches,
-    grant: CompiledGrant,
-    now: Situation,
-    ground: BaseGeometry,
-    lower_m: float,
-    upper_m: float,
-    margin_m: float,
-) -> Iterator[tuple[Rule, Patch | None]]:
+def _in_force(patches: Patches, grant: CompiledGrant, now: Situation, air: Air) -> Iterator[tuple[Rule, Patch | None]]:
     for rule in patches.everywhere:
         if rule.in_force(now.time_s):
             yield rule, None
-    for patch in patches.near(ground, margin_m, lower_m, upper_m, now, grant.flat_terrain):
+    for patch in patches.near(air, now, grant.flat_terrain):
         yield patch.rule, patch
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from fractus_core.policy.compiled import OPERATION_AREA, CompiledGrant
+from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Patch
 from fractus_core.policy.limits import Bound, altitude_bounds, speed_bounds
 from fractus_core.policy.motion import XY, stop_altitude_m, stop_point
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Situation, Takeover, Verdict, deny
@@ -44,12 +45,30 @@ def monitor(now: Situation, grant: CompiledGrant) -> Verdict | None:
     way = shapely.Point(start) if start == stop else shapely.LineString((start, stop))
     lower = min(now.altitude_m, rest_m) - now.altitude_error_m
     upper = max(now.altitude_m, rest_m) + now.altitude_error_m
-    found = [
-        *_fences(now, grant, way, start, stop, lower, upper),
-    ]
+    ahead = _Ahead(Air(way, now.position_error_m, lower, upper), shapely.Point(start), shapely.Point(stop))
+    found = _fences(now, grant, ahead)
     if found:
         return min(found, key=lambda f: (-_RANK[f[1].takeover if f[1].action == "takeover" else None], -f[0]))[1]
     return _limits(now, grant, start, stop, rest_m)
+
+
+@dataclass(frozen=True, slots=True)
+class _Ahead:
+    """The way to where the drone can stop, with its ends."""
+
+    air: Air
+    here: BaseGeometry
+    rest: BaseGeometry
+
+
+@dataclass(frozen=True, slots=True)
+class _Fence:
+    """What a fence is called, and what its policy does."""
+
+    policy: str
+    action: str | None
+    code: str
+    name: str
 
 
 def _finite(now: Situation) -> bool:
@@ -57,84 +76,59 @@ def _finite(now: Situation) -> bool:
     return all(math.isfinite(figure) for figure in figures)
 
 
-def _fences(
-    now: Situation, grant: CompiledGrant, way: BaseGeometry, start: XY, stop: XY, lower: float, upper: float
-) -> list[tuple[int, Verdict]]:
-    found: list[tuple[int, Verdict]] = []
-    margin = now.position_error_m
-    here, rest = shapely.Point(start), shapely.Point(stop)
-    if grant.exclusions.patches:
-        for patch in grant.exclusions.near(way, margin, lower, upper, now, grant.flat_terrain):
-            inside = patch.shape.intersects(here)
-            worse = _depth(patch.shape, rest) > _depth(patch.shape, here) + DEEPER_M
-            where = "is inside" if inside else "is about to enter"
-            verdict = _reaction(
-                patch.rule.spec.action,
-                inside,
-                worse or (not inside and patch.shape.intersects(way)),
-                "InsideExclusionZone" if inside else "ExclusionZoneAhead",
-                f"the drone {where} zone {patch.zone} of policy {patch.rule.name}",
-                patch.rule.name,
-            )
-            if verdict is not None:
-                found.append((patch.rule.spec.priority, verdict))
+def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead) -> list[tuple[int, Verdict]]:
+    """What fences ask for, each with its policy's priority."""
+    found: list[tuple[int, Verdict | None]] = [
+        (patch.rule.spec.priority, _kept_out(patch, ahead))
+        for patch in grant.exclusions.near(ahead.air, now, grant.flat_terrain)
+    ]
     if grant.passage is not None and grant.passage_border is not None:
-        verdict = _kept_in(
-            grant.passage, grant.passage_border, way, here, rest, margin, "ignore", OPERATION_AREA,
-            "OutsideOperationArea", "the operation area",
-        )  # fmt: skip
-        if verdict is not None:
-            found.append((0, verdict))
-    for fence in grant.inclusions:
-        if not fence.rule.in_force(now.time_s):
-            continue
-        shape, border = fence.at(lower, upper, now, grant.flat_terrain)
-        zones = ", ".join(dict.fromkeys(p.zone for p in fence.patches)) or "its zones"
-        verdict = _kept_in(
-            shape, border, way, here, rest, margin, fence.rule.spec.action, fence.rule.name,
-            "OutsideInclusionZone", f"{zones} of policy {fence.rule.name}",
-        )  # fmt: skip
-        if verdict is not None:
-            found.append((fence.rule.spec.priority, verdict))
-    return found
+        area = _Fence(OPERATION_AREA, "ignore", "OutsideOperationArea", "the operation area")
+        found.append((0, _kept_in(grant.passage, grant.passage_border, ahead, area)))
+    for inclusion in grant.inclusions:
+        if inclusion.rule.in_force(now.time_s):
+            shape, border = inclusion.at(ahead.air.lower_m, ahead.air.upper_m, now, grant.flat_terrain)
+            zones = ", ".join(dict.fromkeys(p.zone for p in inclusion.patches)) or "its zones"
+            rule = inclusion.rule
+            fence = _Fence(rule.name, rule.spec.action, "OutsideInclusionZone", f"{zones} of policy {rule.name}")
+            found.append((rule.spec.priority, _kept_in(shape, border, ahead, fence)))
+    return [(priority, verdict) for priority, verdict in found if verdict is not None]
 
 
-def _kept_in(
-    shape: BaseGeometry,
-    border: BaseGeometry,
-    way: BaseGeometry,
-    here: BaseGeometry,
-    rest: BaseGeometry,
-    margin: float,
-    action: str | None,
-    policy: str,
-    code: str,
-    name: str,
-) -> Verdict | None:
-    if shape.covers(way) and not border.dwithin(way, margin):
+def _kept_out(patch: Patch, ahead: _Ahead) -> Verdict | None:
+    inside = bool(patch.shape.intersects(ahead.here))
+    worse = _depth(patch.shape, ahead.rest) > _depth(patch.shape, ahead.here) + DEEPER_M
+    entering = not inside and bool(patch.shape.intersects(ahead.air.ground))
+    code = "InsideExclusionZone" if inside else "ExclusionZoneAhead"
+    where = "is inside" if inside else "is about to enter"
+    fence = _Fence(patch.rule.name, patch.rule.spec.action, code, f"zone {patch.zone} of policy {patch.rule.name}")
+    return _reaction(fence, inside, worse or entering, where)
+
+
+def _kept_in(shape: BaseGeometry, border: BaseGeometry, ahead: _Ahead, fence: _Fence) -> Verdict | None:
+    way = ahead.air.ground
+    if shape.covers(way) and not border.dwithin(way, ahead.air.margin_m):
         return None
-    outside = not shape.covers(here)
-    if shape.is_empty:
-        worse = False
-    else:
-        worse = -_signed_depth(shape, border, rest) > -_signed_depth(shape, border, here) + DEEPER_M
+    outside = not shape.covers(ahead.here)
+    worse = False
+    if not shape.is_empty:
+        worse = _signed_depth(shape, border, ahead.rest) < _signed_depth(shape, border, ahead.here) - DEEPER_M
     leaving = worse or (not outside and not shape.covers(way))
-    return _reaction(
-        action, outside, leaving, code, f"the drone {'is outside' if outside else 'is about to leave'} {name}", policy
-    )
+    return _reaction(fence, outside, leaving, "is outside" if outside else "is about to leave")
 
 
-def _reaction(action: str | None, broken: bool, worse: bool, code: str, reason: str, policy: str) -> Verdict | None:
+def _reaction(fence: _Fence, broken: bool, worse: bool, what: str) -> Verdict | None:
     """What follows from a fence that is broken or about to be.
 
     A policy that takes the drone over does so for both; one that ignores requests only stops the motion that makes
     things worse.
     """
-    takeover = _TAKEOVERS.get(action or "ignore")
+    takeover = _TAKEOVERS.get(fence.action or "ignore")
+    reason = f"the drone {what} {fence.name}"
     if takeover is not None and (broken or worse):
-        return Verdict("takeover", None, code, reason, (policy,), takeover)
+        return Verdict("takeover", None, fence.code, reason, (fence.policy,), takeover)
     if worse:
-        return Verdict("deny", None, code, f"{reason}; the motion is stopped", (policy,), "hover")
+        return Verdict("deny", None, fence.code, f"{reason}; the motion is stopped", (fence.policy,), "hover")
     return None
 
 
@@ -150,7 +144,7 @@ def _signed_depth(shape: BaseGeometry, border: BaseGeometry, point: BaseGeometry
 def _limits(now: Situation, grant: CompiledGrant, start: XY, stop: XY, rest_m: float) -> Verdict | None:
     here = shapely.Point(start)
     if grant.max_altitude_m is not None or grant.altitude_limits:
-        bounds = altitude_bounds(grant, now, here, now.altitude_m, now.altitude_m, 0.0)
+        bounds = altitude_bounds(grant, now, Air(here, 0.0, now.altitude_m, now.altitude_m))
         if isinstance(bounds, Verdict):
             return deny(bounds.code, bounds.reason, bounds.policies) if now.down_mps < -0.5 else None
         over = _lowest(bounds)
@@ -162,7 +156,7 @@ def _limits(now: Situation, grant: CompiledGrant, start: XY, stop: XY, rest_m: f
             return Verdict("correct", GotoArgs(lat, lon, over.upper), "AltitudeAboveLimit", reason, names)
     if grant.max_speed_mps is not None or grant.speed_limits:
         speed = math.hypot(now.north_mps, now.east_mps)
-        over = _lowest(speed_bounds(grant, now, here, now.altitude_m, now.altitude_m, 0.0))
+        over = _lowest(speed_bounds(grant, now, Air(here, 0.0, now.altitude_m, now.altitude_m)))
         if over is not None and over.upper is not None and speed > over.upper * 1.1 + 1.0:
             reason = f"the drone flies at {speed:.1f} m/s, above the limit of {over.upper:.1f} m/s"
             names = (over.name,) if over.name else ()

@@ -365,7 +365,7 @@ def test_the_operator_does_its_work_with_the_chart_s_permissions(
     operator.start()
     try:
         world.put(traffic(namespace))
-        wait_for(lambda: len(world.pods(namespace)) == 7, lambda: operator.log())
+        wait_for(lambda: len(world.pods(namespace)) == 7, operator.log)
         world.run_pods(namespace)
         world.phase(namespace, "Running")
         grant = f"{FRACTUS}/grants/{namespace}.traffic-navigator/status"

@@ -1,0 +1,71 @@
+"""The authority: what it issues, when it renews, what it refuses."""
+
+from __future__ import annotations
+
+import base64
+from datetime import UTC, datetime, timedelta
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID
+from fractus_operator.authority import COMPONENT_LIFE, Authority, BrokenAuthority
+
+NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
+IDENTITY = "spiffe://fractus.dev/ns/a/app/b/component/C/instance/b-c"
+AUTHORITY = Authority.generate(NOW)
+
+
+def certificate(data: dict[str, str]) -> x509.Certificate:
+    return x509.load_pem_x509_certificate(base64.b64decode(data["tls.crt"]))
+
+
+def test_a_component_gets_a_short_lived_client_certificate() -> None:
+    issued = certificate(AUTHORITY.issue_component(IDENTITY, NOW))
+    assert issued.not_valid_after_utc == NOW + COMPONENT_LIFE
+    assert list(issued.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value) == [
+        ExtendedKeyUsageOID.CLIENT_AUTH
+    ]
+    names = issued.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert [n.value for n in names] == [IDENTITY]
+    key = issued.public_key()
+    assert isinstance(key, ec.EllipticCurvePublicKey)
+    assert isinstance(key.curve, ec.SECP256R1)
+    issued.verify_directly_issued_by(AUTHORITY.certificate)
+
+
+def test_a_certificate_is_kept_for_two_thirds_of_its_life() -> None:
+    data = AUTHORITY.issue_component(IDENTITY, NOW)
+    assert AUTHORITY.still_good(data, IDENTITY, NOW + timedelta(hours=15))
+    assert not AUTHORITY.still_good(data, IDENTITY, NOW + timedelta(hours=17))
+
+
+def test_a_certificate_of_another_identity_or_authority_is_not_good() -> None:
+    data = AUTHORITY.issue_component(IDENTITY, NOW)
+    assert not AUTHORITY.still_good(data, IDENTITY + "2", NOW)
+    assert not Authority.generate(NOW).still_good(data, IDENTITY, NOW)
+    assert not AUTHORITY.still_good({}, IDENTITY, NOW)
+    assert not AUTHORITY.still_good({**data, "tls.crt": "bm9uc2Vuc2U="}, IDENTITY, NOW)
+    assert not AUTHORITY.still_good({**data, "ca.crt": ""}, IDENTITY, NOW)
+
+
+def test_the_authority_survives_its_secret() -> None:
+    again = Authority.from_data(AUTHORITY.to_data())
+    assert again.certificate == AUTHORITY.certificate
+    assert again.still_good(AUTHORITY.issue_component(IDENTITY, NOW), IDENTITY, NOW)
+
+
+def test_a_damaged_authority_is_not_replaced_in_silence() -> None:
+    other = Authority.generate(NOW).to_data()
+    with pytest.raises(BrokenAuthority, match=r"tls\.key"):
+        Authority.from_data({**AUTHORITY.to_data(), "tls.key": other["tls.key"]})
+    with pytest.raises(BrokenAuthority):
+        Authority.from_data({})
+
+
+def test_the_authority_signs_no_authorities() -> None:
+    constraints = AUTHORITY.certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
+    assert (constraints.ca, constraints.path_length) == (True, 0)
+    issued = certificate(AUTHORITY.issue_component(IDENTITY, NOW))
+    assert not issued.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+    assert not issued.extensions.get_extension_for_class(x509.KeyUsage).value.key_cert_sign

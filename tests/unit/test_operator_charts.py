@@ -1,0 +1,47 @@
+"""The charts: the kinds they install are those of the models, their values are documented and checked."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from fractus_core.api import KINDS
+from fractus_core.api.crd import crd
+
+ROOT = Path(__file__).parents[2]
+CHARTS = ROOT / "charts"
+
+
+def test_the_chart_carries_the_generated_kinds() -> None:
+    carried = {
+        path.name: yaml.safe_load(path.read_text()) for path in (CHARTS / "fractus-crds" / "files").glob("*.yaml")
+    }
+    assert {body["metadata"]["name"] for body in carried.values()} == {f"{kind.PLURAL}.fractus.dev" for kind in KINDS}
+    for kind in KINDS:
+        assert carried[f"{kind.PLURAL}.yaml"] == json.loads(json.dumps(crd(kind))), "run `make generate`"
+
+
+@pytest.mark.parametrize("chart", ["fractus", "fractus-crds"])
+def test_every_value_is_in_the_schema_and_the_other_way_round(chart: str) -> None:
+    values = yaml.safe_load((CHARTS / chart / "values.yaml").read_text())
+    schema = json.loads((CHARTS / chart / "values.schema.json").read_text())
+
+    def compare(value: dict, part: dict, path: str) -> None:
+        known = set(part.get("properties", {})) - {"global"}
+        assert set(value) == known, path
+        for key, inner in value.items():
+            below = part["properties"][key]
+            if isinstance(inner, dict) and "properties" in below:
+                compare(inner, below, f"{path}.{key}")
+
+    compare(values, schema, chart)
+
+
+def test_the_charts_have_the_version_of_the_package() -> None:
+    import tomllib
+
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    for chart in ("fractus", "fractus-crds"):
+        assert yaml.safe_load((CHARTS / chart / "Chart.yaml").read_text())["appVersion"] == version

@@ -1,0 +1,253 @@
+"""The operator's pure decisions: conditions, differences, missions, locations, quantities, settings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+
+import pytest
+from fractus_core.api import Application, Drone, EdgeNode, Grant
+from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
+from fractus_core.planning.inventory import Host, Inventory
+from fractus_operator.conditions import Fact, merge
+from fractus_operator.difference import contains, is_current, stamped
+from fractus_operator.location import geohash, location_labels
+from fractus_operator.missions import (
+    Hindered,
+    deployed_standing,
+    hindered_standing,
+    mission_outcome,
+    replan_reason,
+    stuck_nodes,
+)
+from fractus_operator.pods import PodView, amount_of, read_host, read_pod
+from fractus_operator.settings import BadSetting, Settings
+
+NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
+V1 = "fractus.dev/v1alpha1"
+
+
+# -- conditions --
+
+
+def test_a_transition_is_news_and_moves_the_time() -> None:
+    first, news = merge([], [Fact("Ready", "False", "PodsNotReady")], 1, NOW)
+    assert [n.reason for n in news] == ["PodsNotReady"]
+    later = NOW + timedelta(minutes=1)
+    same, news = merge(first, [Fact("Ready", "False", "PodsNotReady", "two to go")], 2, later)
+    assert news == ()
+    assert (same[0].last_transition_time, same[0].message, same[0].observed_generation) == (NOW, "two to go", 2)
+    other, news = merge(same, [Fact("Ready", "False", "NodeGone")], 2, later)
+    assert [n.reason for n in news] == ["NodeGone"]
+    assert other[0].last_transition_time == NOW
+    true, _ = merge(other, [Fact("Ready", "True", "PodsReady")], 2, later)
+    assert true[0].last_transition_time == later
+
+
+def test_only_trouble_is_a_warning() -> None:
+    assert Fact("Ready", "False", "X").warning
+    assert not Fact("Ready", "False", "X", progress=True).warning
+    assert not Fact("Ready", "True", "X").warning
+
+
+# -- differences --
+
+
+def test_an_applied_object_is_current_until_someone_changes_it() -> None:
+    desired = stamped(
+        {"metadata": {"name": "a"}, "spec": {"replicas": 1, "ports": [{"port": 1}], "empty": {}, "none": []}}
+    )
+    observed = {
+        "metadata": {**desired["metadata"], "uid": "u"},
+        "spec": {"replicas": 1, "ports": [{"port": 1, "protocol": "TCP"}], "more": 2},
+    }
+    assert is_current(desired, observed)
+    assert not is_current(desired, None)
+    for spoil in ({"replicas": 2}, {"ports": []}, {"ports": [{"port": 1}, {"port": 2}]}, {"ports": None}):
+        assert not is_current(desired, {**observed, "spec": {**observed["spec"], **spoil}}), spoil
+
+
+def test_a_field_that_is_dropped_is_a_difference() -> None:
+    before = stamped({"metadata": {"name": "a"}, "spec": {"x": 1, "y": 2}})
+    assert not is_current(stamped({"metadata": {"name": "a"}, "spec": {"x": 1}}), before)
+
+
+@pytest.mark.parametrize(
+    ("observed", "desired"), [(1, 1.0), (None, ""), (None, False), (None, {}), (None, []), ({"a": 1}, {})]
+)
+def test_what_the_api_server_stores_its_own_way_is_equal(observed: object, desired: object) -> None:
+    assert contains(observed, desired)
+
+
+# -- missions --
+
+
+def application(generation: int = 1) -> Application:
+    parts = [{"name": "A", "placement": "cloud", "container": {"image": "a"}}]
+    metadata = {"name": "app", "namespace": "ns", "uid": "u1", "generation": generation}
+    return Application.from_body(
+        {"apiVersion": V1, "kind": "Application", "metadata": metadata, "spec": {"components": parts}}
+    )
+
+
+def placed(instance: str, node: str | None, **more: object) -> PlannedInstance:
+    values = {"component": "A", "placement": "edge" if node else "cloud", "role": "static" if node else "cloud"} | more
+    return PlannedInstance.model_validate({"instance": instance, "node": node, **values})
+
+
+def edge(name: str) -> EdgeNode:
+    spec = {"location": {"lat": 1, "lon": 2}}
+    return EdgeNode.from_body({"apiVersion": V1, "kind": "EdgeNode", "metadata": {"name": name}, "spec": spec})
+
+
+PLAN = DeploymentPlanSpec(
+    application="app", application_generation=1, placements=(placed("a-1", "edge-1"), placed("a-c", None, replicas=2))
+)
+INVENTORY = Inventory(hosts={"edge-1": Host("edge-1")}, edge_nodes={"edge-1": edge("edge-1")})
+
+
+def test_a_plan_stands_while_its_nodes_exist() -> None:
+    assert replan_reason(application(), PLAN, INVENTORY, {}) is None
+    unreachable = replace(INVENTORY, hosts={"edge-1": Host("edge-1", ready=False)})
+    assert replan_reason(application(), PLAN, unreachable, {}) is None
+
+
+def test_a_new_plan_is_made_for_a_reason() -> None:
+    assert replan_reason(application(), None, INVENTORY, {}) == "NoPlanYet"
+    assert replan_reason(application(2), PLAN, INVENTORY, {}) == "SpecChanged"
+    assert replan_reason(application(), PLAN, replace(INVENTORY, hosts={}), {}) == "NodeGone"
+    assert replan_reason(application(), PLAN, replace(INVENTORY, edge_nodes={}), {}) == "NodeGone"
+    assert replan_reason(application(), PLAN, INVENTORY, {"edge-1": "full"}) == "NodeUnusable"
+
+
+def view(instance: str, **more: object) -> PodView:
+    values: dict[str, object] = {"ready": True, "finished": False, "terminating": False, "ip": None, **more}
+    return PodView("ns", f"{instance}-x", None, {"fractus.dev/instance": instance}, {}, **values)  # type: ignore[arg-type]
+
+
+def test_a_node_is_stuck_after_a_grace() -> None:
+    waiting = view("a-1", ready=False, unschedulable_since=NOW - timedelta(seconds=2), unschedulable_message="no cpu")
+    assert stuck_nodes(PLAN, [waiting], NOW) == ({}, 3.0)
+    stuck, again_s = stuck_nodes(PLAN, [waiting], NOW + timedelta(seconds=10))
+    assert (set(stuck), again_s) == ({"edge-1"}, None)
+    assert "no cpu" in stuck["edge-1"]
+    in_the_cloud = view("a-c", ready=False, unschedulable_since=NOW - timedelta(minutes=1))
+    leaving = view("a-1", terminating=True, unschedulable_since=NOW - timedelta(minutes=1))
+    assert stuck_nodes(PLAN, [in_the_cloud, leaving], NOW) == ({}, None)
+
+
+def test_readiness_counts_each_instance_up_to_its_replicas() -> None:
+    pods = [view("a-c"), view("a-c"), view("a-c"), view("a-1", ready=False)]
+    standing = deployed_standing(PLAN, pods, 0)
+    assert (standing.phase, standing.pods) == ("Deploying", "2/3")
+    assert "a-1" in standing.message
+    done = deployed_standing(PLAN, [view("a-1"), view("a-c"), view("a-c"), view("a-c", terminating=True)], 0)
+    assert (done.phase, done.pods) == ("Running", "3/3")
+    old = deployed_standing(PLAN, [view("a-1", terminating=True), view("a-c"), view("a-c")], 0)
+    assert old.pods == "2/3"
+
+
+def grant(phase: str | None, uid: str = "u1", class_: str = "driver") -> Grant:
+    owner = {"namespace": "ns", "name": "app", "uid": uid}
+    spec = {"node": "d", "application": owner, "component": "N", "instance": "n", "class": class_}
+    status = {"status": {"phase": phase, "message": "because"}} if phase else {}
+    return Grant.from_body({"apiVersion": V1, "kind": "Grant", "metadata": {"name": "ns.n"}, "spec": spec, **status})
+
+
+def test_only_the_driver_of_this_application_ends_the_mission() -> None:
+    assert mission_outcome("u1", [grant(None), grant("Active"), grant("Pending")]) is None
+    assert mission_outcome("u1", [grant("Complete", uid="u0"), grant("Failed", class_="passenger")]) is None
+    complete = mission_outcome("u1", [grant("Complete")])
+    assert complete is not None
+    assert (complete.complete, complete.message) == (True, "because")
+    failed = mission_outcome("u1", [grant("Failed")])
+    assert failed is not None
+    assert not failed.complete
+
+
+def test_what_hinders_is_said_of_its_stage() -> None:
+    standing = hindered_standing(Hindered("Pending", "Granted", "PolicyInvalid", "no zone"), None)
+    assert [(f.type, f.status) for f in standing.facts] == [
+        ("Planned", "True"),
+        ("Granted", "False"),
+        ("Ready", "False"),
+    ]
+    queued = hindered_standing(Hindered("Queued", "Planned", "DroneBusy", "busy"), None)
+    assert not any(fact.warning for fact in queued.facts)
+
+
+# -- locations --
+
+
+@pytest.mark.parametrize(
+    ("lat", "lon", "cell"),
+    [(57.64911, 10.40744, "u4pruydqqvj"), (-25.382708, -49.265506, "6gkzwgjzn82"), (42.605, -5.603, "ezs42")],
+)
+def test_geohashes_are_the_known_ones(lat: float, lon: float, cell: str) -> None:
+    assert geohash(lat, lon, len(cell)) == cell
+
+
+def test_a_drone_is_labelled_where_it_is() -> None:
+    spec = {"depot": "base", "home": {"lat": 1, "lon": 2}, "interfaces": [{"technology": "WiFi"}, {"technology": "4G"}]}
+    body = {"apiVersion": V1, "kind": "Drone", "metadata": {"name": "d"}, "spec": spec}
+    assert location_labels(Drone.from_body(body)) == {
+        "fractus.dev/depot": "base",
+        "fractus.dev/geohash": geohash(1, 2),
+        "fractus.dev/interface-wifi": "true",
+        "fractus.dev/interface-4g": "true",
+    }
+    flown = Drone.from_body({**body, "status": {"position": {"lat": 40, "lon": 20}}})
+    assert location_labels(flown)["fractus.dev/geohash"] == geohash(40, 20)
+
+
+# -- pods and nodes --
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("250m", 0.25), ("1Ki", 1024), ("1e3", 1000), ("500n", 5e-7), ("2E", 2e18), (3, 3)]
+)
+def test_quantities_of_any_spelling_are_read(text: str | int, value: float) -> None:
+    assert amount_of(text) == pytest.approx(value)
+
+
+def test_a_pod_asks_for_the_larger_of_its_phases() -> None:
+    def asks(cpu: str) -> dict:
+        return {"resources": {"requests": {"cpu": cpu}}}
+
+    body = {
+        "metadata": {"name": "p", "namespace": "ns", "labels": {"x": "y", "fractus.dev/instance": "i"}},
+        "spec": {"containers": [asks("100m"), asks("200m")], "initContainers": [asks("1")], "overhead": {"cpu": "50m"}},
+    }
+    pod = read_pod(body)
+    assert pod.requests["cpu"] == pytest.approx(1.05)
+    assert (pod.instance, pod.ready, pod.labels) == ("i", False, {"fractus.dev/instance": "i"})
+
+
+def test_a_node_s_heartbeat_changes_nothing() -> None:
+    def node(beat: str) -> dict:
+        condition = {"type": "Ready", "status": "True", "lastHeartbeatTime": beat}
+        return {
+            "metadata": {"name": "n", "resourceVersion": beat},
+            "status": {"conditions": [condition], "allocatable": {"cpu": "2"}},
+        }
+
+    assert read_host(node("1")) == read_host(node("2"))
+    assert not read_host({"metadata": {"name": "n"}, "spec": {"unschedulable": True}}).schedulable
+
+
+# -- settings --
+
+
+def test_settings_come_from_the_environment() -> None:
+    settings = Settings.from_environment({"FRACTUS_PLANNING_SAFETY_RADIUS": "9.5", "FRACTUS_LOG_LEVEL": "debug"})
+    assert (settings.planning.safety_radius_m, settings.log_level) == (9.5, 10)
+    assert settings.agent_user == "system:serviceaccount:fractus-system:fractus-agent"
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [{"FRACTUS_LOG_LEVEL": "LOUD"}, {"FRACTUS_PLANNING_CRUISE_SPEED": "fast"}, {"FRACTUS_PLANNING_CRUISE_SPEED": "-1"}],
+)
+def test_a_bad_setting_is_named(environment: dict[str, str]) -> None:
+    with pytest.raises(BadSetting, match=next(iter(environment))):
+        Settings.from_environment(environment)

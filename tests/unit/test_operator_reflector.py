@@ -1,0 +1,193 @@
+"""The reflector and the worklist against a scripted API server: breaks, expiry, retries; no network."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+from fractus_operator import reflector as reflector_module
+from fractus_operator import worklist as worklist_module
+from fractus_operator.kinds import POLICY, ZONE, Body, Key
+from fractus_operator.reflector import Reflector
+from fractus_operator.store import Expired, Page, StoreError
+from fractus_operator.worklist import Worklist
+
+
+def zone(name: str, version: int, value: int = 0) -> Body:
+    return {"metadata": {"name": name, "resourceVersion": str(version)}, "value": value}
+
+
+class Script:
+    """Gives lists and watches in the order written; then waits for ever."""
+
+    def __init__(self, *steps: Any) -> None:
+        self.steps = list(steps)
+        self.calls: list[str] = []
+        self.done = asyncio.Event()
+
+    async def list_page(self, kind: Any, *, selectors: Any = None, continue_: str = "", limit: int = 500) -> Page:
+        self.calls.append(f"list {continue_}".strip())
+        step = await self._next()
+        if isinstance(step, Exception):
+            raise step
+        return Page(step)
+
+    async def watch(self, kind: Any, *, resource_version: str, **_: Any) -> AsyncIterator[tuple[str, Body]]:
+        self.calls.append(f"watch {resource_version}")
+        for event in await self._next():
+            if isinstance(event, Exception):
+                raise event
+            yield event
+
+    async def _next(self) -> Any:
+        if not self.steps:
+            self.done.set()
+            await asyncio.Event().wait()
+        return self.steps.pop(0)
+
+
+def page(version: int, *items: Body, continue_: str = "") -> Body:
+    return {"metadata": {"resourceVersion": str(version), "continue": continue_}, "items": list(items)}
+
+
+async def follow(
+    script: Script, monkeypatch: pytest.MonkeyPatch
+) -> tuple[dict[Key, int], list[tuple[Key, int | None, int | None]]]:
+    """Run a reflector through the script; what it holds then, and what it reported."""
+    monkeypatch.setattr(reflector_module, "_BACKOFF_S", (0.0, 0.0))
+    changes: list[tuple[Key, int | None, int | None]] = []
+    reflector: Reflector[int] = Reflector(
+        script,  # type: ignore[arg-type]
+        ZONE,
+        lambda body: body["value"],
+        lambda key, old, new: changes.append((key, old, new)),
+        rng=random.Random(1),
+    )
+    task = asyncio.create_task(reflector.run())
+    async with asyncio.timeout(5):
+        await script.done.wait()
+        await reflector.synced.wait()
+    task.cancel()
+    return dict(reflector.items()), changes
+
+
+async def test_a_list_in_pages_is_one_list(monkeypatch: pytest.MonkeyPatch) -> None:
+    script = Script(page(5, zone("a", 1, 1), continue_="more"), page(5, zone("b", 2, 2)))
+    held, changes = await follow(script, monkeypatch)
+    assert held == {("", "a"): 1, ("", "b"): 2}
+    assert sorted(changes) == [(("", "a"), None, 1), (("", "b"), None, 2)]
+    assert script.calls == ["list", "list more", "watch 5"]
+
+
+async def test_a_watch_goes_on_from_where_it_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    events = [("ADDED", zone("a", 6, 1)), ("BOOKMARK", {"metadata": {"resourceVersion": "9"}})]
+    script = Script(page(5), events, [("MODIFIED", zone("a", 10, 2)), ("DELETED", zone("a", 11, 2))])
+    held, changes = await follow(script, monkeypatch)
+    assert held == {}
+    assert changes == [(("", "a"), None, 1), (("", "a"), 1, 2), (("", "a"), 2, None)]
+    assert script.calls == ["list", "watch 5", "watch 9", "watch 11"]
+
+
+async def test_an_expired_watch_lists_again_and_reports_the_difference(monkeypatch: pytest.MonkeyPatch) -> None:
+    script = Script(
+        page(5, zone("gone", 1, 1), zone("same", 2, 2), zone("new", 3, 3)),
+        [Expired(410, "Expired", "too old")],
+        page(50, zone("same", 2, 2), zone("new", 40, 4)),
+    )
+    held, changes = await follow(script, monkeypatch)
+    assert held == {("", "same"): 2, ("", "new"): 4}
+    assert changes[3:] == [(("", "gone"), 1, None), (("", "new"), 3, 4)]
+    assert script.calls == ["list", "watch 5", "list", "watch 50"]
+
+
+async def test_a_broken_connection_is_taken_up_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = StoreError(0, "Unreachable", "reset")
+    script = Script(broken, page(5), [("ADDED", zone("a", 6, 1)), broken], [("MODIFIED", zone("a", 7, 2))])
+    held, _ = await follow(script, monkeypatch)
+    assert held == {("", "a"): 2}
+    assert script.calls == ["list", "list", "watch 5", "watch 6", "watch 7"]
+
+
+async def test_an_unchanged_view_wakes_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    script = Script(page(5, zone("a", 1, 1)), [("MODIFIED", zone("a", 6, 1))])
+    _, changes = await follow(script, monkeypatch)
+    assert changes == [(("", "a"), None, 1)]
+
+
+# -- worklist --
+
+
+async def test_a_key_is_reconciled_once_for_many_changes() -> None:
+    seen: list[Key] = []
+    done = asyncio.Event()
+
+    async def reconcile(key: Key) -> None:
+        seen.append(key)
+        if key == ("", "last"):
+            done.set()
+
+    worklist = Worklist("test", reconcile)
+    for _ in range(5):
+        worklist.add(("", "a"))
+    worklist.add(("", "last"))
+    task = asyncio.create_task(worklist.run())
+    async with asyncio.timeout(5):
+        await done.wait()
+    task.cancel()
+    assert seen == [("", "a"), ("", "last")]
+
+
+async def test_a_change_during_a_reconcile_is_not_lost() -> None:
+    seen: list[int] = []
+    done = asyncio.Event()
+    value = 1
+
+    async def reconcile(key: Key) -> None:
+        nonlocal value
+        seen.append(value)
+        if value == 1:
+            value = 2
+            worklist.add(key)
+            await asyncio.sleep(0)
+        else:
+            done.set()
+
+    worklist = Worklist("test", reconcile)
+    worklist.add(("", "a"))
+    task = asyncio.create_task(worklist.run())
+    async with asyncio.timeout(5):
+        await done.wait()
+    task.cancel()
+    assert seen == [1, 2]
+
+
+async def test_a_failure_is_tried_again_and_holds_up_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worklist_module, "_BACKOFF_S", (0.001, 0.01))
+    attempts: dict[Key, int] = {}
+    done = asyncio.Event()
+
+    async def reconcile(key: Key) -> None:
+        attempts[key] = attempts.get(key, 0) + 1
+        if key == ("", "bad") and attempts[key] < 4:
+            raise StoreError(500, "InternalError", "not now")
+        if key == ("", "bad"):
+            done.set()
+
+    worklist = Worklist("test", reconcile, rng=random.Random(1))
+    worklist.add(("", "bad"))
+    worklist.add(("", "good"))
+    task = asyncio.create_task(worklist.run())
+    async with asyncio.timeout(5):
+        await done.wait()
+        await asyncio.sleep(0)
+    task.cancel()
+    assert attempts == {("", "bad"): 4, ("", "good"): 1}
+    assert worklist.failures == {}
+
+
+def test_paths_of_objects() -> None:
+    assert ZONE.path(name="a", subresource="status") == "/apis/fractus.dev/v1alpha1/zones/a/status"
+    assert POLICY.path() == "/apis/fractus.dev/v1alpha1/policies"

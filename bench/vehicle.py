@@ -1,0 +1,220 @@
+"""The simulated vehicle beside the measured figures of a real ArduCopter, and what it costs to run.
+
+    uv run python bench/vehicle.py [--quick] [--json FILE]
+
+Motion is measured in lockstep (simulated seconds); processor time and memory of the real process at its default step,
+idle and with every stream at 4 Hz while it hovers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import select
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from fractus_sim.vehicle.earth import Place
+from fractus_sim.vehicle.mav import Command
+from fractus_sim.vehicle.pilot import Pilot
+from fractus_sim.vehicle.simulation import Simulation, formation
+from fractus_sim.vehicle.vehicle import VehicleConfig
+from fractus_sim.vehicle.wire import Parser, encode, layout_named
+
+START = Place.from_degrees(48.2, 16.37, 150.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """One figure: ours, what it is compared with, and whether the target holds."""
+
+    name: str
+    ours: float
+    theirs: float | None
+    unit: str
+    target: str
+    holds: bool
+
+    def as_json(self) -> dict[str, object]:
+        """The claim as the benchmarks' common format has it."""
+        ratio = None if not self.theirs else round(self.ours / self.theirs, 3)
+        return {
+            "name": self.name,
+            "ours": round(self.ours, 3),
+            "theirs": self.theirs,
+            "unit": self.unit,
+            "ratio": ratio,
+            "target": self.target,
+            "holds": self.holds,
+        }
+
+
+def near(name: str, ours: float, theirs: float, unit: str) -> Claim:
+    """A figure of the real vehicle that must hold within 20 %."""
+    return Claim(name, ours, theirs, unit, "within 20 %", abs(ours / theirs - 1.0) <= 0.2)
+
+
+def at_most(name: str, ours: float, limit: float, unit: str) -> Claim:
+    """A cost with a ceiling."""
+    return Claim(name, ours, None, unit, f"< {limit:g}", ours < limit)
+
+
+def motion() -> list[Claim]:
+    """Takeoff, a leg of 50 m, and the way home, as the real one was measured."""
+    simulation = Simulation([VehicleConfig(start=START, ready_after_s=2.0)])
+    pilot = Pilot(simulation, simulation.crafts[0])
+    vehicle = simulation.crafts[0].vehicle
+    climb_s = pilot.take_off(10.0)
+    pilot.fly_on(6.0)
+    pilot.go_to(50.0, 0.0, 10.0)
+    peak, begun = 0.0, simulation.time_s
+    while math.hypot(vehicle.body.north - 50.0, vehicle.body.east) > 1.0:
+        pilot.step()
+        peak = max(peak, math.hypot(vehicle.body.vn, vehicle.body.ve))
+    leg_s = simulation.time_s - begun
+    pilot.fly_on(6.0)
+    pilot.command(Command.NAV_RETURN_TO_LAUNCH)
+    home_s = pilot.wait(lambda: not vehicle.armed, 120.0)
+    return [
+        near("takeoff to 9.5 m", climb_s, 9.5, "s"),
+        near("50 m leg to within 1 m", leg_s, 9.3, "s"),
+        near("peak speed of the leg", peak, 8.4, "m/s"),
+        near("return to launch until disarmed", home_s, 49.0, "s"),
+    ]
+
+
+def speed(flight_s: float) -> list[Claim]:
+    """How much faster than real time one flying vehicle runs, and how much of a core fifty take."""
+    claims = []
+    for count, name in ((1, "one flying vehicle, times real time"), (50, "50 flying vehicles, times real time")):
+        configs = formation(VehicleConfig(start=START, ready_after_s=2.0), count, 10.0)
+        simulation = Simulation(configs)
+        pilots = [Pilot(simulation, craft) for craft in simulation.crafts]
+        for pilot in pilots:
+            pilot.craft.vehicle.params.assign("DISARM_DELAY", 0)
+            pilot.channel.streams.clear()
+        simulation.advance(2.5)
+        for pilot in pilots:
+            pilot.send("COMMAND_LONG", _order(pilot, 176, 1.0, 4.0))
+            pilot.send("COMMAND_LONG", _order(pilot, 400, 1.0))
+            pilot.send("COMMAND_LONG", _order(pilot, 22, 0, 0, 0, 0, 0, 0, 10.0))
+            pilot.channel.take()
+        simulation.advance(6.0)
+        begun = time.perf_counter()
+        simulation.advance(flight_s / (1 if count == 1 else 20))
+        rate = flight_s / (1 if count == 1 else 20) / (time.perf_counter() - begun)
+        flying = sum(not craft.vehicle.landed for craft in simulation.crafts)
+        floor = 20.0 if count == 1 else 1.0
+        claims.append(Claim(name, rate, None, "x", f">= {floor:g}", rate >= floor and flying == count))
+    return claims
+
+
+def _order(pilot: Pilot, command: int, *params: float) -> dict[str, float]:
+    values = {f"param{at}": float(value) for at, value in enumerate(params, start=1)}
+    return {"target_system": pilot.craft.config.sysid, "target_component": 1, "command": command} | values
+
+
+def _cpu_s(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _memory_mb(pid: int) -> float:
+    return int(Path(f"/proc/{pid}/status").read_text(encoding="ascii").split("VmRSS:")[1].split()[0]) / 1024
+
+
+class Link:
+    """A bare TCP client."""
+
+    def __init__(self, port: int) -> None:
+        self.socket = socket.create_connection(("127.0.0.1", port), timeout=5.0)
+        self.parser = Parser()
+
+    def send(self, name: str, **values: float) -> None:
+        """Send one message to the vehicle."""
+        target = {"target_system": 1, "target_component": 1}
+        self.socket.sendall(encode(layout_named(name), target | values, sequence=0, sysid=255, compid=190))
+
+    def read(self, duration_s: float, until: str = "") -> int:
+        """Read for a time, or until a message of that name; returns how many came."""
+        count, end = 0, time.monotonic() + duration_s
+        while time.monotonic() < end:
+            if not select.select([self.socket], [], [], max(0.0, end - time.monotonic()))[0]:
+                break
+            messages = self.parser.feed(self.socket.recv(65536))
+            count += len(messages)
+            if any(message.name == until for message in messages):
+                break
+        return count
+
+
+def process(duration_s: float) -> list[Claim]:
+    """Processor time, memory, stream rate and acknowledgement time of the process in real time."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-m", "fractus_sim.vehicle", "--listen", f"tcp:127.0.0.1:{port}", "--ready-after", "1"]
+    child = subprocess.Popen([*command, "--param", "DISARM_DELAY=0"], stderr=subprocess.PIPE, text=True)
+    assert child.stderr is not None
+    try:
+        child.stderr.readline()
+        link = Link(port)
+        link.read(2.0)
+        before = _cpu_s(child.pid)
+        link.read(duration_s)
+        idle = (_cpu_s(child.pid) - before) / duration_s * 100.0
+        link.send("REQUEST_DATA_STREAM", req_message_rate=4, start_stop=1)
+        for values in (
+            {"command": 176, "param1": 1, "param2": 4},
+            {"command": 400, "param1": 1},
+            {"command": 22, "param7": 20},
+        ):
+            link.send("COMMAND_LONG", **values)
+            link.read(1.0, until="COMMAND_ACK")
+        link.read(15.0)
+        before = _cpu_s(child.pid)
+        rate = link.read(duration_s) / duration_s
+        flying = (_cpu_s(child.pid) - before) / duration_s * 100.0
+        waits = []
+        for at in range(100):
+            link.read(0.0037 * (1 + at % 5))
+            begun = time.perf_counter()
+            link.send("COMMAND_LONG", command=520, param1=1)
+            link.read(1.0, until="COMMAND_ACK")
+            waits.append((time.perf_counter() - begun) * 1000.0)
+        return [
+            near("messages per second, every stream at 4 Hz", rate, 107.0, "1/s"),
+            near("acknowledgement, median", sorted(waits)[50], 5.8, "ms"),
+            at_most("processor, on the ground", idle, 3.0, "% of a core"),
+            at_most("processor, flying, every stream at 4 Hz", flying, 3.0, "% of a core"),
+            at_most("resident memory", _memory_mb(child.pid), 80.0, "MB"),
+        ]
+    finally:
+        child.terminate()
+        child.wait(10)
+
+
+def main() -> None:
+    """Measure and report."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    claims = motion() + speed(20.0 if arguments.quick else 120.0) + process(5.0 if arguments.quick else 20.0)
+    width = max(len(claim.name) for claim in claims)
+    for claim in claims:
+        theirs = "" if claim.theirs is None else f"real {claim.theirs:g}"
+        verdict = "holds" if claim.holds else "MISSED"
+        print(f"{claim.name:<{width}}  {claim.ours:9.2f} {claim.unit:<12} {theirs:<12} {claim.target:<12} {verdict}")
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps({"claims": [claim.as_json() for claim in claims]}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

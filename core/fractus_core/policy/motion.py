@@ -13,6 +13,9 @@ from fractus_core.policy.values import Situation
 
 XY = tuple[float, float]
 
+OVERSHOOT = 0.35
+"""Share of the stopping distance that a drone which turns in flight may overshoot its target by."""
+
 
 def stopping_distance_m(speed_mps: float, accel_mps2: float, position_gain: float) -> float:
     """Distance ArduPilot's position controller needs to stop from a speed.
@@ -95,7 +98,7 @@ class Leg:
     @cached_property
     def ground(self) -> BaseGeometry:
         """The ground below the leg: a triangle, a line or a point."""
-        start, turn, target = self.start, self.turn, self.target
+        start, turn, target = self.start, self.turn, self._beyond
         if start == turn:
             return shapely.Point(start) if start == target else shapely.LineString((start, target))
         if turn == target:
@@ -104,6 +107,16 @@ class Leg:
         if abs(doubled) < 1e-6:
             return shapely.MultiPoint((start, turn, target)).convex_hull
         return shapely.Polygon((start, turn, target))
+
+    @property
+    def _beyond(self) -> XY:
+        """How far the drone may overshoot: one that turns on its way arrives askew and swings past the target."""
+        (tx, ty), (x, y) = self.turn, self.target
+        along = math.hypot(x - tx, y - ty)
+        over = OVERSHOOT * math.hypot(self.stop[0] - self.start[0], self.stop[1] - self.start[1])
+        if over == 0 or along < 1e-6:
+            return self.target
+        return x + (x - tx) / along * over, y + (y - ty) / along * over
 
     @cached_property
     def unavoidable(self) -> BaseGeometry:

@@ -134,6 +134,21 @@ def geojson(frame: LocalFrame, shape: BaseGeometry) -> dict[str, Any]:
     return {"type": "MultiPolygon", "coordinates": coordinates}
 
 
+def geojson_line(points: Sequence[Point]) -> dict[str, Any]:
+    """A polyline as a GeoJSON MultiLineString, lon before lat, cut at the antimeridian (RFC 7946)."""
+    unwrapped: list[tuple[float, float]] = []
+    for p in points:
+        unwrapped.append((_near(p.lon, unwrapped[-1][0]) if unwrapped else p.lon, p.lat))
+    whole = shapely.LineString(unwrapped)
+    lines = []
+    for shift in (0.0, 360.0, -360.0):
+        moved = shapely.transform(whole, lambda c, s=shift: c + np.array([s, 0.0]))
+        inside = moved.intersection(shapely.box(-180.0, -90.0, 180.0, 90.0))
+        lines += [part for part in shapely.get_parts(inside) if part.length > 0]
+    coordinates = [[[round(x, 7), round(y, 7)] for x, y in line.coords] for line in lines]
+    return {"type": "MultiLineString", "coordinates": coordinates}
+
+
 def _unwrapped(frame: LocalFrame, coords: Iterable[tuple[float, ...]]) -> list[tuple[float, float]]:
     """Lon, lat of a ring, each longitude within 180 degrees of its neighbour."""
     out: list[tuple[float, float]] = []

@@ -39,8 +39,8 @@ def distance_m(a: Point, b: Point) -> float:
     chord = math.sqrt(across + up)
     if chord > CHORDS_TO_M:
         return geodesic_m(a, b)
-    if chord == 0:
-        return 0.0
+    if chord < 1e-9:
+        return chord
     equator, pole = SEMI_MAJOR_AXIS_M**-2, (SEMI_MAJOR_AXIS_M * (1 - FLATTENING)) ** -2
     middle, height = ((ax + bx) ** 2 + (ay + by) ** 2) / 4, (az + bz) ** 2 / 4
     depth, slope = middle * equator + height * pole, middle * equator**2 + height * pole**2

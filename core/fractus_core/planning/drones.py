@@ -156,7 +156,7 @@ def _flying_by(draft: Draft, leader: Component) -> list[str]:
             holder = "/".join(flight.holder)
             order = " in this order" if poi.ordered else ""
             message = f"{name} flies for {holder}, which does not visit pointsOfInterest.points[{missed}]{order}"
-            draft.reject(leader, name, Check("PathMissesPoint", message))
+            draft.reject(leader, name, Check("PathMissesPoint", message), far=True)
     return found
 
 

@@ -1,0 +1,70 @@
+"""A plan as GeoJSON features, coloured for map viewers that follow simplestyle."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from fractus_core.api import Application
+from fractus_core.api.geometry import Point
+from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
+from fractus_core.geo import geojson, geojson_line
+from fractus_core.planning import Inventory, Settings, operation_area
+
+_COLOURS = {
+    "drone": "#d62728",
+    "static": "#1f77b4",
+    "hybrid-edge": "#2ca02c",
+    "hybrid-drone": "#ff7f0e",
+}
+
+Feature = dict[str, Any]
+
+
+def plan_map(
+    application: Application, plan: DeploymentPlanSpec, stock: Inventory, settings: Settings
+) -> Iterator[Feature]:
+    """The operation area with a part for each control point, the way, the legs the system flies, and the nodes."""
+    name = "/".join(application.key)
+    area = operation_area(application.spec, stock.depots, settings.safety_radius_m)
+    if plan.operation_area is not None:
+        style = {"fill": "#9467bd", "fill-opacity": 0.25, "stroke": "#9467bd"}
+        yield _feature(plan.operation_area, name, "operationArea", style)
+    if area is not None:
+        if len(area.parts) > 1:
+            for i, part in enumerate(area.parts):
+                shape = geojson(area.frame, part)
+                yield _feature(shape, name, f"controlPoints[{i}]", {"fill-opacity": 0, "stroke": "#8c564b"})
+        if len(area.route) > 1:
+            yield _feature(geojson_line(area.route), name, "route", {"stroke": "#d62728", "stroke-width": 2})
+    for leg in plan.drone.chauffeur if plan.drone is not None else ():
+        yield _feature(geojson_line((leg.start, leg.end)), name, "chauffeur", {"stroke": "#7f7f7f"})
+    for node, instances in _by_node(plan.placements).items():
+        place = _place(node, stock)
+        if place is not None:
+            components = ", ".join(f"{p.component} ({p.role})" for p in instances)
+            colour = next((c for role, c in _COLOURS.items() if any(p.role == role for p in instances)), "#7f7f7f")
+            shape = {"type": "Point", "coordinates": [place.lon, place.lat]}
+            more = {"marker-color": colour, "node": node, "instances": [p.instance for p in instances]}
+            yield _feature(shape, name, components, more)
+
+
+def _feature(geometry: Mapping[str, Any], application: str, title: str, more: Mapping[str, Any]) -> Feature:
+    properties = {"application": application, "title": title, **more}
+    return {"type": "Feature", "properties": properties, "geometry": dict(geometry)}
+
+
+def _by_node(placements: Sequence[PlannedInstance]) -> dict[str, list[PlannedInstance]]:
+    nodes: dict[str, list[PlannedInstance]] = {}
+    for placed in placements:
+        if placed.node is not None:
+            nodes.setdefault(placed.node, []).append(placed)
+    return nodes
+
+
+def _place(node: str, stock: Inventory) -> Point | None:
+    located = stock.located()
+    for index in (located.edge_nodes, located.stands):
+        if node in index:
+            return index.position(node)
+    return None

@@ -1,0 +1,71 @@
+"""A plan as text for people."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+from fractus_core.api import Application
+from fractus_core.api.plans import DeploymentPlanSpec, DroneChoice, PlannedInstance, Rejection
+from fractus_core.planning import Infeasible
+
+_LISTED = 20
+
+
+def plan_table(application: Application, plan: DeploymentPlanSpec) -> str:
+    """Which instance goes where, and which nodes were rejected."""
+    lines = [f"{'/'.join(application.key)}: feasible"]
+    if plan.drone is not None:
+        lines.append(_drone(plan.drone))
+    lines += ["", *_columns(("COMPONENT", "INSTANCE", "NODE", "ROLE", "SERVES", "ADDS"), map(_row, plan.placements))]
+    covered = sum(p.coverage or 0.0 for p in plan.placements if p.role == "hybrid-drone")
+    if covered:
+        lines.append(f"hybrid instances along the way add direct links over {covered:.1%} of the operation area")
+    return "\n".join([*lines, *_rejections(plan.rejected, plan.rejected_omitted or 0), ""])
+
+
+def infeasible_table(application: Application, refusal: Infeasible) -> str:
+    """Why there is no plan."""
+    lines = [f"{'/'.join(application.key)}: infeasible ({refusal.reason})", refusal.message]
+    return "\n".join([*lines, *_rejections(refusal.rejected, 0), ""])
+
+
+def _drone(choice: DroneChoice) -> str:
+    text = f"drone {choice.node}"
+    if choice.shared_with is not None:
+        text += f" comes along with {choice.shared_with}"
+    if choice.mission is not None:
+        mission = choice.mission
+        text += f" flies {mission.distance:.0f} m in {mission.duration:.1f} min of the {mission.available:.1f} it has"
+    if choice.chauffeur:
+        legs = len(choice.chauffeur)
+        text += f"; the system flies {legs} leg{'s' if legs > 1 else ''} of it"
+    if choice.alternatives:
+        text += f"; then {', '.join(a.node for a in choice.alternatives[:3])}"
+    return text
+
+
+def _row(placed: PlannedInstance) -> tuple[str, ...]:
+    node = placed.node or (f"any cloud node, {placed.replicas} replicas" if placed.replicas > 1 else "any cloud node")
+    serves = f"{placed.serves.component} on {placed.serves.node}" if placed.serves is not None else ""
+    adds = f"{placed.coverage:.1%}" if placed.coverage is not None else ""
+    return (placed.component, placed.instance, node, placed.role, serves, adds)
+
+
+def _rejections(rejected: Sequence[Rejection], omitted: int) -> list[str]:
+    if not rejected:
+        return []
+    rows = [(r.component, r.node, r.reason, r.message) for r in rejected[:_LISTED]]
+    lines = ["", *_columns(("REJECTED FOR", "NODE", "REASON", "MESSAGE"), rows)]
+    hidden = len(rejected) - len(rows) + omitted
+    if hidden:
+        counts = Counter(r.reason for r in rejected[_LISTED:])
+        why = ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items()))
+        lines.append(f"and {hidden} more{f' ({why})' if why else ''}; see -o yaml")
+    return lines
+
+
+def _columns(titles: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> list[str]:
+    table = [titles, *rows]
+    widths = [max(len(row[i]) for row in table) for i in range(len(titles))]
+    return ["   ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]

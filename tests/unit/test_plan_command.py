@@ -1,0 +1,253 @@
+"""`fractus plan`: what it prints, how it exits, and the sentence for what it cannot read."""
+
+import json
+import pathlib
+
+import pytest
+import yaml
+from click.testing import CliRunner
+from fractus_core.api import DeploymentPlan
+from fractus_core.planning import plan as decide
+from fractus_operator.commands import plan as command
+from fractus_operator.commands.manifests import read_manifests
+from test_planning import (
+    CHECKER,
+    PATH,
+    STORE,
+    VIEWER,
+    application,
+    at,
+    component,
+    drone,
+    edge,
+    manifest,
+    navigator,
+    nodes_of,
+)
+
+EXAMPLE = pathlib.Path(__file__).parents[2] / "examples" / "traffic-monitoring"
+DEPOT = manifest("Depot", "base", {"location": at(0, 0), "radius": 20})
+VISITS = [at(120, 0), at(250, 3)]
+
+
+def spec_only(resource):
+    body = resource.to_dict()
+    return {k: body[k] for k in ("apiVersion", "kind", "spec")} | {"metadata": {"name": resource.name}}
+
+
+def named(app, name):
+    body = spec_only(app)
+    return body | {"metadata": {"name": name}}
+
+
+TRAFFIC = named(application(navigator(PATH), VIEWER, CHECKER, STORE), "traffic")
+SCENE = [DEPOT, spec_only(drone("d1")), spec_only(drone("d2")), spec_only(edge("e1", (150, 0)))]
+
+
+def node(name, node_class, cpu="4", **more):
+    status = {"allocatable": {"cpu": cpu}, "conditions": [{"type": "Ready", "status": "True"}]}
+    return {
+        "apiVersion": "v1",
+        "kind": "Node",
+        "metadata": {"name": name, "labels": {"fractus.dev/class": node_class}},
+        "status": status,
+        **more,
+    }
+
+
+def write(path, objects):
+    path.write_text(yaml.safe_dump_all(objects))
+    return path
+
+
+@pytest.fixture
+def run(tmp_path):
+    def invoke(objects, *options):
+        file = write(tmp_path / "all.yaml", objects)
+        return CliRunner().invoke(command.plan, ["-f", str(file), *options])
+
+    return invoke
+
+
+def test_table_says_who_goes_where(run):
+    result = run([*SCENE, TRAFFIC])
+    assert result.exit_code == 0, result.output
+    lines = result.output.splitlines()
+    assert lines[0] == "default/traffic: feasible"
+    assert lines[1].startswith("drone d1 flies ")
+    assert any(line.split()[:4] == ["ImageChecker", "traffic-image-checker-e1", "e1", "hybrid-drone"] for line in lines)
+    assert any("any cloud node, 3 replicas" in line for line in lines)
+
+
+@pytest.mark.parametrize(("output", "read"), [("yaml", yaml.safe_load), ("json", json.loads)])
+def test_the_plan_is_the_one_that_the_operator_would_write(run, tmp_path, output, read):
+    result = run([*SCENE, TRAFFIC], "-o", output)
+    assert result.exit_code == 0
+    printed = DeploymentPlan.from_body(read(result.stdout))
+    manifests = read_manifests([tmp_path / "all.yaml"])
+    assert printed.spec == decide(manifests.applications()[0], manifests.inventory())
+    assert (printed.name, printed.metadata.namespace) == ("traffic", "default")
+
+
+def test_geojson_has_area_way_and_nodes(run):
+    result = run([*SCENE, TRAFFIC], "-o", "geojson")
+    collection = json.loads(result.stdout)
+    assert collection["type"] == "FeatureCollection"
+    kinds = {f["properties"]["title"]: f["geometry"]["type"] for f in collection["features"]}
+    assert kinds["operationArea"] == "MultiPolygon"
+    assert kinds["route"] == "MultiLineString"
+    points = {f["properties"]["node"]: f for f in collection["features"] if f["geometry"]["type"] == "Point"}
+    assert set(points) == {"d1", "e1"}
+    assert points["e1"]["geometry"]["coordinates"] == pytest.approx([at(150, 0)["lon"], at(150, 0)["lat"]])
+
+
+def test_infeasible_exits_2_with_the_reasons(run):
+    result = run([DEPOT, spec_only(edge("e1", (150, 0))), TRAFFIC])
+    assert result.exit_code == 2
+    assert "default/traffic: infeasible (NoDrone)" in result.output
+    result = run([DEPOT, spec_only(drone("d", minutes=2)), TRAFFIC], "-o", "yaml")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "FlightTooLong" not in result.stderr
+    assert "the mission takes" in result.stderr
+
+
+def test_two_applications_never_get_one_drone(run):
+    result = run(
+        [
+            DEPOT,
+            spec_only(drone("d1")),
+            named(application(navigator(PATH)), "a"),
+            named(application(navigator(PATH)), "b"),
+        ]
+    )
+    assert result.exit_code == 2
+    assert "default/a: feasible" in result.output
+    assert "default/b: infeasible (DroneBusy)" in result.output
+
+
+def test_passengers_come_along_with_a_driver_of_the_same_manifests(run):
+    guest = named(application(VIEWER | {"egress": [], "pointsOfInterest": {"points": VISITS}}), "a-guest")
+    result = run([DEPOT, spec_only(drone("d1")), guest, named(application(navigator(PATH)), "host")], "-o", "json")
+    assert result.exit_code == 0, result.output
+    plans = {p["metadata"]["name"]: p["spec"] for p in json.loads(result.stdout)["items"]}
+    assert plans["a-guest"]["drone"]["sharedWith"] == "default/host"
+    against = named(application(VIEWER | {"egress": [], "pointsOfInterest": {"points": VISITS[::-1]}}), "a-guest")
+    result = run([DEPOT, spec_only(drone("d1")), against, named(application(navigator(PATH)), "host")])
+    assert "default/a-guest: infeasible (DroneBusy)" in result.output
+
+
+def test_nodes_give_resources_and_readiness(run):
+    cloud, flying = node("c", "cloud"), node("d1", "drone")
+    result = run([*SCENE, TRAFFIC, cloud, flying, node("e1", "edge", cpu="50m")], "-o", "yaml")
+    plan = DeploymentPlan.from_body(yaml.safe_load(result.stdout)).spec
+    assert nodes_of(plan, "ImageChecker") == [None]
+    assert {(r.node, r.reason) for r in plan.rejected} == {("e1", "InsufficientResources"), ("d2", "NodeMissing")}
+    result = run([*SCENE, TRAFFIC, flying])
+    assert "infeasible (NoCloudNode)" in result.output
+    result = run([*SCENE, TRAFFIC, cloud, flying | {"spec": {"unschedulable": True}}])
+    assert "d1 is cordoned" in result.output
+
+
+def test_bookings_of_one_application_are_seen_by_the_next(run):
+    big = component("Big", "edge", locations=[{"center": at(150, 0), "radius": 10}])
+    big["container"]["resources"] = {"requests": {"cpu": "3"}}
+    result = run([SCENE[3], node("e1", "edge"), *(named(application(big), n) for n in ("one", "two"))])
+    assert "default/one: feasible" in result.output
+    assert "default/two: infeasible (NoEdgeNode)" in result.output
+    assert "cpu: 3 asked, 1 free" in result.output
+
+
+def test_a_plan_in_force_is_kept(run, tmp_path):
+    first = run([*SCENE[:2], TRAFFIC], "-o", "yaml").stdout.replace("d1", "d2")
+    result = run([*SCENE, TRAFFIC, yaml.safe_load(first)], "-o", "yaml")
+    assert DeploymentPlan.from_body(yaml.safe_load(result.stdout)).spec.drone.node == "d2"
+
+
+def test_the_example_is_feasible():
+    result = CliRunner().invoke(
+        command.plan,
+        [
+            "-f",
+            str(EXAMPLE / "application.yaml"),
+            *map(
+                str,
+                (EXAMPLE / f for f in ("depot.yaml", "drone.yaml", "edge-nodes.yaml", "policies.yaml", "zones.yaml")),
+            ),
+        ],
+    )
+    assert result.exit_code == 0, result.output
+    assert "drone drone-1 flies" in result.output
+
+
+def test_other_kinds_and_other_files_of_a_directory_are_passed_over(tmp_path):
+    (tmp_path / "deep").mkdir()
+    write(
+        tmp_path / "deep" / "scene.yml", [*SCENE, {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": "x"}}]
+    )
+    write(tmp_path / "values.yaml", [{"replicas": 1}])
+    (tmp_path / "list.json").write_text(json.dumps({"apiVersion": "v1", "kind": "List", "items": [TRAFFIC]}))
+    result = CliRunner().invoke(command.plan, ["-f", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+
+
+SELECTS = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["nowhere"]}}
+BOW_TIE = [{"lat": 0, "lon": 0}, {"lat": 1e-3, "lon": 1e-3}, {"lat": 0, "lon": 1e-3}, {"lat": 1e-3, "lon": 0}]
+
+
+@pytest.mark.parametrize(
+    ("objects", "sentence"),
+    [
+        ([DEPOT], "there is no Application in the manifests"),
+        ([{"replicas": 1}], "a document has no kind"),
+        ([{"kind": "Drone", "metadata": {}}], "Drone: metadata.name: give the object a name"),
+        ([manifest("Drone", "d", {"depo": "base"})], "Drone d: spec.depo: extra inputs are not permitted"),
+        ([TRAFFIC | {"spec": {"components": []}}], "Application traffic: spec.components: "),
+        ([TRAFFIC], "Application traffic: spec.components[0].controlPoints[0].point.depot: there is no Depot base"),
+        ([DEPOT, DEPOT], "Depot base: metadata.name: "),
+        ([node("n", "edge", cpu="lots")], "Node n: status.allocatable.cpu: 'lots' is not a quantity"),
+        ([manifest("Policy", "p", SELECTS)], "p: spec.selector.zones[0]: there is no Zone nowhere"),
+        (
+            [manifest("Zone", "z", {"area": {"polygon": {"exterior": BOW_TIE}}})],
+            "z: spec.area.polygon.exterior: the ring crosses itself",
+        ),
+    ],
+)
+def test_bad_input_exits_1_with_one_sentence_that_names_file_object_and_field(run, objects, sentence):
+    result = run(objects)
+    assert result.exit_code == 1
+    assert result.stdout == ""
+    assert sentence in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert sentence.startswith("there is no App") or "all.yaml: " in result.stderr
+
+
+def test_broken_yaml_and_json_name_the_line(tmp_path):
+    bad_yaml, bad_json = tmp_path / "bad.yaml", tmp_path / "bad.json"
+    bad_yaml.write_text("kind: Drone\n  metadata: [")
+    bad_json.write_text('{\n"kind": }')
+    for file, line in ((bad_yaml, 2), (bad_json, 2)):
+        result = CliRunner().invoke(command.plan, ["-f", str(file)])
+        assert result.exit_code == 1
+        assert f"{file}:{line}: " in result.stderr
+    result = CliRunner().invoke(command.plan, ["-f", str(tmp_path / "bad.yaml"), "--ranking", "best"])
+    assert result.exit_code == 1
+
+
+def test_unknown_plug_in_is_named(run):
+    result = run([*SCENE, TRAFFIC], "--ranking", "best")
+    assert result.exit_code == 1
+    assert "--ranking: there is no plug-in best" in result.stderr
+
+
+def test_plug_ins_are_entry_points(run, monkeypatch):
+    class Entry:
+        name, value = "last", "module:last"
+
+        def load(self):
+            return lambda facts: facts.drone.name == "d2"
+
+    monkeypatch.setattr(
+        command.importlib.metadata, "entry_points", lambda group: [Entry()] if group == "fractus.planning" else []
+    )
+    result = run([*SCENE, TRAFFIC], "--ranking", "last")
+    assert "drone d2 flies" in result.output

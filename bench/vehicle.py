@@ -116,8 +116,8 @@ def speed(flight_s: float) -> list[Claim]:
 
 
 def _order(pilot: Pilot, command: int, *params: float) -> dict[str, float]:
-    values = {f"param{at}": float(value) for at, value in enumerate(params, start=1)}
-    return {"target_system": pilot.craft.config.sysid, "target_component": 1, "command": command} | values
+    values: dict[str, float] = {f"param{at}": float(value) for at, value in enumerate(params, start=1)}
+    return values | {"target_system": pilot.craft.config.sysid, "target_component": 1, "command": command}
 
 
 def _cpu_s(pid: int) -> float:

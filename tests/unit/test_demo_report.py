@@ -80,7 +80,7 @@ def test_a_takeover_is_told_with_the_requests() -> None:
 def test_the_page_shows_corrections_refusals_placements_and_the_chain(record: Record) -> None:
     page = summary(record)
     assert page.startswith("# Flight of traffic-monitoring\n\n**Completed.** drone-1 flew 79")
-    assert "policies corrected 2 and refused 3" in page
+    assert "policies corrected 2 and refused 3. 0 pictures were checked and kept" in page
     for row in (
         "| Goto 50.865633, 4.680631, 70 m | corrected | town-altitude | AltitudeAboveLimit: ",
         "| Goto 50.865992, 4.679565, 20 m | refused | no-fly-hospital, operation-area | InsideExclusionZone: ",

@@ -11,10 +11,10 @@ from typing import Any
 from fractus_services.audit import Finding, verify
 
 from fractus_sim.demo.kube import NAMESPACE, SYSTEM, DemoError, Kube, Object
-from fractus_sim.demo.report.record import AUDIT, OBJECTS
+from fractus_sim.demo.report.record import AUDIT, CAMERA_AUDIT, OBJECTS
 from fractus_sim.demo.watch import Mission
 
-AUDIT_PATH = "/var/lib/fractus/audit/mobility.jsonl"
+LOGS = {AUDIT: "/var/lib/fractus/audit/mobility.jsonl", CAMERA_AUDIT: "/var/lib/fractus/audit/camera.jsonl"}
 _KINDS = "applications,deploymentplans,depots,drones,edgenodes,policies,zones"
 _KEPT = re.compile(rb"\[pod/[^/]+/data-store\] .* kept ")
 
@@ -29,7 +29,7 @@ def collect(kube: Kube, mission: Mission, folder: Path, logs: Path) -> None:
     events = [
         event for event in kube.objects("events") if mission.application in event["involvedObject"].get("name", "")
     ]
-    audit = _audit(kube, mission, folder / AUDIT)
+    audit = _audit(kube, mission, folder)
     content = {
         "objects": objects,
         "pods": list(mission.pods.values()),
@@ -46,22 +46,26 @@ def _concerns(body: Object, application: str) -> bool:
     return own or (body["metadata"]["name"] == application and body["metadata"].get("namespace") == NAMESPACE)
 
 
-def _audit(kube: Kube, mission: Mission, path: Path) -> dict[str, Any]:
-    """Fetch the drone's log, check its chain, and keep what is of this mission."""
-    path.write_bytes(b"")
+def _audit(kube: Kube, mission: Mission, folder: Path) -> dict[str, Any]:
+    """Fetch the drone's logs, check their chains, and keep what is of this mission."""
+    found: dict[str, Any] = {"entries": 0, "kept": 0, "problem": ""}
     if not mission.drone:
         return {}
     try:
-        text = kube.run(
-            "exec", "-n", SYSTEM, _mobility_pod(kube, mission.drone), "--", "cat", AUDIT_PATH, timeout_s=120.0
-        )
+        pod = _mobility_pod(kube, mission.drone)
+        for name, path in LOGS.items():
+            command = f"cat {path} 2>/dev/null || test ! -e {path}"
+            text = kube.run("exec", "-n", SYSTEM, pod, "--", "sh", "-c", command, timeout_s=120.0)
+            lines = text.encode().splitlines(keepends=True)
+            kept = [line for line in lines if line.endswith(b"\n") and of_mission(line, mission.times["applied"])]
+            (folder / name).write_bytes(b"".join(kept))
+            finding = verify(lines)
+            found["entries"] += finding.entries
+            found["kept"] += len(kept)
+            found["problem"] = found["problem"] or _problem(path, finding)
     except DemoError as error:
-        return {"entries": 0, "kept": 0, "problem": f"it could not be fetched: {error}"}
-    lines = text.encode().splitlines(keepends=True)
-    finding = verify(lines)
-    kept = [line for line in lines if line.endswith(b"\n") and of_mission(line, mission.times["applied"])]
-    path.write_bytes(b"".join(kept))
-    return {"entries": finding.entries, "kept": len(kept), "problem": _problem(finding)}
+        found["problem"] = f"it could not be fetched: {error}"
+    return found
 
 
 def of_mission(line: bytes, applied_s: float) -> bool:
@@ -72,8 +76,8 @@ def of_mission(line: bytes, applied_s: float) -> bool:
         return False
 
 
-def _problem(finding: Finding) -> str:
-    return f"line {finding.line} {finding.problem}" if finding.problem else ""
+def _problem(path: str, finding: Finding) -> str:
+    return f"line {finding.line} of {path} {finding.problem}" if finding.problem else ""
 
 
 def _mobility_pod(kube: Kube, node: str) -> str:

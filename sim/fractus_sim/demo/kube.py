@@ -39,9 +39,9 @@ class Kube:
         """
         return self._run(self.kubectl, arguments, stdin, timeout_s)
 
-    def objects(self, kinds: str, *arguments: str) -> list[Object]:
-        """Objects of the kinds (comma-separated) in the default namespace, or of the whole cluster."""
-        text = self.run("get", kinds, "-n", NAMESPACE, "-o", "json", *arguments)
+    def objects(self, kinds: str, namespace: str = NAMESPACE) -> list[Object]:
+        """Objects of the kinds (comma-separated) in a namespace, or of the whole cluster where they have none."""
+        text = self.run("get", kinds, "-n", namespace, "-o", "json")
         return list(json.loads(text)["items"])
 
     def apply(self, objects: Sequence[Object]) -> None:

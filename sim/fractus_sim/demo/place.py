@@ -38,7 +38,13 @@ def documents(path: Path) -> list[Object]:
 
 
 class Place(Protocol):
-    """A cluster that the demo can use."""
+    """A cluster that the demo can use.
+
+    Attributes:
+        disposable: nobody else uses it: pods may be restarted, and it goes away with all that is on it.
+    """
+
+    disposable: bool
 
     def images(self) -> None:
         """Build what the nodes will run."""
@@ -58,6 +64,7 @@ class Embedded:
     """A cluster on this machine; taken down again unless it ran before."""
 
     say: Say
+    disposable: bool = True
     built: list[str] = field(default_factory=list)
     _cluster: Cluster | None = None
     _was_running: bool = False
@@ -90,6 +97,7 @@ class Current:
 
     say: Say
     given: Mapping[str, str]
+    disposable: bool = False
     _assigned: Mapping[str, str] = field(default_factory=dict)
 
     def images(self) -> None:

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from fractus_sim.cluster import ClusterError
 from fractus_sim.demo.collect import collect
-from fractus_sim.demo.kube import DemoError, Kube, Object
+from fractus_sim.demo.kube import SYSTEM, DemoError, Kube, Object
 from fractus_sim.demo.place import EXAMPLE, ROOT, Place, documents
 from fractus_sim.demo.report import Record, write_report
 from fractus_sim.demo.report.summary import figures
@@ -35,7 +35,9 @@ class Teller:
 
     def __call__(self, line: str) -> None:
         """Say something for good."""
-        self._console.print(f"[dim]{time.monotonic() - self._start:7.1f} s[/dim]  {_escaped(line)}", highlight=False)
+        self._console.print(
+            f"[dim]{time.monotonic() - self._start:7.1f} s[/dim]  {_escaped(line)}", highlight=False, soft_wrap=True
+        )
 
     def show(self, line: str) -> None:
         """Say what is so at the moment."""
@@ -84,42 +86,43 @@ class Demo:
             ClusterError: the embedded cluster could not be brought up.
         """
         self.out.mkdir(parents=True, exist_ok=True)
-        for stale in ("objects.json", "audit.jsonl", "events.json", LOGS):
+        for stale in ("objects.json", "audit.jsonl", "camera-audit.jsonl", "events.json", LOGS):
             (self.out / stale).unlink(missing_ok=True)
         kube: Kube | None = None
         installed: list[str] = []
-        applied: list[Object] = []
         try:
             with self.tell.step("images"):
                 self.place.images()
             with self.tell.step("cluster"):
                 kube = self.place.up()
+            with self.tell.step("what an earlier run left"):
+                self._remove_application(kube)
             with self.tell.step("Fractus"):
-                installed += self._install(kube)
-            return self._fly(kube, applied)
+                self._install(kube, installed)
+            return self._fly(kube)
         finally:
             if not self.keep:
                 with self.tell.step("cleaning up"):
-                    self._clean_up(kube, applied, installed)
+                    self._clean_up(kube, installed)
 
-    def _install(self, kube: Kube) -> list[str]:
-        fresh = [release for release in RELEASES if kube.install(release, ROOT / "charts" / release)]
+    def _install(self, kube: Kube, installed: list[str]) -> None:
+        installed.extend(release for release in RELEASES if kube.install(release, ROOT / "charts" / release))
+        if self.place.disposable and "fractus" not in installed:  # images of the same name may have new content
+            kube.run(
+                "delete", "pods", "-n", SYSTEM, "-l", "app.kubernetes.io/name=fractus", "--timeout=60s", timeout_s=90
+            )
         hardware = self.place.hardware(kube)
         if hardware:
             kube.apply(hardware)
         kube.apply(self._surroundings())
-        wait_ready(kube, None, READY_TIMEOUT_S, self.tell.show)
-        return fresh
+        wait_ready(kube, READY_TIMEOUT_S, self.tell.show)
 
     def _surroundings(self) -> list[Object]:
         return [body for name in ("depot.yaml", "zones.yaml", "policies.yaml") for body in documents(EXAMPLE / name)]
 
-    def _fly(self, kube: Kube, applied: list[Object]) -> bool:
+    def _fly(self, kube: Kube) -> bool:
         application = documents(EXAMPLE / "application.yaml")
         mission = Mission(application[0]["metadata"]["name"])
-        with self.tell.step("application of an earlier run"):
-            kube.delete(application, HOME_TIMEOUT_S)
-        applied += application
         logs = self.out / LOGS
         with self.tell.step("mission"):
             mission.times["applied"] = time.time()
@@ -132,24 +135,30 @@ class Demo:
                 write_report(record, self.out)
         return _as_promised(record, self.tell)
 
-    def _clean_up(self, kube: Kube | None, applied: list[Object], installed: list[str]) -> None:
-        if kube is not None:
+    def _clean_up(self, kube: Kube | None, installed: list[str]) -> None:
+        if kube is not None and not self.place.disposable:
             try:
-                self._remove(kube, applied, installed)
+                self._remove(kube, installed)
             except DemoError as error:
                 self.tell(f"not removed: {error}")
         self.place.down()
 
-    def _remove(self, kube: Kube, applied: list[Object], installed: list[str]) -> None:
-        if applied:
-            kube.delete(applied, HOME_TIMEOUT_S)
-            deadline = time.monotonic() + HOME_TIMEOUT_S
-            while time.monotonic() < deadline:
-                states = {(body.get("status") or {}).get("flightState") for body in kube.objects("drones")}
-                if states <= {*GROUNDED, None}:
-                    break
-                self.tell.show("waiting for the drone to land")
-                time.sleep(1.0)
+    def _remove_application(self, kube: Kube) -> None:
+        """Delete the application and wait until no drone is in the air."""
+        if "applications.fractus.dev" not in kube.run("get", "crd", "-o", "name"):
+            return
+        kube.delete(documents(EXAMPLE / "application.yaml"), HOME_TIMEOUT_S)
+        deadline = time.monotonic() + HOME_TIMEOUT_S
+        while time.monotonic() < deadline:
+            states = {(body.get("status") or {}).get("flightState") for body in kube.objects("drones")}
+            if states <= {*GROUNDED, None}:
+                return
+            self.tell.show("waiting for the drone to land")
+            time.sleep(1.0)
+        raise DemoError(f"a drone is still in the air {HOME_TIMEOUT_S:.0f} s after its application was deleted")
+
+    def _remove(self, kube: Kube, installed: list[str]) -> None:
+        self._remove_application(kube)
         if "fractus" in installed:
             kube.delete([*self._surroundings(), *self.place.hardware(kube)], 60.0)
         for release in reversed(installed):

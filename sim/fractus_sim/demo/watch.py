@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from fractus_sim.demo.kube import NAMESPACE, DemoError, Kube, Object
+from fractus_sim.demo.kube import NAMESPACE, SYSTEM, DemoError, Kube, Object
 
 POLL_S = 0.5
 LANDING_TIMEOUT_S = 180.0
@@ -138,8 +138,8 @@ def follow(kube: Kube, mission: Mission, logs: Path, *, timeout_s: float, say: S
                 tail.wait(timeout=10)
 
 
-def wait_ready(kube: Kube, drone: str | None, timeout_s: float, show: Say) -> None:
-    """Wait until a drone reports that it can fly.
+def wait_ready(kube: Kube, timeout_s: float, show: Say) -> None:
+    """Wait until some drone reports that it can fly.
 
     Raises:
         DemoError: it did not in time; the message carries its condition.
@@ -148,15 +148,25 @@ def wait_ready(kube: Kube, drone: str | None, timeout_s: float, show: Say) -> No
     reason = "no Drone has registered"
     while time.monotonic() < deadline:
         for body in kube.objects("drones"):
-            if drone is not None and body["metadata"]["name"] != drone:
-                continue
             ready = [c for c in (body.get("status") or {}).get("conditions", ()) if c["type"] == "Ready"]
             if ready and ready[0]["status"] == "True":
                 return
             reason = f"{body['metadata']['name']}: " + (ready[0].get("message") if ready else "has not reported yet")
         show(reason)
         time.sleep(POLL_S)
-    raise DemoError(f"no drone was ready within {timeout_s:.0f} s ({reason}); see: kubectl -n fractus-system get pods")
+    sick = "; ".join(_sick(kube)) or "see: kubectl -n fractus-system get pods"
+    raise DemoError(f"no drone was ready within {timeout_s:.0f} s ({reason}); {sick}")
+
+
+def _sick(kube: Kube) -> list[str]:
+    """Pods of the system that do not get up, with the reason."""
+    found = []
+    for pod in kube.objects("pods", SYSTEM):
+        for container in pod.get("status", {}).get("containerStatuses", ()):
+            waiting = container.get("state", {}).get("waiting", {})
+            if waiting.get("reason") in {"CrashLoopBackOff", "ErrImageNeverPull", "ImagePullBackOff", "ErrImagePull"}:
+                found.append(f"pod {pod['metadata']['name']} is in {waiting['reason']}")
+    return found
 
 
 def _tell(logs: Path, start: int, say: Say) -> int:

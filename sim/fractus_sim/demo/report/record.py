@@ -16,7 +16,7 @@ from fractus_core.api.geometry import Point
 from fractus_core.geo import LocalFrame, geodesic_m
 from fractus_core.policy.grants import node_attributes, selects
 
-OBJECTS, AUDIT = "objects.json", "audit.jsonl"
+OBJECTS, AUDIT, CAMERA_AUDIT = "objects.json", "audit.jsonl", "camera-audit.jsonl"
 _DECIDED = {"correct", "deny", "takeover"}
 _KINDS: tuple[type[Resource], ...] = (Application, DeploymentPlan, Depot, Drone, EdgeNode, Policy, Zone)
 
@@ -105,6 +105,7 @@ class Record:
     samples: tuple[Sample, ...]
     judgements: tuple[Judgement, ...]
     calls: int
+    results: int = 0
     audit: Mapping[str, Any] = field(default_factory=dict)
     times: Mapping[str, float] = field(default_factory=dict)
 
@@ -117,7 +118,7 @@ class Record:
             ValueError: a file is not what the demo writes.
         """
         content = json.loads((folder / OBJECTS).read_text())
-        return cls.of(content, _lines(folder / AUDIT))
+        return cls.of(content, [*_lines(folder / AUDIT), *_lines(folder / CAMERA_AUDIT)])
 
     @classmethod
     def of(cls, content: Mapping[str, Any], audit: Iterable[Mapping[str, Any]]) -> Record:
@@ -125,7 +126,7 @@ class Record:
 
         Args:
             content: `objects` (manifests as the API server has them), `pods`, `events`, `times`, `audit`.
-            audit: entries of the mobility service's audit log: calls, takeovers, and the flight recorder.
+            audit: entries of the drone's audit logs: calls, takeovers, and the flight recorder.
         """
         found: dict[str, list[Any]] = {kind.KIND: [] for kind in _KINDS}
         parsers = {kind.KIND: kind for kind in _KINDS}
@@ -149,6 +150,7 @@ class Record:
             samples=_flight(_sample(e) for e in entries if _has_state(e)),
             judgements=_merged(judged),
             calls=sum(e.get("kind") == "call" for e in entries),
+            results=content.get("results", 0),
             audit=content.get("audit", {}),
             times=content.get("times", {}),
         )

@@ -44,6 +44,7 @@ def figures(record: Record) -> dict[str, Any]:
         "message": status.message if status else None,
         "drone": record.drone.name if record.drone else None,
         "calls": record.calls,
+        "pictures": record.results,
         "corrected": sum(j.count for j in record.judgements if not j.refused),
         "refused": sum(j.count for j in record.judgements if j.refused),
         "flight_s": _round(_span(record.takeoff_s, record.landing_s)),
@@ -90,7 +91,7 @@ def _headline(record: Record) -> str:
     return (
         f"**{phase}.** {drone} flew {record.distance_m:.0f} m{took}, up to {record.max_altitude_m:.1f} m high and"
         f" {record.max_speed_mps:.1f} m/s fast, and {end}. Of {record.calls} calls, policies corrected {corrected}"
-        f" and refused {refused}."
+        f" and refused {refused}. {record.results} pictures were checked and kept."
     )
 
 
@@ -108,9 +109,10 @@ def _durations(record: Record) -> list[tuple[str, float]]:
         ("all pods Running", record.times.get("running")),
         ("takeoff", record.takeoff_s),
         ("landed", record.landing_s),
-        ("phase Completed or Failed", record.times.get("ended")),
+        ("mission over, flying home", record.times.get("ended")),
     ]
-    return [(name, at - start) for name, at in marks if at is not None]
+    known = [(name, at - start) for name, at in marks if at is not None]
+    return sorted(known, key=lambda mark: mark[1])
 
 
 def _judged(judgements: Sequence[Judgement]) -> str:

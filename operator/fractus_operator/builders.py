@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -22,6 +23,7 @@ from fractus_operator.kinds import (
 )
 from fractus_operator.labels import (
     APPLICATION_LABEL,
+    CAUSE_ANNOTATION,
     CLASS_LABEL,
     COMPONENT_LABEL,
     INSTANCE_LABEL,
@@ -141,7 +143,16 @@ def deployment(application: Application, placed: PlannedInstance, drone: Drone |
             "spec": _pod_spec(application, component, placed, drone),
         },
     }
-    return _child(DEPLOYMENT, application, placed.instance, _location_labels(component, placed), spec=spec)
+    body = _child(DEPLOYMENT, application, placed.instance, _location_labels(component, placed), spec=spec)
+    body["metadata"]["annotations"] = {CAUSE_ANNOTATION: f"{_wish(application, component)}@{placed.node or 'cloud'}"}
+    return body
+
+
+def _wish(application: Application, component: Component) -> str:
+    """A digest of what the manifest says that concerns a component's pods."""
+    called = [application.spec.component(name).container.ports for name in component.egress]
+    said = [component.to_dict(), [[port.port for port in ports] for ports in called]]
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def application_status(application: Body, status: Body) -> Body:

@@ -19,9 +19,9 @@ from fractus_operator import builders, kinds
 from fractus_operator.authority import Authority
 from fractus_operator.children import Children, NameTaken
 from fractus_operator.conditions import Fact, merge
-from fractus_operator.inventory import SETTLED, LiveInventory, Submitted
-from fractus_operator.kinds import Body, Key, Kind
-from fractus_operator.labels import FINALIZER
+from fractus_operator.inventory import SETTLED, LiveInventory, Submitted, is_flying
+from fractus_operator.kinds import Body, Key, Kind, key_of
+from fractus_operator.labels import CAUSE_ANNOTATION, FINALIZER
 from fractus_operator.missions import (
     Hindered,
     Phase,
@@ -44,6 +44,10 @@ _REFUSALS = frozenset({400, 403, 422})
 
 EXCLUSION = timedelta(minutes=5)
 """How long a node that the scheduler refused is left out of an application's plans."""
+
+
+class BeingDeleted(Exception):
+    """The application is on its way out: there is nothing more to reconcile."""
 
 
 @dataclass
@@ -83,18 +87,23 @@ class Deployments:
 
         Returns:
             In how many seconds to run again if nothing changes before.
+
+        Raises:
+            BeingDeleted: the application is being deleted.
         """
         submitted = self._live.applications.get(key)
         if submitted is None:
             return RESYNC_S
         metadata = submitted.metadata
+        if metadata.deletion_timestamp:
+            raise BeingDeleted
         # Without the finalizer nothing is made: a deletion now would leave grants behind.
-        if metadata.deletion_timestamp or FINALIZER not in metadata.finalizers or metadata.uid in self._torn_down:
+        if FINALIZER not in metadata.finalizers:
             return RESYNC_S
         memory = self._memories.setdefault(key, _Memory())
         async with memory.lock:
             if metadata.uid in self._torn_down:
-                return RESYNC_S
+                raise BeingDeleted
             standing, again_s = await self._advance(key, submitted, memory)
             if standing is not None:
                 await self._report(submitted, standing, memory)
@@ -205,16 +214,29 @@ class Deployments:
                 instances = builders.base_instances(decided, component)
                 bases = [pod for pod in pods if pod.instance in instances]
                 wanted[kinds.ENDPOINT_SLICE].append(builders.endpoint_slice(application, component, bases))
-        drones = self._live.snapshot().drones
         for placed in decided.placements:
-            drone = drones.get(placed.node) if placed.node is not None else None
+            drone = self._live.drones.get(("", placed.node)) if placed.node is not None else None
             wanted[kinds.DEPLOYMENT].append(builders.deployment(application, placed, drone))
         secrets = {builders.secret_name(placed.instance): placed for placed in decided.placements}
         await self._children.prune(application, wanted, keep_secrets=secrets.keys())
         for placed in secrets.values():
             wanted[kinds.SECRET].append(await self._certificate(application, placed))
+        wanted[kinds.DEPLOYMENT] = [body for body in wanted[kinds.DEPLOYMENT] if not self._in_the_air(body, decided)]
         for kind in kinds.CHILDREN:
             await self._children.apply(application, kind, wanted[kind])
+
+    def _in_the_air(self, desired: Body, decided: DeploymentPlanSpec) -> bool:
+        """Whether a Deployment is left alone: its drone flies, and its owner has asked for no change.
+
+        So no upgrade of the operator, which may build pods in another way, restarts a driver in flight.
+        """
+        drone = self._live.drones.get(("", decided.drone.node)) if decided.drone is not None else None
+        observed = self._live.children[kinds.DEPLOYMENT].get(key_of(desired))
+        if drone is None or observed is None or not is_flying(drone):
+            return False
+        cause = str(desired["metadata"]["annotations"][CAUSE_ANNOTATION])
+        present = (observed["metadata"].get("annotations") or {}).get(CAUSE_ANNOTATION)
+        return cause == present and cause.rpartition("@")[2] == drone.name
 
     async def _certificate(self, application: Application, placed: PlannedInstance) -> Body:
         """The Secret of an instance: the present certificate while it is good, so that a restart renews nothing."""

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import logging
+import os
 import random
 from typing import Any
 
 import kopf
 
-from fractus_operator.deployments import Deployments
+from fractus_operator.deployments import BeingDeleted, Deployments
 from fractus_operator.inventory import LiveInventory
 from fractus_operator.kinds import APPLICATION, Key
 from fractus_operator.labels import FINALIZER
@@ -29,7 +31,12 @@ def register(registry: kopf.OperatorRegistry, live: LiveInventory, deployments: 
     @kopf.on.login(registry=registry, retries=3)
     def login(**kwargs: Any) -> kopf.ConnectionInfo | None:
         """Use the credentials that the store uses; called again when they expire."""
-        return kopf.login_with_service_account(**kwargs) or kopf.login_with_kubeconfig(**kwargs)
+        return _by_address(kopf.login_with_service_account(**kwargs)) or kopf.login_with_kubeconfig(**kwargs)
+
+    @kopf.on.probe(registry=registry, id="silence_s")
+    def silence(**_: object) -> float:
+        """Tell, at the liveness endpoint, for how long the quietest watch has heard nothing."""
+        return round(max(reflector.age_s() for reflector in live.reflectors()), 1)
 
     @kopf.daemon(group, version, APPLICATION.plural, registry=registry, backoff=_RETRY_S, cancellation_timeout=5.0)
     async def application(namespace: str | None, name: str, stopped: kopf.DaemonStopped, **_: object) -> None:
@@ -46,6 +53,14 @@ def register(registry: kopf.OperatorRegistry, live: LiveInventory, deployments: 
             raise kopf.TemporaryError(str(error), delay=_RETRY_S) from error
 
 
+def _by_address(info: kopf.ConnectionInfo | None) -> kopf.ConnectionInfo | None:
+    """The API server by its address, as the store has it: no DNS is needed to start."""
+    host, port = os.environ.get("KUBERNETES_SERVICE_HOST"), os.environ.get("KUBERNETES_SERVICE_PORT")
+    if info is None or host is None or port is None:
+        return info
+    return dataclasses.replace(info, server=f"https://{f'[{host}]' if ':' in host else host}:{port}")
+
+
 async def follow(live: LiveInventory, deployments: Deployments, key: Key, stopped: kopf.DaemonStopped) -> None:
     """Reconcile an application whenever one of its inputs changes, until it is deleted."""
     failures = 0
@@ -55,6 +70,8 @@ async def follow(live: LiveInventory, deployments: Deployments, key: Key, stoppe
             try:
                 again_s = await deployments.reconcile(key)
                 failures = 0
+            except BeingDeleted:
+                return
             except StoreError as error:
                 failures += 1
                 low, high = _BACKOFF_S

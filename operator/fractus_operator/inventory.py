@@ -388,7 +388,7 @@ class LiveInventory:
         for key, submitted in sorted(self.applications.items()):
             if (submitted.body.get("status") or {}).get("drone") == drone:
                 return key
-        return ("", "a flight home")
+        return ("fractus-system", "flight-home")
 
 
 def is_flying(drone: Drone) -> bool:

@@ -20,6 +20,9 @@ MANAGED_SELECTOR = f"{MANAGED_LABEL}={MANAGED_BY},{APPLICATION_LABEL}"
 DIGEST_ANNOTATION = f"{GROUP}/applied"
 """Digest of what was applied last, so that an unchanged object is not written again."""
 
+CAUSE_ANNOTATION = f"{GROUP}/cause"
+"""On Deployments: DIGEST@NODE, of what the manifest says of the component, and the node that it is made for."""
+
 FINALIZER = f"{GROUP}/teardown"
 CLASS_LABEL = f"{GROUP}/class"
 DEPOT_LABEL = f"{GROUP}/depot"

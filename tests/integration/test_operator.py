@@ -275,6 +275,27 @@ def test_a_node_out_of_reach_keeps_its_instances(world: World, operator: Operato
     assert versions(world, namespace) == before
 
 
+def test_an_upgraded_operator_restarts_nothing_in_the_air(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    running(world, namespace)
+    world.drone_status("drone-1", "flying")
+    operator.stop()
+    # What an older operator would have built: something else than this one wants.
+    root = f"/apis/apps/v1/namespaces/{namespace}/deployments"
+    for name in ("traffic-navigator", "traffic-data-store"):
+        world.api.merge(f"{root}/{name}", {"spec": {"template": {"spec": {"terminationGracePeriodSeconds": 11}}}})
+    operator.start()
+
+    def grace_s(name: str) -> int:
+        return int((world.api.get(f"{root}/{name}") or {})["spec"]["template"]["spec"]["terminationGracePeriodSeconds"])
+
+    wait_for(lambda: grace_s("traffic-data-store") == 10, "the cloud's pods to be renewed")
+    assert grace_s("traffic-navigator") == 11
+    world.drone_status("drone-1", "inactive")
+    wait_for(lambda: grace_s("traffic-navigator") == 10, "the drone's pods to be renewed on the ground")
+
+
 def test_deleting_leaves_nothing(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     world.api.delete(world.path(traffic(namespace)))

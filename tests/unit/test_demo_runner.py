@@ -1,0 +1,149 @@
+"""How the demo follows a mission, assigns nodes, and picks its own entries from an audit log."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import demo_flight
+import pytest
+import yaml
+from click.testing import CliRunner
+from fractus_sim.demo import watch
+from fractus_sim.demo.__main__ import demo
+from fractus_sim.demo.collect import of_mission
+from fractus_sim.demo.kube import DemoError
+from fractus_sim.demo.place import ROOT, assign
+from fractus_sim.demo.watch import Mission
+
+
+def node(name: str, label: str | None = None) -> dict[str, Any]:
+    labels = {"fractus.dev/class": label} if label else {}
+    return {"kind": "Node", "metadata": {"name": name, "labels": labels}}
+
+
+def application(phase: str, message: str = "", drone: str | None = "drone-1") -> dict[str, Any]:
+    status = {"phase": phase, "message": message, **({"drone": drone} if drone else {})}
+    return {"kind": "Application", "metadata": {"name": "traffic-monitoring"}, "status": status}
+
+
+def flying(state: str) -> dict[str, Any]:
+    return {"kind": "Drone", "metadata": {"name": "drone-1"}, "status": {"flightState": state}}
+
+
+def pod(name: str, ready: bool) -> dict[str, Any]:
+    conditions = [{"type": "Ready", "status": str(ready)}]
+    return {"kind": "Pod", "metadata": {"name": name}, "status": {"conditions": conditions}}
+
+
+def test_a_mission_is_told_from_apply_to_landing() -> None:
+    said: list[str] = []
+    mission = Mission("traffic-monitoring", {"applied": 100.0})
+    plan = {
+        "kind": "DeploymentPlan",
+        "metadata": {"name": "traffic-monitoring"},
+        "spec": {"placements": [{}, {}], "drone": {"node": "drone-1"}},
+    }
+    mission.see([application("Pending", drone=None)], 100.5, said.append)
+    mission.see([application("Deploying"), plan, pod("a", False), flying("inactive")], 101.0, said.append)
+    mission.see([application("Running"), plan, pod("a", True), flying("inactive")], 104.0, said.append)
+    assert not mission.ended
+    mission.see([application("Running"), plan, pod("a", True), flying("flying")], 110.0, said.append)
+    assert not mission.grounded
+    mission.see([application("Completed", "done"), plan, flying("landing")], 200.0, said.append)
+    assert mission.ended
+    assert not mission.grounded
+    mission.see([application("Completed", "done"), plan, flying("inactive")], 230.0, said.append)
+    assert mission.grounded
+    assert mission.times == {"applied": 100.0, "planned": 101.0, "running": 104.0, "ended": 200.0, "landed": 230.0}
+    assert "planned after 1.0 s: 2 instances, drone-1 flies" in said
+    assert "all pods Running after 4.0 s" in said
+    assert said.count("drone-1 is flying") == 1
+    assert said[-1] == "drone-1 is on the ground"
+    assert set(mission.pods) == {"a"}, "pods are remembered after the operator deleted them"
+
+
+def test_other_applications_and_their_drones_are_not_told() -> None:
+    said: list[str] = []
+    mission = Mission("traffic-monitoring", {"applied": 0.0})
+    other = application("Failed")
+    other["metadata"]["name"] = "other"
+    elsewhere = flying("flying")
+    elsewhere["metadata"]["name"] = "drone-9"
+    mission.see([other, application("Running"), elsewhere], 1.0, said.append)
+    assert said == ["application Running"]
+
+
+class Silent:
+    """A cluster on which nothing ever happens."""
+
+    def objects(self, kinds: str, namespace: str = "default") -> list[dict[str, Any]]:
+        del kinds, namespace
+        return [application("Pending", "no drone is free", drone=None)]
+
+
+def test_a_mission_that_does_not_end_is_given_up(tmp_path: Path) -> None:
+    mission = Mission("traffic-monitoring", {"applied": 0.0})
+    with pytest.raises(DemoError, match="did not end within 5 s: no drone is free"):
+        watch.follow(Silent(), mission, tmp_path / "log", timeout_s=5.0, say=print, show=print)  # type: ignore[arg-type]
+
+
+def test_the_driver_s_log_lines_are_told_whole_and_once(tmp_path: Path) -> None:
+    log, said = tmp_path / "log", list[str]()
+    log.write_bytes(b"[pod/x-navigator-1/navigator] 08:00 armed\n[pod/y/data-store] 08:00 kept 1\n[pod/x-navi")
+    at = watch._tell(log, 0, said.append)
+    log.write_bytes(log.read_bytes() + b"gator-1/navigator] 08:01 waypoint 1/5\n")
+    watch._tell(log, at, said.append)
+    assert said == ["navigator: 08:00 armed", "navigator: 08:01 waypoint 1/5"]
+
+
+def test_nodes_are_assigned_by_word_then_name_then_class() -> None:
+    nodes = [node("kind-a", "edge"), node("kind-b"), node("kind-c", "edge"), node("kind-d", "cloud"), node("drone-1")]
+    assert assign(nodes, {"edge-1": "kind-b"}) == {
+        "edge-1": "kind-b",
+        "drone-1": "drone-1",
+        "edge-2": "kind-a",
+        "edge-3": "kind-c",
+        "cloud-1": "kind-d",
+    }
+
+
+def test_a_missing_node_is_named_with_the_remedy() -> None:
+    nodes = [node("a", "drone"), node("b", "edge"), node("c", "cloud")]
+    with pytest.raises(DemoError, match=r"stands for edge-2; name one: --assign edge-2=NODE \(nodes: a, b, c\)"):
+        assign(nodes, {})
+    with pytest.raises(DemoError, match="the cluster has no node z"):
+        assign(nodes, {"edge-2": "z"})
+    assert "edge-3" not in assign([*nodes, node("d", "edge")], {})
+
+
+def test_only_entries_of_this_mission_are_kept() -> None:
+    before, after = (json.dumps({"time": demo_flight.stamp(s)}).encode() for s in (99.0, 101.0))
+    assert of_mission(after, 100.0)
+    assert not of_mission(before, 100.0)
+    assert not of_mission(b"{torn", 100.0)
+
+
+def test_a_wrong_assignment_is_refused() -> None:
+    done = CliRunner().invoke(demo, ["--cluster", "current", "--assign", "drone-7=x"])
+    assert done.exit_code == 2
+    assert "expected drone-1=NODE" in done.output
+
+
+def test_a_report_without_a_record_says_so(tmp_path: Path) -> None:
+    done = CliRunner().invoke(demo, ["--report-only", "--out", str(tmp_path)])
+    assert done.exit_code == 1
+    assert "no record of a flight" in done.output
+
+
+def test_the_simulated_hardware_stands_where_the_drone_is_kept() -> None:
+    (hardware,) = yaml.safe_load_all((ROOT / "examples" / "simulated-hardware.yaml").read_text())
+    pod_spec = hardware["spec"]["template"]["spec"]
+    arguments = pod_spec["containers"][0]["args"]
+    lat, lon, _ = (float(part) for part in arguments[arguments.index("--home") + 1].split(","))
+    depot = demo_flight.documents("depot.yaml")[0]["spec"]["location"]
+    assert (lat, lon) == (depot["lat"], depot["lon"])
+    drone = demo_flight.documents("drone.yaml")[0]["spec"]["services"]["mobility"]
+    assert drone["connection"] in arguments
+    assert pod_spec["hostNetwork"] is True

@@ -18,11 +18,11 @@ from fractus_core.policy.values import Takeover, Verdict
 from fractus_services.audit import AuditLog
 from fractus_services.grants import GrantFiles, Held
 from fractus_services.mobility.autopilot import Autopilot, AutopilotError
-from fractus_services.mobility.failsafes import Checked, configure
+from fractus_services.mobility.failsafes import Checked
 from fractus_services.mobility.journal import Journal, Mission
 from fractus_services.mobility.leases import Lease, Motion, News, State
 from fractus_services.mobility.motions import distance_m
-from fractus_services.mobility.vehicle import GUIDED, HOMEWARD, LAND, MODE_NAMES, RTL
+from fractus_services.mobility.vehicle import GUIDED, HOMEWARD, LAND, RTL
 from fractus_services.replies import Refused, aborted, precondition, refused, unavailable
 
 log = logging.getLogger(__name__)
@@ -62,11 +62,11 @@ class Control:
         self._grants = grants
         self._audit = audit
         self._grace_s = grace_s
-        self._expected: int | None = None
-        self._changing = 0
-        self._arming = False
-        self._was_armed: bool | None = None
-        self._system: asyncio.Task[None] | None = None
+        self.expected: int | None = None
+        self.changing = 0
+        self.arming = False
+        self.was_armed: bool | None = None
+        self.system: asyncio.Task[None] | None = None
         self._grace: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._changed = asyncio.Event()
@@ -151,20 +151,16 @@ class Control:
     def _not_ready(self) -> str | None:
         """Why the drone cannot be handed to a driver now."""
         vehicle = self.autopilot.vehicle
-        if not self.autopilot.connected:
-            return "the autopilot is not connected"
-        if self.checked is None:
-            return "the autopilot's failsafes are being set"
-        if self.hands == "pilot":
-            return f"a human pilot has the drone ({vehicle.mode_name})"
-        if self.homeward:
-            return "the system brings the drone home"
-        if not vehicle.armed and not vehicle.ready:
-            why = next((t for t in reversed(vehicle.texts) if t.startswith("PreArm")), "")
-            return f"the autopilot is not ready to arm{': ' + why if why else ''}"
-        if vehicle.lat is None or vehicle.home is None:
-            return "position and home are not known yet"
-        return None
+        why = next((t for t in reversed(vehicle.texts) if t.startswith("PreArm")), "")
+        reasons = (
+            (not self.autopilot.connected, "the autopilot is not connected"),
+            (self.checked is None, "the autopilot's failsafes are being set"),
+            (self.hands == "pilot", f"a human pilot has the drone ({vehicle.mode_name})"),
+            (self.homeward, "the system brings the drone home"),
+            (not vehicle.armed and not vehicle.ready, f"the autopilot is not ready to arm{': ' if why else ''}{why}"),
+            (vehicle.lat is None or vehicle.home is None, "position and home are not known yet"),
+        )
+        return next((reason for holds, reason in reasons if holds), None)
 
     async def _wait(self, timeout_s: float) -> None:
         try:
@@ -173,18 +169,19 @@ class Control:
         except TimeoutError:
             return
 
-    def _wake(self) -> None:
+    def wake(self) -> None:
+        """Let waiting drivers look again."""
         self._changed.set()
         self._changed = asyncio.Event()
 
     def _hand_over(self, lease: Lease, mission: Mission) -> News:
-        self._cancel(self._grace)
-        self._cancel(self._system)
+        self.drop(self._grace)
+        self.drop(self.system)
         self.hands = "driver"
         lease.granted = True
         self.journal.active = mission.key
         self.journal.save_soon()
-        self._note("granted", lease.held.identity, f"control point {mission.points_done}")
+        self.note("granted", lease.held.identity, f"control point {mission.points_done}")
         return News(State.GRANTED, mission.points_done, "", mission.waypoints)
 
     def _left(self, lease: Lease) -> None:
@@ -196,13 +193,13 @@ class Control:
         if mission is None or not (lease.granted or self.autopilot.vehicle.in_air):
             return
         self.hands = "system"
-        self._note("driver lost", lease.held.identity, "its stream broke")
+        self.note("driver lost", lease.held.identity, "its stream broke")
         log.warning("driver %s is lost", lease.held.identity)
         coming_down = self.motion is not None and self.motion.kind in {"Land", "ReturnToLaunch"}
         self._stop_motion(precondition("ControlLost", "the driver's stream broke"))
         if self.autopilot.vehicle.in_air and not coming_down:
-            self._start("hover")
-        self._begin_grace(mission, "driver lost")
+            self.start("hover")
+        self.begin_grace(mission, "driver lost")
 
     def require(self, held: Held) -> Lease:
         """The lease of a caller that moves the drone.
@@ -226,16 +223,16 @@ class Control:
         self.lease = None
         self.hands = "system"
         self._stop_motion(aborted("ControlReturned", "control was returned"))
-        self._note("returned", held.identity, "the mission is complete" if last else "")
+        self.note("returned", held.identity, "the mission is complete" if last else "")
         if last:
             mission.outcome = "complete"
             lease.tell(News(State.COMPLETE, mission.points_done - 1, "every control point is done"))
-            self._start("returnToLaunch")
+            self.start("returnToLaunch")
         else:
             lease.tell(None)
             if self.autopilot.vehicle.in_air:
-                self._start("hover")
-            self._begin_grace(mission, "driver did not ask for its next control point")
+                self.start("hover")
+            self.begin_grace(mission, "driver did not ask for its next control point")
         await self.journal.save()
         return last
 
@@ -254,8 +251,8 @@ class Control:
 
     def begin_transit(self, mission: Mission, grant: CompiledGrant) -> None:
         """The system flies for a waiting driver."""
-        self._cancel(self._grace)
-        self._cancel(self._system)
+        self.drop(self._grace)
+        self.drop(self.system)
         self.hands, self.chauffeured = "system", grant
         self.journal.active = mission.key
         self.journal.save_soon()
@@ -280,7 +277,7 @@ class Control:
     def cancelled(self, motion: Motion) -> None:
         """The caller of a motion gave it up: hover, unless the driver is gone and the drone comes home anyway."""
         if self.motion is motion:
-            self._spawn(self._hover_after(motion))
+            self.spawn(self._hover_after(motion))
 
     async def _hover_after(self, motion: Motion) -> None:
         if motion.kind in {"Land", "ReturnToLaunch"}:
@@ -288,7 +285,7 @@ class Control:
         if self.motion is motion and self.hands == "driver":
             self.motion = None
             motion.stop(aborted("Cancelled", "the call was cancelled"))
-            await self._try(self.hold())
+            await self.attempt(self.hold())
 
     def _stop_motion(self, why: Refused) -> None:
         if self.motion is not None:
@@ -297,17 +294,17 @@ class Control:
 
     async def change_mode(self, mode: int) -> None:
         """Change the flight mode ourselves, so that it is not taken for a pilot's doing."""
-        if self.autopilot.vehicle.mode == mode and self._expected == mode:
+        if self.autopilot.vehicle.mode == mode and self.expected == mode:
             return
-        before, self._expected = self._expected, mode
-        self._changing += 1
+        before, self.expected = self.expected, mode
+        self.changing += 1
         try:
             await self.autopilot.set_mode(mode)
         except AutopilotError:
-            self._expected = before
+            self.expected = before
             raise
         finally:
-            self._changing -= 1
+            self.changing -= 1
 
     async def hold(self) -> None:
         """Brake and hover."""
@@ -327,7 +324,7 @@ class Control:
             raise precondition("FailsafesNotVerified", f"the autopilot's failsafes are not verified: {why}")
         if self._audit.failure:
             raise precondition("AuditUnavailable", self._audit.failure)
-        self._arming = True
+        self.arming = True
         try:
             await self.change_mode(GUIDED)
             await self.autopilot.arm()
@@ -338,13 +335,13 @@ class Control:
                     raise AutopilotError("the autopilot accepted to arm and did not")
                 await self.autopilot.update(WAIT_S)
         finally:
-            self._arming = False
+            self.arming = False
 
     # The system
 
     def brake(self, verdict: Verdict) -> None:
         """Stop the present motion; the driver keeps the drone."""
-        self._note("brake", self.controller, verdict.reason, verdict.code, verdict.policies)
+        self.note("brake", self.controller, verdict.reason, verdict.code, policies=verdict.policies)
         self._stop_motion(aborted(verdict.code, verdict.reason, verdict.policies))
         self.autopilot.stop()
 
@@ -357,31 +354,32 @@ class Control:
     def _seize(self, action: Takeover, verdict: Verdict, outcome: str) -> None:
         mission = self.journal.flying
         log.warning("the system takes the drone (%s): %s", action, verdict.reason)
-        self._note(action, "system", verdict.reason, verdict.code, verdict.policies, kind="takeover")
-        self._lose(verdict.reason)
+        self.note(action, "system", verdict.reason, verdict.code, policies=verdict.policies, kind="takeover")
+        self.lose(verdict.reason)
         self.hands = "system"
         if mission is not None and outcome and not mission.outcome:
             mission.outcome = f"{outcome}: {verdict.reason}"
             self.journal.save_soon()
-        self._start(action)
+        self.start(action)
         if mission is not None and not mission.outcome:
-            self._begin_grace(mission, verdict.reason)
+            self.begin_grace(mission, verdict.reason)
 
-    def _lose(self, reason: str) -> None:
+    def lose(self, reason: str) -> None:
         """Take the lease from the driver and tell it why."""
         lease, self.lease = self.lease, None
         self._stop_motion(precondition("ControlLost", reason))
-        self._cancel(self._grace)
+        self.drop(self._grace)
         if lease is not None:
             lease.tell(News(State.LOST, reason=reason))
-        self._wake()
+        self.wake()
 
-    def _start(self, action: Takeover) -> None:
-        self._cancel(self._system)
+    def start(self, action: Takeover) -> None:
+        """Begin what the system wants of the drone; what it did before ends."""
+        self.drop(self.system)
         self.homeward = action != "hover" and self.autopilot.vehicle.armed
-        self._system = self._spawn(self._act(action))
+        self.system = self.spawn(self.act(action))
 
-    async def _act(self, action: Takeover) -> None:
+    async def act(self, action: Takeover) -> None:
         """Carry out what the system wants, however often the link fails."""
         tries = 0
         while self.autopilot.vehicle.armed and self.hands == "system":
@@ -401,12 +399,13 @@ class Control:
                 log.warning("cannot %s yet: %s", action, error)
             await asyncio.sleep(RETRY_S)
         self.homeward = False
-        self._wake()
+        self.wake()
 
-    def _begin_grace(self, mission: Mission, why: str) -> None:
-        self._cancel(self._grace)
+    def begin_grace(self, mission: Mission, why: str) -> None:
+        """Give a lost driver its time to come back; then the mission has failed."""
+        self.drop(self._grace)
         if mission.flown or self.autopilot.vehicle.armed:
-            self._grace = self._spawn(self._give_up(mission, why))
+            self._grace = self.spawn(self._give_up(mission, why))
 
     async def _give_up(self, mission: Mission, why: str) -> None:
         await asyncio.sleep(self._grace_s)
@@ -414,139 +413,12 @@ class Control:
             return
         mission.outcome = f"failed: {why}"
         log.warning("mission of %s failed: %s", mission.identity, why)
-        self._note("returnToLaunch", "system", why, "DriverLost", kind="takeover")
+        self.note("returnToLaunch", "system", why, "DriverLost", kind="takeover")
         await self.journal.save()
         if self.hands == "system" and not self.homeward:
-            self._start("returnToLaunch")
+            self.start("returnToLaunch")
 
-    # What others do
-
-    def found(self) -> None:
-        """The autopilot is there, for the first time or again."""
-        self.checked = None
-        self._spawn(self._prepare())
-
-    async def _prepare(self) -> None:
-        while self.autopilot.connected:
-            try:
-                await self.autopilot.set_rates(flying=self.autopilot.vehicle.armed)
-                self._resume()
-                self.checked = await configure(self.autopilot)
-                self._wake()
-                if self.autopilot.vehicle.home is None:
-                    await self.autopilot.ask_home()
-            except AutopilotError as error:
-                log.warning("cannot prepare the autopilot yet: %s", error)
-                await asyncio.sleep(RETRY_S)
-            else:
-                return
-
-    def _resume(self) -> None:
-        """Decide who has a vehicle that was there before us, or comes back from a broken link."""
-        vehicle = self.autopilot.vehicle
-        mission = self.journal.flying
-        if self._was_armed is None:
-            self._was_armed = vehicle.armed
-        if self.lease is not None and self.lease.granted:
-            return
-        self._expected = vehicle.mode
-        if not vehicle.armed:
-            if mission is not None and mission.flown and not mission.outcome:
-                self._begin_grace(mission, "driver lost")
-            return
-        if mission is None or vehicle.mode not in HOMEWARD | {GUIDED}:
-            self._pilot(f"is flying in {vehicle.mode_name}")
-        elif vehicle.mode in HOMEWARD:
-            self.hands, self.homeward = "system", True
-            if not mission.outcome:
-                mission.outcome = "failed: the autopilot flew home by itself while the mobility service was away"
-                self.journal.save_soon()
-            self._note("homeward", "system", f"found the drone in {vehicle.mode_name}", kind="takeover")
-            self._system = self._spawn(self._act("returnToLaunch" if vehicle.mode != LAND else "land"))
-        else:
-            self.hands = "system"
-            self._note("hover", "system", "found the drone in the air", kind="takeover")
-            if mission.outcome or self.mission_grant is None:
-                self._revoke_missing(mission)
-                self._start("returnToLaunch")
-            else:
-                self._start("hover")
-                self._begin_grace(mission, "driver lost")
-
-    def _revoke_missing(self, mission: Mission) -> None:
-        if not mission.outcome:
-            mission.outcome = "revoked: the grant was removed"
-            self.journal.save_soon()
-
-    def heartbeat(self) -> None:
-        """Look at mode and arming after each heartbeat."""
-        vehicle = self.autopilot.vehicle
-        if self._was_armed is None:
-            return
-        if vehicle.armed != self._was_armed:
-            self._was_armed = vehicle.armed
-            self._armed() if vehicle.armed else self._landed()
-        if vehicle.armed and not self._changing and self._expected is not None and vehicle.mode != self._expected:
-            self._foreign_mode(vehicle.mode)
-        if not vehicle.armed and not self._changing:
-            self._expected = vehicle.mode
-
-    def _armed(self) -> None:
-        if self.hands != "driver" and not self._arming:
-            self._pilot("armed the drone")
-        self._spawn(self._try(self.autopilot.set_rates(flying=True)))
-
-    def _landed(self) -> None:
-        """The motors stopped."""
-        mission = self.journal.flying
-        self._cancel(self._system)
-        self.homeward = False
-        if self.hands == "pilot" and mission is not None and mission.flown and not mission.outcome:
-            mission.outcome = "failed: a human pilot took the drone and landed it"
-        if self.lease is None or not self.lease.granted:
-            self.hands = "system"
-            if mission is None or mission.outcome:
-                self.journal.active = None
-        self._note("landed", self.controller, "the motors are stopped")
-        self.journal.save_soon()
-        self._spawn(self._try(self.autopilot.set_rates(flying=False)))
-        self._wake()
-
-    def _foreign_mode(self, mode: int) -> None:
-        """Somebody else changed the mode: the autopilot's own failsafe, or a human pilot."""
-        vehicle = self.autopilot.vehicle
-        name = MODE_NAMES.get(mode, str(mode))
-        self._expected = mode
-        said = next((t for t in reversed(vehicle.texts[-6:]) if "ailsafe" in t or "Fence" in t), "")
-        if (vehicle.failsafe or said) and mode in HOMEWARD and self.hands != "pilot":
-            reason = f"the autopilot's own failsafe took the drone ({said or name})"
-            self._note(name, "system", reason, "AutopilotFailsafe", kind="takeover")
-            mission = self.journal.flying
-            if mission is not None and not mission.outcome:
-                mission.outcome = f"failed: {reason}"
-                self.journal.save_soon()
-            self._lose(reason)
-            self.hands, self.homeward = "system", True
-            self._cancel(self._system)
-            self._system = self._spawn(self._act("land" if mode == LAND else "returnToLaunch"))
-        elif self.hands == "pilot" and mode == GUIDED and self.journal.flying is not None:
-            self._note("hover", "system", "the pilot handed the drone back", kind="takeover")
-            self.hands = "system"
-            self._start("hover")
-            self._begin_grace(self.journal.flying, "driver lost")
-        else:
-            self._pilot(f"changed the mode to {name}")
-
-    def _pilot(self, what: str) -> None:
-        """A human pilot has the drone: applications lose it at once, and we keep our hands off."""
-        reason = f"a human pilot {what}"
-        log.warning("%s", reason)
-        if self.hands != "pilot":
-            self._note("pilot", "pilot", reason, "PilotTookOver", kind="takeover")
-        self._cancel(self._system)
-        self.homeward = False
-        self._lose(reason)
-        self.hands = "pilot"
+    # News
 
     def in_air(self) -> None:
         """Remember that the mission flies."""
@@ -576,15 +448,10 @@ class Control:
 
     # Plumbing
 
-    def _note(
-        self,
-        what: str,
-        who: str,
-        reason: str,
-        code: str = "",
-        policies: tuple[str, ...] = (),
-        kind: str = "control",
+    def note(
+        self, what: str, who: str, reason: str, code: str = "", *, policies: tuple[str, ...] = (), kind: str = "control"
     ) -> None:
+        """Write a change of control to the audit log."""
         vehicle = self.autopilot.vehicle
         self._audit.append(
             kind,
@@ -594,13 +461,15 @@ class Control:
             },
         )  # fmt: skip
 
-    async def _try(self, attempt: Coroutine[Any, Any, None]) -> None:
+    async def attempt(self, work: Coroutine[Any, Any, None]) -> None:
+        """Await something of the autopilot that may fail without harm."""
         try:
-            await attempt
+            await work
         except AutopilotError as error:
             log.warning("%s", error)
 
-    def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+    def spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Run something in the background; failures are logged."""
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._ended)
@@ -611,6 +480,7 @@ class Control:
         if not task.cancelled() and task.exception() is not None:
             log.error("a task of the drone's control failed", exc_info=task.exception())
 
-    def _cancel(self, task: asyncio.Task[None] | None) -> None:
+    def drop(self, task: asyncio.Task[None] | None) -> None:
+        """Cancel a task, unless it is the one that asks."""
         if task is not None and task is not asyncio.current_task():
             task.cancel()

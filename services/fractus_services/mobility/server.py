@@ -22,6 +22,7 @@ from fractus_services.mobility.control import Control
 from fractus_services.mobility.guard import Guard
 from fractus_services.mobility.handlers import MobilityHandlers
 from fractus_services.mobility.journal import Journal
+from fractus_services.mobility.observer import Observer
 from fractus_services.mobility.service import MobilityService
 from fractus_services.mobility.watch import Watch
 
@@ -63,8 +64,9 @@ async def run(options: Options, stop: asyncio.Event) -> None:
     guard = Guard(control, audit, clock)
     control.chauffeur = Chauffeur(control, guard).bring
     watch = Watch(control, guard, audit)
-    autopilot.on_found = control.found
-    autopilot.on_message = lambda m: control.heartbeat() if m.get_type() == "HEARTBEAT" else None
+    observer = Observer(control)
+    autopilot.on_found = observer.found
+    autopilot.on_message = lambda m: observer.heartbeat() if m.get_type() == "HEARTBEAT" else None
     audit.append("started", {"node": node, "autopilot": url})
     grants.listen(lambda old, new: _record_grant(audit, old, new))
     grants.scan()

@@ -51,6 +51,8 @@ class Vehicle:
     fix_type: int = 0
     position_error_m: float = _UNTOLD_ERROR_M
     texts: list[str] = field(default_factory=list)
+    failsafe_text: str = ""
+    failsafe_text_at: float = -math.inf
 
     @property
     def mode_name(self) -> str:
@@ -147,10 +149,13 @@ def _gps(vehicle: Vehicle, message: Any, _now: float) -> None:
         vehicle.position_error_m = min(max(message.h_acc / 1e3, _LEAST_ERROR_M), _WORST_ERROR_M)
 
 
-def _text(vehicle: Vehicle, message: Any, _now: float) -> None:
-    text = message.text.split(b"\0", 1)[0] if isinstance(message.text, bytes) else message.text.encode()
-    vehicle.texts.append(text.decode("utf-8", "replace"))
+def _text(vehicle: Vehicle, message: Any, now: float) -> None:
+    raw = message.text.split(b"\0", 1)[0] if isinstance(message.text, bytes) else message.text.encode()
+    text = raw.decode("utf-8", "replace")
+    vehicle.texts.append(text)
     del vehicle.texts[:-20]
+    if ("ailsafe" in text and "leared" not in text) or "Fence" in text:
+        vehicle.failsafe_text, vehicle.failsafe_text_at = text, now
 
 
 _HANDLERS = {

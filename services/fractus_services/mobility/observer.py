@@ -1,0 +1,165 @@
+"""What others do to the drone: it appears, arms, lands, changes its mode; and who has it then."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+
+from fractus_services.mobility.autopilot import AutopilotError
+from fractus_services.mobility.control import RETRY_S, Control
+from fractus_services.mobility.failsafes import configure
+from fractus_services.mobility.journal import Mission
+from fractus_services.mobility.vehicle import GUIDED, HOMEWARD, LAND, MODE_NAMES
+
+log = logging.getLogger(__name__)
+
+SAID_S = 3.0
+"""A mode change this soon after the autopilot spoke of a failsafe is the failsafe's."""
+
+
+class Observer:
+    """Follows the autopilot's heartbeats and decides between failsafe, human pilot and our own doing.
+
+    Args:
+        control: the state machine that takes the consequences.
+    """
+
+    def __init__(self, control: Control) -> None:
+        self._control = control
+
+    def found(self) -> None:
+        """The autopilot is there, for the first time or again."""
+        self._control.checked = None
+        self._control.spawn(self._prepare())
+
+    async def _prepare(self) -> None:
+        while self._control.autopilot.connected:
+            try:
+                await self._control.autopilot.set_rates(flying=self._control.autopilot.vehicle.armed)
+                self._resume()
+                self._control.checked = await configure(self._control.autopilot)
+                self._control.wake()
+                if self._control.autopilot.vehicle.home is None:
+                    await self._control.autopilot.ask_home()
+            except AutopilotError as error:
+                log.warning("cannot prepare the autopilot yet: %s", error)
+                await asyncio.sleep(RETRY_S)
+            else:
+                return
+
+    def _resume(self) -> None:
+        """Decide who has a vehicle that was there before us, or comes back from a broken link."""
+        vehicle = self._control.autopilot.vehicle
+        mission = self._control.journal.flying
+        if self._control.was_armed is None:
+            self._control.was_armed = vehicle.armed
+        if self._control.lease is not None and self._control.lease.granted:
+            return
+        self._control.expected = vehicle.mode
+        if vehicle.armed and self._control.hands == "pilot":
+            return
+        if not vehicle.armed:
+            if mission is not None and mission.flown and not mission.outcome:
+                self._control.begin_grace(mission, "driver lost")
+            return
+        if mission is None or vehicle.mode not in HOMEWARD | {GUIDED}:
+            self._pilot(f"is flying in {vehicle.mode_name}")
+        elif vehicle.mode in HOMEWARD:
+            self._control.hands, self._control.homeward = "system", True
+            if not mission.outcome:
+                mission.outcome = "failed: the autopilot flew home by itself while the mobility service was away"
+                self._control.journal.save_soon()
+            self._control.note("homeward", "system", f"found the drone in {vehicle.mode_name}", kind="takeover")
+            self._control.system = self._control.spawn(
+                self._control.act("returnToLaunch" if vehicle.mode != LAND else "land")
+            )
+        else:
+            self._control.hands = "system"
+            self._control.note("hover", "system", "found the drone in the air", kind="takeover")
+            if mission.outcome or self._control.mission_grant is None:
+                self._revoke_missing(mission)
+                self._control.start("returnToLaunch")
+            else:
+                self._control.start("hover")
+                self._control.begin_grace(mission, "driver lost")
+
+    def _revoke_missing(self, mission: Mission) -> None:
+        if not mission.outcome:
+            mission.outcome = "revoked: the grant was removed"
+            self._control.journal.save_soon()
+
+    def heartbeat(self) -> None:
+        """Look at mode and arming after each heartbeat."""
+        vehicle = self._control.autopilot.vehicle
+        if self._control.was_armed is None:
+            return
+        if vehicle.armed != self._control.was_armed:
+            self._control.was_armed = vehicle.armed
+            self._armed() if vehicle.armed else self._landed()
+        if (
+            vehicle.armed
+            and not self._control.changing
+            and self._control.expected is not None
+            and vehicle.mode != self._control.expected
+        ):
+            self._foreign_mode(vehicle.mode)
+        if not vehicle.armed and not self._control.changing:
+            self._control.expected = vehicle.mode
+
+    def _armed(self) -> None:
+        if self._control.hands != "driver" and not self._control.arming:
+            self._pilot("armed the drone")
+        self._control.spawn(self._control.attempt(self._control.autopilot.set_rates(flying=True)))
+
+    def _landed(self) -> None:
+        """The motors stopped."""
+        mission = self._control.journal.flying
+        self._control.drop(self._control.system)
+        self._control.homeward = False
+        if self._control.hands == "pilot" and mission is not None and mission.flown and not mission.outcome:
+            mission.outcome = "failed: a human pilot took the drone and landed it"
+        if self._control.lease is None or not self._control.lease.granted:
+            self._control.hands = "system"
+            if mission is None or mission.outcome:
+                self._control.journal.active = None
+        self._control.note("landed", self._control.controller, "the motors are stopped")
+        self._control.journal.save_soon()
+        self._control.spawn(self._control.attempt(self._control.autopilot.set_rates(flying=False)))
+        self._control.wake()
+
+    def _foreign_mode(self, mode: int) -> None:
+        """Somebody else changed the mode: the autopilot's own failsafe, or a human pilot."""
+        vehicle = self._control.autopilot.vehicle
+        name = MODE_NAMES.get(mode, str(mode))
+        self._control.expected = mode
+        recent = self._control.autopilot.now - vehicle.failsafe_text_at < SAID_S
+        said = vehicle.failsafe_text if recent else ""
+        if (vehicle.failsafe or said) and mode in HOMEWARD and self._control.hands != "pilot":
+            reason = f"the autopilot's own failsafe took the drone ({said or name})"
+            self._control.note(name, "system", reason, "AutopilotFailsafe", kind="takeover")
+            mission = self._control.journal.flying
+            if mission is not None and not mission.outcome:
+                mission.outcome = f"failed: {reason}"
+                self._control.journal.save_soon()
+            self._control.lose(reason)
+            self._control.hands, self._control.homeward = "system", True
+            self._control.drop(self._control.system)
+            self._control.system = self._control.spawn(self._control.act("land" if mode == LAND else "returnToLaunch"))
+        elif self._control.hands == "pilot" and mode == GUIDED and self._control.journal.flying is not None:
+            self._control.note("hover", "system", "the pilot handed the drone back", kind="takeover")
+            self._control.hands = "system"
+            self._control.start("hover")
+            self._control.begin_grace(self._control.journal.flying, "driver lost")
+        else:
+            self._pilot(f"changed the mode to {name}")
+
+    def _pilot(self, what: str) -> None:
+        """A human pilot has the drone: applications lose it at once, and we keep our hands off."""
+        reason = f"a human pilot {what}"
+        log.warning("%s", reason)
+        if self._control.hands != "pilot":
+            self._control.note("pilot", "pilot", reason, "PilotTookOver", kind="takeover")
+        self._control.drop(self._control.system)
+        self._control.homeward = False
+        self._control.lose(reason)
+        self._control.hands = "pilot"

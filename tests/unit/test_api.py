@@ -1,12 +1,14 @@
 """Kinds: what is accepted, and the sentence for what is not."""
 
 import pathlib
+from datetime import datetime
 
 import pytest
 import yaml
 from fractus_core.api import KINDS, Application, InvalidObject, Policy, Zone
 from fractus_core.api.crd import crd
 from fractus_core.api.model import quantity
+from fractus_core.api.policies import ActiveTime, active_at
 from fractus_core.validation import check_application, check_area, check_policy
 from test_planning import CHECKER, PATH, STORE, VIEWER, application, component, manifest, navigator
 
@@ -63,6 +65,8 @@ def test_sentences_of_bad_applications():
         ([edge_component(services=[{"service": "mobility", "methods": ["Goto"]}])], "spec.components[0].services: the mobility service is on drones only"),
         ([STORE, STORE | {"name": "data-store"}], "spec.components[1].name: data-store and DataStore get the same object name"),
         ([STORE | {"replica": 2}], "spec.components[0].replica: extra inputs are not permitted, not 2"),
+        ([STORE | {"container": {"image": "x", "volumes": [{"name": "v", "mountPath": "/v"}]}}], "spec.components[0].container.volumes[0]: give exactly one of emptyDir"),
+        ([STORE | {"container": {"image": "x", "volumes": [{"name": "tls", "mountPath": "/v", "claim": "c"}]}}], "spec.components[0].container.volumes[0].name: tls is taken"),
         ([STORE | {"container": {"image": "x", "resources": {"limits": {"cpu": "much"}}}}], "spec.components[0].container.resources.limits.cpu: 'much' is not a quantity"),
     ]  # fmt: skip
     for components, sentence in cases:
@@ -133,3 +137,63 @@ def test_policy_with_an_unknown_zone_names_it():
 @pytest.mark.parametrize(("text", "value"), [("250m", 0.25), ("2", 2), ("512Mi", 2**29), ("1.5G", 1.5e9), (3, 3)])
 def test_quantities(text, value):
     assert quantity(text) == pytest.approx(value)
+
+
+def test_volumes_become_those_of_a_pod():
+    volumes = [
+        {"name": "scratch", "mountPath": "/scratch", "emptyDir": {"sizeLimit": "64Mi", "medium": "memory"}},
+        {"name": "models", "mountPath": "/models", "claim": "models", "readOnly": True},
+        {"name": "config", "mountPath": "/config", "configMap": "settings"},
+        {"name": "key", "mountPath": "/key", "secret": "key"},
+    ]
+    app = application(STORE | {"container": {"image": "x", "volumes": volumes}})
+    found = app.spec.components[0].container.volumes
+    assert [v.pod_volume() for v in found] == [
+        {"name": "scratch", "emptyDir": {"sizeLimit": "64Mi", "medium": "Memory"}},
+        {"name": "models", "persistentVolumeClaim": {"claimName": "models"}},
+        {"name": "config", "configMap": {"name": "settings"}},
+        {"name": "key", "secret": {"secretName": "key", "defaultMode": 0o440}},
+    ]
+    assert [v.mount()["readOnly"] for v in found] == [False, True, True, True]
+
+
+def unix(text):
+    return datetime.fromisoformat(text).timestamp()
+
+
+@pytest.mark.parametrize(
+    ("time", "moment", "active"),
+    [
+        ({}, "2026-06-01T00:00:00+00:00", True),
+        ({"days": ["Mon"]}, "2026-06-01T23:59:59+00:00", True),
+        ({"days": ["Mon"]}, "2026-06-02T00:00:00+00:00", False),
+        ({"start": "08:00", "end": "17:30"}, "2026-06-01T08:00:00+00:00", True),
+        ({"start": "08:00", "end": "17:30"}, "2026-06-01T17:30:00+00:00", False),
+        ({"start": "22:00", "end": "06:00", "days": ["Fri"]}, "2026-06-06T05:59:00+00:00", True),
+        ({"start": "22:00", "end": "06:00", "days": ["Fri"]}, "2026-06-05T05:59:00+00:00", False),
+        ({"start": "22:00", "end": "06:00", "days": ["Fri"]}, "2026-06-06T22:00:00+00:00", False),
+        ({"start": "08:00", "end": "09:00"}, "2026-06-01T10:30:00+02:00", True),
+        ({"validFrom": "2026-06-01T12:00:00Z"}, "2026-06-01T11:59:59+00:00", False),
+        ({"validUntil": "2026-06-01T12:00:00Z"}, "2026-06-01T12:00:00+00:00", False),
+    ],
+)
+def test_schedules(time, moment, active):
+    window = ActiveTime.model_validate(time)
+    assert window.active(unix(moment)) is active
+    assert active_at((), unix(moment))
+    assert active_at((window,), unix(moment)) is active
+
+
+@pytest.mark.parametrize(
+    ("time", "sentence"),
+    [
+        ({"start": "08:00"}, "spec.schedule[0].start: give start and end together"),
+        ({"start": "24:00", "end": "25:00"}, "spec.schedule[0].start: "),
+        ({"validFrom": "2026-06-02T00:00:00Z", "validUntil": "2026-06-01T00:00:00Z"}, "spec.schedule[0].validUntil: must be after"),
+    ],
+)
+def test_sentences_of_bad_schedules(time, sentence):
+    area = {"circle": {"center": {"lat": 1, "lon": 2}, "radius": 5}}
+    with pytest.raises(InvalidObject) as caught:
+        Zone.from_body(manifest("Zone", "z", {"area": area, "schedule": [time]}))
+    assert str(caught.value).startswith(sentence)

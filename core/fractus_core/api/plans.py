@@ -10,7 +10,7 @@ from pydantic import Field, WithJsonSchema
 from fractus_core.api.applications import ControlPoint, Placement, PointsOfInterest, ServiceRequest
 from fractus_core.api.geometry import AltitudeBand, Area, Point, Position
 from fractus_core.api.model import Condition, Model, OpenModel, Resource
-from fractus_core.api.policies import PolicySpec
+from fractus_core.api.policies import ActiveTime, PolicySpec
 
 Role = Literal["drone", "static", "hybrid-edge", "hybrid-drone", "cloud"]
 GeoJson = Annotated[dict[str, Any], WithJsonSchema({"type": "object", "x-kubernetes-preserve-unknown-fields": True})]
@@ -120,6 +120,7 @@ class GrantedZone(Model):
     name: str
     area: Area
     altitude: AltitudeBand | None = None
+    schedule: tuple[ActiveTime, ...] = Field(default=(), description="When the zone is active; empty: always.")
 
 
 class GrantedPolicy(Model):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from datetime import datetime
-from typing import ClassVar, Literal, Self
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
@@ -19,11 +20,79 @@ class ReadyStatus(OpenModel):
     conditions: tuple[Condition, ...] = ()
 
 
+Day = Literal["Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun"]
+ClockTime = Annotated[str, Field(pattern=r"^([01][0-9]|2[0-3]):[0-5][0-9]$", max_length=5)]
+
+_DAYS: tuple[Day, ...] = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")
+_DAY_S = 86_400.0
+_THURSDAY = 3
+"""1970-01-01 was one."""
+
+
+class ActiveTime(Model):
+    """When a zone is active; what is given must hold together. Times are UTC, as in ED-269."""
+
+    model_config = ConfigDict(
+        json_schema_extra=rules(("has(self.start) == has(self.end)", "give start and end together, or neither"))
+    )
+
+    days: tuple[Day, ...] = Field(default=(), max_length=7, description="Days of the week in UTC; empty: every day.")
+    start: ClockTime | None = Field(default=None, description="HH:MM, UTC; unset: midnight.")
+    end: ClockTime | None = Field(
+        default=None, description="HH:MM, UTC; not later than start: on the day after. Unset: midnight."
+    )
+    valid_from: datetime | None = Field(default=None, description="RFC 3339; unset: always active before validUntil.")
+    valid_until: datetime | None = Field(default=None, description="RFC 3339; unset: active for ever.")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if (self.start is None) != (self.end is None):
+            raise InvalidObject("start", "give start and end together, or neither")
+        if self.valid_from and self.valid_until and self.valid_from >= self.valid_until:
+            raise InvalidObject("validUntil", "must be after validFrom")
+        return self
+
+    def active(self, time_s: float) -> bool:
+        """Whether a moment, in seconds since 1970 UTC, is in this time."""
+        if self.valid_from is not None and time_s < _unix(self.valid_from):
+            return False
+        if self.valid_until is not None and time_s >= _unix(self.valid_until):
+            return False
+        start, end = _clock_s(self.start or "00:00"), _clock_s(self.end or "00:00")
+        length = end - start if end > start else _DAY_S + end - start
+        today = time_s // _DAY_S
+        # A time that began yesterday may last until today.
+        for day in (today, today - 1):
+            weekday = _DAYS[int(day + _THURSDAY) % 7]
+            if 0 <= time_s - day * _DAY_S - start < length and (not self.days or weekday in self.days):
+                return True
+        return False
+
+
+def active_at(schedule: Sequence[ActiveTime], time_s: float) -> bool:
+    """Whether a schedule is active at a moment, in seconds since 1970 UTC; an empty one always is."""
+    return not schedule or any(time.active(time_s) for time in schedule)
+
+
+def _clock_s(text: str) -> float:
+    hours, minutes = text.split(":")
+    return int(hours) * 3600.0 + int(minutes) * 60.0
+
+
+def _unix(moment: datetime) -> float:
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
 class ZoneSpec(Model):
     """A named piece of air or ground."""
 
     area: Area
     altitude: AltitudeBand | None = Field(default=None, description="The slab of air; unset: from the ground up.")
+    schedule: tuple[ActiveTime, ...] = Field(
+        default=(),
+        max_length=50,
+        description="When the zone is active; empty: always. Outside it, it is as if not there.",
+    )
     description: str = Field(default="", max_length=1024)
 
 

@@ -58,7 +58,7 @@ def _matching(
     found = {rule.name: rule for rule in patches.everywhere if rule.in_force(now.time_s)}
     if now.lat is None or now.lon is None:
         if not certain:
-            found |= {p.rule.name: p.rule for p in patches.patches if p.rule.in_force(now.time_s)}
+            found |= {p.rule.name: p.rule for p in patches.patches if p.in_force(now.time_s)}
         return _ordered(found)
     if patches.patches:
         here = shapely.Point(grant.frame.xy(now.lat, now.lon))

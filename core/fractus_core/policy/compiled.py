@@ -13,7 +13,7 @@ from shapely.geometry.base import BaseGeometry
 from fractus_core.api.geometry import AltitudeBand, Area, Point, Reference
 from fractus_core.api.methods import METHODS_OF
 from fractus_core.api.plans import GrantedPolicy, GrantSpec
-from fractus_core.api.policies import PolicySpec
+from fractus_core.api.policies import ActiveTime, PolicySpec, active_at
 from fractus_core.geo import LocalFrame, middle, polygon
 from fractus_core.policy.values import Home, Situation
 
@@ -48,6 +48,11 @@ class Patch:
     zone: str
     shape: BaseGeometry
     band: AltitudeBand | None
+    schedule: tuple[ActiveTime, ...] = ()
+
+    def in_force(self, time_s: float) -> bool:
+        """Whether the policy is in its validity window, and the zone active."""
+        return self.rule.in_force(time_s) and active_at(self.schedule, time_s)
 
 
 def height_m(value: float, reference: Reference, home: Home | None, flat_terrain: bool) -> float | None:
@@ -93,7 +98,7 @@ class Patches:
         else:
             near = [self.patches[i] for i in self._tree.query(air.ground, predicate="dwithin", distance=air.margin_m)]
         for patch in near:
-            if patch.rule.in_force(now.time_s) and band_meets(patch.band, air.lower_m, air.upper_m, now.home, flat):
+            if patch.in_force(now.time_s) and band_meets(patch.band, air.lower_m, air.upper_m, now.home, flat):
                 yield patch
 
 
@@ -135,7 +140,11 @@ class Inclusion:
         """The allowed ground and its border for a range of altitudes above home."""
         if not self.banded:
             return self.shape, self.border
-        kept = [p.shape for p in self.patches if band_holds(p.band, lower_m, upper_m, now.home, flat)]
+        kept = [
+            p.shape
+            for p in self.patches
+            if band_holds(p.band, lower_m, upper_m, now.home, flat) and active_at(p.schedule, now.time_s)
+        ]
         shape = shapely.union_all(kept) if kept else shapely.Polygon()
         return shape, shape.boundary
 
@@ -251,7 +260,7 @@ def _union(frame: LocalFrame, areas: tuple[Area, ...]) -> BaseGeometry | None:
 
 def _zone_patches(frame: LocalFrame, rule: Rule, policy: GrantedPolicy) -> list[Patch]:
     return [
-        Patch(rule, zone.name, _prepared(polygon(frame, zone.area)), zone.altitude)
+        Patch(rule, zone.name, _prepared(polygon(frame, zone.area)), zone.altitude, zone.schedule)
         for zone in policy.zones
         if _within_reach(frame, zone.area)
     ]
@@ -306,5 +315,9 @@ def _inclusion(frame: LocalFrame, rule: Rule, policy: GrantedPolicy) -> Inclusio
     patches = tuple(_zone_patches(frame, rule, policy))
     shape = shapely.union_all([p.shape for p in patches]) if patches else shapely.Polygon()
     return Inclusion(
-        rule, patches, _prepared(shape), _prepared(shape.boundary), any(p.band is not None for p in patches)
+        rule,
+        patches,
+        _prepared(shape),
+        _prepared(shape.boundary),
+        any(p.band is not None or p.schedule for p in patches),
     )

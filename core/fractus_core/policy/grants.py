@@ -155,7 +155,7 @@ def _zone(policy: Policy, index: int, name: str, zones: Mapping[str, Zone]) -> G
         polygon(LocalFrame.at(middle(spec.area)), spec.area)
     except InvalidObject as error:
         raise InvalidObject(f"Zone {name} spec.area.{error.field}", error.problem) from None
-    return GrantedZone(name=name, area=spec.area, altitude=spec.altitude)
+    return GrantedZone(name=name, area=spec.area, altitude=spec.altitude, schedule=spec.schedule)
 
 
 def _distance_m(area: Area, base: Point) -> float:

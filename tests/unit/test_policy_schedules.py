@@ -1,0 +1,46 @@
+"""Zones with a schedule: as if they were not there outside it."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from fractus_core.policy.values import Call
+from policy_world import ask, at, box, compiled, goto, policy, zone
+
+NOW = datetime.fromtimestamp(at().time_s, tz=UTC)
+OFF = [{"days": [("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")[(NOW.weekday() + 3) % 7]]}]
+ON = [{"days": [("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")[NOW.weekday()]]}]
+
+
+def scheduled(name: str, area: dict[str, Any], schedule: list[dict[str, Any]]) -> dict[str, Any]:
+    return {**zone(name, area), "schedule": schedule}
+
+
+def test_an_exclusion_zone_counts_only_while_it_is_active() -> None:
+    def verdict(schedule: list[dict[str, Any]]) -> str:
+        found = policy("no-fly", "GeofenceControl", "exclusion", [scheduled("z", box(20, -9, 40, 9), schedule)])
+        return ask(compiled(found), goto(30, 0)).action
+
+    assert verdict([]) != "allow"
+    assert verdict(ON) != "allow"
+    assert verdict(OFF) == "allow"
+    assert verdict([*OFF, *ON]) != "allow"
+
+
+def test_an_inclusion_zone_that_is_not_active_holds_nothing() -> None:
+    def verdict(schedule: list[dict[str, Any]]) -> str:
+        found = policy("keep-in", "GeofenceControl", "inclusion", [scheduled("z", box(-90, -90, 90, 90), schedule)])
+        return ask(compiled(found), goto(10, 0)).action
+
+    assert verdict(ON) == "allow"
+    assert verdict(OFF) != "allow"
+
+
+def test_a_method_is_granted_in_a_zone_only_while_it_is_active() -> None:
+    def code(schedule: list[dict[str, Any]]) -> str | None:
+        here = policy("h", "AccessControl", "grant", [scheduled("z", box(-9, -9, 9, 9), schedule)], methods=["Hover"])
+        return ask(compiled(here), Call("Hover"), at(0, 0)).code
+
+    assert code(ON) != "MethodNotGrantedHere"
+    assert code(OFF) == "MethodNotGrantedHere"

@@ -1,0 +1,100 @@
+"""Grant files, identities and clocks."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fractus_services.auth import Caller, NotAuthenticated, caller_of
+from fractus_services.clock import Clock
+from fractus_services.grants import GrantFiles, Held
+from policy_world import spec
+
+
+def body(**changes: Any) -> str:
+    grant = {
+        "apiVersion": "fractus.dev/v1alpha1",
+        "kind": "Grant",
+        "metadata": {"name": "g", "uid": changes.pop("uid", "u1")},
+        "spec": {**spec().to_dict(), **changes},
+    }
+    return json.dumps(grant)
+
+
+def test_files_come_change_and_go(tmp_path: Path) -> None:
+    seen: list[tuple[str | None, str | None]] = []
+    files = GrantFiles(tmp_path, "drone-1")
+    files.listen(lambda old, new: seen.append((old and old.key, new and new.key)))
+    path = tmp_path / "g.json"
+    path.write_text(body())
+    files.scan()
+    files.scan()
+    (held,) = files.held.values()
+    assert isinstance(held, Held)
+    assert files.of(held.identity) is held
+    path.write_text(body(uid="u2"))
+    files.scan()
+    path.write_text("{")
+    files.scan()
+    assert not files.held
+    path.write_text(body(uid="u3"))
+    files.scan()
+    path.unlink()
+    files.scan()
+    assert seen == [(None, "u1"), ("u1", "u2"), ("u2", None), (None, "u3"), ("u3", None)]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", "[]", '{"kind": "Policy"}', body(node="drone-2"),
+        body(operationArea=[{"polygon": {"exterior": [{"lat": 0, "lon": 0}, {"lat": 1, "lon": 1}, {"lat": 0, "lon": 1}, {"lat": 1, "lon": 0}]}}]),
+        body(policies=[{"name": "p", "spec": {"type": "GeofenceControl", "kind": "wall"}}]), body(surprise=1),
+    ],
+)  # fmt: skip
+def test_what_is_not_understood_grants_nothing(tmp_path: Path, text: str) -> None:
+    (tmp_path / "g.json").write_text(text)
+    files = GrantFiles(tmp_path, "drone-1")
+    files.scan()
+    assert not files.held
+
+
+def test_two_files_for_one_instance(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(body(uid="first"))
+    (tmp_path / "b.json").write_text(body(uid="second"))
+    files = GrantFiles(tmp_path, "drone-1")
+    files.scan()
+    assert [held.key for held in files.held.values()] == ["first"]
+
+
+def test_a_missing_directory_is_empty(tmp_path: Path) -> None:
+    files = GrantFiles(tmp_path / "none", "drone-1")
+    files.scan()
+    assert not files.held
+
+
+def test_callers() -> None:
+    with pytest.raises(NotAuthenticated, match="mutual TLS"):
+        caller_of({}, 0.0)
+    with pytest.raises(NotAuthenticated, match="cannot be read"):
+        caller_of({"x509_pem_cert": [b"nonsense"]}, 0.0)
+    caller = Caller("spiffe://fractus.dev/node/a", 100.0, 200.0)
+    caller.check(150.0)
+    with pytest.raises(NotAuthenticated, match="expired"):
+        caller.check(200.0)
+    with pytest.raises(NotAuthenticated, match="not valid yet"):
+        caller.check(10.0)
+
+
+def test_time_never_runs_backwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    wall, steady = [1000.0], [50.0]
+    monkeypatch.setattr("fractus_services.clock.time.time", lambda: wall[0])
+    monkeypatch.setattr("fractus_services.clock.time.monotonic", lambda: steady[0])
+    clock = Clock()
+    assert clock() == 1000.0
+    wall[0], steady[0] = 500.0, 60.0
+    assert clock() == 1010.0, "set back: it goes on by its own count"
+    wall[0] = 5000.0
+    assert clock() == 5000.0, "set forward: it follows"

@@ -138,7 +138,7 @@ class Link:
 
     def send(self, name: str, **values: float) -> None:
         """Send one message to the vehicle."""
-        target = {"target_system": 1, "target_component": 1}
+        target: dict[str, float] = {"target_system": 1, "target_component": 1}
         self.socket.sendall(encode(layout_named(name), target | values, sequence=0, sysid=255, compid=190))
 
     def read(self, duration_s: float, until: str = "") -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import sys
 import time
@@ -11,9 +12,10 @@ import click
 
 from fractus_sim.vehicle.earth import Place
 from fractus_sim.vehicle.links import Hub, LinkError, LinkSpec
+from fractus_sim.vehicle.lockstep import Conductor, conduct
 from fractus_sim.vehicle.params import UnknownParameterError
 from fractus_sim.vehicle.simulation import Simulation, formation
-from fractus_sim.vehicle.vehicle import CONTROL_STEP_S, VehicleConfig
+from fractus_sim.vehicle.vehicle import CONTROL_STEP_S, REPEATABLE_EPOCH_US, VehicleConfig
 
 DEFAULT_LISTEN = "tcp:127.0.0.1:5760"
 MAX_BATCH = 25
@@ -118,6 +120,11 @@ def _parameters(_context: click.Context, _option: click.Parameter, texts: tuple[
 @click.option("--spacing", type=float, default=10.0, help="Distance between vehicles, metres toward east.")
 @click.option("--store", type=click.Path(path_type=Path), help="File that keeps changed parameters.")
 @click.option("--tlog", type=click.Path(path_type=Path), help="Record what the (first) vehicle says to a tlog.")
+@click.option(
+    "--lockstep",
+    metavar="HOST:PORT",
+    help="Advance only as a driver connected here asks: it writes a number of 10 ms steps a line, and reads the total.",
+)
 @click.option("--duration", type=float, help="End after so many simulated seconds.")
 def vehicle(
     *,
@@ -134,9 +141,13 @@ def vehicle(
     spacing: float,
     store: Path | None,
     tlog: Path | None,
+    lockstep: str | None,
     duration: float | None,
 ) -> None:
     """Simulate ArduCopter-compatible vehicles that speak MAVLink 2."""
+    stop = _Stop()
+    signal.signal(signal.SIGTERM, stop)
+    signal.signal(signal.SIGINT, stop)
     config = VehicleConfig(
         start=home,
         heading_deg=heading_deg,
@@ -145,31 +156,36 @@ def vehicle(
         ready_after_s=ready_after,
         parameters=parameters | wind,
         store=store,
-        epoch_us=int(time.time() * 1e6),
+        epoch_us=REPEATABLE_EPOCH_US if lockstep else int(time.time() * 1e6),
     )
-    hub = Hub()
-    stop = _Stop()
-    signal.signal(signal.SIGTERM, stop)
-    signal.signal(signal.SIGINT, stop)
-    try:
-        simulation = Simulation(formation(config, count, spacing))
-        for at, craft in enumerate(simulation.crafts):
-            for port, text in enumerate(links or (DEFAULT_LISTEN,)):
-                hub.open(LinkSpec.parse(text).shifted(at), craft, port)
-    except LinkError as error:
-        raise click.ClickException(str(error)) from error
-    except UnknownParameterError as error:
-        raise click.ClickException(f"unknown parameter {error.args[0]}") from error
-    click.echo(f"vehicle {sysid} ready for connections on {' '.join(links or (DEFAULT_LISTEN,))}", err=True)
-    log = tlog.open("wb") if tlog is not None else None
-    try:
-        if log is not None:
-            simulation.crafts[0].record(log)
-        run(simulation, hub, speedup, stop, duration)
-    finally:
-        hub.close()
-        if log is not None:
-            log.close()
+    with contextlib.ExitStack() as stack:
+        hub = Hub()
+        stack.callback(hub.close)
+        try:
+            simulation = Simulation(formation(config, count, spacing))
+            for at, craft in enumerate(simulation.crafts):
+                for port, text in enumerate(links or (DEFAULT_LISTEN,)):
+                    hub.open(LinkSpec.parse(text).shifted(at), craft, port)
+                if tlog is not None:
+                    name = tlog if count == 1 else tlog.with_stem(f"{tlog.stem}-{craft.config.sysid}")
+                    craft.record(stack.enter_context(name.open("wb")))
+            conductor = None if lockstep is None else Conductor(hub, *_address(lockstep))
+        except (LinkError, OSError) as error:
+            raise click.ClickException(str(error)) from error
+        except UnknownParameterError as error:
+            raise click.ClickException(f"unknown parameter {error.args[0]}") from error
+        click.echo(f"vehicle {sysid} ready for connections on {' '.join(links or (DEFAULT_LISTEN,))}", err=True)
+        if conductor is not None:
+            conduct(simulation, hub, conductor, lambda: stop.wanted)
+        else:
+            run(simulation, hub, speedup, stop, duration)
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, colon, port = text.rpartition(":")
+    if not colon or not port.isdigit() or not 0 < int(port) < 65536:
+        raise click.BadParameter(f"--lockstep {text!r}: expected HOST:PORT")
+    return host or "127.0.0.1", int(port)
 
 
 def main() -> None:

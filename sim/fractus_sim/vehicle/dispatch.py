@@ -103,6 +103,10 @@ def _ping(v: Vehicle, m: Message, c: Channel) -> None:
         )
 
 
+def _version(v: Vehicle, c: Channel) -> None:
+    v.send(c, "AUTOPILOT_VERSION")
+
+
 def _file_transfer(_v: Vehicle, m: Message, c: Channel) -> None:
     """There is no file system: every request is refused at once, so that clients use the plain protocols instead."""
     request = bytes(int(value) for value in m.array("payload"))
@@ -315,6 +319,7 @@ HANDLERS: dict[str, Handler] = {
     "FILE_TRANSFER_PROTOCOL": _file_transfer,
     "TIMESYNC": _timesync,
     "PING": _ping,
+    "AUTOPILOT_VERSION_REQUEST": lambda v, _m, c: _version(v, c),
     "SET_POSITION_TARGET_LOCAL_NED": lambda v, m, _c: _local_target(v, m),
     "SET_POSITION_TARGET_GLOBAL_INT": lambda v, m, _c: _global_target(v, m),
     "SET_ATTITUDE_TARGET": _attitude_target,

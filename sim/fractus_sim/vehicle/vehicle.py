@@ -31,6 +31,8 @@ from fractus_sim.vehicle.wire import Message, Value
 CONTROL_STEP_S = 0.01
 PHYSICS_PER_CONTROL = 2
 ARMING_DELAY_S = 2.0
+# The time of day at which runs begin that must be repeatable.
+REPEATABLE_EPOCH_US = 1_700_000_000_000_000
 STICKS_CENTRED = (1500,) * 4 + (1800,) + (1000,) * 3 + (0,) * 10
 
 
@@ -45,7 +47,7 @@ class VehicleConfig:
     ready_after_s: float = 32.0
     parameters: Mapping[str, float] = field(default_factory=dict)
     store: Path | None = None
-    epoch_us: int = 1_700_000_000_000_000
+    epoch_us: int = REPEATABLE_EPOCH_US
     position_noise_m: float = 0.12
 
 

@@ -29,7 +29,7 @@ def until(condition: Callable[[], bool], what: str, timeout_s: float = 40.0) -> 
 def main(address: str) -> None:
     """Fly."""
     vehicle = connect(address, wait_ready=True, timeout=60, heartbeat_timeout=20)
-    assert str(vehicle.version).startswith("APM:Copter-4."), vehicle.version
+    until(lambda: str(vehicle.version).startswith("APM:Copter-4."), "version")
     until(lambda: vehicle.is_armable, "armable")
     vehicle.mode = VehicleMode("GUIDED")
     vehicle.armed = True

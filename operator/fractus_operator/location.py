@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 
 from fractus_core.api import Drone, EdgeNode
 from fractus_core.api.geometry import Point
@@ -11,7 +10,7 @@ from fractus_core.api.geometry import Point
 from fractus_operator.inventory import LiveInventory
 from fractus_operator.kinds import NODE, Key
 from fractus_operator.labels import DEPOT_LABEL, GEOHASH_LABEL, INTERFACE_LABEL
-from fractus_operator.store import Store, Taken
+from fractus_operator.store import NotFound, Store
 
 logger = logging.getLogger(__name__)
 
@@ -74,14 +73,12 @@ class Locations:
     def __init__(self, store: Store, live: LiveInventory) -> None:
         self._store = store
         self._live = live
-        self._applied: dict[str, Mapping[str, str]] = {}
 
     async def reconcile(self, key: Key) -> None:
-        """Label one Node as its Drone or EdgeNode says; with neither, take our labels away."""
+        """Label one Node as its Drone or EdgeNode says; with neither, take these labels away."""
         name = key[1]
         host = self._live.hosts.get(key)
         if host is None:
-            self._applied.pop(name, None)
             return
         node = self._live.drones.get(key) or self._live.edge_nodes.get(key)
         home = None
@@ -90,12 +87,10 @@ class Locations:
             home = depot.spec.location if depot is not None else None
         wanted = location_labels(node, home) if node is not None else {}
         present = {label: value for label, value in host.labels.items() if is_location_label(label)}
-        if present == wanted or (not wanted and self._applied.get(name) == {}):
+        if present == wanted:
             return
-        body = NODE.header(name, labels=wanted)
-        body["metadata"]["uid"] = (await self._store.get(NODE, name))["metadata"]["uid"]
+        stale = dict.fromkeys(present.keys() - wanted.keys())
         try:
-            await self._store.apply(NODE, body)
-        except Taken:
+            await self._store.label(NODE, name, {**wanted, **stale})
+        except NotFound:
             return
-        self._applied[name] = wanted

@@ -201,6 +201,20 @@ class Store:
             content_type="application/apply-patch+yaml",
         )
 
+    async def label(self, kind: Kind, name: str, labels: Mapping[str, str | None]) -> None:
+        """Set labels of somebody else's cluster-scoped object, and take off those that are None.
+
+        Raises:
+            NotFound: the object is gone; it is not made anew, as an apply would.
+        """
+        await self._send(
+            "PATCH",
+            kind.path(name=name),
+            params={"fieldManager": FIELD_MANAGER},
+            body={"metadata": {"labels": labels}},
+            content_type="application/merge-patch+json",
+        )
+
     async def replace(self, kind: Kind, body: Body, *, subresource: str) -> Body:
         """Write a subresource that takes no apply, such as a signing request's approval.
 

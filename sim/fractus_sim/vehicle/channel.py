@@ -11,6 +11,9 @@ from fractus_sim.vehicle.wire import Message, Parser, Signing, Value, encode, la
 # A client that does not read costs at most this much memory; what does not fit is dropped, as on a radio.
 OUTBOX_LIMIT = 256 * 1024
 PARAMETERS_PER_TICK = 16
+# Sums of intervals round differently from multiples of the step.
+TIME_SLACK_S = 1e-6
+AT_ONCE = -1e9
 
 
 @dataclass(slots=True)
@@ -106,26 +109,25 @@ class Channel:
         self._waiting = 0
         return data
 
-    def set_interval(self, name: str, interval_s: float | None, now_s: float) -> None:
-        """Send a message at an interval, or no more (None)."""
+    def set_interval(self, name: str, interval_s: float | None) -> None:
+        """Send a message at an interval from now on, or no more (None)."""
         if interval_s is None:
             self.streams.pop(name, None)
         else:
-            self.streams[name] = Stream(interval_s, now_s)
-            self.next_due_s = min(self.next_due_s, now_s)
+            self.streams[name] = Stream(interval_s, AT_ONCE)
+            self.next_due_s = AT_ONCE
 
     def due(self, now_s: float) -> list[str]:
         """Names of the messages to send now; keeps long-term rates exact and never bursts to catch up."""
-        if now_s < self.next_due_s:
+        if now_s + TIME_SLACK_S < self.next_due_s:
             return []
         names: list[str] = []
         soonest = now_s + 1.0
         for name, stream in self.streams.items():
-            if stream.due_s <= now_s + 1e-9:
+            if stream.due_s <= now_s + TIME_SLACK_S:
                 names.append(name)
-                stream.due_s += stream.interval_s
-                if stream.due_s <= now_s:
-                    stream.due_s = now_s + stream.interval_s
+                following = stream.due_s + stream.interval_s
+                stream.due_s = following if following > now_s + TIME_SLACK_S else now_s + stream.interval_s
             soonest = min(soonest, stream.due_s)
         self.next_due_s = soonest
         return names

@@ -218,11 +218,11 @@ def _set_interval(v: Vehicle, o: Order, c: Channel) -> Result:
     if name is None or not math.isfinite(interval_us):
         return Result.DENIED
     if interval_us < 0.0:
-        c.set_interval(name, None, v.time_s)
+        c.set_interval(name, None)
     elif interval_us == 0.0:
-        c.set_interval(name, 1.0 if name == "HEARTBEAT" else None, v.time_s)
+        c.set_interval(name, 1.0 if name == "HEARTBEAT" else None)
     else:
-        c.set_interval(name, max(interval_us, 10_000.0) / 1e6, v.time_s)
+        c.set_interval(name, max(interval_us, 10_000.0) / 1e6)
     return Result.ACCEPTED
 
 

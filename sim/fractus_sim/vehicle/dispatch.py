@@ -64,7 +64,7 @@ def _request_stream(v: Vehicle, m: Message, c: Channel) -> None:
     rate = m.integer("req_message_rate") if m.integer("start_stop") else 0
     for number in ALL_GROUPS if group == 0 else (group,):
         for name in GROUPS.get(number, ("", ()))[1]:
-            c.set_interval(name, 1.0 / min(rate, 100) if rate > 0 else None, v.time_s)
+            c.set_interval(name, 1.0 / min(rate, 100) if rate > 0 else None)
 
 
 def _parameter_list(v: Vehicle, _m: Message, c: Channel) -> None:

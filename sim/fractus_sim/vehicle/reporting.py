@@ -19,12 +19,12 @@ UNKNOWN_U16 = 65535
 
 def boot_ms(vehicle: Vehicle) -> int:
     """Milliseconds since boot."""
-    return int(vehicle.time_s * 1000.0) & 0xFFFFFFFF
+    return round(vehicle.time_s * 1000.0) & 0xFFFFFFFF
 
 
 def boot_us(vehicle: Vehicle) -> int:
     """Microseconds since boot."""
-    return int(vehicle.time_s * 1e6)
+    return round(vehicle.time_s * 1e6)
 
 
 def centi(value: float) -> int:

@@ -85,7 +85,7 @@ class Craft:
         vehicle.attach(channel)
         for group in ALL_GROUPS:
             for name in GROUPS[group][1]:
-                channel.set_interval(name, 1.0 / rate_hz, vehicle.time_s)
+                channel.set_interval(name, 1.0 / rate_hz)
 
 
 def signing_clock(unix_us: int) -> int:

@@ -111,7 +111,7 @@ class Vehicle:
     @property
     def unix_us(self) -> int:
         """Time of day in microseconds."""
-        return self.config.epoch_us + int(self.time_s * 1e6)
+        return self.config.epoch_us + round(self.time_s * 1e6)
 
     @property
     def origin(self) -> Place | None:
@@ -526,7 +526,7 @@ class Vehicle:
     def attach(self, channel: Channel) -> None:
         """Open a link: HEARTBEAT at 1 Hz and silence otherwise, unless SR parameters ask for streams."""
         self.channels.append(channel)
-        channel.set_interval("HEARTBEAT", 1.0, self.time_s)
+        channel.set_interval("HEARTBEAT", 1.0)
         for group in ALL_GROUPS:
             self._set_default_rate(channel, group)
 
@@ -535,7 +535,7 @@ class Vehicle:
         rate = 0.0 if channel.port is None else self.params[f"SR{min(channel.port, 6)}_{label}"]
         if rate > 0.0:
             for name in names:
-                channel.set_interval(name, 1.0 / min(rate, 100.0), self.time_s)
+                channel.set_interval(name, 1.0 / min(rate, 100.0))
 
     def detach(self, channel: Channel) -> None:
         """Close a link."""

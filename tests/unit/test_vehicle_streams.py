@@ -1,0 +1,89 @@
+"""Streams: groups, intervals, silence, and the outbox that a deaf client fills."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+from fractus_sim.vehicle.channel import OUTBOX_LIMIT, Channel
+from fractus_sim.vehicle.mav import Command, Result
+from fractus_sim.vehicle.streams import ALL_GROUPS, BUILDERS, GROUPS
+from vehicle_world import airborne, alone
+
+
+@pytest.mark.parametrize("interval_us", [10_000, 20_000, 30_000, 33_333, 100_000, 250_000, 1_000_000])
+def test_intervals_are_exact(interval_us: int):
+    vehicle, pilot = alone()
+    assert pilot.command(Command.SET_MESSAGE_INTERVAL, 30, interval_us) is Result.ACCEPTED
+    times = []
+    for _ in range(3000):
+        times += [m.integer("time_boot_ms") for m in pilot.step() if m.name == "ATTITUDE"]
+    assert len(times) == pytest.approx(30e6 / interval_us, abs=4)
+    gaps = {later - earlier for earlier, later in itertools.pairwise(times)}
+    assert all(abs(gap - interval_us / 1000.0) <= 10.0 for gap in gaps)
+    if interval_us % 10_000 == 0:
+        assert gaps == {interval_us // 1000}
+    assert vehicle.time_s >= 30.0
+
+
+def test_every_stream_at_4_hz_gives_the_measured_rate():
+    _, pilot = airborne(5.0)
+    pilot.send(
+        "REQUEST_DATA_STREAM", {"target_system": 1, "target_component": 1, "req_message_rate": 4, "start_stop": 1}
+    )
+    count = sum(len(pilot.step()) for _ in range(1000)) / 10.0
+    assert count == pytest.approx(107.0, rel=0.2)
+
+
+def test_stopping_a_stream_and_asking_for_the_unknown():
+    _, pilot = alone()
+    pilot.command(Command.SET_MESSAGE_INTERVAL, 30, 100_000)
+    pilot.fly_on(1.0)
+    assert pilot.command(Command.SET_MESSAGE_INTERVAL, 30, -1) is Result.ACCEPTED
+    pilot.last.clear()
+    pilot.fly_on(2.0)
+    assert pilot.last.keys() <= {"HEARTBEAT", "STATUSTEXT", "HOME_POSITION"}
+    assert pilot.command(Command.SET_MESSAGE_INTERVAL, 9999, 1000) is Result.DENIED
+    assert pilot.command(Command.REQUEST_MESSAGE, 9999) is Result.FAILED
+    assert pilot.command(Command.REQUEST_MESSAGE, float("nan")) is Result.FAILED
+
+
+@pytest.mark.parametrize("name", sorted(BUILDERS))
+def test_every_message_can_be_built_in_every_phase(name: str):
+    for vehicle, pilot in (alone(), airborne(5.0, FENCE_ENABLE=1)):
+        pilot.read()
+        if vehicle.send(pilot.channel, name):
+            assert pilot.read()[-1].name == name
+        else:
+            assert BUILDERS[name](vehicle) is None
+
+
+def test_groups_name_known_messages_once():
+    names = [name for number in ALL_GROUPS for name in GROUPS[number][1]]
+    assert len(names) == len(set(names))
+    assert set(names) <= set(BUILDERS)
+
+
+def test_default_streams_follow_their_parameters():
+    vehicle, pilot = alone(SR0_POSITION=5)
+    channel = pilot.craft.open("second", port=0)
+    pilot.fly_on(4.0)
+    frames = channel.take()
+    assert frames.count(bytes((33, 0, 0))) >= 15
+    assert "LOCAL_POSITION_NED" in channel.streams
+    assert vehicle.channels[0].streams.keys() == {"HEARTBEAT"}
+
+
+def test_a_deaf_client_costs_bounded_memory_and_loses_only_its_own_messages():
+    vehicle, pilot = alone()
+    deaf = pilot.craft.open("deaf")
+    for name in BUILDERS:
+        deaf.set_interval(name, 0.01)
+    pilot.command(Command.SET_MESSAGE_INTERVAL, 30, 100_000)
+    seen = 0
+    for _ in range(3000):
+        seen += sum(m.name == "ATTITUDE" for m in pilot.step())
+    assert seen == pytest.approx(300, abs=2)
+    assert deaf.waiting <= OUTBOX_LIMIT
+    assert deaf.dropped > 1000
+    assert isinstance(vehicle.channels[1], Channel)

@@ -151,7 +151,11 @@ def deployment(application: Application, placed: PlannedInstance, drone: Drone |
 def _wish(application: Application, component: Component) -> str:
     """A digest of what the manifest says that concerns a component's pods."""
     called = [application.spec.component(name).container.ports for name in component.egress]
-    said = [component.to_dict(), [[port.port for port in ports] for ports in called]]
+    # Defaults are left out: a new version of the kinds adds some.
+    said = [
+        component.model_dump(mode="json", by_alias=True, exclude_defaults=True),
+        [[port.port for port in ports] for ports in called],
+    ]
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:12]
 
 
@@ -181,6 +185,7 @@ def _pod_spec(application: Application, component: Component, placed: PlannedIns
         "volumes": [
             {"name": "tls", "secret": {"secretName": secret_name(placed.instance), "defaultMode": 0o440}},
             {"name": "tmp", "emptyDir": {"sizeLimit": "64Mi"}},
+            *(volume.pod_volume() for volume in container.volumes),
         ],
         "containers": [
             {
@@ -196,6 +201,7 @@ def _pod_spec(application: Application, component: Component, placed: PlannedIns
                 "volumeMounts": [
                     {"name": "tls", "mountPath": TLS_DIR, "readOnly": True},
                     {"name": "tmp", "mountPath": "/tmp"},  # noqa: S108  (the pod's own)
+                    *(volume.mount() for volume in container.volumes),
                 ],
             }
         ],

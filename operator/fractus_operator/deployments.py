@@ -10,7 +10,7 @@ from datetime import datetime, timedelta
 
 from fractus_core.api import Application, Component, Condition, InvalidObject, component_identity
 from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec, PlannedInstance
-from fractus_core.planning.inventory import Settings
+from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.plan import Infeasible, plan
 from fractus_core.policy.grants import compile_grants
 from fractus_core.validation import check_application
@@ -151,16 +151,17 @@ class Deployments:
         application = submitted.application
         if application is None:
             raise Hindered("Invalid", "Planned", "Invalid", str(submitted.error))
+        inventory = self._live.snapshot()
         try:
-            check_application(application, self._live.snapshot().depots)
-            decided, again_s = self._plan(application, memory)
+            check_application(application, inventory.depots)
+            decided, again_s = self._plan(application, inventory, memory)
         except InvalidObject as error:
             raise Hindered("Invalid", "Planned", "Invalid", str(error)) from error
         except Infeasible as none:
             phase: Phase = "Queued" if none.reason == "DroneBusy" else "Pending"
             raise Hindered(phase, "Planned", none.reason, none.message) from none
         try:
-            grants = compile_grants(application, decided, self._live.snapshot(), self._settings)
+            grants = compile_grants(application, decided, inventory, self._settings)
         except InvalidObject as error:
             raise Hindered("Pending", "Granted", "PolicyInvalid", str(error)) from error
         try:
@@ -175,14 +176,15 @@ class Deployments:
             raise Hindered("Pending", "Deployed", error.reason, str(error), again_s=10.0) from error
         return deployed_standing(decided, pods, len(grants)), again_s
 
-    def _plan(self, application: Application, memory: _Memory) -> tuple[DeploymentPlanSpec, float]:
+    def _plan(
+        self, application: Application, inventory: Inventory, memory: _Memory
+    ) -> tuple[DeploymentPlanSpec, float]:
         """The plan to deploy: the present one while it stands, else a new one that moves as little as it can.
 
         There is no await between looking at the inventory and deciding, so two applications never
         get one drone.
         """
         key, uid, now = application.key, application.metadata.uid or "", self._clock()
-        inventory = self._live.snapshot()
         previous = self._live.plan_of(key, uid)
         stuck, again_s = stuck_nodes(previous, self._live.pods_of(key), now)
         reason = replan_reason(application, previous, inventory, stuck)

@@ -285,9 +285,8 @@ def _manual(v: Vehicle, m: Message, _c: Channel) -> None:
         v.set_sticks((1500 + y // 2, 1500 - x // 2, 1000 + max(z, 0), 1500 + r // 2))
 
 
-def _set_origin(v: Vehicle, m: Message, c: Channel) -> None:
-    if v.origin is None and valid_coordinates(m.integer("latitude"), m.integer("longitude")):
-        v.estimator.origin = Place(m.integer("latitude"), m.integer("longitude"), m.integer("altitude") / 1000.0)
+def _set_origin(v: Vehicle, _m: Message, c: Channel) -> None:
+    """The origin comes from GPS here; the answer tells where it is."""
     v.send(c, "GPS_GLOBAL_ORIGIN")
 
 

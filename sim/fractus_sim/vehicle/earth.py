@@ -45,6 +45,15 @@ class Place:
         )
 
 
+# Nothing that ArduPilot takes for a place lies higher.
+ALTITUDE_MAX_M = 83_000.0
+
+
+def valid_place(lat_e7: int, lon_e7: int, alt_m: float) -> bool:
+    """Whether a point lies on the globe, at an altitude that makes sense."""
+    return valid_coordinates(lat_e7, lon_e7) and abs(alt_m) <= ALTITUDE_MAX_M
+
+
 def valid_coordinates(lat_e7: int, lon_e7: int) -> bool:
     """Whether latitude and longitude lie on the globe."""
     return abs(lat_e7) <= 900_000_000 and abs(lon_e7) <= 1_800_000_000

@@ -11,7 +11,7 @@ from pathlib import Path
 from fractus_sim.vehicle.body import Airframe, Body, Wind
 from fractus_sim.vehicle.channel import PARAMETERS_PER_TICK, Channel
 from fractus_sim.vehicle.control import Control
-from fractus_sim.vehicle.earth import Place, valid_coordinates
+from fractus_sim.vehicle.earth import Place, valid_place
 from fractus_sim.vehicle.estimator import Estimator
 from fractus_sim.vehicle.failsafes import Failsafes
 from fractus_sim.vehicle.fence import Fence
@@ -392,7 +392,7 @@ class Vehicle:
 
     def set_home_at(self, lat_e7: int, lon_e7: int, alt_amsl_m: float) -> bool:
         """Make a given position home."""
-        if not valid_coordinates(lat_e7, lon_e7) or (lat_e7 == 0 and lon_e7 == 0) or self.origin is None:
+        if not valid_place(lat_e7, lon_e7, alt_amsl_m) or (lat_e7 == 0 and lon_e7 == 0) or self.origin is None:
             return False
         self._home_locked = True
         self._set_home(Place(lat_e7, lon_e7, alt_amsl_m))

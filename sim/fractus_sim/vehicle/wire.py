@@ -9,6 +9,8 @@ from __future__ import annotations
 import functools
 import hashlib
 import hmac
+import math
+import re
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -28,6 +30,7 @@ SIGNATURE_WINDOW = 6_000_000
 Scalar = int | float
 Value = Scalar | bytes | tuple[Scalar, ...]
 
+_FLOAT_MAX = 3.4028234e38
 _header_v2 = struct.Struct("<BBBBBBBHB")
 
 
@@ -48,9 +51,17 @@ class Layout:
     plain: bool
 
     def pack(self, values: Mapping[str, Value]) -> bytes:
-        """Serialise `values`; a field that is not given is zero."""
+        """Serialise `values`; a field that is not given is zero, a number that does not fit saturates."""
+        flat: list[Scalar | bytes] = self._flat(values)
+        try:
+            return self.packer.pack(*flat)
+        except (struct.error, OverflowError):
+            codes = _expanded(self.packer.format)
+            return self.packer.pack(*[_fitted(code, value) for code, value in zip(codes, flat, strict=True)])
+
+    def _flat(self, values: Mapping[str, Value]) -> list[Scalar | bytes]:
         if self.plain:
-            return self.packer.pack(*[values.get(name, 0) for name in self.fields])
+            return [0 if isinstance(number := values.get(name, 0), tuple) else number for name in self.fields]
         flat: list[Scalar | bytes] = []
         for name, count in zip(self.fields, self.counts, strict=True):
             value = values.get(name)
@@ -62,7 +73,7 @@ class Layout:
                 items = value if isinstance(value, tuple) else ()
                 flat.extend(items)
                 flat.extend([0] * (count - len(items)))
-        return self.packer.pack(*flat)
+        return flat
 
     def unpack(self, payload: bytes) -> dict[str, Value]:
         """Read a payload, which may be shorter (trailing zeros cut) or longer (newer extensions)."""
@@ -80,6 +91,24 @@ class Layout:
                 values[name] = tuple(flat[at : at + count])
                 at += count
         return values
+
+
+def _expanded(format_: str) -> list[str]:
+    """`<2Hb16s` to `H H b s`: one code for each value that the struct takes."""
+    codes: list[str] = []
+    for count, code in re.findall(r"(\d*)([a-zA-Z])", format_):
+        codes += [code] * (1 if code == "s" else int(count or 1))
+    return codes
+
+
+def _fitted(code: str, value: Scalar | bytes) -> Scalar | bytes:
+    if isinstance(value, bytes) or code == "s":
+        return value if isinstance(value, bytes) else b""
+    if code in "fd":
+        return max(-_FLOAT_MAX, min(_FLOAT_MAX, value)) if math.isfinite(value) else value
+    bits = 8 * struct.calcsize(code if code not in "qQ" else "<" + code)
+    low, high = (-(1 << (bits - 1)), (1 << (bits - 1)) - 1) if code.islower() else (0, (1 << bits) - 1)
+    return max(low, min(high, int(value))) if math.isfinite(value) else 0
 
 
 @functools.cache

@@ -1,0 +1,82 @@
+"""Zones as GeoJSON (RFC 7946): polygons, multipolygons, and points with a radius."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from typing import Any
+
+from fractus_core.api import InvalidObject, Zone
+from fractus_core.geo.formats.drafts import (
+    Drafts,
+    Exported,
+    Imported,
+    area_rings,
+    objects,
+    parse_json,
+    place,
+    rings,
+    round_area,
+    unsaid,
+)
+
+_KNOWN = frozenset({"name", "title", "description", "radius", "altitude", "schedule"})
+_STYLE = frozenset({"fill", "fill-opacity", "stroke", "stroke-width", "stroke-opacity", "marker-color"})
+
+
+def read_geojson(text: str) -> Imported:
+    """Zones from features; altitude and schedule come from properties of these names, spelt as in a Zone.
+
+    Raises:
+        InvalidObject: this is no GeoJSON, or a geometry is broken.
+    """
+    whole = parse_json(text)
+    kind = whole.get("type")
+    if kind == "FeatureCollection":
+        features = objects(whole.get("features"), "features")
+    elif kind == "Feature":
+        features = [whole]
+    elif kind in {"Polygon", "MultiPolygon"}:
+        features = [{"type": "Feature", "geometry": whole, "properties": {}}]
+    else:
+        raise InvalidObject("type", f"{kind!r} is no GeoJSON of zones; expected a FeatureCollection of polygons")
+    drafts = Drafts()
+    for i, feature in enumerate(features):
+        _read_feature(drafts, feature, f"features[{i}]")
+    return drafts.result()
+
+
+def _read_feature(drafts: Drafts, feature: dict[str, Any], field: str) -> None:
+    properties = feature.get("properties") or {}
+    title = str(properties.get("name") or properties.get("title") or feature.get("id") or f"zone {field[9:-1]}")
+    spec = {k: properties[k] for k in ("altitude", "schedule", "description") if properties.get(k)}
+    dropped = sorted(set(properties) - _KNOWN - _STYLE)
+    if dropped:
+        drafts.note(title, f"no place for properties {', '.join(dropped)}; left out")
+    geometry = feature.get("geometry") or {}
+    coordinates = geometry.get("coordinates")
+    where = f"{field}.geometry.coordinates"
+    match geometry.get("type"):
+        case "Polygon":
+            drafts.add(title, {**spec, "area": rings(coordinates, where)})
+        case "MultiPolygon":
+            for j, part in enumerate(coordinates or ()):
+                drafts.add(title, {**spec, "area": rings(part, f"{where}[{j}]")})
+        case "Point" if "radius" in properties:
+            area = round_area(place(coordinates, where), properties["radius"], f"{field}.properties.radius")
+            drafts.add(title, {**spec, "area": area})
+        case other:
+            drafts.note(title, f"a geometry of type {other} is no zone; left out")
+
+
+def write_geojson(zones: Iterable[Zone]) -> Exported:
+    """A FeatureCollection with a polygon for each zone; read_geojson takes it back."""
+    zones = tuple(zones)
+    features = []
+    for zone in zones:
+        spec = zone.spec.to_dict()
+        properties = {"name": zone.name} | {k: spec[k] for k in ("altitude", "schedule", "description") if spec.get(k)}
+        geometry = {"type": "Polygon", "coordinates": area_rings(zone.spec.area)}
+        features.append({"type": "Feature", "properties": properties, "geometry": geometry})
+    text = json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"
+    return Exported(text, tuple(unsaid(zones, "circle")))

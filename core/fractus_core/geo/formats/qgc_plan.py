@@ -1,0 +1,90 @@
+"""Zones as the geofence of a QGroundControl plan file (version 2 of geoFence)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+
+from fractus_core.api import InvalidObject, Zone
+from fractus_core.geo.formats.drafts import (
+    Drafts,
+    Exported,
+    Imported,
+    objects,
+    parse_json,
+    place,
+    ring,
+    round_area,
+    unsaid,
+)
+
+_FENCE_VERSION = 2
+
+
+def read_qgc_plan(text: str) -> Imported:
+    """Zones from the fence's polygons and circles; whether each is for inclusion is told in its description.
+
+    Raises:
+        InvalidObject: this is no plan file, or a shape is broken.
+    """
+    whole = parse_json(text)
+    if whole.get("fileType") != "Plan":
+        raise InvalidObject("fileType", f"must be Plan, not {whole.get('fileType')!r}")
+    fence = whole.get("geoFence") or {}
+    if fence and fence.get("version") != _FENCE_VERSION:
+        raise InvalidObject(
+            "geoFence.version", f"must be {_FENCE_VERSION}, not {fence.get('version')!r}; save the plan anew"
+        )
+    drafts = Drafts()
+    for i, item in enumerate(objects(fence.get("polygons"), "geoFence.polygons")):
+        field = f"geoFence.polygons[{i}]"
+        exterior = ring(item.get("polygon"), f"{field}.polygon", lat_first=True)
+        _add(drafts, f"polygon {i + 1}", {"polygon": {"exterior": exterior}}, inclusion=bool(item.get("inclusion")))
+    for i, item in enumerate(objects(fence.get("circles"), "geoFence.circles")):
+        field = f"geoFence.circles[{i}].circle"
+        circle = item.get("circle") or {}
+        area = round_area(
+            place(circle.get("center"), f"{field}.center", lat_first=True), circle.get("radius"), f"{field}.radius"
+        )
+        _add(drafts, f"circle {i + 1}", area, inclusion=bool(item.get("inclusion")))
+    if (whole.get("mission") or {}).get("items"):
+        drafts.note("mission", "its items are no zones; left out")
+    if (whole.get("rallyPoints") or {}).get("points"):
+        drafts.note("rallyPoints", "its points are no zones; left out")
+    if fence.get("breachReturn"):
+        drafts.note("geoFence.breachReturn", "is no zone; left out")
+    return drafts.result()
+
+
+def _add(drafts: Drafts, title: str, area: dict[str, object], *, inclusion: bool) -> None:
+    kind = "inclusion" if inclusion else "exclusion"
+    drafts.add(f"{kind} {title}", {"area": area, "description": f"From a QGroundControl plan, for {kind}."})
+    drafts.note(f"{kind} {title}", f"a Zone forbids nothing by itself; add a GeofenceControl policy of kind {kind}")
+
+
+def write_qgc_plan(zones: Iterable[Zone], *, inclusion: bool = False) -> Exported:
+    """A plan file without a mission whose fence has all zones, for exclusion or for inclusion."""
+    zones = tuple(zones)
+    polygons, circles = [], []
+    for zone in zones:
+        area = zone.spec.area
+        if area.circle is not None:
+            centre = [area.circle.center.lat, area.circle.center.lon]
+            circle = {"center": centre, "radius": area.circle.radius}
+            circles.append({"circle": circle, "inclusion": inclusion, "version": 1})
+        elif area.polygon is not None:
+            corners = [[p.lat, p.lon] for p in area.polygon.exterior]
+            polygons.append({"polygon": corners, "inclusion": inclusion, "version": 1})
+    mission = {
+        "cruiseSpeed": 15, "firmwareType": 3, "globalPlanAltitudeMode": 1, "hoverSpeed": 5, "items": [],
+        "plannedHomePosition": [0, 0, 0], "vehicleType": 2, "version": 2,
+    }  # fmt: skip
+    whole = {
+        "fileType": "Plan",
+        "geoFence": {"circles": circles, "polygons": polygons, "version": _FENCE_VERSION},
+        "groundStation": "QGroundControl",
+        "mission": mission,
+        "rallyPoints": {"points": [], "version": 2},
+        "version": 1,
+    }
+    return Exported(json.dumps(whole, indent=2) + "\n", tuple(unsaid(zones, "altitude", "schedule", "holes")))

@@ -80,10 +80,15 @@ def dns_objects(listen: IPv4Address) -> list[tuple[str, Json]]:
 
 def extended_resources_patch(node: NodeSpec, present: Json) -> tuple[str, Json] | None:
     """Return path and merge patch that give a node its extended resources; None when it offers them already."""
-    capacity = present.get("status", {}).get("capacity", {})
-    if all(str(capacity.get(name)) == amount for name, amount in node.extended_resources.items()):
-        return None
-    return f"/api/v1/nodes/{node.name}/status", {"status": {"capacity": dict(node.extended_resources)}}
+    wanted = dict(node.extended_resources)
+    status = present.get("status", {})
+    # Kubelet would work out what is allocatable by itself, but only at its next heartbeat.
+    patch = {
+        field: wanted
+        for field in ("capacity", "allocatable")
+        if any(str(status.get(field, {}).get(name)) != amount for name, amount in wanted.items())
+    }
+    return (f"/api/v1/nodes/{node.name}/status", {"status": patch}) if patch else None
 
 
 def is_ready(node: Json, *, since: datetime | None = None) -> bool:

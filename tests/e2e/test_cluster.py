@@ -1,0 +1,309 @@
+"""The embedded cluster: real nodes that can lose power and contact, complete repair, complete removal.
+
+These tests bring up clusters of their own, so they run wherever this is root on Linux, whatever FRACTUS_E2E_CLUSTER says.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from fractus_sim.cluster import Cluster, ClusterError, ClusterSpec
+from fractus_sim.cluster.images.build import build_images
+from fractus_sim.cluster.network import host_link
+from fractus_sim.cluster.processes import kill, read_record
+from fractus_sim.cluster.spec import load_spec, parse_spec
+from fractus_sim.cluster.state import state_of
+
+pytestmark = [pytest.mark.root, pytest.mark.skipif(os.geteuid() != 0, reason="needs root")]
+
+ROOT = Path(__file__).parents[2]
+NAME = f"ct{os.getpid()}"
+IMAGE = "localhost/fractus/component:dev"
+
+WORKLOAD = f"""
+apiVersion: apps/v1
+kind: DaemonSet
+metadata: {{name: web}}
+spec:
+  selector: {{matchLabels: {{app: web}}}}
+  template:
+    metadata: {{labels: {{app: web}}}}
+    spec:
+      terminationGracePeriodSeconds: 0
+      tolerations: [{{operator: Exists}}]
+      securityContext: {{runAsNonRoot: true, seccompProfile: {{type: RuntimeDefault}}}}
+      containers:
+        - name: web
+          image: {IMAGE}
+          args: [-m, http.server, "8080", --directory, /etc]
+          securityContext:
+            allowPrivilegeEscalation: false
+            readOnlyRootFilesystem: true
+            capabilities: {{drop: [ALL]}}
+          readinessProbe: {{httpGet: {{port: 8080, path: /hostname}}, periodSeconds: 1}}
+---
+apiVersion: v1
+kind: Service
+metadata: {{name: web}}
+spec: {{selector: {{app: web}}, ports: [{{port: 80, targetPort: 8080}}]}}
+"""
+
+
+def spec_of(name: str, nodes: int = 2) -> ClusterSpec:
+    """A drone, and edge nodes."""
+    drone = load_spec(ROOT / "examples" / "clusters" / "demo.yaml").nodes[0].model_dump(by_alias=True)
+    edges = [
+        {"name": f"edge-{n}", "class": "edge", "resources": {"cpu": 1, "memory": "1Gi", "fractus.dev/gpu": 3}}
+        for n in range(1, nodes)
+    ]
+    return parse_spec({"name": name, "nodes": [drone, *edges]}, source="test")
+
+
+def until(condition: Callable[[], Any], what: str, timeout_s: float = 40.0) -> Any:
+    """Wait for a condition and return what it returned."""
+    deadline = time.monotonic() + timeout_s
+    while not (found := condition()):
+        assert time.monotonic() < deadline, f"waited {timeout_s:.0f} s for {what}"
+        threading.Event().wait(0.1)
+    return found
+
+
+def leftovers(name: str) -> list[str]:
+    """All that a cluster of this name has on the machine."""
+    found = [f"mount {line}" for line in Path("/proc/self/mountinfo").read_text().splitlines() if f"/{name}/" in line]
+    found += [f"netns {p}" for p in Path("/run/netns").glob(f"fractus.{name}*")]
+    found += [f"cgroup {p}" for p in Path("/sys/fs/cgroup").glob(f"**/fractus-sim/{name}")]
+    found += [f"state {p}" for p in (state_of(name).path, Path(f"/run/fractus-sim/cluster.{name}.lock")) if p.exists()]
+    ledger = Path("/run/fractus-sim/machine.json")
+    found += ["claim"] if ledger.exists() and name in json.loads(ledger.read_text())["claims"] else []
+    found += ["link"] if Path(f"/sys/class/net/{host_link(name)}").exists() else []
+    for process in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            words = process.read_bytes().decode(errors="replace").split("\0")
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+        found += [f"process {words[:4]}"] if any(f"/{name}/" in w or f"fractus.{name}" in w for w in words) else []
+    return found
+
+
+def ready(cluster: Cluster) -> dict[str, bool]:
+    """Which nodes the API server calls Ready."""
+    return {node.name: bool(node.ready) for node in cluster.status()}
+
+
+def pods(cluster: Cluster) -> dict[str, dict[str, Any]]:
+    """The workload's pods by node."""
+    items = json.loads(cluster.kubectl("get", "pods", "-l", "app=web", "-o", "json").stdout)["items"]
+    return {item["spec"]["nodeName"]: item for item in items if "nodeName" in item["spec"]}
+
+
+def running(cluster: Cluster, node: str) -> bool:
+    """Whether the workload's pod on a node is ready."""
+    conditions = pods(cluster).get(node, {}).get("status", {}).get("conditions", [])
+    return any(entry["type"] == "Ready" and entry["status"] == "True" for entry in conditions)
+
+
+@pytest.fixture(scope="module")
+def small() -> Iterator[Cluster]:
+    """A drone and an edge node with a web server each."""
+    build_images(ROOT, targets=("component",), report=print)
+    cluster = Cluster.load(spec_of(NAME), report=print)
+    try:
+        cluster.up(images=[IMAGE])
+        cluster.kubectl("apply", "-f", "-", input_text=WORKLOAD)
+        for node in ("drone-1", "edge-1"):
+            until(lambda node=node: running(cluster, node), f"the pod on {node}")
+        yield cluster
+    finally:
+        cluster.down()
+        assert leftovers(NAME) == []
+
+
+@pytest.fixture
+def healthy(small: Cluster) -> Iterator[Cluster]:
+    """The small cluster, put right again afterwards."""
+    yield small
+    small.up()
+    for node in ("drone-1", "edge-1"):
+        until(lambda node=node: running(small, node), f"the pod on {node}")
+
+
+def test_nodes_are_as_described(small: Cluster) -> None:
+    items = json.loads(small.kubectl("get", "nodes", "-o", "json").stdout)["items"]
+    nodes = {item["metadata"]["name"]: item for item in items}
+    assert set(nodes) == {"drone-1", "edge-1"}
+    assert nodes["drone-1"]["metadata"]["labels"]["fractus.dev/class"] == "drone"
+    offered = nodes["edge-1"]["status"]["allocatable"]
+    assert (offered["cpu"], offered["memory"], offered["fractus.dev/gpu"]) == ("1", "1Gi", "3")
+    written = yaml.safe_load(small.node("drone-1").exec(["cat", "/etc/fractus/node.yaml"]).stdout)
+    assert written == small.spec.nodes[0].manifest
+    assert small.node("drone-1").exec(["hostname"]).stdout.strip() == "drone-1"
+    assert not Path("/etc/fractus/node.yaml").exists()
+
+
+def test_services_and_names_work_across_nodes(small: Cluster) -> None:
+    found = pods(small)
+    for node, other in (("drone-1", "edge-1"), ("edge-1", "drone-1")):
+        name, address = found[node]["metadata"]["name"], found[other]["status"]["podIP"]
+        fetched = small.kubectl("exec", name, "--", "wget", "-qO-", "-T", "5", f"http://{address}:8080/hostname")
+        assert fetched.stdout.strip() == found[other]["metadata"]["name"]
+        small.kubectl("exec", name, "--", "wget", "-qO-", "-T", "5", "http://web.default.svc.cluster.local/hostname")
+    assert "GET /hostname" in small.kubectl("logs", found["edge-1"]["metadata"]["name"]).stdout
+
+
+def test_machine_reaches_pods_but_keeps_its_settings(small: Cluster) -> None:
+    address = pods(small)["edge-1"]["status"]["podIP"]
+    done = subprocess.run(
+        ["curl", "-sf", "-m", "5", f"http://{address}:8080/hostname"], capture_output=True, check=True
+    )
+    assert done.stdout
+    seen = small.node("edge-1").exec(["cat", "/proc/sys/vm/overcommit_memory"]).stdout.strip()
+    assert seen == "1"  # what kubelet wants, without the machine's own being touched
+    records = json.loads(Path("/run/fractus-sim/machine.json").read_text())["sysctls"]
+    assert set(records) <= {"fs.inotify.max_user_instances", "fs.inotify.max_user_watches"}
+
+
+def test_second_up_changes_nothing(small: Cluster) -> None:
+    state = state_of(NAME)
+    before = {path.name: path.read_text() for path in (state.path / "processes").iterdir()}
+    started = time.monotonic()
+    small.up(images=[IMAGE])
+    took_s = time.monotonic() - started
+    assert {path.name: path.read_text() for path in (state.path / "processes").iterdir()} == before
+    assert took_s < 5, f"took {took_s:.1f} s"  # under 2 s on an idle machine
+
+
+def test_power_off_kills_the_node_but_not_its_vehicle(healthy: Cluster) -> None:
+    drone = healthy.node("drone-1")
+    vehicle = read_record(state_of(NAME).process("vehicle.drone-1"))
+    assert vehicle is not None
+    uid = pods(healthy)["drone-1"]["metadata"]["uid"]
+    drone.power_off()
+    assert not drone.powered
+    assert vehicle.alive
+    with pytest.raises(ClusterError, match="drone-1 is off"):
+        drone.exec(["true"])
+    until(lambda: not ready(healthy)["drone-1"], "the node to be missed")
+    assert vehicle.alive
+    drone.power_on()
+    until(lambda: ready(healthy)["drone-1"], "the node to be back")
+    until(lambda: running(healthy, "drone-1"), "the pod to be back")
+    assert pods(healthy)["drone-1"]["metadata"]["uid"] == uid
+    assert vehicle.alive
+
+
+def test_cut_link_loses_contact_and_nothing_else(healthy: Cluster) -> None:
+    edge = healthy.node("edge-1")
+    pod = pods(healthy)["edge-1"]
+    edge.cut_link()
+    assert [node.linked for node in healthy.status() if node.name == "edge-1"] == [False]
+    until(lambda: not ready(healthy)["edge-1"], "the node to be missed")
+    assert edge.exec(["curl", "-sf", "-m", "5", f"http://{pod['status']['podIP']}:8080/hostname"]).stdout
+    edge.heal_link()
+    until(lambda: ready(healthy)["edge-1"] and running(healthy, "edge-1"), "the node to be back")
+    again = pods(healthy)["edge-1"]
+    assert again["metadata"]["uid"] == pod["metadata"]["uid"]
+    assert again["status"]["containerStatuses"][0]["restartCount"] == 0
+
+
+@pytest.mark.parametrize("victim", ["control-plane", "node.edge-1", "vehicle.drone-1"])
+def test_up_repairs_what_died(healthy: Cluster, victim: str) -> None:
+    record = read_record(state_of(NAME).process(victim))
+    assert record is not None
+    kill(record)
+    healthy.up()
+    again = read_record(state_of(NAME).process(victim))
+    assert again is not None
+    assert again.alive
+    assert again != record
+    assert all(ready(healthy).values())
+
+
+def test_daemons_that_die_come_back_and_pods_live_on(healthy: Cluster) -> None:
+    edge = healthy.node("edge-1")
+    before = pods(healthy)["edge-1"]["status"]["containerStatuses"][0]["containerID"]
+
+    def pid(program: str) -> str:
+        listed = edge.exec(["sh", "-c", f'for p in /proc/[0-9]*; do [ "$(cat $p/comm)" = {program} ] && echo $p; done'])
+        return listed.stdout.strip()
+
+    for program in ("kubelet", "containerd"):
+        old = pid(program)
+        edge.exec(["kill", "-9", old.removeprefix("/proc/")])
+        until(lambda program=program, old=old: pid(program) not in ("", old), f"{program} to be back")
+    until(
+        lambda: edge.exec(["ctr", "-n", "k8s.io", "tasks", "ls"], check=False).returncode == 0, "containerd to answer"
+    )
+    until(lambda: running(healthy, "edge-1"), "the pod to be ready")
+    assert pods(healthy)["edge-1"]["status"]["containerStatuses"][0]["containerID"] == before
+
+
+def test_nodes_come_and_go_with_the_file(healthy: Cluster) -> None:
+    address = healthy.node("edge-1").address
+    three = Cluster(spec_of(NAME, 3), report=print)
+    three.up()
+    assert set(ready(three)) == {"drone-1", "edge-1", "edge-2"}
+    assert all(ready(three).values())
+    Cluster(spec_of(NAME, 2), report=print).up()
+    names = healthy.kubectl("get", "nodes", "-o", "name").stdout.split()
+    assert sorted(names) == ["node/drone-1", "node/edge-1"]
+    assert healthy.node("edge-1").address == address
+    assert not list(Path("/run/netns").glob(f"fractus.{NAME}.edge-2"))
+
+
+def test_images_come_in_the_layers_that_are_missing(small: Cluster) -> None:
+    assert small.load_images([IMAGE]) == {"drone-1": 0, "edge-1": 0}
+    with pytest.raises(ClusterError, match="no image localhost/fractus/nothing:1"):
+        small.load_images(["localhost/fractus/nothing:1"])
+
+
+def test_second_cluster_does_not_disturb(small: Cluster) -> None:
+    name = f"{NAME}b"
+    second = Cluster(spec_of(name, 1), report=print)
+    try:
+        second.up()
+        assert ready(second) == {"drone-1": True}
+        assert second.node("drone-1").address != small.node("drone-1").address
+        assert sorted(ready(small)) == ["drone-1", "edge-1"]
+        second.node("drone-1").power_off()
+        assert small.node("drone-1").powered
+    finally:
+        second.down()
+    assert leftovers(name) == []
+    assert all(ready(small).values())
+
+
+@pytest.mark.parametrize("after_s", [0.8, 2.0, 3.5])
+@pytest.mark.parametrize("then", ["up", "down"])
+def test_survives_an_interrupted_up(then: str, after_s: float) -> None:
+    name = f"{NAME}i"
+    file = state_of(name).path.parent / f".{name}.yaml"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(spec_of(name).to_yaml())
+    cluster = Cluster.load(file)
+    try:
+        argv = [sys.executable, "-m", "fractus.cli", "cluster", "up", str(file)]
+        with subprocess.Popen(argv, stderr=subprocess.DEVNULL) as process:
+            try:
+                process.wait(timeout=after_s)
+            except subprocess.TimeoutExpired:
+                process.send_signal(signal.SIGKILL)
+        if then == "up":
+            cluster.up()
+            assert all(ready(cluster).values())
+    finally:
+        file.unlink()
+        cluster.down()
+    assert leftovers(name) == []
+    cluster.down()  # once more is harmless

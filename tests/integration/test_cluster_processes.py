@@ -1,0 +1,180 @@
+"""Processes of a cluster: known again, killed for certain, restarted, and locked against each other."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from fractus_sim.cluster import ClusterError
+from fractus_sim.cluster.locking import locked
+from fractus_sim.cluster.pki import Authority
+from fractus_sim.cluster.processes import ProcessRecord, kill, read_record, record_of, spawn, write_record
+
+ENVIRONMENT = {"PATH": os.environ["PATH"]}
+
+
+def until(condition: Callable[[], bool], what: str, timeout_s: float = 20.0) -> None:
+    """Wait for a condition."""
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, f"waited {timeout_s:.0f} s for {what}"
+        threading.Event().wait(0.02)
+
+
+@pytest.fixture
+def sleeper(tmp_path: Path) -> Iterator[ProcessRecord]:
+    """A process of ours that does nothing."""
+    record = spawn(["sleep", "300"], log=tmp_path / "log", env=ENVIRONMENT)
+    yield record
+    kill(record)
+
+
+def test_record_survives_being_stored(sleeper: ProcessRecord, tmp_path: Path) -> None:
+    write_record(tmp_path / "record.json", sleeper)
+    stored = read_record(tmp_path / "record.json")
+    assert stored == sleeper
+    assert stored is not None
+    assert stored.alive
+
+
+def test_broken_record_is_none(tmp_path: Path) -> None:
+    for text in ("", "{", '{"pid": 1}', "[]"):
+        (tmp_path / "record.json").write_text(text)
+        assert read_record(tmp_path / "record.json") is None
+
+
+def test_kill_ends_the_process(sleeper: ProcessRecord) -> None:
+    kill(sleeper)
+    assert not sleeper.alive
+
+
+@pytest.mark.parametrize("change", [{"start_ticks": 1}, {"boot_id": "another"}])
+def test_another_process_with_the_same_pid_is_left_alone(sleeper: ProcessRecord, change: dict[str, object]) -> None:
+    stranger = replace(sleeper, **change)  # type: ignore[arg-type]
+    assert not stranger.alive
+    kill(stranger)
+    assert sleeper.alive
+
+
+def test_process_is_in_a_session_of_its_own(sleeper: ProcessRecord) -> None:
+    assert os.getsid(sleeper.pid) == sleeper.pid
+    assert os.getsid(sleeper.pid) != os.getsid(0)
+
+
+@pytest.fixture
+def supervisor(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
+    """Starts a supervisor with shell scripts as units."""
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start(**scripts: str) -> subprocess.Popen[bytes]:
+        units = [
+            {"name": name, "argv": ["/bin/sh", "-c", script], "log": str(tmp_path / f"{name}.log"), "env": ENVIRONMENT}
+            for name, script in scripts.items()
+        ]
+        (tmp_path / "units.json").write_text(json.dumps({"units": units}))
+        with (tmp_path / "supervisor.log").open("wb") as log:
+            argv = [sys.executable, "-m", "fractus_sim.cluster.supervisor", str(tmp_path / "units.json")]
+            started.append(subprocess.Popen(argv, stdout=log, stderr=log))
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.kill()
+        process.wait(timeout=10)
+
+
+def test_supervisor_restarts_what_ends_ever_more_slowly(
+    supervisor: Callable[..., subprocess.Popen[bytes]], tmp_path: Path
+) -> None:
+    supervisor(crashing="date +%s%N", steady="echo up; exec sleep 300")
+
+    def starts() -> list[int]:
+        log = tmp_path / "crashing.log"
+        return [int(line) for line in log.read_text().split()] if log.exists() else []
+
+    until(lambda: len(starts()) >= 4, "four starts")
+    first, second, third = (after - before for before, after in zip(starts(), starts()[1:4], strict=False))
+    assert first < second < third
+    assert (tmp_path / "steady.log").read_text() == "up\n"
+
+
+def test_units_die_with_their_supervisor(supervisor: Callable[..., subprocess.Popen[bytes]], tmp_path: Path) -> None:
+    process = supervisor(unit="echo $$; exec sleep 300")
+    log = tmp_path / "unit.log"
+    until(lambda: log.exists() and log.read_text().strip().isdigit(), "the unit's start")
+    record = record_of(int(log.read_text()))
+    assert record is not None
+    process.kill()
+    until(lambda: not record.alive, "the unit's end")
+
+
+def test_supervisor_ends_on_request(supervisor: Callable[..., subprocess.Popen[bytes]], tmp_path: Path) -> None:
+    process = supervisor(unit="echo up; exec sleep 300")
+    until(lambda: (tmp_path / "unit.log").exists() and (tmp_path / "unit.log").stat().st_size > 0, "the unit's start")
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(timeout=10) == 0
+
+
+def test_supervisor_goes_on_when_a_program_is_missing(
+    supervisor: Callable[..., subprocess.Popen[bytes]], tmp_path: Path
+) -> None:
+    units = [
+        {"name": "gone", "argv": ["/nonexistent"], "log": str(tmp_path / "gone.log"), "env": {}},
+        {"name": "here", "argv": ["/bin/echo", "up"], "log": str(tmp_path / "here.log"), "env": {}},
+    ]
+    process = supervisor()
+    process.kill()
+    process.wait(timeout=10)
+    (tmp_path / "units.json").write_text(json.dumps({"units": units}))
+    argv = [sys.executable, "-m", "fractus_sim.cluster.supervisor", str(tmp_path / "units.json")]
+    with subprocess.Popen(argv, stdout=subprocess.DEVNULL) as second:
+        try:
+            until(lambda: (tmp_path / "here.log").exists() and "up" in (tmp_path / "here.log").read_text(), "here")
+        finally:
+            second.kill()
+
+
+def test_lock_is_held_by_one_and_freed_by_death(tmp_path: Path) -> None:
+    script = (
+        "import sys, time; from pathlib import Path; from fractus_sim.cluster.locking import locked\n"
+        "with locked(Path(sys.argv[1]), timeout_s=5, what='x'):\n    print('held', flush=True); time.sleep(300)"
+    )
+    path = tmp_path / "lock"
+    argv = [sys.executable, "-c", script, str(path)]
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        said: list[str] = []
+        with (
+            pytest.raises(ClusterError, match="somebody builds"),
+            locked(path, timeout_s=0.3, what="somebody builds", report=said.append),
+        ):
+            pytest.fail("two hold the lock")
+        assert said == ["waiting: somebody builds"]
+        holder.kill()
+        holder.wait(timeout=10)
+    with locked(path, timeout_s=5, what="nobody", remove=True):
+        assert path.exists()
+    assert not path.exists()
+
+
+def test_certificates_are_made_once_and_again_for_other_names(tmp_path: Path) -> None:
+    authority = Authority(tmp_path)
+    first = authority.issue("server", common_name="s", alternative_names=("a.example",)).certificate.read_bytes()
+    again = Authority(tmp_path).issue("server", common_name="s", alternative_names=("a.example",))
+    assert again.certificate.read_bytes() == first
+    other = authority.issue("server", common_name="s", alternative_names=("b.example",))
+    assert other.certificate.read_bytes() != first
+    issued = x509.load_pem_x509_certificate(other.certificate.read_bytes())
+    issued.verify_directly_issued_by(x509.load_pem_x509_certificate(authority.credential.certificate.read_bytes()))
+    assert all(path.stat().st_mode & 0o077 == 0 for path in tmp_path.iterdir())

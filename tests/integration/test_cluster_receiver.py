@@ -1,0 +1,107 @@
+"""The registry of one push, against buildah itself."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import http.client
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fractus_sim.cluster.images.layout import Layout
+from fractus_sim.cluster.images.receiver import receiving
+
+NAME = "localhost/fractus-test/receiver:1"
+
+
+@pytest.fixture
+def layout(tmp_path: Path) -> Layout:
+    """An empty layout."""
+    made = Layout(tmp_path / "layout")
+    made.create()
+    return made
+
+
+def buildah(*arguments: str) -> str:
+    """Run buildah; an image of ours alone, so no other is touched."""
+    done = subprocess.run(["buildah", *arguments], capture_output=True, text=True, timeout=60, check=True)
+    return done.stdout.strip()
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Iterator[str]:
+    """A small image in buildah's storage."""
+    if shutil.which("buildah") is None or os.geteuid() != 0:
+        pytest.skip("needs buildah and root")
+    container = buildah("from", "scratch")
+    try:
+        (tmp_path / "file").write_bytes(b"content " * 5000)
+        buildah("add", "--quiet", container, str(tmp_path / "file"), "/file")
+        buildah("commit", "--quiet", container, NAME)
+    finally:
+        buildah("rm", container)
+    yield NAME
+    buildah("rmi", NAME)
+
+
+@pytest.mark.root
+def test_takes_an_image_of_buildah_uncompressed(layout: Layout, image: str) -> None:
+    with receiving(layout) as address:
+        buildah("push", "--quiet", "--tls-verify=false", image, f"docker://{address}/{image}")
+    received = layout.image(image)
+    *layers, config, _ = layout.digests(received)
+    assert json.loads(layout.blob(config).read_text())["rootfs"]["diff_ids"] == layers
+    for digest in layers:
+        assert "sha256:" + hashlib.sha256(layout.blob(digest).read_bytes()).hexdigest() == digest
+    assert buildah("inspect", "--format", "{{.FromImageID}}", image) == layout.image_id(received)
+    assert not list(layout.path.glob(".upload-*"))
+
+
+@pytest.mark.root
+def test_second_push_sends_no_layer(layout: Layout, image: str) -> None:
+    with receiving(layout) as address:
+        buildah("push", "--quiet", "--tls-verify=false", image, f"docker://{address}/{image}")
+    written = {path.name: path.stat().st_mtime_ns for path in (layout.path / "blobs" / "sha256").iterdir()}
+    with receiving(layout) as address:
+        buildah("push", "--quiet", "--tls-verify=false", image, f"docker://{address}/{image}")
+    layers = {digest.removeprefix("sha256:") for digest in layout.digests(layout.image(image))[:-2]}
+    assert all((layout.path / "blobs" / "sha256" / name).stat().st_mtime_ns == written[name] for name in layers)
+
+
+def upload(address: str, content: bytes, digest: str) -> int:
+    """Upload a blob the way a client does, and return the last status."""
+    connection = http.client.HTTPConnection(address, timeout=10)
+    connection.request("POST", "/v2/a/b/blobs/uploads/")
+    begun = connection.getresponse()
+    begun.read()
+    place = begun.headers["Location"]
+    connection.request("PATCH", place, body=content)
+    connection.getresponse().read()
+    connection.request("PUT", f"{place}?digest={digest}")
+    status = connection.getresponse().status
+    connection.close()
+    return status
+
+
+def test_refuses_what_is_not_what_it_claims(layout: Layout) -> None:
+    with receiving(layout) as address:
+        assert upload(address, b"content", "sha256:" + "0" * 64) == 400
+        digest = "sha256:" + hashlib.sha256(b"content").hexdigest()
+        assert upload(address, b"content", digest) == 201
+        assert layout.blob(digest).read_bytes() == b"content"
+
+
+def test_knows_compressed_layers_by_their_content(layout: Layout) -> None:
+    packed = gzip.compress(b"layer" * 1000)
+    plain = "sha256:" + hashlib.sha256(b"layer" * 1000).hexdigest()
+    with receiving(layout) as address:
+        assert upload(address, packed, "sha256:" + hashlib.sha256(packed).hexdigest()) == 201
+        connection = http.client.HTTPConnection(address, timeout=10)
+        connection.request("HEAD", f"/v2/a/b/blobs/{plain}")
+        assert connection.getresponse().status == 200
+        connection.close()

@@ -1,0 +1,116 @@
+"""Programs: pinned sources, accepted versions, and messages of what is missing."""
+
+from __future__ import annotations
+
+import re
+from importlib import resources
+from pathlib import Path
+
+import pytest
+from fractus_sim.cluster import ClusterError, PrerequisiteError
+from fractus_sim.cluster.binaries import CLUSTER_PROGRAMS, KUBERNETES_VERSION, PROGRAMS, ensure_binaries
+from fractus_sim.cluster.binaries import build as build_module
+from fractus_sim.cluster.binaries.catalog import MODULES
+from fractus_sim.cluster.prerequisites import check_root
+
+GOMOD = resources.files("fractus_sim.cluster.binaries") / "gomod"
+
+REQUIRED = {
+    "etcd": "go.etcd.io/etcd/server/v3",
+    "coredns": "github.com/coredns/coredns",
+    "helm": "helm.sh/helm/v3",
+    "kwok": "sigs.k8s.io/kwok",
+    "crane": "github.com/google/go-containerregistry",
+    "kubelet": "k8s.io/kubernetes",
+}
+
+
+def script(path: Path, prints: str) -> None:
+    """A program that says its version."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!/bin/sh\necho '{prints}'\n")
+    path.chmod(0o755)
+
+
+@pytest.mark.parametrize(("program", "module"), REQUIRED.items())
+def test_go_mod_pins_the_version_of_the_catalog(program: str, module: str) -> None:
+    entry = PROGRAMS[program]
+    text = (GOMOD / entry.module / "go.mod").read_text()
+    found = re.search(rf"^(?:require )?\s*{re.escape(module)} v(\S+)", text, re.MULTILINE)
+    assert found is not None
+    assert found[1] == entry.version
+
+
+@pytest.mark.parametrize("module", sorted(set(MODULES) - {"pause"}))
+def test_sources_are_pinned_by_checksum(module: str) -> None:
+    assert (GOMOD / module / "go.sum").read_text().count("h1:") > 20
+
+
+def test_staging_modules_match_kubernetes() -> None:
+    text = (GOMOD / "kubernetes" / "go.mod").read_text()
+    versions = set(re.findall(r"=> k8s\.io/\S+ v(\S+)", text))
+    assert versions == {"0" + KUBERNETES_VERSION[1:]}
+
+
+@pytest.fixture
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A machine with an empty cache, nothing on PATH but a shell, and no Go."""
+    monkeypatch.setenv("FRACTUS_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("PATH", str(tmp_path / "path"))
+    monkeypatch.delenv("KUBEBUILDER_ASSETS", raising=False)
+    return tmp_path
+
+
+def test_takes_programs_from_assets_and_path(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script(machine / "assets" / "etcd", "etcd Version: 3.5.1")
+    script(machine / "path" / "etcd", "etcd Version: 3.6.0")
+    script(machine / "path" / "kubectl", f"Client Version: v{KUBERNETES_VERSION}")
+    assert ensure_binaries(["etcd", "kubectl"], report=print)["etcd"] == machine / "path" / "etcd"
+    monkeypatch.setenv("KUBEBUILDER_ASSETS", str(machine / "assets"))
+    found = ensure_binaries(["etcd", "kubectl"], report=print)
+    assert found["etcd"] == machine / "assets" / "etcd"
+    assert found["kubectl"] == machine / "path" / "kubectl"
+
+
+def test_does_not_take_another_version(machine: Path) -> None:
+    script(machine / "path" / "kubectl", "Client Version: v1.32.4")
+    with pytest.raises(PrerequisiteError, match=r"Go 1\.25"):
+        ensure_binaries(["kubectl"], report=print)
+
+
+def test_old_go_is_refused(machine: Path) -> None:
+    script(machine / "path" / "go", "go1.21.3")
+    with pytest.raises(PrerequisiteError, match=r"found go1\.21\.3"):
+        ensure_binaries(["pause"], report=print)
+
+
+def test_failed_build_leaves_nothing(machine: Path) -> None:
+    go = machine / "path" / "go"
+    script(go, "go1.25.0")
+    go.write_text('#!/bin/sh\n[ "$1" = env ] && echo go1.25.0 && exit 0\necho "compiler on fire" >&2\nexit 2\n')
+    with pytest.raises(ClusterError, match="compiler on fire"):
+        ensure_binaries(["pause"], report=print)
+    left = list((machine / "cache").rglob("*"))
+    assert [path.name for path in left if path.is_file()] == ["lock"]
+
+
+def test_wrong_version_of_a_build_is_refused(machine: Path) -> None:
+    script(machine / "etcd", "etcd Version: 3.5.9")
+    with pytest.raises(ClusterError, match=r"reports 3\.5\.9"):
+        build_module.check_version(machine / "etcd", PROGRAMS["etcd"])
+
+
+def test_unknown_program_is_named() -> None:
+    with pytest.raises(ClusterError, match="no program called vim"):
+        ensure_binaries(["vim"], report=print)
+
+
+def test_cluster_programs_are_in_the_catalog() -> None:
+    assert set(CLUSTER_PROGRAMS) <= set(PROGRAMS)
+    assert not {"kwok", "crane"} & set(CLUSTER_PROGRAMS)
+
+
+def test_other_users_are_told_to_use_sudo(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.geteuid", lambda: 1000)
+    with pytest.raises(PrerequisiteError, match="sudo"):
+        check_root()

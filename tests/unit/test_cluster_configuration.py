@@ -1,0 +1,144 @@
+"""What the daemons of a cluster are told."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime, timedelta
+from ipaddress import IPv4Network
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from fractus_sim.cluster import PrerequisiteError
+from fractus_sim.cluster.addressing import Addressing
+from fractus_sim.cluster.cgroups import find_hierarchies
+from fractus_sim.cluster.controlplane import corefile
+from fractus_sim.cluster.manifests import dns_objects, extended_resources_patch, is_ready, node_object
+from fractus_sim.cluster.network import host_link
+from fractus_sim.cluster.nodeconfig import Machine, cni_config, kubelet_config, node_units, shortfalls
+from fractus_sim.cluster.spec import NodeSpec
+
+PLACE = Addressing(IPv4Network("10.200.0.0/16"))
+MACHINE = Machine(cpus=4, memory_bytes=16 * 2**30)
+
+
+def node(**resources: str) -> NodeSpec:
+    """A node that offers these resources; `gpu` stands for fractus.dev/gpu."""
+    named = {"fractus.dev/gpu" if key == "gpu" else key: value for key, value in resources.items()}
+    return NodeSpec.model_validate({"name": "n", "class": "edge", "resources": named, "labels": {"zone": "z"}})
+
+
+def kubelet(spec: NodeSpec, version: int = 1) -> Any:
+    """The parsed configuration of the node's kubelet."""
+    return yaml.safe_load(kubelet_config(spec, cgroup_root="a/b", cgroup_version=version, machine=MACHINE))
+
+
+def test_kubelet_holds_back_what_the_node_does_not_offer() -> None:
+    assert kubelet(node(cpu="1500m", memory="4Gi"))["systemReserved"] == {"cpu": "2500m", "memory": str(12 * 2**30)}
+
+
+def test_kubelet_holds_nothing_back_when_all_is_offered() -> None:
+    assert kubelet(node())["systemReserved"] == {}
+    assert kubelet(node(cpu="8", memory="64Gi"))["systemReserved"] == {}
+
+
+def test_more_than_the_machine_has_is_said() -> None:
+    assert shortfalls(node(cpu="4", memory="16Gi"), MACHINE) == []
+    cpu, memory = shortfalls(node(cpu="8", memory="64Gi"), MACHINE)
+    assert "4 CPUs, not 8" in cpu
+    assert "16384Mi of memory, not 64Gi" in memory
+
+
+def test_kubelet_accepts_old_control_groups_only_where_there_are_some() -> None:
+    assert kubelet(node(), 1)["failCgroupV1"] is False
+    assert "failCgroupV1" not in kubelet(node(), 2)
+
+
+def test_maximum_of_pods() -> None:
+    assert kubelet(node(pods="7"))["maxPods"] == 7
+    assert kubelet(node())["maxPods"] == 110
+
+
+def test_each_node_hands_out_addresses_of_its_own() -> None:
+    subnets = [json.loads(cni_config(i, PLACE))["plugins"][0]["ipam"]["ranges"][0][0]["subnet"] for i in range(3)]
+    assert subnets == [str(PLACE.pods(i)) for i in range(3)]
+    assert len(set(subnets)) == 3
+
+
+def test_node_object_says_class_and_pod_network() -> None:
+    path, body = node_object(node(), 2, PLACE)
+    assert path == "/api/v1/nodes/n"
+    assert body["metadata"]["labels"]["fractus.dev/class"] == "edge"
+    assert body["metadata"]["labels"]["zone"] == "z"
+    assert body["spec"]["podCIDR"] == str(PLACE.pods(2))
+
+
+def test_extended_resources_are_patched_only_when_missing() -> None:
+    spec = node(gpu="1", cpu="1")
+    has = {"fractus.dev/gpu": "1"}
+    path, patch = extended_resources_patch(spec, {"status": {"capacity": {"cpu": "4"}}}) or pytest.fail("no patch")
+    assert path == "/api/v1/nodes/n/status"
+    assert patch == {"status": {"capacity": has, "allocatable": has}}
+    half = extended_resources_patch(spec, {"status": {"capacity": has}}) or pytest.fail("no patch")
+    assert half[1] == {"status": {"allocatable": has}}
+    assert extended_resources_patch(spec, {"status": {"capacity": has, "allocatable": has}}) is None
+    assert extended_resources_patch(node(), {}) is None
+
+
+def test_ready_is_believed_only_since() -> None:
+    said = datetime(2026, 1, 1, tzinfo=UTC)
+    condition = {"type": "Ready", "status": "True", "lastHeartbeatTime": "2026-01-01T00:00:00Z"}
+    body = {"status": {"conditions": [condition]}}
+    assert is_ready(body)
+    assert is_ready(body, since=said)
+    assert not is_ready(body, since=said + timedelta(seconds=1))
+    assert not is_ready({"status": {"conditions": [{**condition, "status": "Unknown"}]}})
+    assert not is_ready({})
+
+
+def test_dns_is_at_its_well_known_address() -> None:
+    objects = {body["kind"]: body for _, body in dns_objects(PLACE.control_plane)}
+    assert objects["Service"]["spec"]["clusterIP"] == "10.96.0.10"
+    assert "selector" not in objects["Service"]["spec"]
+    assert objects["EndpointSlice"]["endpoints"][0]["addresses"] == [str(PLACE.control_plane)]
+    assert f"bind {PLACE.control_plane}" in corefile(PLACE, Path("/kubeconfig"))
+
+
+def test_units_name_logs_and_programs() -> None:
+    units = {unit["name"]: unit for unit in node_units(node(), address="10.200.0.10")}
+    assert set(units) == {"containerd", "kubelet", "kube-proxy"}
+    assert "--node-ip=10.200.0.10" in units["kubelet"]["argv"]
+    assert all(unit["log"] == f"/run/fractus/logs/{name}.log" for name, unit in units.items())
+
+
+@pytest.mark.parametrize("name", ["a", "demo", "a-very-long-name-of-a-cluster-x"])
+def test_link_names_fit_the_kernel(name: str) -> None:
+    assert len(host_link(name)) <= 15
+    assert host_link(name) != host_link(name + "2")
+
+
+V1 = "".join(
+    f"cgroup /sys/fs/cgroup/{name} cgroup rw,{name} 0 0\n"
+    for name in ("cpu,cpuacct", "cpuset", "memory", "devices", "freezer", "pids")
+)
+UNIFIED = "cgroup2 /sys/fs/cgroup/unified cgroup2 rw,relatime 0 0\n"
+
+
+def test_hierarchies_of_version_1_and_hybrid() -> None:
+    assert find_hierarchies(V1).version == 1
+    hybrid = find_hierarchies(V1 + UNIFIED)
+    assert hybrid.version == 1
+    assert Path("/sys/fs/cgroup/unified") in hybrid.roots
+
+
+def test_hierarchies_of_version_2() -> None:
+    found = find_hierarchies("cgroup2 /sys/fs/cgroup cgroup2 rw,nsdelegate 0 0\nproc /proc proc rw 0 0\n")
+    assert (found.version, found.roots) == (2, (Path("/sys/fs/cgroup"),))
+
+
+def test_missing_control_groups_are_named() -> None:
+    with pytest.raises(PrerequisiteError, match="memory"):
+        find_hierarchies(V1.replace("memory", "misc"))
+    with pytest.raises(PrerequisiteError, match="no control groups"):
+        find_hierarchies("proc /proc proc rw 0 0\n")

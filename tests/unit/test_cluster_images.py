@@ -1,0 +1,133 @@
+"""Images: layouts, archives with just the missing layers, and what makes an image stale."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import tarfile
+from pathlib import Path
+
+import pytest
+from fractus_sim.cluster import ClusterError
+from fractus_sim.cluster.images.build import TARGETS, build_images, find_source, image_name, source_digest
+from fractus_sim.cluster.images.layout import Layout
+
+ROOT = Path(__file__).parents[2]
+NAME = "localhost/test/tool:1"
+
+
+@pytest.fixture
+def layout(tmp_path: Path) -> Layout:
+    """A layout with one image."""
+    program = tmp_path / "tool"
+    program.write_bytes(b"\x7fELF tool")
+    made = Layout(tmp_path / "layout")
+    made.add_program(NAME, program)
+    return made
+
+
+def archive_of(layout: Layout, without: set[str]) -> tarfile.TarFile:
+    """The archive of the layout's image, opened for reading."""
+    out = io.BytesIO()
+    layout.write_archive([layout.image(NAME)], without=without, out=out)
+    out.seek(0)
+    return tarfile.open(fileobj=out)
+
+
+def test_program_is_the_image(layout: Layout) -> None:
+    layer, config, manifest = layout.digests(layout.image(NAME))
+    with tarfile.open(layout.blob(layer)) as files:
+        assert [(member.name, member.mode) for member in files] == [("tool", 0o755)]
+    described = json.loads(layout.blob(config).read_text())
+    assert described["config"]["Entrypoint"] == ["/tool"]
+    assert described["rootfs"]["diff_ids"] == [layer]
+    assert json.loads(layout.blob(manifest).read_text())["config"]["digest"] == config
+
+
+def test_same_program_is_the_same_image(layout: Layout, tmp_path: Path) -> None:
+    before = layout.image(NAME)
+    assert layout.add_program(NAME, tmp_path / "tool") == before
+    assert len(layout.images()) == 1
+    (tmp_path / "tool").write_bytes(b"\x7fELF other")
+    assert layout.add_program(NAME, tmp_path / "tool").digest != before.digest
+
+
+def test_archive_holds_what_the_receiver_lacks(layout: Layout) -> None:
+    digests = layout.digests(layout.image(NAME))
+    with archive_of(layout, set()) as whole:
+        blobs = {name for name in whole.getnames() if name.startswith("blobs/")}
+        assert blobs == {f"blobs/{digest.replace(':', '/')}" for digest in digests}
+    with archive_of(layout, {digests[0]}) as rest:
+        assert f"blobs/{digests[0].replace(':', '/')}" not in rest.getnames()
+        index = json.loads((rest.extractfile("index.json") or pytest.fail("no index")).read())
+        assert index["manifests"][0]["annotations"]["io.containerd.image.name"] == NAME
+
+
+def test_unused_blobs_go(layout: Layout, tmp_path: Path) -> None:
+    old = layout.digests(layout.image(NAME))
+    (tmp_path / "tool").write_bytes(b"\x7fELF other")
+    layout.add_program(NAME, tmp_path / "tool")
+    layout.remove_unused()
+    assert not any(layout.blob(digest).exists() for digest in old)
+    assert all(layout.blob(digest).exists() for digest in layout.digests(layout.image(NAME)))
+
+
+def test_missing_image_is_named(layout: Layout) -> None:
+    with pytest.raises(ClusterError, match="no image nothing:1"):
+        layout.image("nothing:1")
+
+
+def test_every_target_is_in_the_dockerfile() -> None:
+    stages = {
+        line.split(" AS ")[1].strip()
+        for line in (ROOT / "Dockerfile").read_text().splitlines()
+        if line.startswith("FROM ")
+    }
+    assert set(TARGETS) <= stages
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A small copy of what images are made of."""
+    for name in ("Dockerfile", ".dockerignore", "pyproject.toml", "uv.lock", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, tmp_path / name)
+    for room in ("core", "operator", "agent", "services", "sdk", "proto", "sim"):
+        (tmp_path / room).mkdir()
+        (tmp_path / room / "module.py").write_text(f"ROOM = {room!r}\n")
+    (tmp_path / "examples" / "traffic-monitoring").mkdir(parents=True)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("changed", "stale"),
+    [
+        ("core/module.py", {"operator", "agent", "services", "sim"}),
+        ("operator/module.py", {"operator"}),
+        ("sdk/module.py", {"component", "services", "sim", "example-traffic-monitoring"}),
+        ("examples/traffic-monitoring/navigator.py", {"example-traffic-monitoring"}),
+        ("uv.lock", set(TARGETS)),
+        ("core/__pycache__/module.pyc", set()),
+    ],
+)
+def test_a_change_makes_just_its_images_stale(checkout: Path, changed: str, stale: set[str]) -> None:
+    before = {target: source_digest(checkout, target) for target in TARGETS}
+    (checkout / changed).parent.mkdir(exist_ok=True)
+    with (checkout / changed).open("a") as file:
+        file.write("# changed\n")
+    assert {target for target in TARGETS if source_digest(checkout, target) != before[target]} == stale
+
+
+def test_source_is_found_from_below(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    assert find_source(checkout / "core") == checkout
+    with pytest.raises(ClusterError, match="--source"):
+        find_source(tmp_path_factory.mktemp("elsewhere"))
+
+
+def test_unknown_target_is_refused(checkout: Path) -> None:
+    with pytest.raises(ClusterError, match="no image plane"):
+        build_images(checkout, targets=["plane"], report=print)
+
+
+def test_names() -> None:
+    assert image_name("agent") == "localhost/fractus/agent:dev"

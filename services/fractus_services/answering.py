@@ -16,6 +16,29 @@ from fractus_services.replies import Refused, abort, refused
 
 log = logging.getLogger(__name__)
 
+CALLS_PER_S = 50.0
+BURST = 100.0
+"""What one identity may ask of a service; a driver that streams setpoints stays far below it."""
+
+
+class Allowance:
+    """A token bucket for each caller: a flood costs its sender, not the drone."""
+
+    def __init__(self, rate: float = CALLS_PER_S, burst: float = BURST) -> None:
+        self._rate = rate
+        self._burst = burst
+        self._left: dict[str, tuple[float, float]] = {}
+
+    def take(self, identity: str, time_s: float) -> bool:
+        """Use up one call; False when there is none left."""
+        left, at = self._left.get(identity, (self._burst, time_s))
+        left = min(self._burst, left + max(time_s - at, 0.0) * self._rate)
+        if left < 1.0:
+            self._left[identity] = (left, time_s)
+            return False
+        self._left[identity] = (left - 1.0, time_s)
+        return True
+
 
 class Reception:
     """Receives the calls of one service.
@@ -38,12 +61,17 @@ class Reception:
         self.clock = clock
         self._translate = translate
         self._failed = failed
+        self._allowance = Allowance()
 
     @asynccontextmanager
     async def call(self, context: Any) -> AsyncIterator[Caller]:
         """The caller of a call; exceptions inside end it with a status."""
         try:
-            yield caller_of(context.auth_context(), self.clock())
+            caller = caller_of(context.auth_context(), self.clock())
+            if not self._allowance.take(caller.identity, self.clock()):
+                reason = f"more than {CALLS_PER_S:.0f} calls a second; slow down"
+                raise Refused(grpc.StatusCode.RESOURCE_EXHAUSTED, Verdict("deny", None, "TooManyCalls", reason))
+            yield caller
         except NotAuthenticated as error:
             verdict = Verdict("deny", None, "NotAuthenticated", str(error))
             await abort(context, Refused(grpc.StatusCode.UNAUTHENTICATED, verdict))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
+import signal
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -82,6 +84,11 @@ async def test_a_whole_mission_with_a_correction_and_refusals(rig: Rig) -> None:
     code, why = await denied(driver.stub.Disarm(pb.DisarmRequest(), timeout=5))
     assert why.code == "InAir"
 
+    await _return_and_land(rig, driver)
+    _check_audit(rig)
+
+
+async def _return_and_land(rig: Rig, driver: Driver) -> None:
     reply = await driver.stub.ReturnControl(pb.ReturnControlRequest(), timeout=5)
     assert reply.mission_complete
     await driver.next(pb.ControlEvent.STATE_COMPLETE)
@@ -92,7 +99,9 @@ async def test_a_whole_mission_with_a_correction_and_refusals(rig: Rig) -> None:
     code, why = await denied(_first_event(Driver(rig)))
     assert (code, why.code) == (grpc.StatusCode.FAILED_PRECONDITION, "MissionComplete")
 
-    rig.kill("service", __import__("signal").SIGTERM)
+
+def _check_audit(rig: Rig) -> None:
+    rig.kill("service", signal.SIGTERM)
     with rig.audit.open("rb") as log:
         finding = verify(log)
     assert not finding.problem
@@ -186,3 +195,28 @@ async def test_cancelling_a_motion_stops_the_drone(rig: Rig) -> None:
     still = await rig.until(lambda t: abs(t.velocity.north_mps) < 0.3, 10)
     assert still.controller == DRIVER
     assert xy(still.position)[1] < 70
+
+
+async def test_a_flood_of_calls_harms_nobody_else(rig: Rig) -> None:
+    rig.write_grant(grant())
+    rig.write_grant(passenger_grant())
+    rig.start_service()
+    rig.start_vehicle()
+    driver = Driver(rig)
+    await driver.up()
+    flooder = rig.stub(PASSENGER)
+
+    async def flood() -> int:
+        refused = 0
+        for _ in range(60):
+            calls = [flooder.GetPosition(pb.GetPositionRequest(), timeout=5) for _ in range(10)]
+            for outcome in await asyncio.gather(*calls, return_exceptions=True):
+                if isinstance(outcome, grpc.aio.AioRpcError):
+                    assert outcome.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+                    refused += 1
+        return refused
+
+    flooding = asyncio.create_task(flood())
+    await driver.goto(0, 40)
+    assert await flooding > 100
+    assert (await rig.telemetry()).controller == DRIVER

@@ -146,7 +146,7 @@ async def test_a_zone_around_the_drone_with_a_takeover(rig: Rig) -> None:
     assert "new" in event.reason
     state = await rig.until(lambda t: t.mode == "RTL", 5)
     assert outcome(state).startswith("revoked:")
-    code, why = await denied(driver.stub.Hover(pb.HoverRequest(), timeout=5))
+    _, why = await denied(driver.stub.Hover(pb.HoverRequest(), timeout=5))
     assert why.code == "NotInControl"
     await rig.until(lambda t: not t.armed, 60, "landing")
 
@@ -246,7 +246,7 @@ async def test_partial_control_begins_where_the_chauffeur_brings_it(rig: Rig) ->
     assert "the system flies to the control point" in waits
     state = await rig.telemetry()
     assert math.dist(xy(state.position), (30, 40)) < 2.0
-    code, why = await denied(driver.stub.Hover(pb.HoverRequest(), timeout=5))
+    _, why = await denied(driver.stub.Hover(pb.HoverRequest(), timeout=5))
     assert why.code == "MethodNotGranted"
     await driver.goto(60, 40)
     await driver.stub.ReturnControl(pb.ReturnControlRequest(), timeout=5)

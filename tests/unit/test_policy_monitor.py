@@ -26,7 +26,7 @@ def test_a_drone_brakes_while_it_still_can() -> None:
         verdict = monitor(at(0, float(y), north_mps=8), grant)
         if verdict is not None:
             assert (verdict.action, verdict.takeover, verdict.code) == ("deny", "hover", "ExclusionZoneAhead")
-            stop = 8 * 0.3 + 1.25 + 64 / 5
+            stop = 8 * (0.3 + 0.25) + 1.25 + 64 / 5
             assert 50 - stop - 3 < y < 50 - stop + 1, "neither too early nor too late"
             return
     raise AssertionError("it never braked")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fractus_services.answering import Allowance
 from fractus_services.auth import Caller, NotAuthenticated, caller_of
 from fractus_services.clock import Clock
 from fractus_services.grants import GrantFiles, Held
@@ -98,3 +99,11 @@ def test_time_never_runs_backwards(monkeypatch: pytest.MonkeyPatch) -> None:
     assert clock() == 1010.0, "set back: it goes on by its own count"
     wall[0] = 5000.0
     assert clock() == 5000.0, "set forward: it follows"
+
+
+def test_a_flood_runs_dry_and_fills_again() -> None:
+    allowance = Allowance(rate=10, burst=5)
+    assert [allowance.take("a", 0.0) for _ in range(7)] == [True] * 5 + [False] * 2
+    assert allowance.take("b", 0.0), "others are not concerned"
+    assert [allowance.take("a", 0.2) for _ in range(3)] == [True, True, False]
+    assert [allowance.take("a", 100.0) for _ in range(6)] == [True] * 5 + [False]

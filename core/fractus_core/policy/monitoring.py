@@ -13,7 +13,10 @@ from fractus_core.policy.limits import Bound, altitude_bounds, speed_bounds
 from fractus_core.policy.motion import XY, stop_altitude_m, stop_point
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Situation, Takeover, Verdict, deny
 
-DEEPER_M = 0.3
+STRAY = 0.3
+"""Share of the tracking margin of accepted legs that the monitor keeps as well."""
+
+DEEPER_M = 0.6
 """A drone on the wrong side of a fence is stopped again only when it moves this much further in."""
 
 _TAKEOVERS: dict[str, Takeover] = {
@@ -45,7 +48,11 @@ def monitor(now: Situation, grant: CompiledGrant) -> Verdict | None:
     way = shapely.Point(start) if start == stop else shapely.LineString((start, stop))
     lower = min(now.altitude_m, rest_m) - now.altitude_error_m
     upper = max(now.altitude_m, rest_m) + now.altitude_error_m
-    ahead = _Ahead(Air(way, now.position_error_m, lower, upper), shapely.Point(start), shapely.Point(stop))
+    ahead = _Ahead(
+        Air(way, now.position_error_m + STRAY * now.airframe.tracking_m, lower, upper),
+        shapely.Point(start),
+        shapely.Point(stop),
+    )
     found = _fences(now, grant, ahead)
     if found:
         return min(found, key=lambda f: (-_RANK[f[1].takeover if f[1].action == "takeover" else None], -f[0]))[1]
@@ -59,6 +66,11 @@ class _Ahead:
     air: Air
     here: BaseGeometry
     rest: BaseGeometry
+
+    @property
+    def moving(self) -> bool:
+        """Whether it goes anywhere; a hovering drone wobbles."""
+        return bool(self.air.ground.length > DEEPER_M)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +110,7 @@ def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead) -> list[tuple[i
 def _kept_out(patch: Patch, ahead: _Ahead) -> Verdict | None:
     inside = bool(patch.shape.intersects(ahead.here))
     worse = _depth(patch.shape, ahead.rest) > _depth(patch.shape, ahead.here) + DEEPER_M
-    entering = not inside and bool(patch.shape.intersects(ahead.air.ground))
+    entering = not inside and ahead.moving and bool(patch.shape.intersects(ahead.air.ground))
     code = "InsideExclusionZone" if inside else "ExclusionZoneAhead"
     where = "is inside" if inside else "is about to enter"
     fence = _Fence(patch.rule.name, patch.rule.spec.action, code, f"zone {patch.zone} of policy {patch.rule.name}")
@@ -113,7 +125,7 @@ def _kept_in(shape: BaseGeometry, border: BaseGeometry, ahead: _Ahead, fence: _F
     worse = False
     if not shape.is_empty:
         worse = _signed_depth(shape, border, ahead.rest) < _signed_depth(shape, border, ahead.here) - DEEPER_M
-    leaving = worse or (not outside and not shape.covers(way))
+    leaving = worse or (not outside and ahead.moving and not shape.covers(way))
     return _reaction(fence, outside, leaving, "is outside" if outside else "is about to leave")
 
 

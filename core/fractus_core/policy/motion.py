@@ -13,6 +13,9 @@ from fractus_core.policy.values import Situation
 
 XY = tuple[float, float]
 
+SLOW_MPS = 0.5
+"""A drone slower than this turns within its tracking margin."""
+
 OVERSHOOT = 0.35
 """Share of the stopping distance that a drone which turns in flight may overshoot its target by."""
 
@@ -28,13 +31,19 @@ def stopping_distance_m(speed_mps: float, accel_mps2: float, position_gain: floa
     return accel_mps2 / (2 * position_gain**2) + speed * speed / (2 * accel_mps2)
 
 
+def reaction_s(situation: Situation, accel_mps2: float) -> float:
+    """Time at unchanged speed before the brakes bite: latency, and half the time that the jerk limit takes."""
+    return situation.latency_s + accel_mps2 / (2 * situation.airframe.jerk_mps3)
+
+
 def stop_point(situation: Situation, at: XY) -> XY:
     """Where the drone comes to rest, in frame metres, when it is told to stop now."""
     speed = math.hypot(situation.north_mps, situation.east_mps)
     if speed < 0.05:
         return at
     frame = situation.airframe
-    run = speed * situation.latency_s + stopping_distance_m(speed, frame.accel_mps2, frame.position_gain)
+    run = speed * reaction_s(situation, frame.accel_mps2)
+    run += stopping_distance_m(speed, frame.accel_mps2, frame.position_gain)
     return at[0] + situation.east_mps / speed * run, at[1] + situation.north_mps / speed * run
 
 
@@ -46,10 +55,10 @@ def turn_point(situation: Situation, at: XY, target: XY) -> XY:
     the triangle of its control points.
     """
     speed = math.hypot(situation.north_mps, situation.east_mps)
-    if speed < 0.05:
-        return at
     frame = situation.airframe
     stop = stop_point(situation, at)
+    if speed < SLOW_MPS:
+        return stop
     change = 0.0
     for origin in (at, stop):
         dx, dy = target[0] - origin[0], target[1] - origin[1]
@@ -58,7 +67,7 @@ def turn_point(situation: Situation, at: XY, target: XY) -> XY:
         east, north = (dx / away * cruise, dy / away * cruise) if away > 0 else (0.0, 0.0)
         change = max(change, math.hypot(east - situation.east_mps, north - situation.north_mps), speed)
     slack = frame.accel_mps2 / (2 * frame.position_gain**2)
-    run = speed * situation.latency_s + slack + speed * change / (2 * frame.accel_mps2)
+    run = speed * reaction_s(situation, frame.accel_mps2) + slack + speed * change / (2 * frame.accel_mps2)
     run = max(run, math.hypot(stop[0] - at[0], stop[1] - at[1]))
     return at[0] + situation.east_mps / speed * run, at[1] + situation.north_mps / speed * run
 
@@ -68,7 +77,8 @@ def stop_altitude_m(situation: Situation) -> float:
     climb = -situation.down_mps
     if abs(climb) < 0.05:
         return situation.altitude_m
-    run = abs(climb) * situation.latency_s + stopping_distance_m(climb, situation.airframe.climb_accel_mps2, 1.0)
+    accel = situation.airframe.climb_accel_mps2
+    run = abs(climb) * reaction_s(situation, accel) + stopping_distance_m(climb, accel, 1.0)
     return situation.altitude_m + math.copysign(run, climb)
 
 

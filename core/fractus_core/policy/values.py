@@ -94,6 +94,7 @@ class Airframe:
         accel_mps2: horizontal acceleration it brakes with.
         position_gain: proportional gain of the position controller, 1/s.
         climb_accel_mps2: vertical acceleration.
+        jerk_mps3: how fast it changes its acceleration.
         return_altitude_m: altitude above home at which it returns to launch.
         tracking_m: how far it strays from a straight leg, sideways and in height, in still air.
     """
@@ -101,6 +102,7 @@ class Airframe:
     accel_mps2: float = 2.5
     position_gain: float = 1.0
     climb_accel_mps2: float = 1.0
+    jerk_mps3: float = 5.0
     return_altitude_m: float = 15.0
     tracking_m: float = 1.0
 

@@ -33,6 +33,8 @@ WAIT_S = 0.5
 RETRY_S = 0.5
 RTL_TRIES = 4
 ARMED_S = 3.0
+SETTLE_S = 10.0
+STANDING_MPS = 0.2
 
 
 class Control:
@@ -311,6 +313,7 @@ class Control:
         self.autopilot.stop()
         await self.change_mode(GUIDED)
         self.autopilot.stop()
+        self.spawn(self._settle())
 
     async def arm(self) -> None:
         """Arm in GUIDED, when the last line holds.
@@ -344,6 +347,16 @@ class Control:
         self.note("brake", self.controller, verdict.reason, verdict.code, policies=verdict.policies)
         self._stop_motion(aborted(verdict.code, verdict.reason, verdict.policies))
         self.autopilot.stop()
+        self.spawn(self._settle())
+
+    async def _settle(self) -> None:
+        """Keep braking until the drone stands: a single velocity setpoint times out in the autopilot."""
+        deadline = self.autopilot.now + SETTLE_S
+        while self.motion is None and self.autopilot.vehicle.mode == GUIDED and self.autopilot.now < deadline:
+            if self.autopilot.vehicle.speed_mps < STANDING_MPS:
+                return
+            self.autopilot.stop()
+            await asyncio.sleep(WAIT_S)
 
     def take_over(self, verdict: Verdict) -> None:
         """The system takes the drone from its driver, as a policy or the monitor says."""

@@ -102,12 +102,14 @@ async def _airframe(autopilot: Autopilot) -> tuple[Airframe, float]:
     accel = await _read(autopilot, (("WPNAV_ACCEL", 0.01), ("WP_ACC", 1.0)), standard.accel_mps2)
     gain = await _read(autopilot, (("PSC_POSXY_P", 1.0), ("PSC_NE_POS_P", 1.0)), standard.position_gain)
     climb = await _read(autopilot, (("WPNAV_ACCEL_Z", 0.01), ("WP_ACC_Z", 1.0)), standard.climb_accel_mps2)
+    jerk = await _read(autopilot, (("PSC_JERK_XY", 1.0), ("PSC_JERK_NE", 1.0)), standard.jerk_mps3)
     height = await _read(autopilot, (("RTL_ALT", 0.01), ("RTL_ALT_M", 1.0)), standard.return_altitude_m)
     speed = await _read(autopilot, (("WPNAV_SPEED", 0.01), ("WP_SPD", 1.0)), 5.0)
     airframe = Airframe(
         accel_mps2=max(accel, 0.1),
         position_gain=max(gain, 0.1),
         climb_accel_mps2=max(climb, 0.1),
+        jerk_mps3=max(jerk, 0.5),
         return_altitude_m=height,
     )
     return airframe, speed

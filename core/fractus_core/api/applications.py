@@ -28,6 +28,18 @@ Placement = Literal["drone", "edge", "hybrid", "cloud"]
 class ServiceRequest(Model):
     """A system service a component uses, and the methods it will call."""
 
+    model_config = ConfigDict(
+        json_schema_extra=rules(
+            *(
+                (
+                    f"self.service != '{service}' || self.methods.all(m, m in {sorted(methods)})",
+                    f"the {service} service has {', '.join(sorted(methods))}",
+                )
+                for service, methods in METHODS_OF.items()
+            )
+        )
+    )
+
     service: Service
     methods: tuple[Method, ...] = Field(min_length=1, max_length=32)
 
@@ -282,6 +294,24 @@ _COMPONENT_RULES = rules(
         "hybridTo is needed for placement hybrid, and only there",
     ),
     ("!has(self.replicas) || self.placement == 'cloud'", "replicas are for placement cloud"),
+    ("!has(self.heuristic) || self.placement == 'hybrid'", "heuristic is for placement hybrid"),
+    (
+        "self.placement in ['drone', 'edge'] || !has(self.services) || size(self.services) == 0",
+        "services are for placements drone and edge",
+    ),
+    (
+        "self.placement == 'drone' || !has(self.services) || !self.services.exists(s, s.service == 'mobility')",
+        "the mobility service is on drones only; use placement drone",
+    ),
+    (
+        "!has(self.services) || self.services.all(s, self.services.exists_one(t, t.service == s.service))",
+        "name each service once, with all its methods",
+    ),
+    (
+        "!has(self.class) || self.class != 'driver' ||"
+        " (has(self.services) && self.services.exists(s, s.service == 'mobility'))",
+        "a driver needs the mobility service with the methods it will call",
+    ),
 )
 
 
@@ -368,6 +398,32 @@ _APPLICATION_RULES = rules(
             f"{field} names a component that the application does not have",
         )
         for field in ("ingress", "egress", "hybridTo")
+    ),
+    *(
+        (
+            f"self.components.all(c, !has(c.{field}) || !c.{field}.exists(n, n == c.name))",
+            f"{field} names the component itself; remove it",
+        )
+        for field in ("ingress", "egress", "hybridTo")
+    ),
+    (
+        "self.components.all(c, !has(c.hybridTo) || c.hybridTo.all(n, self.components.exists(d, d.name == n &&"
+        " d.placement in ['drone', 'edge'])))",
+        "hybridTo takes components placed on a drone or at the edge",
+    ),
+    (
+        "self.components.all(c, !has(c.egress) || c.egress.all(n, self.components.exists(d, d.name == n &&"
+        " has(d.container.ports) && size(d.container.ports) > 0)))",
+        "egress names a component without container.ports; give it the port it listens on",
+    ),
+    (
+        "self.components.filter(c, has(c.pointsOfInterest)).size() <= 1",
+        "only one passenger gives pointsOfInterest",
+    ),
+    (
+        "!self.components.exists(c, has(c.pointsOfInterest)) ||"
+        " !self.components.exists(c, has(c.class) && c.class == 'driver')",
+        "the driver says where the drone flies; remove pointsOfInterest",
     ),
 )
 

@@ -38,6 +38,8 @@ def crd(kind: type[Resource]) -> Schema:
     for name in ("spec", "status"):
         if name in schema["properties"]:
             properties[name] = structural(schema["properties"][name], definitions, f"{kind.KIND}.{name}")
+    if kind.WRITTEN_BY_OPERATOR:
+        properties = {name: _without_rules(schema) for name, schema in properties.items()}
     version: Schema = {
         "name": VERSION,
         "served": True,
@@ -76,6 +78,17 @@ def crd(kind: type[Resource]) -> Schema:
             "versions": [version],
         },
     }
+
+
+def _without_rules(schema: Schema) -> Schema:
+    """The schema without CEL rules at any depth."""
+    out: Schema = {key: value for key, value in schema.items() if key != "x-kubernetes-validations"}
+    for key in ("items", "additionalProperties"):
+        if isinstance(out.get(key), dict):
+            out[key] = _without_rules(out[key])
+    if "properties" in out:
+        out["properties"] = {name: _without_rules(value) for name, value in out["properties"].items()}
+    return out
 
 
 def structural(schema: Schema, definitions: dict[str, Schema], path: str) -> Schema:

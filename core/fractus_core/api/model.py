@@ -116,6 +116,8 @@ class Resource(OpenModel):
     """Printer columns: (title, type, JSONPath)."""
     SELECTABLE: ClassVar[Sequence[str]] = ()
     """JSONPaths that watches may select on."""
+    WRITTEN_BY_OPERATOR: ClassVar[bool] = False
+    """The operator alone writes it, of parts that were checked where they came in: its schema needs no rules."""
 
     api_version: Literal["fractus.dev/v1alpha1"] = "fractus.dev/v1alpha1"
     kind: str

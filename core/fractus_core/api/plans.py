@@ -103,6 +103,7 @@ class DeploymentPlan(Resource):
     KIND: ClassVar[str] = "DeploymentPlan"
     PLURAL: ClassVar[str] = "deploymentplans"
     SHORT: ClassVar[str] = "fplan"
+    WRITTEN_BY_OPERATOR: ClassVar[bool] = True
     NAMESPACED: ClassVar[bool] = True
     COLUMNS = (
         ("Application", "string", ".spec.application"),
@@ -216,6 +217,7 @@ class Grant(Resource):
     KIND: ClassVar[str] = "Grant"
     PLURAL: ClassVar[str] = "grants"
     SHORT: ClassVar[str] = "fgr"
+    WRITTEN_BY_OPERATOR: ClassVar[bool] = True
     SELECTABLE = (".spec.node",)
     COLUMNS = (
         ("Node", "string", ".spec.node"),

@@ -29,11 +29,20 @@ _THURSDAY = 3
 """1970-01-01 was one."""
 
 
+_VALIDITY = (
+    "!has(self.validFrom) || !has(self.validUntil) || self.validFrom < self.validUntil",
+    "validUntil must be after validFrom",
+)
+
+
 class ActiveTime(Model):
     """When a zone is active; what is given must hold together. Times are UTC, as in ED-269."""
 
     model_config = ConfigDict(
-        json_schema_extra=rules(("has(self.start) == has(self.end)", "give start and end together, or neither"))
+        json_schema_extra=rules(
+            ("has(self.start) == has(self.end)", "give start and end together, or neither"),
+            _VALIDITY,
+        )
     )
 
     days: tuple[Day, ...] = Field(default=(), max_length=7, description="Days of the week in UTC; empty: every day.")
@@ -127,6 +136,11 @@ class NodeExpression(Model):
                 "!(self.operator in ['Gt', 'Lt']) || !has(self.values) || size(self.values) == 1",
                 "Gt and Lt take exactly one value",
             ),
+            (
+                "!(self.operator in ['Gt', 'Lt']) || !has(self.values) ||"
+                " self.values.all(v, v.matches('^[-+]?([0-9]+[.]?[0-9]*|[.][0-9]+)$'))",
+                "Gt and Lt compare numbers",
+            ),
         )
     )
 
@@ -136,7 +150,7 @@ class NodeExpression(Model):
         description="Attribute, dotted for nested ones: class, mtom, name, services.camera.model.",
     )
     operator: Literal["In", "NotIn", "Exists", "Gt", "Lt"]
-    values: tuple[str, ...] = Field(default=(), max_length=100)
+    values: tuple[Annotated[str, Field(max_length=256)], ...] = Field(default=(), max_length=100)
 
     @model_validator(mode="after")
     def _values_fit(self) -> Self:
@@ -206,6 +220,7 @@ class PolicySpec(Model):
                 " ['refuse', 'black', 'blurAverage', 'blurMedian', 'blurFaces', 'removeBackground'])",
                 "PrivacyControl takes kind camera, and action refuse, black, blurAverage, blurMedian, blurFaces or removeBackground",
             ),
+            _VALIDITY,
         )
     )
 

@@ -14,7 +14,7 @@ ARG PIP_CERT
 ARG SSL_CERT_FILE
 RUN apt-get update -q \
  && DEBIAN_FRONTEND=noninteractive apt-get install -qy --no-install-recommends \
-      python3 python3-pip busybox-static binutils media-types netbase >/dev/null \
+      python3 python3-pip busybox binutils media-types netbase >/dev/null \
  && rm -rf /var/lib/apt/lists/*
 RUN python3 -m pip install --quiet --no-cache-dir --break-system-packages --root-user-action=ignore uv==${UV_VERSION}
 
@@ -25,7 +25,7 @@ RUN mkdir -p /out/usr/bin /out/usr/sbin /out/usr/lib /out/usr/lib64 /out/etc /ou
  && ln -s usr/bin usr/sbin usr/lib usr/lib64 /out/ && ln -s /run /out/var/run && mkdir -m 1777 /out/tmp /out/var/tmp \
  && dpkg -L base-files libc6 libgcc-s1 libstdc++6 zlib1g libssl3 libffi8 libexpat1 libbz2-1.0 liblzma5 libuuid1 \
       libsqlite3-0 python3-minimal python3.11-minimal libpython3.11-minimal libpython3.11-stdlib \
-      busybox-static media-types netbase | sort -u \
+      busybox media-types netbase | sort -u \
   | grep -Ev '^/usr/share/(doc|man|locale|lintian|bug|perl5|base-files|binfmts)|/gconv/|__pycache__|/(audit|ld-)[^/]*/' \
   | grep -Ev '/python3.11/(lib2to3|pydoc_data|idlelib|turtledemo|tkinter|unittest/test|ensurepip|config-)' \
   | while read -r path; do if [ -L "$path" ] || [ ! -d "$path" ]; then echo "$path"; fi; done \

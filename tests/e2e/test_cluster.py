@@ -156,9 +156,9 @@ def test_services_and_names_work_across_nodes(small: Cluster) -> None:
     found = pods(small)
     for node, other in (("drone-1", "edge-1"), ("edge-1", "drone-1")):
         name, address = found[node]["metadata"]["name"], found[other]["status"]["podIP"]
-        fetched = small.kubectl("exec", name, "--", "wget", "-qO-", "-T", "5", f"http://{address}:8080/hostname")
+        fetched = small.kubectl("exec", name, "--", "wget", "-qO-", f"http://{address}:8080/hostname")
         assert fetched.stdout.strip() == found[other]["metadata"]["name"]
-        small.kubectl("exec", name, "--", "wget", "-qO-", "-T", "5", "http://web.default.svc.cluster.local/hostname")
+        small.kubectl("exec", name, "--", "wget", "-qO-", "http://web.default.svc.cluster.local/hostname")
     assert "GET /hostname" in small.kubectl("logs", found["edge-1"]["metadata"]["name"]).stdout
 
 
@@ -235,12 +235,11 @@ def test_daemons_that_die_come_back_and_pods_live_on(healthy: Cluster) -> None:
     before = pods(healthy)["edge-1"]["status"]["containerStatuses"][0]["containerID"]
 
     def pid(program: str) -> str:
-        listed = edge.exec(["sh", "-c", f'for p in /proc/[0-9]*; do [ "$(cat $p/comm)" = {program} ] && echo $p; done'])
-        return listed.stdout.strip()
+        return edge.exec(["sh", "-c", f"grep -lx {program} /proc/[0-9]*/comm; true"]).stdout.strip()
 
     for program in ("kubelet", "containerd"):
         old = pid(program)
-        edge.exec(["kill", "-9", old.removeprefix("/proc/")])
+        edge.exec(["kill", "-9", old.split("/")[2]])
         until(lambda program=program, old=old: pid(program) not in ("", old), f"{program} to be back")
     until(
         lambda: edge.exec(["ctr", "-n", "k8s.io", "tasks", "ls"], check=False).returncode == 0, "containerd to answer"

@@ -164,6 +164,12 @@ class Heuristic(Model):
     kind: Literal["max", "min", "preferDirect"]
     metric: Literal["ingress-bandwidth", "egress-bandwidth", "ingress-latency", "egress-latency"] | None = None
 
+    @model_validator(mode="after")
+    def _measured(self) -> Self:
+        if self.kind != "preferDirect" and self.metric is None:
+            raise InvalidObject("metric", f"kind {self.kind} needs a metric")
+        return self
+
 
 class ContainerPort(Model):
     """A port the component listens on."""

@@ -1,0 +1,141 @@
+"""Bad manifests against a real API server: each is refused at apply, with a sentence that says what is wrong."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+from control_plane import ControlPlane, Refused
+from fractus_core.api import KINDS, InvalidObject
+
+Body = dict[str, Any]
+API = "/apis/fractus.dev/v1alpha1"
+MODELS = {kind.KIND: kind for kind in KINDS}
+
+HERE = {"lat": 50.0, "lon": 4.0}
+CONTAINER = {"image": "app", "ports": [{"port": 8080}]}
+MOBILITY = {"service": "mobility", "methods": ["Arm", "Goto"]}
+CAMERA = {"service": "camera", "methods": ["CaptureImage"]}
+PATH = {"navigation": "pathBased", "path": [HERE]}
+DRIVER = {
+    "name": "Navigator",
+    "placement": "drone",
+    "class": "driver",
+    "services": [MOBILITY],
+    "controlPoints": [PATH],
+    "container": CONTAINER,
+}
+PASSENGER = {"name": "Viewer", "placement": "drone", "class": "passenger", "container": CONTAINER}
+GUIDED = PASSENGER | {"pointsOfInterest": {"points": [HERE]}}
+EDGE = {"name": "Ground", "placement": "edge", "locations": [{"center": HERE, "radius": 5}], "container": CONTAINER}
+HYBRID = {"name": "Checker", "placement": "hybrid", "hybridTo": ["Ground"], "container": CONTAINER}
+CLOUD = {"name": "Store", "placement": "cloud", "container": CONTAINER}
+MUTE = CLOUD | {"name": "Mute", "container": {"image": "app"}}
+RING = {"exterior": [HERE, {"lat": 50.1, "lon": 4.0}, {"lat": 50.1, "lon": 4.1}]}
+DISC = {"circle": {"center": HERE, "radius": 10}}
+
+
+def body(kind: str, spec: Body) -> Body:
+    return {"apiVersion": "fractus.dev/v1alpha1", "kind": kind, "metadata": {"name": "bad"}, "spec": spec}
+
+
+def app(*components: Body) -> Body:
+    return body("Application", {"components": list(components)})
+
+
+def driver(**point: Any) -> Body:
+    return app(DRIVER | {"controlPoints": [PATH | point]})
+
+
+def volume(**source: Any) -> Body:
+    return app(CLOUD | {"container": CONTAINER | {"volumes": [{"name": "v", "mountPath": "/v", **source}]}})
+
+
+def policy(type_: str, kind: str, **more: Any) -> Body:
+    return body("Policy", {"type": type_, "kind": kind, **more})
+
+
+def selecting(*expressions: Body) -> Body:
+    return policy("LimitControl", "speed", upperLimit=5, selector={"nodes": list(expressions)})
+
+
+def zone(**spec: Any) -> Body:
+    return body("Zone", {"area": DISC} | spec)
+
+
+BAD: list[tuple[str, Body, str]] = [
+    ("two drivers", app(DRIVER, DRIVER | {"name": "Other"}), "an application has at most one driver"),
+    ("nobody says where to fly", app(PASSENGER), "an application with drone components needs a driver, or one passenger with pointsOfInterest"),
+    ("driver and points of interest", app(DRIVER, GUIDED), "the driver says where the drone flies; remove pointsOfInterest"),
+    ("two guides", app(GUIDED, GUIDED | {"name": "Second"}), "only one passenger gives pointsOfInterest"),
+    ("driver without control points", app({k: v for k, v in DRIVER.items() if k != "controlPoints"}), "a driver needs controlPoints"),
+    ("driver without mobility", app(DRIVER | {"services": [CAMERA]}), "a driver needs the mobility service with the methods it will call"),
+    ("drone component without class", app({k: v for k, v in GUIDED.items() if k != "class"}), "class (driver or passenger) is needed for placement drone, and only there"),
+    ("path without waypoints", driver(path=[]), "spec.components[0].controlPoints[0].path"),
+    ("path and region", driver(region=DISC), "give either path or region, and only one of them"),
+    ("region without region", app(DRIVER | {"controlPoints": [{"navigation": "regionBased"}]}), "regionBased navigation needs region"),
+    ("stay on a path", driver(duration=5), "duration is for regionBased navigation"),
+    ("start twice", driver(point={"depot": "base", "position": HERE}), "give either depot or position, and only one of them"),
+    ("latitude of 95", driver(path=[HERE | {"lat": 95}]), "should be less than or equal to 90"),
+    ("edge component without locations", app({k: v for k, v in EDGE.items() if k != "locations"}), "locations are needed for placement edge, and only there"),
+    ("radius of 0", app(EDGE | {"locations": [{"center": HERE, "radius": 0}]}), "radius: Invalid value: 0: spec.components[0].locations[0].radius in body should be greater than 0"),
+    ("no instances", app(EDGE | {"locations": [{"center": HERE, "radius": 5, "instances": 0}]}), 'instances is a whole number of at least 1, or "*" for as many as possible'),
+    ("hybrid to nothing", app({k: v for k, v in HYBRID.items() if k != "hybridTo"}), "hybridTo is needed for placement hybrid, and only there"),
+    ("hybrid to the cloud", app(CLOUD, HYBRID | {"hybridTo": ["Store"]}), "hybridTo takes components placed on a drone or at the edge"),
+    ("heuristic in the cloud", app(CLOUD | {"heuristic": {"kind": "preferDirect"}}), "heuristic is for placement hybrid"),
+    ("heuristic without metric", app(EDGE, HYBRID | {"heuristic": {"kind": "max"}}), "kinds max and min need a metric"),
+    ("replicas at the edge", app(EDGE | {"replicas": 2}), "replicas are for placement cloud"),
+    ("services in the cloud", app(CLOUD | {"services": [CAMERA]}), "services are for placements drone and edge"),
+    ("mobility at the edge", app(EDGE | {"services": [MOBILITY]}), "the mobility service is on drones only; use placement drone"),
+    ("service named twice", app(EDGE | {"services": [CAMERA, CAMERA]}), "name each service once, with all its methods"),
+    ("method of another service", app(EDGE | {"services": [CAMERA | {"methods": ["Goto"]}]}), "the camera service has CaptureImage, DeleteImage, ListImages, RetrieveImage"),
+    ("egress to a stranger", app(CLOUD | {"egress": ["Nobody"]}), "egress names a component that the application does not have"),
+    ("egress to itself", app(CLOUD | {"egress": ["Store"]}), "egress names the component itself; remove it"),
+    ("egress to one without ports", app(CLOUD | {"egress": ["Mute"]}, MUTE), "egress names a component without container.ports; give it the port it listens on"),
+    ("two components of one name", app(CLOUD, CLOUD), "duplicate entries for key"),
+    ("volume from nowhere", volume(), "give exactly one of emptyDir, configMap, secret and claim"),
+    ("volume from two sources", volume(claim="c", secret="s"), "give exactly one of emptyDir, configMap, secret and claim"),
+    ("zone of two shapes", zone(area=DISC | {"polygon": RING}), "give either polygon or circle, and only one of them"),
+    ("zone upside down", zone(altitude={"lower": 50, "upper": 10}), "lower must be below upper"),
+    ("half a time of day", zone(schedule=[{"start": "08:00"}]), "give start and end together, or neither"),
+    ("no such time", zone(schedule=[{"start": "08:00", "end": "24:30"}]), "spec.schedule[0].end"),
+    ("schedule that ends before it begins", zone(schedule=[{"validFrom": "2026-02-01T00:00:00Z", "validUntil": "2026-01-01T00:00:00Z"}]), "validUntil must be after validFrom"),
+    ("ring of two points", zone(area={"polygon": {"exterior": RING["exterior"][:2]}}), "should have at least 3 items"),
+    ("denial of nothing", policy("AccessControl", "denial"), "AccessControl takes kind grant or denial, and methods"),
+    ("limit without limits", policy("LimitControl", "speed"), "LimitControl takes kind speed or altitude, and upperLimit or lowerLimit"),
+    ("limits crossed", policy("LimitControl", "speed", upperLimit=1, lowerLimit=2), "lowerLimit must not be above upperLimit"),
+    ("limit that lands", policy("LimitControl", "speed", upperLimit=1, action="land"), "LimitControl takes action enforce or refuse"),
+    ("geofence nowhere", policy("GeofenceControl", "exclusion"), "GeofenceControl takes kind inclusion or exclusion, and selector.zones"),
+    ("privacy without filter", policy("PrivacyControl", "camera"), "PrivacyControl takes kind camera, and action refuse"),
+    ("policy that ends before it begins", policy("LimitControl", "speed", upperLimit=1, validFrom="2026-02-01T00:00:00Z", validUntil="2026-01-01T00:00:00Z"), "validUntil must be after validFrom"),
+    ("nothing to be in", selecting({"key": "class", "operator": "In"}), "values must be given for In, NotIn, Gt and Lt, and left out for Exists"),
+    ("greater than two", selecting({"key": "mtom", "operator": "Gt", "values": ["1", "2"]}), "Gt and Lt take exactly one value"),
+    ("heavier than much", selecting({"key": "mtom", "operator": "Gt", "values": ["much"]}), "Gt and Lt compare numbers"),
+    ("drone of class C9", body("Drone", {"class": "C9"}), 'Unsupported value: "C9"'),
+    ("edge node in no place", body("EdgeNode", {}), "spec.location: Required value"),
+    ("depot without radius", body("Depot", {"location": HERE, "radius": 0}), "should be greater than 0"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("manifest", "sentence"), [case[1:] for case in BAD], ids=[case[0] for case in BAD])
+def test_bad_manifest_is_refused_at_apply_with_its_sentence(
+    control_plane: ControlPlane, manifest: Body, sentence: str
+) -> None:
+    model = MODELS[manifest["kind"]]
+    place = f"namespaces/default/{model.PLURAL}" if model.NAMESPACED else model.PLURAL
+    with pytest.raises(Refused) as refused:
+        control_plane.admin.apply(f"{API}/{place}/bad", copy.deepcopy(manifest))
+    assert sentence.lower() in str(refused.value).lower()
+
+
+@pytest.mark.parametrize("manifest", [case[1] for case in BAD], ids=[case[0] for case in BAD])
+def test_what_the_schema_refuses_the_models_refuse_too(manifest: Body) -> None:
+    with pytest.raises(InvalidObject):
+        MODELS[manifest["kind"]].from_body(manifest)
+
+
+def test_unknown_fields_are_refused(control_plane: ControlPlane) -> None:
+    """As kubectl does by default: --validate=strict."""
+    with pytest.raises(Refused, match="unknown field"):
+        control_plane.admin.call("POST", f"{API}/zones", zone(colour="red"), fieldValidation="Strict")

@@ -12,6 +12,7 @@ from policy_world import (
     CAMERA,
     FRAME,
     HOME,
+    NOW,
     altitude,
     ask,
     at,
@@ -412,6 +413,23 @@ def test_privacy_refuses_or_names_its_filters() -> None:
         assert ask(grant, Call(method)).filters == ()
         assert ask(grant, Call(method), at(20, 20)).filters == ("blurFaces",)
         assert ask(grant, Call(method), at(40, 40)).code == "PrivacyZone"
+
+
+# Schedules
+
+
+def test_a_zone_counts_while_it_is_active() -> None:
+    def at_night(kind: str, *area: float) -> dict[str, Any]:
+        scheduled = {**zone("z", box(*area)), "schedule": [{"start": "22:00", "end": "06:00"}]}
+        return policy("night", "GeofenceControl", kind, [scheduled])
+
+    noon, midnight = at(), at(time_s=NOW + 12 * 3600)
+    shut = compiled(at_night("exclusion", 50, -20, 80, 20))
+    assert ask(shut, goto(60, 0), noon).action == "allow"
+    assert ask(shut, goto(60, 0), midnight).code == "InsideExclusionZone"
+    kept = compiled(at_night("inclusion", -100, -100, 100, 100))
+    assert ask(kept, goto(60, 0), midnight).action == "allow"
+    assert ask(kept, goto(60, 0), noon).action == "deny", "a zone that is not active allows nothing"
 
 
 # Geometry far away

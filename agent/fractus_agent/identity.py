@@ -128,7 +128,9 @@ class Identity:
                 self._backoff.succeeded()
             except Refused as refusal:
                 self._refused(refusal)
-                delay_s = max(30.0, self._backoff.delay_s())
+                # A new installation's operator is about to publish its authority; a refusal wants patience.
+                pause_s = self._backoff.delay_s()
+                delay_s = min(5.0, pause_s) if refusal.reason == "NoAuthority" else max(30.0, pause_s)
             except (Unavailable, Rejected, Conflict, OSError) as error:
                 if self._wanting():
                     self._find("False", "Requested", f"The node has no usable certificate yet: {error}")

@@ -141,3 +141,22 @@ def test_signatures_interoperate_with_pymavlink():
     stranger = wire.Signing(hashlib.sha256(b"other").digest(), 10**9)
     forged = wire.encode(wire.layout_named("HEARTBEAT"), {}, sequence=0, sysid=255, compid=190, signing=stranger)
     assert parser.feed(forged) == []
+
+
+def test_a_refused_frame_does_not_delay_the_next():
+    key = hashlib.sha256(b"secret").digest()
+    signing = wire.Signing(key, 1000)
+    parser = wire.Parser(lambda: signing)
+    # The unsigned frame holds a byte that looks like the start of a long frame.
+    unsigned = wire.encode(
+        wire.layout_named("HEARTBEAT"), {"custom_mode": 0xFDFD}, sequence=0xFD, sysid=255, compid=190
+    )
+    sender = wire.Signing(key, 2000)
+    good = wire.encode(wire.layout_named("HEARTBEAT"), {}, sequence=1, sysid=255, compid=190, signing=sender)
+    assert parser.feed(unsigned) == []
+    assert [message.name for message in parser.feed(good)] == ["HEARTBEAT"]
+    unknown = bytearray(wire.encode(wire.layout_named("HEARTBEAT"), {}, sequence=2, sysid=255, compid=190))
+    unknown[7:10] = (60_000).to_bytes(3, "little")
+    parser = wire.Parser()
+    again = wire.encode(wire.layout_named("HEARTBEAT"), {}, sequence=3, sysid=255, compid=190)
+    assert [message.name for message in parser.feed(bytes(unknown) + again)] == ["HEARTBEAT"]

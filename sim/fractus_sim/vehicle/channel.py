@@ -10,7 +10,7 @@ from fractus_sim.vehicle.wire import Message, Parser, Signing, Value, encode, la
 
 # A client that does not read costs at most this much memory; what does not fit is dropped, as on a radio.
 OUTBOX_LIMIT = 256 * 1024
-PARAMETERS_PER_TICK = 16
+PARAMETERS_PER_TICK = 14
 # Sums of intervals round differently from multiples of the step.
 TIME_SLACK_S = 1e-6
 AT_ONCE = -1e9

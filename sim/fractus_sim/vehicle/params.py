@@ -103,6 +103,12 @@ class Parameters:
         self._save()
         return True
 
+    def changes(self) -> dict[str, float]:
+        """The parameters that differ from their defaults."""
+        return {
+            row.name: self._values[row.name] for row in table() if self._values[row.name] != row.coerce(row.default)
+        }
+
     def find(self, name: str, index: int = -1) -> tuple[str, Parameter, int] | None:
         """A parameter by index or, with a negative index, by name: the name asked for, the row, its position."""
         if index >= 0:
@@ -116,8 +122,7 @@ class Parameters:
     def _save(self) -> None:
         if self._store is None:
             return
-        changed = (row for row in table() if self._values[row.name] != row.coerce(row.default))
-        text = "".join(f"{row.name},{self._values[row.name]:.9g}\n" for row in changed)
+        text = "".join(f"{name},{value:.9g}\n" for name, value in self.changes().items())
         scratch = self._store.with_suffix(".new")
         scratch.write_text(text, encoding="ascii")
         scratch.replace(self._store)

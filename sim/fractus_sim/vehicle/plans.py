@@ -27,6 +27,16 @@ class Plans:
         stores = (self.mission.store, self.fence, self.rally)
         self.transfers = Transfers({store.kind: store for store in stores})
 
+    def restore(self, kept: Plans) -> None:
+        """Take over the lists that were stored before a reboot."""
+        for mine, theirs in (
+            (self.mission.store, kept.mission.store),
+            (self.fence, kept.fence),
+            (self.rally, kept.rally),
+        ):
+            if theirs.items and mine.accept(list(theirs.items)) is MissionResult.ACCEPTED:
+                mine.items = list(theirs.items)
+
     def return_point(
         self, params: Parameters, origin: Place, home: Place, here: tuple[float, float]
     ) -> tuple[float, float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import replace
 from typing import BinaryIO
@@ -66,10 +67,16 @@ class Craft:
             self._reboot()
 
     def _reboot(self) -> None:
-        channels = self.vehicle.channels
-        place = self.vehicle.true_place
-        self.vehicle = Vehicle(replace(self.config, start=replace(place, alt_m=self.config.start.alt_m)))
-        for channel in channels:
+        """Start anew where the vehicle stands, with what a real one keeps: parameters, plans and the signing key."""
+        old = self.vehicle
+        place = replace(old.true_place, alt_m=self.config.start.alt_m)
+        heading_deg = math.degrees(old.body.euler()[2]) % 360.0
+        self.vehicle = Vehicle(
+            replace(self.config, start=place, heading_deg=heading_deg, parameters=old.params.changes())
+        )
+        self.vehicle.signing_key = old.signing_key
+        self.vehicle.plans.restore(old.plans)
+        for channel in old.channels:
             channel.streams.clear()
             channel.parameters.clear()
             self.vehicle.attach(channel)

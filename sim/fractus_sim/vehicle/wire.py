@@ -14,6 +14,7 @@ import re
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from enum import Enum
 from importlib import resources
 
 from fastcrc.crc16 import mcrf4xx
@@ -241,6 +242,14 @@ def encode(
     return frame if signing is None else signing.sign(frame)
 
 
+class _Refusal(Enum):
+    """Why a frame is no message; decides where the search for the next one begins."""
+
+    DAMAGED = 1  # right behind the first byte: it was no frame
+    UNKNOWN = 2  # behind it, if another frame follows
+    SIGNATURE = 3  # behind it: a sound frame of somebody without the key
+
+
 class Parser:
     """Cuts one link's byte stream into messages; whatever is not a sound frame is counted and skipped."""
 
@@ -275,21 +284,23 @@ class Parser:
                 length += SIGNATURE_LENGTH
             if end - at < length:
                 break
-            message = self._decode(bytes(buffer[at : at + length]))
-            if message is None:
-                self.bad += 1
-                at += 1
+            after = at + length
+            verdict = self._decode(bytes(buffer[at:after]))
+            if isinstance(verdict, Message):
+                messages.append(verdict)
+                at = after
             else:
-                at += length
-                messages.append(message)
+                self.bad += 1
+                framed = verdict is _Refusal.UNKNOWN and (after == end or buffer[after] in (MAGIC_V2, MAGIC_V1))
+                at = after if framed or verdict is _Refusal.SIGNATURE else at + 1
         del buffer[:at]
         return messages
 
-    def _decode(self, frame: bytes) -> Message | None:
+    def _decode(self, frame: bytes) -> Message | _Refusal:
         length = frame[1]
         if frame[0] == MAGIC_V2:
             if frame[2] & ~INCOMPAT_SIGNED:
-                return None
+                return _Refusal.DAMAGED
             sequence, sysid, compid = frame[4], frame[5], frame[6]
             msgid = frame[7] | frame[8] << 8 | frame[9] << 16
             start = HEADER_V2
@@ -300,17 +311,17 @@ class Parser:
             signed = False
         layout = layout_of(msgid)
         if layout is None:
-            return None
+            return _Refusal.UNKNOWN
         crc_at = start + length
         if mcrf4xx(frame[1:crc_at] + bytes((layout.crc_extra,))) != frame[crc_at] | frame[crc_at + 1] << 8:
-            return None
+            return _Refusal.DAMAGED
         authentic = False
         signing = self._signing()
         if signing is not None:
             authentic = signed and signing.accepts(frame)
             # RADIO_STATUS comes from a modem that has no key; ArduPilot lets it through as well.
             if not authentic and layout.name != "RADIO_STATUS":
-                return None
+                return _Refusal.SIGNATURE
         self._count_lost(sysid, compid, sequence)
         return Message(layout.name, msgid, sysid, compid, layout.unpack(frame[start:crc_at]), frame, authentic)
 

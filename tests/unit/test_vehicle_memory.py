@@ -1,0 +1,100 @@
+"""What the vehicle keeps: parameters on disk, and everything stored over a reboot."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from fractus_sim.vehicle.mav import Command, Result
+from fractus_sim.vehicle.params import Parameters, UnknownParameterError, table
+from fractus_sim.vehicle.wire import Parser, Signing, encode, layout_named
+from vehicle_world import CONFIG, START, airborne, alone, upload
+
+FENCE = {"command": 5003, "param1": 80.0, "frame": 0, "x": START.lat_e7, "y": START.lon_e7}
+
+
+def test_the_table_is_sound():
+    names = [row.name for row in table()]
+    assert names == sorted(set(names))
+    assert all(0 < len(name) <= 16 for name in names)
+    assert len(names) == pytest.approx(1400, rel=0.2)
+
+
+def test_values_take_the_type_of_their_parameter():
+    params = Parameters()
+    assert params.set("RTL_ALT", 1234.6)
+    assert params["RTL_ALT"] == 1235.0
+    assert params.set("FS_GCS_ENABLE", 1000.0)
+    assert params["FS_GCS_ENABLE"] == 127.0
+    assert not params.set("RTL_ALT", float("nan"))
+    assert not params.set("NO_SUCH", 1.0)
+    assert not params.set("SYSID_THISMAV", 7.0)
+    with pytest.raises(UnknownParameterError):
+        params.assign("NO_SUCH", 1.0)
+
+
+def test_changed_parameters_are_kept_on_disk(tmp_path: Path):
+    store = tmp_path / "vehicle.parm"
+    config = replace(CONFIG, store=store)
+    _, pilot = alone(config=config)
+    assert pilot.parameter("WPNAV_SPEED", 750.0) == 750.0
+    again, _ = alone(config=config)
+    assert again.params["WPNAV_SPEED"] == 750.0
+    assert again.control.limits.speed_mps == 7.5
+    assert "WPNAV_SPEED,750" in store.read_text()
+
+
+def test_later_names_of_a_parameter_are_understood():
+    vehicle, pilot = alone()
+    pilot.parameter("MAV_GCS_SYSID", 42)
+    assert vehicle.params["SYSID_MYGCS"] == 42.0
+    assert pilot.last["PARAM_VALUE"].text("param_id") == "MAV_GCS_SYSID"
+
+
+def test_a_reboot_keeps_what_is_stored_and_forgets_the_rest():
+    vehicle, pilot = alone()
+    pilot.parameter("WPNAV_SPEED", 750.0)
+    assert upload(pilot, 1, [FENCE]) == 0
+    pilot.command(Command.SET_MESSAGE_INTERVAL, 30, 100_000)
+    assert pilot.command(Command.PREFLIGHT_REBOOT_SHUTDOWN, 1) is Result.ACCEPTED
+    pilot.fly_on(0.1)
+    rebooted = pilot.craft.vehicle
+    assert rebooted is not vehicle
+    assert rebooted.params["WPNAV_SPEED"] == 750.0
+    assert len(rebooted.fence.shapes) == 1
+    assert pilot.channel.streams.keys() == {"HEARTBEAT"}
+    pilot.wait(lambda: rebooted.arming_refusal() is None, 10.0)
+
+
+def test_it_does_not_reboot_in_the_air():
+    vehicle, pilot = airborne(5.0)
+    assert pilot.command(Command.PREFLIGHT_REBOOT_SHUTDOWN, 1) is Result.FAILED
+    pilot.fly_on(0.1)
+    assert pilot.craft.vehicle is vehicle
+
+
+def test_signing_shuts_out_whoever_has_no_key():
+    vehicle, pilot = alone()
+    key = hashlib.sha256(b"secret").digest()
+    target = {"target_system": 1, "target_component": 1}
+    pilot.send("SETUP_SIGNING", target | {"secret_key": tuple(key), "initial_timestamp": 5_000})
+    pilot.fly_on(0.1)
+    order = target | {"command": 512, "param1": 0.0}
+
+    def answers(signing: Signing | None) -> bool:
+        pilot.channel.take()
+        frame = encode(layout_named("COMMAND_LONG"), order, sequence=0, sysid=255, compid=190, signing=signing)
+        pilot.craft.receive(pilot.channel, frame)
+        pilot.simulation.step()
+        read = Parser(lambda: Signing(key, 0)).feed(pilot.channel.take())
+        return any(message.name == "COMMAND_ACK" and message.signed for message in read)
+
+    assert not answers(None)
+    assert not answers(Signing(hashlib.sha256(b"other").digest(), 9_000))
+    mine = Signing(key, 9_000)
+    assert answers(mine)
+    assert not answers(Signing(key, 8_000)), "a replayed time must not pass"
+    assert answers(mine)
+    assert vehicle.signing_key == key

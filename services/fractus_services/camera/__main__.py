@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import click
+from fractus_core.api.model import InvalidObject
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +96,10 @@ async def _until_signalled(options: Options) -> None:
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    await run(options, stop)
+    try:
+        await run(options, stop)
+    except InvalidObject as error:
+        raise click.ClickException(f"{options.description}: {error}") from None
 
 
 if __name__ == "__main__":

@@ -82,7 +82,8 @@ PLAN: dict[str, Any] = {
                 "version": 1,
                 "inclusion": True,
                 "polygon": [
-                    [HOME[0] + n / 111_319, HOME[1] + e / 74_000] for n, e in ((-90, -90), (90, -90), (90, 90))
+                    [HOME[0] + n / 111_319, HOME[1] + e / 74_000]
+                    for n, e in ((-90, -90), (90, -90), (90, 90), (-90, 90))
                 ],
             }
         ],
@@ -134,7 +135,7 @@ def test_a_plan_of_qgroundcontrol_is_uploaded_and_flown(tmp_path: Path):
             ack = client.wait_for("MISSION_ACK")
             assert (ack.type, ack.mission_type) == (0, kind)
         mav.mission_request_list_send(1, 1, 1)
-        assert client.wait_for("MISSION_COUNT").count == 4
+        assert client.wait_for("MISSION_COUNT").count == 5
         assert client.command(207, 1) == 0
         while client.command(400, 1) != 0:
             client.beat()

@@ -251,6 +251,11 @@ def test_passengers_do_not_come_along_against_the_order():
     result = plan(passenger([at(250, 3), at(120, 0)]), stock)
     assert (result.drone.node, result.drone.shared_with) == ("idle", None)
     assert len(result.drone.chauffeur) == 3
+    busy = next(r for r in result.rejected if r.node == "busy")
+    assert busy.reason == "Claimed"
+    assert "does not visit pointsOfInterest.points[1] in this order" in busy.message
+    elsewhere = shared([drone("busy", home=(9000, 0), depot=None), drone("idle")], {"busy": flown_by_other()})
+    result = plan(passenger([at(250, 3), at(120, 0)]), elsewhere)
     assert reasons(result)["AerialViewer", "busy"] == "PathMissesPoint"
     assert plan(passenger([at(250, 3), at(120, 0)], ordered=False), stock).drone.node == "busy"
 

@@ -70,6 +70,11 @@ class Draft:
         notes = self._far if far else self._rejected
         notes.setdefault((component.name, node), check.rejection(component, node))
 
+    def far_note(self, component: Component, node: str) -> str:
+        """Why a node was no candidate by place; empty if that was not noted."""
+        found = self._far.get((component.name, node))
+        return found.message if found is not None else ""
+
     def rejections(self, component: Component) -> list[Rejection]:
         """What was rejected for one component: first what was there, then what was too far; each by name."""
         here = sorted((r for r in self._rejected.values() if r.component == component.name), key=lambda r: r.node)

@@ -56,8 +56,8 @@ def default_score(facts: DroneFacts) -> float:
 def find_drones(draft: Draft, area: OperationArea) -> DroneCandidates:
     """The candidates by place: from depots at or near the start, and for passengers alone also those that fly by."""
     leader = draft.spec.driver or next(draft.spec.on("drone"))
-    names = set(_standing(draft, area, leader))
     flying = _flying_by(draft, leader) if draft.spec.driver is None else []
+    names = set(_standing(draft, area, leader))
     idle = [draft.inventory.drones[name] for name in sorted(names - set(flying)) if name in draft.inventory.drones]
     return DroneCandidates(tuple(idle), tuple(draft.inventory.drones[name] for name in flying))
 
@@ -212,7 +212,9 @@ def _passing(
     """
     owner = draft.inventory.claimed.get(drone.name)
     if owner is not None and owner != draft.application.key and not used:
-        return Check("Claimed", f"{owner[0]}/{owner[1]} has {drone.name}")
+        leader = draft.spec.driver or components[0]
+        note = draft.far_note(leader, drone.name)
+        return Check("Claimed", f"{owner[0]}/{owner[1]} has {drone.name}" + (f", and {note}" if note else ""))
     host = check_host(draft.inventory.hosts, drone.name, draft.settings, kept=kept)
     if kept:
         return host

@@ -53,7 +53,7 @@ RUN --mount=type=cache,target=/root/.cache/uv \
       uv export --quiet --frozen --no-dev --no-emit-project $extra --output-file /build/$name.txt; \
       uv pip install --quiet --no-deps --require-hashes --target /deps/$name -r /build/$name.txt; \
       cd /deps/$name; \
-      rm -rf bin .lock numpy/_core/include numpy/_core/lib numpy/f2py numpy/distutils cv2/gapi \
+      rm -rf bin .lock numpy/_core/_simd.* numpy/_core/include numpy/_core/lib numpy/f2py numpy/distutils cv2/gapi \
         lxml lxml-* pymavlink/dialects/v09 pymavlink/dialects/v10 pymavlink/dfindexer pymavlink/tools; \
       find . -path '*/tests' -prune -exec rm -rf {} +; \
       find . -path './pymavlink/generator/*' -type d -prune -exec rm -rf {} +; \
@@ -68,7 +68,8 @@ RUN --mount=type=cache,target=/root/.cache/uv \
       find /only-$name -type d -empty -delete; \
     done; \
     cp -a /deps/sdk /only-sdk; \
-    for name in sdk core operator agent services; do \
+    mkdir /only-geometry; cd /only-core; mv numpy* shapely* geographiclib* /only-geometry/; \
+    for name in sdk core geometry operator agent services; do \
       python3 -m compileall -q --invalidation-mode unchecked-hash -s /only-$name \
         -p /usr/local/lib/python3.11/dist-packages /only-$name; \
     done
@@ -100,8 +101,12 @@ COPY --from=root /out /
 COPY --from=dependencies /only-sdk /usr/local/lib/python3.11/dist-packages
 ENV PATH=/usr/local/bin:/usr/bin:/bin LANG=C.UTF-8 PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1
 
-FROM python AS domain
+# Who only reads and writes objects needs their models; who plans and judges needs geometry as well.
+FROM python AS model
 COPY --from=dependencies /only-core /usr/local/lib/python3.11/dist-packages
+
+FROM model AS domain
+COPY --from=dependencies /only-geometry /usr/local/lib/python3.11/dist-packages
 
 # ---- component: what applications' components start from
 FROM python AS component
@@ -120,7 +125,7 @@ USER 10001:10001
 ENTRYPOINT ["python3", "-m", "fractus_operator"]
 COPY --from=code /images/operator /usr/local/lib/python3.11/dist-packages
 
-FROM domain AS agent
+FROM model AS agent
 COPY --from=dependencies /only-agent /usr/local/lib/python3.11/dist-packages
 ENTRYPOINT ["python3", "-m", "fractus_agent"]
 COPY --from=code /images/agent /usr/local/lib/python3.11/dist-packages

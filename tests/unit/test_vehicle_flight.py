@@ -133,7 +133,6 @@ def test_a_target_during_spool_up_cancels_the_takeoff():
         (Command.DO_REPOSITION, Result.COMMAND_INT_ONLY),
         (Command.REQUEST_MESSAGE, Result.ACCEPTED),
         (Command.DO_FLIGHTTERMINATION, Result.FAILED),
-        (Command.MISSION_START, Result.FAILED),
     ],
 )
 def test_results_of_commands(command: int, result: Result):
@@ -282,8 +281,19 @@ def test_unknown_modes_are_refused():
     assert pilot.command(Command.DO_SET_MODE, 1, 99) is Result.FAILED
     assert pilot.texts[-1] == "No such mode 99"
     assert pilot.command(Command.DO_SET_MODE, 0, 4) is Result.DENIED
-    assert pilot.mode(Mode.AUTO) is Result.FAILED, "there is no mission"
     assert vehicle.mode is Mode.STABILIZE
+
+
+def test_modes_are_checked_once_the_motors_run():
+    vehicle, pilot = alone()
+    assert pilot.mode(Mode.AUTO) is Result.ACCEPTED, "disarmed, every mode can be selected"
+    assert pilot.mode(Mode.GUIDED) is Result.ACCEPTED
+    pilot.wait(lambda: vehicle.arming_refusal() is None, 5.0)
+    pilot.command(Command.COMPONENT_ARM_DISARM, 1.0)
+    assert pilot.mode(Mode.AUTO) is Result.FAILED, "there is no mission"
+    assert pilot.texts[-1] == "Mode change to AUTO failed: init failed"
+    assert pilot.command(Command.MISSION_START) is Result.FAILED
+    assert vehicle.mode is Mode.GUIDED
 
 
 def test_nan_targets_are_ignored():

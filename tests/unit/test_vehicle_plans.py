@@ -42,6 +42,8 @@ def test_a_mission_is_flown_with_its_jump_and_return():
     vehicle, pilot = alone()
     assert upload(pilot, 0, MISSION) == MissionResult.ACCEPTED
     pilot.wait(lambda: vehicle.arming_refusal() is None, 5.0)
+    pilot.mode(Mode.GUIDED)
+    assert pilot.command(Command.COMPONENT_ARM_DISARM, 1.0) is Result.ACCEPTED
     assert pilot.command(Command.MISSION_START) is Result.ACCEPTED
     reached: list[int] = []
     fastest_after_change = 0.0

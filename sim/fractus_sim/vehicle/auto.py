@@ -21,6 +21,7 @@ class AutoFlight(Flight):
         self._item: Item | None = None
         self._index = 0
         self._arrived_s: float | None = None
+        self._started = False
         self._landing = False
         self._returning: Flight | None = None
         self._wait_until_s = 0.0
@@ -30,16 +31,19 @@ class AutoFlight(Flight):
         self._angle = 0.0
 
     def begin(self, v: Vehicle) -> None:
-        """Continue at the current item, or start over."""
+        """Hold; the mission starts with the first step, which needs running motors."""
         v.control.hold_here()
         v.yaw.follow_course()
+
+    def _start(self, v: Vehicle) -> None:
+        """Continue at the current item, or start over."""
+        self._started = True
         mission = v.mission
         if mission.complete or int(v.params["MIS_RESTART"]) == 1 or mission.current == 0:
             mission.rewind()
-            first = mission.next_after(0)
+            self._start_from(v, mission.next_after(0))
         else:
-            first = mission.current
-        self._start_from(v, first)
+            self._start_from(v, mission.current)
 
     def pause(self, v: Vehicle, *, paused: bool) -> None:
         """DO_PAUSE_CONTINUE: stop where it is; continuing repeats the current item."""
@@ -51,6 +55,7 @@ class AutoFlight(Flight):
 
     def jump_to(self, v: Vehicle, index: int) -> None:
         """Continue at an item (DO_SET_MISSION_CURRENT)."""
+        self._started = True
         self._returning = None
         self._landing = False
         v.mission.complete = False
@@ -131,6 +136,8 @@ class AutoFlight(Flight):
 
     def step(self, v: Vehicle, dt: float) -> None:
         """Fly the current item and go on when it is done."""
+        if not self._started:
+            self._start(v)
         item = self._item
         if item is None or self.paused:
             return

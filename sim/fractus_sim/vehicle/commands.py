@@ -259,10 +259,6 @@ def _fence_enable(v: Vehicle, o: Order, _c: Channel) -> Result:
 
 
 def _mission_start(v: Vehicle, _o: Order, _c: Channel) -> Result:
-    if not v.armed:
-        if v.arming_refusal() is not None or len(v.mission.items) <= 1:
-            return Result.FAILED
-        v.arm()
     return Result.ACCEPTED if v.set_mode(Mode.AUTO) else Result.FAILED
 
 

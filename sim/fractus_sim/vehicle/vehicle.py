@@ -289,8 +289,10 @@ class Vehicle:
         self._idle_since_s = self.time_s
 
     def mode_refusal(self, mode: Mode) -> str | None:
-        """Why a mode cannot be entered now, or None."""
-        if FLIGHTS[mode].needs_position and not self.position_ok and (self.armed or mode is Mode.RTL):
+        """Why a mode cannot be entered now, or None; on the ground with the motors off every mode can."""
+        if not self.armed:
+            return None
+        if FLIGHTS[mode].needs_position and not self.position_ok:
             return f"Mode change to {mode.name} failed: requires position"
         if mode is Mode.AUTO and len(self.mission.items) <= 1:
             return "Mode change to AUTO failed: init failed"

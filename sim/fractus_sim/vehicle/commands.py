@@ -317,7 +317,7 @@ def _prearm(v: Vehicle, _o: Order, _c: Channel) -> Result:
 
 
 def _banner(v: Vehicle, _o: Order, _c: Channel) -> Result:
-    v.banner()
+    v.voice.banner()
     return Result.ACCEPTED
 
 

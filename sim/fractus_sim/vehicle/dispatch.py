@@ -74,7 +74,7 @@ def _parameter_list(v: Vehicle, _m: Message, c: Channel) -> None:
 
 def _parameter_read(v: Vehicle, m: Message, c: Channel) -> None:
     index = m.integer("param_index")
-    v.send_parameter(c, m.text("param_id"), index)
+    v.voice.send_parameter(c, m.text("param_id"), index)
 
 
 def _parameter_set(v: Vehicle, m: Message, c: Channel) -> None:
@@ -82,7 +82,7 @@ def _parameter_set(v: Vehicle, m: Message, c: Channel) -> None:
     v.params.set(name, m.real("param_value"))
     for channel in v.channels:
         if channel is c or not channel.signing:
-            v.send_parameter(channel, name, -1, 65535)
+            v.voice.send_parameter(channel, name, -1, 65535)
 
 
 def _timesync(v: Vehicle, m: Message, c: Channel) -> None:

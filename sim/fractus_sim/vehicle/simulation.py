@@ -31,13 +31,13 @@ class Craft:
         key = self.vehicle.signing_key
         if key is not None:
             channel.signing = Signing(key, signing_clock(self.vehicle.unix_us))
-        self.vehicle.attach(channel)
+        self.vehicle.voice.attach(channel)
         return channel
 
     def close(self, channel: Channel) -> None:
         """Close a link."""
         if channel in self.vehicle.channels:
-            self.vehicle.detach(channel)
+            self.vehicle.voice.detach(channel)
 
     def receive(self, channel: Channel, data: bytes) -> None:
         """Take bytes that arrived on a link."""
@@ -79,7 +79,7 @@ class Craft:
         for channel in old.channels:
             channel.streams.clear()
             channel.parameters.clear()
-            self.vehicle.attach(channel)
+            self.vehicle.voice.attach(channel)
 
     def record(self, file: BinaryIO, rate_hz: float = 4.0) -> None:
         """Write everything the vehicle says on a link of its own to a tlog, with every stream at `rate_hz`."""
@@ -89,7 +89,7 @@ class Craft:
             file.write(struct.pack(">Q", self.vehicle.unix_us) + frame)
 
         channel = Channel(self.config.sysid, name="recorder", tap=tap, discard=True)
-        vehicle.attach(channel)
+        vehicle.voice.attach(channel)
         for group in ALL_GROUPS:
             for name in GROUPS[group][1]:
                 channel.set_interval(name, 1.0 / rate_hz)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fractus_sim.vehicle.body import Airframe, Body, Wind
-from fractus_sim.vehicle.channel import PARAMETERS_PER_TICK, Channel
+from fractus_sim.vehicle.channel import Channel
 from fractus_sim.vehicle.control import Control
 from fractus_sim.vehicle.earth import Place, valid_place
 from fractus_sim.vehicle.estimator import Estimator
@@ -17,7 +17,7 @@ from fractus_sim.vehicle.failsafes import Failsafes
 from fractus_sim.vehicle.fence import Fence
 from fractus_sim.vehicle.flight import Flight
 from fractus_sim.vehicle.guided import Heading
-from fractus_sim.vehicle.mav import VERSION_TEXT, Landed, Mode, Severity
+from fractus_sim.vehicle.mav import Landed, Mode, Severity
 from fractus_sim.vehicle.mission import Item, Mission
 from fractus_sim.vehicle.modes import FLIGHTS, ReturnToLaunch, new_flight
 from fractus_sim.vehicle.params import Parameters
@@ -25,7 +25,7 @@ from fractus_sim.vehicle.plans import Plans
 from fractus_sim.vehicle.sensors import Battery, Gps
 from fractus_sim.vehicle.settings import LIMIT_PREFIXES, set_battery, set_fence, set_limits, set_wind
 from fractus_sim.vehicle.shaping import clamp, wrap_pi
-from fractus_sim.vehicle.streams import ALL_GROUPS, BUILDERS, GROUPS
+from fractus_sim.vehicle.voice import Voice
 from fractus_sim.vehicle.wire import Message, Value
 
 CONTROL_STEP_S = 0.01
@@ -62,6 +62,8 @@ class Vehicle:
         self.compid = 1
         self.start = config.start
         self.rng = random.Random(f"{config.seed}:{config.sysid}")  # noqa: S311 - a simulation, not a secret
+        self.channels: list[Channel] = []
+        self.voice = Voice(self)
         self.params = Parameters(config.parameters, config.store)
         self.params.assign("SYSID_THISMAV", config.sysid)
         self.time_s = 0.0
@@ -81,7 +83,6 @@ class Vehicle:
         self.fence = Fence()
         self.failsafes = Failsafes()
         self.plans = Plans(self)
-        self.channels: list[Channel] = []
         self.yaw = Heading()
         self.armed = False
         self.armed_at_s = 0.0
@@ -224,37 +225,15 @@ class Vehicle:
 
     def broadcast(self, name: str, values: Mapping[str, Value]) -> None:
         """Send a message on every link."""
-        for channel in self.channels:
-            channel.send(name, values)
+        self.voice.broadcast(name, values)
 
     def say(self, severity: Severity, text: str) -> None:
-        """Send a STATUSTEXT on every link, in chunks when it is long."""
-        data = text.encode("ascii", "replace")
-        for channel in self.channels:
-            for chunk in range(0, max(len(data), 1), 50):
-                channel.send(
-                    "STATUSTEXT",
-                    {
-                        "severity": int(severity),
-                        "text": data[chunk : chunk + 50],
-                        "id": 1 + self.ticks % 65000 if len(data) > 50 else 0,
-                        "chunk_seq": chunk // 50,
-                    },
-                )
-
-    def banner(self) -> None:
-        """Say what this is, as at a connection."""
-        self.say(Severity.INFO, VERSION_TEXT)
-        self.say(Severity.INFO, "Frame: QUAD/X")
+        """Send a STATUSTEXT on every link."""
+        self.voice.say(severity, text)
 
     def send(self, channel: Channel, name: str) -> bool:
         """Send one of the telemetry messages on one link; False when there is no such message now."""
-        builder = BUILDERS.get(name)
-        values = None if builder is None else builder(self)
-        if values is None:
-            return False
-        channel.send(name, values)
-        return True
+        return self.voice.send(channel, name)
 
     # -- arming and modes --------------------------------------------------------------------------------------
 
@@ -430,10 +409,7 @@ class Vehicle:
         elif prefix in ("SIM", "BATT"):
             set_battery(self.params, self.battery)
         elif prefix[:2] == "SR" and prefix[2:].isdigit():
-            for channel in self.channels:
-                for group in ALL_GROUPS:
-                    if name == f"SR{channel.port}_{GROUPS[group][0]}":
-                        self._set_default_rate(channel, group)
+            self.voice.follow_rate(name)
 
     # -- time --------------------------------------------------------------------------------------------------
 
@@ -455,7 +431,7 @@ class Vehicle:
         if self.plans.transfers.upload is not None and self.plans.transfers.step(self.time_s) is not None:
             self.say(Severity.WARNING, "Mission upload timeout")
         for channel in self.channels:
-            self._serve(channel)
+            self.voice.serve(channel)
 
     def _move(self) -> None:
         dt = CONTROL_STEP_S / PHYSICS_PER_CONTROL
@@ -498,52 +474,6 @@ class Vehicle:
             self.disarm("landed")
         elif delay > 0.0 and self.time_s - self._idle_since_s >= delay:
             self.disarm("idle")
-
-    # -- links -------------------------------------------------------------------------------------------------
-
-    def _serve(self, channel: Channel) -> None:
-        for name in channel.due(self.time_s):
-            self.send(channel, name)
-        for _ in range(min(PARAMETERS_PER_TICK, len(channel.parameters))):
-            self.send_parameter(channel, "", channel.parameters.popleft())
-
-    def send_parameter(self, channel: Channel, name: str, index: int, shown_index: int | None = None) -> bool:
-        """Send PARAM_VALUE by name or index; False when there is no such parameter."""
-        found = self.params.find(name, index)
-        if found is None:
-            return False
-        shown, row, at = found
-        channel.send(
-            "PARAM_VALUE",
-            {
-                "param_id": shown.encode("ascii"),
-                "param_value": self.params[row.name],
-                "param_type": row.wire_type,
-                "param_count": len(self.params),
-                "param_index": at if shown_index is None else shown_index,
-            },
-        )
-        return True
-
-    def attach(self, channel: Channel) -> None:
-        """Open a link: HEARTBEAT at 1 Hz and silence otherwise, unless SR parameters ask for streams."""
-        self.channels.append(channel)
-        channel.set_interval("HEARTBEAT", 1.0)
-        for group in ALL_GROUPS:
-            self._set_default_rate(channel, group)
-
-    def _set_default_rate(self, channel: Channel, group: int) -> None:
-        label, names = GROUPS[group]
-        rate = 0.0 if channel.port is None else self.params[f"SR{min(channel.port, 6)}_{label}"]
-        if rate > 0.0:
-            for name in names:
-                channel.set_interval(name, 1.0 / min(rate, 100.0))
-
-    def detach(self, channel: Channel) -> None:
-        """Close a link."""
-        self.channels.remove(channel)
-        if self.plans.transfers.upload is not None and self.plans.transfers.upload.channel is channel:
-            self.plans.transfers.upload = None
 
     def heard(self, message: Message) -> None:
         """Note a heartbeat of the ground station that failsafes watch."""

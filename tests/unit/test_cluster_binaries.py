@@ -79,15 +79,15 @@ def test_does_not_take_another_version(machine: Path) -> None:
 
 
 def test_old_go_is_refused(machine: Path) -> None:
-    script(machine / "path" / "go", "go1.21.3")
-    with pytest.raises(PrerequisiteError, match=r"found go1\.21\.3"):
+    script(machine / "path" / "go", "go1.21.3\nlocal")
+    with pytest.raises(PrerequisiteError, match=r"Go 1\.25 or newer is needed to build pause, found go1\.21\.3"):
         ensure_binaries(["pause"], report=print)
 
 
 def test_failed_build_leaves_nothing(machine: Path) -> None:
     go = machine / "path" / "go"
-    script(go, "go1.25.0")
-    go.write_text('#!/bin/sh\n[ "$1" = env ] && echo go1.25.0 && exit 0\necho "compiler on fire" >&2\nexit 2\n')
+    script(go, "")
+    go.write_text('#!/bin/sh\n[ "$1" = env ] && echo go1.25.0 local && exit 0\necho "compiler on fire" >&2\nexit 2\n')
     with pytest.raises(ClusterError, match="compiler on fire"):
         ensure_binaries(["pause"], report=print)
     left = list((machine / "cache").rglob("*"))

@@ -23,6 +23,7 @@ from fractus_sim.cluster.cgroups import Branch, cluster_branch
 from fractus_sim.cluster.commands import run
 from fractus_sim.cluster.controlplane import (
     API_PORT,
+    CONTROL_PLANE_PROGRAMS,
     DNS_READY_PORT,
     ControlPlaneFiles,
     administrator,
@@ -354,7 +355,9 @@ class Cluster:
         network.wire_control_plane(wiring)
         units = control_plane_units(binaries, authority, wiring.addressing, files)
         view: dict[str, object] = {"hostname": None, "files": "", "logs": "", "programs": {}, "sysctls": {}}
-        config = json.dumps({"view": view, "units": units, "builds": binaries.builds()}, indent=1)
+        config = json.dumps(
+            {"view": view, "units": units, "builds": binaries.builds(*CONTROL_PLANE_PROGRAMS)}, indent=1
+        )
         path = files.directory / "init.json"
         if self.running and path.exists() and path.read_text() == config:
             return

@@ -13,6 +13,7 @@ from fractus_sim.cluster.pki import Authority, Credential, write_private
 
 API_PORT = 6443
 DNS_READY_PORT = 8181
+CONTROL_PLANE_PROGRAMS = ("etcd", "kube-apiserver", "kube-controller-manager", "kube-scheduler", "coredns")
 _ETCD_URL = "http://127.0.0.1:2379"
 _CLUSTER_DOMAIN = "cluster.local"
 

@@ -27,6 +27,7 @@ from fractus_sim.cluster.processes import kill, read_record, spawn, write_record
 from fractus_sim.cluster.spec import NodeSpec
 from fractus_sim.cluster.state import StateDirectory
 
+_PROGRAMS = ("kubelet", "kube-proxy")
 _FOLDERS = ("etc", "etc-work", "var-lib", "var-log", "config")
 _ENVIRONMENT = {
     "PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
@@ -254,7 +255,7 @@ class Node:
             "hostname": self.name,
             "files": str(self.directory),
             "logs": str(self.state.logs / self.name),
-            "programs": {name: str(binaries[name].resolve()) for name in ("kubelet", "kube-proxy")},
+            "programs": {name: str(binaries[name].resolve()) for name in _PROGRAMS},
             "sysctls": nodeconfig.SHOWN_SYSCTLS,
         }
         return json.dumps(

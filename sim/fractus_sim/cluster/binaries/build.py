@@ -12,13 +12,13 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from importlib import resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from fractus_sim.cluster.binaries.catalog import MODULES, Module, Program
 from fractus_sim.cluster.commands import run
 from fractus_sim.cluster.errors import ClusterError, PrerequisiteError
 
-GO_MINIMUM = (1, 25)
 _BUILD_TIMEOUT_S = 3600.0
 _REPORT_EVERY_S = 10.0
 
@@ -28,8 +28,7 @@ Report = Callable[[str], None]
 def module_digest(module: Module) -> str:
     """Return a digest of all that decides the outcome of building a module: sources, pins, link variables."""
     digest = hashlib.sha256()
-    folder = resources.files("fractus_sim.cluster.binaries") / "gomod" / module.name
-    for entry in sorted(folder.iterdir(), key=lambda item: item.name):
+    for entry in sorted(_sources(module).iterdir(), key=lambda item: item.name):
         digest.update(entry.name.encode() + b"\0" + entry.read_bytes() + b"\0")
     digest.update(repr(sorted(module.link_variables.items())).encode())
     return digest.hexdigest()[:16]
@@ -49,7 +48,7 @@ def build(programs: Sequence[Program], into: Path, *, report: Report) -> None:
         ClusterError: The build failed; the message ends with what the compiler said.
     """
     module = MODULES[programs[0].module]
-    check_go()
+    check_go(module)
     into.mkdir(parents=True, exist_ok=True)
     names = ", ".join(program.name for program in programs)
     report(f"building {names} {programs[0].version} from Go modules (once; kept in {into})")
@@ -59,7 +58,7 @@ def build(programs: Sequence[Program], into: Path, *, report: Report) -> None:
     with tempfile.TemporaryDirectory(prefix=".building-", dir=into) as scratch:
         source, output = Path(scratch) / "source", Path(scratch) / "bin"
         output.mkdir()
-        with resources.as_file(resources.files("fractus_sim.cluster.binaries") / "gomod" / module.name) as folder:
+        with resources.as_file(_sources(module)) as folder:
             shutil.copytree(folder, source)
         _go_build(module, programs, source, output, report)
         for program in programs:
@@ -123,22 +122,36 @@ def _follow(process: subprocess.Popen[str], module: str, report: Report) -> list
     return tail
 
 
-def check_go() -> None:
-    """Check that a Go toolchain that can build the modules is on PATH.
+def check_go(module: Module) -> None:
+    """Check that a Go toolchain that can build a module is on PATH, or can be fetched by the one that is.
 
     Raises:
         PrerequisiteError: It is missing or too old.
     """
-    wanted = ".".join(map(str, GO_MINIMUM))
+    wanted = _go_version((_sources(module) / "go.mod").read_text(), r"^go (\d+)\.(\d+)")
+    text = ".".join(map(str, wanted))
     if shutil.which("go") is None:
         raise PrerequisiteError(
-            f"the Kubernetes programs have to be built once, which needs Go {wanted} or newer on PATH "
-            "(or put ready-made ones into a directory and name it in KUBEBUILDER_ASSETS)"
+            f"{module.name} has to be built once, which needs Go {text} or newer on PATH "
+            "(or put ready-made programs into a directory and name it in KUBEBUILDER_ASSETS)"
         )
-    said = run(["go", "env", "GOVERSION"], timeout_s=60).stdout.strip()
-    found = re.match(r"go(\d+)\.(\d+)", said)
-    if found and (int(found[1]), int(found[2])) < GO_MINIMUM:
-        raise PrerequisiteError(f"Go {wanted} or newer is needed to build the Kubernetes programs, found {said}")
+    found, toolchain = run(["go", "env", "GOVERSION", "GOTOOLCHAIN"], timeout_s=60).stdout.split()
+    if _go_version(found, r"go(\d+)\.(\d+)") < wanted and toolchain == "local":
+        raise PrerequisiteError(
+            f"Go {text} or newer is needed to build {module.name}, found {found}, "
+            "and GOTOOLCHAIN=local forbids it to fetch a newer one"
+        )
+
+
+def _sources(module: Module) -> Traversable:
+    return resources.files("fractus_sim.cluster.binaries") / "gomod" / module.name
+
+
+def _go_version(text: str, pattern: str) -> tuple[int, int]:
+    found = re.search(pattern, text, re.MULTILINE)
+    if found is None:
+        raise ClusterError(f"no Go version in {text[:100]!r}")
+    return int(found[1]), int(found[2])
 
 
 def reported_version(path: Path, program: Program) -> str | None:

@@ -36,9 +36,9 @@ class Binaries:
         except KeyError:
             raise ClusterError(f"{name} was not provided; run `fractus cluster binaries --with {name}`") from None
 
-    def builds(self) -> dict[str, int]:
-        """Return what changes when a program is built anew: when its file was written, nanoseconds."""
-        return {name: path.stat().st_mtime_ns for name, path in self.paths.items()}
+    def builds(self, *names: str) -> dict[str, int]:
+        """Return what changes when one of these programs is built anew: when its file was written, nanoseconds."""
+        return {name: self[name].stat().st_mtime_ns for name in names}
 
 
 def cache_directory() -> Path:

@@ -7,7 +7,7 @@ from importlib import resources
 from pathlib import Path
 
 import pytest
-from fractus_sim.cluster import ClusterError, PrerequisiteError
+from fractus_sim.cluster import ClusterError, PrerequisiteError, prerequisites
 from fractus_sim.cluster.binaries import CLUSTER_PROGRAMS, KUBERNETES_VERSION, PROGRAMS, ensure_binaries
 from fractus_sim.cluster.binaries import build as build_module
 from fractus_sim.cluster.binaries.catalog import MODULES
@@ -114,3 +114,13 @@ def test_other_users_are_told_to_use_sudo(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("os.geteuid", lambda: 1000)
     with pytest.raises(PrerequisiteError, match="sudo"):
         check_root()
+
+
+def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    there = {"containerd", "ctr", "ip", "nsenter", "unshare", "mount", "iptables"}
+    monkeypatch.setattr("shutil.which", lambda name, path=None: name if name in there else None)
+    monkeypatch.setattr(prerequisites, "plugin_directory", lambda: None)
+    assert prerequisites.missing_packages() == ["containernetworking-plugins", "nftables", "runc"]
+    monkeypatch.setattr(prerequisites, "check_root", lambda: None)
+    with pytest.raises(PrerequisiteError, match="apt-get install containernetworking-plugins nftables runc"):
+        prerequisites.check_prerequisites()

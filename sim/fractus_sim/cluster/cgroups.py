@@ -195,10 +195,16 @@ def _fill_cpuset(above: Path, directory: Path) -> None:
 
 def _delegate(directory: Path) -> None:
     there = set((directory / "cgroup.controllers").read_text().split())
-    enabled = set((directory / "cgroup.subtree_control").read_text().split())
-    for name in _DELEGATED_V2:
-        if name in there and name not in enabled:
-            (directory / "cgroup.subtree_control").write_text(f"+{name}")
     missing = [name for name in _NEEDED_V2 if name not in there]
     if missing:
         raise PrerequisiteError(f"the control groups at {directory} lack {', '.join(missing)}; Kubernetes needs them")
+    enabled = set((directory / "cgroup.subtree_control").read_text().split())
+    for name in _DELEGATED_V2:
+        if name in there and name not in enabled:
+            try:
+                (directory / "cgroup.subtree_control").write_text(f"+{name}")
+            except OSError as error:
+                raise PrerequisiteError(
+                    f"the control group {directory} cannot hand {name} on ({error.strerror}); inside a container "
+                    "without control groups of its own the embedded cluster does not run"
+                ) from error

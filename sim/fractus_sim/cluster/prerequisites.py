@@ -19,7 +19,6 @@ _PACKAGES = {
     "runc": "runc",
     "nft": "nftables",
     "iptables": "iptables",
-    "conntrack": "conntrack",
     "ip": "iproute2",
     "nsenter": "util-linux",
     "unshare": "util-linux",

@@ -8,7 +8,7 @@ MAKEFLAGS += --no-print-directory
 CLUSTER ?= embedded
 OUT ?= out
 UV_VERSION := 0.13.8
-APT_PACKAGES := buildah ca-certificates conntrack containerd containernetworking-plugins debootstrap iproute2 \
+APT_PACKAGES := buildah ca-certificates containerd containernetworking-plugins debootstrap iproute2 \
 	iptables nftables python3-venv runc
 
 UV := $(shell command -v uv || echo .tools/bin/uv)
@@ -21,16 +21,18 @@ help: ## List the targets
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z0-9-]+:.*## / {printf "  %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 .PHONY: demo
-demo: packages env ## Fly the traffic-monitoring example and leave its report in out/demo (CLUSTER=embedded|current)
-	$(RUN) python -m fractus_sim.demo --cluster $(CLUSTER) --out $(OUT)/demo
+demo: packages uv ## Fly the traffic-monitoring example and leave its report in out/demo (CLUSTER=embedded|current)
+	$(UV) run --frozen --extra sim python -m fractus_sim.demo --cluster $(CLUSTER) --out $(OUT)/demo
 
 .PHONY: test
 test: packages env lint ## Everything: lint, types, unit, integration and end-to-end tests
-	$(RUN) pytest tests/unit tests/integration tests/e2e
+	$(RUN) fractus cluster binaries
+	$(RUN) pytest -n 4 --dist loadfile tests/unit tests/integration
+	$(RUN) pytest tests/e2e
 
 .PHONY: test-fast
 test-fast: env lint ## The inner loop: lint, types and unit tests
-	$(RUN) pytest -q tests/unit
+	$(RUN) pytest -q -n 2 --dist loadfile tests/unit
 
 .PHONY: test-e2e
 test-e2e: packages env ## End-to-end tests only, on the embedded cluster or on FRACTUS_E2E_CLUSTER=current
@@ -72,10 +74,11 @@ packages: ## Install the Debian packages that are missing (root)
 		apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $$missing > /dev/null; \
 	fi
 
-.PHONY: env
+.PHONY: env uv
 env: .venv/.synced
+uv: $(if $(filter .tools/bin/uv,$(UV)),.tools/bin/uv)
 
-.venv/.synced: pyproject.toml uv.lock | $(if $(filter .tools/bin/uv,$(UV)),.tools/bin/uv)
+.venv/.synced: pyproject.toml uv.lock | uv
 	$(UV) sync --frozen --all-extras --quiet
 	@touch $@
 

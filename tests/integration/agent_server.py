@@ -13,7 +13,7 @@ from typing import Any
 
 import httpx2
 from agent_pki import TestAuthority
-from control_plane import ControlPlane, Refused, find_programs, wait_for
+from control_plane import ControlPlane, Refused, programs, wait_for
 
 FRACTUS = "/apis/fractus.dev/v1alpha1"
 REQUESTS = "/apis/certificates.k8s.io/v1/certificatesigningrequests"
@@ -126,9 +126,7 @@ def _post(url: str, body: dict[str, Any]) -> dict[str, Any]:
 @contextlib.contextmanager
 def running(directory: Path) -> Iterator[ApiServer]:
     """A furnished control plane for the length of a block."""
-    programs = find_programs()
-    assert programs is not None
-    server = ApiServer(programs, directory)
+    server = ApiServer(programs(), directory)
     try:
         server.start()
         yield server

@@ -9,18 +9,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from control_plane import ControlPlane, find_programs
+from control_plane import ControlPlane, programs
 from operator_world import OperatorProcess, World, fresh_namespace
 
 
 @pytest.fixture(scope="session")
 def control_plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ControlPlane]:
     """A real API server with the CRDs installed; about 6 s, once a session."""
-    programs = find_programs()
-    if programs is None:
-        pytest.skip("no control plane: set KUBEBUILDER_ASSETS, or run `fractus cluster up` once to build one")
     directory: Path = tmp_path_factory.mktemp("control-plane")
-    plane = ControlPlane(programs, directory)
+    plane = ControlPlane(programs(), directory)
     try:
         plane.start()
         yield plane

@@ -6,8 +6,6 @@ No kubelets: objects are real, nothing runs. Tests say of pods what kubelets wou
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import signal
 import socket
 import ssl
@@ -21,6 +19,7 @@ from typing import Any, TypeVar
 import httpx2
 from fractus_core.api import KINDS
 from fractus_core.api.crd import crd
+from fractus_sim.cluster.binaries import ensure_binaries
 from fractus_sim.cluster.pki import Authority
 
 T = TypeVar("T")
@@ -37,13 +36,10 @@ _CONTROLLERS = (
 )
 
 
-def find_programs() -> dict[str, Path] | None:
-    """The programs of a control plane, from KUBEBUILDER_ASSETS, the cache of `fractus cluster`, or PATH."""
-    caches = sorted((Path.home() / ".cache" / "fractus").glob("*/bin"), reverse=True)
-    assets = os.environ.get("KUBEBUILDER_ASSETS")
-    path = os.pathsep.join([*([assets] if assets else []), *map(str, caches), os.environ.get("PATH", "")])
-    found = {name: shutil.which(name, path=path) for name in PROGRAMS}
-    return {k: Path(v) for k, v in found.items() if v} if all(found.values()) else None
+def programs() -> dict[str, Path]:
+    """The programs of a control plane; `fractus cluster binaries` builds them where the machine has none."""
+    found = ensure_binaries(PROGRAMS, report=print)
+    return {name: found[name] for name in PROGRAMS}
 
 
 def free_port() -> int:

@@ -19,16 +19,13 @@ import pytest
 import yaml
 from agent_pki import TestAuthority
 from agent_server import FRACTUS, REQUESTS, ApiServer, running
-from control_plane import find_programs, free_port, wait_for
+from control_plane import free_port, wait_for
 from fractus_core.api.plans import Grant
 from fractus_proto.v1 import mobility_pb2_grpc
 from fractus_proto.v1.mobility_pb2 import SubscribeTelemetryRequest, Telemetry
 from fractus_proto.v1.types_pb2 import Position
 
-pytestmark = [
-    pytest.mark.skipif(find_programs() is None, reason="no kube-apiserver: run `fractus cluster up` once"),
-    pytest.mark.timeout(180),
-]
+pytestmark = pytest.mark.timeout(180)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 from agent_pki import TestAuthority
 from agent_server import FRACTUS, ApiServer, running
-from control_plane import find_programs
 from fractus_agent.store import (
     Changed,
     Conflict,
@@ -26,10 +25,7 @@ from fractus_agent.store import (
     connect,
 )
 
-pytestmark = [
-    pytest.mark.skipif(find_programs() is None, reason="no control plane: run `fractus cluster up` once"),
-    pytest.mark.timeout(120),
-]
+pytestmark = pytest.mark.timeout(120)
 PATIENCE_S = 30.0
 
 

@@ -6,8 +6,6 @@ import gzip
 import hashlib
 import http.client
 import json
-import os
-import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,8 +34,6 @@ def buildah(*arguments: str) -> str:
 @pytest.fixture
 def image(tmp_path: Path) -> Iterator[str]:
     """A small image in buildah's storage."""
-    if shutil.which("buildah") is None or os.geteuid() != 0:
-        pytest.skip("needs buildah and root")
     container = buildah("from", "scratch")
     try:
         (tmp_path / "file").write_bytes(b"content " * 5000)

@@ -189,7 +189,10 @@ def test_schedules(time, moment, active):
     [
         ({"start": "08:00"}, "spec.schedule[0].start: give start and end together"),
         ({"start": "24:00", "end": "25:00"}, "spec.schedule[0].start: "),
-        ({"validFrom": "2026-06-02T00:00:00Z", "validUntil": "2026-06-01T00:00:00Z"}, "spec.schedule[0].validUntil: must be after"),
+        (
+            {"validFrom": "2026-06-02T00:00:00Z", "validUntil": "2026-06-01T00:00:00Z"},
+            "spec.schedule[0].validUntil: must be after",
+        ),
     ],
 )
 def test_sentences_of_bad_schedules(time, sentence):

@@ -3,15 +3,17 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
 MAKEFLAGS += --no-print-directory
+.NOTPARALLEL:
 
 # embedded: a real Kubernetes that Fractus brings up on this machine. current: the cluster of KUBECONFIG (k3s, kind).
 CLUSTER ?= embedded
 OUT ?= out
 UV_VERSION := 0.13.8
-APT_PACKAGES := buildah ca-certificates containerd containernetworking-plugins debootstrap iproute2 \
-	iptables nftables python3-venv runc
+# What is looked for : the Debian package that has it.
+PROGRAMS := buildah:buildah containerd:containerd runc:runc nft:nftables iptables:iptables ip:iproute2 \
+	debootstrap:debootstrap /usr/lib/cni/ptp:containernetworking-plugins /etc/ssl/certs/ca-certificates.crt:ca-certificates
 
-UV := $(shell command -v uv || echo .tools/bin/uv)
+UV := $(shell uv --version 2> /dev/null | grep -q '^uv ' && command -v uv || echo .tools/bin/uv)
 RUN := $(UV) run --frozen --all-extras
 GO_PATH := $(PATH):/usr/local/go/bin
 export PATH := $(GO_PATH)
@@ -65,13 +67,18 @@ bench: env ## Run every benchmark
 	for file in bench/*.py; do $(RUN) python "$$file" --quick; done
 
 .PHONY: packages
-packages: ## Install the Debian packages that are missing (root)
-	@missing="$$(dpkg-query -W -f='$${db:Status-Status} $${Package}\n' $(APT_PACKAGES) 2>/dev/null \
-		| awk '$$1 == "installed" {print $$2}' | sort | comm -13 - <(printf '%s\n' $(APT_PACKAGES) | sort) || true)"; \
+packages: ## Install the Debian packages whose programs are missing (root); nothing is ever removed
+	@missing=""; PATH="$$PATH:/usr/sbin:/sbin"; \
+	for pair in $(PROGRAMS); do \
+		[ -e "$${pair%%:*}" ] || command -v "$${pair%%:*}" > /dev/null || missing="$$missing $${pair##*:}"; \
+	done; \
+	python3 -c 'import ensurepip, venv' 2> /dev/null || missing="$$missing python3-venv"; \
 	if [ -n "$$missing" ]; then \
-		command -v apt-get > /dev/null || { echo "install these first: $$missing" >&2; exit 1; }; \
-		echo "installing: "$$missing; \
-		apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $$missing > /dev/null; \
+		command -v apt-get > /dev/null || { echo "install these first:$$missing" >&2; exit 1; }; \
+		[ "$$(id -u)" = 0 ] || { echo "run as root, or install these first: apt-get install$$missing" >&2; exit 1; }; \
+		echo "installing:$$missing"; \
+		apt-get update -qq && DEBIAN_FRONTEND=noninteractive \
+			apt-get install -y -qq --no-remove --no-install-recommends $$missing > /dev/null; \
 	fi
 
 .PHONY: env uv

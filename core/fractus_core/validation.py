@@ -9,6 +9,9 @@ from fractus_core.api.geometry import Area
 from fractus_core.geo import LocalFrame, geodesic_m, middle, polygon
 from fractus_core.planning.area import operation_area
 
+MAX_WAYPOINTS = 2000
+"""Waypoints and points of interest of one application: far more than a battery lasts for."""
+
 MAX_EXTENT_M = 1_000_000.0
 """No point of an area may be further from its middle: beyond, a local frame means nothing."""
 
@@ -64,6 +67,12 @@ def check_application(application: Application, depots: Mapping[str, Depot]) -> 
     driver = application.spec.driver
     if driver is not None:
         index = application.spec.components.index(driver)
+        count = sum(len(point.path or ()) for point in driver.control_points)
+        if count > MAX_WAYPOINTS:
+            raise InvalidObject(
+                f"spec.components[{index}].controlPoints",
+                f"{count} waypoints in all, more than {MAX_WAYPOINTS}; split the mission",
+            )
         for i, point in enumerate(driver.control_points):
             if point.region is not None:
                 check_area(point.region, f"spec.components[{index}].controlPoints[{i}].region")

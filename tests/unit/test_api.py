@@ -200,3 +200,11 @@ def test_sentences_of_bad_schedules(time, sentence):
     with pytest.raises(InvalidObject) as caught:
         Zone.from_body(manifest("Zone", "z", {"area": area, "schedule": [time]}))
     assert str(caught.value).startswith(sentence)
+
+
+def test_too_many_waypoints_are_refused():
+    path = [{"lat": 50 + i * 1e-6, "lon": 4} for i in range(1000)]
+    point = {"navigation": "pathBased", "path": path}
+    app = application(navigator(PATH) | {"controlPoints": [point] * 3})
+    with pytest.raises(InvalidObject, match=r"controlPoints: 3000 waypoints in all, more than 2000"):
+        check_application(app, {})

@@ -95,3 +95,15 @@ def test_areas_survive_the_round_trip(lat, lon):
 def test_middle_is_right_across_the_antimeridian():
     middle = middle_of([Point(lat=0, lon=179), Point(lat=0, lon=-179)])
     assert abs(middle.lon) == pytest.approx(180)
+
+
+def test_corridor_of_a_path_that_crosses_itself_a_thousand_times_is_the_dilated_path():
+    frame = LocalFrame(50, 4)
+    turns = [
+        frame.latlon(300 * math.sin(math.tau * i * 0.497), 300 * math.cos(math.tau * i * 0.497)) for i in range(60)
+    ]
+    points = [Point(lat=lat, lon=lon) for lat, lon in turns]
+    whole = shapely.LineString([frame.xy(*t) for t in turns]).buffer(7, quad_segs=32)
+    shape = corridor(frame, points, 7)
+    assert shape.covers(whole)
+    assert shape.area == pytest.approx(whole.area, rel=2e-3)

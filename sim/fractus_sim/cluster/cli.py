@@ -14,7 +14,9 @@ import click
 from fractus_sim.cluster.binaries import CLUSTER_PROGRAMS, PROGRAMS, ensure_binaries
 from fractus_sim.cluster.cluster import Cluster, NodeStatus, print_report
 from fractus_sim.cluster.errors import ClusterError, PrerequisiteError
-from fractus_sim.cluster.state import known_clusters
+from fractus_sim.cluster.machine import holders
+from fractus_sim.cluster.prerequisites import check_root
+from fractus_sim.cluster.state import known_clusters, state_root
 
 _P = ParamSpec("_P")
 
@@ -60,13 +62,13 @@ def up(file: Path, name: str | None, images: tuple[str, ...]) -> None:
 @_one_line_errors
 def down(name: str | None, every: bool) -> None:
     """Take the cluster away with everything that it put on the machine."""
-    if every:
-        for each in known_clusters():
-            Cluster.bare(each, report=print_report).down()
-    elif name is not None:
-        Cluster.bare(name, report=print_report).down()
-    elif known_clusters():
-        Cluster.existing(report=print_report).down()
+    check_root()
+    # A cluster whose state directory was deleted is still in the machine's ledger.
+    ours = sorted({*known_clusters(), *(held for held, at in holders().items() if at.parent == state_root())})
+    if name is None and len(ours) > 1 and not every:
+        raise ClusterError(f"there are {', '.join(ours)}; name one with --name, or take all down with --all")
+    for each in [name] if name is not None else ours:
+        Cluster.bare(each, report=print_report).down()
 
 
 @cluster.command()

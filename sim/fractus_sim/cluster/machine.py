@@ -74,8 +74,8 @@ def claim(name: str, state: Path, block: IPv4Network | None) -> IPv4Network:
         others = [IPv4Network(entry.block) for entry in ledger.claims.values()]
         if block is None:
             block = choose_block([*networks_in_use(), *others])
-        elif any(block.overlaps(other) for other in others):
-            raise ClusterError(f"{name}: its addresses {block} are in use by another cluster now; take it down first")
+        elif any(block.overlaps(other) for other in (*networks_in_use(), *others)):
+            raise ClusterError(f"{name}: its addresses {block} are in use by something else now; take it down first")
         if not ledger.claims:
             _note_machine(ledger)
         ledger.claims[name] = _Claim(str(state), str(block))
@@ -84,11 +84,17 @@ def claim(name: str, state: Path, block: IPv4Network | None) -> IPv4Network:
         return block
 
 
+def holders() -> dict[str, Path]:
+    """Return the state directory of each cluster that holds a name."""
+    if not _LEDGER.exists():
+        return {}
+    with locked(_LOCK, timeout_s=_LOCK_TIMEOUT_S, what="another cluster is coming up or going down"):
+        return {name: Path(held.state) for name, held in _read().claims.items()}
+
+
 def holder(name: str) -> Path | None:
     """Return the state directory of the cluster that holds a name, or None."""
-    with locked(_LOCK, timeout_s=_LOCK_TIMEOUT_S, what="another cluster is coming up or going down"):
-        held = _read().claims.get(name)
-    return None if held is None else Path(held.state)
+    return holders().get(name)
 
 
 def release(name: str) -> None:

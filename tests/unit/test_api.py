@@ -66,6 +66,7 @@ def test_sentences_of_bad_applications():
         ([STORE, STORE | {"name": "data-store"}], "spec.components[1].name: data-store and DataStore get the same object name"),
         ([STORE | {"replica": 2}], "spec.components[0].replica: extra inputs are not permitted, not 2"),
         ([STORE | {"container": {"image": "x", "volumes": [{"name": "v", "mountPath": "/v"}]}}], "spec.components[0].container.volumes[0]: give exactly one of emptyDir"),
+        ([STORE | {"container": {"image": "x", "volumes": [{"name": "v", "mountPath": "/v", "secret": "other-tls"}]}}], "spec.components[0].container.volumes[0].secret: Secrets whose names end in -tls"),
         ([STORE | {"container": {"image": "x", "volumes": [{"name": "tls", "mountPath": "/v", "claim": "c"}]}}], "spec.components[0].container.volumes[0].name: tls is taken"),
         ([STORE | {"container": {"image": "x", "resources": {"limits": {"cpu": "much"}}}}], "spec.components[0].container.resources.limits.cpu: 'much' is not a quantity"),
     ]  # fmt: skip

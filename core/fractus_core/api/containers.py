@@ -1,0 +1,118 @@
+"""The container of a component: image, environment, ports, resources, volumes."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, Self
+
+from pydantic import ConfigDict, Field, model_validator
+
+from fractus_core.api.model import InvalidObject, Model, Name, Quantity, rules
+
+
+class ContainerPort(Model):
+    """A port the component listens on."""
+
+    port: int = Field(ge=1, le=65535)
+    name: Name | None = None
+    protocol: Literal["TCP", "UDP"] = "TCP"
+
+
+class EnvVar(Model):
+    """An environment variable."""
+
+    name: str = Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", max_length=128)
+    value: str = Field(default="", max_length=32768)
+
+
+class Resources(Model):
+    """Kubernetes resources: cpu, memory, and extended ones such as fractus.dev/gpu."""
+
+    requests: dict[str, Quantity] = Field(default_factory=dict, max_length=32)
+    limits: dict[str, Quantity] = Field(default_factory=dict, max_length=32)
+
+
+class EmptyDirectory(Model):
+    """An empty directory that lives as long as the pod."""
+
+    size_limit: Quantity | None = Field(default=None, description="Bytes, such as 256Mi; unset: what the node allows.")
+    medium: Literal["disk", "memory"] = "disk"
+
+
+class Volume(Model):
+    """Files that the component sees: an empty directory, a ConfigMap, a Secret or a claim of storage."""
+
+    model_config = ConfigDict(
+        json_schema_extra=rules(
+            (
+                "[has(self.emptyDir), has(self.configMap), has(self.secret), has(self.claim)].filter(x, x).size() == 1",
+                "give exactly one of emptyDir, configMap, secret and claim",
+            ),
+            (
+                "!has(self.secret) || !self.secret.endsWith('-tls')",
+                "Secrets whose names end in -tls are certificates of components; give yours another name",
+            ),
+        )
+    )
+
+    name: Name
+    mount_path: str = Field(
+        pattern=r"^/[^:]*$", max_length=512, description="Where the component finds it; an absolute path."
+    )
+    read_only: bool = Field(default=False, description="ConfigMaps and Secrets are read-only anyway.")
+    empty_dir: EmptyDirectory | None = None
+    config_map: Name | None = Field(default=None, description="A ConfigMap of the application's namespace.")
+    secret: Name | None = Field(default=None, description="A Secret of the application's namespace.")
+    claim: Name | None = Field(default=None, description="A PersistentVolumeClaim of the application's namespace.")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        given = [s for s in (self.empty_dir, self.config_map, self.secret, self.claim) if s is not None]
+        if len(given) != 1:
+            raise InvalidObject("", "give exactly one of emptyDir, configMap, secret and claim")
+        if self.secret is not None and self.secret.endswith("-tls"):
+            raise InvalidObject(
+                "secret", "Secrets whose names end in -tls are certificates of components; give yours another name"
+            )
+        return self
+
+    def pod_volume(self) -> dict[str, Any]:
+        """The entry for volumes of a pod."""
+        if self.empty_dir is not None:
+            source: dict[str, Any] = {}
+            if self.empty_dir.size_limit is not None:
+                source["sizeLimit"] = self.empty_dir.size_limit
+            if self.empty_dir.medium == "memory":
+                source["medium"] = "Memory"
+            return {"name": self.name, "emptyDir": source}
+        if self.config_map is not None:
+            return {"name": self.name, "configMap": {"name": self.config_map}}
+        if self.secret is not None:
+            return {"name": self.name, "secret": {"secretName": self.secret, "defaultMode": 0o440}}
+        return {"name": self.name, "persistentVolumeClaim": {"claimName": self.claim}}
+
+    def mount(self) -> dict[str, Any]:
+        """The entry for volumeMounts of a container."""
+        fixed = self.config_map is not None or self.secret is not None
+        return {"name": self.name, "mountPath": self.mount_path, "readOnly": self.read_only or fixed}
+
+
+class Container(Model):
+    """What runs in the component's pods."""
+
+    image: str = Field(min_length=1, max_length=512)
+    command: tuple[str, ...] = Field(default=(), max_length=64)
+    args: tuple[str, ...] = Field(default=(), max_length=64)
+    env: tuple[EnvVar, ...] = Field(default=(), max_length=256)
+    ports: tuple[ContainerPort, ...] = Field(default=(), max_length=32)
+    resources: Resources = Field(default_factory=Resources)
+    volumes: tuple[Volume, ...] = Field(default=(), max_length=16)
+
+    @model_validator(mode="after")
+    def _distinct_volumes(self) -> Self:
+        for i, volume in enumerate(self.volumes):
+            others = self.volumes[:i]
+            if volume.name in {"tls", "tmp"} or any(v.name == volume.name for v in others):
+                raise InvalidObject(f"volumes[{i}].name", f"{volume.name} is taken; choose another name")
+            if any(v.mount_path == volume.mount_path for v in others):
+                raise InvalidObject(f"volumes[{i}].mountPath", f"{volume.mount_path} is taken; choose another path")
+        return self

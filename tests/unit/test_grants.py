@@ -4,7 +4,7 @@ import pytest
 from fractus_core.api import InvalidObject, Policy, Zone
 from fractus_core.api.policies import NodeExpression
 from fractus_core.planning import plan
-from fractus_core.policy.grants import compile_grants, matches, node_attributes
+from fractus_core.policy.grants import compile_grants, matches, node_attributes, refresh
 from test_planning import PATH, VIEWER, application, at, drone, edge, inventory, manifest, navigator
 
 
@@ -54,6 +54,48 @@ def test_policies_come_with_their_zones_sorted_by_name():
 def test_unknown_zone_grants_nothing():
     with pytest.raises(InvalidObject, match=r"Policy a spec\.selector\.zones\[0\]: there is no Zone nowhere"):
         compiled(policy("a", zones=["nowhere"], **FENCE))
+
+
+def stocked(*policies, zones=(), **more):
+    named = {z.name: z for z in zones}
+    return inventory([drone("d")], zones=named, policies={p.name: p for p in policies}, **more)
+
+
+def test_a_refresh_gives_what_a_new_grant_would():
+    policies = policy("a", zones=["z"], **FENCE), policy("b", **ALTITUDE), policy("c", zones=["far"], **FENCE)
+    zones = zone("z", (100, 100)), zone("far", (80_000, 0))
+    (old,) = compiled()
+    (new,) = compiled(*policies, zones=zones)
+    assert refresh(old, stocked(*policies, zones=zones)) == new
+    assert refresh(new, stocked()) == old
+
+
+@pytest.mark.parametrize("more", [{}, {"unreadable_zones": {"z": "no area"}}])
+def test_a_broken_policy_stays_as_granted_and_blocks_no_other(more):
+    fence = policy("fence", zones=["z"], **FENCE)
+    (old,) = compiled(fence, policy("read", **ALTITUDE), zones=[zone("z", (100, 100))])
+    never = policy("never", zones=["nowhere"], **FENCE)
+    stock = stocked(fence, never, policy("low", **ALTITUDE), unreadable_policies={"read": "no kind"}, **more)
+    fresh = refresh(old, stock)
+    assert [p.name for p in fresh.policies] == ["fence", "low", "read"]
+    assert fresh.policies[0] == old.policies[0]
+    assert fresh.policies[2] == old.policies[1]
+    app = application(navigator(PATH))
+    assert compile_grants(app, plan(app, stock), stock, None, [old]) == (fresh,)
+
+
+def test_while_a_policy_cannot_be_read_nothing_new_is_granted():
+    stock = stocked(unreadable_policies={"odd": "spec.validFrom: no date"})
+    app = application(navigator(PATH))
+    with pytest.raises(InvalidObject, match=r"Policy odd: spec\.validFrom: no date"):
+        compile_grants(app, plan(app, stock), stock)
+
+
+def test_a_node_without_a_description_keeps_what_held_for_it():
+    heavy = policy("heavy", nodes=[{"key": "interfaces", "operator": "NotIn", "values": ["x"]}], **ALTITUDE)
+    (old,) = compiled(heavy)
+    fresh = refresh(old, inventory([], policies={"heavy": heavy, "low": policy("low", **ALTITUDE)}))
+    assert [p.name for p in fresh.policies] == ["heavy", "low"]
 
 
 def test_zone_beyond_reach_is_left_out_but_not_for_inclusion():

@@ -56,6 +56,8 @@ class Inventory:
     """All that a plan and its grants are made from; every mapping is by object name.
 
     Attributes:
+        unreadable_policies: policies that exist but cannot be read, with what is wrong: they may hold for anybody.
+        unreadable_zones: zones that exist but cannot be read, with what is wrong.
         claimed: drones that an application has, by drone: (namespace, name) of the application.
         flights: what claimed drones fly, by drone, as far as it is known; without it nobody comes along.
         whereabouts: indexes of these very mappings, from whoever keeps them current; None: built when first needed.
@@ -67,6 +69,8 @@ class Inventory:
     depots: Mapping[str, Depot] = field(default_factory=dict)
     zones: Mapping[str, Zone] = field(default_factory=dict)
     policies: Mapping[str, Policy] = field(default_factory=dict)
+    unreadable_policies: Mapping[str, str] = field(default_factory=dict)
+    unreadable_zones: Mapping[str, str] = field(default_factory=dict)
     claimed: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     flights: Mapping[str, Flight] = field(default_factory=dict)
     whereabouts: Whereabouts | None = field(default=None, compare=False, repr=False)

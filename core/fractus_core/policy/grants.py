@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import shapely
 
-from fractus_core.api import Application, Component, Drone, EdgeNode, InvalidObject, Policy, Zone
+from fractus_core.api import Application, Component, Drone, EdgeNode, InvalidObject, Policy
 from fractus_core.api.geometry import Area, Circle, Point, Position
 from fractus_core.api.plans import (
     DeploymentPlanSpec,
@@ -28,18 +28,31 @@ FIXED_NODE_REACH_M = 1000.0
 
 
 def compile_grants(
-    application: Application, plan: DeploymentPlanSpec, inventory: Inventory, settings: Settings | None = None
+    application: Application,
+    plan: DeploymentPlanSpec,
+    inventory: Inventory,
+    settings: Settings | None = None,
+    present: Iterable[GrantSpec] = (),
 ) -> tuple[GrantSpec, ...]:
     """One Grant for each planned instance that uses system services, in the plan's order.
 
     Policies are those whose node and application selectors match, with their zones resolved; zones that the node can
     never reach are left out.
 
+    Args:
+        application: As submitted.
+        plan: Where its instances run.
+        inventory: As of now.
+        settings: As for the plan.
+        present: The application's grants as they are. An instance that has one, on the same node, keeps a broken
+            policy as it was granted last.
+
     Raises:
-        InvalidObject: a policy that holds for an instance selects a zone which does not exist or is broken. Nothing is
-            granted then: what cannot be enforced must not be flown.
+        InvalidObject: a policy that holds for a new instance selects a zone which does not exist or is broken, or a
+            policy cannot be read. Nothing is granted then: what cannot be enforced must not be flown.
     """
     settings = settings or Settings()
+    before = {(grant.instance, grant.node): grant for grant in present}
     area = operation_area(application.spec, inventory.depots, settings.safety_radius_m)
     grants = []
     for placed in plan.placements:
@@ -47,10 +60,34 @@ def compile_grants(
         if not component.services or placed.node is None:
             continue
         if placed.placement == "drone" and area is not None:
-            grants.append(_drone_grant(application, component, placed, inventory, area))
+            grant = _drone_grant(application, component, placed, inventory, area)
         else:
-            grants.append(_edge_grant(application, component, placed, inventory))
+            grant = _edge_grant(application, component, placed, inventory)
+        last = before.get((grant.instance, grant.node))
+        if last is None:
+            check_policies(inventory)
+        policies = _policies(grant, inventory, last.policies if last is not None else None)
+        grants.append(grant.model_copy(update={"policies": policies}))
     return tuple(grants)
+
+
+def check_policies(inventory: Inventory) -> None:
+    """Refuse new grants while there is a policy that cannot be read: nobody knows for whom it holds.
+
+    Raises:
+        InvalidObject: naming the policy.
+    """
+    for name, problem in sorted(inventory.unreadable_policies.items()):
+        raise InvalidObject(f"Policy {name}", f"{problem}; correct or delete it")
+
+
+def refresh(grant: GrantSpec, inventory: Inventory) -> GrantSpec:
+    """The grant with its policies brought up to date; all else stays as it was granted.
+
+    It needs neither the application nor its plan, so that no trouble with these keeps a policy from a grant in use.
+    A policy that is broken, or has a broken zone, stays as it was granted last.
+    """
+    return grant.model_copy(update={"policies": _policies(grant, inventory, grant.policies)})
 
 
 def _drone_grant(
@@ -61,7 +98,6 @@ def _drone_grant(
     depot = inventory.depots.get(drone.spec.depot or "")
     home = drone.spec.home
     base = ground(home) if home is not None else depot.spec.location if depot is not None else area.start
-    reach_m = mobility.max_speed * mobility.max_flight_time * 60 if mobility is not None else FIXED_NODE_REACH_M
     stand = Area(circle=Circle(center=base, radius=depot.spec.radius if depot is not None else 30.0))
     way = shapely.union(area.shape, polygon(area.frame, stand)).convex_hull
     driver = component.class_ == "driver"
@@ -80,7 +116,6 @@ def _drone_grant(
         depot=depot.spec.location if depot is not None else None,
         home=home,
         limits=GrantedLimits(max_altitude=mobility.max_altitude, max_speed=mobility.max_speed) if mobility else None,
-        policies=_policies(application, component, drone, inventory, base=base, reach_m=reach_m),
     )
 
 
@@ -109,9 +144,6 @@ def _edge_grant(
         instance=placed.instance,
         services=component.services,
         home=node.spec.location,
-        policies=_policies(
-            application, component, node, inventory, base=ground(node.spec.location), reach_m=FIXED_NODE_REACH_M
-        ),
     )
 
 
@@ -121,36 +153,84 @@ def _owner(application: Application) -> GrantApplication:
 
 
 def _policies(
-    application: Application,
-    component: Component,
-    node: Drone | EdgeNode,
-    inventory: Inventory,
-    *,
-    base: Point,
-    reach_m: float,
+    grant: GrantSpec, inventory: Inventory, last: Sequence[GrantedPolicy] | None
 ) -> tuple[GrantedPolicy, ...]:
-    attributes = node_attributes(node)
-    granted = []
-    for policy in sorted(inventory.policies.values(), key=lambda p: p.name):
-        if not selects(policy.spec, application, component, attributes):
+    """The policies for a grant, by name.
+
+    Args:
+        grant: Its owner, component and node say which policies hold.
+        inventory: As of now.
+        last: The policies as they were granted last, to fall back on; None: nothing was granted yet.
+
+    Raises:
+        InvalidObject: a policy is broken, and `last` is None.
+    """
+    node = inventory.drones.get(grant.node) or inventory.edge_nodes.get(grant.node)
+    attributes = node_attributes(node) if node is not None else {"name": grant.node}
+    kept = {policy.name: policy for policy in last or ()}
+    bounds = _bounds(grant, node, inventory)
+    granted = {name: policy for name, policy in kept.items() if name in inventory.unreadable_policies}
+    for name, policy in inventory.policies.items():
+        # Of a node without a description nobody knows what it has: what held for it goes on.
+        known = node is not None or name not in kept or not policy.spec.selector.nodes
+        if known and not _holds(policy.spec, grant.application, grant.component, attributes):
             continue
-        zones = [_zone(policy, i, name, inventory.zones) for i, name in enumerate(policy.spec.selector.zones)]
-        near = [z for z in zones if _distance_m(z.area, base) <= reach_m]
-        # An inclusion zone out of reach still forbids everything else.
-        if zones and not near and policy.spec.kind != "inclusion":
-            continue
-        kept = zones if policy.spec.kind == "inclusion" else near
-        granted.append(GrantedPolicy(name=policy.name, spec=policy.spec, zones=tuple(kept)))
-    return tuple(granted)
+        try:
+            found = _granted(policy, inventory, bounds)
+        except InvalidObject:
+            if last is None:
+                raise
+            found = kept.get(name)
+        if found is not None:
+            granted[name] = found
+    return tuple(granted[name] for name in sorted(granted))
 
 
-def _zone(policy: Policy, index: int, name: str, zones: Mapping[str, Zone]) -> GrantedZone:
-    if name not in zones:
+def _granted(policy: Policy, inventory: Inventory, bounds: tuple[Point, float] | None) -> GrantedPolicy | None:
+    """The policy with its zones; None if all of them are out of reach.
+
+    Raises:
+        InvalidObject: a zone does not exist, or is broken.
+    """
+    zones = [_zone(policy, i, name, inventory) for i, name in enumerate(policy.spec.selector.zones)]
+    # An inclusion zone out of reach still forbids everything else.
+    if bounds is None or policy.spec.kind == "inclusion":
+        near = zones
+    else:
+        near = [zone for zone in zones if _distance_m(zone.area, bounds[0]) <= bounds[1]]
+    if zones and not near:
+        return None
+    return GrantedPolicy(name=policy.name, spec=policy.spec, zones=tuple(near))
+
+
+def _bounds(grant: GrantSpec, node: Drone | EdgeNode | None, inventory: Inventory) -> tuple[Point, float] | None:
+    """Where the node has its place, and how far from there zones concern it; None: wherever they are.
+
+    It is made of what a grant keeps, so that it is the same when a grant is made and when it is refreshed.
+    """
+    if isinstance(node, EdgeNode):
+        return ground(node.spec.location), FIXED_NODE_REACH_M
+    if node is None:
+        return None
+    depot = inventory.depots.get(node.spec.depot or "")
+    mobility = node.spec.services.mobility
+    reach_m = mobility.max_speed * mobility.max_flight_time * 60 if mobility is not None else FIXED_NODE_REACH_M
+    if node.spec.home is not None:
+        return ground(node.spec.home), reach_m
+    if depot is not None:
+        return depot.spec.location, reach_m
+    return (middle(grant.operation_area[0]), reach_m) if grant.operation_area else None
+
+
+def _zone(policy: Policy, index: int, name: str, inventory: Inventory) -> GrantedZone:
+    if name in inventory.unreadable_zones:
+        raise InvalidObject(f"Zone {name}", inventory.unreadable_zones[name])
+    if name not in inventory.zones:
         raise InvalidObject(
             f"Policy {policy.name} spec.selector.zones[{index}]",
             f"there is no Zone {name}; apply it, or correct the policy",
         )
-    spec = zones[name].spec
+    spec = inventory.zones[name].spec
     try:
         polygon(LocalFrame.at(middle(spec.area)), spec.area)
     except InvalidObject as error:
@@ -168,15 +248,18 @@ def selects(
     policy: PolicySpec, application: Application, component: Component, attributes: Mapping[str, object]
 ) -> bool:
     """Whether a policy holds for a component of an application on a node (its zones are judged in flight)."""
+    return _holds(policy, _owner(application), component.name, attributes)
+
+
+def _holds(policy: PolicySpec, owner: GrantApplication, component: str, attributes: Mapping[str, object]) -> bool:
     wanted = policy.selector.applications
     unknown = policy.kind != "grant"
     if wanted is not None:
-        namespace, name = application.key
-        if wanted.namespaces and namespace not in wanted.namespaces:
+        if wanted.namespaces and owner.namespace not in wanted.namespaces:
             return False
-        if wanted.names and name not in wanted.names:
+        if wanted.names and owner.name not in wanted.names:
             return False
-        if wanted.components and component.name not in wanted.components:
+        if wanted.components and component not in wanted.components:
             return False
     return all(matches(expression, attributes, unknown=unknown) for expression in policy.selector.nodes)
 

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import asyncio
+import ipaddress
+import logging
 import os
 import termios
+import time
 import tty
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from fractus_services.mobility.dialect import Codec
+
 Receive = Callable[[bytes], None]
 Closed = Callable[[Exception | None], None]
 
+log = logging.getLogger(__name__)
+
 CONNECT_TIMEOUT_S = 5.0
+PEER_SILENCE_S = 3.0
+"""An autopilot that is silent for so long may come back from another port."""
+
+_NO_AUTOPILOT = 8
 
 
 class BadUrl(ValueError):
@@ -42,32 +53,74 @@ class _Stream(asyncio.Protocol):
 
 
 class _Datagrams(asyncio.DatagramProtocol):
-    """A UDP link; a listening one answers to whoever spoke last."""
+    """A UDP link.
 
-    def __init__(self, receive: Receive, closed: Closed, peer: tuple[str, int] | None) -> None:
+    One that listens belongs to whoever sent an autopilot's first heartbeat: others are neither heard nor spoken to until
+    that one has been silent for a while.
+
+    Args:
+        receive: takes what arrives.
+        closed: called once when the link breaks.
+        connected: whether the socket has its peer already, and hears nobody else.
+    """
+
+    def __init__(self, receive: Receive, closed: Closed, connected: bool) -> None:
         self._receive = receive
         self._closed = closed
-        self._peer = peer
-        self._transport: asyncio.DatagramTransport | None = None
+        self._connected = connected
+        self._peer: tuple[Any, ...] | None = None
+        self._heard_at = 0.0
+        self._transport: Any = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        if isinstance(transport, asyncio.DatagramTransport):
-            self._transport = transport
+        self._transport = transport
 
     def datagram_received(self, data: bytes, addr: tuple[Any, ...]) -> None:
-        self._peer = (addr[0], addr[1])
+        if not self._connected and not self._from_peer(data, addr):
+            return
         self._receive(data)
+
+    def _from_peer(self, data: bytes, addr: tuple[Any, ...]) -> bool:
+        now = time.monotonic()
+        if addr != self._peer:
+            if self._peer is not None and now - self._heard_at < PEER_SILENCE_S:
+                return False
+            if not _from_autopilot(data):
+                return False
+            log.info("the autopilot speaks from %s port %s", addr[0], addr[1])
+            self._peer = addr
+        self._heard_at = now
+        return True
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._closed(exc)
 
     def write(self, data: bytes) -> None:
-        if self._transport is not None and self._peer is not None:
+        if self._transport is None:
+            return
+        if self._connected:
+            self._transport.sendto(data)
+        elif self._peer is not None:
             self._transport.sendto(data, self._peer)
 
     def close(self) -> None:
         if self._transport is not None:
             self._transport.close()
+
+
+def _from_autopilot(data: bytes) -> bool:
+    """Whether a datagram holds a sound heartbeat of a flight controller."""
+    heard = Codec(0, 0).decode(data)
+    return any(m.get_type() == "HEARTBEAT" and m.autopilot != _NO_AUTOPILOT for m in heard)
+
+
+def _loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 class _Serial:
@@ -124,7 +177,8 @@ async def open_link(url: str, receive: Receive, closed: Closed) -> Transport:
     """Open a link.
 
     Args:
-        url: `tcp:HOST:PORT`, `udpin:HOST:PORT`, `udpout:HOST:PORT` or `serial:DEVICE:BAUD`.
+        url: `tcp:HOST:PORT`, `udpin:HOST:PORT`, `udpout:HOST:PORT` or `serial:DEVICE:BAUD`. MAVLink proves nothing
+            about its sender, so `udpin` listens to this computer only; `udpout` and `tcp` pick the peer themselves.
         receive: takes what arrives.
         closed: called once when the link breaks.
 
@@ -138,6 +192,10 @@ async def open_link(url: str, receive: Receive, closed: Closed) -> Transport:
         raise BadUrl(
             f"{url!r} is no autopilot link; use tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD"
         )
+    if scheme == "udpin" and not _loopback(where):
+        raise BadUrl(
+            f"{url!r} would take an autopilot from any host that reaches this one; use udpin:127.0.0.1:{number}"
+        )
     if scheme == "serial":
         return _Serial(where, int(number), receive, closed)
     loop = asyncio.get_running_loop()
@@ -145,11 +203,10 @@ async def open_link(url: str, receive: Receive, closed: Closed) -> Transport:
         if scheme == "tcp":
             transport, _ = await loop.create_connection(lambda: _Stream(receive, closed), where, int(number))
             return transport
-        peer = (where, int(number)) if scheme == "udpout" else None
-        local = (where, int(number)) if scheme == "udpin" else None
+        place = (where, int(number))
         _, protocol = await loop.create_datagram_endpoint(
-            lambda: _Datagrams(receive, closed, peer), local_addr=local, remote_addr=None if local else peer
+            lambda: _Datagrams(receive, closed, scheme == "udpout"),
+            local_addr=place if scheme == "udpin" else None,
+            remote_addr=place if scheme == "udpout" else None,
         )
-        if peer is not None:
-            protocol._peer = None
         return protocol

@@ -15,8 +15,9 @@ from fractus_services.mobility.vehicle import GUIDED, Vehicle
 
 log = logging.getLogger(__name__)
 
-SYSTEM_ID, COMPONENT_ID = 255, 191
-"""ArduPilot's failsafe listens to the heartbeats of system 255; 191 is the onboard computer."""
+SYSTEM_ID, COMPONENT_ID = 244, 191
+"""The companion is a system of its own, whose heartbeats alone hold off the autopilot's failsafe: ground stations, which
+are 255 as a rule, must not. 191 is the onboard computer."""
 
 HEARTBEAT_S = 1.0
 SILENCE_S = 3.0

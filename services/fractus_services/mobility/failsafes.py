@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass
 
 from fractus_core.policy.values import Airframe
 
-from fractus_services.mobility.autopilot import Autopilot
+from fractus_services.mobility.autopilot import SYSTEM_ID, Autopilot
 
 log = logging.getLogger(__name__)
 
@@ -31,13 +32,20 @@ class Setting:
     why: str
 
 
+_LISTENS = "listens for the companion's heartbeats, and takes no ground station for it"
+_OLD_NAME, _NEW_NAME = "SYSID_MYGCS", "MAV_GCS_SYSID"
+
 SETTINGS = (
+    Setting((_OLD_NAME, _NEW_NAME), SYSTEM_ID, frozenset(), True, _LISTENS),
     Setting(("FS_GCS_ENABLE",), 1, frozenset({1.0}), True, "returns to launch when the companion falls silent"),
     Setting(("FS_GCS_TIMEOUT",), 5, frozenset(), False, "after five seconds of silence"),
     Setting(("BATT_FS_LOW_ACT",), 2, frozenset({1.0, 2.0}), False, "returns to launch on a low battery"),
     Setting(("BATT_FS_CRT_ACT",), 1, frozenset({1.0}), False, "lands on a critical battery"),
     Setting(("FS_EKF_ACTION",), 1, frozenset({1.0, 3.0}), False, "lands when it no longer knows where it is"),
 )
+
+RANGE = Setting(("MAV_GCS_SYSID_HI",), 0, frozenset(float(n) for n in range(1, SYSTEM_ID + 1)), False, _LISTENS)
+"""Releases that know the new name can take a whole range of systems for the companion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,14 +73,17 @@ async def configure(autopilot: Autopilot) -> Checked:
     """
     problems, missing = [], []
     for setting in SETTINGS:
-        verdict = await _establish(autopilot, setting)
-        if verdict is None:
+        name, problem = await _establish(autopilot, setting)
+        if not name:
             missing.append(setting.names[0])
             if setting.needed:
-                problems.append(f"the autopilot has no {setting.names[0]} ({setting.why})")
-        elif verdict:
-            problems.append(verdict)
-    airframe, speed = await _airframe(autopilot)
+                problems.append(f"the autopilot has no {' or '.join(setting.names)} ({setting.why})")
+        elif problem:
+            problems.append(problem)
+        if name == _NEW_NAME:
+            problems.extend(filter(None, [(await _establish(autopilot, RANGE))[1]]))
+    airframe, speed, unsound = await _airframe(autopilot)
+    problems.extend(f"{name} is not a number" for name in unsound)
     checked = Checked("; ".join(problems), tuple(missing), airframe, speed)
     if checked.problem:
         log.error("failsafes are not verified, arming is refused: %s", checked.problem)
@@ -81,30 +92,43 @@ async def configure(autopilot: Autopilot) -> Checked:
     return checked
 
 
-async def _establish(autopilot: Autopilot, setting: Setting) -> str | None:
-    """An empty text when the setting holds, a problem when it does not, None when there is no such parameter."""
+async def _establish(autopilot: Autopilot, setting: Setting) -> tuple[str, str]:
+    """The name under which the vehicle has the setting, empty when it has none, and a problem when it does not hold."""
     for name in setting.names:
         found = await autopilot.read_parameter(name, attempts=3)
         if found is None:
             continue
         if found == setting.value or found in setting.accepted:
-            return ""
+            return name, ""
         after = await autopilot.write_parameter(name, setting.value)
         if after is not None and abs(after - setting.value) < 1e-6:
             log.info("set %s from %g to %g: the autopilot %s", name, found, setting.value, setting.why)
-            return ""
-        return f"{name} is {found:g} and cannot be set to {setting.value:g} (the autopilot {setting.why})"
-    return None
+            return name, ""
+        return name, f"{name} is {found:g} and cannot be set to {setting.value:g} (the autopilot {setting.why})"
+    return "", ""
 
 
-async def _airframe(autopilot: Autopilot) -> tuple[Airframe, float]:
+async def _airframe(autopilot: Autopilot) -> tuple[Airframe, float, list[str]]:
+    """How the vehicle moves, the speed of its legs, and the parameters that are not numbers."""
+    unsound: list[str] = []
+
+    async def read(names: tuple[tuple[str, float], ...], default: float) -> float:
+        for name, scale in names:
+            value = await autopilot.read_parameter(name, attempts=2)
+            if value is not None and math.isfinite(value):
+                return value * scale
+            if value is not None:
+                unsound.append(name)
+                return default
+        return default
+
     standard = Airframe()
-    accel = await _read(autopilot, (("WPNAV_ACCEL", 0.01), ("WP_ACC", 1.0)), standard.accel_mps2)
-    gain = await _read(autopilot, (("PSC_POSXY_P", 1.0), ("PSC_NE_POS_P", 1.0)), standard.position_gain)
-    climb = await _read(autopilot, (("WPNAV_ACCEL_Z", 0.01), ("WP_ACC_Z", 1.0)), standard.climb_accel_mps2)
-    jerk = await _read(autopilot, (("PSC_JERK_XY", 1.0), ("PSC_JERK_NE", 1.0)), standard.jerk_mps3)
-    height = await _read(autopilot, (("RTL_ALT", 0.01), ("RTL_ALT_M", 1.0)), standard.return_altitude_m)
-    speed = await _read(autopilot, (("WPNAV_SPEED", 0.01), ("WP_SPD", 1.0)), 5.0)
+    accel = await read((("WPNAV_ACCEL", 0.01), ("WP_ACC", 1.0)), standard.accel_mps2)
+    gain = await read((("PSC_POSXY_P", 1.0), ("PSC_NE_POS_P", 1.0)), standard.position_gain)
+    climb = await read((("WPNAV_ACCEL_Z", 0.01), ("WP_ACC_Z", 1.0)), standard.climb_accel_mps2)
+    jerk = await read((("PSC_JERK_XY", 1.0), ("PSC_JERK_NE", 1.0)), standard.jerk_mps3)
+    height = await read((("RTL_ALT", 0.01), ("RTL_ALT_M", 1.0)), standard.return_altitude_m)
+    speed = await read((("WPNAV_SPEED", 0.01), ("WP_SPD", 1.0)), 5.0)
     airframe = Airframe(
         accel_mps2=max(accel, 0.1),
         position_gain=max(gain, 0.1),
@@ -112,12 +136,4 @@ async def _airframe(autopilot: Autopilot) -> tuple[Airframe, float]:
         jerk_mps3=max(jerk, 0.5),
         return_altitude_m=height,
     )
-    return airframe, speed
-
-
-async def _read(autopilot: Autopilot, names: tuple[tuple[str, float], ...], default: float) -> float:
-    for name, scale in names:
-        value = await autopilot.read_parameter(name, attempts=2)
-        if value is not None:
-            return value * scale
-    return default
+    return airframe, speed, unsound

@@ -144,6 +144,9 @@ def test_nodes_are_as_described(small: Cluster) -> None:
     nodes = {item["metadata"]["name"]: item for item in items}
     assert set(nodes) == {"drone-1", "edge-1"}
     assert nodes["drone-1"]["metadata"]["labels"]["fractus.dev/class"] == "drone"
+    for name, node_class in (("drone-1", "drone"), ("edge-1", "edge")):
+        taint = {"key": "fractus.dev/class", "value": node_class, "effect": "NoExecute"}
+        assert nodes[name]["spec"]["taints"] == [taint]
     offered = nodes["edge-1"]["status"]["allocatable"]
     assert (offered["cpu"], offered["memory"], offered["fractus.dev/gpu"]) == ("1", "1Gi", "3")
     written = yaml.safe_load(small.node("drone-1").exec(["cat", "/etc/fractus/node.yaml"]).stdout)

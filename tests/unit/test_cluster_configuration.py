@@ -14,7 +14,7 @@ from fractus_sim.cluster import PrerequisiteError
 from fractus_sim.cluster.addressing import Addressing
 from fractus_sim.cluster.cgroups import find_hierarchies
 from fractus_sim.cluster.controlplane import corefile
-from fractus_sim.cluster.manifests import dns_objects, extended_resources_patch, is_ready, node_object
+from fractus_sim.cluster.manifests import dns_objects, extended_resources_patch, is_ready, node_object, taints_patch
 from fractus_sim.cluster.network import host_link
 from fractus_sim.cluster.nodeconfig import Machine, cni_config, kubelet_config, node_units, shortfalls
 from fractus_sim.cluster.spec import NodeSpec
@@ -72,6 +72,27 @@ def test_node_object_says_class_and_pod_network() -> None:
     assert body["metadata"]["labels"]["fractus.dev/class"] == "edge"
     assert body["metadata"]["labels"]["zone"] == "z"
     assert body["spec"]["podCIDR"] == str(PLACE.pods(2))
+
+
+def test_drones_and_edge_nodes_are_tainted_and_other_taints_stay() -> None:
+    ours = {"key": "fractus.dev/class", "value": "edge", "effect": "NoExecute"}
+    other = {"key": "node.kubernetes.io/unschedulable", "effect": "NoSchedule"}
+
+    def patched(spec: NodeSpec, *taints: dict[str, str]) -> Any:
+        patch = taints_patch(spec, {"metadata": {"resourceVersion": "7"}, "spec": {"taints": list(taints)}})
+        if patch is None:
+            return None
+        assert patch[0] == "/api/v1/nodes/n"
+        assert patch[1]["metadata"] == {"resourceVersion": "7"}
+        return patch[1]["spec"]["taints"]
+
+    assert patched(node()) == [ours]
+    assert patched(node(), other) == [other, ours]
+    assert patched(node(), {**ours, "value": "drone"}, other) == [other, ours]
+    assert patched(node(), ours, other) is None
+    cloud = NodeSpec.model_validate({"name": "n", "class": "cloud"})
+    assert patched(cloud, other) is None
+    assert patched(cloud, ours, other) == [other]
 
 
 def test_extended_resources_are_patched_only_when_missing() -> None:

@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from http import HTTPStatus
 from pathlib import Path
 
 from fractus_sim.cluster import machine, manifests, network
@@ -50,6 +51,7 @@ _API_TIMEOUT_S = 60.0
 _READY_TIMEOUT_S = 90.0
 _DNS_TIMEOUT_S = 30.0
 _POLL_S = 0.1
+_CONFLICTS = 5
 _CONTROL_PLANE = "control-plane"
 _ENVIRONMENT = {
     "PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
@@ -402,14 +404,15 @@ class Cluster:
 
     def _apply_objects(self, api: ApiClient, nodes: list[Node], memory: Memory) -> None:
         place = Addressing(memory.block)
-        objects = [manifests.node_object(node.spec, node.index, place) for node in nodes]
-        objects += manifests.dns_objects(place.control_plane)
         names = {node.name for node in nodes}
         for present in api.request("GET", "/api/v1/nodes")["items"]:
             name = present["metadata"]["name"]
             if name not in names and "fractus-sim" in str(present["metadata"].get("managedFields")):
                 api.request("DELETE", f"/api/v1/nodes/{name}")
-        for path, body in objects:
+        for node in nodes:
+            # Before its kubelet starts, so that no pod is there before labels and taints are.
+            _apply_node(api, node, place)
+        for path, body in manifests.dns_objects(place.control_plane):
             api.apply(path, body)
 
     def _write_kubeconfig(self, authority: Authority, memory: Memory) -> None:
@@ -469,6 +472,20 @@ class Cluster:
         except ClusterError:
             return None
         return {item["metadata"]["name"]: manifests.is_ready(item) for item in items}
+
+
+def _apply_node(api: ApiClient, node: Node, place: Addressing) -> None:
+    for tries_left in reversed(range(_CONFLICTS)):
+        present = api.apply(*manifests.node_object(node.spec, node.index, place))
+        patch = manifests.taints_patch(node.spec, present)
+        if patch is None:
+            return
+        try:
+            api.patch(*patch)
+        except ApiError as error:
+            # The node controller has set a taint of its own meanwhile.
+            if error.status != HTTPStatus.CONFLICT or not tries_left:
+                raise
 
 
 def print_report(message: str) -> None:

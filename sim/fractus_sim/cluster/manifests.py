@@ -32,6 +32,27 @@ def node_object(node: NodeSpec, index: int, addressing: Addressing) -> tuple[str
     }
 
 
+def taints_patch(node: NodeSpec, present: Json) -> tuple[str, Json] | None:
+    """Return path and merge patch that keep pods off a drone or edge node unless they are meant for such; None when done.
+
+    Taints of others stay; Kubernetes itself keeps some there.
+
+    Args:
+        node: The node's part of the cluster file.
+        present: Its Node object.
+    """
+    taints = present["spec"].get("taints", [])
+    # NoExecute: kubelet heeds it too, so that naming the node in a pod does not get around it.
+    wanted = [{"key": CLASS_LABEL, "value": node.node_class, "effect": "NoExecute"}]
+    if node.node_class == "cloud":
+        wanted = []
+    others = [taint for taint in taints if taint["key"] != CLASS_LABEL]
+    if len(others) + len(wanted) == len(taints) and all(taint in taints for taint in wanted):
+        return None
+    metadata = {"resourceVersion": present["metadata"]["resourceVersion"]}
+    return f"/api/v1/nodes/{node.name}", {"metadata": metadata, "spec": {"taints": [*others, *wanted]}}
+
+
 def dns_objects(listen: IPv4Address) -> list[tuple[str, Json]]:
     """Return path and content of the objects that point the well-known DNS address at the DNS of the cluster."""
     metadata = {"name": "kube-dns", "namespace": "kube-system"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
@@ -30,7 +31,7 @@ class Allowance:
         self._left: dict[str, tuple[float, float]] = {}
 
     def take(self, identity: str, time_s: float) -> bool:
-        """Use up one call; False when there is none left."""
+        """Use up one call; False when there is none left. Times are monotonic seconds."""
         left, at = self._left.get(identity, (self._burst, time_s))
         left = min(self._burst, left + max(time_s - at, 0.0) * self._rate)
         if left < 1.0:
@@ -64,11 +65,16 @@ class Reception:
         self._allowance = Allowance()
 
     @asynccontextmanager
-    async def call(self, context: Any) -> AsyncIterator[Caller]:
-        """The caller of a call; exceptions inside end it with a status."""
+    async def call(self, context: Any, urgent: bool = False) -> AsyncIterator[Caller]:
+        """The caller of a call; exceptions inside end it with a status.
+
+        Args:
+            context: gRPC's context of the call.
+            urgent: the call only makes things safer, so no limit of rates holds it up.
+        """
         try:
             caller = caller_of(context.auth_context(), self.clock())
-            if not self._allowance.take(caller.identity, self.clock()):
+            if not urgent and not self._allowance.take(caller.identity, time.monotonic()):
                 reason = f"more than {CALLS_PER_S:.0f} calls a second; slow down"
                 raise Refused(grpc.StatusCode.RESOURCE_EXHAUSTED, Verdict("deny", None, "TooManyCalls", reason))
             yield caller

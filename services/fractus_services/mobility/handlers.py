@@ -20,10 +20,12 @@ from fractus_services.mobility.autopilot import AutopilotError
 from fractus_services.mobility.control import Control
 from fractus_services.mobility.leases import News, State
 from fractus_services.mobility.service import MobilityService, Progress
-from fractus_services.mobility.telemetry import position_of, telemetry_of, velocity_of
+from fractus_services.mobility.telemetry import located, position_of, telemetry_of, velocity_of
 from fractus_services.replies import Refused, decision, precondition, refused, unavailable
 
 LEAST_INTERVAL_S, USUAL_INTERVAL_S = 0.05, 0.2
+JUDGED_S = 0.5
+"""A stream is judged again so often: what was revoked ends it within a second."""
 
 _REFERENCES: dict[int, Reference] = {
     types_pb2.ALTITUDE_REFERENCE_HOME: "home",
@@ -73,7 +75,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def ReturnControl(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context) as caller:
+        async with self._reception.call(context, urgent=True) as caller:
             held = self._held(caller)
             self._service.allow(Call("ReturnControl"), held)
             last = await self._control.give_back(held)
@@ -93,7 +95,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def Hover(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context) as caller:
+        async with self._reception.call(context, urgent=True) as caller:
             return mobility_pb2.HoverResponse(decision=decision(await self._service.hover(self._held(caller))))
 
     async def SetSpeed(self, request: Any, context: Any) -> Any:  # noqa: N802
@@ -114,7 +116,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         async with self._reception.call(context) as caller:
             verdict = self._service.allow(Call("GetPosition"), self._held(caller))
             vehicle = self._control.autopilot.vehicle
-            if vehicle.lat is None:
+            if not located(self._control):
                 raise unavailable("the drone's position is not known yet")
             return mobility_pb2.GetPositionResponse(
                 decision=decision(verdict), position=position_of(vehicle), velocity=velocity_of(vehicle)
@@ -137,12 +139,12 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def Land(self, _request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context) as caller:
+        async with self._reception.call(context, urgent=True) as caller:
             await self._report(self._service.land(self._held(caller)), context)
 
     async def ReturnToLaunch(self, _request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context) as caller:
+        async with self._reception.call(context, urgent=True) as caller:
             await self._report(self._service.return_to_launch(self._held(caller)), context)
 
     async def _report(self, progress: AsyncIterator[Progress], context: Any) -> None:
@@ -164,18 +166,23 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     async def SubscribeTelemetry(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context) as caller:
-            if caller.identity != self._node:
-                self._service.allow(Call("GetPosition"), self._held(caller))
+            node = caller.identity == self._node
             interval = (
                 request.interval_s if math.isfinite(request.interval_s) and request.interval_s > 0 else USUAL_INTERVAL_S
             )
             interval = max(interval, LEAST_INTERVAL_S)
+            loop = asyncio.get_running_loop()
+            judged = due = -math.inf
             while True:
-                caller.check(self._clock())
-                if caller.identity != self._node:
-                    self._held(caller)
-                await context.write(telemetry_of(self._control, self._clock()))
-                await asyncio.sleep(interval)
+                if loop.time() - judged >= JUDGED_S:
+                    judged = loop.time()
+                    caller.check(self._clock())
+                    if not node:
+                        self._service.allow(Call("GetPosition"), self._held(caller))
+                if loop.time() >= due:
+                    due = loop.time() + interval
+                    await context.write(telemetry_of(self._control, self._clock(), missions=node))
+                await asyncio.sleep(max(min(due - loop.time(), JUDGED_S), 0.0))
 
 
 def _known(error: Exception) -> Refused | None:

@@ -8,6 +8,7 @@ from typing import Any
 from fractus_proto.v1 import mobility_pb2, types_pb2
 
 from fractus_services.mobility.control import Control
+from fractus_services.mobility.guard import STALE_S
 from fractus_services.mobility.vehicle import Vehicle
 
 
@@ -23,12 +24,27 @@ def velocity_of(vehicle: Vehicle) -> types_pb2.Velocity:
     return types_pb2.Velocity(north_mps=vehicle.north_mps, east_mps=vehicle.east_mps, down_mps=vehicle.down_mps)
 
 
-def telemetry_of(control: Control, time_s: float) -> Any:
-    """The message that subscribers get."""
+def position_age_s(control: Control) -> float:
+    """How old the position is; infinite while there was none."""
+    return control.autopilot.now - control.autopilot.vehicle.position_at
+
+
+def located(control: Control) -> bool:
+    """Whether the position is known and fresh."""
+    return control.autopilot.vehicle.lat is not None and position_age_s(control) <= STALE_S
+
+
+def telemetry_of(control: Control, time_s: float, missions: bool) -> Any:
+    """The message that subscribers get.
+
+    Args:
+        control: who flies, and what.
+        time_s: Unix time.
+        missions: whether the subscriber may know of everybody's missions.
+    """
     vehicle = control.autopilot.vehicle
     message = mobility_pb2.Telemetry(
         altitude_amsl_m=vehicle.amsl_m,
-        velocity=velocity_of(vehicle),
         yaw_deg=vehicle.yaw_deg,
         battery_remaining=_known(vehicle.battery_remaining),
         battery_voltage_v=_known(vehicle.battery_v),
@@ -40,11 +56,13 @@ def telemetry_of(control: Control, time_s: float) -> Any:
         flight_state=vehicle.flight_state,
         controller=control.controller,
         autopilot_connected=control.autopilot.connected,
-        missions=control.journal.outcomes(),
+        missions=control.journal.outcomes() if missions else {},
     )
     message.time.FromNanoseconds(int(time_s * 1e9))
-    if vehicle.lat is not None:
+    if located(control):
         message.position.CopyFrom(position_of(vehicle))
+        message.velocity.CopyFrom(velocity_of(vehicle))
+        message.position_error_m = vehicle.position_error_m + vehicle.speed_mps * max(position_age_s(control), 0.0)
     if vehicle.home is not None:
         message.home.latitude_deg, message.home.longitude_deg = vehicle.home.lat, vehicle.home.lon
         message.home.altitude_m = vehicle.home.amsl_m

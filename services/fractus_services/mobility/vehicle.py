@@ -22,12 +22,17 @@ _ARMED = 0x80
 _CRITICAL, _EMERGENCY = 5, 6
 _PREARM = 0x10000000
 _IN_AIR = frozenset({2, 3, 4})
+_FIX_3D = 3
 _LEAST_ERROR_M, _UNTOLD_ERROR_M, _WORST_ERROR_M = 0.5, 1.5, 10.0
 
 
 @dataclass(slots=True)
 class Vehicle:
-    """The streamed state; times are monotonic seconds."""
+    """The streamed state; times are monotonic seconds.
+
+    Attributes:
+        located: whether GPS has a three-dimensional fix of some accuracy; positions without one are not taken.
+    """
 
     lat: float | None = None
     lon: float | None = None
@@ -49,6 +54,7 @@ class Vehicle:
     battery_a: float = math.nan
     ready: bool = False
     fix_type: int = 0
+    located: bool = False
     position_error_m: float = _UNTOLD_ERROR_M
     texts: list[str] = field(default_factory=list)
     failsafe_text: str = ""
@@ -114,7 +120,7 @@ def _heartbeat(vehicle: Vehicle, message: Any, now: float) -> None:
 
 
 def _position(vehicle: Vehicle, message: Any, now: float) -> None:
-    if vehicle.fix_type and vehicle.fix_type < 3:
+    if not vehicle.located:
         return
     if message.lat == 0 and message.lon == 0:
         return
@@ -145,8 +151,10 @@ def _status(vehicle: Vehicle, message: Any, _now: float) -> None:
 
 def _gps(vehicle: Vehicle, message: Any, _now: float) -> None:
     vehicle.fix_type = message.fix_type
-    if message.h_acc:
-        vehicle.position_error_m = min(max(message.h_acc / 1e3, _LEAST_ERROR_M), _WORST_ERROR_M)
+    error = message.h_acc / 1e3 if message.h_acc else _UNTOLD_ERROR_M
+    vehicle.located = message.fix_type >= _FIX_3D and error <= _WORST_ERROR_M
+    if vehicle.located:
+        vehicle.position_error_m = max(error, _LEAST_ERROR_M)
 
 
 def _text(vehicle: Vehicle, message: Any, now: float) -> None:

@@ -1,0 +1,65 @@
+"""When the vehicle's position is known, and who is told of it."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from fractus_services.mobility.dialect import message
+from fractus_services.mobility.telemetry import telemetry_of
+from fractus_services.mobility.vehicle import Vehicle
+
+
+def place(vehicle: Vehicle, lat: float, now: float) -> None:
+    vehicle.take(message("GLOBAL_POSITION_INT", lat=round(lat * 1e7), lon=229500000, relative_alt=20_000, vx=300), now)
+
+
+def fix(vehicle: Vehicle, fix_type: int, h_acc: int = 600) -> None:
+    vehicle.take(message("GPS_RAW_INT", fix_type=fix_type, h_acc=h_acc), 0.0)
+
+
+@pytest.mark.parametrize(("fix_type", "h_acc"), [(0, 0), (1, 600), (2, 600), (3, 10_001), (6, 80_000)])
+def test_without_a_good_fix_no_position_is_taken(fix_type: int, h_acc: int) -> None:
+    vehicle = Vehicle()
+    place(vehicle, 39.0, 1.0)
+    assert vehicle.lat is None
+    fix(vehicle, 3)
+    place(vehicle, 39.1, 2.0)
+    fix(vehicle, fix_type, h_acc)
+    place(vehicle, 39.2, 3.0)
+    assert (vehicle.lat, vehicle.position_at) == (39.1, 2.0)
+
+
+def test_an_accuracy_that_is_not_told_any_more_is_not_the_last_one() -> None:
+    vehicle = Vehicle()
+    fix(vehicle, 3, 9_000)
+    assert vehicle.position_error_m == 9.0
+    fix(vehicle, 3, 0)
+    assert vehicle.position_error_m == 1.5
+
+
+def told(vehicle: Vehicle, now: float, missions: bool = False) -> Any:
+    autopilot = SimpleNamespace(vehicle=vehicle, now=now, connected=True)
+    journal = SimpleNamespace(outcomes=lambda: {"uid": "complete"})
+    control: Any = SimpleNamespace(autopilot=autopilot, journal=journal, checked=None, controller="system")
+    return telemetry_of(control, 0.0, missions)
+
+
+def test_telemetry_carries_no_stale_position() -> None:
+    vehicle = Vehicle()
+    fix(vehicle, 3)
+    place(vehicle, 39.0, 10.0)
+    fresh = told(vehicle, 10.5)
+    assert fresh.HasField("position")
+    assert fresh.position_error_m == pytest.approx(0.6 + 3.0 * 0.5)
+    stale = told(vehicle, 11.1)
+    assert not stale.HasField("position")
+    assert not stale.HasField("velocity")
+    assert not told(Vehicle(), math.inf).HasField("position")
+
+
+def test_missions_are_for_the_node_alone() -> None:
+    assert dict(told(Vehicle(), 0.0, missions=True).missions) == {"uid": "complete"}
+    assert not told(Vehicle(), 0.0).missions

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import random
 
+from fractus_core.policy.engine import LEAST_LEG_M
 from fractus_core.policy.values import Call, GotoArgs, TakeoffArgs
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -176,8 +177,13 @@ def test_altitudes_against_a_plain_reading_of_the_rules(
     want = max(min(asked, 120.0, upper if upper is not None else math.inf), lower if lower is not None else -math.inf)
     for call in (goto(10, 10, asked), Call("Takeoff", TakeoffArgs(asked))):
         verdict = ask(grant, call, at(alt=0.0) if call.method == "Takeoff" else at())
+        low = min(max(asked, lower or 0.0), upper or 120.0) < LEAST_LEG_M and not any(
+            edge is not None and edge < LEAST_LEG_M for edge in (lower, upper)
+        )
         if breaks and refuse:
             assert verdict.action == "deny"
+        elif low and call.method == "Goto":
+            assert verdict.code == "AltitudeTooLow"
         else:
             assert verdict.permits
             flown = verdict.args.alt if isinstance(verdict.args, GotoArgs) else verdict.args.altitude_m  # type: ignore[union-attr]

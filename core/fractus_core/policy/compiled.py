@@ -15,7 +15,7 @@ from fractus_core.api.methods import METHODS_OF
 from fractus_core.api.plans import GrantedPolicy, GrantSpec
 from fractus_core.api.policies import ActiveTime, PolicySpec, active_at
 from fractus_core.geo import LocalFrame, middle, polygon
-from fractus_core.policy.values import Home, Situation
+from fractus_core.policy.values import Home, Moment, Situation, earliest
 
 FOREVER = float("inf")
 REACH_M = 500_000.0
@@ -37,7 +37,7 @@ class Rule:
 
     def in_force(self, time_s: float) -> bool:
         """Whether the policy is in its validity window."""
-        return self.valid_from_s <= time_s < self.valid_until_s
+        return self.valid_from_s <= time_s and earliest(time_s) < self.valid_until_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,11 @@ class Patch:
 
     def in_force(self, time_s: float) -> bool:
         """Whether the policy is in its validity window, and the zone active."""
-        return self.rule.in_force(time_s) and active_at(self.schedule, time_s)
+        if not self.rule.in_force(time_s):
+            return False
+        return active_at(self.schedule, time_s) or (
+            isinstance(time_s, Moment) and active_at(self.schedule, time_s.earliest)
+        )
 
 
 def height_m(value: float, reference: Reference, home: Home | None, flat_terrain: bool) -> float | None:
@@ -126,6 +130,10 @@ def band_holds(band: AltitudeBand | None, lower_m: float, upper_m: float, home: 
     return floor is not None and ceiling is not None and floor <= lower_m and upper_m <= ceiling
 
 
+def _surely_active(patch: Patch, time_s: float) -> bool:
+    return active_at(patch.schedule, time_s) and active_at(patch.schedule, earliest(time_s))
+
+
 @dataclass(frozen=True, slots=True)
 class Inclusion:
     """A policy that keeps the drone inside the union of its zones."""
@@ -143,7 +151,7 @@ class Inclusion:
         kept = [
             p.shape
             for p in self.patches
-            if band_holds(p.band, lower_m, upper_m, now.home, flat) and active_at(p.schedule, now.time_s)
+            if band_holds(p.band, lower_m, upper_m, now.home, flat) and _surely_active(p, now.time_s)
         ]
         shape = shapely.union_all(kept) if kept else shapely.Polygon()
         return shape, shape.boundary

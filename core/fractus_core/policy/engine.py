@@ -14,7 +14,7 @@ import shapely
 from fractus_core.policy.access import judge_access, judge_privacy
 from fractus_core.policy.compiled import Air, CompiledGrant, height_m
 from fractus_core.policy.fences import Breach, breaches, last_legal
-from fractus_core.policy.limits import Bound, Clamped, altitude_bounds, clamp, speed_bounds
+from fractus_core.policy.limits import SLACK, Bound, Clamped, altitude_bounds, clamp, speed_bounds
 from fractus_core.policy.motion import XY, Leg, standing, stop_altitude_m, stop_point, turn_point
 from fractus_core.policy.values import (
     Call,
@@ -34,6 +34,8 @@ MAX_SPEED_MPS = 100.0
 MAX_PIXELS = 20_000
 LEAST_ALTITUDE_M = 0.5
 """A takeoff goes at least this high."""
+LEAST_LEG_M = 2.0
+"""A goto ends at least this high above home, where no altitude limit says that lower is fine."""
 
 
 def judge(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
@@ -47,11 +49,24 @@ def judge(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     Returns:
         The verdict; an internal error is the caller's to turn into refusal and hover.
     """
+    if not now.sound:
+        now = _unsound(now)
     problem = _check_arguments(call) or judge_access(call, now, grant)
     if problem is not None:
         return problem
     rule = _RULES.get(call.method)
     return rule(call, now, grant) if rule is not None else Verdict("allow", call.args)
+
+
+def _unsound(now: Situation) -> Situation:
+    """A state with a figure that is no number: nothing is known of where the drone is and how it moves.
+
+    Raises:
+        ValueError: not even the time is known.
+    """
+    if not math.isfinite(now.time_s):
+        raise ValueError("the time is not a number")
+    return Situation(time_s=now.time_s, armed=now.armed, in_air=now.in_air, vertical=now.vertical)
 
 
 def margin_m(now: Situation) -> float:
@@ -186,6 +201,11 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Clamped])
     height = clamp("Altitude", "m above home", aim.altitude_m, bounds)
     if isinstance(height, Verdict):
         return height
+    if height.value < LEAST_LEG_M - SLACK and not _lower_is_fine(bounds):
+        return deny(
+            "AltitudeTooLow",
+            f"a leg ends at least {LEAST_LEG_M:.0f} m above home, not at {height.value:.1f} m; use land to come down",
+        )
     asked = request.args.speed_mps if aim.speed_mps is None else aim.speed_mps
     speed = clamp("Speed", "m/s", now.speed_setpoint_mps if asked is None else asked, speed_bounds(grant, now, air))
     problem = _altitude_on_entry(request.at, now, bounds, height_margin_m(now))
@@ -195,6 +215,11 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Clamped])
         return speed
     notes.extend(note for note in (height, speed) if note.code)
     return _Aim(aim.target, height.value, speed.value if speed.code or asked is not None else None)
+
+
+def _lower_is_fine(bounds: list[Bound]) -> bool:
+    """Whether an altitude limit in force speaks of heights below the least that a leg has otherwise."""
+    return any(edge is not None and edge < LEAST_LEG_M for bound in bounds for edge in (bound.lower, bound.upper))
 
 
 def _leg(at: XY, target: XY, now: Situation, altitude_m: float) -> Leg:
@@ -309,12 +334,8 @@ def _outcome(args: GotoArgs, flown: _Aim, notes: list[Clamped], grant: CompiledG
 
 
 def _located(now: Situation, grant: CompiledGrant) -> XY | Verdict:
-    known = now.lat is not None and now.lon is not None
-    if not known or now.lat is None or now.lon is None:
+    if now.lat is None or now.lon is None:
         return deny("PositionUnknown", "the drone's position is unknown; wait for a fix")
-    figures = (now.lat, now.lon, now.altitude_m, now.north_mps, now.east_mps, now.down_mps)
-    if not all(math.isfinite(figure) for figure in figures):
-        return deny("PositionUnknown", "the drone's position or velocity is not a number; wait for a fix")
     return grant.frame.xy(now.lat, now.lon)
 
 
@@ -382,6 +403,10 @@ def _judge_speed(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 
 def _judge_picture(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
+    if call.method == "CaptureImage" and (now.lat is None or now.lon is None):
+        return deny(
+            "PositionUnknown", "nobody knows what the camera sees while its position is unknown; wait for a fix"
+        )
     verdict = judge_privacy(now, grant)
     return verdict if verdict.action == "deny" else replace(verdict, args=call.args)
 

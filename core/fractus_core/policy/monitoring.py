@@ -40,7 +40,9 @@ def monitor(now: Situation, grant: CompiledGrant) -> Verdict | None:
     """
     if not now.in_air:
         return None
-    if now.lat is None or now.lon is None or not _finite(now):
+    if not now.sound and not math.isfinite(now.time_s):
+        raise ValueError("the time is not a number")
+    if now.lat is None or now.lon is None or not now.sound:
         return Verdict("takeover", None, "PositionUnknown", "the drone's position is unknown", (), "hover")
     start = grant.frame.xy(now.lat, now.lon)
     stop = stop_point(now, start)
@@ -81,11 +83,6 @@ class _Fence:
     action: str | None
     code: str
     name: str
-
-
-def _finite(now: Situation) -> bool:
-    figures = (now.lat or 0.0, now.lon or 0.0, now.altitude_m, now.north_mps, now.east_mps, now.down_mps)
-    return all(math.isfinite(figure) for figure in figures)
 
 
 def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead) -> list[tuple[int, Verdict]]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
 from fractus_core.api.geometry import Reference
@@ -56,6 +57,26 @@ class CaptureArgs:
 
     width: int = 0
     height: int = 0
+
+
+class Moment(float):
+    """Unix time of a clock that was set back: the later reading, and the earlier one that may be right instead.
+
+    Restrictions hold from the earlier to the later reading, permissions only when they hold at both.
+    """
+
+    earliest: float
+
+    def __new__(cls, latest: float, earliest: float) -> Moment:
+        """A time between two readings."""
+        moment = super().__new__(cls, latest)
+        moment.earliest = min(earliest, latest)
+        return moment
+
+
+def earliest(time_s: float) -> float:
+    """The earliest that a time may be."""
+    return time_s.earliest if isinstance(time_s, Moment) else time_s
 
 
 Args = TakeoffArgs | GotoArgs | SetSpeedArgs | CaptureArgs | None
@@ -112,7 +133,7 @@ class Situation:
     """The state of node and drone at the moment of a decision.
 
     Attributes:
-        time_s: Unix time in seconds.
+        time_s: Unix time in seconds; a `Moment` when the clock is in doubt.
         lat: degrees north; None while the position is unknown.
         lon: degrees east; None while the position is unknown.
         altitude_m: metres above home.
@@ -125,6 +146,7 @@ class Situation:
         latency_s: time from a decision to its effect on the motion.
         speed_setpoint_mps: horizontal speed that the autopilot flies legs with.
         vertical: whether the drone is taking off or landing, when lower altitude limits do not hold.
+        half_view_deg: how far from straight down the camera sees.
     """
 
     time_s: float
@@ -143,6 +165,29 @@ class Situation:
     speed_setpoint_mps: float = 5.0
     vertical: bool = False
     airframe: Airframe = field(default_factory=Airframe)
+    half_view_deg: float = 45.0
+
+    @property
+    def sound(self) -> bool:
+        """Whether every figure is a number."""
+        figures = [getattr(self, name) for name in _FIGURES]
+        figures += [getattr(self.airframe, name) for name in _MOTION]
+        if self.home is not None:
+            figures += [self.home.lat, self.home.lon, self.home.amsl_m]
+        return all(figure is None or math.isfinite(figure) for figure in figures)
+
+    @property
+    def footprint_m(self) -> float:
+        """Radius of the ground that a picture may show, around the position."""
+        height_m = max(self.altitude_m + self.altitude_error_m, 0.0)
+        return height_m * math.tan(math.radians(self.half_view_deg)) + self.position_error_m
+
+
+_FIGURES = (
+    "time_s", "lat", "lon", "altitude_m", "north_mps", "east_mps", "down_mps", "position_error_m", "altitude_error_m",
+    "latency_s", "speed_setpoint_mps", "half_view_deg",
+)  # fmt: skip
+_MOTION = tuple(f.name for f in fields(Airframe))
 
 
 @dataclass(frozen=True, slots=True)

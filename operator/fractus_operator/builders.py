@@ -62,6 +62,16 @@ def grant(application: Application, spec: GrantSpec) -> Body:
     return body
 
 
+def granted_again(observed: Body, spec: GrantSpec) -> Body:
+    """A Grant that exists, with another spec, made without its application: as `grant` makes it."""
+    body = GRANT.header(observed["metadata"]["name"])
+    ours = (APPLICATION_LABEL, MANAGED_LABEL, NAMESPACE_LABEL, COMPONENT_LABEL, INSTANCE_LABEL)
+    labels = observed["metadata"].get("labels") or {}
+    body["metadata"]["labels"] = {label: labels[label] for label in ours if label in labels}
+    body["spec"] = spec.to_dict()
+    return body
+
+
 def tls_secret(application: Application, placed: PlannedInstance, data: dict[str, str]) -> Body:
     """The Secret with an instance's client certificate."""
     labels = {COMPONENT_LABEL: placed.component, INSTANCE_LABEL: placed.instance}

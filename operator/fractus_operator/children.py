@@ -6,9 +6,10 @@ import asyncio
 import logging
 from collections.abc import Collection, Mapping, Sequence
 
-from fractus_core.api import Application
+from fractus_core.api import Application, Grant
+from fractus_core.api.plans import GrantSpec
 
-from fractus_operator import kinds
+from fractus_operator import builders, kinds
 from fractus_operator.difference import digest, is_current, stamped
 from fractus_operator.inventory import LiveInventory
 from fractus_operator.kinds import Body, Key, Kind, key_of
@@ -55,6 +56,24 @@ class Children:
         for result in results:
             if isinstance(result, BaseException):
                 raise result
+
+    async def refresh(self, grants: Sequence[tuple[Grant, GrantSpec]]) -> None:
+        """Bring Grants that exist up to date; one that is refused stops no other."""
+        results = await asyncio.gather(*(self._refresh_one(*pair) for pair in grants), return_exceptions=True)
+        for result in results:
+            if isinstance(result, BaseException):
+                raise result
+
+    async def _refresh_one(self, grant: Grant, spec: GrantSpec) -> None:
+        key = ("", grant.name)
+        observed = self._live.children[kinds.GRANT].get(key)
+        if observed is None or "deletionTimestamp" in observed["metadata"]:
+            return
+        body = stamped(builders.granted_again(observed, spec))
+        # With its uid, a grant that went meanwhile is not made anew.
+        body["metadata"]["uid"] = observed["metadata"]["uid"]
+        async with self._parallel:
+            self._live.children[kinds.GRANT].note(key, await self._store.apply(kinds.GRANT, body))
 
     async def _apply_one(self, application: Application, kind: Kind, body: Body) -> None:
         key = key_of(body)

@@ -12,14 +12,14 @@ from fractus_core.api import Application, Component, Condition, InvalidObject, c
 from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec, PlannedInstance
 from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.plan import Infeasible, plan
-from fractus_core.policy.grants import compile_grants
+from fractus_core.policy.grants import compile_grants, refresh
 from fractus_core.validation import check_application
 
 from fractus_operator import builders, kinds
 from fractus_operator.authority import Authority
 from fractus_operator.children import Children, NameTaken
 from fractus_operator.conditions import Fact, merge
-from fractus_operator.inventory import SETTLED, LiveInventory, Submitted, is_flying
+from fractus_operator.inventory import LiveInventory
 from fractus_operator.kinds import Body, Key, Kind, key_of
 from fractus_operator.labels import CAUSE_ANNOTATION, FINALIZER
 from fractus_operator.missions import (
@@ -34,6 +34,7 @@ from fractus_operator.missions import (
     stuck_nodes,
 )
 from fractus_operator.pods import PodView
+from fractus_operator.reading import SETTLED, Submitted
 from fractus_operator.store import Store, StoreError, Taken
 
 logger = logging.getLogger(__name__)
@@ -131,7 +132,8 @@ class Deployments:
         status = self._status(submitted, memory)
         if status.get("phase") in SETTLED:
             same = status.get("observedGeneration") == submitted.metadata.generation
-            left_over = await self._clear(key)
+            begun = self._live.plan_of(key, submitted.uid) is not None
+            left_over = not begun and await self._clear(key)
             if same or left_over:
                 # The last mission's grants must be gone before a new one begins.
                 return None, RESYNC_S if same else 1.0
@@ -143,15 +145,44 @@ class Deployments:
             await self._clear(key)
             return None, RESYNC_S
         try:
+            await self._refresh(key, submitted.uid)
+            await self._give_up_lost_drone(key, submitted.uid)
             return await self._progress(key, submitted, memory)
         except Hindered as hindrance:
             return hindered_standing(hindrance, present), hindrance.again_s
+
+    async def _refresh(self, key: Key, uid: str) -> None:
+        """Bring the policies of what is granted up to date, whatever becomes of the application's next plan."""
+        inventory = self._live.snapshot(uid)
+        grants = [(grant, refresh(grant.spec, inventory)) for grant in self._live.grants_of(key, uid)]
+        stale = [(grant, spec) for grant, spec in grants if spec != grant.spec]
+        try:
+            await self._children.refresh(stale)
+        except StoreError as error:
+            # The watch of grants brings a newer one, or the next look finds it refused still.
+            logger.warning("%s/%s: grants are not up to date: %s", *key, error)
+            if error.status not in _REFUSALS and not isinstance(error, Taken):
+                raise
+
+    async def _give_up_lost_drone(self, key: Key, uid: str) -> None:
+        """Take down an application whose drone is another's by an older grant, so that it is planned anew.
+
+        Raises:
+            Hindered: it has lost its drone.
+        """
+        drone = self._live.has_lost_drone(key, uid)
+        if drone is None:
+            return
+        await self._clear(key)
+        await self._children.remove(key, kinds.DEPLOYMENT_PLAN)
+        self._live.forget(key)
+        raise Hindered("Queued", "Planned", "DroneBusy", f"another application has {drone}", again_s=1.0)
 
     async def _progress(self, key: Key, submitted: Submitted, memory: _Memory) -> tuple[Standing, float]:
         application = submitted.application
         if application is None:
             raise Hindered("Invalid", "Planned", "Invalid", str(submitted.error))
-        inventory = self._live.snapshot()
+        inventory = self._live.snapshot(submitted.uid)
         try:
             check_application(application, inventory.depots)
             decided, again_s = self._plan(application, inventory, memory)
@@ -161,7 +192,8 @@ class Deployments:
             phase: Phase = "Queued" if none.reason == "DroneBusy" else "Pending"
             raise Hindered(phase, "Planned", none.reason, none.message) from none
         try:
-            grants = compile_grants(application, decided, inventory, self._settings)
+            present = [grant.spec for grant in self._live.grants_of(key, submitted.uid)]
+            grants = compile_grants(application, decided, inventory, self._settings, present)
         except InvalidObject as error:
             raise Hindered("Pending", "Granted", "PolicyInvalid", str(error)) from error
         try:
@@ -187,17 +219,27 @@ class Deployments:
         key, uid, now = application.key, application.metadata.uid or "", self._clock()
         previous = self._live.plan_of(key, uid)
         stuck, again_s = stuck_nodes(previous, self._live.pods_of(key), now)
-        reason = replan_reason(application, previous, inventory, stuck)
+        aloft = self._aloft(previous)
+        stuck = {node: why for node, why in stuck.items() if node != aloft}
+        reason = replan_reason(application, previous, inventory, stuck, aloft)
         if previous is not None and reason is None:
             return previous, again_s or RESYNC_S
         memory.excluded = {n: (until, why) for n, (until, why) in memory.excluded.items() if until > now}
         memory.excluded |= {node: (now + EXCLUSION, why) for node, why in stuck.items()}
         settings = replace(self._settings, excluded={n: why for n, (_, why) in memory.excluded.items()})
         decided = plan(application, inventory, settings, previous)
+        if previous is not None and aloft is not None and reason != "SpecChanged" and _flies(decided) != aloft:
+            # Trouble elsewhere is no reason to leave a drone that flies.
+            return previous, RESYNC_S
         self._live.decide(key, uid, decided)
         drone = f" with drone {decided.drone.node}" if decided.drone is not None else ""
         logger.info("%s/%s is planned (%s)%s", *key, reason, drone)
         return decided, RESYNC_S
+
+    def _aloft(self, decided: DeploymentPlanSpec | None) -> str | None:
+        """The drone of a plan, while it flies."""
+        drone = _flies(decided) if decided is not None else None
+        return drone if drone is not None and self._live.in_the_air(drone) else None
 
     async def _deploy(
         self,
@@ -232,13 +274,13 @@ class Deployments:
 
         So no upgrade of the operator, which may build pods in another way, restarts a driver in flight.
         """
-        drone = self._live.drones.get(("", decided.drone.node)) if decided.drone is not None else None
+        drone = self._aloft(decided)
         observed = self._live.children[kinds.DEPLOYMENT].get(key_of(desired))
-        if drone is None or observed is None or not is_flying(drone):
+        if drone is None or observed is None:
             return False
         cause = str(desired["metadata"]["annotations"][CAUSE_ANNOTATION])
         present = (observed["metadata"].get("annotations") or {}).get(CAUSE_ANNOTATION)
-        return cause == present and cause.rpartition("@")[2] == drone.name
+        return cause == present and cause.rpartition("@")[2] == drone
 
     async def _certificate(self, application: Application, placed: PlannedInstance) -> Body:
         """The Secret of an instance: the present certificate while it is good, so that a restart renews nothing."""
@@ -294,11 +336,11 @@ class Deployments:
         if status == before:
             return
         try:
-            await self._store.apply(
-                kinds.APPLICATION, builders.application_status(submitted.body, status), subresource="status"
-            )
+            body = builders.application_status(submitted.body, status)
+            applied = await self._store.apply(kinds.APPLICATION, body, subresource="status")
         except Taken:
             return
+        self._live.applications.note(key_of(applied), applied)
         memory.status = (submitted.metadata.uid or "", status)
         await self._announce(submitted, news, now)
 
@@ -316,6 +358,10 @@ class Deployments:
                 )
             except StoreError as error:
                 logger.warning("Event %s of %s: %s", fact.reason, submitted.metadata.name, error)
+
+
+def _flies(decided: DeploymentPlanSpec) -> str | None:
+    return decided.drone.node if decided.drone is not None else None
 
 
 def _with_service(application: Application) -> Iterator[Component]:

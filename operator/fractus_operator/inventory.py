@@ -6,18 +6,15 @@ import asyncio
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any, TypeVar
 
 from fractus_core.api import (
-    Application,
     DeploymentPlan,
     Depot,
     Drone,
     EdgeNode,
     Grant,
-    InvalidObject,
-    Metadata,
     Policy,
     Resource,
     Zone,
@@ -27,9 +24,11 @@ from fractus_core.planning.candidates import requests
 from fractus_core.planning.inventory import Host, Inventory
 
 from fractus_operator import kinds
+from fractus_operator.claims import Claim, OwnedPlan, claims
 from fractus_operator.kinds import Body, Key, Kind
 from fractus_operator.labels import APPLICATION_LABEL, MANAGED_SELECTOR, NAMESPACE_LABEL, label_value
 from fractus_operator.pods import PodView, read_host, read_pod
+from fractus_operator.reading import Broken, Submitted, keeping_broken, read_submitted, reader
 from fractus_operator.reflector import Reflector
 from fractus_operator.store import Store
 
@@ -37,49 +36,7 @@ logger = logging.getLogger(__name__)
 
 R = TypeVar("R", bound=Resource)
 
-SETTLED = frozenset({"Completed", "Failed"})
-"""Phases of an application whose mission is over."""
-
 SIGNER = "fractus.dev/node"
-
-
-@dataclass(frozen=True)
-class Submitted:
-    """An Application as it was submitted: parsed, or with the reason why it cannot be."""
-
-    body: Body
-    application: Application | None
-    error: InvalidObject | None
-
-    @property
-    def metadata(self) -> Metadata:
-        """Its metadata."""
-        return Metadata.model_validate(self.body["metadata"])
-
-    @property
-    def settled(self) -> bool:
-        """Whether the mission of this generation is over."""
-        status = self.body.get("status") or {}
-        return status.get("phase") in SETTLED and status.get("observedGeneration") == self.body["metadata"].get(
-            "generation"
-        )
-
-
-def read_submitted(body: Body) -> Submitted:
-    """Parse an Application, keeping what cannot be parsed with the reason."""
-    body["metadata"].pop("managedFields", None)
-    try:
-        return Submitted(body, Application.from_body(body), None)
-    except InvalidObject as error:
-        return Submitted(body, None, error)
-
-
-@dataclass(frozen=True, slots=True)
-class OwnedPlan:
-    """A plan and the uid of the Application it is for: one made anew under an old name does not inherit it."""
-
-    uid: str
-    spec: DeploymentPlanSpec
 
 
 class Subscription:
@@ -104,17 +61,6 @@ class Subscription:
         return True
 
 
-def _model(model: type[R]) -> Callable[[Body], R | None]:
-    def parse(body: Body) -> R | None:
-        try:
-            return model.from_body(body)
-        except InvalidObject as error:
-            logger.warning("%s %s is left out: %s", model.KIND, body["metadata"]["name"], error)
-            return None
-
-    return parse
-
-
 class LiveInventory:
     """What the operator knows of the cluster, current within a watch event's delay."""
 
@@ -122,11 +68,11 @@ class LiveInventory:
         managed = {"labelSelector": MANAGED_SELECTOR}
         self.hosts = Reflector(store, kinds.NODE, read_host, self._host_changed)
         self.pods = Reflector(store, kinds.POD, read_pod, self._pod_changed)
-        self.drones = Reflector(store, kinds.DRONE, _model(Drone), self._drone_changed)
-        self.edge_nodes = Reflector(store, kinds.EDGE_NODE, _model(EdgeNode), self._edge_node_changed)
-        self.depots = Reflector(store, kinds.DEPOT, _model(Depot), self._spec_changed)
-        self.zones = Reflector(store, kinds.ZONE, _model(Zone), self._spec_changed)
-        self.policies = Reflector(store, kinds.POLICY, _model(Policy), self._spec_changed)
+        self.drones = Reflector(store, kinds.DRONE, reader(Drone), self._drone_changed)
+        self.edge_nodes = Reflector(store, kinds.EDGE_NODE, reader(EdgeNode), self._edge_node_changed)
+        self.depots = Reflector(store, kinds.DEPOT, reader(Depot), self._spec_changed(kinds.DEPOT))
+        self.zones = Reflector(store, kinds.ZONE, keeping_broken(Zone), self._spec_changed(kinds.ZONE))
+        self.policies = Reflector(store, kinds.POLICY, keeping_broken(Policy), self._spec_changed(kinds.POLICY))
         self.applications = Reflector(store, kinds.APPLICATION, read_submitted, self._application_changed)
         self.signing_requests = Reflector(
             store,
@@ -143,7 +89,8 @@ class LiveInventory:
         self._decided: dict[Key, OwnedPlan] = {}
         self._plans: dict[Key, OwnedPlan] = {}
         self._grants: dict[Key, Grant] = {}
-        self._last_holder: dict[str, Key] = {}
+        self._last_claims: dict[str, Claim] = {}
+        self._aloft: set[str] = set()
         self._requested: dict[str, dict[str, float]] = {}
 
     # -- running --
@@ -175,48 +122,65 @@ class LiveInventory:
 
     # -- reading --
 
-    def snapshot(self) -> Inventory:
-        """The input of planning and of grants, as of now."""
+    def snapshot(self, uid: str | None = None) -> Inventory:
+        """The input of planning and of grants, as of now.
+
+        Args:
+            uid: The application that asks: claims under its name that are not its own show another holder.
+        """
         return Inventory(
             hosts=self._hosts_with_requests(),
             drones=_by_name(self.drones),
             edge_nodes=_by_name(self.edge_nodes),
             depots=_by_name(self.depots),
-            zones=_by_name(self.zones),
-            policies=_by_name(self.policies),
-            claimed=self.claimed(),
+            zones={z.name: z for z in self.zones.values() if isinstance(z, Zone)},
+            policies={p.name: p for p in self.policies.values() if isinstance(p, Policy)},
+            unreadable_zones={z.name: z.problem for z in self.zones.values() if isinstance(z, Broken)},
+            unreadable_policies={p.name: p.problem for p in self.policies.values() if isinstance(p, Broken)},
+            claimed={node: claim.holder(uid) for node, claim in self.claims().items()},
         )
 
-    def plans(self) -> dict[Key, DeploymentPlanSpec]:
+    def plans(self) -> dict[Key, OwnedPlan]:
         """The plan of every application whose mission is not over."""
-        active: dict[Key, DeploymentPlanSpec] = {}
-        for key, plan in (self._plans | self._decided).items():
-            submitted = self.applications.get(key)
-            if submitted is None or submitted.metadata.uid != plan.uid:
-                continue
-            if key in self._decided or not submitted.settled:
-                active[key] = plan.spec
-        return active
+        return {key: plan for key, plan in (self._plans | self._decided).items() if self._is_live(key, plan)}
 
     def plan_of(self, key: Key, uid: str) -> DeploymentPlanSpec | None:
-        """The plan last made for the application with this uid."""
+        """The plan of the application with this uid, unless the mission it was made for is over."""
         plan = self._decided.get(key) or self._plans.get(key)
-        return plan.spec if plan is not None and plan.uid == uid else None
+        return plan.spec if plan is not None and plan.uid == uid and self._is_live(key, plan) else None
 
-    def claimed(self) -> dict[str, Key]:
+    def _is_live(self, key: Key, plan: OwnedPlan) -> bool:
+        submitted = self.applications.get(key)
+        if submitted is None or submitted.uid != plan.uid:
+            return False
+        over = submitted.settled_generation
+        return over is None or (plan.spec.application_generation or 0) > over
+
+    def claims(self) -> dict[str, Claim]:
         """Which application has which drone.
 
         A drone is claimed from the plan on until its grants are gone and it has come home.
         """
-        claims = {plan.drone.node: key for key, plan in self.plans().items() if plan.drone is not None}
-        for grant in self._grants.values():
-            owner = grant.spec.application
-            claims.setdefault(grant.spec.node, (owner.namespace, owner.name))
+        found = claims(self.plans(), self._grants.values())
         for drone in self.drones.values():
-            if drone is not None and drone.name not in claims and is_flying(drone):
-                claims[drone.name] = self._last_holder.get(drone.name) or self._holder_on_record(drone.name)
-        self._last_holder.update(claims)
-        return claims
+            if drone is not None and drone.name not in found and is_flying(drone):
+                last = self._last_claims.get(drone.name) or self._claim_on_record(drone.name)
+                found[drone.name] = replace(last, over=True)
+        self._last_claims.update(found)
+        return found
+
+    def has_lost_drone(self, key: Key, uid: str) -> str | None:
+        """The drone of an application's plan that another application turns out to have; None: it has its own."""
+        plan = self.plan_of(key, uid)
+        if plan is None or plan.drone is None or plan.drone.shared_with is not None:
+            return None
+        claim = self.claims().get(plan.drone.node)
+        return plan.drone.node if claim is not None and claim.uid != uid else None
+
+    def in_the_air(self, node: str) -> bool:
+        """Whether a drone flies; one whose object went while it flew still does, for all that is known."""
+        drone = self.drones.get(("", node))
+        return is_flying(drone) if drone is not None else node in self._aloft
 
     def pods_of(self, key: Key) -> list[PodView]:
         """The pods of an application."""
@@ -228,12 +192,13 @@ class LiveInventory:
             if pod.namespace == namespace and pod.labels.get(APPLICATION_LABEL) == label
         ]
 
-    def grants_of(self, key: Key) -> list[Grant]:
-        """The grants of an application."""
+    def grants_of(self, key: Key, uid: str | None = None) -> list[Grant]:
+        """The grants of an application; with a uid, only of the one that has it."""
         return [
             grant
             for grant in self._grants.values()
             if (grant.spec.application.namespace, grant.spec.application.name) == key
+            and uid in (None, grant.spec.application.uid)
         ]
 
     def children_of(self, key: Key, kind: Kind) -> list[Body]:
@@ -284,6 +249,8 @@ class LiveInventory:
 
     def _drone_changed(self, key: Key, old: Drone | None, new: Drone | None) -> None:
         self._report(kinds.DRONE, key)
+        if new is not None:
+            (self._aloft.add if is_flying(new) else self._aloft.discard)(new.name)
         if old is None or new is None or _planning_view(old) != _planning_view(new):
             self.wake_all()
 
@@ -292,18 +259,19 @@ class LiveInventory:
         if old is None or new is None or old.spec != new.spec:
             self.wake_all()
 
-    def _spec_changed(self, key: Key, old: Any, new: Any) -> None:
-        changed = new or old
-        for kind in (kinds.ZONE, kinds.POLICY, kinds.DEPOT):
-            if changed is not None and kind.name == changed.KIND:
-                self._report(kind, key)
-        if old is None or new is None or old.spec != new.spec:
-            self.wake_all()
+    def _spec_changed(self, kind: Kind) -> Callable[[Key, Any, Any], None]:
+        def changed(key: Key, old: Any, new: Any) -> None:
+            self._report(kind, key)
+            if old is None or new is None or type(old) is not type(new) or old.spec != new.spec:
+                self.wake_all()
+
+        return changed
 
     def _application_changed(self, key: Key, old: Submitted | None, new: Submitted | None) -> None:
         self._report(kinds.APPLICATION, key)
         if new is None:
             self._decided.pop(key, None)
+        if old is None or new is None or old.settled_generation != new.settled_generation:
             self.wake_all()
         else:
             self.wake(key)
@@ -319,7 +287,7 @@ class LiveInventory:
             self.wake((key[0] or labels.get(NAMESPACE_LABEL, ""), labels[APPLICATION_LABEL]))
 
     def _grant_changed(self, key: Key, new: Body | None) -> None:
-        grant = _model(Grant)(new) if new is not None else None
+        grant = reader(Grant)(new) if new is not None else None
         if grant is None:
             self._grants.pop(key, None)
             self.wake_all()
@@ -328,7 +296,7 @@ class LiveInventory:
         self._report(kinds.GRANT, key)
 
     def _plan_changed(self, key: Key, new: Body | None) -> None:
-        plan = _model(DeploymentPlan)(new) if new is not None else None
+        plan = reader(DeploymentPlan)(new) if new is not None else None
         owner = next((o.uid for o in plan.metadata.owner_references), None) if plan is not None else None
         if plan is None or owner is None:
             self._plans.pop(key, None)
@@ -374,7 +342,7 @@ class LiveInventory:
             if submitted is None or submitted.application is None:
                 continue
             components = {c.name: c for c in submitted.application.spec.components}
-            for placed in plan.placements:
+            for placed in plan.spec.placements:
                 if placed.node is None or (key[0], placed.instance, placed.node) in bound:
                     continue
                 if placed.component in components:
@@ -383,12 +351,12 @@ class LiveInventory:
                         total[resource] = total.get(resource, 0.0) + amount
         return totals.items()
 
-    def _holder_on_record(self, drone: str) -> Key:
+    def _claim_on_record(self, drone: str) -> Claim:
         """Who flew the drone last, from the applications' statuses, for an operator that was restarted since."""
         for key, submitted in sorted(self.applications.items()):
             if (submitted.body.get("status") or {}).get("drone") == drone:
-                return key
-        return ("fractus-system", "flight-home")
+                return Claim(key, submitted.uid)
+        return Claim(("fractus-system", "flight-home"), "")
 
 
 def is_flying(drone: Drone) -> bool:

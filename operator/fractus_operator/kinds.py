@@ -74,8 +74,8 @@ DEPLOYMENT = Kind("apps/v1", "Deployment", "deployments", namespaced=True)
 ENDPOINT_SLICE = Kind("discovery.k8s.io/v1", "EndpointSlice", "endpointslices", namespaced=True)
 SIGNING_REQUEST = Kind("certificates.k8s.io/v1", "CertificateSigningRequest", "certificatesigningrequests", False)
 
-CHILDREN: tuple[Kind, ...] = (DEPLOYMENT_PLAN, SECRET, GRANT, SERVICE, ENDPOINT_SLICE, DEPLOYMENT)
-"""What the operator makes for an Application, in the order in which it is applied."""
+CHILDREN: tuple[Kind, ...] = (GRANT, DEPLOYMENT_PLAN, SECRET, SERVICE, ENDPOINT_SLICE, DEPLOYMENT)
+"""What the operator makes for an Application, in the order in which it is applied: what an object in the way of another must not stop comes first."""
 
 
 def key_of(body: Body) -> Key:

@@ -87,6 +87,7 @@ def replan_reason(
     plan: DeploymentPlanSpec | None,
     inventory: Inventory,
     stuck: Mapping[str, str],
+    aloft: str | None = None,
 ) -> str | None:
     """Why a (new) plan is needed, as a CamelCase reason; None while the present one stands.
 
@@ -97,13 +98,14 @@ def replan_reason(
         plan: The present plan.
         inventory: As of now.
         stuck: Nodes on which the scheduler refuses a pod of the application.
+        aloft: The plan's drone while it flies: whatever becomes of its node, what runs there stays until it is down.
     """
     if plan is None:
         return "NoPlanYet"
     if plan.application_generation != application.metadata.generation:
         return "SpecChanged"
     for placed in plan.placements:
-        if placed.node is None:
+        if placed.node is None or placed.node == aloft:
             continue
         described = placed.node in inventory.drones or placed.node in inventory.edge_nodes
         if placed.node not in inventory.hosts or not described:
@@ -127,6 +129,9 @@ def stuck_nodes(
     for pod in pods:
         node = nodes.get(pod.instance or "")
         if pod.unschedulable_since is None or node is None or pod.terminating:
+            continue
+        # Anybody in the namespace may make a pod with our labels.
+        if pod.deployment != pod.instance:
             continue
         left = (pod.unschedulable_since + UNSCHEDULABLE_GRACE - now).total_seconds()
         if left <= 0:

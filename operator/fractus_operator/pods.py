@@ -21,6 +21,7 @@ class PodView:
 
     Attributes:
         requests: what it asks of its node, in base units.
+        deployment: name of the Deployment that made it, through a ReplicaSet; None for a pod of other making.
         unschedulable_since: since when the scheduler has found no node for it, if so.
         unschedulable_message: what the scheduler said.
     """
@@ -34,6 +35,7 @@ class PodView:
     finished: bool
     terminating: bool
     ip: str | None
+    deployment: str | None = None
     unschedulable_since: datetime | None = None
     unschedulable_message: str = ""
 
@@ -86,9 +88,18 @@ def read_pod(body: Body) -> PodView:
         finished=status.get("phase") in {"Succeeded", "Failed"},
         terminating="deletionTimestamp" in metadata,
         ip=status.get("podIP"),
+        deployment=_deployment(metadata),
         unschedulable_since=datetime.fromisoformat(since) if since else None,
         unschedulable_message=scheduled.get("message", "") if unschedulable else "",
     )
+
+
+def _deployment(metadata: Body) -> str | None:
+    """ReplicaSets are named after their Deployment: NAME-HASH."""
+    for owner in metadata.get("ownerReferences") or ():
+        if owner.get("controller") and (owner.get("apiVersion"), owner.get("kind")) == ("apps/v1", "ReplicaSet"):
+            return str(owner["name"]).rpartition("-")[0]
+    return None
 
 
 def _requests(spec: Body) -> dict[str, float]:

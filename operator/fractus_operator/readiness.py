@@ -12,6 +12,7 @@ from fractus_core.validation import check_policy, check_zone
 from fractus_operator.conditions import Fact, merge
 from fractus_operator.inventory import LiveInventory
 from fractus_operator.kinds import POLICY, ZONE, Key, Kind
+from fractus_operator.reading import Broken
 from fractus_operator.store import NotFound, Store, Taken
 
 
@@ -37,17 +38,25 @@ class Readiness:
 
     def policies_of(self, zone: str) -> Sequence[Key]:
         """The policies that select a zone."""
-        return [key for key, policy in self._live.policies.items() if policy and zone in policy.spec.selector.zones]
+        return [
+            key
+            for key, policy in self._live.policies.items()
+            if isinstance(policy, Policy) and zone in policy.spec.selector.zones
+        ]
 
-    def _judge_zone(self, zone: Zone) -> Fact:
+    def _judge_zone(self, zone: Zone | Broken) -> Fact:
+        if isinstance(zone, Broken):
+            return Fact("Ready", "False", "Invalid", zone.problem)
         try:
             check_zone(zone)
         except InvalidObject as error:
             return Fact("Ready", "False", "Invalid", str(error))
         return Fact("Ready", "True", "Valid", "the zone can be enforced")
 
-    def _judge_policy(self, policy: Policy) -> Fact:
-        zones = {zone.name: zone for zone in self._live.zones.values() if zone is not None}
+    def _judge_policy(self, policy: Policy | Broken) -> Fact:
+        if isinstance(policy, Broken):
+            return Fact("Ready", "False", "Invalid", policy.problem)
+        zones = {zone.name: zone for zone in self._live.zones.values()}
         try:
             check_policy(policy, zones.keys())
         except InvalidObject as error:
@@ -59,10 +68,10 @@ class Readiness:
                 return Fact("Ready", "False", "ZoneInvalid", message)
         return Fact("Ready", "True", "Valid", "the policy can be enforced")
 
-    async def _report(self, kind: Kind, resource: Zone | Policy, fact: Fact) -> None:
+    async def _report(self, kind: Kind, resource: Zone | Policy | Broken, fact: Fact) -> None:
         now = self._clock()
         generation = resource.metadata.generation
-        before: tuple[Condition, ...] = resource.status.conditions if resource.status is not None else ()
+        before = _conditions(resource)
         conditions, news = merge(before, [fact], generation, now)
         if conditions == before:
             return
@@ -76,9 +85,15 @@ class Readiness:
             if item.warning:
                 await self._warn(kind, resource, item, now)
 
-    async def _warn(self, kind: Kind, resource: Zone | Policy, fact: Fact, now: datetime) -> None:
+    async def _warn(self, kind: Kind, resource: Zone | Policy | Broken, fact: Fact, now: datetime) -> None:
         regarding: dict[str, Any] = kind.header(resource.name, uid=resource.metadata.uid)
         name = f"{resource.name}.{int(now.timestamp() * 1000):x}"
         await self._store.record_event(
             regarding, reason=fact.reason, message=fact.message, warning=True, name=name, now=now
         )
+
+
+def _conditions(resource: Zone | Policy | Broken) -> tuple[Condition, ...]:
+    if isinstance(resource, Broken):
+        return resource.conditions
+    return resource.status.conditions if resource.status is not None else ()

@@ -46,6 +46,7 @@ class Reflector(Generic[T]):
         self._selectors = dict(selectors or {})
         self._rng = rng or random.Random()  # noqa: S311  (jitter)
         self._objects: dict[Key, T] = {}
+        self._noted: dict[Key, int] = {}
         self._last_contact = float("-inf")
 
     def get(self, key: Key) -> T | None:
@@ -65,8 +66,9 @@ class Reflector(Generic[T]):
         return len(self._objects)
 
     def note(self, key: Key, body: Body) -> None:
-        """Take what a write of our own returned, ahead of the watch; nobody is told of it."""
-        self._objects[key] = self._parse(self._typed(body))
+        """Take what a write of our own returned, ahead of the watch, which then has nothing older to say of it."""
+        self._noted[key] = _version(body)
+        self._put(key, body)
 
     def age_s(self) -> float:
         """Seconds since the API server last said anything about the collection."""
@@ -104,22 +106,22 @@ class Reflector(Generic[T]):
         self._last_contact = asyncio.get_running_loop().time()
 
     async def _list(self) -> str:
-        fresh: dict[Key, T] = {}
-        page = await self._store.list_page(self.kind, selectors=self._selectors)
+        listed: set[Key] = set()
+        continue_ = ""
         while True:
+            page = await self._store.list_page(self.kind, selectors=self._selectors, continue_=continue_)
+            self._heard()
             for item in page.items:
-                fresh[key_of(item)] = self._parse(self._typed(item))
-            if not page.continue_:
+                listed.add(key_of(item))
+                self._take("MODIFIED", item)
+            continue_ = page.continue_
+            if not continue_:
                 break
-            page = await self._store.list_page(self.kind, selectors=self._selectors, continue_=page.continue_)
-        old, self._objects = self._objects, fresh
-        self._heard()
-        for key in old.keys() - fresh.keys():
-            self._on_change(key, old[key], None)
-        for key, new in fresh.items():
-            before = old.get(key)
-            if before is None or before != new:
-                self._on_change(key, before, new)
+        version = int(page.resource_version) if page.resource_version.isdecimal() else 0
+        for key in self._objects.keys() - listed:
+            # What was made while the list was on its way is not in it.
+            if self._noted.get(key, 0) <= version:
+                self._drop(key)
         self.synced.set()
         return page.resource_version
 
@@ -139,19 +141,45 @@ class Reflector(Generic[T]):
 
     def _take(self, type_: str, body: Body) -> None:
         key = key_of(body)
-        old = self._objects.get(key)
-        if type_ == "DELETED":
-            self._objects.pop(key, None)
-            if old is not None:
-                self._on_change(key, old, None)
+        if _version(body) < self._noted.get(key, 0):
             return
-        new = self._parse(self._typed(body))
+        self._noted.pop(key, None)
+        if type_ == "DELETED":
+            self._drop(key)
+        else:
+            self._put(key, body)
+
+    def _put(self, key: Key, body: Body) -> None:
+        try:
+            new = self._parse(self._typed(body))
+        except Exception:
+            # One object that nobody foresaw must not hide all others: its last readable version stays.
+            logger.exception("%s %s cannot be read", self.kind.name, "/".join(filter(None, key)))
+            return
+        old = self._objects.get(key)
         self._objects[key] = new
         if old is None or old != new:
+            self._tell(key, old, new)
+
+    def _drop(self, key: Key) -> None:
+        self._noted.pop(key, None)
+        if key in self._objects:
+            self._tell(key, self._objects.pop(key), None)
+
+    def _tell(self, key: Key, old: T | None, new: T | None) -> None:
+        try:
             self._on_change(key, old, new)
+        except Exception:
+            logger.exception("a change of %s %s was not followed", self.kind.name, "/".join(filter(None, key)))
 
     def _typed(self, item: Body) -> Body:
         """Items of a list come without their kind; give it to them."""
         item.setdefault("apiVersion", self.kind.api_version)
         item.setdefault("kind", self.kind.name)
         return item
+
+
+def _version(body: Body) -> int:
+    """An object's resource version as a number, which grows; 0 where it is none."""
+    version = str(body["metadata"].get("resourceVersion", ""))
+    return int(version) if version.isdecimal() else 0

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from cryptography import x509
-from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric import ec
 from fractus_core.api import node_identity, node_server_name
 
@@ -67,20 +66,18 @@ def judge(body: Body, agent: str) -> Judgement:
     if not usages >= _USAGES or usages - _USAGES - _TOLERATED_USAGES:
         return Judgement("WrongUsages", f"usages must be server auth and client auth, not {', '.join(sorted(usages))}")
     try:
-        request = _read(spec["request"])
+        request, asked = _read(spec["request"])
     except Refused as refused:
         return Judgement(refused.reason, str(refused))
     wanted = {(x509.UniformResourceIdentifier, node_identity(node)), (x509.DNSName, node_server_name(node))}
-    names = request.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-    asked = {(type(name), name.value) for name in names}
     if asked != wanted:
         listed = ", ".join(sorted(str(value) for _, value in asked))
         return Judgement("WrongNames", f"the agent of {node} may ask for the names of {node} only, not for {listed}")
     return Judgement("NodeAgent", f"the agent on {node} asks for its own certificate", node, request)
 
 
-def _read(encoded: str) -> x509.CertificateSigningRequest:
-    """Parse a request that proves possession of a P-256 key and has alternative names.
+def _read(encoded: str) -> tuple[x509.CertificateSigningRequest, frozenset[tuple[type[x509.GeneralName], object]]]:
+    """Parse a request that proves possession of a P-256 key and has alternative names; the request and the names.
 
     Raises:
         Refused: it is not of that kind.
@@ -88,17 +85,18 @@ def _read(encoded: str) -> x509.CertificateSigningRequest:
     try:
         request = x509.load_pem_x509_csr(base64.b64decode(encoded, validate=True))
         key = request.public_key()
-        request.extensions.get_extension_for_class(x509.SubjectAlternativeName)
+        names = request.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        asked = frozenset((type(name), name.value) for name in names)
         genuine = request.is_signature_valid
     except x509.ExtensionNotFound:
         raise Refused("WrongNames", "the request has no subject alternative names") from None
-    except (ValueError, UnsupportedAlgorithm) as error:
-        raise Refused("Malformed", f"the request cannot be read: {error}") from error
+    except Exception as error:
+        raise Refused("Malformed", f"the request cannot be read: {error or type(error).__name__}") from error
     if not genuine:
         raise Refused("Malformed", "the request is not signed with its own key")
     if not isinstance(key, ec.EllipticCurvePublicKey) or not isinstance(key.curve, ec.SECP256R1):
         raise Refused("WrongKey", "the key must be P-256")
-    return request
+    return request, asked
 
 
 class NodeSigning:

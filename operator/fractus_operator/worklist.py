@@ -54,17 +54,19 @@ class Worklist:
     async def _attempt(self, key: Key) -> None:
         try:
             await self._reconcile(key)
-        except StoreError as error:
+        except Exception as error:
             failures = self.failures[key] = self.failures.get(key, 0) + 1
             low, high = _BACKOFF_S
             pause_s = min(high, low * 2.0 ** min(failures, 8)) * self._rng.uniform(0.5, 1.0)
+            expected = isinstance(error, StoreError)
             logger.log(
-                logging.WARNING if failures > 2 else logging.INFO,
+                logging.INFO if expected and failures <= 2 else logging.WARNING,
                 "%s %s: %s; again in %.1f s",
                 self.name,
                 "/".join(filter(None, key)),
-                error,
+                error if expected else repr(error),
                 pause_s,
+                exc_info=None if expected else error,
             )
             if key not in self._waiting:
                 self._later[key] = asyncio.get_running_loop().call_later(pause_s, self.add, key)

@@ -120,8 +120,16 @@ def test_a_new_plan_is_made_for_a_reason() -> None:
     assert replan_reason(application(), PLAN, INVENTORY, {"edge-1": "full"}) == "NodeUnusable"
 
 
+def test_a_drone_in_the_air_keeps_its_plan() -> None:
+    without = replace(INVENTORY, hosts={}, edge_nodes={})
+    assert replan_reason(application(), PLAN, without, {}) == "NodeGone"
+    assert replan_reason(application(), PLAN, without, {"edge-1": "full"}, aloft="edge-1") is None
+    assert replan_reason(application(2), PLAN, without, {}, aloft="edge-1") == "SpecChanged"
+
+
 def view(instance: str, **more: object) -> PodView:
-    values: dict[str, object] = {"ready": True, "finished": False, "terminating": False, "ip": None, **more}
+    values: dict[str, object] = {"ready": True, "finished": False, "terminating": False, "ip": None}
+    values |= {"deployment": instance, **more}
     return PodView("ns", f"{instance}-x", None, {"fractus.dev/instance": instance}, {}, **values)  # type: ignore[arg-type]
 
 
@@ -133,7 +141,8 @@ def test_a_node_is_stuck_after_a_grace() -> None:
     assert "no cpu" in stuck["edge-1"]
     in_the_cloud = view("a-c", ready=False, unschedulable_since=NOW - timedelta(minutes=1))
     leaving = view("a-1", terminating=True, unschedulable_since=NOW - timedelta(minutes=1))
-    assert stuck_nodes(PLAN, [in_the_cloud, leaving], NOW) == ({}, None)
+    forged = view("a-1", deployment=None, unschedulable_since=NOW - timedelta(minutes=1))
+    assert stuck_nodes(PLAN, [in_the_cloud, leaving, forged], NOW) == ({}, None)
 
 
 def test_readiness_counts_each_instance_up_to_its_replicas() -> None:

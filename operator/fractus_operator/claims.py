@@ -1,0 +1,65 @@
+"""Which application has which drone: by uid, so that one made anew under an old name inherits nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from fractus_core.api import Grant
+from fractus_core.api.plans import DeploymentPlanSpec
+
+from fractus_operator.kinds import Key
+
+_LATEST = datetime.max.replace(tzinfo=UTC)
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """An application that has a drone.
+
+    Attributes:
+        over: its mission is over, and the drone has yet to come home.
+    """
+
+    key: Key
+    uid: str
+    over: bool = False
+
+    def holder(self, asking: str | None) -> Key:
+        """The holder as the application with the uid `asking` should see it: its own key is its own claim."""
+        namespace, name = self.key
+        if asking is None:
+            return self.key
+        if self.over:
+            return namespace, f"{name} (on the way home)"
+        return self.key if self.uid == asking else (namespace, f"{name} (uid {self.uid[:8]})")
+
+
+@dataclass(frozen=True, slots=True)
+class OwnedPlan:
+    """A plan and the uid of the Application it is for."""
+
+    uid: str
+    spec: DeploymentPlanSpec
+
+
+def claims(plans: Mapping[Key, OwnedPlan], grants: Iterable[Grant]) -> dict[str, Claim]:
+    """Claims by node name.
+
+    Who has the oldest grant on a node has it, whatever plans say; without any grant, plans do.
+
+    Args:
+        plans: Plans of applications whose mission is not over.
+        grants: All grants.
+    """
+    found: dict[str, Claim] = {}
+    for key, plan in sorted(plans.items(), key=lambda item: item[0]):
+        if plan.spec.drone is not None and plan.spec.drone.shared_with is None:
+            found.setdefault(plan.spec.drone.node, Claim(key, plan.uid))
+    oldest: dict[str, tuple[datetime, Key, str]] = {}
+    for grant in grants:
+        owner, node = grant.spec.application, grant.spec.node
+        rank = (grant.metadata.creation_timestamp or _LATEST, (owner.namespace, owner.name), owner.uid)
+        oldest[node] = min(rank, oldest.get(node, rank))
+    return found | {node: Claim(key, uid) for node, (_, key, uid) in oldest.items()}

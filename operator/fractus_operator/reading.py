@@ -1,0 +1,125 @@
+"""Reads objects so that one which cannot be read is known as such, and never stops the others."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from fractus_core.api import Application, Condition, InvalidObject, Metadata, Resource
+from pydantic import ValidationError
+
+from fractus_operator.kinds import Body
+
+logger = logging.getLogger(__name__)
+
+R = TypeVar("R", bound=Resource)
+
+SETTLED = frozenset({"Completed", "Failed"})
+"""Phases of an application whose mission is over."""
+
+
+@dataclass(frozen=True)
+class Submitted:
+    """An Application as it was submitted: parsed, or with the reason why it cannot be."""
+
+    body: Body
+    application: Application | None
+    error: InvalidObject | None
+
+    @property
+    def metadata(self) -> Metadata:
+        """Its metadata."""
+        return Metadata.model_validate(self.body["metadata"])
+
+    @property
+    def uid(self) -> str:
+        """metadata.uid."""
+        return str(self.body["metadata"].get("uid", ""))
+
+    @property
+    def settled_generation(self) -> int | None:
+        """The generation whose mission is over; None while a mission goes on, or before the first."""
+        status = self.body.get("status") or {}
+        return int(status.get("observedGeneration") or 0) if status.get("phase") in SETTLED else None
+
+
+@dataclass(frozen=True)
+class Broken:
+    """An object that the API server took and that cannot be read."""
+
+    body: Body
+    problem: str
+
+    @property
+    def metadata(self) -> Metadata:
+        """Its metadata."""
+        return Metadata.model_validate(self.body["metadata"])
+
+    @property
+    def name(self) -> str:
+        """metadata.name."""
+        return str(self.body["metadata"]["name"])
+
+    @property
+    def spec(self) -> Any:
+        """As the API server has it."""
+        return self.body.get("spec")
+
+    @property
+    def conditions(self) -> tuple[Condition, ...]:
+        """Its conditions, as far as they can be read."""
+        try:
+            return tuple(Condition.model_validate(c) for c in (self.body.get("status") or {}).get("conditions") or ())
+        except ValidationError:
+            return ()
+
+
+def read(model: type[R], body: Body) -> R:
+    """Parse an object.
+
+    Raises:
+        InvalidObject: it cannot be parsed, for whatever reason.
+    """
+    try:
+        return model.from_body(body)
+    except InvalidObject:
+        raise
+    except Exception as error:
+        raise InvalidObject("", f"the object cannot be read: {type(error).__name__}: {error}") from error
+
+
+def read_submitted(body: Body) -> Submitted:
+    """Parse an Application, keeping what cannot be parsed with the reason."""
+    body["metadata"].pop("managedFields", None)
+    try:
+        return Submitted(body, read(Application, body), None)
+    except InvalidObject as error:
+        return Submitted(body, None, error)
+
+
+def reader(model: type[R]) -> Callable[[Body], R | None]:
+    """A parser for objects that can be left out where they cannot be read."""
+
+    def parse(body: Body) -> R | None:
+        try:
+            return read(model, body)
+        except InvalidObject as error:
+            logger.warning("%s %s is left out: %s", model.KIND, body["metadata"]["name"], error)
+            return None
+
+    return parse
+
+
+def keeping_broken(model: type[R]) -> Callable[[Body], R | Broken]:
+    """A parser for objects that count also where they cannot be read."""
+
+    def parse(body: Body) -> R | Broken:
+        try:
+            return read(model, body)
+        except InvalidObject as error:
+            body["metadata"].pop("managedFields", None)
+            return Broken(body, str(error))
+
+    return parse

@@ -33,6 +33,7 @@ class Shot:
         lat: where the camera was; None when that was unknown.
         lon: as lat.
         altitude_m: above home.
+        position_error_m: bound of the error of lat and lon.
     """
 
     name: str
@@ -43,10 +44,11 @@ class Shot:
     lat: float | None
     lon: float | None
     altitude_m: float
+    position_error_m: float = 10.0
 
 
 class Album:
-    """The pictures of all instances on this node.
+    """The pictures of all instances on this node; an owner is one instance of one application.
 
     Args:
         directory: where they are kept.
@@ -59,16 +61,16 @@ class Album:
         self._keep = keep
         self._keep_bytes = keep_bytes
 
-    def _folder(self, identity: str) -> Path:
-        return self._directory / hashlib.sha256(identity.encode()).hexdigest()[:32]
+    def _folder(self, owner: str) -> Path:
+        return self._directory / hashlib.sha256(owner.encode()).hexdigest()[:32]
 
-    def list(self, identity: str) -> tuple[Shot, ...]:
+    def list(self, owner: str) -> tuple[Shot, ...]:
         """The pictures of an instance, oldest first."""
-        return tuple(Shot(**json.loads(path.read_bytes())) for path in sorted(self._folder(identity).glob("*.json")))
+        return tuple(Shot(**json.loads(path.read_bytes())) for path in sorted(self._folder(owner).glob("*.json")))
 
-    def room(self, identity: str) -> str:
+    def room(self, owner: str) -> str:
         """Why an instance may not add a picture; empty when it may."""
-        shots = self.list(identity)
+        shots = self.list(owner)
         used = sum(shot.size_bytes for shot in shots)
         if len(shots) >= self._keep:
             return f"{len(shots)} pictures are kept, as many as allowed; delete some"
@@ -76,17 +78,17 @@ class Album:
             return f"{used / 1e6:.0f} MB of pictures are kept, as much as allowed; delete some"
         return ""
 
-    def add(self, identity: str, shot: Shot, data: bytes) -> None:
+    def add(self, owner: str, shot: Shot, data: bytes) -> None:
         """Keep a picture.
 
         Raises:
             AlbumFull: the quota is used up.
             OSError: the disk is full.
         """
-        problem = self.room(identity)
+        problem = self.room(owner)
         if problem:
             raise AlbumFull(problem)
-        folder = self._folder(identity)
+        folder = self._folder(owner)
         folder.mkdir(parents=True, exist_ok=True)
         picture = folder / shot.name
         try:
@@ -96,34 +98,34 @@ class Album:
             picture.unlink(missing_ok=True)
             raise
 
-    def find(self, identity: str, name: str) -> Shot:
+    def find(self, owner: str, name: str) -> Shot:
         """What is known of a picture.
 
         Raises:
             NoSuchImage: there is none of that name.
         """
-        path = self._folder(identity) / name
+        path = self._folder(owner) / name
         if not _NAME.match(name) or not path.with_suffix(".json").is_file():
             raise NoSuchImage(f"there is no picture {name[:64]!r} of this component; ListImages tells which there are")
         return Shot(**json.loads(path.with_suffix(".json").read_bytes()))
 
-    def read(self, identity: str, name: str) -> bytes:
+    def read(self, owner: str, name: str) -> bytes:
         """A picture's bytes.
 
         Raises:
             NoSuchImage: there is none of that name.
         """
-        self.find(identity, name)
-        return (self._folder(identity) / name).read_bytes()
+        self.find(owner, name)
+        return (self._folder(owner) / name).read_bytes()
 
-    def delete(self, identity: str, name: str) -> None:
+    def delete(self, owner: str, name: str) -> None:
         """Remove a picture.
 
         Raises:
             NoSuchImage: there is none of that name.
         """
-        self.find(identity, name)
-        path = self._folder(identity) / name
+        self.find(owner, name)
+        path = self._folder(owner) / name
         path.unlink(missing_ok=True)
         path.with_suffix(".json").unlink()
 

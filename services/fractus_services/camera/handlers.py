@@ -26,7 +26,8 @@ class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
         """See camera.proto."""
         async with self._reception.call(context) as caller:
             held = self._reception.held(caller)
-            verdict, shot = await self._service.capture(held, CaptureArgs(request.width, request.height))
+            args = CaptureArgs(request.width, request.height)
+            verdict, shot = await self._service.capture(held, args, lambda: self._reception.held(caller))
             return camera_pb2.CaptureImageResponse(decision=decision(verdict), image=_info(shot))
 
     async def RetrieveImage(self, request: Any, context: Any) -> None:  # noqa: N802

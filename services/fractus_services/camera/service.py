@@ -24,6 +24,13 @@ from fractus_services.replies import Refused, refused
 log = logging.getLogger(__name__)
 
 MAX_PX = 8192
+MAX_WAITING = 8
+"""So many pictures may be under way or wait for the shutter."""
+
+
+def owner_of(held: Held) -> str:
+    """Whose pictures they are: an instance of this very application, not of a later one of the same name."""
+    return f"{held.spec.application.uid}/{held.identity}"
 
 
 class Whereabouts(Protocol):
@@ -64,54 +71,94 @@ class CameraService:
         self._resolution = resolution
         self._numbers = itertools.count()
         self._shutter = asyncio.Lock()
+        self._exposing: set[asyncio.Task[tuple[Verdict, Shot]]] = set()
 
-    async def capture(self, held: Held, args: CaptureArgs) -> tuple[Verdict, Shot]:
-        """Take a picture and keep it."""
-        now = self._whereabouts.situation(self._clock())
-        verdict = self._allow(Call("CaptureImage", args), held, now)
+    async def capture(
+        self, held: Held, args: CaptureArgs, present: Callable[[], Held] | None = None
+    ) -> tuple[Verdict, Shot]:
+        """Take a picture and keep it.
+
+        It is judged when the shutter is free, and again when the picture is taken: the drone moves meanwhile, and grants
+        change.
+
+        Args:
+            held: the caller's grant.
+            args: pixels; 0 means the camera's own.
+            present: the caller's grant at a later moment; raises when there is none any more.
+        """
         width, height = args.width or self._resolution[0], args.height or self._resolution[1]
         if width > MAX_PX or height > MAX_PX or width < 16 or height < 16:
             reason = f"{width}x{height} pixels is not between 16x16 and {MAX_PX}x{MAX_PX}"
             raise refused(Verdict("deny", None, "InvalidArgument", reason))
-        lines = (
-            held.spec.node,
-            f"{now.lat:.7f} {now.lon:.7f} {now.altitude_m:.1f} m" if now.lat is not None else "no fix",
-        )
+        if len(self._exposing) >= MAX_WAITING:
+            reason = f"{MAX_WAITING} pictures are waiting to be taken; try again"
+            raise Refused(grpc.StatusCode.RESOURCE_EXHAUSTED, Verdict("deny", None, "ShutterBusy", reason))
+        work = self._in_turn(replace(args, width=width, height=height), present or (lambda: held))
+        task = asyncio.get_running_loop().create_task(work)
+        self._exposing.add(task)
+        task.add_done_callback(self._exposed)
+        # A caller that hangs up does not free the shutter before the picture is done.
+        return await asyncio.shield(task)
+
+    def _exposed(self, task: asyncio.Task[tuple[Verdict, Shot]]) -> None:
+        self._exposing.discard(task)
+        if not task.cancelled() and task.exception() is not None:
+            log.debug("no picture: %s", task.exception())
+
+    async def _in_turn(self, args: CaptureArgs, present: Callable[[], Held]) -> tuple[Verdict, Shot]:
         async with self._shutter:
-            data = await asyncio.to_thread(render, width, height, lines, now.time_s)
+            held, call = present(), Call("CaptureImage", args)
+            now = self._whereabouts.situation(self._clock())
+            verdict = self._allow(call, held, now)
+            problem = await asyncio.to_thread(self._album.room, owner_of(held))
+            if problem:
+                raise AlbumFull(problem)
+            lines = (
+                held.spec.node,
+                f"{now.lat:.7f} {now.lon:.7f} {now.altitude_m:.1f} m" if now.lat is not None else "no fix",
+            )
+            data = await asyncio.to_thread(render, args.width, args.height, lines, now.time_s)
+            after = self._whereabouts.situation(self._clock())
+            held = present()
+            self._allow(call, held, after, always=False)
             moment = datetime.fromtimestamp(now.time_s, UTC).strftime("%Y%m%d%H%M%S%f")[:17]
             name = f"{moment}-{next(self._numbers) % 10000:04d}.jpg"
-            shot = Shot(name, now.time_s, width, height, len(data), now.lat, now.lon, now.altitude_m)
-            await asyncio.to_thread(self._album.add, held.identity, shot, data)
+            shot = Shot(
+                name, float(now.time_s), args.width, args.height, len(data), now.lat, now.lon, now.altitude_m,
+                now.position_error_m,
+            )  # fmt: skip
+            await asyncio.to_thread(self._album.add, owner_of(held), shot, data)
         return verdict, shot
 
     async def retrieve(self, held: Held, name: str) -> tuple[Verdict, Shot, bytes]:
         """A picture; policies hold for where it was taken and for where the camera is now."""
         now = self._whereabouts.situation(self._clock())
         verdict = self._allow(Call("RetrieveImage"), held, now)
-        shot = await asyncio.to_thread(self._album.find, held.identity, name)
-        then = replace(now, lat=shot.lat, lon=shot.lon, altitude_m=shot.altitude_m)
+        shot = await asyncio.to_thread(self._album.find, owner_of(held), name)
+        then = replace(
+            now, lat=shot.lat, lon=shot.lon, altitude_m=shot.altitude_m, position_error_m=shot.position_error_m
+        )
         self._check(Call("RetrieveImage"), held, judge_privacy(then, held.compiled), then)
-        return verdict, shot, await asyncio.to_thread(self._album.read, held.identity, name)
+        return verdict, shot, await asyncio.to_thread(self._album.read, owner_of(held), name)
 
     async def list(self, held: Held) -> tuple[Verdict, tuple[Shot, ...]]:
         """The pictures of the caller."""
         verdict = self._allow(Call("ListImages"), held, self._whereabouts.situation(self._clock()))
-        return verdict, await asyncio.to_thread(self._album.list, held.identity)
+        return verdict, await asyncio.to_thread(self._album.list, owner_of(held))
 
     async def delete(self, held: Held, name: str) -> Verdict:
         """Remove a picture of the caller."""
         verdict = self._allow(Call("DeleteImage"), held, self._whereabouts.situation(self._clock()))
-        await asyncio.to_thread(self._album.delete, held.identity, name)
+        await asyncio.to_thread(self._album.delete, owner_of(held), name)
         return verdict
 
-    def _allow(self, call: Call, held: Held, now: Situation) -> Verdict:
+    def _allow(self, call: Call, held: Held, now: Situation, always: bool = True) -> Verdict:
         try:
             verdict = judge(call, now, held.compiled)
         except Exception:
             log.exception("the policy engine failed on %s; refused", call.method)
             verdict = Verdict("deny", None, "InternalError", f"the policy engine failed on {call.method}")
-        return self._check(call, held, verdict, now, always=True)
+        return self._check(call, held, verdict, now, always)
 
     def _check(self, call: Call, held: Held, verdict: Verdict, now: Situation, always: bool = False) -> Verdict:
         """Refuse what is denied, and what needs a filter that we do not have."""

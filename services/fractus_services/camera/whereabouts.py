@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -20,6 +21,8 @@ log = logging.getLogger(__name__)
 INTERVAL_S = 0.1
 STALE_S = 1.0
 RETRY_S = 1.0
+UNTOLD_ERROR_M = 10.0
+"""Position error of a mobility service that tells none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +69,10 @@ class Airborne:
 
     def situation(self, time_s: float) -> Situation:
         """The state as the engine judges it; unknown when the mobility service is silent."""
-        message = self._latest
-        if message is None or self._now() - self._heard_at > STALE_S or not message.HasField("position"):
+        message, age_s = self._latest, self._now() - self._heard_at
+        if message is None or age_s > STALE_S or not message.HasField("position"):
             return Situation(time_s=time_s)
+        speed_mps = math.hypot(message.velocity.north_mps, message.velocity.east_mps)
         home = None
         if message.HasField("home"):
             home = Home(message.home.latitude_deg, message.home.longitude_deg, message.home.altitude_m)
@@ -83,6 +87,7 @@ class Airborne:
             home=home,
             armed=message.armed,
             in_air=message.in_air,
+            position_error_m=(message.position_error_m or UNTOLD_ERROR_M) + speed_mps * max(age_s, 0.0),
         )
 
     async def run(self) -> None:
@@ -95,8 +100,8 @@ class Airborne:
                     async for message in stub.SubscribeTelemetry(
                         mobility_pb2.SubscribeTelemetryRequest(interval_s=INTERVAL_S)
                     ):
-                        if message.autopilot_connected:
-                            self._latest, self._heard_at = message, self._now()
+                        self._latest = message if message.autopilot_connected else None
+                        self._heard_at = self._now()
             except grpc.aio.AioRpcError as error:
                 log.warning("no telemetry from %s: %s", self._address, error.details())
             except OSError as error:

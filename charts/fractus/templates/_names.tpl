@@ -63,3 +63,8 @@ capabilities: {drop: [ALL]}
 seccompProfile: {type: RuntimeDefault}
 {{- end }}
 {{- end }}
+
+{{/* CEL: whether a pod may run on drones and edge nodes; takes the name of the variable that holds the pod. */}}
+{{- define "fractus.tolerates" -}}
+{{ . }}.spec.?tolerations.orValue([]).exists(t, t.?key.orValue("") in ["", "fractus.dev/class"])
+{{- end }}

@@ -1,0 +1,256 @@
+"""What a user who may edit a namespace, and no more, gets of a drone: pods on it, but nothing of the node itself."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator
+
+import pytest
+import yaml
+from conftest import DRONE
+from kube import Kube, Object
+
+NAMESPACE = "isolation"
+ALICE = "alice"
+IMAGE = "localhost/fractus/example-traffic-monitoring:dev"
+
+
+@pytest.fixture(scope="module")
+def alices(kube: Kube) -> Iterator[Kube]:
+    """The cluster with a namespace that Alice may edit."""
+    binding = {
+        "apiVersion": "rbac.authorization.k8s.io/v1",
+        "kind": "RoleBinding",
+        "metadata": {"name": ALICE, "namespace": NAMESPACE},
+        "roleRef": {"apiGroup": "rbac.authorization.k8s.io", "kind": "ClusterRole", "name": "edit"},
+        "subjects": [{"apiGroup": "rbac.authorization.k8s.io", "kind": "User", "name": ALICE}],
+    }
+    kube.apply({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NAMESPACE}}, binding)
+    kube.wait("the namespace has its account", lambda: kube.get("serviceaccount", "default", NAMESPACE))
+    yield kube
+    kube.run("delete", "namespace", NAMESPACE, "--wait=true", "--timeout=90s", timeout_s=120)
+
+
+def pod(name: str) -> Object:
+    """A pod that may run on drones."""
+    container = {
+        "name": "main",
+        "image": IMAGE,
+        "imagePullPolicy": "IfNotPresent",
+        "command": ["python3", "-c", "import signal; signal.pause()"],
+        "resources": {"requests": {"cpu": "1m", "memory": "8Mi"}},
+        "securityContext": {"allowPrivilegeEscalation": False, "capabilities": {"drop": ["ALL"]}},
+    }
+    return {
+        "apiVersion": "v1",
+        "kind": "Pod",
+        "metadata": {"name": name, "namespace": NAMESPACE},
+        "spec": {
+            "terminationGracePeriodSeconds": 0,
+            "securityContext": {"runAsNonRoot": True, "runAsUser": 10001, "seccompProfile": {"type": "RuntimeDefault"}},
+            "nodeSelector": {"fractus.dev/class": "drone"},
+            "tolerations": [{"key": "fractus.dev/class", "operator": "Exists"}],
+            "containers": [container],
+        },
+    }
+
+
+def grasping(name: str) -> Object:
+    """A pod that uses the network of its node."""
+    made = pod(name)
+    made["spec"]["hostNetwork"] = True
+    return made
+
+
+def create(kube: Kube, obj: Object) -> str:
+    """Create an object as Alice and return the refusal, empty when it was accepted."""
+    done = kube.run("create", "-f", "-", "--as", ALICE, stdin=yaml.safe_dump(obj))
+    return done.stderr if done.returncode else ""
+
+
+def host_network(spec: Object, _main: Object) -> None:
+    spec["hostNetwork"] = True
+
+
+def host_network_by_wildcard(spec: Object, _main: Object) -> None:
+    spec["hostNetwork"] = True
+    spec["tolerations"] = [{"operator": "Exists"}]
+
+
+def host_network_by_value(spec: Object, _main: Object) -> None:
+    spec["hostNetwork"] = True
+    spec["tolerations"] = [{"key": "fractus.dev/class", "value": "drone", "effect": "NoExecute"}]
+
+
+def host_processes(spec: Object, _main: Object) -> None:
+    spec["hostPID"] = True
+
+
+def host_ipc(spec: Object, _main: Object) -> None:
+    spec["hostIPC"] = True
+
+
+def host_path(spec: Object, _main: Object) -> None:
+    spec["volumes"] = [{"name": "state", "hostPath": {"path": "/var/lib/fractus"}}]
+
+
+def node_name(spec: Object, _main: Object) -> None:
+    spec["nodeName"] = DRONE
+
+
+def privileged(_spec: Object, main: Object) -> None:
+    main["securityContext"] = {"privileged": True, "capabilities": {"drop": ["ALL"]}}
+
+
+def privileged_at_first(spec: Object, main: Object) -> None:
+    first = {**copy.deepcopy(main), "name": "first"}
+    privileged(spec, first)
+    spec["initContainers"] = [first]
+
+
+def escalation(_spec: Object, main: Object) -> None:
+    del main["securityContext"]["allowPrivilegeEscalation"]
+
+
+def capability(_spec: Object, main: Object) -> None:
+    main["securityContext"]["capabilities"]["add"] = ["NET_RAW"]
+
+
+def default_capabilities(_spec: Object, main: Object) -> None:
+    del main["securityContext"]["capabilities"]
+
+
+def host_port(_spec: Object, main: Object) -> None:
+    main["ports"] = [{"containerPort": 5760, "hostPort": 5761}]
+
+
+def probe_of_the_autopilot(_spec: Object, main: Object) -> None:
+    main["livenessProbe"] = {"tcpSocket": {"host": "127.0.0.1", "port": 5760}}
+
+
+def hook_to_the_autopilot(_spec: Object, main: Object) -> None:
+    main["lifecycle"] = {"postStart": {"httpGet": {"host": "127.0.0.1", "port": 5760}}}
+
+
+def root(_spec: Object, main: Object) -> None:
+    main["securityContext"]["runAsUser"] = 0
+
+
+def unconfined(_spec: Object, main: Object) -> None:
+    main["securityContext"]["seccompProfile"] = {"type": "Unconfined"}
+
+
+def displacing(spec: Object, _main: Object) -> None:
+    spec["priorityClassName"] = "system-node-critical"
+
+
+GRASPS: dict[Callable[[Object, Object], None], str] = {
+    host_network: "remove hostNetwork",
+    host_network_by_wildcard: "remove hostNetwork",
+    host_network_by_value: "remove hostNetwork",
+    host_processes: "remove hostNetwork",
+    host_ipc: "remove hostNetwork",
+    host_path: "use volumes of the types",
+    node_name: "instead of nodeName",
+    privileged: "allowPrivilegeEscalation to false",
+    privileged_at_first: "allowPrivilegeEscalation to false",
+    escalation: "allowPrivilegeEscalation to false",
+    capability: "remove add",
+    default_capabilities: "capabilities.drop to [ALL]",
+    host_port: "remove hostPort",
+    probe_of_the_autopilot: "remove host from httpGet",
+    hook_to_the_autopilot: "remove host from httpGet",
+    root: "do not run as root",
+    unconfined: "RuntimeDefault",
+    displacing: "PriorityClass below",
+}
+
+
+@pytest.mark.parametrize("grasp", GRASPS, ids=lambda grasp: grasp.__name__)
+def test_pods_for_drones_get_nothing_of_the_node(alices: Kube, grasp: Callable[[Object, Object], None]) -> None:
+    wanted = pod("grasp")
+    grasp(wanted["spec"], wanted["spec"]["containers"][0])
+    refusal = create(alices, wanted)
+    assert "fractus-pods" in refusal
+    assert GRASPS[grasp] in refusal
+
+
+def test_pods_that_take_nothing_run_there(alices: Kube) -> None:
+    assert create(alices, pod("modest")) == ""
+    running = alices.wait("the pod runs", lambda: phase(alices, "modest") == "Running" and get(alices, "modest"))
+    assert running["spec"]["nodeName"] == DRONE
+    # What was let in can still be labelled and deleted.
+    alices.must("label", "pod", "modest", "-n", NAMESPACE, "--as", ALICE, "seen=yes")
+    alices.must("delete", "pod", "modest", "-n", NAMESPACE, "--as", ALICE, "--timeout=30s")
+
+
+def test_debugging_such_a_pod_gives_no_more(alices: Kube) -> None:
+    assert create(alices, pod("debugged")) == ""
+    alices.wait("the pod runs", lambda: phase(alices, "debugged") == "Running")
+    debug = {"name": "debug", "image": IMAGE, "securityContext": {"privileged": True}}
+    patch = yaml.safe_dump({"spec": {"ephemeralContainers": [debug]}})
+    # By the administrator: edit does not reach so far by itself.
+    done = alices.run(
+        "patch", "pod", "debugged", "-n", NAMESPACE, "--subresource=ephemeralcontainers", "--patch", patch
+    )
+    assert "allowPrivilegeEscalation to false" in done.stderr
+
+
+def test_a_deployment_makes_no_such_pods(alices: Kube) -> None:
+    template = grasping("unused")["spec"]
+    deployment = {
+        "apiVersion": "apps/v1",
+        "kind": "Deployment",
+        "metadata": {"name": "grasps", "namespace": NAMESPACE},
+        "spec": {
+            "selector": {"matchLabels": {"app": "grasps"}},
+            "template": {"metadata": {"labels": {"app": "grasps"}}, "spec": {**template, "nodeName": DRONE}},
+        },
+    }
+    assert create(alices, deployment) == ""
+
+    def failure() -> str:
+        conditions = (alices.get("deployment", "grasps", NAMESPACE) or {}).get("status", {}).get("conditions", [])
+        return next((c["message"] for c in conditions if c["type"] == "ReplicaFailure"), "")
+
+    assert "fractus-pods" in alices.wait("the deployment says that it cannot", failure)
+    assert not alices.all("pods", NAMESPACE, "app=grasps")
+
+
+def test_a_waiting_pod_is_not_let_in_afterwards(alices: Kube) -> None:
+    waiting = grasping("waiting")
+    waiting["spec"]["schedulingGates"] = [{"name": "example.com/later"}]
+    tolerations = waiting["spec"].pop("tolerations")
+    assert create(alices, waiting) == ""
+    patch = yaml.safe_dump({"spec": {"tolerations": tolerations}})
+    done = alices.run("patch", "pod", "waiting", "-n", NAMESPACE, "--as", ALICE, "--type=merge", "--patch", patch)
+    assert "remove hostNetwork" in done.stderr
+
+
+def test_naming_the_drone_does_not_get_a_pod_there(alices: Kube) -> None:
+    named = grasping("named")
+    del named["spec"]["tolerations"]
+    named["spec"]["nodeName"] = DRONE
+    assert create(alices, named) == ""
+    seen: list[Object] = []
+
+    def over() -> bool:
+        now = get(alices, "named")
+        seen.extend([now] if now else [])
+        return now is None or now["status"]["phase"] == "Failed"
+
+    alices.wait("the pod is turned away", over, timeout_s=60)
+    statuses = [s for found in seen for s in found["status"].get("containerStatuses", [])]
+    assert not [s for s in statuses if s.get("started") or "running" in s["state"] or "terminated" in s["state"]]
+    events = [e for e in alices.all("events", NAMESPACE) if e["involvedObject"]["name"] == "named"]
+    assert not {"Pulled", "Created", "Started"} & {e["reason"] for e in events}
+
+
+def get(kube: Kube, name: str) -> Object | None:
+    """One of Alice's pods."""
+    return kube.get("pod", name, NAMESPACE)
+
+
+def phase(kube: Kube, name: str) -> str:
+    """How far one of Alice's pods is."""
+    return str(((get(kube, name) or {}).get("status") or {}).get("phase"))

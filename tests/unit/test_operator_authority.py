@@ -7,9 +7,11 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.x509.oid import ExtendedKeyUsageOID
+from cryptography.x509.oid import ExtendedKeyUsageOID, ExtensionOID
 from fractus_operator.authority import COMPONENT_LIFE, Authority, BrokenAuthority
+from fractus_operator.signing import NODE_NAME_CLAIM, judge
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
 IDENTITY = "spiffe://fractus.dev/ns/a/app/b/component/C/instance/b-c"
@@ -69,3 +71,18 @@ def test_the_authority_signs_no_authorities() -> None:
     issued = certificate(AUTHORITY.issue_component(IDENTITY, NOW))
     assert not issued.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
     assert not issued.extensions.get_extension_for_class(x509.KeyUsage).value.key_cert_sign
+
+
+@pytest.mark.parametrize("names", ["3002a300", "3000ff", "30048202ffff"])
+def test_a_request_whose_names_cannot_be_read_is_malformed(names: str) -> None:
+    odd = x509.UnrecognizedExtension(ExtensionOID.SUBJECT_ALTERNATIVE_NAME, bytes.fromhex(names))
+    builder = x509.CertificateSigningRequestBuilder().subject_name(x509.Name([])).add_extension(odd, critical=False)
+    request = builder.sign(ec.generate_private_key(ec.SECP256R1()), hashes.SHA256())
+    spec = {
+        "username": "agent",
+        "extra": {NODE_NAME_CLAIM: ["drone-1"]},
+        "usages": ["server auth", "client auth"],
+        "request": base64.b64encode(request.public_bytes(serialization.Encoding.PEM)).decode(),
+    }
+    judgement = judge({"spec": spec}, "agent")
+    assert (judgement.reason, judgement.node) == ("Malformed", None)

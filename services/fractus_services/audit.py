@@ -9,8 +9,9 @@ import json
 import logging
 import math
 import os
-import queue
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -24,6 +25,13 @@ log = logging.getLogger(__name__)
 GENESIS = "0" * 64
 SYNC_S = 0.5
 """Entries that do not decide anything are on disk after this time at the latest."""
+
+
+MOST_WAITING = 10_000
+"""So many entries wait for a disk that does not take them."""
+
+HUNG_S = 2.0
+"""A write that takes longer counts as failed until it comes back."""
 
 
 def digest(entry: dict[str, Any]) -> str:
@@ -47,8 +55,20 @@ def _plain(value: Any) -> Any:
     return value
 
 
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    """An entry that is not on disk yet; it gets its place in the chain when it is written."""
+
+    time: str
+    kind: str
+    content: dict[str, Any]
+
+
 class AuditLog:
     """Appends entries; a thread writes them, so that a slow disk never holds up a flight.
+
+    While the disk is full or does not answer, entries wait; those beyond `MOST_WAITING` are lost, and one entry in their
+    place tells how many.
 
     Args:
         path: the file; a chain that it holds is continued, a last line torn by a crash is cut off and noted.
@@ -58,8 +78,14 @@ class AuditLog:
     def __init__(self, path: Path, clock: Callable[[], float]) -> None:
         self._path = path
         self._clock = clock
-        self._queue: queue.SimpleQueue[tuple[bytes, bool] | None] = queue.SimpleQueue()
-        self.failure = ""
+        self._waiting: deque[_Waiting] = deque()
+        self._lost = 0
+        self._news = threading.Condition()
+        self._urgent = False
+        self._closing = False
+        self._problem = ""
+        self._busy_since_s: float | None = None
+        self._sound_bytes: int | None = None
         path.parent.mkdir(parents=True, exist_ok=True)
         torn = _cut_torn_line(path)
         self._sequence, self._previous = _last_link(path)
@@ -67,6 +93,14 @@ class AuditLog:
         self._thread.start()
         if torn:
             self.append("recovered", {"torn_bytes": torn})
+
+    @property
+    def failure(self) -> str:
+        """Why entries do not reach the disk; empty while they do."""
+        since_s = self._busy_since_s
+        if since_s is not None and time.monotonic() - since_s > HUNG_S:
+            return f"the audit log cannot be written: the disk has not answered for {time.monotonic() - since_s:.0f} s"
+        return self._problem
 
     def append(self, kind: str, content: dict[str, Any], now: bool = True) -> None:
         """Add an entry.
@@ -76,60 +110,92 @@ class AuditLog:
             content: JSON values.
             now: whether it must reach the disk at once.
         """
-        self._sequence += 1
         moment = datetime.fromtimestamp(self._clock(), UTC).isoformat(timespec="milliseconds")
-        entry = {"seq": self._sequence, "time": moment, "kind": kind, **_plain(content), "prev": self._previous}
-        self._previous = entry["hash"] = digest(entry)
-        self._queue.put((_canonical(entry) + b"\n", now))
+        entry = _Waiting(moment, kind, _plain(content))
+        _canonical(entry.content)  # what is no JSON is the caller's error, not the thread's
+        with self._news:
+            if len(self._waiting) >= MOST_WAITING:
+                self._lost += 1
+                return
+            self._waiting.append(entry)
+            self._urgent = self._urgent or now
+            self._news.notify()
 
     async def close(self) -> None:
         """Write what is left."""
-        self._queue.put(None)
+        with self._news:
+            self._closing = True
+            self._news.notify()
         await asyncio.to_thread(self._thread.join, 5.0)
 
     def _write(self) -> None:
         """The thread: append in batches, one fsync for each."""
-        pending: list[bytes] = []
         while True:
-            try:
-                item = self._queue.get(timeout=SYNC_S if pending else None)
-            except queue.Empty:
-                item = (b"", True)
-            if item is not None and item[0]:
-                pending.append(item[0])
-            if item is None or item[1]:
-                while not self._queue.empty() and item is not None:
-                    item = self._queue.get()
-                    if item is not None:
-                        pending.append(item[0])
-                pending = self._flush(pending)
-                if item is None:
+            with self._news:
+                while not self._waiting and not self._closing:
+                    self._news.wait()
+                self._news.wait_for(lambda: self._closing or (self._urgent and not self._problem), SYNC_S)
+                batch, self._urgent, closing = tuple(self._waiting), False, self._closing
+            written = not batch or self._flush(batch)
+            if written and batch:
+                self._forget(len(batch))
+            with self._news:
+                if closing and (not written or not self._waiting):
                     return
 
-    def _flush(self, lines: list[bytes]) -> list[bytes]:
-        """Append and sync; returns what could not be written, to be tried again."""
-        if not lines:
-            return lines
+    def _forget(self, written: int) -> None:
+        """Take what is on disk off the queue, and note what was lost while it was full."""
+        with self._news:
+            for _ in range(written):
+                self._waiting.popleft()
+            if self._lost:
+                moment = datetime.fromtimestamp(self._clock(), UTC).isoformat(timespec="milliseconds")
+                self._waiting.append(_Waiting(moment, "lost", {"entries": self._lost}))
+                self._lost, self._urgent = 0, True
+
+    def _flush(self, batch: Iterable[_Waiting]) -> bool:
+        """Append and sync; what could not be written is tried again."""
+        lines, sequence, previous = [], self._sequence, self._previous
+        for waiting in batch:
+            sequence += 1
+            entry = {"seq": sequence, "time": waiting.time, "kind": waiting.kind, **waiting.content, "prev": previous}
+            previous = entry["hash"] = digest(entry)
+            lines.append(_canonical(entry) + b"\n")
+        self._busy_since_s = time.monotonic()
         try:
-            file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o640)
-            try:
-                size = os.fstat(file).st_size
-                try:
-                    with os.fdopen(os.dup(file), "ab") as stream:
-                        stream.write(b"".join(lines))
-                except OSError:
-                    os.ftruncate(file, size)
-                    raise
-                os.fsync(file)
-            finally:
-                os.close(file)
+            self._store(b"".join(lines))
         except OSError as error:
-            if not self.failure:
+            if not self._problem:
                 log.critical("cannot write the audit log %s: %s", self._path, error)
-            self.failure = f"the audit log cannot be written: {error.strerror or error}"
-            return lines[-10_000:]
-        self.failure = ""
-        return []
+            self._problem = f"the audit log cannot be written: {error.strerror or error}"
+            return False
+        finally:
+            self._busy_since_s = None
+        self._problem = ""
+        self._sequence, self._previous = sequence, previous
+        return True
+
+    def _store(self, data: bytes) -> None:
+        """Have bytes at the end of the file and on disk, or leave the file as it was.
+
+        What a failed attempt left and could not be cut off then is cut off before the next.
+        """
+        file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o640)
+        try:
+            if self._sound_bytes is not None and os.fstat(file).st_size > self._sound_bytes:
+                os.ftruncate(file, self._sound_bytes)
+            self._sound_bytes = size = os.fstat(file).st_size
+            try:
+                left = memoryview(data)
+                while left:
+                    left = left[os.write(file, left) :]
+                os.fsync(file)
+            except OSError:
+                os.ftruncate(file, size)
+                raise
+            self._sound_bytes = None
+        finally:
+            os.close(file)
 
 
 def _cut_torn_line(path: Path) -> int:

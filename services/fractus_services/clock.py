@@ -1,20 +1,46 @@
-"""Wall-clock time that never runs backwards while the service lives."""
+"""Wall-clock time that a clock which is set back does not take back."""
 
 from __future__ import annotations
 
+import logging
 import time
+
+from fractus_core.policy.values import Moment
+
+log = logging.getLogger(__name__)
+
+TRUST_S = 120.0
+"""A clock that was set back and goes on so long is right: what it showed before was a glitch."""
+
+SLEW_S = 1.0
+"""What a clock is set back by in the course of its upkeep."""
 
 
 class Clock:
     """Unix time in seconds.
 
-    A clock that is set back must not bring expired certificates and policies back to life.
+    A clock that is set back must not bring expired certificates and policies back to life, and one that jumped ahead for
+    a moment must not end them for ever. Until it is clear which of the two happened, the time is a `Moment`: what it is
+    as a number is the later reading, so that certificates are expired at either, and the policy engine counts both
+    against the caller.
     """
 
     def __init__(self) -> None:
         self._offset_s = time.time() - time.monotonic()
+        self._behind_since_s: float | None = None
 
     def __call__(self) -> float:
         """Now."""
-        self._offset_s = max(self._offset_s, time.time() - time.monotonic())
-        return time.monotonic() + self._offset_s
+        steady_s = time.monotonic()
+        offset_s = time.time() - steady_s
+        back_s = self._offset_s - offset_s
+        if back_s <= SLEW_S:
+            self._behind_since_s = None
+        elif self._behind_since_s is None:
+            self._behind_since_s = steady_s
+        if self._behind_since_s is not None and steady_s - self._behind_since_s < TRUST_S:
+            return Moment(steady_s + self._offset_s, steady_s + offset_s)
+        if back_s > SLEW_S:
+            log.warning("the clock was set back by %.0f s and stayed there; it is taken for right", back_s)
+        self._offset_s, self._behind_since_s = offset_s, None
+        return steady_s + offset_s

@@ -101,6 +101,9 @@ class GrantFiles:
                     stat = path.stat()
                 except FileNotFoundError:
                     continue
+                except OSError as error:
+                    log.critical("cannot look at %s, so nothing is granted by it: %s", path, error)
+                    continue
                 found[path] = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
         except OSError as error:
             log.critical("cannot read the grants in %s: %s; nothing is granted", self._directory, error)
@@ -124,6 +127,9 @@ class GrantFiles:
         except (OSError, ValueError, InvalidObject) as error:
             log.critical("%s is no grant, so nothing is granted by it: %s", path, error)
             return None
+        except Exception:
+            log.exception("%s cannot be made sense of, so nothing is granted by it", path)
+            return None
         return Held(grant.metadata.uid or grant.spec.identity, grant.name, grant.spec, compiled)
 
     def _replace(self) -> None:
@@ -142,5 +148,11 @@ class GrantFiles:
                 log.info(
                     "grant of %s %s", identity, "added" if old is None else "removed" if new is None else "changed"
                 )
-                for listener in self._listeners:
-                    listener(old, new)
+                self._tell(old, new)
+
+    def _tell(self, old: Held | None, new: Held | None) -> None:
+        for listener in self._listeners:
+            try:
+                listener(old, new)
+            except Exception:
+                log.exception("a listener failed on a change of grants; the others are told")

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
+import os
+import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -79,18 +83,105 @@ async def test_a_full_disk_is_told_and_nothing_is_lost_when_there_is_room_again(
     log = AuditLog(path, lambda: 0.0)
     folder.rmdir()  # any write fails now
     log.append("call", {"n": 0})
-    for _ in range(1000):
-        if log.failure:
-            break
-        import asyncio
-
-        await asyncio.sleep(0.005)
+    await until(lambda: log.failure)
     assert "cannot be written" in log.failure
     folder.mkdir()
     log.append("call", {"n": 1})
     await log.close()
     assert verify(read(path)).entries == 2
     assert not log.failure
+
+
+async def until(condition: Callable[[], object]) -> None:
+    for _ in range(1000):
+        if condition():
+            return
+        await asyncio.sleep(0.005)
+    raise AssertionError("it never happened")
+
+
+async def test_a_sync_that_fails_leaves_nothing_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real, failing = os.fsync, [True]
+
+    def fsync(file: int) -> None:
+        if failing:
+            failing.pop()
+            raise OSError(5, "Input/output error")
+        real(file)
+
+    monkeypatch.setattr("fractus_services.audit.os.fsync", fsync)
+    log = AuditLog(tmp_path / "audit.jsonl", lambda: 0.0)
+    log.append("call", {"n": 0})
+    await until(lambda: log.failure)
+    log.append("call", {"n": 1})
+    await until(lambda: not log.failure)
+    await log.close()
+    finding = verify(read(tmp_path / "audit.jsonl"))
+    assert (finding.entries, finding.problem) == (2, "")
+
+
+async def test_what_a_failed_write_left_is_cut_off_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = {"fsync": os.fsync, "ftruncate": os.ftruncate}
+    failing = [True]
+
+    def fails(which: str) -> Callable[..., None]:
+        def call(*args: int) -> None:
+            if failing:
+                raise OSError(5, "Input/output error")
+            real[which](*args)
+
+        return call
+
+    for which in real:
+        monkeypatch.setattr(f"fractus_services.audit.os.{which}", fails(which))
+    log = AuditLog(tmp_path / "audit.jsonl", lambda: 0.0)
+    log.append("call", {"n": 0})
+    await until(lambda: log.failure)
+    failing.clear()
+    await until(lambda: not log.failure)
+    await log.close()
+    finding = verify(read(tmp_path / "audit.jsonl"))
+    assert (finding.entries, finding.problem) == (1, "")
+
+
+async def test_a_disk_that_hangs_is_a_failure_and_the_queue_has_an_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fractus_services.audit.MOST_WAITING", 10)
+    monkeypatch.setattr("fractus_services.audit.HUNG_S", 0.02)
+    real, answers, asked = os.fsync, threading.Event(), threading.Event()
+
+    def fsync(file: int) -> None:
+        asked.set()
+        answers.wait(10)
+        real(file)
+
+    monkeypatch.setattr("fractus_services.audit.os.fsync", fsync)
+    log = AuditLog(tmp_path / "audit.jsonl", lambda: 0.0)
+    log.append("call", {"n": 0})
+    await until(asked.is_set)
+    await until(lambda: "has not answered" in log.failure)
+    for n in range(1, 25):
+        log.append("call", {"n": n})
+    answers.set()
+    await until(lambda: not log.failure)
+    await until(lambda: len(read(tmp_path / "audit.jsonl")) == 11)
+    log.append("call", {"n": 25})
+    await log.close()
+    lines = read(tmp_path / "audit.jsonl")
+    assert not verify(lines).problem
+    entries = [json.loads(line) for line in lines]
+    assert [e["n"] for e in entries if e["kind"] == "call"] == [*range(10), 25]
+    assert [(e["seq"], e["entries"]) for e in entries if e["kind"] == "lost"] == [(11, 15)]
+
+
+async def test_what_is_no_json_is_the_callers_error(tmp_path: Path) -> None:
+    log = AuditLog(tmp_path / "audit.jsonl", lambda: 0.0)
+    with pytest.raises(TypeError):
+        log.append("call", {"n": object()})
+    log.append("call", {"n": 1})
+    await log.close()
+    assert verify(read(tmp_path / "audit.jsonl")).entries == 1
 
 
 async def test_the_command(tmp_path: Path) -> None:

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fractus_core.policy.values import Moment, earliest
 from fractus_services.answering import Allowance
 from fractus_services.auth import Caller, NotAuthenticated, caller_of
-from fractus_services.clock import Clock
+from fractus_services.clock import TRUST_S, Clock
 from fractus_services.grants import GrantFiles, Held
 from policy_world import spec
 
@@ -99,6 +100,64 @@ def test_time_never_runs_backwards(monkeypatch: pytest.MonkeyPatch) -> None:
     assert clock() == 1010.0, "set back: it goes on by its own count"
     wall[0] = 5000.0
     assert clock() == 5000.0, "set forward: it follows"
+
+
+def test_a_jump_ahead_that_is_corrected_does_not_last_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    wall, steady = [1000.0], [50.0]
+    monkeypatch.setattr("fractus_services.clock.time.time", lambda: wall[0])
+    monkeypatch.setattr("fractus_services.clock.time.monotonic", lambda: steady[0])
+    clock = Clock()
+    wall[0] = 900_000.0
+    assert clock() == 900_000.0
+    wall[0], steady[0] = 1001.0, 51.0
+    doubtful = clock()
+    assert (doubtful, earliest(doubtful)) == (900_001.0, 1001.0), "both readings count"
+    wall[0], steady[0] = 1000.0 + TRUST_S, 50.0 + TRUST_S
+    assert isinstance(clock(), Moment)
+    wall[0], steady[0] = 1002.0 + TRUST_S, 52.0 + TRUST_S
+    assert (clock(), type(clock())) == (1002.0 + TRUST_S, float)
+    wall[0] -= 0.5
+    assert type(clock()) is float, "a clock is set right all the time"
+
+
+NESTED = b"[" * 100_000
+
+
+@pytest.mark.parametrize("odd", [NESTED, b'{"a":' * 5000 + b"1" + b"}" * 5000, b"1" * 5000, b"\0" * 50, b"\xff\xfe{"])
+def test_an_odd_file_does_not_stop_the_others(tmp_path: Path, odd: bytes) -> None:
+    (tmp_path / "a.json").write_bytes(odd)
+    (tmp_path / "b.json").write_text(body(uid="sound"))
+    (tmp_path / "loop.json").symlink_to("loop.json")
+    files = GrantFiles(tmp_path, "drone-1")
+    files.scan()
+    assert [held.key for held in files.held.values()] == ["sound"]
+
+
+def test_whatever_a_file_breaks_it_grants_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_args: object, **_more: object) -> None:
+        raise ZeroDivisionError
+
+    (tmp_path / "a.json").write_text(body())
+    files = GrantFiles(tmp_path, "drone-1")
+    files.scan()
+    assert files.held
+    monkeypatch.setattr("fractus_services.grants.compile_grant", broken)
+    (tmp_path / "a.json").write_text(body(uid="changed"))
+    files.scan()
+    assert not files.held, "the grant that was there before is gone, too"
+
+
+def test_a_listener_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
+    def broken(_old: Held | None, _new: Held | None) -> None:
+        raise ZeroDivisionError
+
+    told: list[str] = []
+    files = GrantFiles(tmp_path, "drone-1")
+    files.listen(broken)
+    files.listen(lambda _old, new: told.append(new.key if new else ""))
+    (tmp_path / "a.json").write_text(body())
+    files.scan()
+    assert told == ["u1"]
 
 
 def test_a_flood_runs_dry_and_fills_again() -> None:

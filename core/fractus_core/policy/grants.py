@@ -177,9 +177,11 @@ def _policies(
             continue
         try:
             found = _granted(policy, inventory, bounds)
-        except InvalidObject:
+        except (ValueError, ArithmeticError, shapely.errors.ShapelyError) as error:
             if last is None:
-                raise
+                if isinstance(error, InvalidObject):
+                    raise
+                raise InvalidObject(f"Policy {name}", str(error)) from error
             found = kept.get(name)
         if found is not None:
             granted[name] = found

@@ -134,6 +134,10 @@ class Deployments:
             same = status.get("observedGeneration") == submitted.metadata.generation
             begun = self._live.plan_of(key, submitted.uid) is not None
             left_over = not begun and await self._clear(key)
+            if not same and not begun:
+                # An old plan neither claims its drone for the next mission nor excuses it from any check.
+                left_over |= await self._children.remove(key, kinds.DEPLOYMENT_PLAN)
+                self._live.forget(key)
             if same or left_over:
                 # The last mission's grants must be gone before a new one begins.
                 return None, RESYNC_S if same else 1.0

@@ -219,8 +219,8 @@ class LiveInventory:
 
     def forget(self, key: Key) -> None:
         """Drop the plan of an application that is over; its drone is free once it is home."""
-        self._decided.pop(key, None)
-        self.wake_all()
+        if self._decided.pop(key, None) is not None:
+            self.wake_all()
 
     def wake_all(self) -> None:
         """Wake every application: something they all depend on changed."""

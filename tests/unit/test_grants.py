@@ -96,6 +96,12 @@ def test_a_node_without_a_description_keeps_what_held_for_it():
     (old,) = compiled(heavy)
     fresh = refresh(old, inventory([], policies={"heavy": heavy, "low": policy("low", **ALTITUDE)}))
     assert [p.name for p in fresh.policies] == ["heavy", "low"]
+    stock, app = inventory([drone("d")]), application(navigator(PATH))
+    decided = plan(app, stock)
+    gone = inventory([], policies={"heavy": heavy, "low": policy("low", **ALTITUDE)})
+    assert compile_grants(app, decided, gone, None, [old]) == (fresh,)
+    with pytest.raises(InvalidObject, match="node d"):
+        compile_grants(app, decided, gone)
 
 
 def test_zone_beyond_reach_is_left_out_but_not_for_inclusion():

@@ -59,11 +59,16 @@ def compile_grants(
         component = application.spec.component(placed.component)
         if not component.services or placed.node is None:
             continue
+        last = before.get((placed.instance, placed.node))
+        if placed.node not in inventory.drones and placed.node not in inventory.edge_nodes:
+            if last is None:
+                raise InvalidObject(f"node {placed.node}", "it has no Drone or EdgeNode; nothing can be granted there")
+            grants.append(refresh(last, inventory))
+            continue
         if placed.placement == "drone" and area is not None:
             grant = _drone_grant(application, component, placed, inventory, area)
         else:
             grant = _edge_grant(application, component, placed, inventory)
-        last = before.get((grant.instance, grant.node))
         if last is None:
             check_policies(inventory)
         policies = _policies(grant, inventory, last.policies if last is not None else None)

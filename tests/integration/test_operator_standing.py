@@ -1,0 +1,192 @@
+"""What stands goes on: policies reach running grants through any trouble, and drones stay with who has them."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+from control_plane import wait_for
+from operator_world import FRACTUS, OperatorProcess, World, at, ours, traffic
+from test_operator import end_mission, gone, running
+
+Body = dict[str, Any]
+LOW = {"type": "LimitControl", "kind": "altitude", "upperLimit": 15}
+UNREADABLE = LOW | {"validFrom": "0000-01-01T00:00:00Z"}
+"""The API server knows a year 0."""
+
+
+def granted(world: World, namespace: str, instance: str = "traffic-navigator") -> list[str]:
+    """Names of the policies in a grant."""
+    grant = world.api.get(f"{FRACTUS}/grants/{namespace}.{instance}") or {"spec": {}}
+    return [policy["name"] for policy in grant["spec"].get("policies", [])]
+
+
+def reason(world: World, namespace: str, wanted: str, name: str = "traffic") -> Body:
+    """The Ready condition, once it has this reason."""
+
+    def reached() -> Body | None:
+        condition = world.condition(namespace, "Ready", name)
+        return condition if condition.get("reason") == wanted else None
+
+    return wait_for(reached, lambda: f"{wanted}, but it is {world.status(namespace, name)}")
+
+
+def policy_ready(world: World, name: str) -> Body:
+    status = (world.api.get(f"{FRACTUS}/policies/{name}") or {}).get("status") or {}
+    return next((c for c in status.get("conditions") or () if c["type"] == "Ready"), {})
+
+
+def _infeasible(world: World, namespace: str) -> None:
+    manifest = traffic(namespace)
+    manifest["spec"]["components"][2]["locations"][0]["center"] = at(50_000, 0)
+    world.put(manifest)
+
+
+def _invalid(world: World, namespace: str) -> None:
+    manifest = traffic(namespace)
+    manifest["spec"]["components"][0]["controlPoints"][0]["point"] = {"depot": "bse"}
+    world.put(manifest)
+
+
+def _foreign_secret(world: World, namespace: str) -> None:
+    path = f"/api/v1/namespaces/{namespace}/secrets/traffic-navigator-tls"
+    world.api.merge(path, {"metadata": {"ownerReferences": None, "annotations": None}, "data": {"tls.crt": ""}})
+
+
+@pytest.mark.parametrize("trouble", [_infeasible, _invalid, _foreign_secret])
+def test_no_trouble_keeps_a_policy_from_a_grant(
+    world: World, operator: OperatorProcess, namespace: str, trouble: Any
+) -> None:
+    running(world, namespace)
+    trouble(world, namespace)
+    wait_for(
+        lambda: world.condition(namespace, "Ready").get("reason") not in (None, "PodsReady", "PodsNotReady"),
+        lambda: f"the trouble to show: {world.status(namespace)}",
+    )
+    world.put(ours("Policy", "low", LOW))
+    wait_for(lambda: granted(world, namespace) == ["low"], lambda: f"the policy: {operator.log()[-3000:]}")
+    world.api.delete(f"{FRACTUS}/policies/low")
+    wait_for(lambda: granted(world, namespace) == [], "the policy to go")
+
+
+def test_a_broken_policy_stays_as_granted_and_blocks_no_other(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    school = ours("Zone", "school", {"area": {"circle": {"center": at(30, 30), "radius": 5}}})
+    world.put(school)
+    fence = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["school"]}}
+    world.put(ours("Policy", "fence", fence))
+    world.put(ours("Policy", "odd", LOW))
+    running(world, namespace)
+    assert granted(world, namespace) == ["fence", "odd"]
+    world.api.delete(f"{FRACTUS}/zones/school")
+    world.put(ours("Policy", "odd", UNREADABLE))
+    condition = wait_for(
+        lambda: policy_ready(world, "odd").get("status") == "False" and policy_ready(world, "odd"), "it"
+    )
+    assert (condition["reason"], "validFrom" in condition["message"]) == ("Invalid", True)
+    world.put(ours("Policy", "slow", {"type": "LimitControl", "kind": "speed", "upperLimit": 3}))
+    wait_for(lambda: granted(world, namespace) == ["fence", "odd", "slow"], "the third policy beside the broken ones")
+    assert world.status(namespace)["phase"] == "Running"
+    # What is new is granted nothing while nobody knows for whom that policy holds.
+    world.add_drone("drone-2")
+    world.put(traffic(namespace, "second"))
+    assert "Policy odd" in reason(world, namespace, "PolicyInvalid", "second")["message"]
+    assert not world.grants(namespace, "second")
+    world.put(school)
+    world.put(ours("Policy", "odd", LOW))
+    world.phase(namespace, "Deploying", "second")
+
+
+# -- who has the drone --
+
+
+def test_a_drone_on_its_way_home_is_nobodys(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    world.drone_status("drone-1", "flying")
+    end_mission(world, namespace, "Complete", "done")
+    world.phase(namespace, "Completed")
+    again = traffic(namespace)
+    again["spec"]["components"][4]["replicas"] = 2
+    world.put(again)
+    world.phase(namespace, "Queued")
+    world.drone_status("drone-1", "inactive", ready="False")
+    # It has no claim any more: what a drone must be for a new mission is asked again.
+    reason(world, namespace, "NoDrone")
+    world.drone_status("drone-1", "inactive")
+    world.phase(namespace, "Deploying")
+
+
+def test_made_anew_it_waits_for_the_old_ones_drone(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    world.drone_status("drone-1", "flying")
+    world.api.delete(world.path(traffic(namespace)))
+    wait_for(lambda: gone(world, namespace), "the application to go")
+    world.put(traffic(namespace))
+    world.phase(namespace, "Queued")
+    assert not world.grants(namespace)
+    world.drone_status("drone-1", "inactive")
+    world.phase(namespace, "Deploying")
+
+
+def test_of_two_plans_with_one_drone_the_one_with_the_older_grant_stands(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    running(world, namespace)
+    world.add_drone("drone-2")
+    world.put(traffic(namespace, "second"))
+    assert world.phase(namespace, "Deploying", "second")["drone"] == "drone-2"
+    world.api.delete(f"{FRACTUS}/drones/drone-2")
+    path = f"{FRACTUS}/namespaces/{namespace}/deploymentplans/second"
+    operator.stop()
+    spec = copy.deepcopy((world.api.get(path) or {})["spec"])
+    spec["drone"]["node"] = "drone-1"
+    for placed in spec["placements"]:
+        placed["node"] = "drone-1" if placed.get("node") == "drone-2" else placed.get("node")
+    world.api.merge(path, {"spec": spec})
+    operator.start()
+    world.phase(namespace, "Queued", "second")
+    wait_for(lambda: not world.grants(namespace, "second"), "its grants to go")
+    assert {g["spec"]["node"] for g in world.grants(namespace)} >= {"drone-1"}
+
+
+# -- in the air --
+
+
+def reconciled(world: World, namespace: str) -> None:
+    """Wait for the end of a whole reconcile: what was changed by hand is mended by its last step."""
+    path = f"/apis/apps/v1/namespaces/{namespace}/deployments/traffic-data-store"
+    world.api.merge(path, {"spec": {"replicas": 3}})
+    wait_for(lambda: (world.api.get(path) or {})["spec"]["replicas"] == 1, "the number of replicas")
+
+
+def test_trouble_with_its_node_moves_nothing_that_flies(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    running(world, namespace)
+    world.add_drone("drone-2")
+    world.drone_status("drone-1", "flying")
+    uids = {g["metadata"]["name"]: g["metadata"]["uid"] for g in world.grants(namespace)}
+    world.api.delete(f"{FRACTUS}/drones/drone-1")
+    world.api.delete("/api/v1/nodes/drone-1")
+    reconciled(world, namespace)
+    world.put(ours("Policy", "low", LOW))
+    wait_for(lambda: granted(world, namespace) == ["low"], "the policy")
+    assert {g["metadata"]["name"]: g["metadata"]["uid"] for g in world.grants(namespace)} == uids
+    assert world.status(namespace)["drone"] == "drone-1"
+
+
+def test_a_pod_with_our_labels_does_not_move_a_plan(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    labels = {"fractus.dev/application": "traffic", "fractus.dev/instance": "traffic-ground-viewer-edge-2",
+              "app.kubernetes.io/managed-by": "fractus"}  # fmt: skip
+    pod = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "forged", "namespace": namespace, "labels": labels},
+           "spec": {"containers": [{"name": "a", "image": "a"}], "schedulerName": "none"}}  # fmt: skip
+    world.api.apply(f"/api/v1/namespaces/{namespace}/pods/forged", pod)
+    refused = {"type": "PodScheduled", "status": "False", "reason": "Unschedulable", "message": "no",
+               "lastTransitionTime": "2026-01-01T00:00:00Z"}  # fmt: skip
+    world.api.merge(f"/api/v1/namespaces/{namespace}/pods/forged/status", {"status": {"conditions": [refused]}})
+    reconciled(world, namespace)
+    assert "deployments/traffic-ground-viewer-edge-2" in world.children(namespace)
+    assert "deployments/traffic-ground-viewer-edge-1" not in world.children(namespace)

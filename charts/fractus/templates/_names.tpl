@@ -68,3 +68,21 @@ seccompProfile: {type: RuntimeDefault}
 {{- define "fractus.tolerates" -}}
 {{ . }}.spec.?tolerations.orValue([]).exists(t, t.?key.orValue("") in ["", "fractus.dev/class"])
 {{- end }}
+
+{{/* Where the operator's image runs: on nodes that are neither drones nor at the edge. */}}
+{{- define "fractus.cloudPod" -}}
+affinity:
+  nodeAffinity:
+    requiredDuringSchedulingIgnoredDuringExecution:
+      nodeSelectorTerms:
+        - matchExpressions:
+            - key: fractus.dev/class
+              operator: NotIn
+              values: [drone, edge]
+{{- with .Values.operator.nodeSelector }}
+nodeSelector: {{- toYaml . | nindent 2 }}
+{{- end }}
+{{- with .Values.operator.tolerations }}
+tolerations: {{- toYaml . | nindent 2 }}
+{{- end }}
+{{- end }}

@@ -1,0 +1,41 @@
+"""When Fractus may be uninstalled: no Application to take down, no drone in the air."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from fractus_operator.uninstall_check import objection
+
+
+def application(name: str, *finalizers: str) -> dict[str, Any]:
+    return {"metadata": {"name": name, "namespace": "default", "finalizers": list(finalizers)}}
+
+
+def drone(name: str, state: str | None) -> dict[str, Any]:
+    return {"metadata": {"name": name}, "status": {"flightState": state} if state else {}}
+
+
+def test_nothing_objects_when_all_is_on_the_ground() -> None:
+    drones = [drone("a", "inactive"), drone("b", "charging"), drone("c", None), {"metadata": {"name": "d"}}]
+    assert objection([], drones) == ""
+    assert objection([application("new"), application("other", "example.com/else")], drones) == ""
+
+
+def test_applications_to_take_down_are_named() -> None:
+    said = objection([application("patrol", "fractus.dev/teardown"), application("new")], [])
+    assert "default/patrol" in said
+    assert "default/new" not in said
+    assert "kubectl delete applications" in said
+
+
+@pytest.mark.parametrize("state", ["flying", "returning", "unknown"])
+def test_drones_in_the_air_are_named(state: str) -> None:
+    said = objection([], [drone("drone-1", state), drone("drone-2", "inactive")])
+    assert f"drone-1 ({state})" in said
+    assert "drone-2" not in said
+
+
+def test_long_lists_are_cut() -> None:
+    said = objection([], [drone(f"d{i}", "flying") for i in range(9)])
+    assert "d4 (flying) and 4 more" in said

@@ -1,0 +1,45 @@
+"""Fractus is not uninstalled while somebody needs it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+
+from conftest import SYSTEM, short_flight
+from kube import Kube
+
+
+def helm(kube: Kube, *args: str) -> subprocess.CompletedProcess[str]:
+    """Run the helm beside kubectl, or else the one on PATH."""
+    beside = kube.kubectl.with_name("helm")
+    return subprocess.run(
+        [str(beside) if beside.exists() else shutil.which("helm") or "helm", *args, "-n", SYSTEM],
+        env={**os.environ, "KUBECONFIG": str(kube.kubeconfig)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def test_uninstalling_is_refused_while_an_application_must_be_taken_down(kube: Kube) -> None:
+    application = short_flight("kept")
+    # It is never placed, so nothing flies; what counts is the finalizer.
+    application["spec"]["components"][0]["controlPoints"][0]["point"] = {"depot": "nowhere"}
+    application["metadata"]["finalizers"] = ["fractus.dev/teardown"]
+    (release,) = json.loads(helm(kube, "list", "--filter", "^fractus$", "--output", "json").stdout)
+    kube.apply(application)
+    try:
+        done = helm(kube, "uninstall", "fractus", "--timeout", "60s")
+        assert done.returncode != 0
+        said = kube.must("logs", "job/fractus-uninstall", "-n", SYSTEM)
+        assert "take down default/kept: delete all Applications first" in said
+        assert kube.get("deployment", "fractus-operator", SYSTEM)
+        assert kube.get("daemonset", "fractus-mobility", SYSTEM)
+    finally:
+        kube.must("delete", "application.fractus.dev", "kept", "--timeout=60s", timeout_s=90)
+        back = helm(kube, "rollback", "fractus", release["revision"])
+    assert back.returncode == 0, back.stderr
+    kube.must("delete", "job", "fractus-uninstall", "-n", SYSTEM, "--ignore-not-found")

@@ -14,6 +14,7 @@ import grpc
 import pytest
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_services.mobility.autopilot import Autopilot
+from fractus_services.mobility.dialect import Codec, message
 from mobility_rig import DRIVER, FRAME, Driver, Rig, denied, fence, flown, grant, xy
 
 LOST = pb.ControlEvent.STATE_LOST
@@ -102,9 +103,14 @@ async def test_a_service_that_stays_dead_leaves_it_to_the_autopilot(rig: Rig) ->
 
 
 async def until_mode(link: str, mode: int) -> None:
-    """Listen to the vehicle without a heartbeat of ours."""
-    watcher = Autopilot(link)
-    watcher._heartbeat = lambda: None  # type: ignore[method-assign]
+    """Listen to the vehicle as a ground station: its heartbeats, of system 255, must not stand for the companion's."""
+    watcher, station = Autopilot(link), Codec(255, 190)
+
+    def heartbeat() -> None:
+        if watcher._transport is not None:
+            watcher._transport.write(station.encode(message("HEARTBEAT", type=6, autopilot=8, mavlink_version=3)))
+
+    watcher._heartbeat = heartbeat  # type: ignore[method-assign]
     task = asyncio.create_task(watcher.run())
     try:
         async with asyncio.timeout(20):

@@ -11,7 +11,7 @@ from typing import Any
 
 from fractus_services.mobility.dialect import Codec, message
 from fractus_services.mobility.transport import BadUrl, Transport, open_link
-from fractus_services.mobility.vehicle import GUIDED, Vehicle
+from fractus_services.mobility.vehicle import Vehicle
 
 log = logging.getLogger(__name__)
 
@@ -27,7 +27,8 @@ ACK_TIMEOUT_S = 0.7
 ATTEMPTS = 4
 
 _ONBOARD_CONTROLLER, _NO_AUTOPILOT, _ACTIVE = 18, 8, 4
-_GLOBAL_RELATIVE = 6
+_GLOBAL, _GLOBAL_RELATIVE = 0, 6
+_SET_HOME = 179
 _SET_MODE, _ARM, _TAKEOFF, _SPEED, _REPOSITION, _YAW, _INTERVAL, _REQUEST = 176, 400, 22, 178, 192, 115, 511, 512
 _ACCEPTED, _TEMPORARILY_REJECTED, _IN_PROGRESS = 0, 1, 5
 _RESULTS = {1: "temporarily rejected", 2: "denied", 3: "unsupported", 4: "failed", 6: "cancelled"}
@@ -36,6 +37,14 @@ _LOCAL_NED = 1
 
 # Message ids and their rates in Hz on the ground and in the air.
 STREAMS = {33: (4.0, 20.0), 245: (2.0, 5.0), 1: (1.0, 1.0), 24: (1.0, 2.0), 242: (0.2, 0.2)}
+
+
+Permit = Callable[[], None]
+"""Asked before each sending of a command; raises when it must not be sent any more."""
+
+
+def always() -> None:
+    """The permit of what may be sent at any time."""
 
 
 class AutopilotError(Exception):
@@ -56,12 +65,14 @@ class Autopilot:
         vehicle: the streamed state.
         on_message: called for every message after the state took it.
         on_found: called when the vehicle is heard first, again after each reconnection.
+        alive: whether the companion does its duty; when not, no heartbeat holds off the autopilot's own failsafe.
     """
 
     def __init__(self, url: str) -> None:
         self.url = url
         self.on_message: Callable[[Any], None] = lambda _m: None
         self.on_found: Callable[[], None] = lambda: None
+        self.alive: Callable[[], bool] = lambda: True
         self.vehicle = Vehicle()
         self._codec = Codec(SYSTEM_ID, COMPONENT_ID)
         self._transport: Transport | None = None
@@ -70,13 +81,18 @@ class Autopilot:
         self._updated = asyncio.Event()
         self._acks: dict[int, asyncio.Queue[Any]] = {}
         self._params: dict[str, asyncio.Queue[float]] = {}
-        self._command_lock = asyncio.Lock()
+        self._locks: dict[int, asyncio.Lock] = {}
         self._flying_rates: bool | None = None
 
     @property
     def now(self) -> float:
         """Monotonic seconds."""
         return asyncio.get_running_loop().time()
+
+    @property
+    def found(self) -> bool:
+        """Whether the vehicle was heard since the link came up."""
+        return self._target is not None
 
     @property
     def connected(self) -> bool:
@@ -126,12 +142,24 @@ class Autopilot:
             self._target = None
             self._flying_rates = None
 
+    def beat(self) -> None:
+        """Send a heartbeat now, if the companion does its duty."""
+        self._heartbeat()
+
     def _heartbeat(self) -> None:
+        if not self.alive():
+            if not self.found:
+                self._knock()
+            return
         self.send(
             message(
                 "HEARTBEAT", type=_ONBOARD_CONTROLLER, autopilot=_NO_AUTOPILOT, system_status=_ACTIVE, mavlink_version=3
             )
         )
+
+    def _knock(self) -> None:
+        """Speak without a heartbeat: an autopilot behind a datagram link answers to whom it has heard."""
+        self.send(message("PARAM_REQUEST_READ", param_index=-1, param_id=b"FS_GCS_ENABLE"))
 
     def send(self, outgoing: Any) -> None:
         """Send a message; without a link it is dropped."""
@@ -182,32 +210,49 @@ class Autopilot:
 
     # Commands
 
-    async def command(self, number: int, *params: float, place: tuple[float, float, float] | None = None) -> None:
+    async def command(
+        self,
+        number: int,
+        *params: float,
+        place: tuple[float, float, float] | None = None,
+        frame: int = _GLOBAL_RELATIVE,
+        permit: Permit = always,
+        attempts: int = ATTEMPTS,
+    ) -> None:
         """Run a MAVLink command and wait for its acknowledgement.
 
         Args:
             number: MAV_CMD.
             params: param1 onwards; the rest is zero.
-            place: latitude, longitude and altitude above home: sends COMMAND_INT.
+            place: latitude, longitude and altitude: sends COMMAND_INT.
+            frame: what the altitude is measured from; home by default.
+            permit: asked before each sending; what it raises ends the command.
+            attempts: how often to send it.
 
         Raises:
             AutopilotError: it was refused, or nobody answered.
         """
-        async with self._command_lock:
-            for attempt in range(ATTEMPTS):
-                ack = await self._attempt(number, attempt, params, place)
+        async with self._locks.setdefault(number, asyncio.Lock()):
+            for attempt in range(attempts):
+                permit()
+                ack = await self._attempt(self._outgoing(number, attempt, params, place, frame), number)
                 if ack is None:
                     continue
                 if ack.result == _ACCEPTED:
                     return
-                if ack.result == _TEMPORARILY_REJECTED and attempt + 1 < ATTEMPTS:
+                if ack.result == _TEMPORARILY_REJECTED and attempt + 1 < attempts:
                     await asyncio.sleep(0.3)
                     continue
                 raise AutopilotError(self._refusal(number, ack.result))
         raise AutopilotError(f"the autopilot did not answer command {number}", link=True)
 
-    async def _attempt(
-        self, number: int, attempt: int, params: tuple[float, ...], place: tuple[float, float, float] | None
+    def _outgoing(
+        self,
+        number: int,
+        attempt: int,
+        params: tuple[float, ...],
+        place: tuple[float, float, float] | None,
+        frame: int,
     ) -> Any:
         target = self._target
         if target is None or not self.connected:
@@ -215,12 +260,13 @@ class Autopilot:
         values = {f"param{i}": float(value) for i, value in enumerate(params, 1)}
         address = {"target_system": target[0], "target_component": target[1]}
         if place is None:
-            outgoing = message("COMMAND_LONG", command=number, confirmation=attempt, **address, **values)
-        else:
-            outgoing = message(
-                "COMMAND_INT", command=number, frame=_GLOBAL_RELATIVE, x=round(place[0] * 1e7),
-                y=round(place[1] * 1e7), z=place[2], **address, **values,
-            )  # fmt: skip
+            return message("COMMAND_LONG", command=number, confirmation=attempt, **address, **values)
+        return message(
+            "COMMAND_INT", command=number, frame=frame, x=round(place[0] * 1e7),
+            y=round(place[1] * 1e7), z=place[2], **address, **values,
+        )  # fmt: skip
+
+    async def _attempt(self, outgoing: Any, number: int) -> Any:
         acks = self._acks[number] = asyncio.Queue()
         try:
             self.send(outgoing)
@@ -239,39 +285,44 @@ class Autopilot:
         said = f": {why[-1]}" if why else ""
         return f"the autopilot {_RESULTS.get(result, 'refused')} command {number}{said}"
 
-    async def set_mode(self, mode: int) -> None:
+    async def set_mode(self, mode: int, permit: Permit = always) -> None:
         """Change the flight mode and wait until the autopilot flies it."""
-        await self.command(_SET_MODE, 1, mode)
+        await self.command(_SET_MODE, 1, mode, permit=permit)
         deadline = self.now + 2.0
         while self.vehicle.mode != mode:
             if self.now > deadline:
                 raise AutopilotError(f"the autopilot accepted mode {mode} and stays in {self.vehicle.mode_name}")
             await self.update(0.3)
 
-    async def arm(self) -> None:
+    async def arm(self, permit: Permit = always) -> None:
         """Start the motors."""
         self.vehicle.texts.clear()
-        await self.command(_ARM, 1)
+        await self.command(_ARM, 1, permit=permit)
 
-    async def disarm(self) -> None:
+    async def disarm(self, permit: Permit = always) -> None:
         """Stop the motors; the autopilot refuses in the air."""
-        await self.command(_ARM, 0)
+        await self.command(_ARM, 0, permit=permit)
 
-    async def take_off(self, altitude_m: float) -> None:
+    async def set_home(self, lat: float, lon: float, amsl_m: float) -> None:
+        """Fix home, so that arming elsewhere does not move it."""
+        await self.command(_SET_HOME, place=(lat, lon, amsl_m), frame=_GLOBAL)
+
+    async def take_off(self, altitude_m: float, permit: Permit = always) -> None:
         """Begin to climb to an altitude above home."""
-        await self.command(_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m)
+        await self.command(_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m, permit=permit)
 
-    async def go_to(self, lat: float, lon: float, altitude_m: float, yaw_deg: float | None) -> None:
+    async def go_to(
+        self, lat: float, lon: float, altitude_m: float, yaw_deg: float | None, permit: Permit = always
+    ) -> None:
         """Begin to fly straight to a point; altitude above home."""
-        await self.command(
-            _REPOSITION, -1, 0, 0, math.nan if yaw_deg is None else yaw_deg, place=(lat, lon, altitude_m)
-        )
+        yaw = math.nan if yaw_deg is None else yaw_deg
+        await self.command(_REPOSITION, -1, 0, 0, yaw, place=(lat, lon, altitude_m), permit=permit)
         if yaw_deg is not None:
-            await self.command(_YAW, yaw_deg % 360.0, 0, 0, 0)
+            await self.command(_YAW, yaw_deg % 360.0, 0, 0, 0, permit=permit)
 
-    async def set_speed(self, speed_mps: float) -> None:
+    async def set_speed(self, speed_mps: float, permit: Permit = always) -> None:
         """Fly legs with this horizontal speed over ground."""
-        await self.command(_SPEED, 1, speed_mps, -1)
+        await self.command(_SPEED, 1, speed_mps, -1, permit=permit)
 
     def stop(self) -> None:
         """Brake and hold: a velocity of zero; GUIDED keeps the position when it times out."""
@@ -284,19 +335,16 @@ class Autopilot:
                 )
             )  # fmt: skip
 
-    async def hold(self) -> None:
-        """Brake and hover where it stops, in GUIDED."""
-        if self.vehicle.mode != GUIDED:
-            await self.set_mode(GUIDED)
-        self.stop()
-
     async def set_rates(self, flying: bool) -> None:
-        """Ask for the streams; more often in the air."""
+        """Ask for the streams, more often in the air; one that is refused comes at the autopilot's own rate."""
         if self._flying_rates is flying:
             return
-        for number, rates in STREAMS.items():
-            await self.command(_INTERVAL, number, 1e6 / rates[flying])
         self._flying_rates = flying
+        for number, rates in STREAMS.items():
+            try:
+                await self.command(_INTERVAL, number, 1e6 / rates[flying], attempts=2)
+            except AutopilotError as error:
+                log.warning("message %d comes at its own rate: %s", number, error)
 
     async def ask_home(self) -> None:
         """Ask for the home position now."""

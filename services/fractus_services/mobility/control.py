@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import aclosing
 from typing import Any, Literal
 
 from fractus_core.geo import LocalFrame
@@ -17,24 +18,22 @@ from fractus_core.policy.values import Takeover, Verdict
 
 from fractus_services.audit import AuditLog
 from fractus_services.grants import GrantFiles, Held
-from fractus_services.mobility.autopilot import Autopilot, AutopilotError
+from fractus_services.mobility.autopilot import Autopilot, AutopilotError, Permit, always
 from fractus_services.mobility.failsafes import Checked
+from fractus_services.mobility.helm import Helm
 from fractus_services.mobility.journal import Journal, Mission
 from fractus_services.mobility.leases import Lease, Motion, News, State
 from fractus_services.mobility.motions import distance_m
-from fractus_services.mobility.vehicle import GUIDED, HOMEWARD, LAND, RTL
 from fractus_services.replies import Refused, aborted, precondition, refused, unavailable
 
 log = logging.getLogger(__name__)
 
 Hands = Literal["driver", "system", "pilot"]
+Transit = Callable[[Held], CompiledGrant]
+"""Makes the grant under which the system flies for a waiting driver."""
+
 WAYPOINT_M = 5.0
 WAIT_S = 0.5
-RETRY_S = 0.5
-RTL_TRIES = 4
-ARMED_S = 3.0
-SETTLE_S = 10.0
-STANDING_MPS = 0.2
 
 
 class Control:
@@ -46,6 +45,9 @@ class Control:
         grants: grants of this node.
         audit: where takeovers are written.
         grace_s: how long a lost driver may take to come back.
+
+    Attributes:
+        decided: whether it is settled who has the vehicle, since its link came up last.
     """
 
     def __init__(
@@ -61,12 +63,12 @@ class Control:
         self.speed_mps: float | None = None
         self.homeward = False
         self.chauffeured: CompiledGrant | None = None
+        self._transit: Transit | None = None
         self._grants = grants
-        self._audit = audit
+        self.audit = audit
         self._grace_s = grace_s
-        self.expected: int | None = None
-        self.changing = 0
-        self.arming = False
+        self.helm = Helm(autopilot, lambda: self.motion is not None)
+        self.decided = False
         self.was_armed: bool | None = None
         self.system: asyncio.Task[None] | None = None
         self._grace: asyncio.Task[None] | None = None
@@ -103,10 +105,12 @@ class Control:
             self.lease.tell(News(State.LOST, reason="another stream of the same instance took over"))
         lease = self.lease = Lease(held)
         try:
-            async for reason in self._until_ready(lease, mission):
-                yield News(State.WAITING, mission.points_done, reason)
-            if self.lease is lease:
-                yield self._hand_over(lease, mission)
+            while self.lease is lease and not lease.granted:
+                async with aclosing(self._until_ready(lease, mission)) as waiting:  # type: ignore[type-var]
+                    async for reason in waiting:
+                        yield News(State.WAITING, mission.points_done, reason)
+                if self.lease is lease and self._not_ready(lease) is None:
+                    yield self._hand_over(lease, mission)
             while True:
                 try:
                     news = await lease.next(timeout_s=5.0)
@@ -128,34 +132,48 @@ class Control:
             raise precondition("MissionComplete", "the mission is complete")
         if mission.outcome:
             raise precondition("ControlLost", f"the mission has ended ({mission.outcome})")
-        flying = self.journal.flying
-        if (self.lease is not None and self.lease.key != held.key) or (
-            flying is not None and flying.key != held.key and self.autopilot.vehicle.armed
-        ):
-            raise precondition("ControlHeld", "another application has the drone; try again when it is back")
+        other = self.lease
+        if other is not None and other.key != held.key and not other.granted and self._flies_for(held.key):
+            self.lose("another application has the drone")
+        if (self.lease is not None and self.lease.key != held.key) or self._taken(held.key):
+            raise _held_by_another()
         return mission
+
+    def _flies_for(self, key: str) -> bool:
+        return self.autopilot.vehicle.armed and self.journal.active == key
+
+    def _taken(self, key: str) -> bool:
+        """Whether the drone flies for another mission."""
+        flying = self.journal.flying
+        return flying is not None and flying.key != key and self.autopilot.vehicle.armed
 
     async def _until_ready(self, lease: Lease, mission: Mission) -> AsyncIterator[str]:
         said = ""
         while self.lease is lease:
-            reason = self._not_ready()
+            reason = self._not_ready(lease)
+            if self._taken(lease.key):
+                raise _held_by_another()
             if reason is None:
                 if self.chauffeur is None or lease.held.spec.control != "partial":
                     return
-                async for news in self.chauffeur(lease, mission):
-                    yield news
+                lease.transit = True
+                async with aclosing(self.chauffeur(lease, mission)) as flying:  # type: ignore[type-var]
+                    async for news in flying:
+                        yield news
                 return
             if reason != said:
                 said = reason
                 yield reason
             await self._wait(WAIT_S)
 
-    def _not_ready(self) -> str | None:
+    def _not_ready(self, lease: Lease) -> str | None:
         """Why the drone cannot be handed to a driver now."""
         vehicle = self.autopilot.vehicle
         why = next((t for t in reversed(vehicle.texts) if t.startswith("PreArm")), "")
         reasons = (
             (not self.autopilot.connected, "the autopilot is not connected"),
+            (not self.decided, "it is not known yet what the drone does"),
+            (self._taken(lease.key), "another application has the drone"),
             (self.checked is None, "the autopilot's failsafes are being set"),
             (self.hands == "pilot", f"a human pilot has the drone ({vehicle.mode_name})"),
             (self.homeward, "the system brings the drone home"),
@@ -192,16 +210,21 @@ class Control:
             return
         self.lease = None
         mission = self.journal.missions.get(lease.key)
-        if mission is None or not (lease.granted or self.autopilot.vehicle.in_air):
+        if mission is None or not (lease.granted or lease.transit):
             return
         self.hands = "system"
         self.note("driver lost", lease.held.identity, "its stream broke")
         log.warning("driver %s is lost", lease.held.identity)
         coming_down = self.motion is not None and self.motion.kind in {"Land", "ReturnToLaunch"}
-        self._stop_motion(precondition("ControlLost", "the driver's stream broke"))
-        if self.autopilot.vehicle.in_air and not coming_down:
+        self.stop_motion(precondition("ControlLost", "the driver's stream broke"))
+        if self.autopilot.vehicle.armed and not coming_down:
             self.start("hover")
         self.begin_grace(mission, "driver lost")
+
+    def valid(self, held: Held) -> bool:
+        """Whether a grant is still in force."""
+        now = self._grants.of(held.identity)
+        return now is not None and now.key == held.key
 
     def require(self, held: Held) -> Lease:
         """The lease of a caller that moves the drone.
@@ -210,11 +233,15 @@ class Control:
             Refused: it does not have the drone.
         """
         lease = self.lease
-        if lease is None or lease.key != held.key or not lease.granted or self.hands != "driver":
+        if lease is None or lease.key != held.key or not self.drives(lease):
             raise precondition("NotInControl", f"the drone is not yours: {self.controller} has it; use GetControl")
         if not self.autopilot.connected:
             raise unavailable("the autopilot is not connected")
         return lease
+
+    def drives(self, lease: Lease) -> bool:
+        """Whether the driver of a lease has the drone."""
+        return lease.granted and self.hands == "driver"
 
     async def give_back(self, held: Held) -> bool:
         """A driver returns control at the end of a control point; True when that was the last one."""
@@ -224,7 +251,7 @@ class Control:
         last = mission.points_done >= len(held.spec.control_points)
         self.lease = None
         self.hands = "system"
-        self._stop_motion(aborted("ControlReturned", "control was returned"))
+        self.stop_motion(aborted("ControlReturned", "control was returned"))
         self.note("returned", held.identity, "the mission is complete" if last else "")
         if last:
             mission.outcome = "complete"
@@ -232,7 +259,7 @@ class Control:
             self.start("returnToLaunch")
         else:
             lease.tell(None)
-            if self.autopilot.vehicle.in_air:
+            if self.autopilot.vehicle.armed:
                 self.start("hover")
             self.begin_grace(mission, "driver did not ask for its next control point")
         await self.journal.save()
@@ -251,23 +278,24 @@ class Control:
 
     # The chauffeur
 
-    def begin_transit(self, mission: Mission, grant: CompiledGrant) -> None:
+    def begin_transit(self, lease: Lease, mission: Mission, transit: Transit) -> None:
         """The system flies for a waiting driver."""
         self.drop(self._grace)
         self.drop(self.system)
-        self.hands, self.chauffeured = "system", grant
+        self._transit = transit
+        self.hands, self.chauffeured = "system", transit(lease.held)
         self.journal.active = mission.key
         self.journal.save_soon()
 
     def end_transit(self) -> None:
         """The drone is at the control point, or the way there failed."""
-        self.chauffeured = None
+        self.chauffeured = self._transit = None
 
     # Motions
 
     def begin(self, kind: str) -> Motion:
         """Start a motion; the one under way is replaced."""
-        self._stop_motion(aborted("Replaced", f"{kind} replaced it"))
+        self.stop_motion(aborted("Replaced", f"{kind} replaced it"))
         self.motion = Motion(kind)
         return self.motion
 
@@ -287,76 +315,38 @@ class Control:
         if self.motion is motion and self.hands == "driver":
             self.motion = None
             motion.stop(aborted("Cancelled", "the call was cancelled"))
-            await self.attempt(self.hold())
+            await self.attempt(self.hold(lambda: self._still("driver")))
 
-    def _stop_motion(self, why: Refused) -> None:
+    def failed(self, motion: Motion) -> None:
+        """A motion ended with an error, and the autopilot may fly on for it: hover."""
+        if self.motion is motion:
+            self.motion = None
+            if self.hands == "driver" and self.autopilot.vehicle.in_air:
+                self.spawn(self.attempt(self.hold(lambda: self._still("driver"))))
+
+    def _still(self, hands: Hands) -> None:
+        if self.motion is not None or self.hands != hands:
+            raise AutopilotError("somebody else flies by now")
+
+    def stop_motion(self, why: Refused) -> None:
+        """End the motion under way."""
         if self.motion is not None:
             self.motion.stop(why)
             self.motion = None
 
-    async def change_mode(self, mode: int) -> None:
-        """Change the flight mode ourselves, so that it is not taken for a pilot's doing."""
-        if self.autopilot.vehicle.mode == mode and self.expected == mode:
-            return
-        before, self.expected = self.expected, mode
-        self.changing += 1
-        try:
-            await self.autopilot.set_mode(mode)
-        except AutopilotError:
-            self.expected = before
-            raise
-        finally:
-            self.changing -= 1
-
-    async def hold(self) -> None:
+    async def hold(self, permit: Permit = always) -> None:
         """Brake and hover."""
-        self.autopilot.stop()
-        await self.change_mode(GUIDED)
-        self.autopilot.stop()
-        self.spawn(self._settle())
-
-    async def arm(self) -> None:
-        """Arm in GUIDED, when the last line holds.
-
-        Raises:
-            Refused: a failsafe is not verified, or the audit log cannot be written.
-            AutopilotError: the autopilot refuses.
-        """
-        if self.checked is None or self.checked.problem:
-            why = self.checked.problem if self.checked else "they are being set"
-            raise precondition("FailsafesNotVerified", f"the autopilot's failsafes are not verified: {why}")
-        if self._audit.failure:
-            raise precondition("AuditUnavailable", self._audit.failure)
-        self.arming = True
-        try:
-            await self.change_mode(GUIDED)
-            await self.autopilot.arm()
-            await self.autopilot.set_rates(flying=True)
-            deadline = self.autopilot.now + ARMED_S
-            while not self.autopilot.vehicle.armed:
-                if self.autopilot.now > deadline:
-                    raise AutopilotError("the autopilot accepted to arm and did not")
-                await self.autopilot.update(WAIT_S)
-        finally:
-            self.arming = False
+        await self.helm.hold(permit)
+        self.spawn(self.helm.settle())
 
     # The system
 
     def brake(self, verdict: Verdict) -> None:
         """Stop the present motion; the driver keeps the drone."""
         self.note("brake", self.controller, verdict.reason, verdict.code, policies=verdict.policies)
-        self._stop_motion(aborted(verdict.code, verdict.reason, verdict.policies))
+        self.stop_motion(aborted(verdict.code, verdict.reason, verdict.policies))
         self.autopilot.stop()
-        self.spawn(self._settle())
-
-    async def _settle(self) -> None:
-        """Keep braking until the drone stands: a single velocity setpoint times out in the autopilot."""
-        deadline = self.autopilot.now + SETTLE_S
-        while self.motion is None and self.autopilot.vehicle.mode == GUIDED and self.autopilot.now < deadline:
-            if self.autopilot.vehicle.speed_mps < STANDING_MPS:
-                return
-            self.autopilot.stop()
-            await asyncio.sleep(WAIT_S)
+        self.spawn(self.helm.settle())
 
     def take_over(self, verdict: Verdict) -> None:
         """The system takes the drone from its driver, as a policy or the monitor says."""
@@ -380,7 +370,7 @@ class Control:
     def lose(self, reason: str) -> None:
         """Take the lease from the driver and tell it why."""
         lease, self.lease = self.lease, None
-        self._stop_motion(precondition("ControlLost", reason))
+        self.stop_motion(precondition("ControlLost", reason))
         self.drop(self._grace)
         if lease is not None:
             lease.tell(News(State.LOST, reason=reason))
@@ -393,26 +383,16 @@ class Control:
         self.system = self.spawn(self.act(action))
 
     async def act(self, action: Takeover) -> None:
-        """Carry out what the system wants, however often the link fails."""
-        tries = 0
-        while self.autopilot.vehicle.armed and self.hands == "system":
-            try:
-                if not self.autopilot.vehicle.in_air and action != "hover":
-                    await self.autopilot.disarm()
-                elif action == "hover":
-                    await self.hold()
-                    return
-                else:
-                    self.autopilot.stop()
-                    await self.change_mode(LAND if action == "land" or tries >= RTL_TRIES else RTL)
-                    while self.autopilot.vehicle.armed and self.autopilot.vehicle.mode in HOMEWARD:
-                        await self.autopilot.update(1.0)
-            except AutopilotError as error:
-                tries += 0 if error.link else 1
-                log.warning("cannot %s yet: %s", action, error)
-            await asyncio.sleep(RETRY_S)
-        self.homeward = False
-        self.wake()
+        """Carry out what the system wants, as long as it has the drone."""
+        await self.helm.carry_out(action, lambda: self.hands == "system")
+        if action != "hover":
+            self.homeward = False
+            self.wake()
+
+    @property
+    def graced(self) -> bool:
+        """Whether a lost driver has time left to come back."""
+        return self._grace is not None and not self._grace.done()
 
     def begin_grace(self, mission: Mission, why: str) -> None:
         """Give a lost driver its time to come back; then the mission has failed."""
@@ -427,9 +407,9 @@ class Control:
         mission.outcome = f"failed: {why}"
         log.warning("mission of %s failed: %s", mission.identity, why)
         self.note("returnToLaunch", "system", why, "DriverLost", kind="takeover")
-        await self.journal.save()
         if self.hands == "system" and not self.homeward:
             self.start("returnToLaunch")
+        self.journal.save_soon()
 
     # News
 
@@ -444,6 +424,8 @@ class Control:
         if old is not None and new is not None and old.key == new.key:
             if self.lease is not None and self.lease.key == new.key:
                 self.lease.held = new
+                if self._transit is not None:
+                    self.chauffeured = self._transit(new)
             return
         if old is None or old.spec.class_ != "driver":
             return
@@ -466,7 +448,7 @@ class Control:
     ) -> None:
         """Write a change of control to the audit log."""
         vehicle = self.autopilot.vehicle
-        self._audit.append(
+        self.audit.append(
             kind,
             {
                 "action": what, "controller": who, "reason": reason, "code": code, "policies": list(policies),
@@ -488,6 +470,13 @@ class Control:
         task.add_done_callback(self._ended)
         return task
 
+    def keep(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Run something that its caller waits for, and that goes on when the caller does not."""
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
     def _ended(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
         if not task.cancelled() and task.exception() is not None:
@@ -497,3 +486,7 @@ class Control:
         """Cancel a task, unless it is the one that asks."""
         if task is not None and task is not asyncio.current_task():
             task.cancel()
+
+
+def _held_by_another() -> Refused:
+    return precondition("ControlHeld", "another application has the drone; try again when it is back")

@@ -40,11 +40,13 @@ class Lease:
     Attributes:
         held: the grant, as it is now.
         granted: whether the driver drives, or still waits.
+        transit: whether the system flies, or flew, for the waiting driver.
     """
 
     def __init__(self, held: Held) -> None:
         self.held = held
         self.granted = False
+        self.transit = False
         self._news: asyncio.Queue[News | None] = asyncio.Queue()
 
     @property

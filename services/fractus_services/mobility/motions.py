@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.values import GotoArgs
 
-from fractus_services.mobility.autopilot import Autopilot
+from fractus_services.mobility.autopilot import Autopilot, Permit
 from fractus_services.mobility.leases import Motion
 from fractus_services.replies import aborted, unavailable
 
@@ -28,10 +28,10 @@ class Step:
     complete: bool
 
 
-async def climb(autopilot: Autopilot, motion: Motion, altitude_m: float) -> AsyncIterator[Step]:
+async def climb(autopilot: Autopilot, motion: Motion, altitude_m: float, permit: Permit) -> AsyncIterator[Step]:
     """Take off to an altitude above home."""
     vehicle = autopilot.vehicle
-    await autopilot.take_off(altitude_m)
+    await autopilot.take_off(altitude_m, permit)
     begun, best = autopilot.now, -math.inf
     while True:
         left = altitude_m - vehicle.altitude_m
@@ -48,11 +48,13 @@ async def climb(autopilot: Autopilot, motion: Motion, altitude_m: float) -> Asyn
         await _tick(autopilot, motion)
 
 
-async def fly_to(autopilot: Autopilot, motion: Motion, args: GotoArgs, reached_m: float) -> AsyncIterator[Step]:
+async def fly_to(
+    autopilot: Autopilot, motion: Motion, args: GotoArgs, reached_m: float, permit: Permit
+) -> AsyncIterator[Step]:
     """Fly straight to a point; altitude above home."""
     altitude = args.alt if args.alt is not None else autopilot.vehicle.altitude_m
     frame = LocalFrame(args.lat, args.lon)
-    await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg)
+    await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg, permit)
     sent, resends, best = autopilot.now, 0, math.inf
     while True:
         vehicle = autopilot.vehicle
@@ -68,7 +70,7 @@ async def fly_to(autopilot: Autopilot, motion: Motion, args: GotoArgs, reached_m
             if resends == RESENDS:
                 raise aborted("NotFollowing", f"the drone stays {math.hypot(away, rise):.1f} m away from the target")
             resends, sent = resends + 1, autopilot.now
-            await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg)
+            await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg, permit)
         await _tick(autopilot, motion)
 
 

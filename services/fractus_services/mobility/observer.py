@@ -6,12 +6,14 @@ import asyncio
 import logging
 
 from fractus_services.mobility.autopilot import AutopilotError
-from fractus_services.mobility.control import RETRY_S, Control
+from fractus_services.mobility.control import Control
 from fractus_services.mobility.failsafes import configure
 from fractus_services.mobility.journal import Mission
 from fractus_services.mobility.vehicle import GUIDED, HOMEWARD, LAND, MODE_NAMES
 
 log = logging.getLogger(__name__)
+
+RETRY_S = 0.5
 
 SAID_S = 3.0
 """A mode change this soon after the autopilot spoke of a failsafe is the failsafe's."""
@@ -30,17 +32,20 @@ class Observer:
     def found(self) -> None:
         """The autopilot is there, for the first time or again."""
         self._control.checked = None
+        self._control.decided = False
+        self._resume()
+        self._control.decided = True
         self._control.spawn(self._prepare())
 
     async def _prepare(self) -> None:
-        while self._control.autopilot.connected:
+        autopilot = self._control.autopilot
+        while autopilot.connected:
             try:
-                await self._control.autopilot.set_rates(flying=self._control.autopilot.vehicle.armed)
-                self._resume()
-                self._control.checked = await configure(self._control.autopilot)
+                await autopilot.set_rates(flying=autopilot.vehicle.armed)
+                self._control.checked = await configure(autopilot)
                 self._control.wake()
-                if self._control.autopilot.vehicle.home is None:
-                    await self._control.autopilot.ask_home()
+                if autopilot.vehicle.home is None:
+                    await autopilot.ask_home()
             except AutopilotError as error:
                 log.warning("cannot prepare the autopilot yet: %s", error)
                 await asyncio.sleep(RETRY_S)
@@ -53,17 +58,22 @@ class Observer:
         mission = self._control.journal.flying
         if self._control.was_armed is None:
             self._control.was_armed = vehicle.armed
-        if self._control.lease is not None and self._control.lease.granted:
+        lease = self._control.lease
+        if lease is not None and (lease.granted or self._control.chauffeured is not None):
             return
-        self._control.expected = vehicle.mode
+        self._control.helm.expected = vehicle.mode
         if vehicle.armed and self._control.hands == "pilot":
             return
         if not vehicle.armed:
             if mission is not None and mission.flown and not mission.outcome:
                 self._control.begin_grace(mission, "driver lost")
             return
-        if mission is None or vehicle.mode not in HOMEWARD | {GUIDED}:
+        if vehicle.mode not in HOMEWARD | {GUIDED} or (mission is None and vehicle.mode != GUIDED):
             self._pilot(f"is flying in {vehicle.mode_name}")
+        elif mission is None:
+            self._control.hands = "system"
+            self._control.note("returnToLaunch", "system", "found the drone armed, and no mission", kind="takeover")
+            self._control.start("returnToLaunch")
         elif vehicle.mode in HOMEWARD:
             self._control.hands, self._control.homeward = "system", True
             if not mission.outcome:
@@ -76,12 +86,16 @@ class Observer:
         else:
             self._control.hands = "system"
             self._control.note("hover", "system", "found the drone in the air", kind="takeover")
-            if mission.outcome or self._control.mission_grant is None:
-                self._revoke_missing(mission)
-                self._control.start("returnToLaunch")
-            else:
-                self._control.start("hover")
-                self._control.begin_grace(mission, "driver lost")
+            self._take_back(mission)
+
+    def _take_back(self, mission: Mission) -> None:
+        """Hover and wait for the driver of a mission that goes on; fly home otherwise."""
+        if mission.outcome or self._control.mission_grant is None:
+            self._revoke_missing(mission)
+            self._control.start("returnToLaunch")
+        else:
+            self._control.start("hover")
+            self._control.begin_grace(mission, "driver lost")
 
     def _revoke_missing(self, mission: Mission) -> None:
         if not mission.outcome:
@@ -98,16 +112,16 @@ class Observer:
             self._armed() if vehicle.armed else self._landed()
         if (
             vehicle.armed
-            and not self._control.changing
-            and self._control.expected is not None
-            and vehicle.mode != self._control.expected
+            and not self._control.helm.changing
+            and self._control.helm.expected is not None
+            and vehicle.mode != self._control.helm.expected
         ):
             self._foreign_mode(vehicle.mode)
-        if not vehicle.armed and not self._control.changing:
-            self._control.expected = vehicle.mode
+        if not vehicle.armed and not self._control.helm.changing:
+            self._control.helm.expected = vehicle.mode
 
     def _armed(self) -> None:
-        if self._control.hands != "driver" and not self._control.arming:
+        if self._control.hands != "driver" and not self._control.helm.arming:
             self._pilot("armed the drone")
         self._control.spawn(self._control.attempt(self._control.autopilot.set_rates(flying=True)))
 
@@ -131,7 +145,7 @@ class Observer:
         """Somebody else changed the mode: the autopilot's own failsafe, or a human pilot."""
         vehicle = self._control.autopilot.vehicle
         name = MODE_NAMES.get(mode, str(mode))
-        self._control.expected = mode
+        self._control.helm.expected = mode
         recent = self._control.autopilot.now - vehicle.failsafe_text_at < SAID_S
         said = vehicle.failsafe_text if recent else ""
         if (vehicle.failsafe or said) and mode in HOMEWARD and self._control.hands != "pilot":
@@ -148,8 +162,7 @@ class Observer:
         elif self._control.hands == "pilot" and mode == GUIDED and self._control.journal.flying is not None:
             self._control.note("hover", "system", "the pilot handed the drone back", kind="takeover")
             self._control.hands = "system"
-            self._control.start("hover")
-            self._control.begin_grace(self._control.journal.flying, "driver lost")
+            self._take_back(self._control.journal.flying)
         else:
             self._pilot(f"changed the mode to {name}")
 

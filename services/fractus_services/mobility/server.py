@@ -24,6 +24,7 @@ from fractus_services.mobility.handlers import MobilityHandlers
 from fractus_services.mobility.journal import Journal
 from fractus_services.mobility.observer import Observer
 from fractus_services.mobility.service import MobilityService
+from fractus_services.mobility.supervisor import Supervisor
 from fractus_services.mobility.watch import Watch
 
 if TYPE_CHECKING:
@@ -63,7 +64,9 @@ async def run(options: Options, stop: asyncio.Event) -> None:
     control = Control(autopilot, journal, grants, audit, options.driver_grace)
     guard = Guard(control, audit, clock)
     control.chauffeur = Chauffeur(control, guard).bring
-    watch = Watch(control, guard, audit)
+    supervisor = Supervisor(control)
+    autopilot.alive = supervisor.alive
+    watch = Watch(control, guard, audit, supervisor)
     observer = Observer(control)
     autopilot.on_found = observer.found
     autopilot.on_message = lambda m: observer.heartbeat() if m.get_type() == "HEARTBEAT" else None

@@ -10,15 +10,19 @@ from dataclasses import dataclass
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, Verdict
 
 from fractus_services.grants import Held
+from fractus_services.mobility.arming import arm
 from fractus_services.mobility.autopilot import Autopilot
 from fractus_services.mobility.control import Control
 from fractus_services.mobility.guard import Guard
 from fractus_services.mobility.leases import Motion
 from fractus_services.mobility.motions import REACHED_M, Step, climb, come_down, fly_to
+from fractus_services.mobility.permits import driver_permit
 from fractus_services.mobility.vehicle import GUIDED, LAND, RTL
 from fractus_services.replies import precondition, refused
 
 MAX_REACHED_M = 50.0
+JUDGE_AGAIN_S = 0.05
+"""A goto whose command waited for longer is judged again, at the place where the drone is by then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,13 +75,13 @@ class MobilityService:
         """Start the motors."""
         verdict = self._allow_motion(Call("Arm"), held)
         if not self._autopilot.vehicle.armed:
-            await self._control.arm()
+            await arm(self._control, held, driver_permit(self._control, held))
         return verdict
 
     async def disarm(self, held: Held) -> Verdict:
         """Stop the motors on the ground."""
         verdict = self._allow_motion(Call("Disarm"), held)
-        await self._autopilot.disarm()
+        await self._autopilot.disarm(driver_permit(self._control, held))
         return verdict
 
     async def hover(self, held: Held) -> Verdict:
@@ -85,7 +89,7 @@ class MobilityService:
         verdict = self._allow_motion(Call("Hover"), held)
         self._flying("Hover")
         self._control.finish(self._control.begin("Hover"))
-        await self._control.hold()
+        await self._control.hold(driver_permit(self._control, held))
         return verdict
 
     async def set_speed(self, held: Held, args: SetSpeedArgs) -> tuple[Verdict, float]:
@@ -93,7 +97,7 @@ class MobilityService:
         verdict = self._allow_motion(Call("SetSpeed", args), held)
         speed = verdict.args.speed_mps if isinstance(verdict.args, SetSpeedArgs) else args.speed_mps
         self._control.speed_mps = speed
-        await self._autopilot.set_speed(speed)
+        await self._autopilot.set_speed(speed, driver_permit(self._control, held))
         return verdict, speed
 
     def take_off(self, held: Held, args: TakeoffArgs) -> AsyncIterator[Progress]:
@@ -101,16 +105,17 @@ class MobilityService:
         verdict = self._allow_motion(Call("Takeoff", args), held)
         if not self._autopilot.vehicle.armed:
             raise precondition("NotArmed", "the motors are off; arm first")
-        if self._autopilot.vehicle.in_air:
+        if self._autopilot.vehicle.in_air and not self._autopilot.vehicle.standing:
             raise precondition("AlreadyFlying", "the drone is in the air; use goto to climb")
         altitude = verdict.args.altitude_m if isinstance(verdict.args, TakeoffArgs) else args.altitude_m
 
-        async def steps(motion: Motion) -> AsyncIterator[Step]:
-            await self._control.change_mode(GUIDED)
-            async for step in climb(self._autopilot, motion, altitude):
-                yield step
+        async def steps(motion: Motion) -> AsyncIterator[Progress]:
+            permit = driver_permit(self._control, held, motion)
+            await self._control.helm.change_mode(GUIDED, permit)
+            async for step in climb(self._autopilot, motion, altitude, permit):
+                yield Progress(verdict, step)
 
-        return self._run("Takeoff", verdict, steps)
+        return self._run("Takeoff", steps)
 
     def goto(self, held: Held, args: GotoArgs, reached_m: float) -> AsyncIterator[Progress]:
         """Fly straight to a point."""
@@ -119,17 +124,24 @@ class MobilityService:
         target = verdict.args if isinstance(verdict.args, GotoArgs) else args
         radius = min(max(reached_m, 0.3), MAX_REACHED_M) if reached_m > 0 else REACHED_M
 
-        async def steps(motion: Motion) -> AsyncIterator[Step]:
-            await self._control.change_mode(GUIDED)
-            speed = target.speed_mps or self._control.speed_mps
+        async def steps(motion: Motion) -> AsyncIterator[Progress]:
+            permit, final, goal = driver_permit(self._control, held, motion), verdict, target
+            begun = self._autopilot.now
+            await self._control.helm.change_mode(GUIDED, permit)
+            speed = goal.speed_mps or self._control.speed_mps
             if speed is not None:
-                await self._autopilot.set_speed(speed)
-            async for step in fly_to(self._autopilot, motion, target, radius):
+                await self._autopilot.set_speed(speed, permit)
+            if self._autopilot.now - begun > JUDGE_AGAIN_S:
+                permit()
+                lease = self._control.require(held)
+                final = self._allow_motion(Call("Goto", args), lease.held)
+                goal = final.args if isinstance(final.args, GotoArgs) else args
+            async for step in fly_to(self._autopilot, motion, goal, radius, permit):
                 if step.complete:
                     self._control.reached(held, args.lat, args.lon)
-                yield step
+                yield Progress(final, step)
 
-        return self._run("Goto", verdict, steps)
+        return self._run("Goto", steps)
 
     def land(self, held: Held) -> AsyncIterator[Progress]:
         """Come down here."""
@@ -143,29 +155,27 @@ class MobilityService:
         verdict = self._allow_motion(Call(method), held)
         self._flying(method)
 
-        async def steps(motion: Motion) -> AsyncIterator[Step]:
-            await self._control.change_mode(mode)
+        async def steps(motion: Motion) -> AsyncIterator[Progress]:
+            await self._control.helm.change_mode(mode, driver_permit(self._control, held, motion))
             async for step in come_down(self._autopilot, motion):
-                yield step
+                yield Progress(verdict, step)
 
-        return self._run(method, verdict, steps)
+        return self._run(method, steps)
 
     def _flying(self, method: str) -> None:
         if not self._autopilot.vehicle.in_air:
             raise precondition("NotFlying", f"{method} needs a drone in the air; take off first")
 
-    async def _run(
-        self, kind: str, verdict: Verdict, steps: Callable[[Motion], AsyncIterator[Step]]
-    ) -> AsyncIterator[Progress]:
+    async def _run(self, kind: str, steps: Callable[[Motion], AsyncIterator[Progress]]) -> AsyncIterator[Progress]:
         motion = self._control.begin(kind)
         try:
             async with aclosing(steps(motion)) as running:  # type: ignore[type-var]
-                async for step in running:
-                    yield Progress(verdict, step)
+                async for progress in running:
+                    yield progress
         except (asyncio.CancelledError, GeneratorExit):
             self._control.cancelled(motion)
             raise
         except Exception:
-            self._control.finish(motion)
+            self._control.failed(motion)
             raise
         self._control.finish(motion)

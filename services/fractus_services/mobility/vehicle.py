@@ -21,6 +21,10 @@ HOMEWARD = frozenset({RTL, LAND, SMART_RTL, 27})
 _ARMED = 0x80
 _CRITICAL, _EMERGENCY = 5, 6
 _PREARM = 0x10000000
+_ON_GROUND = 1
+TOLD_S = 2.0
+SURELY_M, UNTOLD_M = 1.5, 0.5
+"""Above this a drone flies though it says it stands; above the other when it does not say."""
 _IN_AIR = frozenset({2, 3, 4})
 _FIX_3D = 3
 _LEAST_ERROR_M, _UNTOLD_ERROR_M, _WORST_ERROR_M = 0.5, 1.5, 10.0
@@ -49,6 +53,7 @@ class Vehicle:
     failsafe: bool = False
     heartbeat_at: float = -math.inf
     landed_state: int = 0
+    landed_at: float = -math.inf
     battery_remaining: float = math.nan
     battery_v: float = math.nan
     battery_a: float = math.nan
@@ -66,11 +71,25 @@ class Vehicle:
         return MODE_NAMES.get(self.mode, f"MODE{self.mode}" if self.mode >= 0 else "UNKNOWN")
 
     @property
+    def _landed_told(self) -> bool:
+        """Whether the landed state is as fresh as the rest."""
+        return max(self.heartbeat_at, self.position_at) - self.landed_at <= TOLD_S
+
+    @property
+    def standing(self) -> bool:
+        """Whether the autopilot says, now, that it stands on the ground."""
+        return self._landed_told and self.landed_state == _ON_GROUND
+
+    @property
     def in_air(self) -> bool:
-        """Whether it flies; an autopilot that does not tell flies when it is armed and off the ground."""
+        """Whether it flies, as far as anybody can tell: in doubt it does."""
         if not self.armed:
             return False
-        return self.landed_state in _IN_AIR if self.landed_state else self.altitude_m > 0.5
+        if self.landed_state in _IN_AIR:
+            return True
+        if self.standing:
+            return self.altitude_m > SURELY_M
+        return self.position_at == -math.inf or self.altitude_m > UNTOLD_M
 
     @property
     def speed_mps(self) -> float:
@@ -136,8 +155,8 @@ def _home(vehicle: Vehicle, message: Any, _now: float) -> None:
     vehicle.home = Home(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
 
 
-def _landed(vehicle: Vehicle, message: Any, _now: float) -> None:
-    vehicle.landed_state = message.landed_state
+def _landed(vehicle: Vehicle, message: Any, now: float) -> None:
+    vehicle.landed_state, vehicle.landed_at = message.landed_state, now
 
 
 def _status(vehicle: Vehicle, message: Any, _now: float) -> None:

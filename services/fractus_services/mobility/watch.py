@@ -12,9 +12,10 @@ from fractus_services.audit import AuditLog
 from fractus_services.mobility.autopilot import AutopilotError
 from fractus_services.mobility.control import Control
 from fractus_services.mobility.guard import Guard
+from fractus_services.mobility.supervisor import Supervisor
 from fractus_services.mobility.telemetry import recorded
 from fractus_services.mobility.vehicle import GUIDED
-from fractus_services.replies import aborted
+from fractus_services.replies import Refused, aborted
 
 log = logging.getLogger(__name__)
 
@@ -29,10 +30,11 @@ CORRECT_AGAIN_S = 3.0
 class Watch:
     """Judges the flying drone's present state, and acts on what it finds."""
 
-    def __init__(self, control: Control, guard: Guard, audit: AuditLog) -> None:
+    def __init__(self, control: Control, guard: Guard, audit: AuditLog, supervisor: Supervisor) -> None:
         self._control = control
         self._guard = guard
         self._audit = audit
+        self._supervisor = supervisor
         self._alarm = ""
         self._alarm_at = 0.0
         self._corrections: set[asyncio.Task[None]] = set()
@@ -51,6 +53,10 @@ class Watch:
                     self._control.brake(
                         Verdict("deny", None, "InternalError", "the motion monitor failed", (), "hover")
                     )
+            try:
+                self._supervisor.tick()
+            except Exception:
+                log.exception("the supervisor failed; the autopilot's own failsafe brings the drone home")
 
     def look(self) -> None:
         """One check."""
@@ -88,15 +94,21 @@ class Watch:
 
     async def _carry_out(self, verdict: Verdict) -> None:
         control = self._control
+        motion, lease, hands = control.motion, control.lease, control.hands
+
+        def permit() -> None:
+            if control.lease is not lease or control.hands != hands or control.motion not in {motion, None}:
+                raise aborted("Replaced", "something else flies by now")
+
         try:
             if isinstance(verdict.args, SetSpeedArgs):
                 control.speed_mps = verdict.args.speed_mps
-                await control.autopilot.set_speed(verdict.args.speed_mps)
+                await control.autopilot.set_speed(verdict.args.speed_mps, permit)
             elif isinstance(verdict.args, GotoArgs) and verdict.args.alt is not None:
                 if control.motion is not None:
                     control.motion.stop(aborted(verdict.code, verdict.reason, verdict.policies))
-                await control.autopilot.go_to(verdict.args.lat, verdict.args.lon, verdict.args.alt, None)
-        except AutopilotError as error:
+                await control.autopilot.go_to(verdict.args.lat, verdict.args.lon, verdict.args.alt, None, permit)
+        except (AutopilotError, Refused) as error:
             log.warning("cannot correct the motion: %s", error)
 
     async def record(self) -> None:

@@ -1,0 +1,90 @@
+"""Starting the motors: only with every last line in place, and not a moment longer than somebody may."""
+
+from __future__ import annotations
+
+import asyncio
+
+from fractus_core.geo import LocalFrame
+
+from fractus_services.grants import Held
+from fractus_services.mobility.autopilot import AutopilotError, Permit
+from fractus_services.mobility.control import Control
+from fractus_services.mobility.journal import Mission
+from fractus_services.mobility.motions import distance_m
+from fractus_services.mobility.vehicle import GUIDED
+from fractus_services.replies import precondition
+
+ARMED_S = 3.0
+WAIT_S = 0.5
+STRAY_M = 50.0
+"""A drone that stands further than this from the home of its grant would be brought to the wrong place."""
+
+
+async def arm(control: Control, held: Held, permit: Permit) -> None:
+    """Arm in GUIDED. Goes on to its end when the caller hangs up, so that nothing is armed that nobody asks for.
+
+    Args:
+        control: the drone.
+        held: the grant to fly under.
+        permit: raises when the caller may not arm any more.
+
+    Raises:
+        Refused: a failsafe is not verified, audit log or journal cannot be written, or the caller may no more.
+        AutopilotError: the autopilot refuses.
+    """
+    await asyncio.shield(control.keep(_arm(control, held, permit)))
+
+
+async def _arm(control: Control, held: Held, permit: Permit) -> None:
+    autopilot, helm = control.autopilot, control.helm
+    _check(control)
+    mission = control.journal.mission(held)
+    home = mission.home = _home_of(control, held, mission)
+    control.journal.active = mission.key
+    await control.journal.save(timeout_s=ARMED_S)
+    if control.journal.failure:
+        raise precondition("JournalUnavailable", control.journal.failure)
+    permit()
+    helm.arming = True
+    try:
+        await helm.change_mode(GUIDED, permit)
+        try:
+            await autopilot.arm(permit)
+            deadline = autopilot.now + ARMED_S
+            while not autopilot.vehicle.armed:
+                if autopilot.now > deadline:
+                    raise AutopilotError("the autopilot accepted to arm and did not")
+                await autopilot.update(WAIT_S)
+            await autopilot.set_home(*home)
+            await autopilot.ask_home()
+            permit()
+        except Exception:
+            if not autopilot.vehicle.in_air:
+                await control.attempt(autopilot.disarm())
+            raise
+    finally:
+        helm.arming = False
+
+
+def _check(control: Control) -> None:
+    if control.checked is None or control.checked.problem:
+        why = control.checked.problem if control.checked else "they are being set"
+        raise precondition("FailsafesNotVerified", f"the autopilot's failsafes are not verified: {why}")
+    if control.audit.failure:
+        raise precondition("AuditUnavailable", control.audit.failure)
+
+
+def _home_of(control: Control, held: Held, mission: Mission) -> tuple[float, float, float]:
+    """Home is where the mission armed first: landing on the way and arming again does not move it."""
+    vehicle = control.autopilot.vehicle
+    if vehicle.lat is None or vehicle.lon is None:
+        raise precondition("PositionUnknown", "the position is not known yet")
+    lat, lon, amsl_m = mission.home or (vehicle.lat, vehicle.lon, vehicle.amsl_m)
+    base = held.spec.home or held.spec.depot
+    if base is not None:
+        away = distance_m(LocalFrame(base.lat, base.lon), lat, lon)
+        if away > STRAY_M:
+            raise precondition(
+                "NotAtHome", f"the drone would return to a place {away:.0f} m away from the home of its grant"
+            )
+    return lat, lon, amsl_m

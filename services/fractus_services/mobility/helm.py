@@ -1,0 +1,130 @@
+"""Modes and stops: what the system itself changes, so that it is not taken for a pilot's doing."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+
+from fractus_core.policy.values import Takeover
+
+from fractus_services.mobility.autopilot import Autopilot, AutopilotError, Permit, always
+from fractus_services.mobility.vehicle import GUIDED, HOMEWARD, LAND, RTL
+
+log = logging.getLogger(__name__)
+
+AGAIN_S = 0.5
+RTL_TRIES = 4
+SETTLE_S = 10.0
+STANDING_MPS = 0.2
+FRESH_S = 1.0
+
+
+class Helm:
+    """Changes modes and brakes.
+
+    Args:
+        autopilot: the link.
+        moving: whether a motion is under way, which ends the braking before it.
+
+    Attributes:
+        expected: the mode that the autopilot is in by our doing, or that we know of.
+        changing: how many changes are under way.
+        arming: whether the motors are being started by us.
+    """
+
+    def __init__(self, autopilot: Autopilot, moving: Callable[[], bool]) -> None:
+        self.expected: int | None = None
+        self.changing = 0
+        self.arming = False
+        self._autopilot = autopilot
+        self._moving = moving
+
+    async def change_mode(self, mode: int, permit: Permit = always) -> None:
+        """Change the flight mode.
+
+        Raises:
+            AutopilotError: it does not.
+        """
+        permit()
+        if self._autopilot.vehicle.mode == mode and self.expected == mode:
+            return
+        before, self.expected = self.expected, mode
+        done = False
+        self.changing += 1
+        try:
+            await self._autopilot.set_mode(mode, permit)
+            done = True
+        finally:
+            self.changing -= 1
+            if not done and self.expected == mode and self._autopilot.vehicle.mode != mode:
+                self.expected = before
+
+    async def hold(self, permit: Permit = always) -> None:
+        """Brake and hover.
+
+        Raises:
+            AutopilotError: the mode cannot be changed.
+        """
+        permit()
+        self._autopilot.stop()
+        await self.change_mode(GUIDED, permit)
+        self._autopilot.stop()
+
+    async def settle(self) -> None:
+        """Keep braking until the drone stands: a single velocity setpoint times out in the autopilot."""
+        autopilot = self._autopilot
+        deadline = autopilot.now + SETTLE_S
+        while not self._moving() and autopilot.vehicle.mode == GUIDED and autopilot.now < deadline:
+            known = autopilot.now - autopilot.vehicle.position_at < FRESH_S
+            if known and autopilot.vehicle.speed_mps < STANDING_MPS and abs(autopilot.vehicle.down_mps) < STANDING_MPS:
+                return
+            autopilot.stop()
+            await asyncio.sleep(AGAIN_S)
+
+    async def disarm(self) -> bool:
+        """Stop the motors; False when the autopilot refuses, as it does in the air."""
+        try:
+            await self._autopilot.disarm()
+        except AutopilotError as error:
+            if error.link:
+                raise
+            return False
+        return True
+
+    async def carry_out(self, action: Takeover, wanted: Callable[[], bool]) -> None:
+        """Do what the system wants, however often the link fails: hover, or bring the drone to the ground.
+
+        Args:
+            action: what.
+            wanted: whether the system still has the drone.
+        """
+        vehicle, tries, refused = self._autopilot.vehicle, 0, False
+        while (vehicle.armed or self.arming) and wanted():
+            try:
+                if self.arming:
+                    await self._autopilot.update(AGAIN_S)
+                    continue
+                if action == "hover":
+                    await self._hover()
+                    return
+                if (vehicle.standing or not vehicle.in_air) and not refused:
+                    refused = not await self.disarm()
+                else:
+                    self._autopilot.stop()
+                    await self.change_mode(LAND if action == "land" or tries >= RTL_TRIES else RTL)
+                    while vehicle.armed and vehicle.mode in HOMEWARD:
+                        await self._autopilot.update(1.0)
+            except AutopilotError as error:
+                tries += 0 if error.link else 1
+                log.warning("cannot %s yet: %s", action, error)
+            await asyncio.sleep(AGAIN_S)
+
+    async def _hover(self) -> None:
+        """Hold at once, and again when a takeoff under way gets off the ground."""
+        await self.hold()
+        while self._autopilot.vehicle.armed and not self._autopilot.vehicle.in_air:
+            await self._autopilot.update(AGAIN_S)
+        if self._autopilot.vehicle.armed:
+            await self.hold()
+            await self.settle()

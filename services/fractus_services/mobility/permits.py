@@ -1,0 +1,39 @@
+"""What commands are asked for before each sending, so that nothing stale reaches the autopilot."""
+
+from __future__ import annotations
+
+from fractus_services.grants import Held
+from fractus_services.mobility.autopilot import Permit
+from fractus_services.mobility.control import Control
+from fractus_services.mobility.leases import Lease, Motion
+from fractus_services.replies import precondition
+
+
+def driver_permit(control: Control, held: Held, motion: Motion | None = None) -> Permit:
+    """A driver's commands go only while it may still move the drone.
+
+    Args:
+        control: who has the drone.
+        held: the driver's grant.
+        motion: the motion that commands; none for calls that are no motions.
+    """
+    lease = control.lease
+
+    def check() -> None:
+        if motion is not None:
+            motion.check()
+        if control.require(held) is not lease or not control.valid(held):
+            raise precondition("ControlLost", "the drone is not yours any more")
+
+    return check
+
+
+def transit_permit(control: Control, lease: Lease, motion: Motion) -> Permit:
+    """What the system flies for a waiting driver goes only while that one waits."""
+
+    def check() -> None:
+        motion.check()
+        if control.lease is not lease or control.hands != "system" or not control.valid(lease.held):
+            raise precondition("ControlLost", "the driver is gone")
+
+    return check

@@ -1,0 +1,75 @@
+"""The last look: an armed drone that nobody is responsible for is brought home, whatever led there."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+from fractus_core.policy.values import Takeover
+
+from fractus_services.mobility.control import Control
+from fractus_services.replies import precondition
+
+log = logging.getLogger(__name__)
+
+TICKED_S = 1.0
+ORPHAN_S = 3.0
+
+
+class Supervisor:
+    """Runs in every turn of the watch loop, and vouches for the service towards the autopilot.
+
+    The heartbeats that hold off the autopilot's own failsafe are sent only while this is sound.
+    """
+
+    def __init__(self, control: Control) -> None:
+        self._control = control
+        self._ticked_at = -math.inf
+        self._orphan_since: float | None = None
+
+    def tick(self) -> None:
+        """Find out whether somebody is responsible; act when nobody is."""
+        control = self._control
+        now = control.autopilot.now
+        mute = not self.alive()
+        if control.decided and self._orphaned():
+            if self._orphan_since is None:
+                self._orphan_since = now
+            log.error("nobody is responsible for the armed drone; the system takes it")
+            self._adopt()
+        if not self._orphaned():
+            self._orphan_since = None
+        self._ticked_at = now
+        if mute and self.alive():
+            control.autopilot.beat()
+
+    def alive(self) -> bool:
+        """Whether the autopilot may rely on this companion."""
+        control = self._control
+        now = control.autopilot.now
+        return (
+            control.autopilot.found
+            and control.decided
+            and now - self._ticked_at <= TICKED_S
+            and (self._orphan_since is None or now - self._orphan_since < ORPHAN_S)
+        )
+
+    def _orphaned(self) -> bool:
+        """Whether the motors run for nobody: no pilot, no driver, no chauffeur, no grace, nothing that brings it home."""
+        control, lease = self._control, self._control.lease
+        if not control.autopilot.vehicle.armed or control.helm.arming or control.hands == "pilot" or control.graced:
+            return False
+        if lease is not None and (control.drives(lease) or control.chauffeured is not None):
+            return False
+        return not control.homeward or control.system is None or control.system.done()
+
+    def _adopt(self) -> None:
+        control, mission = self._control, self._control.journal.flying
+        control.hands = "system"
+        control.stop_motion(precondition("ControlLost", "the system took the drone"))
+        alive = mission is not None and not mission.outcome and control.mission_grant is not None
+        action: Takeover = "hover" if alive and control.autopilot.vehicle.in_air else "returnToLaunch"
+        control.note(action, "system", "nobody had the drone", "Orphaned", kind="takeover")
+        control.start(action)
+        if action == "hover" and mission is not None:
+            control.begin_grace(mission, "driver lost")

@@ -6,8 +6,10 @@ import asyncio
 import json
 import logging
 import os
-from dataclasses import asdict, dataclass
+import tempfile
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 from fractus_services.grants import Held
 
@@ -27,6 +29,7 @@ class Mission:
         points_done: control points that were returned.
         waypoints: waypoints of the present control point that were reached.
         flown: whether the drone has been in the air for it.
+        home: latitude, longitude and altitude above sea level of where it armed first.
     """
 
     key: str
@@ -35,33 +38,57 @@ class Mission:
     points_done: int = 0
     waypoints: int = 0
     flown: bool = False
+    home: tuple[float, float, float] | None = None
+
+
+_FIELDS = frozenset(field.name for field in fields(Mission))
+
+
+def _mission(stored: dict[str, Any]) -> Mission:
+    """A stored mission; what a newer release wrote beside it is left out."""
+    found = Mission(**{name: value for name, value in stored.items() if name in _FIELDS})
+    if found.home is not None:
+        lat, lon, amsl_m = found.home
+        found.home = (float(lat), float(lon), float(amsl_m))
+    return found
 
 
 class Journal:
-    """Missions on disk, replaced atomically.
+    """Missions on disk, replaced atomically; the copy before the last is kept, for a disk that loses the last.
 
     Args:
         directory: the service's state directory.
+
+    Attributes:
+        failure: why the last writing failed; empty when it did not.
     """
 
     def __init__(self, directory: Path) -> None:
         self._path = directory / "journal.json"
+        self._last = directory / "journal.last.json"
         self._lock = asyncio.Lock()
+        self._queued: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self.missions: dict[str, Mission] = {}
         self.active: str | None = None
+        self.failure = ""
         directory.mkdir(parents=True, exist_ok=True)
+        for left in directory.glob("journal.*.new"):
+            left.unlink(missing_ok=True)
         self._load()
 
     def _load(self) -> None:
-        try:
-            stored = json.loads(self._path.read_bytes())
-            self.missions = {m["key"]: Mission(**m) for m in stored["missions"]}
-            self.active = stored["active"]
-        except FileNotFoundError:
+        for path in (self._path, self._last):
+            try:
+                stored = json.loads(path.read_bytes())
+                missions = {m["key"]: _mission(m) for m in stored["missions"]}
+                self.missions, self.active = missions, stored["active"]
+            except FileNotFoundError:
+                continue
+            except (OSError, ValueError, KeyError, TypeError) as error:
+                log.critical("the journal %s cannot be read: %s", path, error)
+                continue
             return
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            log.critical("the journal %s cannot be read, missions begin anew: %s", self._path, error)
 
     @property
     def flying(self) -> Mission | None:
@@ -81,30 +108,60 @@ class Journal:
         """Ended missions by key."""
         return {m.key: m.outcome for m in self.missions.values() if m.outcome}
 
-    async def save(self) -> None:
-        """Write everything; on disk when this returns."""
-        stored = {"version": 1, "active": self.active, "missions": [asdict(m) for m in self.missions.values()]}
+    async def save(self, timeout_s: float | None = None) -> None:
+        """Write everything; on disk when this returns, unless `failure` says why not.
+
+        The writing goes on when the caller gives up.
+        """
+        task = self.save_soon()
+        try:
+            async with asyncio.timeout(timeout_s):
+                await asyncio.shield(task)
+        except TimeoutError:
+            self.failure = f"the journal {self._path} is not written within {timeout_s:g} s"
+
+    def save_soon(self) -> asyncio.Task[None]:
+        """Write in the background; one writing at a time, and at most one waiting."""
+        if self._queued is None:
+            self._queued = asyncio.get_running_loop().create_task(self._save())
+            self._tasks.add(self._queued)
+            self._queued.add_done_callback(self._tasks.discard)
+        return self._queued
+
+    async def _save(self) -> None:
         async with self._lock:
+            self._queued = None
+            stored = {"version": 1, "active": self.active, "missions": [asdict(m) for m in self.missions.values()]}
             try:
                 await asyncio.to_thread(self._write, json.dumps(stored, indent=1).encode())
             except OSError as error:
-                log.critical("cannot write the journal %s: %s", self._path, error)
-
-    def save_soon(self) -> None:
-        """Write in the background."""
-        task = asyncio.get_running_loop().create_task(self.save())
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+                self.failure = f"cannot write the journal {self._path}: {error}"
+                log.critical("%s", self.failure)
+            else:
+                self.failure = ""
 
     def _write(self, data: bytes) -> None:
-        fresh = self._path.with_suffix(".new")
-        with fresh.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        fresh.replace(self._path)
+        number, name = tempfile.mkstemp(prefix="journal.", suffix=".new", dir=self._path.parent)
+        fresh = Path(name)
+        try:
+            with os.fdopen(number, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            if self._path.exists() and self._sound():
+                self._path.replace(self._last)
+            fresh.replace(self._path)
+        except OSError:
+            fresh.unlink(missing_ok=True)
+            raise
         directory = os.open(self._path.parent, os.O_RDONLY)
         try:
             os.fsync(directory)
         finally:
             os.close(directory)
+
+    def _sound(self) -> bool:
+        try:
+            return "missions" in json.loads(self._path.read_bytes())
+        except ValueError:
+            return False

@@ -53,6 +53,11 @@ def _mission(stored: dict[str, Any]) -> Mission:
     return found
 
 
+def _read(path: Path) -> tuple[dict[str, Mission], str | None]:
+    stored = json.loads(path.read_bytes())
+    return {m["key"]: _mission(m) for m in stored["missions"]}, stored["active"]
+
+
 class Journal:
     """Missions on disk, replaced atomically; the copy before the last is kept, for a disk that loses the last.
 
@@ -80,9 +85,7 @@ class Journal:
     def _load(self) -> None:
         for path in (self._path, self._last):
             try:
-                stored = json.loads(path.read_bytes())
-                missions = {m["key"]: _mission(m) for m in stored["missions"]}
-                self.missions, self.active = missions, stored["active"]
+                self.missions, self.active = _read(path)
             except FileNotFoundError:
                 continue
             except (OSError, ValueError, KeyError, TypeError) as error:
@@ -162,6 +165,7 @@ class Journal:
 
     def _sound(self) -> bool:
         try:
-            return "missions" in json.loads(self._path.read_bytes())
-        except ValueError:
+            _read(self._path)
+        except (ValueError, KeyError, TypeError):
             return False
+        return True

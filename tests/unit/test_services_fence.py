@@ -1,0 +1,49 @@
+"""Commands that were overtaken are not sent; a companion that does not do its duty sends no heartbeats."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+from fractus_services.mobility import autopilot as module
+from fractus_services.mobility.autopilot import Autopilot
+
+
+class Overtaken(Exception):
+    pass
+
+
+@pytest.fixture
+def link(monkeypatch: pytest.MonkeyPatch) -> tuple[Autopilot, list[Any]]:
+    monkeypatch.setattr(module, "ACK_TIMEOUT_S", 0.01)
+    autopilot = Autopilot("tcp:127.0.0.1:1")
+    sent: list[Any] = []
+    monkeypatch.setattr(autopilot, "send", sent.append)
+    return autopilot, sent
+
+
+async def test_a_command_is_not_sent_again_once_it_is_overtaken(link: tuple[Autopilot, list[Any]]) -> None:
+    autopilot, sent = link
+    autopilot._target, autopilot.vehicle.heartbeat_at = (1, 1), asyncio.get_running_loop().time()
+
+    def permit() -> None:
+        if sent:
+            raise Overtaken
+
+    with pytest.raises(Overtaken):
+        await autopilot.go_to(39.0, 22.0, 10.0, None, permit)
+    assert len(sent) == 1
+
+
+async def test_no_duty_no_heartbeat(link: tuple[Autopilot, list[Any]]) -> None:
+    autopilot, sent = link
+    autopilot.alive = lambda: False
+    autopilot.beat()
+    assert [m.get_type() for m in sent] == ["PARAM_REQUEST_READ"], "it knocks, so that it is answered"
+    autopilot._target = (1, 1)
+    autopilot.beat()
+    assert len(sent) == 1
+    autopilot.alive = lambda: True
+    autopilot.beat()
+    assert sent[-1].get_type() == "HEARTBEAT"

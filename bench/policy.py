@@ -97,7 +97,9 @@ class PositionServer:
         peer, _ = self._listener.accept()
         peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         while peer.recv(64):
-            peer.sendall(struct.pack("<IiiiihhhH", 1, int(HOME.lat * 1e7), int(HOME.lon * 1e7), 110000, 10000, 0, 0, 0, 0))
+            peer.sendall(
+                struct.pack("<IiiiihhhH", 1, int(HOME.lat * 1e7), int(HOME.lon * 1e7), 110000, 10000, 0, 0, 0, 0)
+            )
 
     def fetch(self) -> tuple[float, float, float]:
         self._client.sendall(b"\xfd position please")
@@ -110,7 +112,10 @@ class Thesis:
 
     def __init__(self, spec: GrantSpec, server: PositionServer) -> None:
         self._policies = [
-            (p.spec, [shapely.Polygon([(q.lon, q.lat) for q in z.area.polygon.exterior]) for z in p.zones if z.area.polygon])
+            (
+                p.spec,
+                [shapely.Polygon([(q.lon, q.lat) for q in z.area.polygon.exterior]) for z in p.zones if z.area.polygon],
+            )
             for p in spec.policies
         ]
         self._server = server
@@ -166,11 +171,27 @@ def main() -> int:
         thesis = Thesis(spec, server)
         assert thesis.check(call)
         p50, p99 = timed(lambda c=call, g=compiled: judge(c, now, g), runs)  # type: ignore[misc]
-        theirs, _ = timed(lambda c=call, t=thesis: t.check(c), max(runs // (100 if len(spec.policies) > 1000 else 10), 20))  # type: ignore[misc]
+        theirs, _ = timed(
+            lambda c=call, t=thesis: t.check(c), max(runs // (100 if len(spec.policies) > 1000 else 10), 20)
+        )  # type: ignore[misc]
         holds = p50 < target_us and (target_us != 25.0 or p99 < 100.0)
-        print(f"{name:36} {p50:8.1f}us {p99:7.1f}us {theirs:9.1f}us {theirs / p50:6.1f}x {target_us:6.0f}us{'' if holds else '  MISSED'}")
-        claims.append({"name": name, "ours": p50, "theirs": theirs, "unit": "us", "ratio": theirs / p50, "target": target_us, "holds": holds, "p99": p99})
-    watch, _ = timed(lambda g=compile_grant(grant(fence_and_limit())): monitor(now, g), runs)  # type: ignore[misc]
+        print(
+            f"{name:36} {p50:8.1f}us {p99:7.1f}us {theirs:9.1f}us {theirs / p50:6.1f}x {target_us:6.0f}us{'' if holds else '  MISSED'}"
+        )
+        claims.append(
+            {
+                "name": name,
+                "ours": p50,
+                "theirs": theirs,
+                "unit": "us",
+                "ratio": theirs / p50,
+                "target": target_us,
+                "holds": holds,
+                "p99": p99,
+            }
+        )
+    watched = compile_grant(grant(fence_and_limit()))
+    watch, _ = timed(lambda: monitor(now, watched), runs)
     print(f"one tick of the motion monitor: {watch:.1f} us, {watch * 20 / 1e4:.2f} % of a core at 20 Hz")
     if options.json:
         options.json.write_text(json.dumps({"claims": claims}, indent=1))

@@ -257,3 +257,61 @@ async def test_partial_control_begins_where_the_chauffeur_brings_it(rig: Rig) ->
     await driver.goto(60, 40)
     await driver.stub.ReturnControl(pb.ReturnControlRequest(), timeout=5)
     await rig.until(lambda t: not t.armed, 60, "landing")
+
+
+def partial(**changes: Any) -> dict[str, Any]:
+    path = [dict(zip(("lat", "lon", "alt"), (*FRAME.latlon(x, y), 12.0), strict=True)) for x, y in ((30, 40), (60, 40))]
+    points = [{"navigation": "pathBased", "path": path}]
+    services = [{"service": "mobility", "methods": ["Goto", "GetPosition"]}]
+    return grant(control="partial", controlPoints=points, services=services, **changes)
+
+
+async def told(driver: Driver, reason: str) -> None:
+    """Wait until the chauffeur says it is that far."""
+    driver._stream = driver.stub.GetControl(pb.GetControlRequest(), wait_for_ready=True)
+    async with asyncio.timeout(30):
+        while (await driver._stream.read()).reason != reason:
+            pass
+
+
+async def test_a_driver_lost_during_the_chauffeurs_takeoff_strands_nobody(rig: Rig) -> None:
+    rig.write_grant(partial())
+    rig.start_service()
+    rig.start_vehicle()
+    driver = Driver(rig)
+    await told(driver, "the system takes off")
+    await driver.channel.close()
+    await rig.until(lambda t: outcome(t) == "failed: driver lost", 20, "end of the mission")
+    await rig.until(lambda t: not t.armed, 60, "landing")
+
+
+async def test_a_grant_revoked_while_arming_flies_nowhere(rig: Rig) -> None:
+    rig.write_grant(partial())
+    rig.start_service()
+    rig.start_vehicle(1.0)
+    driver = Driver(rig)
+    await told(driver, "the system arms the drone")
+    (rig.grants / "app-navigator.json").unlink()
+    state = await rig.until(lambda t: outcome(t).startswith("revoked"), 5, "revocation")
+    state = await rig.until(lambda t: not t.armed, 10, "stop of the motors")
+    assert state.position.altitude_m < 5
+
+
+async def test_landing_on_the_way_does_not_move_home(rig: Rig) -> None:
+    driver = await flying(rig)
+    await driver.goto(0, 60)
+    await flown(driver.stub.Land(pb.LandRequest(), timeout=60))
+    await driver.arm()
+    await driver.take_off()
+    state = await rig.until(lambda t: t.home.latitude_deg != 0, 5)
+    assert math.dist(xy(state.home), (0, 0)) < 2
+
+
+async def test_a_service_that_lost_its_journal_brings_the_drone_home(rig: Rig) -> None:
+    await flying(rig)
+    rig.kill("service")
+    for path in (rig.directory / "state").glob("journal*"):
+        path.unlink()
+    rig.start_service()
+    state = await rig.until(lambda t: t.mode == "RTL", 10, "return")
+    assert state.controller == "system"

@@ -56,7 +56,7 @@ async def _arm(control: Control, held: Held, permit: Permit) -> None:
                     raise AutopilotError("the autopilot accepted to arm and did not")
                 await autopilot.update(WAIT_S)
             await autopilot.set_home(*home)
-            await autopilot.ask_home()
+            await control.attempt(autopilot.ask_home())
             permit()
         except Exception:
             if not autopilot.vehicle.in_air:

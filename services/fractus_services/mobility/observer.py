@@ -45,7 +45,7 @@ class Observer:
                 self._control.checked = await configure(autopilot)
                 self._control.wake()
                 if autopilot.vehicle.home is None:
-                    await autopilot.ask_home()
+                    await self._control.attempt(autopilot.ask_home())
             except AutopilotError as error:
                 log.warning("cannot prepare the autopilot yet: %s", error)
                 await asyncio.sleep(RETRY_S)

@@ -29,8 +29,8 @@ demo: packages uv ## Fly the traffic-monitoring example and leave its report in 
 .PHONY: test
 test: packages env lint ## Everything: lint, types, unit, integration and end-to-end tests
 	$(RUN) fractus cluster binaries
-	$(RUN) pytest -n 4 --dist loadfile tests/unit tests/integration
-	$(RUN) pytest -n 2 --dist loadgroup tests/e2e
+	$(RUN) pytest -n 4 --dist loadfile tests/unit tests/integration tests/e2e/test_cluster.py
+	$(RUN) pytest tests/e2e --ignore tests/e2e/test_cluster.py
 
 .PHONY: test-fast
 test-fast: env lint ## The inner loop: lint, types and unit tests
@@ -39,7 +39,7 @@ test-fast: env lint ## The inner loop: lint, types and unit tests
 .PHONY: test-e2e
 test-e2e: packages env ## End-to-end tests only, on the embedded cluster or on FRACTUS_E2E_CLUSTER=current
 	[ "$${FRACTUS_E2E_CLUSTER:-embedded}" = current ] || $(RUN) fractus cluster binaries
-	$(RUN) pytest -n 2 --dist loadgroup tests/e2e
+	$(RUN) pytest tests/e2e
 
 .PHONY: lint
 lint: env ## Style, types and the direction of imports

@@ -26,14 +26,12 @@ SYSTEM = "fractus-system"
 DRONE = "drone-1"
 
 
-@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Everything here needs a cluster, and time; what shares the cluster shares a worker."""
+    """Everything here needs a cluster, and time."""
     for item in items:
         if pathlib.Path(__file__).parent in item.path.parents:
             item.add_marker(pytest.mark.e2e)
             item.add_marker(pytest.mark.timeout(420))
-            item.add_marker(pytest.mark.xdist_group("machine" if item.path.stem == "test_cluster" else "fractus"))
 
 
 def say(line: str) -> None:

@@ -75,7 +75,7 @@ async def test_a_killed_service_finds_its_drone_again(rig: Rig) -> None:
     await rig.until(lambda t: t.velocity.north_mps > 3)
     del going
     rig.kill("service")
-    rig.start_service()
+    rig.start_service("--driver-grace", "15")
     hover = await rig.until(lambda t: t.armed and t.controller == "system" and t.mode == "GUIDED", 10, "takeover")
     assert hover.in_air
     again = Driver(rig)

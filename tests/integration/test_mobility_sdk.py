@@ -40,7 +40,8 @@ async def test_a_mission_through_the_sdk(rig: Rig) -> None:
             fence("sensitive", "exclusion", "revoke", 60, 60, 80, 80),
         )
     )
-    rig.start_service()
+    patient = ("--driver-grace", "15")  # a restart takes seconds on a busy machine
+    rig.start_service(*patient)
     rig.start_vehicle()
     async with Mobility(endpoint(rig)) as drone:
         with pytest.raises(ControlLost):
@@ -58,7 +59,7 @@ async def test_a_mission_through_the_sdk(rig: Rig) -> None:
                 with pytest.raises(InvalidRequest):
                     await drone.goto(math.nan, lon, 10)
                 rig.kill("service")
-                rig.start_service()
+                rig.start_service(*patient)
                 await drone.goto(*FRAME.latlon(40, 40), 10)
                 with pytest.raises(PolicyDenied) as taken:
                     await drone.goto(*FRAME.latlon(70, 70), 10)

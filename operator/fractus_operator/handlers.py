@@ -34,8 +34,11 @@ def register(registry: kopf.OperatorRegistry, live: LiveInventory, deployments: 
         return _by_address(kopf.login_with_service_account(**kwargs)) or kopf.login_with_kubeconfig(**kwargs)
 
     @kopf.on.probe(registry=registry, id="silence_s")
-    def silence(**_: object) -> float:
-        """Tell, at the liveness endpoint, for how long the quietest watch has heard nothing."""
+    async def silence(**_: object) -> float:
+        """Tell, at the liveness endpoint, for how long the quietest watch has heard nothing.
+
+        A coroutine, because kopf runs plain functions in a thread, which has no loop whose clock to read.
+        """
         return round(max(reflector.age_s() for reflector in live.reflectors()), 1)
 
     @kopf.daemon(group, version, APPLICATION.plural, registry=registry, backoff=_RETRY_S, cancellation_timeout=5.0)

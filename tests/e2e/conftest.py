@@ -120,7 +120,7 @@ def short_flight(name: str, namespace: str = "default") -> Object:
     navigator["controlPoints"][0]["path"] = [
         {"lat": 50.864239, "lon": 4.679068, "alt": 12},
         {"lat": 50.864800, "lon": 4.679300, "alt": 12},
-        {"lat": 50.864239, "lon": 4.679068, "alt": 12},
+        {"lat": 50.865228, "lon": 4.679352, "alt": 12},
     ]
     navigator["container"].pop("env", None)
     app["metadata"] = {"name": name, "namespace": namespace}

@@ -11,9 +11,9 @@ import demo_flight
 import pytest
 import yaml
 from fractus_core.api import DeploymentPlan
-from fractus_sim.demo.report import Record, write_report
-from fractus_sim.demo.report.features import features
-from fractus_sim.demo.report.summary import figures, summary
+from fractus_sim.report import Record, write_report
+from fractus_sim.report.features import features
+from fractus_sim.report.summary import figures, summary
 
 PNG = b"\x89PNG\r\n\x1a\n"
 

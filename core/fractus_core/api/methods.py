@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Literal
 
 MobilityMethod = Literal[
-    "Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "Goto", "Hover", "GetPosition", "ReturnToLaunch",
+    "Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "Goto", "SetVelocity", "Hover", "GetPosition",
+    "ReturnToLaunch",
 ]  # fmt: skip
 CameraMethod = Literal["CaptureImage", "RetrieveImage", "ListImages", "DeleteImage"]
 ControlMethod = Literal["GetControl", "ReturnControl"]
 Method = Literal[
-    "Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "Goto", "Hover", "GetPosition", "ReturnToLaunch",
-    "CaptureImage", "RetrieveImage", "ListImages", "DeleteImage", "GetControl", "ReturnControl",
+    "Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "Goto", "SetVelocity", "Hover", "GetPosition",
+    "ReturnToLaunch", "CaptureImage", "RetrieveImage", "ListImages", "DeleteImage", "GetControl", "ReturnControl",
 ]  # fmt: skip
 
 Service = Literal["mobility", "camera"]

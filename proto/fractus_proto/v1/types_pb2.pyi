@@ -38,6 +38,16 @@ class Velocity(_message.Message):
     down_mps: float
     def __init__(self, north_mps: _Optional[float] = ..., east_mps: _Optional[float] = ..., down_mps: _Optional[float] = ...) -> None: ...
 
+class Attitude(_message.Message):
+    __slots__ = ("roll_deg", "pitch_deg", "yaw_deg")
+    ROLL_DEG_FIELD_NUMBER: _ClassVar[int]
+    PITCH_DEG_FIELD_NUMBER: _ClassVar[int]
+    YAW_DEG_FIELD_NUMBER: _ClassVar[int]
+    roll_deg: float
+    pitch_deg: float
+    yaw_deg: float
+    def __init__(self, roll_deg: _Optional[float] = ..., pitch_deg: _Optional[float] = ..., yaw_deg: _Optional[float] = ...) -> None: ...
+
 class Decision(_message.Message):
     __slots__ = ("action", "reason", "code", "policies")
     class Action(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):

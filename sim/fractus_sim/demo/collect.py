@@ -11,8 +11,8 @@ from typing import Any
 from fractus_services.audit import Finding, verify
 
 from fractus_sim.demo.kube import NAMESPACE, SYSTEM, DemoError, Kube, Object
-from fractus_sim.demo.report.record import AUDIT, CAMERA_AUDIT, OBJECTS
 from fractus_sim.demo.watch import Mission
+from fractus_sim.report.record import AUDIT, CAMERA_AUDIT, OBJECTS
 
 LOGS = {AUDIT: "/var/lib/fractus/audit/mobility.jsonl", CAMERA_AUDIT: "/var/lib/fractus/audit/camera.jsonl"}
 _KINDS = "applications,deploymentplans,depots,drones,edgenodes,policies,zones"

@@ -15,9 +15,9 @@ from fractus_sim.cluster import ClusterError
 from fractus_sim.demo.collect import collect
 from fractus_sim.demo.kube import SYSTEM, DemoError, Kube, Object
 from fractus_sim.demo.place import EXAMPLE, ROOT, Place, documents
-from fractus_sim.demo.report import Record, write_report
-from fractus_sim.demo.report.summary import figures
 from fractus_sim.demo.watch import GROUNDED, Mission, follow, wait_ready
+from fractus_sim.report import Record, write_report
+from fractus_sim.report.summary import figures
 
 READY_TIMEOUT_S = 180.0
 HOME_TIMEOUT_S = 180.0

@@ -8,7 +8,7 @@ from typing import Any
 
 from fractus_core.geo import geodesic_m
 
-from fractus_sim.demo.report.record import Judgement, Record
+from fractus_sim.report.record import Judgement, Record
 
 _ROLES = {
     "drone": "on the drone",

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, PathPatch
 from matplotlib.path import Path as Outline
 
-from fractus_sim.demo.report.drawing import (
+from fractus_sim.report.drawing import (
     BLUE,
     CORRECTED,
     GREEN,
@@ -29,7 +29,7 @@ from fractus_sim.demo.report.drawing import (
     canvas,
     number,
 )
-from fractus_sim.demo.report.record import Record
+from fractus_sim.report.record import Record
 
 _MARGIN_M = 45.0
 _ZONE_STYLES: Mapping[str, tuple[str, str, str]] = {

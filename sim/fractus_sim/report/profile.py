@@ -6,8 +6,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from fractus_sim.demo.report.drawing import BLUE, CORRECTED, GREY, INK, ORANGE, REFUSED, canvas, number
-from fractus_sim.demo.report.record import Judgement, Record
+from fractus_sim.report.drawing import BLUE, CORRECTED, GREY, INK, ORANGE, REFUSED, canvas, number
+from fractus_sim.report.record import Judgement, Record
 
 _PHASES = {"GUIDED": "driver flies", "RTL": "flies home", "LAND": "lands"}
 

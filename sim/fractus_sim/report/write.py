@@ -7,12 +7,12 @@ from pathlib import Path
 
 import yaml
 
-from fractus_sim.demo.report.drawing import save
-from fractus_sim.demo.report.features import features
-from fractus_sim.demo.report.flightmap import draw_map
-from fractus_sim.demo.report.profile import draw_altitude
-from fractus_sim.demo.report.record import Record
-from fractus_sim.demo.report.summary import figures, summary
+from fractus_sim.report.drawing import save
+from fractus_sim.report.features import features
+from fractus_sim.report.flightmap import draw_map
+from fractus_sim.report.profile import draw_altitude
+from fractus_sim.report.record import Record
+from fractus_sim.report.summary import figures, summary
 
 
 def write_report(record: Record, folder: Path) -> None:

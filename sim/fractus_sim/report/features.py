@@ -6,7 +6,7 @@ from typing import Any
 
 from fractus_core.geo import geojson, polygon
 
-from fractus_sim.demo.report.record import Judgement, Place, Record
+from fractus_sim.report.record import Judgement, Place, Record
 
 
 def features(record: Record) -> dict[str, Any]:

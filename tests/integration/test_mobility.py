@@ -125,7 +125,7 @@ async def test_who_may_call(rig: Rig, tmp_path: Path) -> None:
     rig.write_grant(passenger_grant(services=[{"service": "mobility", "methods": ["GetSpeed"]}]))
     rig.start_service()
     rig.start_vehicle()
-    await rig.until(lambda t: t.ready, 20)
+    await rig.until(lambda t: t.ready and t.HasField("position"), 20)
     ask = pb.GetPositionRequest()
     await rig.stub(DRIVER).GetPosition(ask, timeout=5)
 
@@ -156,7 +156,7 @@ async def test_a_certificate_that_expires_during_a_long_connection(rig: Rig) -> 
     rig.write_grant(grant())
     rig.start_service()
     rig.start_vehicle()
-    await rig.until(lambda t: t.ready, 20)
+    await rig.until(lambda t: t.ready and t.HasField("position"), 20)
     stub = rig.stub(DRIVER, seconds=4.0)
     await stub.GetPosition(pb.GetPositionRequest(), timeout=5)
 
@@ -174,7 +174,7 @@ async def test_renewed_server_certificates_are_used(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service()
     rig.start_vehicle()
-    await rig.until(lambda t: t.ready, 20)
+    await rig.until(lambda t: t.ready and t.HasField("position"), 20)
     from mobility_rig import Authority
 
     rig.authority = Authority(rig.directory, "next")

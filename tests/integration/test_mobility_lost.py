@@ -224,7 +224,7 @@ async def test_a_stopped_driver_process_is_noticed(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service()
     rig.start_vehicle(1.0)
-    await rig.until(lambda t: t.ready, 20)
+    await rig.until(lambda t: t.ready and t.HasField("position"), 20)
     rig.start_driver()
     await rig.until(lambda t: t.controller == DRIVER and t.position.altitude_m > 8, 30, "flight of the other process")
     stopped = time.monotonic()

@@ -109,7 +109,8 @@ def build_images(
         if stale:
             ensure_base(report=report)
             _build_stale(source, stale, tag, report)
-            present = image_ids()
+            before, present = present, image_ids()
+            _remove_replaced(before[name] for name in names if name in before and before[name] != present[name])
             built.update({name: f"{digests[name]} {present[name]}" for name in names})
             _write(ledger, built)
     return names
@@ -145,6 +146,15 @@ def _build_stale(source: Path, targets: Sequence[str], tag: str, report: Report)
     one(targets[0])
     with ThreadPoolExecutor(max_workers=2) as pool:
         list(pool.map(one, targets[1:]))
+
+
+def _remove_replaced(identities: Iterable[str]) -> None:
+    """Remove images that lost their names to newer ones, with the layers that nothing else uses.
+
+    Builds would fill the disk otherwise. An image in use stays, which is no failure.
+    """
+    for identity in identities:
+        run(["buildah", "rmi", identity], check=False)
 
 
 def _build(source: Path, target: str, tag: str) -> None:

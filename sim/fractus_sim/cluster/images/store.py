@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import tarfile
+import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ from fractus_sim.cluster.state import state_root
 
 _LOCK_TIMEOUT_S = 600.0
 _COPY_TIMEOUT_S = 300.0
+_LISTINGS = 5
+_LISTING_PAUSE_S = 1.0
 
 Report = Callable[[str], None]
 
@@ -104,9 +107,19 @@ class ImageStore:
 
 
 def image_ids() -> dict[str, str]:
-    """Return the ids of all images in buildah's storage, by name."""
-    listed = run(["buildah", "images", "--no-trunc", "--format", "{{.Name}}:{{.Tag}} {{.ID}}"]).stdout
-    pairs = (line.split() for line in listed.splitlines())
+    """Return the ids of all images in buildah's storage, by name.
+
+    The listing fails when somebody else removes an image meanwhile, so it is asked for again a few times.
+    """
+    argv = ["buildah", "images", "--no-trunc", "--format", "{{.Name}}:{{.Tag}} {{.ID}}"]
+    for _ in range(_LISTINGS):
+        listed = run(argv, check=False)
+        if listed.returncode == 0:
+            break
+        time.sleep(_LISTING_PAUSE_S)
+    else:
+        listed = run(argv)
+    pairs = (line.split() for line in listed.stdout.splitlines())
     return {pair[0]: pair[1].removeprefix("sha256:") for pair in pairs if len(pair) == 2 and "<none>" not in pair[0]}
 
 

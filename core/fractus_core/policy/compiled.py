@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Literal
 
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from fractus_core.api.applications import ServiceRequest
 from fractus_core.api.geometry import AltitudeBand, Area, Point, Reference
-from fractus_core.api.methods import METHODS_OF
+from fractus_core.api.methods import METHODS_OF, MOBILITY_METHODS
 from fractus_core.api.plans import GrantedPolicy, GrantSpec
 from fractus_core.api.policies import ActiveTime, PolicySpec, active_at
 from fractus_core.geo import LocalFrame, middle, polygon
@@ -229,6 +230,18 @@ def compile_grant(spec: GrantSpec, origin: Point | None = None, flat_terrain: bo
         passage_border=_prepared(passage.boundary) if passage is not None else None,
         flat_terrain=flat_terrain,
     )
+
+
+def for_transit(spec: GrantSpec, origin: Point | None = None, flat_terrain: bool = False) -> CompiledGrant:
+    """The grant under which the system itself flies an application's drone: to its control points and home.
+
+    It is under the application's fences and limits, has every method of the mobility service, and may be anywhere in the
+    operation area and the corridor.
+    """
+    own = ServiceRequest(service="mobility", methods=MOBILITY_METHODS)
+    system = spec.model_copy(update={"services": (own,), "control": "full"})
+    grant = compile_grant(system, origin, flat_terrain)
+    return replace(grant, operation=grant.passage, operation_border=grant.passage_border)
 
 
 def _origin(spec: GrantSpec) -> Point:

@@ -15,7 +15,18 @@ from fractus_core.policy.access import judge_access, judge_privacy
 from fractus_core.policy.compiled import Air, CompiledGrant, height_m
 from fractus_core.policy.fences import Breach, breaches, last_legal
 from fractus_core.policy.limits import SLACK, Bound, Clamped, altitude_bounds, clamp, speed_bounds
-from fractus_core.policy.motion import XY, Leg, standing, stop_altitude_m, stop_point, turn_point
+from fractus_core.policy.motion import (
+    XY,
+    Leg,
+    height_margin_m,
+    margin_m,
+    standing,
+    stop_altitude_m,
+    stop_point,
+    turn_point,
+)
+from fractus_core.policy.returning import straight_home_blocked
+from fractus_core.policy.routes import route
 from fractus_core.policy.values import (
     Call,
     CaptureArgs,
@@ -55,7 +66,11 @@ def judge(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     if problem is not None:
         return problem
     rule = _RULES.get(call.method)
-    return rule(call, now, grant) if rule is not None else Verdict("allow", call.args)
+    if rule is not None:
+        return rule(call, now, grant)
+    if call.method in _ACCESS_ONLY:
+        return Verdict("allow", call.args)
+    return deny("MethodUnknown", f"the policy engine has no rule for {call.method}")
 
 
 def _unsound(now: Situation) -> Situation:
@@ -67,20 +82,6 @@ def _unsound(now: Situation) -> Situation:
     if not math.isfinite(now.time_s):
         raise ValueError("the time is not a number")
     return Situation(time_s=now.time_s, armed=now.armed, in_air=now.in_air, vertical=now.vertical)
-
-
-def margin_m(now: Situation) -> float:
-    """How far a leg keeps from fences: position error, and how far the drone strays from a leg.
-
-    The stopping distance enters along the direction of motion, where it belongs: a leg sweeps the triangle of present
-    position, turning point and target.
-    """
-    return now.position_error_m + now.airframe.tracking_m
-
-
-def height_margin_m(now: Situation) -> float:
-    """How far a leg keeps from floors and ceilings of zones."""
-    return now.altitude_error_m + now.airframe.tracking_m
 
 
 # Arguments
@@ -274,48 +275,14 @@ def _altitude_on_entry(at: XY, now: Situation, bounds: list[Bound], slack_m: flo
 
 
 def _way_home_blocked(target: XY, altitude_m: float, now: Situation, grant: CompiledGrant) -> Verdict | None:
-    """The denial of a target from which the straight way home is not legal.
-
-    That way is the autopilot's own: it climbs to its return altitude, flies straight, and descends at home.
-    """
-    if now.home is None:
-        return deny(
-            "HomeUnknown", "home is unknown, so nothing can be said of the way back; wait for the home position"
-        )
-    if not grant.exclusions.patches and not grant.inclusions:
-        return None
+    """The denial of a target from which the autopilot's way home is not legal."""
+    problem = straight_home_blocked(target, altitude_m, now, grant, margin=margin_m(now), slack=height_margin_m(now))
+    if problem is None or now.home is None or not now.airframe.retraces:
+        return problem
     home = grant.frame.xy(now.home.lat, now.home.lon)
-    height_m = max(altitude_m, now.airframe.return_altitude_m)
-    margin, slack = margin_m(now), height_margin_m(now)
-    lane = shapely.LineString((target, home)) if target != home else shapely.Point(home)
-    anything = grant.exclusions.near(Air(lane, margin, -slack, height_m + slack), now, grant.flat_terrain)
-    if not grant.inclusions and next(anything, None) is None:
+    if route(target, home, now, grant, altitude_m) is not None:
         return None
-    parts = (
-        Leg(target, target, target, home, height_m, height_m),
-        standing(target, altitude_m, height_m),
-        standing(home, 0.0, height_m),
-    )
-    for part in parts:
-        air = Air(part.ground, margin, part.lower_m - slack, part.upper_m + slack)
-        for patch in grant.exclusions.near(air, now, grant.flat_terrain):
-            return deny(
-                "WayHomeBlocked",
-                f"from the target the straight way home, at {height_m:.1f} m, is blocked by zone {patch.zone} of policy"
-                f" {patch.rule.name}",
-                (patch.rule.name,),
-            )
-    for fence in grant.inclusions:
-        if fence.rule.in_force(now.time_s):
-            shape, _ = fence.at(height_m, height_m, now, grant.flat_terrain)
-            if not shape.covers(lane):
-                return deny(
-                    "WayHomeBlocked",
-                    f"from the target the straight way home, at {height_m:.1f} m, leaves the zones of policy"
-                    f" {fence.rule.name}",
-                    (fence.rule.name,),
-                )
-    return None
+    return replace(problem, reason=f"{problem.reason}, and no legal way leads around it")
 
 
 def _outcome(args: GotoArgs, flown: _Aim, notes: list[Clamped], grant: CompiledGrant) -> Verdict:
@@ -410,6 +377,11 @@ def _judge_picture(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     verdict = judge_privacy(now, grant)
     return verdict if verdict.action == "deny" else replace(verdict, args=call.args)
 
+
+_ACCESS_ONLY = frozenset(
+    {"Hover", "GetSpeed", "GetPosition", "ReturnToLaunch", "ListImages", "DeleteImage", "GetControl", "ReturnControl"}
+)
+"""Methods that may be used by who has access: they stop the drone, bring it home, or move nothing."""
 
 _RULES: dict[str, Callable[[Call, Situation, CompiledGrant], Verdict]] = {
     "Arm": _judge_arm,

@@ -9,12 +9,9 @@ from functools import cached_property
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from fractus_core.policy.values import Situation
+from fractus_core.policy.values import STANDING_MPS, Situation
 
 XY = tuple[float, float]
-
-SLOW_MPS = 0.5
-"""A drone slower than this turns within its tracking margin."""
 
 OVERSHOOT = 0.35
 """Share of the stopping distance that a drone which turns in flight may overshoot its target by."""
@@ -34,6 +31,20 @@ def stopping_distance_m(speed_mps: float, accel_mps2: float, position_gain: floa
 def reaction_s(situation: Situation, accel_mps2: float) -> float:
     """Time at unchanged speed before the brakes bite: latency, and half the time that the jerk limit takes."""
     return situation.latency_s + accel_mps2 / (2 * situation.airframe.jerk_mps3)
+
+
+def margin_m(now: Situation) -> float:
+    """How far a leg keeps from fences: position error, and how far the drone strays from a leg.
+
+    The stopping distance enters along the direction of motion, where it belongs: a leg sweeps the triangle of present
+    position, turning point and target.
+    """
+    return now.position_error_m + now.airframe.tracking_m
+
+
+def height_margin_m(now: Situation) -> float:
+    """How far a leg keeps from floors and ceilings of zones."""
+    return now.altitude_error_m + now.airframe.tracking_m
 
 
 def stop_point(situation: Situation, at: XY) -> XY:
@@ -57,7 +68,7 @@ def turn_point(situation: Situation, at: XY, target: XY) -> XY:
     speed = math.hypot(situation.north_mps, situation.east_mps)
     frame = situation.airframe
     stop = stop_point(situation, at)
-    if speed < SLOW_MPS:
+    if speed < STANDING_MPS:
         return stop
     change = 0.0
     for origin in (at, stop):

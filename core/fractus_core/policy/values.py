@@ -8,6 +8,9 @@ from typing import Literal
 
 from fractus_core.api.geometry import Reference
 
+STANDING_MPS = 0.5
+"""A drone slower than this, on the ground and vertically, stands: it turns on the spot, within its tracking margin."""
+
 Action = Literal["allow", "correct", "deny", "takeover"]
 Takeover = Literal["hover", "land", "returnToLaunch", "revoke"]
 
@@ -52,6 +55,25 @@ class SetSpeedArgs:
 
 
 @dataclass(frozen=True, slots=True)
+class VelocityArgs:
+    """Fly with a velocity until the next one comes, or until the hold is over and the drone stops by itself.
+
+    Attributes:
+        north_mps: velocity over ground.
+        east_mps: velocity over ground.
+        down_mps: velocity, positive down.
+        yaw_deg: heading to hold, degrees clockwise from true north; None leaves it to the autopilot.
+        hold_s: seconds after which the drone is stopped when no other setpoint has come.
+    """
+
+    north_mps: float
+    east_mps: float
+    down_mps: float = 0.0
+    yaw_deg: float | None = None
+    hold_s: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
 class CaptureArgs:
     """Take a picture of so many pixels; 0 means the camera's default."""
 
@@ -79,7 +101,7 @@ def earliest(time_s: float) -> float:
     return time_s.earliest if isinstance(time_s, Moment) else time_s
 
 
-Args = TakeoffArgs | GotoArgs | SetSpeedArgs | CaptureArgs | None
+Args = TakeoffArgs | GotoArgs | SetSpeedArgs | VelocityArgs | CaptureArgs | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +139,9 @@ class Airframe:
         climb_accel_mps2: vertical acceleration.
         jerk_mps3: how fast it changes its acceleration.
         return_altitude_m: altitude above home at which it returns to launch.
-        tracking_m: how far it strays from a straight leg, sideways and in height, in still air.
+        tracking_m: how far it strays from a straight leg, sideways and in height.
+        retraces: whether it returns to launch on the path that it came (ArduPilot's SmartRTL), not straight; then a
+            target is legal when some legal way home exists.
     """
 
     accel_mps2: float = 2.5
@@ -126,6 +150,7 @@ class Airframe:
     jerk_mps3: float = 5.0
     return_altitude_m: float = 15.0
     tracking_m: float = 1.0
+    retraces: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,6 +228,9 @@ class Verdict:
         takeover: what the system does with the drone; set with action takeover, and with a denial after an
             internal error.
         filters: what must be done to a picture before it is handed out.
+        brake_first: the drone must be brought to a stop before the call is carried out: it is too fast for the turn that
+            the leg begins with. With `allow` and `correct`: stop (as Hover does), wait until the drone is slower than
+            `STANDING_MPS`, judge the call as it was asked again, and carry out that verdict. Never send `args` before.
     """
 
     action: Action
@@ -212,6 +240,7 @@ class Verdict:
     policies: tuple[str, ...] = ()
     takeover: Takeover | None = None
     filters: tuple[str, ...] = ()
+    brake_first: bool = False
 
     @property
     def permits(self) -> bool:

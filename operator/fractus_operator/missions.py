@@ -68,10 +68,11 @@ class Hindered(Exception):
 
 
 def mission_outcome(uid: str | None, grants: Iterable[Grant]) -> Outcome | None:
-    """How the mission of the application with this uid ended, as the driver's node reports; None while it goes on."""
+    """How the mission of the application with this uid ended, as the node of its driver, or of whom it is flown for, reports; None while it goes on."""
     for grant in grants:
         spec, status = grant.spec, grant.status
-        if spec.class_ != "driver" or spec.application.uid != uid or status is None:
+        leads = spec.class_ == "driver" or spec.tour
+        if not leads or spec.application.uid != uid or status is None:
             continue
         if status.phase == "Complete":
             return Outcome(True, "MissionComplete", status.message or f"{spec.component} finished its mission")

@@ -1,11 +1,13 @@
 """Grants: which policies reach which instance, and that what cannot be resolved grants nothing."""
 
+import dataclasses
+
 import pytest
 from fractus_core.api import InvalidObject, Policy, Zone
 from fractus_core.api.policies import NodeExpression
-from fractus_core.planning import plan
+from fractus_core.planning import flight_of, plan
 from fractus_core.policy.grants import compile_grants, matches, node_attributes, refresh
-from test_planning import PATH, VIEWER, application, at, drone, edge, inventory, manifest, navigator
+from test_planning import FRAME, PATH, VIEWER, application, at, drone, edge, inventory, manifest, navigator
 
 
 def zone(name, where, radius=50):
@@ -42,6 +44,28 @@ def test_driver_and_passenger_get_their_own_grants():
     assert (
         driver.identity == "spiffe://fractus.dev/ns/default/app/traffic/component/Navigator/instance/traffic-navigator"
     )
+
+
+def guide(points, **more):
+    return VIEWER | {"egress": [], "pointsOfInterest": {"points": points, **more}}
+
+
+@pytest.mark.parametrize("services", [VIEWER["services"], []])
+def test_who_has_no_driver_is_flown_a_tour(services):
+    points = [at(100, 0, 10), at(300, 0, 10), at(200, 0, 10)]
+    (grant,) = compiled(components=[guide(points, ordered=False) | {"services": services}])
+    assert [round(FRAME.xy(p.lat, p.lon)[0]) for p in grant.tour] == [100, 200, 300]
+    assert [s.service for s in grant.services] == [s["service"] for s in services]
+
+
+def test_who_comes_along_is_flown_nowhere():
+    app = application(guide([at(100, 0)]))
+    flown = flight_of(application(navigator(PATH)), inventory().depots)
+    flight = dataclasses.replace(flown, holder=("default", "other"))
+    stock = inventory([drone("d")], claimed={"d": flight.holder}, flights={"d": flight})
+    (grant,) = compile_grants(app, plan(app, stock), stock)
+    assert grant.tour == ()
+    assert grant.methods("camera") == {"CaptureImage"}
 
 
 def test_policies_come_with_their_zones_sorted_by_name():

@@ -158,6 +158,11 @@ class GrantSpec(Model):
     control: Literal["full", "partial"] | None = None
     control_points: tuple[ControlPoint, ...] = ()
     points_of_interest: PointsOfInterest | None = None
+    tour: tuple[Position, ...] = Field(
+        default=(),
+        description="Places that the system flies the drone to, in this order, and home from the last: the mission of an"
+        " application without a driver. Empty: a driver flies, or the application comes along with another.",
+    )
     services: tuple[ServiceRequest, ...] = ()
     operation_area: tuple[Area, ...] = Field(
         default=(), description="Where services may be used; empty: anywhere (for fixed nodes)."
@@ -169,7 +174,9 @@ class GrantSpec(Model):
     home: Position | None = None
     limits: GrantedLimits | None = None
     policies: tuple[GrantedPolicy, ...] = ()
-    issued_at: datetime | None = None
+    issued_at: datetime | None = Field(
+        default=None, description="Set by who signs it; of two Grants for one instance the later one counts."
+    )
 
     @property
     def identity(self) -> str:
@@ -185,6 +192,9 @@ class GrantSpec(Model):
 
 
 TRUST_DOMAIN = "fractus.dev"
+
+OPERATOR_IDENTITY = f"spiffe://{TRUST_DOMAIN}/operator"
+"""SPIFFE id of who signs Grants."""
 
 
 def component_identity(namespace: str, application: str, component: str, instance: str) -> str:

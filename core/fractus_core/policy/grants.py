@@ -34,7 +34,7 @@ def compile_grants(
     settings: Settings | None = None,
     present: Iterable[GrantSpec] = (),
 ) -> tuple[GrantSpec, ...]:
-    """One Grant for each planned instance that uses system services, in the plan's order.
+    """One Grant for each planned instance that uses system services or has the drone flown, in the plan's order.
 
     Policies are those whose node and application selectors match, with their zones resolved; zones that the node can
     never reach are left out.
@@ -57,7 +57,8 @@ def compile_grants(
     grants = []
     for placed in plan.placements:
         component = application.spec.component(placed.component)
-        if not component.services or placed.node is None:
+        guides = _guides(component, plan)
+        if placed.node is None or not (component.services or guides):
             continue
         last = before.get((placed.instance, placed.node))
         if placed.node not in inventory.drones and placed.node not in inventory.edge_nodes:
@@ -67,6 +68,7 @@ def compile_grants(
             continue
         if placed.placement == "drone" and area is not None:
             grant = _drone_grant(application, component, placed, inventory, area)
+            grant = grant.model_copy(update={"tour": area.route}) if guides else grant
         else:
             grant = _edge_grant(application, component, placed, inventory)
         if last is None:
@@ -122,6 +124,12 @@ def _drone_grant(
         home=home,
         limits=GrantedLimits(max_altitude=mobility.max_altitude, max_speed=mobility.max_speed) if mobility else None,
     )
+
+
+def _guides(component: Component, plan: DeploymentPlanSpec) -> bool:
+    """Whether a component without a driver has a drone of its own, which the system flies where it wants."""
+    flown = plan.drone is not None and plan.drone.shared_with is None
+    return flown and component.points_of_interest is not None
 
 
 def _opened(component: Component, inventory: Inventory) -> tuple[Any, ...]:

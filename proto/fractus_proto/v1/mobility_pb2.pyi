@@ -24,11 +24,13 @@ class ControlEvent(_message.Message):
         STATE_GRANTED: _ClassVar[ControlEvent.State]
         STATE_LOST: _ClassVar[ControlEvent.State]
         STATE_COMPLETE: _ClassVar[ControlEvent.State]
+        STATE_RIDING: _ClassVar[ControlEvent.State]
     STATE_UNSPECIFIED: ControlEvent.State
     STATE_WAITING: ControlEvent.State
     STATE_GRANTED: ControlEvent.State
     STATE_LOST: ControlEvent.State
     STATE_COMPLETE: ControlEvent.State
+    STATE_RIDING: ControlEvent.State
     STATE_FIELD_NUMBER: _ClassVar[int]
     CONTROL_POINT_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
@@ -80,14 +82,16 @@ class LandRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class GotoRequest(_message.Message):
-    __slots__ = ("target", "yaw_deg", "acceptance_radius_m")
+    __slots__ = ("target", "yaw_deg", "acceptance_radius_m", "speed_mps")
     TARGET_FIELD_NUMBER: _ClassVar[int]
     YAW_DEG_FIELD_NUMBER: _ClassVar[int]
     ACCEPTANCE_RADIUS_M_FIELD_NUMBER: _ClassVar[int]
+    SPEED_MPS_FIELD_NUMBER: _ClassVar[int]
     target: _types_pb2.Position
     yaw_deg: float
     acceptance_radius_m: float
-    def __init__(self, target: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., yaw_deg: _Optional[float] = ..., acceptance_radius_m: _Optional[float] = ...) -> None: ...
+    speed_mps: float
+    def __init__(self, target: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., yaw_deg: _Optional[float] = ..., acceptance_radius_m: _Optional[float] = ..., speed_mps: _Optional[float] = ...) -> None: ...
 
 class ReturnToLaunchRequest(_message.Message):
     __slots__ = ()
@@ -131,6 +135,24 @@ class SetSpeedResponse(_message.Message):
     speed_mps: float
     def __init__(self, decision: _Optional[_Union[_types_pb2.Decision, _Mapping]] = ..., speed_mps: _Optional[float] = ...) -> None: ...
 
+class SetVelocityRequest(_message.Message):
+    __slots__ = ("velocity", "yaw_deg", "hold_s")
+    VELOCITY_FIELD_NUMBER: _ClassVar[int]
+    YAW_DEG_FIELD_NUMBER: _ClassVar[int]
+    HOLD_S_FIELD_NUMBER: _ClassVar[int]
+    velocity: _types_pb2.Velocity
+    yaw_deg: float
+    hold_s: float
+    def __init__(self, velocity: _Optional[_Union[_types_pb2.Velocity, _Mapping]] = ..., yaw_deg: _Optional[float] = ..., hold_s: _Optional[float] = ...) -> None: ...
+
+class SetVelocityResponse(_message.Message):
+    __slots__ = ("decision", "velocity")
+    DECISION_FIELD_NUMBER: _ClassVar[int]
+    VELOCITY_FIELD_NUMBER: _ClassVar[int]
+    decision: _types_pb2.Decision
+    velocity: _types_pb2.Velocity
+    def __init__(self, decision: _Optional[_Union[_types_pb2.Decision, _Mapping]] = ..., velocity: _Optional[_Union[_types_pb2.Velocity, _Mapping]] = ...) -> None: ...
+
 class GetSpeedRequest(_message.Message):
     __slots__ = ()
     def __init__(self) -> None: ...
@@ -156,6 +178,54 @@ class GetPositionResponse(_message.Message):
     position: _types_pb2.Position
     velocity: _types_pb2.Velocity
     def __init__(self, decision: _Optional[_Union[_types_pb2.Decision, _Mapping]] = ..., position: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., velocity: _Optional[_Union[_types_pb2.Velocity, _Mapping]] = ...) -> None: ...
+
+class CheckCallRequest(_message.Message):
+    __slots__ = ("arm", "disarm", "takeoff", "land", "goto", "return_to_launch", "hover", "set_speed", "set_velocity", "get_speed", "get_position", "get_control", "return_control")
+    ARM_FIELD_NUMBER: _ClassVar[int]
+    DISARM_FIELD_NUMBER: _ClassVar[int]
+    TAKEOFF_FIELD_NUMBER: _ClassVar[int]
+    LAND_FIELD_NUMBER: _ClassVar[int]
+    GOTO_FIELD_NUMBER: _ClassVar[int]
+    RETURN_TO_LAUNCH_FIELD_NUMBER: _ClassVar[int]
+    HOVER_FIELD_NUMBER: _ClassVar[int]
+    SET_SPEED_FIELD_NUMBER: _ClassVar[int]
+    SET_VELOCITY_FIELD_NUMBER: _ClassVar[int]
+    GET_SPEED_FIELD_NUMBER: _ClassVar[int]
+    GET_POSITION_FIELD_NUMBER: _ClassVar[int]
+    GET_CONTROL_FIELD_NUMBER: _ClassVar[int]
+    RETURN_CONTROL_FIELD_NUMBER: _ClassVar[int]
+    arm: ArmRequest
+    disarm: DisarmRequest
+    takeoff: TakeoffRequest
+    land: LandRequest
+    goto: GotoRequest
+    return_to_launch: ReturnToLaunchRequest
+    hover: HoverRequest
+    set_speed: SetSpeedRequest
+    set_velocity: SetVelocityRequest
+    get_speed: GetSpeedRequest
+    get_position: GetPositionRequest
+    get_control: GetControlRequest
+    return_control: ReturnControlRequest
+    def __init__(self, arm: _Optional[_Union[ArmRequest, _Mapping]] = ..., disarm: _Optional[_Union[DisarmRequest, _Mapping]] = ..., takeoff: _Optional[_Union[TakeoffRequest, _Mapping]] = ..., land: _Optional[_Union[LandRequest, _Mapping]] = ..., goto: _Optional[_Union[GotoRequest, _Mapping]] = ..., return_to_launch: _Optional[_Union[ReturnToLaunchRequest, _Mapping]] = ..., hover: _Optional[_Union[HoverRequest, _Mapping]] = ..., set_speed: _Optional[_Union[SetSpeedRequest, _Mapping]] = ..., set_velocity: _Optional[_Union[SetVelocityRequest, _Mapping]] = ..., get_speed: _Optional[_Union[GetSpeedRequest, _Mapping]] = ..., get_position: _Optional[_Union[GetPositionRequest, _Mapping]] = ..., get_control: _Optional[_Union[GetControlRequest, _Mapping]] = ..., return_control: _Optional[_Union[ReturnControlRequest, _Mapping]] = ...) -> None: ...
+
+class CheckCallResponse(_message.Message):
+    __slots__ = ("decision", "takeoff", "goto", "set_speed", "set_velocity", "takeover", "brake_first")
+    DECISION_FIELD_NUMBER: _ClassVar[int]
+    TAKEOFF_FIELD_NUMBER: _ClassVar[int]
+    GOTO_FIELD_NUMBER: _ClassVar[int]
+    SET_SPEED_FIELD_NUMBER: _ClassVar[int]
+    SET_VELOCITY_FIELD_NUMBER: _ClassVar[int]
+    TAKEOVER_FIELD_NUMBER: _ClassVar[int]
+    BRAKE_FIRST_FIELD_NUMBER: _ClassVar[int]
+    decision: _types_pb2.Decision
+    takeoff: TakeoffRequest
+    goto: GotoRequest
+    set_speed: SetSpeedRequest
+    set_velocity: SetVelocityRequest
+    takeover: str
+    brake_first: bool
+    def __init__(self, decision: _Optional[_Union[_types_pb2.Decision, _Mapping]] = ..., takeoff: _Optional[_Union[TakeoffRequest, _Mapping]] = ..., goto: _Optional[_Union[GotoRequest, _Mapping]] = ..., set_speed: _Optional[_Union[SetSpeedRequest, _Mapping]] = ..., set_velocity: _Optional[_Union[SetVelocityRequest, _Mapping]] = ..., takeover: _Optional[str] = ..., brake_first: bool = ...) -> None: ...
 
 class SubscribeTelemetryRequest(_message.Message):
     __slots__ = ("interval_s",)

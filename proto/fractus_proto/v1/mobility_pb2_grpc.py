@@ -89,6 +89,11 @@ class MobilityServiceStub(object):
                 request_serializer=fractus__proto_dot_v1_dot_mobility__pb2.GetSpeedRequest.SerializeToString,
                 response_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.GetSpeedResponse.FromString,
                 _registered_method=True)
+        self.SetVelocity = channel.unary_unary(
+                '/fractus.v1.MobilityService/SetVelocity',
+                request_serializer=fractus__proto_dot_v1_dot_mobility__pb2.SetVelocityRequest.SerializeToString,
+                response_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.SetVelocityResponse.FromString,
+                _registered_method=True)
         self.GetPosition = channel.unary_unary(
                 '/fractus.v1.MobilityService/GetPosition',
                 request_serializer=fractus__proto_dot_v1_dot_mobility__pb2.GetPositionRequest.SerializeToString,
@@ -98,6 +103,11 @@ class MobilityServiceStub(object):
                 '/fractus.v1.MobilityService/SubscribeTelemetry',
                 request_serializer=fractus__proto_dot_v1_dot_mobility__pb2.SubscribeTelemetryRequest.SerializeToString,
                 response_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.Telemetry.FromString,
+                _registered_method=True)
+        self.CheckCall = channel.unary_unary(
+                '/fractus.v1.MobilityService/CheckCall',
+                request_serializer=fractus__proto_dot_v1_dot_mobility__pb2.CheckCallRequest.SerializeToString,
+                response_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.CheckCallResponse.FromString,
                 _registered_method=True)
 
 
@@ -174,6 +184,13 @@ class MobilityServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def SetVelocity(self, request, context):
+        """Flies with a velocity until the next one comes; a watchdog hovers when none comes within hold_s.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def GetPosition(self, request, context):
         """Missing associated documentation comment in .proto file."""
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
@@ -182,6 +199,13 @@ class MobilityServiceServicer(object):
 
     def SubscribeTelemetry(self, request, context):
         """Fast telemetry, at the asked interval (0.05 s at least). Needs the method GetPosition, or the node's own identity.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def CheckCall(self, request, context):
+        """What would become of a call at this moment: nothing is done and nothing is taken over. Needs a grant, not control.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -245,6 +269,11 @@ def add_MobilityServiceServicer_to_server(servicer, server):
                     request_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.GetSpeedRequest.FromString,
                     response_serializer=fractus__proto_dot_v1_dot_mobility__pb2.GetSpeedResponse.SerializeToString,
             ),
+            'SetVelocity': grpc.unary_unary_rpc_method_handler(
+                    servicer.SetVelocity,
+                    request_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.SetVelocityRequest.FromString,
+                    response_serializer=fractus__proto_dot_v1_dot_mobility__pb2.SetVelocityResponse.SerializeToString,
+            ),
             'GetPosition': grpc.unary_unary_rpc_method_handler(
                     servicer.GetPosition,
                     request_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.GetPositionRequest.FromString,
@@ -254,6 +283,11 @@ def add_MobilityServiceServicer_to_server(servicer, server):
                     servicer.SubscribeTelemetry,
                     request_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.SubscribeTelemetryRequest.FromString,
                     response_serializer=fractus__proto_dot_v1_dot_mobility__pb2.Telemetry.SerializeToString,
+            ),
+            'CheckCall': grpc.unary_unary_rpc_method_handler(
+                    servicer.CheckCall,
+                    request_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.CheckCallRequest.FromString,
+                    response_serializer=fractus__proto_dot_v1_dot_mobility__pb2.CheckCallResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -564,6 +598,33 @@ class MobilityService(object):
             _registered_method=True)
 
     @staticmethod
+    def SetVelocity(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/fractus.v1.MobilityService/SetVelocity',
+            fractus__proto_dot_v1_dot_mobility__pb2.SetVelocityRequest.SerializeToString,
+            fractus__proto_dot_v1_dot_mobility__pb2.SetVelocityResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
     def GetPosition(request,
             target,
             options=(),
@@ -607,6 +668,33 @@ class MobilityService(object):
             '/fractus.v1.MobilityService/SubscribeTelemetry',
             fractus__proto_dot_v1_dot_mobility__pb2.SubscribeTelemetryRequest.SerializeToString,
             fractus__proto_dot_v1_dot_mobility__pb2.Telemetry.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def CheckCall(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/fractus.v1.MobilityService/CheckCall',
+            fractus__proto_dot_v1_dot_mobility__pb2.CheckCallRequest.SerializeToString,
+            fractus__proto_dot_v1_dot_mobility__pb2.CheckCallResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from fractus_sim.vehicle.descent import descend
 from fractus_sim.vehicle.flight import Flight
+from fractus_sim.vehicle.leg import Leg
 from fractus_sim.vehicle.mav import ABSOLUTE_FRAMES, Command, Frame, Severity
 
 if TYPE_CHECKING:
@@ -26,9 +27,15 @@ class AutoFlight(Flight):
         self._returning: Flight | None = None
         self._wait_until_s = 0.0
         self.paused = False
+        self._leg: Leg | None = None
         self._circle_centre: tuple[float, float] | None = None
         self._turned = 0.0
         self._angle = 0.0
+
+    @property
+    def landing(self) -> bool:
+        """Whether the mission's own landing or return is in its last descent."""
+        return self._landing or (self._returning is not None and self._returning.landing)
 
     def begin(self, v: Vehicle) -> None:
         """Hold; the mission starts with the first step, which needs running motors."""
@@ -79,7 +86,7 @@ class AutoFlight(Flight):
             index = v.mission.next_after(index)
 
     def _finish(self, v: Vehicle) -> None:
-        self._item = None
+        self._item = self._leg = None
         v.mission.complete = True
         if v.landed:
             v.disarm("mission complete")
@@ -93,7 +100,7 @@ class AutoFlight(Flight):
         self._item, self._index = item, index
         self._arrived_s = None
         self._landing = False
-        self._returning = None
+        self._returning = self._leg = None
         north, east, down = self._place(v, item)
         match item.command:
             case Command.NAV_TAKEOFF:
@@ -113,8 +120,10 @@ class AutoFlight(Flight):
                 self._arrived_s = v.time_s
             case Command.NAV_GUIDED_ENABLE:
                 self._arrived_s = v.time_s
+            case Command.NAV_LAND:
+                v.control.go_to(north, east)
             case _:
-                v.control.go_to(north, east, down)
+                self._leg = Leg(v, north, east, down)
 
     def _do(self, v: Vehicle, item: Item) -> None:
         match item.command:
@@ -147,6 +156,8 @@ class AutoFlight(Flight):
             return
         if v.time_s < self._wait_until_s:
             return
+        if self._leg is not None:
+            self._leg.step(v)
         if item.command == Command.NAV_LAND:
             self._land(v)
         elif item.command == Command.NAV_LOITER_TURNS and self._circle_centre is not None:

@@ -27,7 +27,7 @@ from fractus_sim.vehicle.streams import BUILDERS
 from fractus_sim.vehicle.vehicle import Vehicle
 from fractus_sim.vehicle.wire import Message, layout_of
 
-NOT_ARMABLE = frozenset({Mode.RTL, Mode.LAND, Mode.BRAKE, Mode.AUTO})
+NOT_ARMABLE = frozenset({Mode.RTL, Mode.SMART_RTL, Mode.LAND, Mode.BRAKE, Mode.AUTO})
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ def _arm_disarm(v: Vehicle, o: Order, _c: Channel) -> Result:
         if v.armed:
             return Result.ACCEPTED
         if magic != FORCE_ARM_MAGIC:
-            refusal = f"{v.mode.name} mode not armable" if v.mode in NOT_ARMABLE else v.arming_refusal()
+            refusal = f"{v.mode.title} mode not armable" if v.mode in NOT_ARMABLE else v.arming_refusal()
             if refusal is not None:
                 v.say(Severity.CRITICAL, f"Arm: {refusal}")
                 return Result.FAILED

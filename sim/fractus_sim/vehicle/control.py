@@ -108,8 +108,10 @@ class Control:
         self.yaw_setpoint = 0.0
         self._integral = [0.0, 0.0, 0.0]
         self._stopping = False
+        self.speed_cap_mps = math.inf  # of the present target, where its climb takes longer than its way
         self._braking_mps2 = 0.0
         self.thrust_share = 0.0
+        self.wanted_n = (0.0, 0.0, 0.0, 0.0)  # what each motor is asked for
         self.lean = (0.0, 0.0)
 
     def reset(self, est: Estimate) -> None:
@@ -155,6 +157,7 @@ class Control:
         """Fly to a point and stay; without `down` the vertical target stays as it is."""
         self.horizontal = Axis.POSITION
         self._stopping = False
+        self.speed_cap_mps = math.inf
         self.target = (north, east)
         self.target_velocity = (0.0, 0.0)
         if down is not None:
@@ -194,7 +197,7 @@ class Control:
                 error,
                 here,
                 bend,
-                speed_max=limits.speed_mps,
+                speed_max=min(limits.speed_mps, self.speed_cap_mps),
                 accel_max=limits.accel_mps2,
                 jerk_max=limits.jerk_mps3,
                 dt=dt,
@@ -315,9 +318,10 @@ class Control:
         base = thrust / 4.0
         x4, y4, z4 = tau_x / 4.0, tau_y / 4.0, tau_z / 4.0
         low = 0.02 * full
-        return (
+        self.wanted_n = (
             clamp(base - x4 + y4 + z4, low, full),
             clamp(base + x4 - y4 + z4, low, full),
             clamp(base + x4 + y4 - z4, low, full),
             clamp(base - x4 - y4 - z4, low, full),
         )
+        return self.wanted_n

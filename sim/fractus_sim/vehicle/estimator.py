@@ -132,4 +132,7 @@ class Estimator:
         settled = time_s >= ORIGIN_SET * self._ready_after_s
         if self.origin is None and self.gps.fix_type >= 3 and settled:
             self.origin = self._start
-        self.position_ok = self.origin is not None and settled and age_s < GPS_TIMEOUT_S
+        ok = self.origin is not None and settled and age_s < GPS_TIMEOUT_S
+        if self.ready and ok != self.position_ok:
+            self._say(Severity.INFO, "EKF3 IMU0 is using GPS" if ok else "EKF3 IMU0 stopped aiding")
+        self.position_ok = ok

@@ -25,6 +25,14 @@ NAMES = {Breach.ALT_MAX: "Max Alt", Breach.CIRCLE: "Circle", Breach.POLYGON: "Po
 Vertex = tuple[float, float]
 
 
+def _to_edge_m(north: float, east: float, a: Vertex, b: Vertex) -> float:
+    run_n, run_e = b[0] - a[0], b[1] - a[1]
+    length2 = run_n * run_n + run_e * run_e
+    share = 0.0 if length2 == 0.0 else ((north - a[0]) * run_n + (east - a[1]) * run_e) / length2
+    share = min(1.0, max(0.0, share))
+    return math.hypot(north - a[0] - share * run_n, east - a[1] - share * run_e)
+
+
 class FenceShapeError(ValueError):
     """Fence items that do not form shapes."""
 
@@ -48,6 +56,11 @@ class Polygon:
             previous = vertex
         return inside
 
+    def edge_distance_m(self, north: float, east: float) -> float:
+        """Distance to the nearest edge."""
+        edges = zip(self.vertices, (*self.vertices[1:], self.vertices[0]), strict=True)
+        return min(_to_edge_m(north, east, a, b) for a, b in edges)
+
 
 @dataclass(frozen=True, slots=True)
 class Circle:
@@ -61,6 +74,10 @@ class Circle:
     def contains(self, north: float, east: float) -> bool:
         """Whether the point lies inside."""
         return math.hypot(north - self.north, east - self.east) <= self.radius_m
+
+    def edge_distance_m(self, north: float, east: float) -> float:
+        """Distance to the rim."""
+        return abs(math.hypot(north - self.north, east - self.east) - self.radius_m)
 
 
 Shape = Polygon | Circle
@@ -138,6 +155,21 @@ class Fence:
         if self.types & Breach.POLYGON and any(s.contains(north, east) != s.inclusion for s in self.shapes):
             found |= Breach.POLYGON
         return found
+
+    def distance_m(self, north: float, east: float, altitude_m: float, home: Vertex = (0.0, 0.0)) -> float:
+        """How far a point lies beyond the limits that it breaches, at least; 0 inside."""
+        found = self.outside(north, east, altitude_m, home)
+        beyond = [0.0]
+        if Breach.ALT_MAX in found:
+            beyond.append(altitude_m - self.alt_max_m)
+        if Breach.ALT_MIN in found:
+            beyond.append(self.alt_min_m - altitude_m)
+        if Breach.CIRCLE in found:
+            beyond.append(math.hypot(north - home[0], east - home[1]) - self.radius_m)
+        if Breach.POLYGON in found:
+            wrong = [shape for shape in self.shapes if shape.contains(north, east) != shape.inclusion]
+            beyond += [shape.edge_distance_m(north, east) for shape in wrong]
+        return max(beyond)
 
     def check(self, north: float, east: float, altitude_m: float, home: Vertex, now_s: float) -> Breach:
         """Update the breaches and return the new ones."""

@@ -14,8 +14,16 @@ class Flight:
     needs_position = True
     manual_throttle = False
 
+    @property
+    def landing(self) -> bool:
+        """Whether it is in its last descent."""
+        return False
+
     def begin(self, v: Vehicle) -> None:
         """Called once when the mode begins."""
 
     def step(self, v: Vehicle, dt: float) -> None:
         """Called at every control step while armed."""
+
+    def end(self, v: Vehicle) -> None:
+        """Called once when another mode begins."""

@@ -16,6 +16,12 @@ class Mode(IntEnum):
     RTL = 6
     LAND = 9
     BRAKE = 17
+    SMART_RTL = 21
+
+    @property
+    def title(self) -> str:
+        """What the autopilot calls the mode in its texts."""
+        return "SMARTRTL" if self is Mode.SMART_RTL else self.name
 
 
 class Result(IntEnum):

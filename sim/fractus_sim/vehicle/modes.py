@@ -13,12 +13,15 @@ from fractus_sim.vehicle.flight import Flight
 from fractus_sim.vehicle.guided import GuidedFlight
 from fractus_sim.vehicle.mav import Mode
 from fractus_sim.vehicle.shaping import clamp
+from fractus_sim.vehicle.smart_return import SmartReturn
 
 if TYPE_CHECKING:
     from fractus_sim.vehicle.vehicle import Vehicle
 
 # BRAKE decelerates with this, whatever WPNAV_ACCEL says.
 BRAKE_MPS2 = 5.0
+# A landing that a failsafe begins waits so long, for a pilot to object.
+FAILSAFE_PAUSE_S = 4.0
 
 
 def stick_rate(pwm: int, dead_zone: int = 30) -> float:
@@ -138,6 +141,18 @@ class Land(Flight):
 
     needs_position = False
 
+    def __init__(self) -> None:
+        self._sink_from_s = 0.0
+
+    @property
+    def landing(self) -> bool:
+        """Always."""
+        return True
+
+    def pause(self, v: Vehicle) -> None:
+        """Wait before the descent, as every failsafe that lands does."""
+        self._sink_from_s = v.time_s + FAILSAFE_PAUSE_S
+
     def begin(self, v: Vehicle) -> None:
         """Stop, or keep level when the position is unknown."""
         v.touch_time_s = 0.0
@@ -154,7 +169,8 @@ class Land(Flight):
         if v.control.horizontal is not Axis.ATTITUDE and not v.position_ok:
             v.control.horizontal = Axis.ATTITUDE
             v.control.attitude = (0.0, 0.0)
-        descend(v)
+        if v.time_s >= self._sink_from_s or v.body.on_ground:
+            descend(v)
 
 
 class RtlStage(Enum):
@@ -174,6 +190,11 @@ class ReturnToLaunch(Flight):
         self.stage = RtlStage.CLIMB
         self._loiter_until_s = 0.0
         self._target = (0.0, 0.0)
+
+    @property
+    def landing(self) -> bool:
+        """Whether it comes down for good."""
+        return self.stage is RtlStage.LAND
 
     def begin(self, v: Vehicle) -> None:
         """Choose target and altitude, and climb."""
@@ -229,6 +250,7 @@ FLIGHTS: dict[Mode, type[Flight]] = {
     Mode.BRAKE: Brake,
     Mode.LAND: Land,
     Mode.RTL: ReturnToLaunch,
+    Mode.SMART_RTL: SmartReturn,
 }
 
 

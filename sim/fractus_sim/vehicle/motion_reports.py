@@ -121,7 +121,7 @@ def nav_controller_output(v: Vehicle) -> Values:
 
 def position_target_global_int(v: Vehicle) -> Values | None:
     """POSITION_TARGET_GLOBAL_INT while a guided or automatic flight has a target."""
-    if v.origin is None or v.mode not in (Mode.GUIDED, Mode.AUTO, Mode.RTL) or v.landed:
+    if v.origin is None or v.mode not in (Mode.GUIDED, Mode.AUTO, Mode.RTL, Mode.SMART_RTL) or v.landed:
         return None
     c = v.control
     place = v.origin.offset(c.target[0], c.target[1], c.target_down)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fractus_sim.vehicle.body import Airframe, Body, Wind
+from fractus_sim.vehicle.breadcrumbs import Breadcrumbs
 from fractus_sim.vehicle.channel import Channel
 from fractus_sim.vehicle.control import Control
 from fractus_sim.vehicle.earth import Place, valid_place
@@ -22,6 +23,7 @@ from fractus_sim.vehicle.mission import Item, Mission
 from fractus_sim.vehicle.modes import FLIGHTS, ReturnToLaunch, new_flight
 from fractus_sim.vehicle.params import Parameters
 from fractus_sim.vehicle.plans import Plans
+from fractus_sim.vehicle.receiver import Receiver
 from fractus_sim.vehicle.sensors import Battery, Gps
 from fractus_sim.vehicle.settings import LIMIT_PREFIXES, set_battery, set_fence, set_limits, set_wind
 from fractus_sim.vehicle.shaping import clamp, wrap_pi
@@ -33,7 +35,6 @@ PHYSICS_PER_CONTROL = 2
 ARMING_DELAY_S = 2.0
 # The time of day at which runs begin that must be repeatable.
 REPEATABLE_EPOCH_US = 1_700_000_000_000_000
-STICKS_CENTRED = (1500,) * 4 + (1800,) + (1000,) * 3 + (0,) * 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +84,7 @@ class Vehicle:
         self.fence = Fence()
         self.failsafes = Failsafes()
         self.plans = Plans(self)
+        self.breadcrumbs = Breadcrumbs(self.params["SRTL_POINTS"])
         self.yaw = Heading()
         self.armed = False
         self.armed_at_s = 0.0
@@ -98,8 +100,7 @@ class Vehicle:
         self._home_locked = False
         self.reboot_wanted = False
         self.signing_key: bytes | None = None
-        self.sticks: tuple[int, ...] = STICKS_CENTRED
-        self._sticks_until_s = 0.0
+        self.receiver = Receiver()
         self.est = self.estimator.estimate(self.body)
         self.params.changed = self._parameter_changed
         set_limits(self.params, self.control)
@@ -128,6 +129,11 @@ class Vehicle:
     def gps(self) -> Gps:
         """The GPS receiver."""
         return self.estimator.gps
+
+    @property
+    def sticks(self) -> tuple[int, ...]:
+        """The channels of the radio, in microseconds."""
+        return self.receiver.channels
 
     @property
     def mission(self) -> Mission:
@@ -214,6 +220,7 @@ class Vehicle:
             (failsafes.battery, "Battery 1 low voltage failsafe"),
             (volts < self.params["BATT_CRT_VOLT"], "Battery 1 critical voltage failsafe"),
             (failsafes.gcs, "GCS failsafe on"),
+            (failsafes.radio, "Radio failsafe on"),
             (
                 self.home is not None and bool(self.fence.outside(north, east, 0.0, self.home_xy)),
                 "Vehicle outside fence",
@@ -249,6 +256,7 @@ class Vehicle:
         if not self._home_locked and self.position_ok:
             self._set_home(self.place)
         self.control.reset(self.est)
+        self.breadcrumbs.restart(self)
         self.say(Severity.INFO, "Arming motors")
 
     def disarm(self, _reason: str, *, force: bool = False) -> None:
@@ -269,10 +277,12 @@ class Vehicle:
 
     def mode_refusal(self, mode: Mode) -> str | None:
         """Why a mode cannot be entered now, or None; on the ground with the motors off every mode can."""
+        if mode is Mode.SMART_RTL and not self.breadcrumbs.active:
+            return f"Mode change to {mode.title} failed: init failed"
         if not self.armed:
             return None
         if FLIGHTS[mode].needs_position and not self.position_ok:
-            return f"Mode change to {mode.name} failed: requires position"
+            return f"Mode change to {mode.title} failed: requires position"
         if mode is Mode.AUTO and len(self.mission.items) <= 1:
             return "Mode change to AUTO failed: init failed"
         return None
@@ -290,6 +300,7 @@ class Vehicle:
 
     def force_mode(self, mode: Mode, _reason: str) -> None:
         """Change the mode without asking."""
+        self.flight.end(self)
         self.mode = mode
         self.flight = new_flight(mode)
         set_limits(self.params, self.control)
@@ -387,14 +398,7 @@ class Vehicle:
 
     def set_sticks(self, values: tuple[int, ...]) -> None:
         """RC overrides, in microseconds; 0 releases a channel, 65535 leaves it."""
-        sticks = list(self.sticks)
-        for at, value in enumerate(values[: len(sticks)]):
-            if value == 0:
-                sticks[at] = STICKS_CENTRED[at]
-            elif value != 65535:
-                sticks[at] = int(clamp(value, 800, 2200))
-        self.sticks = tuple(sticks)
-        self._sticks_until_s = self.time_s + max(self.params["RC_OVERRIDE_TIME"], 0.0)
+        self.receiver.override(values, self.time_s + max(self.params["RC_OVERRIDE_TIME"], 0.0))
 
     # -- parameters --------------------------------------------------------------------------------------------
 
@@ -421,8 +425,8 @@ class Vehicle:
         if self.home is None and self.estimator.ready and self.position_ok:
             self._set_home(self.place)
         self.failsafes.step(self)
-        if self.time_s > self._sticks_until_s and self.sticks is not STICKS_CENTRED:
-            self.sticks = STICKS_CENTRED
+        self.breadcrumbs.step(self)
+        self.receiver.step(self.time_s)
         if self.armed:
             self.flight.step(self, CONTROL_STEP_S)
             self._check_idle()
@@ -470,7 +474,7 @@ class Vehicle:
         delay = self.params["DISARM_DELAY"]
         if not self.landed or self.flying_wanted:
             self._idle_since_s = self.time_s
-        elif self.mode in (Mode.LAND, Mode.RTL) and self.time_s - self._idle_since_s > 1.0:
+        elif self.mode in (Mode.LAND, Mode.RTL, Mode.SMART_RTL) and self.time_s - self._idle_since_s > 1.0:
             self.disarm("landed")
         elif delay > 0.0 and self.time_s - self._idle_since_s >= delay:
             self.disarm("idle")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Self
@@ -15,6 +16,8 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from fractus_core.api import GROUP, node_identity, node_server_name
+from fractus_core.api.plans import OPERATOR_IDENTITY
+from fractus_core.policy.signatures import DOCUMENT_SIGNING
 
 from fractus_operator.kinds import CONFIG_MAP, SECRET, Body
 from fractus_operator.labels import MANAGED_BY, MANAGED_LABEL
@@ -28,6 +31,7 @@ NAME = "fractus-ca"
 CA_LIFE = timedelta(days=3650)
 COMPONENT_LIFE = timedelta(hours=24)
 NODE_LIFE = timedelta(days=30)
+SIGNER_LIFE = timedelta(days=30)
 _CLOCK_SKEW = timedelta(minutes=5)
 _RENEW_AFTER = 2 / 3
 
@@ -91,23 +95,51 @@ class Authority:
         """The CA certificate, which everyone trusts."""
         return self.certificate.public_bytes(serialization.Encoding.PEM)
 
-    def issue_component(self, identity: str, now: datetime) -> Data:
+    def issue_component(self, identity: str, now: datetime, life: timedelta = COMPONENT_LIFE) -> Data:
         """Make a key and a client certificate for a component instance.
 
         Args:
             identity: Its SPIFFE id, the only subject alternative name.
             now: The time it is valid from.
+            life: How long it is valid.
         """
         key = ec.generate_private_key(ec.SECP256R1())
-        names: list[x509.GeneralName] = [x509.UniformResourceIdentifier(identity)]
         certificate = self._issue(
             key.public_key(),
             common_name=_short(identity),
-            names=names,
+            names=[x509.UniformResourceIdentifier(identity)],
             usages=[ExtendedKeyUsageOID.CLIENT_AUTH],
-            life=COMPONENT_LIFE,
+            life=life,
             now=now,
         )
+        return self._data(key, certificate)
+
+    def issue_node(self, node: str, now: datetime, life: timedelta = NODE_LIFE) -> Data:
+        """Make a key and the certificate of a node's services, for nodes without an agent that keeps its own key.
+
+        Args:
+            node: Its name.
+            now: The time it is valid from.
+            life: How long it is valid.
+        """
+        key = ec.generate_private_key(ec.SECP256R1())
+        return self._data(key, self._node_certificate(key.public_key(), node, now, life))
+
+    def issue_signer(self, now: datetime) -> tuple[ec.EllipticCurvePrivateKey, x509.Certificate]:
+        """Make a key and a certificate that is good for signing Grants and for nothing else."""
+        key = ec.generate_private_key(ec.SECP256R1())
+        pem = self._issue(
+            key.public_key(),
+            common_name=f"{GROUP} operator",
+            names=[x509.UniformResourceIdentifier(OPERATOR_IDENTITY)],
+            usages=[DOCUMENT_SIGNING],
+            life=SIGNER_LIFE,
+            now=now,
+            signs_grants=True,
+        )
+        return key, x509.load_pem_x509_certificate(pem)
+
+    def _data(self, key: ec.EllipticCurvePrivateKey, certificate: bytes) -> Data:
         return {
             "tls.crt": _encoded(certificate),
             "tls.key": _encoded(_key_pem(key)),
@@ -135,13 +167,16 @@ class Authority:
         key = request.public_key()
         if not isinstance(key, ec.EllipticCurvePublicKey):
             raise TypeError(f"the request of {node} has no elliptic curve key")
+        return self._node_certificate(key, node, now, NODE_LIFE)
+
+    def _node_certificate(self, key: ec.EllipticCurvePublicKey, node: str, now: datetime, life: timedelta) -> bytes:
         names: list[x509.GeneralName] = [
             x509.UniformResourceIdentifier(node_identity(node)),
             x509.DNSName(node_server_name(node)),
         ]
         usages = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
         return self._issue(
-            key, common_name=_short(node_server_name(node)), names=names, usages=usages, life=NODE_LIFE, now=now
+            key, common_name=_short(node_server_name(node)), names=names, usages=usages, life=life, now=now
         )
 
     def _issue(
@@ -149,10 +184,11 @@ class Authority:
         key: ec.EllipticCurvePublicKey,
         *,
         common_name: str,
-        names: list[x509.GeneralName],
+        names: Sequence[x509.GeneralName],
         usages: list[x509.ObjectIdentifier],
         life: timedelta,
         now: datetime,
+        signs_grants: bool = False,
     ) -> bytes:
         issuer_key = self.certificate.extensions.get_extension_for_class(x509.SubjectKeyIdentifier).value
         return (
@@ -164,7 +200,7 @@ class Authority:
             .not_valid_before(now - _CLOCK_SKEW)
             .not_valid_after(min(now + life, self.certificate.not_valid_after_utc))
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-            .add_extension(_key_usage(signs_certificates=False), critical=True)
+            .add_extension(_key_usage(signs_grants=signs_grants), critical=True)
             .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
             .add_extension(x509.SubjectAlternativeName(names), critical=False)
             .add_extension(x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(issuer_key), critical=False)
@@ -206,12 +242,12 @@ def _owned(header: Body) -> Body:
     return header
 
 
-def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
+def _key_usage(*, signs_certificates: bool = False, signs_grants: bool = False) -> x509.KeyUsage:
     return x509.KeyUsage(
-        digital_signature=not signs_certificates,
+        digital_signature=not (signs_certificates or signs_grants),
         key_cert_sign=signs_certificates,
         crl_sign=signs_certificates,
-        content_commitment=False,
+        content_commitment=signs_grants,
         key_encipherment=False,
         data_encipherment=False,
         key_agreement=False,

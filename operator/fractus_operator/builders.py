@@ -58,7 +58,7 @@ def grant(application: Application, spec: GrantSpec) -> Body:
         COMPONENT_LABEL: spec.component,
         INSTANCE_LABEL: spec.instance,
     }
-    body["spec"] = spec.to_dict()
+    body["spec"] = _unsigned(spec)
     return body
 
 
@@ -68,8 +68,13 @@ def granted_again(observed: Body, spec: GrantSpec) -> Body:
     ours = (APPLICATION_LABEL, MANAGED_LABEL, NAMESPACE_LABEL, COMPONENT_LABEL, INSTANCE_LABEL)
     labels = observed["metadata"].get("labels") or {}
     body["metadata"]["labels"] = {label: labels[label] for label in ours if label in labels}
-    body["spec"] = spec.to_dict()
+    body["spec"] = _unsigned(spec)
     return body
+
+
+def _unsigned(spec: GrantSpec) -> Body:
+    """The spec without what is added when it is signed, so that what was signed before compares with it."""
+    return spec.model_copy(update={"issued_at": None}).to_dict()
 
 
 def tls_secret(application: Application, placed: PlannedInstance, data: dict[str, str]) -> Body:

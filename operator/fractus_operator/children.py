@@ -6,14 +6,16 @@ import asyncio
 import logging
 from collections.abc import Collection, Mapping, Sequence
 
-from fractus_core.api import Application, Grant
+from fractus_core.api import Application, Grant, InvalidObject
 from fractus_core.api.plans import GrantSpec
 
 from fractus_operator import builders, kinds
 from fractus_operator.difference import digest, is_current, stamped
+from fractus_operator.grantor import Grantor
 from fractus_operator.inventory import LiveInventory
 from fractus_operator.kinds import Body, Key, Kind, key_of
 from fractus_operator.labels import APPLICATION_LABEL, MANAGED_SELECTOR, NAMESPACE_LABEL, label_value
+from fractus_operator.reading import read
 from fractus_operator.store import NotFound, Store
 
 logger = logging.getLogger(__name__)
@@ -28,9 +30,10 @@ class NameTaken(Exception):
 class Children:
     """The children of Applications."""
 
-    def __init__(self, store: Store, live: LiveInventory) -> None:
+    def __init__(self, store: Store, live: LiveInventory, grantor: Grantor) -> None:
         self._store = store
         self._live = live
+        self._grantor = grantor
         self._parallel = asyncio.Semaphore(_PARALLEL)
         self._normalised: dict[tuple[Kind, Key], tuple[object, ...] | None] = {}
 
@@ -69,7 +72,7 @@ class Children:
         observed = self._live.children[kinds.GRANT].get(key)
         if observed is None or "deletionTimestamp" in observed["metadata"]:
             return
-        body = stamped(builders.granted_again(observed, spec))
+        body = self._grantor.signed(stamped(builders.granted_again(observed, spec)), grant)
         # With its uid, a grant that went meanwhile is not made anew.
         body["metadata"]["uid"] = observed["metadata"]["uid"]
         async with self._parallel:
@@ -80,14 +83,16 @@ class Children:
         desired = stamped(body)
         async with self._parallel:
             observed = await self.observed(kind, key)
-            if is_current(desired, observed) or self._is_normalised(kind, key, desired, observed):
+            current = is_current(desired, observed) or self._is_normalised(kind, key, desired, observed)
+            if current and (kind is not kinds.GRANT or observed is None or self._grantor.vouches_for(observed)):
                 return
             if observed is not None and not _is_child(application, kind, observed):
                 raise NameTaken(f"{kind.name} {key[1]} exists and is not of this application; rename one of them")
             if kind is kinds.GRANT and observed is not None and _moved(observed, body):
                 # A Grant belongs to one node for its whole life: its status tells what happened there.
                 await self._store.delete(kind, key, observed["metadata"]["uid"])
-            applied = await self._store.apply(kind, desired)
+            wanted = self._grantor.signed(desired, _readable(observed)) if kind is kinds.GRANT else desired
+            applied = await self._store.apply(kind, wanted)
             self._live.children[kind].note(key, applied)
             if not is_current(desired, applied):
                 # The API server spells some value its own way (0.5 cores become 500m).
@@ -146,6 +151,13 @@ def _is_child(application: Application, kind: Kind, body: Body) -> bool:
         return bool(owner.get("uid") == application.metadata.uid)
     owners = body["metadata"].get("ownerReferences") or ()
     return any(owner.get("uid") == application.metadata.uid for owner in owners)
+
+
+def _readable(observed: Body | None) -> Grant | None:
+    try:
+        return read(Grant, observed) if observed is not None else None
+    except InvalidObject:
+        return None
 
 
 def _moved(observed: Body, desired: Body) -> bool:

@@ -19,6 +19,7 @@ from fractus_operator import builders, kinds
 from fractus_operator.authority import Authority
 from fractus_operator.children import Children, NameTaken
 from fractus_operator.conditions import Fact, merge
+from fractus_operator.grantor import Grantor
 from fractus_operator.inventory import LiveInventory
 from fractus_operator.kinds import Body, Key, Kind, key_of
 from fractus_operator.labels import CAUSE_ANNOTATION, FINALIZER
@@ -77,7 +78,8 @@ class Deployments:
         self._authority = authority
         self._clock = clock
         self._settings = settings or Settings()
-        self._children = Children(store, live)
+        self._grantor = Grantor(authority, clock)
+        self._children = Children(store, live, self._grantor)
         self._memories: dict[Key, _Memory] = {}
         self._torn_down: set[str] = set()
 
@@ -159,7 +161,7 @@ class Deployments:
         """Bring the policies of what is granted up to date, whatever becomes of the application's next plan."""
         inventory = self._live.snapshot(uid)
         grants = [(grant, refresh(grant.spec, inventory)) for grant in self._live.grants_of(key, uid)]
-        stale = [(grant, spec) for grant, spec in grants if spec != grant.spec]
+        stale = [(grant, spec) for grant, spec in grants if spec != grant.spec or not self._grantor.vouches(grant)]
         try:
             await self._children.refresh(stale)
         except StoreError as error:

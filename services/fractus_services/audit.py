@@ -121,6 +121,10 @@ class AuditLog:
             self._urgent = self._urgent or now
             self._news.notify()
 
+    def refused_grant(self, name: str, reason: str) -> None:
+        """Write down that a file of the grants grants nothing."""
+        self.append("grant", {"change": "refused", "name": name, "reason": reason})
+
     async def close(self) -> None:
         """Write what is left."""
         with self._news:

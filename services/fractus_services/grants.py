@@ -12,6 +12,9 @@ from pathlib import Path
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.plans import Grant, GrantSpec
 from fractus_core.policy.compiled import CompiledGrant, compile_grant
+from fractus_core.policy.signatures import BadSignature
+
+from fractus_services.seals import Seals
 
 log = logging.getLogger(__name__)
 
@@ -25,12 +28,14 @@ class Held:
 
     Attributes:
         key: names the mission: the grant object's uid, or the identity where nobody gave it one.
+        digest: of what was signed.
     """
 
     key: str
     name: str
     spec: GrantSpec
     compiled: CompiledGrant
+    digest: str = ""
 
     @property
     def identity(self) -> str:
@@ -41,22 +46,38 @@ class Held:
 Listener = Callable[[Held | None, Held | None], None]
 """Called with the grant before and after a change; None: there is none."""
 
+Complaint = Callable[[str, str], None]
+"""Called with the name of a file that grants nothing, and why."""
+
 
 class GrantFiles:
     """Watches a directory of Grant manifests.
 
-    What cannot be read or understood is not a grant: a file that turns bad takes its grant away.
+    What cannot be read or understood, or is not signed by the operator, is not a grant: a file that turns bad takes its
+    grant away.
 
     Args:
         directory: where the agent stores the grants; it may not exist yet.
         node: the node that grants must be for.
+        seals: tells which are the operator's.
         flat_terrain: see `compile_grant`.
+        refused: told of files that grant nothing.
     """
 
-    def __init__(self, directory: Path, node: str, flat_terrain: bool = False) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        node: str,
+        seals: Seals,
+        flat_terrain: bool = False,
+        refused: Complaint = lambda _name, _why: None,
+    ) -> None:
         self._directory = directory
         self._node = node
+        self._seals = seals
         self._flat_terrain = flat_terrain
+        self._refused = refused
+        self._saving: asyncio.Task[None] | None = None
         self._stamps: dict[Path, _Stamp] = {}
         self._loaded: dict[Path, Held | None] = {}
         self._held: dict[str, Held] = {}
@@ -87,14 +108,44 @@ class GrantFiles:
                     recursive=False,
                 ):  # fmt: skip
                     self.scan()
+                    self._remember()
             except (OSError, RuntimeError) as error:
                 log.warning("cannot watch %s, looking again: %s", self._directory, error)
             await asyncio.sleep(RESCAN_MS / 1000)
             self.scan()
 
+    def _remember(self) -> None:
+        """Store what was seen, beside the loop: a disk that hangs must hold up no news."""
+        if self._saving is None or self._saving.done():
+            content = self._seals.unsaved()
+            if content is not None:
+                self._saving = asyncio.create_task(asyncio.to_thread(self._seals.store, content))
+
     def scan(self) -> None:
         """Read what changed."""
+        found, whole = self._look()
+        trusted = self._seals.renewed()
+        if found == self._stamps and not trusted:
+            return
+        before = dict(self._loaded)
+        for path in self._stamps.keys() - found.keys():
+            self._loaded.pop(path, None)
+        for path, stamp in found.items():
+            if self._stamps.get(path) != stamp or (trusted and self._loaded.get(path) is None):
+                self._loaded[path] = self._load(path)
+        self._stamps = found
+        if whole:
+            renamed = {held.digest for held in self._loaded.values() if held is not None}
+            for path in before.keys() - self._loaded.keys():
+                gone = before[path]
+                if gone is not None and gone.digest not in renamed:
+                    self._revoke(gone)
+        self._replace()
+
+    def _look(self) -> tuple[dict[Path, _Stamp], bool]:
+        """The files, and whether those that are missing are gone for certain."""
         found: dict[Path, _Stamp] = {}
+        whole = True
         try:
             for path in sorted(self._directory.glob("*.json")):
                 try:
@@ -102,40 +153,54 @@ class GrantFiles:
                 except FileNotFoundError:
                     continue
                 except OSError as error:
+                    whole = False
                     log.critical("cannot look at %s, so nothing is granted by it: %s", path, error)
                     continue
                 found[path] = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
         except OSError as error:
+            whole = False
             log.critical("cannot read the grants in %s: %s; nothing is granted", self._directory, error)
-        if found == self._stamps:
-            return
-        for path in self._stamps.keys() - found.keys():
-            self._loaded.pop(path, None)
-        for path, stamp in found.items():
-            if self._stamps.get(path) != stamp:
-                self._loaded[path] = self._load(path)
-        self._stamps = found
-        self._replace()
+        return found, whole and self._directory.is_dir()
 
     def _load(self, path: Path) -> Held | None:
+        """The grant of a file; one that it held before and holds no more is revoked."""
+        before = self._loaded.get(path)
         try:
-            grant = Grant.from_body(json.loads(path.read_bytes()))
-            if grant.spec.node != self._node:
-                log.error("%s is a grant for node %s, not for %s; ignored", path, grant.spec.node, self._node)
-                return None
-            compiled = compile_grant(grant.spec, flat_terrain=self._flat_terrain)
-        except (OSError, ValueError, InvalidObject) as error:
+            held = self._read(path)
+        except (OSError, ValueError, InvalidObject, BadSignature) as error:
             log.critical("%s is no grant, so nothing is granted by it: %s", path, error)
+            self._refused(path.name, str(error))
+            if not isinstance(error, OSError):
+                self._revoke(before)
             return None
-        except Exception:
+        except Exception as error:
             log.exception("%s cannot be made sense of, so nothing is granted by it", path)
+            self._refused(path.name, f"{type(error).__name__}: {error}")
             return None
-        return Held(grant.metadata.uid or grant.spec.identity, grant.name, grant.spec, compiled)
+        if held is None or (before is not None and before.identity != held.identity):
+            self._revoke(before)
+        return held
+
+    def _read(self, path: Path) -> Held | None:
+        grant = Grant.from_body(json.loads(path.read_bytes()))
+        if grant.spec.node != self._node:
+            log.error("%s is a grant for node %s, not for %s; ignored", path, grant.spec.node, self._node)
+            return None
+        digest = self._seals.check(grant)
+        compiled = compile_grant(grant.spec, flat_terrain=self._flat_terrain)
+        return Held(grant.metadata.uid or grant.spec.identity, grant.name, grant.spec, compiled, digest)
+
+    def _revoke(self, held: Held | None) -> None:
+        if held is not None:
+            self._seals.revoke(held.identity, held.digest)
 
     def _replace(self) -> None:
         fresh: dict[str, Held] = {}
         for path, held in sorted(self._loaded.items()):
             if held is None:
+                continue
+            if not self._seals.holds(held.identity, held.digest):
+                log.error("%s was replaced by a later grant of %s; ignored", path, held.identity)
                 continue
             if held.identity in fresh:
                 log.error("%s grants %s a second time; ignored", path, held.identity)

@@ -20,8 +20,9 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
-from fractus_core.api.plans import component_identity, node_identity, node_server_name
+from fractus_core.api.plans import OPERATOR_IDENTITY, component_identity, node_identity, node_server_name
 from fractus_core.geo import LocalFrame
+from fractus_core.policy.signatures import DOCUMENT_SIGNING, sign
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_proto.v1 import mobility_pb2_grpc, types_pb2
 from grpc_status import rpc_status
@@ -117,6 +118,8 @@ class Authority:
             .sign(self._key, hashes.SHA256())
         )
         self.pem = self.certificate.public_bytes(serialization.Encoding.PEM)
+        self._signer: tuple[ec.EllipticCurvePrivateKey, x509.Certificate] | None = None
+        self._issued = now
 
     def issue(
         self, identity: str, *, dns: str | None = None, seconds: float = 3600.0, begun: float = -60.0
@@ -143,6 +146,44 @@ class Authority:
         )
         return pem, certificate.public_bytes(serialization.Encoding.PEM)
 
+    def sign(self, body: dict[str, Any]) -> dict[str, Any]:
+        """A grant as the operator signs it, later than all before."""
+        if self._signer is None:
+            self._signer = issue_signer(self.certificate, self._key)
+        now = datetime.datetime.now(datetime.UTC)
+        self._issued = max(now, self._issued + datetime.timedelta(microseconds=1))
+        return sign(body, *self._signer, self._issued)
+
+
+def issue_signer(
+    authority: x509.Certificate, authority_key: ec.EllipticCurvePrivateKey, identity: str = OPERATOR_IDENTITY
+) -> tuple[ec.EllipticCurvePrivateKey, x509.Certificate]:
+    """A key and a certificate for signing grants."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    now = datetime.datetime.now(datetime.UTC)
+    usage = dict.fromkeys(
+        (
+            "digital_signature", "key_encipherment", "data_encipherment", "key_agreement", "key_cert_sign", "crl_sign",
+            "encipher_only", "decipher_only",
+        ),
+        False,
+    )  # fmt: skip
+    certificate = (
+        x509.CertificateBuilder()
+        .subject_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "signer")]))
+        .issuer_name(authority.subject)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - datetime.timedelta(hours=1))
+        .not_valid_after(now + datetime.timedelta(hours=1))
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(x509.KeyUsage(content_commitment=True, **usage), critical=True)
+        .add_extension(x509.ExtendedKeyUsage([DOCUMENT_SIGNING]), critical=False)
+        .add_extension(x509.SubjectAlternativeName([x509.UniformResourceIdentifier(identity)]), critical=False)
+        .sign(authority_key, hashes.SHA256())
+    )
+    return key, certificate
+
 
 class Rig:
     """Everything on a drone, in one directory."""
@@ -168,10 +209,10 @@ class Rig:
             fresh.write_bytes(data)
             fresh.replace(self.tls / name)
 
-    def write_grant(self, body: dict[str, Any]) -> Path:
+    def write_grant(self, body: dict[str, Any], signed: bool = True) -> Path:
         path = self.grants / f"{body['spec']['instance']}.json"
         fresh = path.with_suffix(".new")
-        fresh.write_text(json.dumps(body))
+        fresh.write_text(json.dumps(self.authority.sign(body) if signed else body))
         fresh.replace(path)
         return path
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,9 @@ from fractus_core.api.model import Metadata
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
 from fractus_core.planning import Inventory
 from fractus_core.policy.grants import compile_grants
+from fractus_core.policy.signatures import sign
 from fractus_services.audit import verify
+from mobility_rig import issue_signer
 from sdk_service import Authority
 
 ROOT = Path(__file__).parents[2]
@@ -87,7 +90,9 @@ class Stage:
         )
         authority.issue(folder / "driver-tls", [x509.UniformResourceIdentifier(self.grant.spec.identity)])
         (folder / "grants").mkdir()
-        (folder / "grants" / "navigator.json").write_text(json.dumps(self.grant.to_dict()))
+        signer = issue_signer(authority.certificate, authority.key)
+        signed = sign(self.grant.to_dict(), *signer, datetime.now(UTC))
+        (folder / "grants" / "navigator.json").write_text(json.dumps(signed))
 
     def start_vehicle(self) -> None:
         depot = documents("depot.yaml")[0]["spec"]["location"]

@@ -12,22 +12,34 @@ from fractus_services.answering import Allowance
 from fractus_services.auth import Caller, NotAuthenticated, caller_of
 from fractus_services.clock import TRUST_S, Clock
 from fractus_services.grants import GrantFiles, Held
+from fractus_services.seals import Seals
+from grant_signing import CA_PEM, signed
 from policy_world import spec
 
 
-def body(**changes: Any) -> str:
-    grant = {
+def manifest(**changes: Any) -> dict[str, Any]:
+    return {
         "apiVersion": "fractus.dev/v1alpha1",
         "kind": "Grant",
         "metadata": {"name": "g", "uid": changes.pop("uid", "u1")},
         "spec": {**spec().to_dict(), **changes},
     }
-    return json.dumps(grant)
+
+
+def body(**changes: Any) -> str:
+    return json.dumps(signed(manifest(**changes)))
+
+
+def grant_files(directory: Path, refused: Any = lambda _name, _why: None) -> GrantFiles:
+    tls = directory.parent / f"{directory.name}-tls"
+    tls.mkdir(exist_ok=True)
+    (tls / "ca.crt").write_bytes(CA_PEM)
+    return GrantFiles(directory, "drone-1", Seals(tls, tls / "seen.json"), refused=refused)
 
 
 def test_files_come_change_and_go(tmp_path: Path) -> None:
     seen: list[tuple[str | None, str | None]] = []
-    files = GrantFiles(tmp_path, "drone-1")
+    files = grant_files(tmp_path)
     files.listen(lambda old, new: seen.append((old and old.key, new and new.key)))
     path = tmp_path / "g.json"
     path.write_text(body())
@@ -51,28 +63,32 @@ def test_files_come_change_and_go(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "", "[]", '{"kind": "Policy"}', body(node="drone-2"),
+        "", "[]", '{"kind": "Policy"}', body(node="drone-2"), json.dumps(manifest()),
         body(operationArea=[{"polygon": {"exterior": [{"lat": 0, "lon": 0}, {"lat": 1, "lon": 1}, {"lat": 0, "lon": 1}, {"lat": 1, "lon": 0}]}}]),
-        body(policies=[{"name": "p", "spec": {"type": "GeofenceControl", "kind": "wall"}}]), body(surprise=1),
+        json.dumps(manifest(policies=[{"name": "p", "spec": {"type": "GeofenceControl", "kind": "wall"}}])),
+        json.dumps(manifest(surprise=1)),
     ],
 )  # fmt: skip
 def test_what_is_not_understood_grants_nothing(tmp_path: Path, text: str) -> None:
     (tmp_path / "g.json").write_text(text)
-    files = GrantFiles(tmp_path, "drone-1")
+    files = grant_files(tmp_path)
     files.scan()
     assert not files.held
 
 
 def test_two_files_for_one_instance(tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text(body(uid="first"))
-    (tmp_path / "b.json").write_text(body(uid="second"))
-    files = GrantFiles(tmp_path, "drone-1")
+    (tmp_path / "b.json").write_text(body(uid="first"))
+    (tmp_path / "a.json").write_text(body(uid="second"))
+    files = grant_files(tmp_path)
     files.scan()
-    assert [held.key for held in files.held.values()] == ["first"]
+    assert [held.key for held in files.held.values()] == ["second"], "the later one counts"
+    (tmp_path / "a.json").unlink()
+    files.scan()
+    assert not files.held, "the earlier one does not come back"
 
 
 def test_a_missing_directory_is_empty(tmp_path: Path) -> None:
-    files = GrantFiles(tmp_path / "none", "drone-1")
+    files = grant_files(tmp_path / "none")
     files.scan()
     assert not files.held
 
@@ -128,7 +144,7 @@ def test_an_odd_file_does_not_stop_the_others(tmp_path: Path, odd: bytes) -> Non
     (tmp_path / "a.json").write_bytes(odd)
     (tmp_path / "b.json").write_text(body(uid="sound"))
     (tmp_path / "loop.json").symlink_to("loop.json")
-    files = GrantFiles(tmp_path, "drone-1")
+    files = grant_files(tmp_path)
     files.scan()
     assert [held.key for held in files.held.values()] == ["sound"]
 
@@ -138,7 +154,7 @@ def test_whatever_a_file_breaks_it_grants_nothing(tmp_path: Path, monkeypatch: p
         raise ZeroDivisionError
 
     (tmp_path / "a.json").write_text(body())
-    files = GrantFiles(tmp_path, "drone-1")
+    files = grant_files(tmp_path)
     files.scan()
     assert files.held
     monkeypatch.setattr("fractus_services.grants.compile_grant", broken)
@@ -152,7 +168,7 @@ def test_a_listener_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
         raise ZeroDivisionError
 
     told: list[str] = []
-    files = GrantFiles(tmp_path, "drone-1")
+    files = grant_files(tmp_path)
     files.listen(broken)
     files.listen(lambda _old, new: told.append(new.key if new else ""))
     (tmp_path / "a.json").write_text(body())

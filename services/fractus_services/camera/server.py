@@ -24,6 +24,7 @@ from fractus_services.camera.service import CameraService, Whereabouts, known
 from fractus_services.camera.whereabouts import Airborne, Fixed
 from fractus_services.clock import Clock
 from fractus_services.grants import GrantFiles
+from fractus_services.seals import Seals
 
 if TYPE_CHECKING:
     from fractus_services.camera.__main__ import Options
@@ -66,7 +67,9 @@ async def run(options: Options, stop: asyncio.Event) -> None:
     node = options.node or (description.name if description is not None else socket.gethostname())
     tls = TlsFiles(options.tls)
     audit = AuditLog(options.audit, clock)
-    grants = GrantFiles(options.grants, node)
+    grants = GrantFiles(
+        options.grants, node, Seals(options.tls, options.state / "grants-seen.json"), refused=audit.refused_grant
+    )
     grants.scan()
     whereabouts: Whereabouts
     if isinstance(description, EdgeNode):

@@ -26,6 +26,7 @@ from fractus_services.mobility.observer import Observer
 from fractus_services.mobility.service import MobilityService
 from fractus_services.mobility.supervisor import Supervisor
 from fractus_services.mobility.watch import Watch
+from fractus_services.seals import Seals
 
 if TYPE_CHECKING:
     from fractus_services.mobility.__main__ import Options
@@ -58,7 +59,8 @@ async def run(options: Options, stop: asyncio.Event) -> None:
     node, url = options.node or name, options.autopilot or link
     tls = TlsFiles(options.tls)
     audit = AuditLog(options.audit, clock)
-    grants = GrantFiles(options.grants, node, options.flat_terrain)
+    seals = Seals(options.tls, options.state / "grants-seen.json")
+    grants = GrantFiles(options.grants, node, seals, options.flat_terrain, audit.refused_grant)
     journal = Journal(options.state)
     autopilot = Autopilot(url)
     control = Control(autopilot, journal, grants, audit, options.driver_grace)

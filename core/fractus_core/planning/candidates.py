@@ -13,31 +13,34 @@ from fractus_core.planning.inventory import Host, Settings
 
 
 class Ledger:
-    """What hosts have left while a plan is made: allocatable minus requested minus what the plan already placed."""
+    """What hosts have left while a plan is made: allocatable minus requested minus what the plan already placed.
 
-    def __init__(self, hosts: Mapping[str, Host], reclaimed: Mapping[str, Mapping[str, float]] | None = None) -> None:
+    What a component had on a node in the plan before is kept for it until it is placed anew, so that nothing that comes
+    first in the manifest drives out what runs there.
+    """
+
+    def __init__(self, hosts: Mapping[str, Host], kept: Iterable[tuple[Component, str]] = ()) -> None:
         self._hosts = hosts
-        self._reclaimed = reclaimed or {}
         self._placed: dict[str, dict[str, float]] = {}
+        self._kept: dict[str, dict[str, Mapping[str, float]]] = {}
+        for component, node in kept:
+            self._kept.setdefault(node, {})[component.name] = requests(component)
 
     def shortage(self, node: str, component: Component) -> str | None:
         """The first resource that does not suffice, with figures; None when the component fits."""
         host = self._hosts[node]
         placed = self._placed.get(node, {})
-        back = self._reclaimed.get(node, {})
+        kept = [amounts for name, amounts in self._kept.get(node, {}).items() if name != component.name]
         for resource, wanted in requests(component).items():
-            free = (
-                host.allocatable.get(resource, 0.0)
-                - host.requested.get(resource, 0.0)
-                - placed.get(resource, 0.0)
-                + back.get(resource, 0.0)
-            )
+            free = host.allocatable.get(resource, 0.0) - host.requested.get(resource, 0.0) - placed.get(resource, 0.0)
+            free -= sum(amounts.get(resource, 0.0) for amounts in kept)
             if wanted > free + 1e-9:
                 return f"{resource}: {wanted:g} asked, {max(free, 0.0):g} free"
         return None
 
     def take(self, node: str, component: Component) -> None:
         """Book the component's requests on the node."""
+        self._kept.get(node, {}).pop(component.name, None)
         placed = self._placed.setdefault(node, {})
         for resource, wanted in requests(component).items():
             placed[resource] = placed.get(resource, 0.0) + wanted

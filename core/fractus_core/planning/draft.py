@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator
 
 from fractus_core.api.applications import Application, Component
 from fractus_core.api.nodes import EdgeNode
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance, Rejection, Role, Serves
-from fractus_core.planning.candidates import Check, Ledger, check_host, check_resources, check_services, requests
+from fractus_core.planning.candidates import Check, Ledger, check_host, check_resources, check_services
 from fractus_core.planning.inventory import Inventory, Settings
 
 
@@ -35,7 +35,13 @@ class Draft:
     """One run of the planner: its inputs, and what it has decided so far."""
 
     def __init__(
-        self, application: Application, inventory: Inventory, settings: Settings, previous: DeploymentPlanSpec | None
+        self,
+        application: Application,
+        inventory: Inventory,
+        settings: Settings,
+        previous: DeploymentPlanSpec | None,
+        *,
+        reserving: bool = True,
     ) -> None:
         self.application = application
         self.spec = application.spec
@@ -43,8 +49,9 @@ class Draft:
         self.settings = settings
         self.located = inventory.located()
         self.placements: list[PlannedInstance] = []
-        self.ledger = Ledger(inventory.hosts, _own_requests(application, previous))
+        self.ledger = Ledger(inventory.hosts, _running(application, previous) if reserving else ())
         self.drone_before = previous.drone.node if previous is not None and previous.drone is not None else None
+        self.shared_before = self.drone_before is not None and previous is not None and _shares(previous)
         self.before = previous.placements if previous is not None else ()
         self._used_before = {(p.component, p.node) for p in self.before}
         self._placed: set[tuple[str, str | None]] = set()
@@ -54,6 +61,10 @@ class Draft:
     def had(self, component: Component, node: str) -> bool:
         """Whether the plan before had the component on the node."""
         return (component.name, node) in self._used_before
+
+    def flew(self, drone: str, *, shared: bool) -> bool:
+        """Whether the plan before had the drone, and in the same way: for itself alone, or coming along."""
+        return drone == self.drone_before and shared == self.shared_before
 
     # -- judging --
 
@@ -136,15 +147,13 @@ class Draft:
         return tuple(kept), len(wanted) - len(kept)
 
 
-def _own_requests(application: Application, previous: DeploymentPlanSpec | None) -> dict[str, dict[str, float]]:
-    """What the application's own pods of the previous plan hold: it is theirs to use again."""
-    held: dict[str, dict[str, float]] = {}
+def _shares(plan: DeploymentPlanSpec) -> bool:
+    return plan.drone is not None and plan.drone.shared_with is not None
+
+
+def _running(application: Application, previous: DeploymentPlanSpec | None) -> Iterator[tuple[Component, str]]:
+    """What of the application the plan before has on which node."""
     components: dict[str, Component] = {c.name: c for c in application.spec.components}
-    placements: Sequence[PlannedInstance] = previous.placements if previous else ()
-    for placed in placements:
-        if placed.node is None or placed.component not in components:
-            continue
-        for resource, amount in requests(components[placed.component]).items():
-            on_node = held.setdefault(placed.node, {})
-            on_node[resource] = on_node.get(resource, 0.0) + amount
-    return held
+    for placed in previous.placements if previous is not None else ():
+        if placed.node is not None and placed.component in components:
+            yield components[placed.component], placed.node

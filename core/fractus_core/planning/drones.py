@@ -82,7 +82,7 @@ def choose_drone(draft: Draft, area: OperationArea, candidates: DroneCandidates)
         busy = any(r.reason == "Claimed" for r in draft.rejections(leader))
         reason = "DroneBusy" if busy else "NoDrone"
         raise draft.infeasible(leader, reason, f"no drone can fly {leader.name}", "there is no drone")
-    ranked.sort(key=lambda r: (r.drone.name != draft.drone_before, -r.score, r.drone.name))
+    ranked.sort(key=lambda r: (not draft.flew(r.drone.name, shared=r.used), -r.score, r.drone.name))
     best = ranked[0]
     for component in components:
         draft.place(component, "drone", best.drone.name)
@@ -166,7 +166,7 @@ def _flying_by(draft: Draft, leader: Component) -> list[str]:
 def _judge(draft: Draft, asked: Mission, drone: Drone, components: list[Component], *, used: bool) -> _Ranked | None:
     """The drone with its score, or None with the first rule it fails noted."""
     leader = draft.spec.driver or components[0]
-    kept = drone.name == draft.drone_before
+    kept = draft.flew(drone.name, shared=used)
     home = _home(draft, drone)
     mission = asked.estimate(home, drone) if home is not None and not used else None
     check = _lasting(draft, drone, components, mission, kept=kept) and (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,6 +148,39 @@ def flight_of(application: Application, depots: Mapping[str, Depot], reached: in
     elif spec.points_of_interest is not None:
         legs.append(tuple(spec.points_of_interest.points))
     return Flight(application.key, tuple(leg for leg in legs if leg), reached)
+
+
+def ahead(flight: Flight, place: Position, radius_m: float) -> Flight | None:
+    """What is left of a flight whose drone is at a place: from there on, along the path.
+
+    Where the path passes the place more than once, the last passage counts, so that nobody is promised what may lie behind.
+
+    Returns:
+        The rest of the flight; None where the drone is nowhere near its path, so that nothing is known of its way.
+    """
+    if not flight.legs:
+        return None
+    path = [p for leg in flight.legs for p in leg]
+    frame = LocalFrame.at(middle_of([*path, place]))
+    starts, ends = _segments(frame, replace(flight, reached=0))
+    near = np.flatnonzero(np.isfinite(_passages(starts, ends, _spot(frame, place, None), radius_m)[:, 0]))
+    if not len(near):
+        return None
+    piece = int(near[-1])
+    for i, leg in enumerate(flight.legs):
+        pieces = max(len(leg) - 1, 1)
+        if piece < pieces:
+            return replace(flight, legs=((place, *leg[piece + 1 :]), *flight.legs[i + 1 :]), reached=0)
+        piece -= pieces
+    return None
+
+
+def misses(application: Application, flight: Flight, radius_m: float) -> int | None:
+    """The first point of interest of an application that a flight does not visit; None if it can come along."""
+    poi = application.spec.points_of_interest
+    if poi is None:
+        return 0
+    return first_missed(poi.points, flight, radius_m, ordered=poi.ordered)
 
 
 def first_missed(points: Sequence[Position], flight: Flight, radius_m: float, *, ordered: bool) -> int | None:

@@ -20,7 +20,7 @@ class Host:
 
     Attributes:
         allocatable: what it offers to pods, resource name to quantity in base units (cores, bytes, pieces).
-        requested: what the pods on it have asked for, the same way.
+        requested: what the pods on it have asked for, the same way; those of the application that is planned do not count.
     """
 
     name: str

@@ -64,7 +64,17 @@ def plan_in_steps(
     The phases are the thesis' own: area, then for each kind of component (drone, static, hybrid, cloud) the search of
     candidates by place (`drone.candidates`) and the choice among them (`drone.host`).
     """
-    draft = Draft(application, inventory, settings or Settings(), previous)
+    try:
+        return (yield from _drafted(Draft(application, inventory, settings or Settings(), previous)))
+    except Infeasible:
+        if previous is None:
+            raise
+    # What runs takes no room from what must run: without keeping it in place there may be a plan.
+    return (yield from _drafted(Draft(application, inventory, settings or Settings(), previous, reserving=False)))
+
+
+def _drafted(draft: Draft) -> Generator[str, None, DeploymentPlanSpec]:
+    application, inventory = draft.application, draft.inventory
     area = operation_area(draft.spec, inventory.depots, draft.settings.safety_radius_m)
     yield "area"
     choice: DroneChoice | None = None

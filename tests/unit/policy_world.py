@@ -9,13 +9,15 @@ from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled import CompiledGrant, compile_grant
 from fractus_core.policy.engine import judge
-from fractus_core.policy.values import Call, GotoArgs, Home, Situation, Verdict
+from fractus_core.policy.values import Call, GotoArgs, Home, Lens, Situation, Verdict
 
 HOME = Home(39.36, 22.95, 100.0)
 FRAME = LocalFrame(HOME.lat, HOME.lon)
 NOW = datetime(2026, 6, 1, 12, tzinfo=UTC).timestamp()
 METHODS = ["Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "Goto", "Hover", "GetPosition", "ReturnToLaunch"]
 CAMERA = ["CaptureImage", "RetrieveImage"]
+DOWN = Lens(90.0, 90.0, stabilised=True, error_deg=0.0)
+"""Straight down; while the yaw is unknown it sees a disc of altitude times the root of two."""
 
 Corners = list[tuple[float, float]]
 
@@ -83,7 +85,7 @@ def compiled(*policies: dict[str, Any], flat_terrain: bool = False, **changes: A
 
 def at(x: float = 0.0, y: float = 0.0, alt: float = 10.0, **more: Any) -> Situation:
     lat, lon = FRAME.latlon(x, y)
-    state: dict[str, Any] = {"time_s": NOW, "home": HOME, "armed": True, "in_air": True, **more}
+    state: dict[str, Any] = {"time_s": NOW, "home": HOME, "armed": True, "in_air": True, "lens": DOWN, **more}
     return Situation(lat=lat, lon=lon, altitude_m=alt, **state)
 
 

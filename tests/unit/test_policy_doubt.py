@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
-from fractus_core.policy.values import Airframe, Call, CaptureArgs, Home, Moment, Situation
+from fractus_core.policy.values import Airframe, Call, CaptureArgs, Home, Lens, Moment, Situation
 from policy_world import HOME, NOW, altitude, ask, at, box, compiled, exclusion, goto, inclusion, policy, zone
 
 CAPTURE = Call("CaptureImage", CaptureArgs())
@@ -89,7 +89,7 @@ def test_a_zone_to_stay_in_must_be_active_at_both_readings() -> None:
 
 
 @pytest.mark.parametrize(
-    ("x", "height_m", "seen"), [(0, 20, True), (0, 35, True), (23, 20, True), (45, 20, False), (80, 70, True)]
+    ("x", "height_m", "seen"), [(0, 20, True), (0, 35, True), (23, 20, True), (45, 20, True), (53, 20, False), (80, 70, True)]
 )
 def test_privacy_is_judged_by_what_a_picture_shows(x: float, height_m: float, seen: bool) -> None:
     private = policy("p", "PrivacyControl", "camera", [zone("z", box(-20, -20, 20, 20), upper=30)], action="refuse")
@@ -100,7 +100,7 @@ def test_privacy_is_judged_by_what_a_picture_shows(x: float, height_m: float, se
 def test_a_denial_of_the_camera_counts_for_what_it_would_see() -> None:
     denial = policy("d", "AccessControl", "denial", [zone("z", box(-20, -20, 20, 20))], methods=["CaptureImage"])
     assert ask(compiled(denial), CAPTURE, at(35, 0, alt=20)).code == "MethodDenied"
-    narrow = replace(at(35, 0, alt=20), half_view_deg=20.0)
+    narrow = replace(at(35, 0, alt=20), lens=Lens(30.0, 20.0, stabilised=True))
     assert ask(compiled(denial), CAPTURE, narrow).action == "allow"
 
 

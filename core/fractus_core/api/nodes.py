@@ -66,13 +66,56 @@ class MobilityFeatures(Model):
     methods: tuple[MobilityMethod, ...] = Field(min_length=1, max_length=32, description="Methods offered.")
 
 
+class CameraMount(Model):
+    """How a camera sits on its node."""
+
+    pitch: float = Field(
+        default=-90, ge=-90, le=90, description="Degrees: 0 looks forward, -90 straight down, 90 straight up."
+    )
+    yaw: float = Field(
+        default=0,
+        ge=-360,
+        le=360,
+        description="Degrees clockwise from the drone's nose; on an edge node from true north.",
+    )
+    stabilised: bool = Field(default=False, description="Whether a gimbal keeps it level while the airframe tilts.")
+    height: float | None = Field(
+        default=None,
+        ge=0,
+        le=10_000,
+        description="On an edge node: metres above the ground. Unset: unknown, and it may see everything around it.",
+    )
+
+
 class CameraFeatures(Model):
     """What the camera service of a node offers."""
 
+    connection: str = Field(
+        default="test:",
+        pattern=r"^(https?://[^/].*|v4l2:/dev/.+|picamera2:[0-9]|directory:/.+|test:)$",
+        max_length=512,
+        description="Where pictures come from: http://HOST/snapshot.jpg, v4l2:/dev/video0, picamera2:0, directory:/PATH"
+        " of geotagged pictures, or test: for a drawn one.",
+    )
     model: str = Field(default="", max_length=128, description="Make and model.")
     resolution: str = Field(default="1920x1080", pattern=r"^\d{2,5}x\d{2,5}$", description="Pixels, WIDTHxHEIGHT.")
     sensor_type: Literal["RGB", "IR"] = Field(default="RGB", description="What the sensor sees.")
+    horizontal_field_of_view: float | None = Field(
+        default=None,
+        gt=0,
+        lt=180,
+        description="Degrees from side to side. Unset: unknown, and privacy policies take it to see everything around.",
+    )
+    mount: CameraMount | None = Field(
+        default=None, description="Unset: unknown, and privacy policies take it to look everywhere."
+    )
     methods: tuple[CameraMethod, ...] = Field(min_length=1, max_length=32, description="Methods offered.")
+
+    @property
+    def pixels(self) -> tuple[int, int]:
+        """Width and height."""
+        width, height = self.resolution.split("x")
+        return int(width), int(height)
 
 
 class NodeServices(Model):

@@ -220,6 +220,11 @@ class PolicySpec(Model):
                 " ['refuse', 'black', 'blurAverage', 'blurMedian', 'blurFaces', 'removeBackground'])",
                 "PrivacyControl takes kind camera, and action refuse, black, blurAverage, blurMedian, blurFaces or removeBackground",
             ),
+            (
+                "!(has(self.faces) || has(self.fallback)) || (self.type == 'PrivacyControl' && has(self.action)"
+                " && self.action == 'blurFaces')",
+                "faces and fallback go with PrivacyControl and action blurFaces",
+            ),
             _VALIDITY,
         )
     )
@@ -252,6 +257,14 @@ class PolicySpec(Model):
         default=None,
         description="What happens on a violation; unset: enforce for limits, ignore (the request is discarded) for geofences.",
     )  # fmt: skip
+    faces: Literal["pixelate", "gaussian"] | None = Field(
+        default=None, description="For blurFaces: how faces are hidden; unset: pixelate."
+    )
+    fallback: Literal["blurAverage", "black", "refuse"] | None = Field(
+        default=None,
+        description="For blurFaces: what is done where faces would be too small or too far to be found reliably;"
+        " unset: blurAverage, of the whole picture.",
+    )
     selector: PolicySelector = Field(default_factory=PolicySelector)
     valid_from: datetime | None = Field(default=None, description="RFC 3339; unset: always valid before validUntil.")
     valid_until: datetime | None = Field(default=None, description="RFC 3339; unset: valid for ever.")
@@ -260,6 +273,9 @@ class PolicySpec(Model):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         _KIND_CHECKS[self.type](self)
+        for name, value in (("faces", self.faces), ("fallback", self.fallback)):
+            if value is not None and self.action != "blurFaces":
+                raise InvalidObject(name, "goes with PrivacyControl and action blurFaces; leave it out here")
         if self.valid_from and self.valid_until and self.valid_from >= self.valid_until:
             raise InvalidObject("validUntil", "must be after validFrom")
         return self
@@ -296,7 +312,10 @@ def _check_privacy(spec: PolicySpec) -> None:
     if spec.kind != "camera":
         raise InvalidObject("kind", "PrivacyControl takes camera")
     if spec.action not in {"refuse", "black", "blurAverage", "blurMedian", "blurFaces", "removeBackground"}:
-        raise InvalidObject("action", "PrivacyControl needs an image filter, or refuse")
+        raise InvalidObject(
+            "action",
+            "PrivacyControl needs refuse, or an image filter: black, blurAverage, blurMedian, blurFaces or removeBackground",
+        )
 
 
 _KIND_CHECKS = {

@@ -154,6 +154,46 @@ class Airframe:
 
 
 @dataclass(frozen=True, slots=True)
+class Attitude:
+    """How the airframe is turned: yaw, then pitch, then roll.
+
+    Attributes:
+        roll_deg: right side down is positive.
+        pitch_deg: nose up is positive.
+        yaw_deg: clockwise from true north.
+        tilt_error_deg: bound of the errors of roll and pitch, added up.
+        yaw_error_deg: bound of the error of yaw.
+    """
+
+    roll_deg: float
+    pitch_deg: float
+    yaw_deg: float
+    tilt_error_deg: float = 5.0
+    yaw_error_deg: float = 15.0
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """What a camera sees of the world around its airframe, or around its fixed node.
+
+    Attributes:
+        horizontal_deg: field of view from side to side.
+        vertical_deg: field of view from top to bottom.
+        pitch_deg: of the mount: 0 forward, -90 straight down.
+        yaw_deg: of the mount: clockwise from the nose; on a fixed node from true north.
+        stabilised: whether a gimbal keeps the mount level, so that roll and pitch of the airframe do not matter.
+        error_deg: bound of the error of the mount's direction.
+    """
+
+    horizontal_deg: float
+    vertical_deg: float
+    pitch_deg: float = -90.0
+    yaw_deg: float = 0.0
+    stabilised: bool = False
+    error_deg: float = 2.0
+
+
+@dataclass(frozen=True, slots=True)
 class Situation:
     """The state of node and drone at the moment of a decision.
 
@@ -171,7 +211,9 @@ class Situation:
         latency_s: time from a decision to its effect on the motion.
         speed_setpoint_mps: horizontal speed that the autopilot flies legs with.
         vertical: whether the drone is taking off or landing, when lower altitude limits do not hold.
-        half_view_deg: how far from straight down the camera sees.
+        attitude: None while it is unknown; the camera may look anywhere then, unless a gimbal keeps it level.
+        lens: None on a node whose camera is not described: it may see everything around it.
+        relief_m: how far the ground around may lie below home.
     """
 
     time_s: float
@@ -190,7 +232,9 @@ class Situation:
     speed_setpoint_mps: float = 5.0
     vertical: bool = False
     airframe: Airframe = field(default_factory=Airframe)
-    half_view_deg: float = 45.0
+    attitude: Attitude | None = None
+    lens: Lens | None = None
+    relief_m: float = 0.0
 
     @property
     def sound(self) -> bool:
@@ -199,20 +243,40 @@ class Situation:
         figures += [getattr(self.airframe, name) for name in _MOTION]
         if self.home is not None:
             figures += [self.home.lat, self.home.lon, self.home.amsl_m]
+        if self.attitude is not None:
+            figures += [getattr(self.attitude, name) for name in _TURNS]
+        if self.lens is not None:
+            figures += [getattr(self.lens, name) for name in _VIEW]
         return all(figure is None or math.isfinite(figure) for figure in figures)
-
-    @property
-    def footprint_m(self) -> float:
-        """Radius of the ground that a picture may show, around the position."""
-        height_m = max(self.altitude_m + self.altitude_error_m, 0.0)
-        return height_m * math.tan(math.radians(self.half_view_deg)) + self.position_error_m
 
 
 _FIGURES = (
     "time_s", "lat", "lon", "altitude_m", "north_mps", "east_mps", "down_mps", "position_error_m", "altitude_error_m",
-    "latency_s", "speed_setpoint_mps", "half_view_deg",
+    "latency_s", "speed_setpoint_mps", "relief_m",
 )  # fmt: skip
 _MOTION = tuple(f.name for f in fields(Airframe))
+_TURNS = tuple(f.name for f in fields(Attitude))
+_VIEW = tuple(f.name for f in fields(Lens))
+
+
+FilterAction = Literal["black", "removeBackground", "blurMedian", "blurAverage", "blurFaces"]
+FaceMethod = Literal["pixelate", "gaussian"]
+Fallback = Literal["blurAverage", "black", "refuse"]
+
+
+@dataclass(frozen=True, slots=True)
+class Filter:
+    """What is done to a picture before anybody gets it.
+
+    Attributes:
+        action: black it out, blur all of it, hide faces, or keep only what moves.
+        faces: how faces are hidden; means something with blurFaces only.
+        fallback: what is done where faces cannot be found reliably; means something with blurFaces only.
+    """
+
+    action: FilterAction
+    faces: FaceMethod = "pixelate"
+    fallback: Fallback = "blurAverage"
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,10 +291,11 @@ class Verdict:
         policies: names of the policies that decided, most restrictive first.
         takeover: what the system does with the drone; set with action takeover, and with a denial after an
             internal error.
-        filters: what must be done to a picture before it is handed out.
-        brake_first: the drone must be brought to a stop before the call is carried out: it is too fast for the turn that
-            the leg begins with. With `allow` and `correct`: stop (as Hover does), wait until the drone is slower than
-            `STANDING_MPS`, judge the call as it was asked again, and carry out that verdict. Never send `args` before.
+        filters: what must be done to a picture before it is handed out, in this order.
+        brake_first: the drone must be brought to a stop before anything else, for it is too fast for the turn that
+            follows. With `allow` and `correct`: stop (as Hover does), wait until the drone is slower than `STANDING_MPS`,
+            judge the call as it was asked again, and carry out that verdict; never send these `args` before. With
+            `takeover`: stop, wait for the same, then land or return.
     """
 
     action: Action
@@ -239,7 +304,7 @@ class Verdict:
     reason: str = ""
     policies: tuple[str, ...] = ()
     takeover: Takeover | None = None
-    filters: tuple[str, ...] = ()
+    filters: tuple[Filter, ...] = ()
     brake_first: bool = False
 
     @property
@@ -251,3 +316,6 @@ class Verdict:
 def deny(code: str, reason: str, policies: tuple[str, ...] = ()) -> Verdict:
     """A refusal."""
     return Verdict("deny", None, code, reason, policies)
+
+
+POSITION_UNKNOWN = deny("PositionUnknown", "the drone's position is unknown; wait for a fix")

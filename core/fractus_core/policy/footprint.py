@@ -1,0 +1,228 @@
+"""What a camera sees: the ground that a picture may show, and the air that it looks through (design, section 6)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from fractus_core.api.nodes import CameraFeatures
+from fractus_core.geo import LocalFrame
+from fractus_core.policy.motion import XY
+from fractus_core.policy.values import Attitude, Lens, Situation
+
+SIGHT_M = 10_000.0
+"""Nothing is told apart from further away: at 5 degrees of view, 8 megapixels resolve 0.3 m there."""
+WIDEST_DEG = 80.0
+"""A view that reaches further to one side, errors included, is taken to see everything."""
+_FURTHEST_TURN_DEG = 60.0
+_ARC_DEG = 15.0
+_SIDES = 24
+_CIRCLE = tuple(
+    (math.sin(2 * math.pi * i / _SIDES) / math.cos(math.pi / _SIDES),
+     math.cos(2 * math.pi * i / _SIDES) / math.cos(math.pi / _SIDES))
+    for i in range(_SIDES)
+)  # fmt: skip
+_ANY_YAW = Attitude(0.0, 0.0, 0.0, 0.0, 180.0)
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Footprint:
+    """What a picture may show, in metres east and north in the frame of a grant.
+
+    Attributes:
+        sight: plan of the air between the camera and the ground that it shows, both included.
+        margin_m: how far the camera may be from where it is thought to be; counts around `sight`.
+        upper_m: nothing above this height, over home, is seen; infinite where the picture may show sky.
+        farthest_m: how far the ground is that is shown furthest from the camera; infinite at the horizon.
+    """
+
+    sight: BaseGeometry
+    margin_m: float
+    upper_m: float
+    farthest_m: float
+    _at: XY | None = None
+    _below: tuple[XY, ...] = ()
+    _lowest_m: float = 0.0
+    _highest_m: float = 0.0
+
+    def shows(self, shape: BaseGeometry, lower_m: float = -math.inf, upper_m: float = math.inf) -> bool:
+        """Whether a picture may show something of a piece of air, or of the ground below it.
+
+        Args:
+            shape: its plan.
+            lower_m: its floor above home.
+            upper_m: its ceiling above home.
+        """
+        if lower_m > self.upper_m or not shape.dwithin(self.sight, self.margin_m):
+            return False
+        if self._at is None or not (upper_m < self._lowest_m or lower_m > 0.0):
+            return True
+        # All rays go down and straight, so what is seen at a depth is what is seen at depth 1, enlarged.
+        far, near = self._highest_m - max(lower_m, 0.0), max(self._lowest_m - upper_m, 0.0)
+        if far < 0.0:
+            return False
+        x, y = self._at
+        points = [(x + e * d, y + n * d) for d in (near, far) for e, n in self._below]
+        return bool(shape.dwithin(_hull(points), self.margin_m))
+
+    def joined(self, other: Footprint) -> Footprint:
+        """What is shown by a picture that is taken while the camera moves from here to there."""
+        return Footprint(
+            shapely.union(self.sight, other.sight).convex_hull,
+            max(self.margin_m, other.margin_m),
+            max(self.upper_m, other.upper_m),
+            max(self.farthest_m, other.farthest_m),
+        )
+
+
+def footprint(now: Situation, frame: LocalFrame) -> Footprint | None:
+    """What the camera may see at present, for every error inside the bounds; None while its position is unknown.
+
+    The ground is taken for level, between home's height and `relief_m` below it. Whatever is unknown - attitude, lens,
+    ground - makes the camera see everything around it.
+    """
+    if now.lat is None or now.lon is None:
+        return None
+    at = frame.xy(now.lat, now.lon)
+    attitude = _attitude(now)
+    if now.lens is None or attitude is None:
+        return _everything(at, now)
+    half = _widened(now.lens, now.lens.error_deg + (0.0 if now.lens.stabilised else attitude.tilt_error_deg))
+    if half is None:
+        return _everything(at, now)
+    axis, right, up = _axes(now.lens, attitude)
+    corners = [
+        (
+            axis[0] + sx * half[0] * right[0] + sy * half[1] * up[0],
+            axis[1] + sx * half[0] * right[1] + sy * half[1] * up[1],
+            axis[2] + sx * half[0] * right[2] + sy * half[1] * up[2],
+        )
+        for sx, sy in ((1, 1), (1, -1), (-1, -1), (-1, 1))
+    ]
+    high = max(now.altitude_m + now.altitude_error_m + now.relief_m, 0.1)
+    if any(down * SIGHT_M <= high * math.hypot(north, east, down) for north, east, down in corners):
+        vertical = _sees_vertical(axis, right, up, half)
+        return _everything(at, now) if vertical else _sector(at, now, axis, corners, attitude.yaw_error_deg)
+    below = _turned([(east / down, north / down) for north, east, down in corners], attitude.yaw_error_deg)
+    sight = _hull([at, *((at[0] + e * high, at[1] + n * high) for e, n in below)])
+    farthest_m = high * max(math.hypot(north, east, down) / down for north, east, down in corners)
+    low = max(now.altitude_m - now.altitude_error_m, 0.0)
+    return Footprint(sight, now.position_error_m, high - now.relief_m, farthest_m, at, tuple(below), low, high)
+
+
+def _attitude(now: Situation) -> Attitude | None:
+    """How the airframe is turned, as far as it matters; None where nobody knows what ground lies below the camera."""
+    if now.altitude_m + now.altitude_error_m + now.relief_m < 0.0:
+        return None
+    if now.attitude is None and now.lens is not None and now.lens.stabilised:
+        return _ANY_YAW
+    return now.attitude
+
+
+def lens_of(camera: CameraFeatures | None) -> Lens | None:
+    """What a description tells of a camera; None where it does not tell enough."""
+    if camera is None or camera.horizontal_field_of_view is None or camera.mount is None:
+        return None
+    width, height = camera.pixels
+    half = math.tan(math.radians(camera.horizontal_field_of_view) / 2) * height / width
+    return Lens(
+        camera.horizontal_field_of_view,
+        math.degrees(2 * math.atan(half)),
+        camera.mount.pitch,
+        camera.mount.yaw,
+        camera.mount.stabilised,
+    )
+
+
+def _everything(at: XY, now: Situation) -> Footprint:
+    x, y = at
+    return Footprint(
+        _hull([(x + SIGHT_M * e, y + SIGHT_M * n) for e, n in _CIRCLE]), now.position_error_m, math.inf, math.inf
+    )
+
+
+def _widened(lens: Lens, error_deg: float) -> tuple[float, float] | None:
+    """Tangents of the half views that hold every ray, when the camera is turned by the error in any direction.
+
+    On the sphere of directions a turn by e moves a ray sideways by asin(sin e / cos elevation) at most.
+    """
+    wide, tall, error = (math.radians(v) for v in (lens.horizontal_deg / 2, lens.vertical_deg / 2, error_deg))
+    limit = math.radians(WIDEST_DEG)
+    if not (0 < wide < limit and 0 < tall < limit and 0 <= error < math.pi / 2 - max(wide, tall)):
+        return None
+    wider = wide + math.asin(math.sin(error) / math.cos(tall))
+    taller = tall + math.asin(math.sin(error) / math.cos(wide))
+    if wider >= limit or taller >= limit:
+        return None
+    return math.tan(wider), math.tan(taller)
+
+
+def _axes(lens: Lens, attitude: Attitude) -> tuple[Vector, Vector, Vector]:
+    """Where the camera looks, and where right and up of its pictures point: north, east, down."""
+    pitch, yaw = math.radians(lens.pitch_deg), math.radians(lens.yaw_deg)
+    cp, sp, cy, sy = math.cos(pitch), math.sin(pitch), math.cos(yaw), math.sin(yaw)
+    mounted = ((cp * cy, cp * sy, -sp), (-sy, cy, 0.0), (sp * cy, sp * sy, cp))
+    roll = pitch = 0.0
+    if not lens.stabilised:
+        roll, pitch = math.radians(attitude.roll_deg), math.radians(attitude.pitch_deg)
+    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
+    yaw = math.radians(attitude.yaw_deg)
+    cy, sy = math.cos(yaw), math.sin(yaw)
+
+    def turned(vector: Vector) -> Vector:
+        x, y, z = vector
+        y, z = cr * y - sr * z, sr * y + cr * z
+        x, z = cp * x + sp * z, -sp * x + cp * z
+        return cy * x - sy * y, sy * x + cy * y, z
+
+    axis, right, down = mounted
+    return turned(axis), turned(right), turned((-down[0], -down[1], -down[2]))
+
+
+def _sees_vertical(axis: Vector, right: Vector, up: Vector, half: tuple[float, float]) -> bool:
+    """Whether straight down or straight up is in the picture."""
+    depth = abs(axis[2])
+    return abs(right[2]) <= half[0] * depth and abs(up[2]) <= half[1] * depth
+
+
+def _sector(at: XY, now: Situation, axis: Vector, corners: list[Vector], error_deg: float) -> Footprint:
+    """Everything within sight between the left and the right of a picture that shows the horizon."""
+    ahead = math.atan2(axis[1], axis[0])
+    turns = [math.remainder(math.atan2(east, north) - ahead, 2 * math.pi) for north, east, _ in corners]
+    left, right = min(turns) - math.radians(error_deg), max(turns) + math.radians(error_deg)
+    if right - left >= math.radians(175):
+        return _everything(at, now)
+    steps = math.ceil((right - left) / math.radians(_ARC_DEG))
+    step = (right - left) / steps
+    reach_m, (x, y) = SIGHT_M / math.cos(step / 2), at
+    bearings = [ahead + left + i * step for i in range(steps + 1)]
+    points = [at, *((x + reach_m * math.sin(b), y + reach_m * math.cos(b)) for b in bearings)]
+    return Footprint(_hull(points), now.position_error_m, math.inf, math.inf)
+
+
+def _turned(corners: list[XY], error_deg: float) -> list[XY]:
+    """Points whose hull holds the corners of a piece of ground, turned around the camera by every error of yaw."""
+    if error_deg <= 0.0:
+        return corners
+    if error_deg > _FURTHEST_TURN_DEG:
+        reach = max(math.hypot(e, n) for e, n in corners)
+        return [(reach * e, reach * n) for e, n in _CIRCLE]
+    turn = math.radians(error_deg)
+    c, s = math.cos(turn), math.sin(turn)
+    # The ends of each corner's arc, and where the tangents there meet.
+    return [
+        point
+        for e, n in corners
+        for point in ((e * c + n * s, n * c - e * s), (e / c, n / c), (e * c - n * s, n * c + e * s))
+    ]
+
+
+def _hull(points: list[XY]) -> BaseGeometry:
+    hull: BaseGeometry = shapely.convex_hull(shapely.multipoints(np.array(points)))
+    return hull

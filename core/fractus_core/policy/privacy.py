@@ -1,0 +1,124 @@
+"""What privacy asks of a picture: nothing, filters in a fixed order, or refusal (thesis Table 8.1, PrivacyControl)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import shapely
+
+from fractus_core.policy.compiled import Air, CompiledGrant, Patch, Patches, Rule, height_m
+from fractus_core.policy.footprint import Footprint, footprint
+from fractus_core.policy.values import Fallback, Filter, FilterAction, Situation, Verdict, deny
+
+_IN_ORDER: tuple[FilterAction, ...] = ("blurFaces", "removeBackground", "blurMedian", "blurAverage", "black")
+"""Filters from the mildest to the strictest, which is also the order in which they are applied."""
+_FALLBACKS: tuple[Fallback, ...] = ("blurAverage", "black", "refuse")
+_WHOLE: frozenset[FilterAction] = frozenset({"blurMedian", "blurAverage", "black"})
+"""Filters of the whole picture, which leave no face to find."""
+
+
+def judge_privacy(now: Situation, grant: CompiledGrant, until: Situation | None = None) -> Verdict:
+    """What privacy policies ask of a picture taken or handed out here: nothing, filters, or refusal.
+
+    Args:
+        now: where the camera is and how it is turned.
+        grant: whose policies hold.
+        until: where it is at the end of the exposure; the picture may show what is seen on the way as well.
+    """
+    rules = seen(grant.privacy, now, grant, until) if grant.privacy else []
+    refusing = [rule for rule in rules if rule.spec.action == "refuse"]
+    if refusing:
+        return deny("PrivacyZone", f"policy {refusing[0].name} forbids pictures here", names(refusing))
+    if not rules:
+        return Verdict("allow")
+    filters = compose(filter_of(rule) for rule in rules)
+    reason = f"policy {rules[0].name} asks for {', '.join(f.action for f in filters)} here"
+    return Verdict("correct", None, "PrivacyFilter", reason, names(rules), None, filters)
+
+
+def filter_of(rule: Rule) -> Filter:
+    """What a rule asks for; one that names no filter blacks the picture out."""
+    spec = rule.spec
+    action = next((known for known in _IN_ORDER if known == spec.action), "black")
+    return Filter(action, spec.faces or "pixelate", spec.fallback or "blurAverage")
+
+
+def compose(filters: Iterable[Filter]) -> tuple[Filter, ...]:
+    """The filters that satisfy all of these, in the order in which they are applied.
+
+    Black satisfies everything. A blur of the whole picture hides its faces as well. Of two ways to hide faces the
+    stricter stands: pixels rather than a soft blur, and the stricter fallback.
+    """
+    asked: dict[FilterAction, list[Filter]] = {}
+    for one in filters:
+        asked.setdefault(one.action, []).append(one)
+    if "black" in asked:
+        return (Filter("black"),)
+    if asked.keys() & _WHOLE:
+        asked.pop("blurFaces", None)
+    return tuple(_strictest(asked[action]) for action in _IN_ORDER if action in asked)
+
+
+def _strictest(alike: list[Filter]) -> Filter:
+    method = "gaussian" if all(one.faces == "gaussian" for one in alike) else "pixelate"
+    return Filter(alike[0].action, method, max((one.fallback for one in alike), key=_FALLBACKS.index))
+
+
+def remaining(asked: Iterable[Filter], applied: Iterable[Filter]) -> tuple[Filter, ...]:
+    """What must still be done to a picture that was filtered before."""
+    done = {one.action for one in applied}
+    if "black" in done:
+        return ()
+    hidden = "blurFaces" in done or bool(done & _WHOLE)
+    return tuple(one for one in compose(asked) if one.action not in done and not (one.action == "blurFaces" and hidden))
+
+
+def seen(patches: Patches, now: Situation, grant: CompiledGrant, until: Situation | None = None) -> list[Rule]:
+    """Policies of an index that hold where the camera is, or of which a picture may show a zone.
+
+    While the position is unknown every policy in force may hold.
+    """
+    found = {rule.name: rule for rule in patches.everywhere if rule.in_force(now.time_s)}
+    view = _view(now, until, grant)
+    if now.lat is None or now.lon is None or view is None:
+        return ordered(found | {p.rule.name: p.rule for p in patches.patches if p.in_force(now.time_s)})
+    if not patches.patches:
+        return ordered(found)
+    here = shapely.Point(grant.frame.xy(now.lat, now.lon))
+    lower_m, upper_m = now.altitude_m - now.altitude_error_m, now.altitude_m + now.altitude_error_m
+    for patch in patches.near(Air(here, now.position_error_m, lower_m, upper_m), now, grant.flat_terrain):
+        found[patch.rule.name] = patch.rule
+    air = Air(view.sight, view.margin_m, -math.inf, view.upper_m)
+    for patch in patches.near(air, now, grant.flat_terrain):
+        if patch.rule.name not in found and view.shows(patch.shape, *_heights(patch, now, grant.flat_terrain)):
+            found[patch.rule.name] = patch.rule
+    return ordered(found)
+
+
+def _view(now: Situation, until: Situation | None, grant: CompiledGrant) -> Footprint | None:
+    view = footprint(now, grant.frame)
+    if until is None or view is None:
+        return view
+    later = footprint(until, grant.frame)
+    return None if later is None else view.joined(later)
+
+
+def _heights(patch: Patch, now: Situation, flat_terrain: bool) -> tuple[float, float]:
+    """Floor and ceiling of a zone above home; one that is unknown reaches from the ground to the sky."""
+    band = patch.band
+    if band is None:
+        return -math.inf, math.inf
+    floor = None if band.lower is None else height_m(band.lower, band.reference, now.home, flat_terrain)
+    ceiling = None if band.upper is None else height_m(band.upper, band.reference, now.home, flat_terrain)
+    return -math.inf if floor is None else floor, math.inf if ceiling is None else ceiling
+
+
+def ordered(rules: dict[str, Rule]) -> list[Rule]:
+    """Policies by falling priority, then by name."""
+    return sorted(rules.values(), key=lambda r: (-r.spec.priority, r.name))
+
+
+def names(rules: Iterable[Rule]) -> tuple[str, ...]:
+    """The names of policies."""
+    return tuple(rule.name for rule in rules)

@@ -1,0 +1,213 @@
+"""What a camera sees, against a brute-force camera that is turned, moved and raised within the bounds of the errors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+from fractus_core.api.nodes import CameraFeatures
+from fractus_core.policy.footprint import SIGHT_M, Footprint, footprint, lens_of
+from fractus_core.policy.privacy import compose, judge_privacy, remaining
+from fractus_core.policy.values import Attitude, Call, Filter, Lens, Situation
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from policy_world import FRAME, NOW, ask, at, box, compiled, policy, zone
+
+_cases = settings(max_examples=400, deadline=None, derandomize=True)
+
+
+def rotation(axis: int, degrees: float) -> np.ndarray:
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    matrix = np.eye(3)
+    i, j = ((1, 2), (2, 0), (0, 1))[axis]
+    matrix[i, i] = matrix[j, j] = c
+    matrix[i, j], matrix[j, i] = -s, s
+    return matrix
+
+
+def ray(lens: Lens, attitude: Attitude, u: float, v: float) -> np.ndarray:
+    """North, east, down of the ray through a point of the picture; u and v go from -1 to 1, right and down."""
+    half = [math.tan(math.radians(d / 2)) for d in (lens.horizontal_deg, lens.vertical_deg)]
+    camera = np.array([1.0, u * half[0], v * half[1]])
+    tilt = np.eye(3)
+    if not lens.stabilised:
+        tilt = rotation(1, attitude.pitch_deg) @ rotation(0, attitude.roll_deg)
+    mount = rotation(2, lens.yaw_deg) @ rotation(1, lens.pitch_deg)
+    return rotation(2, attitude.yaw_deg) @ tilt @ mount @ camera
+
+
+def view(now: Situation) -> Footprint:
+    found = footprint(now, FRAME)
+    assert found is not None
+    return found
+
+
+part = st.floats(-1.0, 1.0)
+lenses = st.builds(
+    Lens, st.floats(5, 140), st.floats(5, 120), st.floats(-90, 90), st.floats(-180, 180), st.booleans(), st.floats(0, 4)
+)
+attitudes = st.builds(
+    Attitude, st.floats(-50, 50), st.floats(-50, 50), st.floats(-180, 180), st.floats(0, 12), st.floats(0, 80)
+)
+
+
+@_cases
+@given(lens=lenses, attitude=attitudes, alt=st.floats(0, 120), errors=st.tuples(*[st.floats(0, 5)] * 3),
+       u=part, v=part, turn=st.tuples(*[part] * 6))  # fmt: skip
+def test_whatever_may_be_in_the_picture_is_in_the_footprint(
+    lens: Lens, attitude: Attitude, alt: float, errors: tuple[float, ...], u: float, v: float, turn: tuple[float, ...]
+) -> None:
+    now = at(0, 0, alt=alt, lens=lens, attitude=attitude, position_error_m=errors[0], altitude_error_m=errors[1],
+             relief_m=errors[2])  # fmt: skip
+    # Roll and pitch share their bound; the mount's error is a turn about any axis, here the camera's own.
+    share = (1 + turn[5]) / 2
+    actual = replace(
+        attitude,
+        roll_deg=attitude.roll_deg + share * attitude.tilt_error_deg * turn[0],
+        pitch_deg=attitude.pitch_deg + (1 - share) * attitude.tilt_error_deg * turn[1],
+        yaw_deg=attitude.yaw_deg + attitude.yaw_error_deg * turn[2],
+    )
+    direction = ray(replace(lens, pitch_deg=lens.pitch_deg + lens.error_deg * turn[3]), actual, u, v)
+    above_m = alt + errors[1] * turn[4]
+    assume(direction[2] > 1e-6 and above_m >= 0)
+    for ground_m in (0.0, -errors[2]):
+        reach = (above_m - ground_m) / direction[2]
+        north, east = direction[0] * reach, direction[1] * reach
+        if math.hypot(north, east) > SIGHT_M:
+            continue
+        x, y = (errors[0] * turn[0] * 0.7, errors[0] * turn[1] * 0.7)
+        shown = view(now)
+        point = shapely.Point(x + east, y + north)
+        assert shown.sight.dwithin(point, shown.margin_m + 1e-6)
+        assert shown.shows(point.buffer(1e-3), -math.inf, ground_m + 1e-3)
+        assert math.dist((0, 0, 0), direction * reach) <= shown.farthest_m + errors[0] + 1e-6
+        # The same holds for what the ray passes on its way down.
+        for share_of_way in (0.3, 0.8):
+            height = above_m - share_of_way * (above_m - ground_m)
+            on_way = shapely.Point(x + east * share_of_way, y + north * share_of_way).buffer(1e-3)
+            assert shown.shows(on_way, height - 1e-3, height + 1e-3)
+
+
+@pytest.mark.parametrize(
+    "unknown",
+    [
+        {"lens": None},
+        {"lens": Lens(60, 45, -90)},
+        {"lens": Lens(60, 45, -90), "attitude": None},
+        {"alt": -20.0, "attitude": Attitude(0, 0, 0)},
+        {"lens": Lens(170, 45, -90, stabilised=True), "attitude": Attitude(0, 0, 0)},
+        {"lens": Lens(60, 45, -10, stabilised=True)},
+    ],
+)
+def test_whatever_is_unknown_makes_the_camera_see_everything_around(unknown: dict[str, object]) -> None:
+    shown = view(at(0, 0, **unknown))  # type: ignore[arg-type]
+    for bearing in range(0, 360, 7):
+        far = shapely.Point(9990 * math.sin(bearing), 9990 * math.cos(bearing))
+        assert shown.sight.covers(far)
+    assert shown.farthest_m == math.inf
+
+
+def test_a_lens_straight_down_sees_a_rectangle_that_turns_with_the_drone() -> None:
+    lens = Lens(2 * math.degrees(math.atan(1.0)), 2 * math.degrees(math.atan(0.5)), error_deg=0.0)
+    sharp = {"position_error_m": 0.0, "altitude_error_m": 0.0, "lens": lens}
+    north = view(at(0, 0, alt=20, attitude=Attitude(0, 0, 0, 0, 0), **sharp))
+    assert north.sight.bounds == pytest.approx((-20, -10, 20, 10))
+    east = view(at(0, 0, alt=20, attitude=Attitude(0, 0, 90, 0, 0), **sharp))
+    assert east.sight.bounds == pytest.approx((-10, -20, 10, 20))
+    # Nose up by 30 degrees: the camera under it looks ahead.
+    ahead = view(at(0, 0, alt=20, attitude=Attitude(0, 30, 0, 0, 0), **sharp))
+    assert ahead.sight.bounds[3] == pytest.approx(20 * math.tan(math.radians(30) + math.atan(0.5)))
+
+
+def test_a_camera_that_shows_the_horizon_sees_what_is_ahead_only() -> None:
+    lens = Lens(60, 40, pitch_deg=0, stabilised=True, error_deg=0)
+    shown = view(at(0, 0, lens=lens, attitude=Attitude(0, 0, 90, 0, 0)))
+    assert shown.sight.covers(shapely.Point(9000, 0))
+    assert not shown.sight.dwithin(shapely.Point(-20, 0), 10)
+    assert shown.upper_m == math.inf
+
+
+def test_bands_of_zones_are_seen_where_the_view_passes_them() -> None:
+    # 45 degrees down to the east, narrow: the ground is seen about 20 m ahead.
+    lens = Lens(10, 10, pitch_deg=-45, stabilised=True, error_deg=0)
+    now = at(0, 0, alt=20, lens=lens, attitude=Attitude(0, 0, 90, 0, 0), position_error_m=0.1, altitude_error_m=0.1)
+
+    def verdict(x0: float, x1: float, **band: float) -> str:
+        private = policy("p", "PrivacyControl", "camera", [zone("z", box(x0, -5, x1, 5), **band)], action="refuse")
+        return ask(compiled(private), _CAPTURE, now).code
+
+    assert verdict(15, 25) == "PrivacyZone"
+    assert verdict(5, 10) == "PrivacyZone", "a house there may stand in the picture"
+    assert verdict(5, 10, upper=3) == "", "a pool there does not"
+    assert verdict(5, 10, lower=8, upper=14) == "PrivacyZone"
+    assert verdict(-30, -5) == "", "behind"
+    assert verdict(40, 60) == "", "beyond"
+    assert verdict(15, 25, lower=25) == "", "above the camera"
+    assert verdict(-5, 5) == "PrivacyZone", "the drone is there"
+
+
+def test_an_exposure_shows_what_lies_between_its_begin_and_its_end() -> None:
+    private = policy("p", "PrivacyControl", "camera", [zone("z", box(40, -5, 45, 5))], action="refuse")
+    grant = compiled(private)
+    now, later = at(0, 0, alt=10), at(100, 0, alt=10)
+    assert judge_privacy(now, grant).action == judge_privacy(later, grant).action == "allow"
+    assert judge_privacy(now, grant, later).code == "PrivacyZone"
+    assert judge_privacy(now, grant, Situation(time_s=NOW)).code == "PrivacyZone", "where it went is unknown"
+
+
+_CAPTURE = Call("CaptureImage")
+_FILTERS = st.builds(
+    Filter,
+    st.sampled_from(["black", "removeBackground", "blurMedian", "blurAverage", "blurFaces"]),
+    st.sampled_from(["pixelate", "gaussian"]),
+    st.sampled_from(["blurAverage", "black", "refuse"]),
+)
+
+
+@_cases
+@given(st.lists(_FILTERS, max_size=6), st.lists(_FILTERS, max_size=4))
+def test_filters_compose_to_what_satisfies_each_of_them(asked: list[Filter], more: list[Filter]) -> None:
+    composed = compose(asked)
+    assert composed == compose(reversed(asked)) == compose(composed)
+    done = {one.action for one in composed}
+    hidden = {"blurAverage", "blurMedian", "black"}
+    for one in asked:
+        assert one.action in done or "black" in done or (one.action == "blurFaces" and done & hidden)
+    assert remaining(asked, composed) == ()
+    # What is done later makes up for what was not asked for before.
+    both = {one.action for one in (*composed, *remaining(more, composed))}
+    assert remaining(compose([*asked, *more]), [Filter(action) for action in both]) == ()
+
+
+def test_the_stricter_way_to_hide_faces_stands() -> None:
+    soft, hard = Filter("blurFaces", "gaussian", "refuse"), Filter("blurFaces", "pixelate", "black")
+    assert compose([soft, hard]) == (Filter("blurFaces", "pixelate", "refuse"),)
+    assert compose([soft]) == (soft,)
+
+
+def test_policies_name_their_filters() -> None:
+    def private(name: str, **fields: str) -> dict[str, object]:
+        return policy(name, "PrivacyControl", "camera", [zone(name, box(-5, -5, 5, 5))], **fields)
+
+    grant = compiled(
+        private("faces", action="blurFaces", faces="gaussian", fallback="refuse"), private("all", action="blurMedian")
+    )
+    verdict = ask(grant, _CAPTURE)
+    assert verdict.filters == (Filter("blurMedian"),)
+    assert set(verdict.policies) == {"faces", "all"}
+    assert ask(compiled(private("faces", action="blurFaces", fallback="refuse")), _CAPTURE).filters == (
+        Filter("blurFaces", "pixelate", "refuse"),
+    )
+
+
+def test_descriptions_tell_the_lens() -> None:
+    fields = {"methods": ["CaptureImage"], "resolution": "1600x900", "horizontalFieldOfView": 90}
+    assert lens_of(None) is None
+    assert lens_of(CameraFeatures.model_validate(fields)) is None, "nobody knows where it looks"
+    lens = lens_of(CameraFeatures.model_validate({**fields, "mount": {"pitch": -60, "stabilised": True}}))
+    assert lens is not None
+    assert (lens.pitch_deg, lens.stabilised) == (-60, True)
+    assert lens.vertical_deg == pytest.approx(2 * math.degrees(math.atan(9 / 16)))

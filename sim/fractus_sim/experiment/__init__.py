@@ -1,0 +1,1 @@
+"""Experiments: drones, services and programs on this machine, faults in time, checks, and a report."""

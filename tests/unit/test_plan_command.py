@@ -163,6 +163,16 @@ def test_a_plan_in_force_is_kept(run, tmp_path):
     assert DeploymentPlan.from_body(yaml.safe_load(result.stdout)).spec.drone.node == "d2"
 
 
+def test_a_plan_in_force_keeps_its_drone_from_the_others(run):
+    mine = yaml.safe_load(
+        run([DEPOT, spec_only(drone("d1")), named(application(navigator(PATH)), "z")], "-o", "yaml").stdout
+    )
+    apps = [named(application(navigator(PATH)), name) for name in "az"]
+    result = run([DEPOT, spec_only(drone("d1")), spec_only(drone("d2", battery=0.5)), *apps, mine], "-o", "json")
+    plans = {p["metadata"]["name"]: p["spec"] for p in json.loads(result.stdout)["items"]}
+    assert {name: spec["drone"]["node"] for name, spec in plans.items()} == {"a": "d2", "z": "d1"}
+
+
 def test_the_example_is_feasible():
     result = CliRunner().invoke(
         command.plan,

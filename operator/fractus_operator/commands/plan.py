@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import json
 import pathlib
@@ -124,14 +125,22 @@ def plan_all(manifests: Manifests, settings: Settings) -> list[Decided]:
     """
     stock = manifests.inventory()
     decided = []
+    standing = {}
     applications = manifests.applications()
     if not applications:
         raise BadManifest("there is no Application in the manifests; name a file that has one")
     for application in applications:
-        previous = manifests.previous(application)
+        before = manifests.previous(application)
+        if before is not None:
+            standing[application.key] = (application, before.spec)
+    for application in applications:
+        previous = standing.pop(application.key, (application, None))[1]
+        left = stock
+        for other, plan_in_force in standing.values():
+            left = _taken(left, other, plan_in_force)
         try:
             check_application(application, stock.depots)
-            found = decide(application, stock, settings, previous.spec if previous is not None else None)
+            found = decide(application, left, settings, previous)
             compile_grants(application, found, stock, settings)
         except InvalidObject as error:
             origin = manifests.origin(application)
@@ -147,19 +156,21 @@ def plan_all(manifests: Manifests, settings: Settings) -> list[Decided]:
 def _taken(stock: Inventory, application: Application, found: DeploymentPlanSpec) -> Inventory:
     """What is left for the next application: the drone is claimed, resources are booked."""
     hosts: dict[str, Host] = dict(stock.hosts)
+    components = {component.name: component for component in application.spec.components}
     for placed in found.placements:
-        if placed.node is None:
+        if placed.node not in hosts or placed.component not in components:
             continue
         host = hosts[placed.node]
         booked = dict(host.requested)
-        for resource, amount in requests(application.spec.component(placed.component)).items():
+        for resource, amount in requests(components[placed.component]).items():
             booked[resource] = booked.get(resource, 0.0) + amount
         hosts[placed.node] = replace(host, requested=booked)
     claimed: dict[str, tuple[str, str]] = dict(stock.claimed)
     flights: dict[str, Flight] = dict(stock.flights)
     if found.drone is not None and found.drone.shared_with is None:
         claimed[found.drone.node] = application.key
-        flights[found.drone.node] = flight_of(application, stock.depots)
+        with contextlib.suppress(InvalidObject):
+            flights[found.drone.node] = flight_of(application, stock.depots)
     return replace(stock, hosts=hosts, claimed=claimed, flights=flights, whereabouts=stock.located())
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import random
 
-from fractus_core.policy.engine import LEAST_LEG_M
+from fractus_core.policy.limits import LEAST_LEG_M
 from fractus_core.policy.values import Call, GotoArgs, TakeoffArgs
 from hypothesis import given, settings
 from hypothesis import strategies as st

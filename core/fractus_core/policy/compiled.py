@@ -190,6 +190,10 @@ class CompiledGrant:
     passage_border: BaseGeometry | None
     flat_terrain: bool
 
+    def locate(self, now: Situation) -> tuple[float, float] | None:
+        """Where the drone is, in metres of the frame; None while nobody knows."""
+        return None if now.lat is None or now.lon is None else self.frame.xy(now.lat, now.lon)
+
 
 def compile_grant(spec: GrantSpec, origin: Point | None = None, flat_terrain: bool = False) -> CompiledGrant:
     """Prepare a grant for the engine.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal
@@ -11,7 +12,7 @@ from shapely.geometry.base import BaseGeometry
 
 from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Inclusion, Patch
 from fractus_core.policy.motion import XY, Leg
-from fractus_core.policy.values import Situation
+from fractus_core.policy.values import Situation, Takeover, Verdict, deny
 
 FenceAction = Literal["ignore", "adjust", "hover", "returnToLaunch", "land", "revoke"]
 
@@ -62,6 +63,32 @@ def breaches(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float, he
     return sorted(found, key=lambda b: (-b.severity, -b.priority, b.policy))
 
 
+def broken(found: list[Breach]) -> Verdict:
+    """What becomes of a request that breaks fences, most restrictive first."""
+    worst = found[0]
+    names = tuple(dict.fromkeys(b.policy for b in found))
+    takeover = TAKEOVERS.get(worst.action) if worst.enters else None
+    if takeover is None:
+        return deny(worst.code, worst.reason, names)
+    return Verdict("takeover", None, worst.code, f"{worst.reason}; {_DOES[takeover]}", names, takeover)
+
+
+TAKEOVERS: dict[str, Takeover] = {
+    "hover": "hover",
+    "land": "land",
+    "returnToLaunch": "returnToLaunch",
+    "revoke": "revoke",
+}
+"""Actions of policies that take the drone from the application."""
+
+_DOES: dict[Takeover, str] = {
+    "hover": "the system takes the drone and hovers",
+    "land": "the system takes the drone and lands it",
+    "returnToLaunch": "the system takes the drone and flies it home",
+    "revoke": "access is revoked and the system flies the drone home",
+}
+
+
 def _operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float) -> Iterator[Breach]:
     """The fence that the grant itself implies: fly to where the application works, and stay there."""
     operation, border = grant.operation, grant.operation_border
@@ -73,6 +100,7 @@ def _operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: fl
         homeward = target.distance(shapely.Point(grant.frame.xy(now.home.lat, now.home.lon))) <= HOME_RADIUS_M
     vertical = leg.start == leg.target
     within = operation.covers(target) and not border.dwithin(target, margin_m)
+    homeward = homeward or (leg.drifts and _approaches(leg, now, grant, operation))
     if not within and not homeward and not vertical:
         inside = operation.covers(target)
         away_m = border.distance(target)
@@ -88,6 +116,19 @@ def _operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: fl
     if not _stays_inside(shape, edge, leg, margin_m):
         reason = f"the leg leaves the {'operation area' if working else 'way to the operation area'} or comes within {margin_m:.1f} m of its border"
         yield _area_breach(reason, not shape.covers(leg.ground))
+
+
+def _approaches(leg: Leg, now: Situation, grant: CompiledGrant, operation: BaseGeometry) -> bool:
+    """Whether a drone outside the operation area comes nearer to it, or to its home."""
+    stop, end = shapely.Point(leg.stop), shapely.Point(leg.target)
+    if operation.covers(stop):
+        return False
+    if operation.distance(end) < operation.distance(stop):
+        return True
+    if now.home is None:
+        return False
+    home = grant.frame.xy(now.home.lat, now.home.lon)
+    return math.dist(leg.target, home) < math.dist(leg.stop, home)
 
 
 def _area_breach(reason: str, enters: bool) -> Breach:

@@ -11,6 +11,8 @@ from fractus_core.policy.compiled import Air, CompiledGrant, Patch, Patches, Rul
 from fractus_core.policy.values import Situation, Verdict, deny
 
 SLACK = 1e-6
+LEAST_LEG_M = 2.0
+"""A motion other than landing ends at least this high above home, where no altitude limit says that lower is fine."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,15 +126,10 @@ def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Clampe
             f"{quantity.lower()} {value:.1f} {unit} breaks the limit of {limit:.1f} {unit} of {_source(bound)}, which refuses it",
             tuple(dict.fromkeys(b.name for b in refusing if b.name)),
         )
-    highest = min((b.upper for b in bounds if b.upper is not None), default=float("inf"))
-    lowest = max((b.lower for b in bounds if b.lower is not None), default=float("-inf"))
-    if lowest > highest + SLACK:
-        every = tuple(dict.fromkeys(b.name for b in bounds if b.name and (b.upper == highest or b.lower == lowest)))
-        return deny(
-            "ConflictingLimits",
-            f"no {quantity.lower()} is at least {lowest:.1f} and at most {highest:.1f} {unit}; ask for another place",
-            every,
-        )
+    problem = conflict(quantity, unit, bounds)
+    if problem is not None:
+        return problem
+    highest, lowest = _highest(bounds), _lowest(bounds)
     new = min(max(value, lowest), highest)
     word = "above" if above else "below"
     return Clamped(
@@ -141,6 +138,61 @@ def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Clampe
         f"{quantity.lower()} {value:.1f} {unit} is {word} the limit of {_source(violated[0])}; corrected to {new:.1f} {unit}",
         names,
     )
+
+
+def conflict(quantity: str, unit: str, bounds: list[Bound]) -> Verdict | None:
+    """The denial of any value, where limits contradict each other."""
+    highest, lowest = _highest(bounds), _lowest(bounds)
+    if lowest <= highest + SLACK:
+        return None
+    every = tuple(dict.fromkeys(b.name for b in bounds if b.name and (b.upper == highest or b.lower == lowest)))
+    return deny(
+        "ConflictingLimits",
+        f"no {quantity.lower()} is at least {lowest:.1f} and at most {highest:.1f} {unit}; ask for another place",
+        every,
+    )
+
+
+def _highest(bounds: list[Bound]) -> float:
+    return min((b.upper for b in bounds if b.upper is not None), default=float("inf"))
+
+
+def _lowest(bounds: list[Bound]) -> float:
+    return max((b.lower for b in bounds if b.lower is not None), default=float("-inf"))
+
+
+def strictest(bounds: list[Bound], *, above: bool) -> Bound | None:
+    """The bound with the lowest upper edge, or the highest lower edge."""
+    if above:
+        return min((b for b in bounds if b.upper is not None), key=_strictest_upper, default=None)
+    return min((b for b in bounds if b.lower is not None), key=_strictest_lower, default=None)
+
+
+def lower_is_fine(bounds: list[Bound]) -> bool:
+    """Whether an altitude limit in force speaks of heights below the least that a motion ends at otherwise."""
+    return any(edge is not None and edge < LEAST_LEG_M for bound in bounds for edge in (bound.lower, bound.upper))
+
+
+def height_on_entry(here: BaseGeometry, now: Situation, bounds: list[Bound], slack_m: float) -> Verdict | None:
+    """The denial of a leg that would carry the present altitude into a zone where it is not allowed."""
+    for bound in bounds:
+        if bound.shape is None or bound.shape.intersects(here):
+            continue
+        if bound.upper is not None and now.altitude_m > bound.upper + slack_m:
+            return deny(
+                "AltitudeAboveLimit",
+                f"the leg enters the zone of policy {bound.name} at {now.altitude_m:.1f} m, above its limit of"
+                f" {bound.upper:.1f} m; descend first",
+                (bound.name,),
+            )
+        if bound.lower is not None and now.altitude_m < bound.lower - slack_m:
+            return deny(
+                "AltitudeBelowLimit",
+                f"the leg enters the zone of policy {bound.name} at {now.altitude_m:.1f} m, below its limit of"
+                f" {bound.lower:.1f} m; climb first",
+                (bound.name,),
+            )
+    return None
 
 
 def _strictest_upper(bound: Bound) -> tuple[float, int, str]:

@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import shapely
 from shapely.geometry.base import BaseGeometry
 
 from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Patch
-from fractus_core.policy.limits import Bound, altitude_bounds, speed_bounds
-from fractus_core.policy.motion import XY, stop_altitude_m, stop_point
-from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Situation, Takeover, Verdict, deny
+from fractus_core.policy.fences import TAKEOVERS, breaches
+from fractus_core.policy.limits import Bound, altitude_bounds, speed_bounds, strictest
+from fractus_core.policy.motion import XY, moving, standing, stop_altitude_m, stop_point
+from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Situation, Verdict
 
 STRAY = 0.3
 """Share of the tracking margin of accepted legs that the monitor keeps as well."""
 
+SINKS_MPS = 0.5
+
 DEEPER_M = 0.6
 """A drone on the wrong side of a fence is stopped again only when it moves this much further in."""
 
-_TAKEOVERS: dict[str, Takeover] = {
-    "hover": "hover",
-    "land": "land",
-    "returnToLaunch": "returnToLaunch",
-    "revoke": "revoke",
-}
 _RANK = {None: 0, "hover": 1, "returnToLaunch": 2, "land": 3, "revoke": 4}
 
 
@@ -57,8 +54,9 @@ def monitor(now: Situation, grant: CompiledGrant) -> Verdict | None:
     )
     found = _fences(now, grant, ahead)
     if found:
-        return min(found, key=lambda f: (-_RANK[f[1].takeover if f[1].action == "takeover" else None], -f[0]))[1]
-    return _limits(now, grant, start, stop, rest_m)
+        worst = min(found, key=lambda f: (-_RANK[f[1].takeover if f[1].action == "takeover" else None], -f[0]))[1]
+        return replace(worst, brake_first=worst.action == "takeover" and moving(now))
+    return _heights(now, grant, start, stop, rest_m) or _speeds(now, grant, start)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,11 +66,6 @@ class _Ahead:
     air: Air
     here: BaseGeometry
     rest: BaseGeometry
-
-    @property
-    def moving(self) -> bool:
-        """Whether it goes anywhere; a hovering drone wobbles."""
-        return bool(self.air.ground.length > DEEPER_M)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +100,7 @@ def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead) -> list[tuple[i
 def _kept_out(patch: Patch, ahead: _Ahead) -> Verdict | None:
     inside = bool(patch.shape.intersects(ahead.here))
     worse = _depth(patch.shape, ahead.rest) > _depth(patch.shape, ahead.here) + DEEPER_M
-    entering = not inside and ahead.moving and bool(patch.shape.intersects(ahead.air.ground))
+    entering = not inside and bool(patch.shape.intersects(ahead.air.ground))
     code = "InsideExclusionZone" if inside else "ExclusionZoneAhead"
     where = "is inside" if inside else "is about to enter"
     fence = _Fence(patch.rule.name, patch.rule.spec.action, code, f"zone {patch.zone} of policy {patch.rule.name}")
@@ -122,7 +115,7 @@ def _kept_in(shape: BaseGeometry, border: BaseGeometry, ahead: _Ahead, fence: _F
     worse = False
     if not shape.is_empty:
         worse = _signed_depth(shape, border, ahead.rest) < _signed_depth(shape, border, ahead.here) - DEEPER_M
-    leaving = worse or (not outside and ahead.moving and not shape.covers(way))
+    leaving = worse or (not outside and not shape.covers(way))
     return _reaction(fence, outside, leaving, "is outside" if outside else "is about to leave")
 
 
@@ -132,7 +125,7 @@ def _reaction(fence: _Fence, broken: bool, worse: bool, what: str) -> Verdict | 
     A policy that takes the drone over does so for both; one that ignores requests only stops the motion that makes
     things worse.
     """
-    takeover = _TAKEOVERS.get(fence.action or "ignore")
+    takeover = TAKEOVERS.get(fence.action or "ignore")
     reason = f"the drone {what} {fence.name}"
     if takeover is not None and (broken or worse):
         return Verdict("takeover", None, fence.code, reason, (fence.policy,), takeover)
@@ -150,29 +143,60 @@ def _signed_depth(shape: BaseGeometry, border: BaseGeometry, point: BaseGeometry
     return distance if shape.covers(point) else -distance
 
 
-def _limits(now: Situation, grant: CompiledGrant, start: XY, stop: XY, rest_m: float) -> Verdict | None:
-    here = shapely.Point(start)
-    if grant.max_altitude_m is not None or grant.altitude_limits:
-        bounds = altitude_bounds(grant, now, Air(here, 0.0, now.altitude_m, now.altitude_m))
-        if isinstance(bounds, Verdict):
-            return deny(bounds.code, bounds.reason, bounds.policies) if now.down_mps < -0.5 else None
-        over = _lowest(bounds)
-        slack = now.altitude_error_m + now.airframe.tracking_m
-        if over is not None and over.upper is not None and max(now.altitude_m, rest_m) > over.upper + slack:
-            lat, lon = grant.frame.latlon(*stop)
-            reason = f"the drone climbs to {max(now.altitude_m, rest_m):.1f} m, above the limit of {over.upper:.1f} m"
-            names = (over.name,) if over.name else ()
-            return Verdict("correct", GotoArgs(lat, lon, over.upper), "AltitudeAboveLimit", reason, names)
-    if grant.max_speed_mps is not None or grant.speed_limits:
-        speed = math.hypot(now.north_mps, now.east_mps)
-        over = _lowest(speed_bounds(grant, now, Air(here, 0.0, now.altitude_m, now.altitude_m)))
-        if over is not None and over.upper is not None and speed > over.upper * 1.1 + 1.0:
-            reason = f"the drone flies at {speed:.1f} m/s, above the limit of {over.upper:.1f} m/s"
-            names = (over.name,) if over.name else ()
-            return Verdict("correct", SetSpeedArgs(over.upper), "SpeedAboveLimit", reason, names)
+def _heights(now: Situation, grant: CompiledGrant, start: XY, stop: XY, rest_m: float) -> Verdict | None:
+    """The correction of an altitude that breaks limits, when the drone has come to rest.
+
+    Lower limits do not hold for a drone that takes off or lands.
+    """
+    if grant.max_altitude_m is None and not grant.altitude_limits:
+        return None
+    bounds = altitude_bounds(grant, now, Air(shapely.Point(start), 0.0, now.altitude_m, now.altitude_m))
+    if isinstance(bounds, Verdict):
+        sinking = now.down_mps > -SINKS_MPS
+        return None if sinking else Verdict("deny", None, bounds.code, bounds.reason, bounds.policies, "hover")
+    slack = now.altitude_error_m + now.airframe.tracking_m
+    over, under = strictest(bounds, above=True), strictest(bounds, above=False)
+    high, low = max(now.altitude_m, rest_m), min(now.altitude_m, rest_m)
+    if over is not None and over.upper is not None and high > over.upper + slack:
+        reason = f"the drone climbs to {high:.1f} m, above the limit of {over.upper:.1f} m"
+        return _changed_height(_Trespass(over, over.upper, "AltitudeAboveLimit", reason), now, grant, stop)
+    if under is not None and under.lower is not None and low < under.lower - slack and not now.vertical:
+        if over is not None and over.upper is not None and over.upper < under.lower:
+            return None
+        reason = f"the drone sinks to {low:.1f} m, below the limit of {under.lower:.1f} m"
+        return _changed_height(_Trespass(under, under.lower, "AltitudeBelowLimit", reason), now, grant, stop)
     return None
 
 
-def _lowest(bounds: list[Bound]) -> Bound | None:
-    capped = [b for b in bounds if b.upper is not None]
-    return min(capped, key=lambda b: (b.upper if b.upper is not None else 0.0, -b.priority, b.name), default=None)
+@dataclass(frozen=True, slots=True)
+class _Trespass:
+    """A limit of altitude that is broken, and the height that keeps it."""
+
+    bound: Bound
+    height_m: float
+    code: str
+    reason: str
+
+
+def _changed_height(found: _Trespass, now: Situation, grant: CompiledGrant, stop: XY) -> Verdict:
+    """The correction to a height, or a stop where zones leave no way to it."""
+    names = (found.bound.name,) if found.bound.name else ()
+    column = standing(stop, min(now.altitude_m, found.height_m), max(now.altitude_m, found.height_m))
+    if breaches(column, now, grant, 0.0, 0.0):
+        reason = f"{found.reason}; zones leave no way back, so it stays"
+        return Verdict("deny", None, found.code, reason, names, "hover")
+    lat, lon = grant.frame.latlon(*stop)
+    return Verdict("correct", GotoArgs(lat, lon, found.height_m), found.code, found.reason, names)
+
+
+def _speeds(now: Situation, grant: CompiledGrant, start: XY) -> Verdict | None:
+    """The correction of a speed that breaks limits."""
+    if grant.max_speed_mps is None and not grant.speed_limits:
+        return None
+    speed = math.hypot(now.north_mps, now.east_mps)
+    bounds = speed_bounds(grant, now, Air(shapely.Point(start), 0.0, now.altitude_m, now.altitude_m))
+    over = strictest(bounds, above=True)
+    if over is None or over.upper is None or speed <= over.upper * 1.1 + 1.0:
+        return None
+    reason = f"the drone flies at {speed:.1f} m/s, above the limit of {over.upper:.1f} m/s"
+    return Verdict("correct", SetSpeedArgs(over.upper), "SpeedAboveLimit", reason, (over.name,) if over.name else ())

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from fractus_core.policy.values import STANDING_MPS, Situation
+from fractus_core.geo import LocalFrame
+from fractus_core.policy.values import STANDING_MPS, Situation, VelocityArgs
 
 XY = tuple[float, float]
 
@@ -45,6 +46,17 @@ def margin_m(now: Situation) -> float:
 def height_margin_m(now: Situation) -> float:
     """How far a leg keeps from floors and ceilings of zones."""
     return now.altitude_error_m + now.airframe.tracking_m
+
+
+def moving(now: Situation) -> bool:
+    """Whether the drone is too fast to turn on the spot."""
+    return math.hypot(now.north_mps, now.east_mps) >= STANDING_MPS or abs(now.down_mps) >= STANDING_MPS
+
+
+def at_rest(now: Situation, grant_frame: LocalFrame, at: XY) -> Situation:
+    """The situation after the drone was told to stop now, wherever its latency lets it come to rest."""
+    lat, lon = grant_frame.latlon(*stop_point(now, at))
+    return replace(now, lat=lat, lon=lon, altitude_m=stop_altitude_m(now), north_mps=0.0, east_mps=0.0, down_mps=0.0)
 
 
 def stop_point(situation: Situation, at: XY) -> XY:
@@ -107,6 +119,8 @@ class Leg:
         target: where it is to go.
         lower_m: lowest altitude above home on the way.
         upper_m: highest altitude above home on the way.
+        corners: further places that the ground below stretches to.
+        drifts: whether it is flown with a velocity, not to a target that was asked for.
     """
 
     start: XY
@@ -115,10 +129,14 @@ class Leg:
     target: XY
     lower_m: float
     upper_m: float
+    corners: tuple[XY, ...] = ()
+    drifts: bool = False
 
     @cached_property
     def ground(self) -> BaseGeometry:
         """The ground below the leg: a triangle, a line or a point."""
+        if self.corners:
+            return shapely.MultiPoint((self.start, self.stop, self.target, *self.corners)).convex_hull
         start, turn, target = self.start, self.turn, self._beyond
         if start == turn:
             return shapely.Point(start) if start == target else shapely.LineString((start, target))
@@ -153,3 +171,45 @@ class Leg:
 def standing(at: XY, lower_m: float, upper_m: float) -> Leg:
     """A drone that stays above one place."""
     return Leg(at, at, at, at, lower_m, upper_m)
+
+
+def swept(now: Situation, at: XY, asked: VelocityArgs) -> Leg:
+    """What a drone sweeps that takes up a velocity, holds it to the end of its hold, and stops.
+
+    The ground is the convex hull of where it may be, whether latency delays the beginning, the end, or neither. The leg's
+    target is where it comes to rest at the latest.
+    """
+    frame = now.airframe
+    present, wanted = (now.east_mps, now.north_mps), (asked.east_mps, asked.north_mps)
+    ways = _course(present, wanted, asked.hold_s, now, (frame.accel_mps2, frame.position_gain))
+    climbs = _course((-now.down_mps, 0.0), (-asked.down_mps, 0.0), asked.hold_s, now, (frame.climb_accel_mps2, 1.0))
+    heights = [now.altitude_m, stop_altitude_m(now), *(now.altitude_m + climb for climb, _ in climbs)]
+    corners = tuple((at[0] + x, at[1] + y) for x, y in ways)
+    stop = stop_point(now, at)
+    return Leg(at, stop, stop, corners[-1], min(heights), max(heights), corners, drifts=True)
+
+
+def _course(present: XY, wanted: XY, hold_s: float, now: Situation, control: tuple[float, float]) -> list[XY]:
+    """Displacements whose hull holds the motion from one velocity to another and to rest; the last is the rest."""
+    accel, gain = control
+    delay_s = reaction_s(now, accel)
+    lasting_s = hold_s + now.latency_s
+    change_s = math.dist(present, wanted) / accel
+    late = (present[0] * delay_s, present[1] * delay_s)
+    found = []
+    for share in (0.25, 0.5, 0.75, 1.0):
+        turning_s = min(change_s * share, lasting_s)
+        done = turning_s / change_s if change_s > 0 else 1.0
+        vx, vy = (p + (w - p) * done for p, w in zip(present, wanted, strict=True))
+        half = turning_s / 2
+        found.append((present[0] * half, present[1] * half))
+        x, y = (present[0] + vx) * half, (present[1] + vy) * half
+        speed = math.hypot(vx, vy)
+        if share == 1.0:
+            found.append((x, y))
+            x, y = x + vx * (lasting_s - turning_s), y + vy * (lasting_s - turning_s)
+        if speed > 0:
+            run = accel / (2 * now.airframe.jerk_mps3) + stopping_distance_m(speed, accel, gain) / speed
+            x, y = x + vx * run, y + vy * run
+        found.append((x, y))
+    return [*found, *((x + late[0], y + late[1]) for x, y in found)]

@@ -1,0 +1,210 @@
+"""Gotos: the leg to a target against limits, fences and the way home."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import shapely
+
+from fractus_core.policy.compiled import Air, CompiledGrant, height_m
+from fractus_core.policy.fences import breaches, broken, last_legal
+from fractus_core.policy.limits import (
+    LEAST_LEG_M,
+    SLACK,
+    Clamped,
+    altitude_bounds,
+    clamp,
+    height_on_entry,
+    lower_is_fine,
+    speed_bounds,
+)
+from fractus_core.policy.motion import (
+    XY,
+    Leg,
+    at_rest,
+    height_margin_m,
+    margin_m,
+    moving,
+    standing,
+    stop_altitude_m,
+    stop_point,
+    turn_point,
+)
+from fractus_core.policy.returning import straight_home_blocked
+from fractus_core.policy.routes import route
+from fractus_core.policy.values import POSITION_UNKNOWN, Call, GotoArgs, Situation, Verdict, deny
+
+MAX_RANGE_M = 100_000.0
+
+
+def judge_goto(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
+    """The verdict on a goto.
+
+    A leg that a moving drone cannot begin, for its turn is too wide, may be flown after a stop when both the stop and the
+    leg from there are legal: see `Verdict.brake_first`.
+    """
+    args, at = call.args, grant.locate(now)
+    if not isinstance(args, GotoArgs):
+        return deny("InvalidArgument", "Goto needs its arguments")
+    if at is None:
+        return POSITION_UNKNOWN
+    target = grant.frame.xy(args.lat, args.lon)
+    if not math.dist(target, at) <= MAX_RANGE_M or _beyond(args, grant):
+        return deny("InvalidArgument", f"the target is more than {MAX_RANGE_M / 1000:.0f} km away")
+    if args.speed_mps is not None and args.speed_mps > now.speed_setpoint_mps:
+        now = replace(now, speed_setpoint_mps=args.speed_mps)
+    verdict = _judge_from(_Request(args, now, grant, at), target)
+    if verdict.action == "allow" or not moving(now) or not _turns_too_wide(verdict, args):
+        return verdict
+    stopped = _judge_after_stop(_Request(args, now, grant, at), target)
+    return stopped if stopped is not None and stopped.permits and not _shortened(stopped, args) else verdict
+
+
+def _turns_too_wide(verdict: Verdict, args: GotoArgs) -> bool:
+    """Whether a leg from standstill may fare better."""
+    return not verdict.permits or _shortened(verdict, args)
+
+
+def _shortened(verdict: Verdict, args: GotoArgs) -> bool:
+    flown = verdict.args
+    return isinstance(flown, GotoArgs) and (flown.lat, flown.lon) != (args.lat, args.lon)
+
+
+def _judge_after_stop(request: _Request, target: XY) -> Verdict | None:
+    """The verdict on a leg that begins with a stop; None when the stop itself breaks a fence."""
+    now, grant, at = request.now, request.grant, request.at
+    stop = stop_point(now, at)
+    heights = (now.altitude_m, stop_altitude_m(now))
+    braking = Leg(at, stop, stop, stop, min(heights), max(heights))
+    on_its_way = replace(grant, operation=grant.passage, operation_border=grant.passage_border)
+    if breaches(braking, now, on_its_way, margin_m(now), height_margin_m(now)):
+        return None
+    verdict = _judge_from(replace(request, now=at_rest(now, grant.frame, at), at=stop), target)
+    return replace(verdict, brake_first=True)
+
+
+def _judge_from(request: _Request, target: XY) -> Verdict:
+    args, now, grant = request.args, request.now, request.grant
+    altitude = now.altitude_m if args.alt is None else height_m(args.alt, args.reference, now.home, grant.flat_terrain)
+    if altitude is None:
+        return deny(
+            "TerrainUnknown", "the target is given above terrain, and no terrain model is loaded; use home or amsl"
+        )
+    notes: list[Clamped] = []
+    if args.alt is not None and args.reference == "terrain":
+        reason = "no terrain model is loaded; the ground is taken as level with home"
+        notes.append(Clamped(altitude, "TerrainAssumedFlat", reason))
+    flown = _fly_leg(request, _Aim(target, altitude), notes, adjusting=True)
+    return flown if isinstance(flown, Verdict) else _outcome(args, flown, notes, grant)
+
+
+@dataclass(frozen=True, slots=True)
+class _Request:
+    """A goto, by whom and from where."""
+
+    args: GotoArgs
+    now: Situation
+    grant: CompiledGrant
+    at: XY
+
+
+@dataclass(frozen=True, slots=True)
+class _Aim:
+    """Where a leg goes; speed None keeps the one in force."""
+
+    target: XY
+    altitude_m: float
+    speed_mps: float | None = None
+
+
+def _beyond(args: GotoArgs, grant: CompiledGrant) -> bool:
+    """Whether the target lies on the far side of the globe, where the frame folds over."""
+    x, y = grant.frame.xy(args.lat, args.lon)
+    lat, lon = grant.frame.latlon(x, y)
+    return abs(lat - args.lat) > 1e-6 or abs((lon - args.lon + 180.0) % 360.0 - 180.0) > 1e-5
+
+
+def _fly_leg(request: _Request, aim: _Aim, notes: list[Clamped], adjusting: bool) -> _Aim | Verdict:
+    """What may be flown of a leg, or the verdict that forbids it."""
+    now, grant = request.now, request.grant
+    leg = _leg(request.at, aim.target, now, aim.altitude_m)
+    within = _within_limits(request, leg, aim, notes)
+    if isinstance(within, Verdict):
+        return within
+    leg = _leg(request.at, aim.target, now, within.altitude_m)
+    found = breaches(leg, now, grant, margin_m(now), height_margin_m(now))
+    if not found:
+        return way_home_blocked(aim.target, within.altitude_m, now, grant) or within
+    shorter = last_legal(leg, found) if adjusting and all(b.action == "adjust" for b in found) else None
+    if shorter is None:
+        return broken(found)
+    names = tuple(dict.fromkeys(b.policy for b in found))
+    notes.append(Clamped(0.0, "LegShortened", f"{found[0].reason}; the leg ends at the last legal point", names))
+    return _fly_leg(request, replace(within, target=shorter), notes, adjusting=False)
+
+
+def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Clamped]) -> _Aim | Verdict:
+    """The aim inside the limits of altitude and speed, or the verdict that forbids it."""
+    now, grant = request.now, request.grant
+    air = Air(leg.ground, margin_m(now), leg.lower_m, leg.upper_m)
+    bounds = altitude_bounds(grant, now, air)
+    if isinstance(bounds, Verdict):
+        return bounds
+    height = clamp("Altitude", "m above home", aim.altitude_m, bounds)
+    if isinstance(height, Verdict):
+        return height
+    if height.value < LEAST_LEG_M - SLACK and not lower_is_fine(bounds):
+        return deny(
+            "AltitudeTooLow",
+            f"a leg ends at least {LEAST_LEG_M:.0f} m above home, not at {height.value:.1f} m; use land to come down",
+        )
+    asked = request.args.speed_mps if aim.speed_mps is None else aim.speed_mps
+    speed = clamp("Speed", "m/s", now.speed_setpoint_mps if asked is None else asked, speed_bounds(grant, now, air))
+    problem = height_on_entry(shapely.Point(request.at), now, bounds, height_margin_m(now))
+    if problem is not None:
+        return problem
+    if isinstance(speed, Verdict):
+        return speed
+    notes.extend(note for note in (height, speed) if note.code)
+    return _Aim(aim.target, height.value, speed.value if speed.code or asked is not None else None)
+
+
+def _leg(at: XY, target: XY, now: Situation, altitude_m: float) -> Leg:
+    heights = (now.altitude_m, stop_altitude_m(now), altitude_m)
+    return Leg(at, stop_point(now, at), turn_point(now, at, target), target, min(heights), max(heights))
+
+
+def way_home_blocked(target: XY, altitude_m: float, now: Situation, grant: CompiledGrant) -> Verdict | None:
+    """The denial of a target from which the autopilot's way home is not legal.
+
+    A drone that is on the wrong side of a fence may leave it wherever its home lies.
+    """
+    problem = straight_home_blocked(target, altitude_m, now, grant, margin=margin_m(now), slack=height_margin_m(now))
+    at = grant.locate(now)
+    if problem is None or now.home is None or at is None:
+        return problem
+    here = standing(at, now.altitude_m, now.altitude_m)
+    if breaches(here, now, grant, margin_m(now), height_margin_m(now)):
+        return None
+    if not now.airframe.retraces:
+        return problem
+    home = grant.frame.xy(now.home.lat, now.home.lon)
+    if route(target, home, now, grant, altitude_m) is not None:
+        return None
+    return replace(problem, reason=f"{problem.reason}, and no legal way leads around it")
+
+
+def _outcome(args: GotoArgs, flown: _Aim, notes: list[Clamped], grant: CompiledGrant) -> Verdict:
+    moved = any(note.code == "LegShortened" for note in notes)
+    lat, lon = grant.frame.latlon(*flown.target) if moved else (args.lat, args.lon)
+    new = replace(args, lat=lat, lon=lon, alt=flown.altitude_m, reference="home", speed_mps=flown.speed_mps)
+    if not notes:
+        return Verdict("allow", new)
+    ordered = sorted(notes, key=lambda n: n.code == "TerrainAssumedFlat")
+    names = tuple(dict.fromkeys(name for note in ordered for name in note.policies))
+    action: str = "allow" if all(n.code == "TerrainAssumedFlat" for n in notes) else "correct"
+    reason = "; ".join(note.reason for note in ordered)
+    if action == "allow":
+        return Verdict("allow", new, ordered[0].code, reason, names)
+    return Verdict("correct", new, ordered[0].code, reason, names)

@@ -1,0 +1,230 @@
+"""Speeds and velocity setpoints: what is scaled, what is refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import shapely
+
+from fractus_core.policy.compiled import Air, CompiledGrant
+from fractus_core.policy.fences import Breach, breaches, broken
+from fractus_core.policy.legs import way_home_blocked
+from fractus_core.policy.limits import (
+    LEAST_LEG_M,
+    SLACK,
+    Bound,
+    Clamped,
+    altitude_bounds,
+    clamp,
+    conflict,
+    height_on_entry,
+    lower_is_fine,
+    speed_bounds,
+    strictest,
+)
+from fractus_core.policy.motion import XY, Leg, height_margin_m, margin_m, swept
+from fractus_core.policy.values import (
+    POSITION_UNKNOWN,
+    Call,
+    SetSpeedArgs,
+    Situation,
+    VelocityArgs,
+    Verdict,
+    deny,
+)
+
+BACK_MPS = 1.0
+"""A drone above or below its limits is led back with this vertical speed."""
+
+LEAST_MPS = 0.3
+"""A velocity that would be scaled below this is refused instead."""
+
+_HALVINGS = 8
+
+
+def judge_speed(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
+    """A change of the speed that legs are flown with."""
+    args, at = call.args, grant.locate(now)
+    if not isinstance(args, SetSpeedArgs):
+        return deny("InvalidArgument", "SetSpeed needs its arguments")
+    if at is None:
+        return POSITION_UNKNOWN
+    bounds = speed_bounds(grant, now, Air(shapely.Point(at), margin_m(now), now.altitude_m, now.altitude_m))
+    clamped = clamp("Speed", "m/s", args.speed_mps, bounds)
+    if isinstance(clamped, Verdict):
+        return clamped
+    if not clamped.code:
+        return Verdict("allow", args)
+    return Verdict("correct", SetSpeedArgs(clamped.value), clamped.code, clamped.reason, clamped.policies)
+
+
+@dataclass(slots=True)
+class _Setpoint:
+    """A velocity on its way through limits and fences."""
+
+    args: VelocityArgs
+    now: Situation
+    grant: CompiledGrant
+    at: XY
+    notes: list[Clamped] = field(default_factory=list)
+
+    @property
+    def leg(self) -> Leg:
+        """What it sweeps as it stands."""
+        return swept(self.now, self.at, self.args)
+
+    @property
+    def air(self) -> Air:
+        """Where limits may hold for it."""
+        leg = self.leg
+        return Air(leg.ground, margin_m(self.now), leg.lower_m, leg.upper_m)
+
+
+def judge_velocity(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
+    """A velocity setpoint, judged by all that the drone sweeps until it stops by itself after the hold.
+
+    Limits that are enforced scale the horizontal or the vertical part; fences that adjust scale the whole. A drone beyond
+    an altitude limit is led back whatever vertical speed was asked for. Lower speed limits do not hold: to hover is always
+    allowed.
+    """
+    args, at = call.args, grant.locate(now)
+    if not isinstance(args, VelocityArgs):
+        return deny("InvalidArgument", "SetVelocity needs its arguments")
+    if at is None:
+        return POSITION_UNKNOWN
+    setpoint = _Setpoint(args, now, grant, at)
+    problem = _within_speed(setpoint) or _within_heights(setpoint) or _within_fences(setpoint)
+    if problem is None:
+        leg = setpoint.leg
+        problem = way_home_blocked(leg.target, leg.upper_m, now, grant)
+    if problem is not None:
+        return problem
+    if not setpoint.notes:
+        return Verdict("allow", args)
+    names = tuple(dict.fromkeys(name for note in setpoint.notes for name in note.policies))
+    reason = "; ".join(note.reason for note in setpoint.notes)
+    return Verdict("correct", setpoint.args, setpoint.notes[0].code, reason, names)
+
+
+def _within_speed(setpoint: _Setpoint) -> Verdict | None:
+    args = setpoint.args
+    asked = math.hypot(args.north_mps, args.east_mps)
+    bounds = [replace(b, lower=None) for b in speed_bounds(setpoint.grant, setpoint.now, setpoint.air)]
+    speed = clamp("Speed", "m/s", asked, bounds)
+    if isinstance(speed, Verdict):
+        return speed
+    if speed.code:
+        share = max(speed.value, 0.0) / asked
+        setpoint.args = replace(args, north_mps=args.north_mps * share, east_mps=args.east_mps * share)
+        setpoint.notes.append(speed)
+    return None
+
+
+def _within_heights(setpoint: _Setpoint) -> Verdict | None:
+    """Bring the vertical part within the limits of altitude, or deny."""
+    now, grant = setpoint.now, setpoint.grant
+    bounds = altitude_bounds(grant, now, setpoint.air)
+    if isinstance(bounds, Verdict):
+        return bounds
+    problem = conflict("Altitude", "m", bounds) or height_on_entry(
+        shapely.Point(setpoint.at), now, bounds, height_margin_m(now)
+    )
+    if problem is not None:
+        return problem
+    floor = -math.inf if lower_is_fine(bounds) else min(LEAST_LEG_M, now.altitude_m)
+    ground = Bound("", 0, floor, None, refuses=False)
+    for above in (True, False):
+        every = bounds if above else [*bounds, ground]
+        bound = strictest(every, above=above)
+        if bound is not None:
+            problem = _lead_back(setpoint, bound, above=above)
+            if problem is not None:
+                return problem
+    return None
+
+
+def _lead_back(setpoint: _Setpoint, bound: Bound, *, above: bool) -> Verdict | None:
+    """Scale the vertical part so that the drone comes to rest within a limit, or turn it back toward the limit."""
+    edge = (bound.upper if above else bound.lower) or 0.0
+    args = setpoint.args
+    if not _beyond(setpoint, args, edge, above=above):
+        return None
+    word, side = ("Above", "above") if above else ("Below", "below")
+    source = f"policy {bound.name}" if bound.name else "the drone" if above else "the ground"
+    names = (bound.name,) if bound.name else ()
+    toward = args.down_mps < 0 if above else args.down_mps > 0
+    reason = f"the drone would come {side} the limit of {edge:.1f} m of {source}"
+    if bound.refuses and toward:
+        return deny(f"Altitude{word}Limit", f"{reason}, which refuses it", names)
+    back = BACK_MPS if above else -BACK_MPS
+    strays_m = setpoint.now.airframe.tracking_m
+    near = edge + strays_m if above else edge - strays_m
+    if not toward and (abs(args.down_mps) >= BACK_MPS or not _beyond(setpoint, args, near, above=above)):
+        return None
+    level = replace(args, down_mps=0.0)
+    if not bound.name and not above:
+        new = level if _beyond(setpoint, level, edge, above=above) else _scaled_climb(setpoint, edge, above=above)
+    elif _beyond(setpoint, level, edge, above=above):
+        new = replace(args, down_mps=back)
+    else:
+        new = _scaled_climb(setpoint, edge, above=above)
+    if new.down_mps != args.down_mps:
+        setpoint.args = new
+        note = f"{reason}; its vertical speed is corrected from {args.down_mps:.1f} to {new.down_mps:.1f} m/s down"
+        setpoint.notes.append(Clamped(new.down_mps, f"Altitude{word}Limit", note, names))
+    return None
+
+
+def _beyond(setpoint: _Setpoint, args: VelocityArgs, edge: float, *, above: bool) -> bool:
+    leg = swept(setpoint.now, setpoint.at, args)
+    return leg.upper_m > edge + SLACK if above else leg.lower_m < edge - SLACK
+
+
+def _scaled_climb(setpoint: _Setpoint, edge: float, *, above: bool) -> VelocityArgs:
+    """The largest share of the vertical part that stays within a limit; none of it does."""
+    args = setpoint.args
+    best, low, high = replace(args, down_mps=0.0), 0.0, 1.0
+    for _ in range(_HALVINGS):
+        share = (low + high) / 2
+        scaled = replace(args, down_mps=args.down_mps * share)
+        if _beyond(setpoint, scaled, edge, above=above):
+            high = share
+        else:
+            low, best = share, scaled
+    return best
+
+
+def _within_fences(setpoint: _Setpoint) -> Verdict | None:
+    found = _breached(setpoint, setpoint.args)
+    if not found:
+        return None
+    args = setpoint.args
+    asked = math.hypot(args.north_mps, args.east_mps, args.down_mps)
+    if any(b.action != "adjust" for b in found) or asked < LEAST_MPS:
+        return broken(found)
+    best, low, high = None, LEAST_MPS / asked, 1.0
+    for _ in range(_HALVINGS):
+        share = (low + high) / 2
+        scaled = _scaled(args, share)
+        if _breached(setpoint, scaled):
+            high = share
+        else:
+            low, best = share, scaled
+    if best is None:
+        return broken(found)
+    setpoint.args = best
+    names = tuple(dict.fromkeys(b.policy for b in found))
+    setpoint.notes.append(Clamped(low, "VelocityScaled", f"{found[0].reason}; scaled to {low:.0%}", names))
+    return None
+
+
+def _scaled(args: VelocityArgs, share: float) -> VelocityArgs:
+    return replace(
+        args, north_mps=args.north_mps * share, east_mps=args.east_mps * share, down_mps=args.down_mps * share
+    )
+
+
+def _breached(setpoint: _Setpoint, args: VelocityArgs) -> list[Breach]:
+    now = setpoint.now
+    return breaches(swept(now, setpoint.at, args), now, setpoint.grant, margin_m(now), height_margin_m(now))

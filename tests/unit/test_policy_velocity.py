@@ -1,0 +1,172 @@
+"""Velocity setpoints: judged by all that they sweep until the drone stops by itself."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from fractus_core.policy.values import Airframe, Call, VelocityArgs, Verdict
+from policy_world import METHODS, altitude, ask, at, box, exclusion, inclusion, speed
+from policy_world import compiled as granted
+
+VELOCITY = [{"service": "mobility", "methods": [*METHODS, "SetVelocity"]}]
+
+
+def compiled(*policies: dict[str, Any], **changes: Any) -> Any:
+    return granted(*policies, services=VELOCITY, **changes)
+
+
+def fly(north: float = 0.0, east: float = 0.0, down: float = 0.0, hold: float = 0.5) -> Call:
+    return Call("SetVelocity", VelocityArgs(north, east, down, hold_s=hold))
+
+
+def flown(verdict: Verdict) -> VelocityArgs:
+    assert verdict.permits, verdict
+    assert isinstance(verdict.args, VelocityArgs)
+    return verdict.args
+
+
+def test_a_velocity_in_free_air_is_allowed_as_asked() -> None:
+    verdict = ask(compiled(), fly(5, 3, -1))
+    assert (verdict.action, verdict.code, verdict.args) == ("allow", "", VelocityArgs(5, 3, -1))
+    assert ask(granted(), fly(1)).code == "MethodNotGranted"
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        VelocityArgs(math.nan, 0), VelocityArgs(0, math.inf), VelocityArgs(0, 0, -math.inf), VelocityArgs(1e9, 0),
+        VelocityArgs(0, 0, 1e3), VelocityArgs(1, 0, 0, yaw_deg=math.nan), VelocityArgs(1, 0, hold_s=math.nan),
+        VelocityArgs(1, 0, hold_s=0), VelocityArgs(1, 0, hold_s=-1), VelocityArgs(1, 0, hold_s=2.5), None,
+    ],
+)  # fmt: skip
+def test_impossible_velocities(args: VelocityArgs | None) -> None:
+    assert ask(compiled(), Call("SetVelocity", args)).code == "InvalidArgument"
+
+
+def test_nobody_flies_blind() -> None:
+    from fractus_core.policy.values import Situation
+
+    assert ask(compiled(operationArea=[]), fly(1), Situation(time_s=0)).code == "PositionUnknown"
+    assert ask(compiled(), fly(1), at(home=None)).code == "HomeUnknown"
+
+
+def test_the_sweep_counts_latency_hold_and_stop() -> None:
+    grant = compiled(exclusion(box(-50, 30, 50, 60)), operationArea=[])
+    # 5 m/s from standstill: 0.8 s of latency and hold, most of it spent on speeding up, and the stop, with 2.5 m of margin.
+    near = [y for y in range(31) if ask(grant, fly(5), at(0, float(y))).permits]
+    assert 19 <= max(near) <= 26
+    longer = [y for y in range(31) if ask(grant, fly(5, hold=2.0), at(0, float(y))).permits]
+    assert max(longer) < max(near) - 3
+    already = [y for y in range(31) if ask(grant, fly(5), at(0, float(y), north_mps=5)).permits]
+    assert max(already) < max(near) - 3
+    stop = 5 * (0.5 + 0.3 + 0.25) + 1.25 + 5
+    assert max(already) <= 30 - stop - 2.5
+
+
+@pytest.mark.parametrize("action", ["ignore", "hover", "land", "returnToLaunch", "revoke"])
+def test_a_velocity_into_a_zone(action: str) -> None:
+    grant = compiled(exclusion(box(-50, 10, 50, 60), action), operationArea=[])
+    verdict = ask(grant, fly(8, hold=2.0))
+    assert verdict.action == ("deny" if action == "ignore" else "takeover")
+    assert verdict.policies == ("no-fly",)
+    assert ask(grant, fly(-8, hold=2.0)).permits
+
+
+def test_an_adjusting_fence_scales_the_velocity() -> None:
+    grant = compiled(exclusion(box(-50, 14, 50, 60), "adjust"), operationArea=[])
+    asked = fly(8, 1, hold=2.0)
+    verdict = ask(grant, asked)
+    new = flown(verdict)
+    assert (verdict.action, verdict.code, verdict.policies) == ("correct", "VelocityScaled", ("no-fly",))
+    assert 1 < new.north_mps < 7
+    assert new.east_mps == pytest.approx(new.north_mps / 8)
+    assert ask(grant, Call("SetVelocity", new)).action == "allow", "what is corrected is legal by itself"
+    assert ask(grant, fly(8, hold=2.0), at(0, 11.4)).action == "deny", "nothing worth flying is left"
+
+
+def test_from_inside_a_zone_only_out() -> None:
+    grant = compiled(exclusion(box(-50, -50, 50, 50), "land"), operationArea=[])
+    inside = at(0, 45)
+    assert ask(grant, fly(9, hold=2.0), inside).permits
+    assert not ask(grant, fly(-3), inside).permits
+    assert not ask(grant, fly(0, 3), inside).permits
+
+
+def test_the_operation_area_and_the_way_to_it() -> None:
+    grant = compiled()
+    assert ask(grant, fly(5), at(0, 195)).code == "OutsideOperationArea"
+    assert ask(grant, fly(-5), at(0, 195)).permits
+    apart = compiled(operationArea=[box(50, -20, 150, 20)], corridor=[box(-30, -30, 150, 30)])
+    assert ask(apart, fly(0, 5), at(0, 0)).permits, "it leads to the area"
+    assert ask(apart, fly(0, -5), at(-10, 0)).code == "OutsideOperationArea", "it leads away from area and home"
+    assert ask(apart, fly(0, -5), at(30, 0)).permits, "it leads home"
+    assert ask(apart, fly(5, 0), at(40, 22)).code == "OutsideOperationArea", "out of the corridor"
+
+
+def test_inclusion_zones() -> None:
+    grant = compiled(inclusion(box(-30, -30, 30, 30)), operationArea=[])
+    assert ask(grant, fly(5), at(0, 0)).permits
+    assert ask(grant, fly(5), at(0, 25)).code in {"OutsideInclusionZone", "TooCloseToInclusionBorder"}
+
+
+def test_speed_limits_scale_the_horizontal_part() -> None:
+    grant = compiled(speed(upperLimit=4, lowerLimit=2))
+    verdict = ask(grant, fly(6, 8, -1))
+    new = flown(verdict)
+    assert (verdict.action, verdict.code, verdict.policies) == ("correct", "SpeedAboveLimit", ("speeds",))
+    assert (new.north_mps, new.east_mps, new.down_mps) == pytest.approx((2.4, 3.2, -1))
+    assert ask(grant, fly(0.1)).action == "allow", "lower limits do not keep a drone from hovering"
+    assert ask(compiled(speed(upperLimit=4, action="refuse")), fly(6)).code == "SpeedAboveLimit"
+    assert ask(compiled(), fly(99)).action == "correct", "the drone's own limit"
+
+
+def test_altitude_limits_scale_the_vertical_part() -> None:
+    grant = compiled(altitude(upperLimit=15, lowerLimit=5))
+    climbing = ask(grant, fly(2, 0, -3, hold=2.0), at(alt=12))
+    assert (climbing.action, climbing.code, climbing.policies) == ("correct", "AltitudeAboveLimit", ("altitudes",))
+    assert -1.5 < flown(climbing).down_mps < 0
+    assert flown(climbing).north_mps == 2
+    sinking = ask(grant, fly(2, 0, 3, hold=2.0), at(alt=8))
+    assert sinking.code == "AltitudeBelowLimit"
+    assert 0 < flown(sinking).down_mps < 1.5
+    assert ask(grant, fly(2, 0, 0), at(alt=15.3)).action == "allow", "within what the autopilot strays"
+    assert ask(compiled(altitude(upperLimit=15, action="refuse")), fly(0, 0, -3, hold=2.0), at(alt=12)).action == "deny"
+
+
+def test_a_drone_beyond_its_limits_is_led_back() -> None:
+    grant = compiled(altitude(upperLimit=15, lowerLimit=5))
+    high = ask(grant, fly(2, 0, -2), at(alt=20))
+    assert (high.code, flown(high).down_mps) == ("AltitudeAboveLimit", 1.0)
+    assert flown(ask(grant, fly(2), at(alt=20))).down_mps == 1.0
+    assert ask(grant, fly(2, 0, 1.5), at(alt=20)).action == "allow"
+    low = ask(grant, fly(2), at(alt=3))
+    assert (low.code, flown(low).down_mps) == ("AltitudeBelowLimit", -1.0)
+
+
+def test_nobody_flies_into_the_ground() -> None:
+    verdict = ask(compiled(), fly(0, 0, 3, hold=2.0), at(alt=5))
+    assert verdict.code == "AltitudeBelowLimit"
+    assert 0 < flown(verdict).down_mps < 1.5
+    assert flown(ask(compiled(), fly(0, 0, 1), at(alt=1.5))).down_mps == 0.0
+    assert ask(compiled(), fly(0, 0, -1), at(alt=1.0)).action == "allow"
+
+
+def test_a_velocity_does_not_carry_a_drone_into_a_zone_of_other_altitudes() -> None:
+    from policy_world import zone
+
+    grant = compiled(altitude(zones=[zone("low", box(-20, 10, 20, 60))], upperLimit=15))
+    assert ask(grant, fly(8, hold=2.0), at(alt=30)).code == "AltitudeAboveLimit"
+    assert not ask(grant, fly(8, hold=2.0), at(alt=30)).permits
+    assert ask(grant, fly(-8, hold=2.0), at(alt=30)).action == "allow"
+
+
+def test_the_way_home_stays_legal() -> None:
+    wall = exclusion(box(-100, 40, 60, 50), name="wall")
+    behind = at(110, 60)
+    free = compiled(wall, operationArea=[])
+    toward = fly(0, -8, hold=2.0)
+    assert ask(free, toward, behind).code == "WayHomeBlocked"
+    assert ask(free, fly(0, 5), behind).permits
+    assert ask(free, toward, at(110, 60, airframe=Airframe(retraces=True))).permits, "back as it came"

@@ -119,7 +119,11 @@ def _parameters(_context: click.Context, _option: click.Parameter, texts: tuple[
 @click.option("--count", type=click.IntRange(1, 200), default=1, help="Number of vehicles; ports and ids count up.")
 @click.option("--spacing", type=float, default=10.0, help="Distance between vehicles, metres toward east.")
 @click.option("--store", type=click.Path(path_type=Path), help="File that keeps changed parameters.")
-@click.option("--tlog", type=click.Path(path_type=Path), help="Record what the (first) vehicle says to a tlog.")
+@click.option(
+    "--tlog",
+    type=click.Path(path_type=Path),
+    help="Record a tlog of both directions (with --count, one a vehicle: NAME-SYSID).",
+)
 @click.option(
     "--lockstep",
     metavar="HOST:PORT",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from fractus_sim.vehicle.descent import descend
 from fractus_sim.vehicle.flight import Flight
 from fractus_sim.vehicle.leg import Leg
-from fractus_sim.vehicle.mav import ABSOLUTE_FRAMES, Command, Frame, Severity
+from fractus_sim.vehicle.mav import Command, Mode, Severity
 
 if TYPE_CHECKING:
     from fractus_sim.vehicle.mission import Item
@@ -101,6 +101,11 @@ class AutoFlight(Flight):
         self._arrived_s = None
         self._landing = False
         self._returning = self._leg = None
+        if item.has_place and v.altitude_base_m(item.frame) is None:
+            v.say(Severity.CRITICAL, "Failsafe: Terrain data missing")
+            if not v.set_mode(Mode.RTL):
+                v.set_mode(Mode.LAND)
+            return
         north, east, down = self._place(v, item)
         match item.command:
             case Command.NAV_TAKEOFF:
@@ -221,13 +226,10 @@ class AutoFlight(Flight):
 def item_target(v: Vehicle, item: Item) -> tuple[float, float, float]:
     """Where an item lies in the local frame; a missing position means here."""
     origin = v.origin or v.start
-    home_alt = v.home.alt_m if v.home is not None else origin.alt_m
-    if item.frame in ABSOLUTE_FRAMES:
-        down = origin.alt_m - item.z
-    elif item.frame == Frame.GLOBAL_TERRAIN_ALT:
-        down = origin.alt_m - (v.start.alt_m + item.z)
-    else:
-        down = origin.alt_m - (home_alt + item.z)
+    base = v.altitude_base_m(item.frame)
+    if base is None:
+        base = (v.home or origin).alt_m
+    down = origin.alt_m - (base + item.z)
     if not item.has_place:
         return (v.control.target[0], v.control.target[1], down)
     north, east, _ = origin.vector_to(type(origin)(item.x, item.y, 0.0))

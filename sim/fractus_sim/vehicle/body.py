@@ -14,6 +14,7 @@ GRAVITY = 9.80665
 # Hitting the ground faster than this, or leaning more than this, breaks propellers.
 CRASH_IMPACT_MPS = 4.0
 CRASH_LEAN_COSINE = 0.5
+CRASHED_ROLL_RAD = math.radians(75.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +68,17 @@ class Wind:
         )
 
 
+def euler_of(quaternion: tuple[float, float, float, float]) -> tuple[float, float, float]:
+    """Roll, pitch, yaw in radians of an attitude."""
+    w, x, y, z = quaternion
+    sine = 2.0 * (w * y - z * x)
+    return (
+        math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
+        math.asin(1.0 if sine > 1.0 else max(sine, -1.0)),
+        math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+    )
+
+
 class Body:
     """Position, velocity, attitude, rates and motor thrusts, and how they evolve."""
 
@@ -110,14 +122,7 @@ class Body:
 
     def euler(self) -> tuple[float, float, float]:
         """Roll, pitch, yaw in radians."""
-        w, x, y, z = self.quaternion
-        sine = 2.0 * (w * y - z * x)
-        pitch = math.asin(1.0 if sine > 1.0 else max(sine, -1.0))
-        return (
-            math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
-            pitch,
-            math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
-        )
+        return euler_of(self.quaternion)
 
     def step(self, dt: float, commands: tuple[float, float, float, float], air: tuple[float, float, float]) -> None:
         """Advance by `dt` seconds with motor thrust `commands` (newtons) in air that moves with velocity `air`."""
@@ -170,10 +175,19 @@ class Body:
         if self.down >= 0.0 and self.vd > 0.0:
             self.impact_mps = self.vd
             lean_cosine = 1.0 - 2.0 * (x * x + y * y)
+            if not self.crashed and self.vd > CRASH_IMPACT_MPS and lean_cosine >= CRASH_LEAN_COSINE:
+                self._topple()
             self.crashed = self.crashed or self.vd > CRASH_IMPACT_MPS or lean_cosine < CRASH_LEAN_COSINE
             self.down = 0.0
             self.vn = self.ve = self.vd = 0.0
             self.on_ground = True
+
+    def _topple(self) -> None:
+        """Come to rest on the side."""
+        half = CRASHED_ROLL_RAD / 2.0
+        w, x, y, z = self.quaternion
+        c, s = math.cos(half), math.sin(half)
+        self.quaternion = (w * c - x * s, x * c + w * s, y * c + z * s, z * c - y * s)
 
     def _rest(self, dt: float) -> None:
         self.p = self.q = self.r = 0.0

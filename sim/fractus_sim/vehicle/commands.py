@@ -144,7 +144,7 @@ def _reposition(v: Vehicle, o: Order, _c: Channel) -> Result:
     if not v.armed or (v.mode is not Mode.GUIDED and not switch):
         return Result.DENIED
     placed = o.has_place and valid_coordinates(o.x, o.y) and math.isfinite(o.z)
-    if not placed or o.frame not in GLOBAL_FRAMES:
+    if not placed or v.altitude_base_m(o.frame) is None:
         return Result.DENIED
     north, east, down = item_target(v, o.item)
     if v.landed or outside_fence(v, north, east, down) or not v.set_mode(Mode.GUIDED):

@@ -272,7 +272,7 @@ class Control:
         """Turn a wanted acceleration into a lean (kept in `self.lean`) and a collective thrust in newtons."""
         an, ae, ad = wanted
         yaw = est.yaw
-        vertical = clamp(GRAVITY - ad, 0.2 * GRAVITY, 2.0 * GRAVITY)
+        vertical = clamp(GRAVITY - ad, 0.2 * GRAVITY, 3.0 * GRAVITY)
         if self.horizontal is Axis.ATTITUDE:
             roll, pitch = self.attitude
         else:

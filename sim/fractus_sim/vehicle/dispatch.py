@@ -10,9 +10,7 @@ from fractus_sim.vehicle.commands import handle_command, outside_fence, set_curr
 from fractus_sim.vehicle.earth import Place, valid_coordinates
 from fractus_sim.vehicle.guided import GuidedFlight
 from fractus_sim.vehicle.mav import (
-    ABSOLUTE_FRAMES,
     FORCE_SET,
-    GLOBAL_FRAMES,
     IGNORE_ACCELERATION,
     IGNORE_POSITION,
     IGNORE_VELOCITY,
@@ -29,8 +27,7 @@ from fractus_sim.vehicle.wire import Message, Signing
 
 _FTP_NAK = 129
 _FTP_UNKNOWN = 7
-_TERRAIN_FRAMES = frozenset({10, 11})
-_BODY_FRAMES = frozenset({Frame.BODY_NED, Frame.BODY_OFFSET_NED, Frame.BODY_FRD})
+_BODY_FRAMES = frozenset({Frame.BODY_NED, Frame.BODY_OFFSET_NED})
 _OFFSET_FRAMES = frozenset({Frame.LOCAL_OFFSET_NED}) | _BODY_FRAMES
 _LOCAL_FRAMES = frozenset({Frame.LOCAL_NED}) | _OFFSET_FRAMES
 
@@ -132,6 +129,7 @@ def _rotated(v: Vehicle, vector: Vector) -> Vector:
 def _local_target(v: Vehicle, m: Message) -> None:
     frame = m.integer("coordinate_frame")
     if frame not in _LOCAL_FRAMES:
+        _stop(v)
         return
     position, velocity = _vector(m, ("x", "y", "z")), _vector(m, ("vx", "vy", "vz"))
     accel = _vector(m, ("afx", "afy", "afz"))
@@ -147,16 +145,21 @@ def _global_target(v: Vehicle, m: Message) -> None:
     frame = m.integer("coordinate_frame")
     lat, lon, alt = m.integer("lat_int"), m.integer("lon_int"), m.real("alt")
     origin = v.origin
-    if frame not in GLOBAL_FRAMES or not valid_coordinates(lat, lon) or origin is None:
+    if origin is None:
         return
-    if frame in ABSOLUTE_FRAMES:
-        amsl = alt
-    elif frame in _TERRAIN_FRAMES:
-        amsl = v.start.alt_m + alt
-    else:
-        amsl = (v.home or origin).alt_m + alt
-    position = origin.vector_to(Place(lat, lon, amsl))
+    base = v.altitude_base_m(frame)
+    if base is None or not valid_coordinates(lat, lon):
+        _stop(v)
+        return
+    position = origin.vector_to(Place(lat, lon, base + alt))
     _target(v, m, position, _vector(m, ("vx", "vy", "vz")), _vector(m, ("afx", "afy", "afz")))
+
+
+def _stop(v: Vehicle) -> None:
+    """What ArduCopter does with a target that it does not understand."""
+    if isinstance(v.flight, GuidedFlight) and v.armed and not v.landed:
+        v.taking_off_until_m = None
+        v.flight.stop(v)
 
 
 def _target(v: Vehicle, m: Message, position: Vector, velocity: Vector, accel: Vector) -> None:
@@ -173,10 +176,8 @@ def _target(v: Vehicle, m: Message, position: Vector, velocity: Vector, accel: V
     use_accel = not mask & IGNORE_ACCELERATION
     yaw = m.real("yaw") if not mask & IGNORE_YAW else None
     yaw_rate = m.real("yaw_rate") if not mask & IGNORE_YAW_RATE else None
-    if mask & FORCE_SET or not (use_position or use_velocity or use_accel):
-        if not mask & FORCE_SET and (yaw is not None or yaw_rate is not None):
-            _turn(v, yaw, yaw_rate)
-            return
+    understood = use_velocity or use_position != use_accel
+    if not understood or (mask & FORCE_SET and use_accel):
         flight.stop(v)
         return
     used: list[float] = []
@@ -252,9 +253,9 @@ def _guided_item(v: Vehicle, m: Message, c: Channel) -> None:
     item = item_from(m)
     flight = v.flight
     ok = isinstance(flight, GuidedFlight) and v.armed and not v.landed and v.origin is not None
-    ok = ok and item.frame in GLOBAL_FRAMES and valid_coordinates(item.x, item.y) and math.isfinite(item.z)
-    if ok and isinstance(flight, GuidedFlight) and v.origin is not None:
-        base = 0.0 if item.frame in ABSOLUTE_FRAMES else (v.home or v.origin).alt_m
+    base = v.altitude_base_m(item.frame)
+    ok = ok and base is not None and valid_coordinates(item.x, item.y) and math.isfinite(item.z)
+    if ok and isinstance(flight, GuidedFlight) and v.origin is not None and base is not None:
         north, east, down = v.origin.vector_to(Place(item.x, item.y, base + item.z))
         if m.integer("current") == 3:
             north, east = v.control.target

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 
-from fractus_sim.vehicle.body import Body
+from fractus_sim.vehicle.body import Body, euler_of
 from fractus_sim.vehicle.control import Estimate
 from fractus_sim.vehicle.earth import Place
 from fractus_sim.vehicle.mav import Severity
@@ -32,6 +32,13 @@ _FLAGS_READY = 831  # all estimates, and predicted positions
 _FLAGS_NO_POSITION = 167  # attitude and altitude, constant position
 _FLAGS_STARTING = 165
 _FLAGS_UNINITIALISED = 1024
+
+
+def _tilted(q: tuple[float, float, float, float], tilt: list[float]) -> tuple[float, float, float, float]:
+    """An attitude turned by small angles about the body axes; exact enough to second order."""
+    w, x, y, z = q
+    a, b, c = 0.5 * tilt[0], 0.5 * tilt[1], 0.5 * tilt[2]
+    return (w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c, z + w * c + x * b - y * a)
 
 
 class Estimator:
@@ -84,7 +91,8 @@ class Estimator:
     def estimate(self, body: Body) -> Estimate:
         """The estimate of the moment."""
         drift = self._drift
-        roll, pitch, yaw = body.euler()
+        quaternion = _tilted(body.quaternion, drift.tilt)
+        roll, pitch, yaw = euler_of(quaternion)
         return Estimate(
             body.north + drift.north,
             body.east + drift.east,
@@ -98,7 +106,7 @@ class Estimator:
             body.p,
             body.q,
             body.r,
-            body.quaternion,
+            quaternion,
         )
 
     def step(self, time_s: float, body: Body) -> None:

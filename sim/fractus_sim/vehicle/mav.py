@@ -71,6 +71,7 @@ class Frame(IntEnum):
 
 GLOBAL_FRAMES = frozenset({0, 3, 5, 6, 10, 11})
 ABSOLUTE_FRAMES = frozenset({0, 5})
+TERRAIN_FRAMES = frozenset({10, 11})
 
 
 class Command(IntEnum):

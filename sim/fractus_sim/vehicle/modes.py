@@ -152,6 +152,7 @@ class Land(Flight):
     def pause(self, v: Vehicle) -> None:
         """Wait before the descent, as every failsafe that lands does."""
         self._sink_from_s = v.time_s + FAILSAFE_PAUSE_S
+        v.control.climb(0.0)
 
     def begin(self, v: Vehicle) -> None:
         """Stop, or keep level when the position is unknown."""
@@ -199,11 +200,11 @@ class ReturnToLaunch(Flight):
     def begin(self, v: Vehicle) -> None:
         """Choose target and altitude, and climb."""
         p = v.params
-        north, east, base_down = v.return_point()
-        self._target = (north, east)
-        distance = math.hypot(north - v.est.north, east - v.est.east)
+        point = v.return_point()
+        self._target, base_down = (point.north, point.east), point.base_down
+        distance = point.distance_m((v.est.north, v.est.east))
         height = base_down - v.est.down
-        wanted = max(height + p["RTL_CLIMB_MIN"] / 100.0, p["RTL_ALT"] / 100.0, 2.0)
+        wanted = max(height + p["RTL_CLIMB_MIN"] / 100.0, p["RTL_ALT"] / 100.0, point.altitude_m, 2.0)
         if p["RTL_CONE_SLOPE"] >= 0.5:
             wanted = min(wanted, max(distance * p["RTL_CONE_SLOPE"], 2.0))
         ceiling = v.fence.alt_max_m - p["FENCE_MARGIN"]
@@ -236,7 +237,7 @@ class ReturnToLaunch(Flight):
                 final = v.params["RTL_ALT_FINAL"] / 100.0
                 self.stage = RtlStage.HOLD if final > 0.0 else RtlStage.LAND
                 if final > 0.0:
-                    control.go_to(*self._target, v.return_point()[2] - final)
+                    control.go_to(*self._target, v.return_point().base_down - final)
         elif self.stage is RtlStage.LAND:
             descend(v)
 

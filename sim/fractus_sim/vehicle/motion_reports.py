@@ -198,13 +198,15 @@ def altitude(v: Vehicle) -> Values:
         "altitude_amsl": place.alt_m,
         "altitude_local": -v.est.down,
         "altitude_relative": relative,
-        "altitude_terrain": place.alt_m - v.start.alt_m,
-        "bottom_clearance": place.alt_m - v.start.alt_m,
+        "altitude_terrain": place.alt_m - v.start.alt_m if int(v.params["TERRAIN_ENABLE"]) else math.nan,
+        "bottom_clearance": math.nan,
     }
 
 
-def terrain_report(v: Vehicle) -> Values:
-    """TERRAIN_REPORT over flat ground at the start's altitude."""
+def terrain_report(v: Vehicle) -> Values | None:
+    """TERRAIN_REPORT: the ground is flat, at the start's altitude, unless TERRAIN_ENABLE says that it is unknown."""
+    if not int(v.params["TERRAIN_ENABLE"]):
+        return None
     place = v.place
     return {
         "lat": place.lat_e7,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from fractus_sim.vehicle.earth import Place
@@ -13,6 +14,20 @@ from fractus_sim.vehicle.mission import Item, ItemStore, Mission, Transfers
 if TYPE_CHECKING:
     from fractus_sim.vehicle.params import Parameters
     from fractus_sim.vehicle.vehicle import Vehicle
+
+
+@dataclass(frozen=True, slots=True)
+class ReturnPoint:
+    """Where a return leads (local metres), what its altitudes count from, and how high above that it asks to be."""
+
+    north: float
+    east: float
+    base_down: float
+    altitude_m: float
+
+    def distance_m(self, here: tuple[float, float]) -> float:
+        """Distance over ground."""
+        return math.dist((self.north, self.east), here)
 
 
 class Plans:
@@ -37,19 +52,24 @@ class Plans:
             if theirs.items and mine.accept(list(theirs.items)) is MissionResult.ACCEPTED:
                 mine.items = list(theirs.items)
 
-    def return_point(
-        self, params: Parameters, origin: Place, home: Place, here: tuple[float, float]
-    ) -> tuple[float, float, float]:
-        """Home or the nearest rally point within RALLY_LIMIT_KM, in local metres."""
+    def return_point(self, params: Parameters, origin: Place, home: Place, here: tuple[float, float]) -> ReturnPoint:
+        """Home or the nearest rally point within RALLY_LIMIT_KM."""
         to_home = origin.vector_to(home)
+        at_home = ReturnPoint(*to_home, altitude_m=0.0)
         limit_m = params["RALLY_LIMIT_KM"] * 1000.0
-        rallies = (origin.vector_to(Place(item.x, item.y, home.alt_m)) for item in self.rally.items)
-        reachable = [rally for rally in rallies if limit_m <= 0.0 or math.dist(rally[:2], here) <= limit_m]
+        rallies = [self._rally(item, origin, home) for item in self.rally.items]
+        reachable = [rally for rally in rallies if limit_m <= 0.0 or rally.distance_m(here) <= limit_m]
         if not reachable:
-            return to_home
-        nearest = min(reachable, key=lambda rally: math.dist(rally[:2], here))
-        home_is_near = math.dist(to_home[:2], here) <= math.dist(nearest[:2], here)
-        return to_home if int(params["RALLY_INCL_HOME"]) and home_is_near else nearest
+            return at_home
+        nearest = min(reachable, key=lambda rally: rally.distance_m(here))
+        home_is_near = at_home.distance_m(here) <= nearest.distance_m(here)
+        return at_home if int(params["RALLY_INCL_HOME"]) and home_is_near else nearest
+
+    def _rally(self, item: Item, origin: Place, home: Place) -> ReturnPoint:
+        north, east, base_down = origin.vector_to(Place(item.x, item.y, home.alt_m))
+        base = self._vehicle.altitude_base_m(item.frame)
+        altitude_m = item.z if base is None else base + item.z - home.alt_m
+        return ReturnPoint(north, east, base_down, altitude_m)
 
     def _accept_mission(self, items: list[Item]) -> MissionResult:
         vehicle = self._vehicle

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from fractus_sim.vehicle import noise
 from fractus_sim.vehicle.body import GRAVITY
 from fractus_sim.vehicle.reporting import UNKNOWN_U16, Values, boot_ms, boot_us, centi, milli
 from fractus_sim.vehicle.shaping import clamp
@@ -12,6 +13,8 @@ from fractus_sim.vehicle.shaping import clamp
 if TYPE_CHECKING:
     from fractus_sim.vehicle.vehicle import Vehicle
     from fractus_sim.vehicle.wire import Value
+
+_BARO_AXIS = 16
 
 
 def gps_raw_int(v: Vehicle) -> Values:
@@ -50,16 +53,21 @@ def _imu(v: Vehicle) -> dict[str, Value]:
     by = 2 * (x * y - w * z) * fn + (1 - 2 * (x * x + z * z)) * fe + 2 * (y * z + w * x) * fd
     bz = 2 * (x * z + w * y) * fn + 2 * (y * z - w * x) * fe + (1 - 2 * (x * x + y * y)) * fd
     yaw = v.est.yaw
+    throttle = v.control.thrust_share if v.armed else 0.0
+    shake = noise.ACCEL_MPS2 + throttle * (noise.ACCEL_THROTTLE_MPS2 + max(v.params["SIM_ACC1_RND"], 0.0))
+    turn = noise.GYRO_RPS + throttle * (noise.GYRO_THROTTLE_RPS + math.radians(max(v.params["SIM_GYR1_RND"], 0.0)))
+    bias = [v.params[f"SIM_ACC1_BIAS_{axis}"] for axis in "XYZ"]
+    draw = [noise.gaussian(v.noise_seed, v.ticks, axis) for axis in range(9)]
     return {
-        "xacc": milli(bx / GRAVITY),
-        "yacc": milli(by / GRAVITY),
-        "zacc": milli(bz / GRAVITY),
-        "xgyro": milli(v.body.p),
-        "ygyro": milli(v.body.q),
-        "zgyro": milli(v.body.r),
-        "xmag": round(230 * math.cos(yaw)),
-        "ymag": round(-230 * math.sin(yaw)),
-        "zmag": 400,
+        "xacc": milli((bx + bias[0] + shake * draw[0]) / GRAVITY),
+        "yacc": milli((by + bias[1] + shake * draw[1]) / GRAVITY),
+        "zacc": milli((bz + bias[2] + shake * draw[2]) / GRAVITY),
+        "xgyro": milli(v.body.p + turn * draw[3]),
+        "ygyro": milli(v.body.q + turn * draw[4]),
+        "zgyro": milli(v.body.r + turn * draw[5]),
+        "xmag": round(230 * math.cos(yaw) + noise.MAG_MGAUSS * draw[6]),
+        "ymag": round(-230 * math.sin(yaw) + noise.MAG_MGAUSS * draw[7]),
+        "zmag": round(400 + noise.MAG_MGAUSS * draw[8]),
         "temperature": 4500,
     }
 
@@ -77,6 +85,7 @@ def scaled_imu2(v: Vehicle) -> Values:
 def scaled_pressure(v: Vehicle) -> Values:
     """SCALED_PRESSURE from the standard atmosphere."""
     altitude = v.true_altitude_amsl_m
+    altitude += max(v.params["SIM_BARO_RND"], 0.0) * noise.gaussian(v.noise_seed, v.ticks, _BARO_AXIS)
     return {
         "time_boot_ms": boot_ms(v),
         "press_abs": 1013.25 * (1.0 - 2.25577e-5 * altitude) ** 5.25588,

@@ -13,6 +13,9 @@ from fractus_sim.vehicle.shaping import clamp
 # Open-circuit voltage of a lithium polymer cell against the share of charge that is left.
 _CELL_CURVE = ((0.0, 3.27), (0.05, 3.60), (0.1, 3.69), (0.2, 3.75), (0.4, 3.80), (0.6, 3.90), (0.8, 4.03), (1.0, 4.20))
 IDLE_CURRENT_A = 0.4
+# How far an estimated attitude wanders from the truth: roll, pitch, yaw.
+TILT_SIGMA_RAD = (math.radians(0.15), math.radians(0.15), math.radians(0.6))
+TILT_CORRELATION_S = 20.0
 HOVER_CURRENT_A = 14.0
 
 
@@ -97,6 +100,7 @@ class Drift:
         self._blind = [0.0, 0.0]
         self._blind_rate = [0.0, 0.0]
         self.north = self.east = self.down = 0.0
+        self.tilt = [0.0, 0.0, 0.0]  # attitude error about the body axes, radians
         self.rate_n = self.rate_e = 0.0
 
     def step(self, dt: float, *, aided: bool) -> None:
@@ -113,6 +117,11 @@ class Drift:
             else:
                 self._blind_rate[axis] += 0.05 * gauss(0.0, 1.0) * math.sqrt(dt)
                 self._blind[axis] += self._blind_rate[axis] * dt
+        if self._sigma_m > 0.0:
+            steady = math.exp(-dt / TILT_CORRELATION_S)
+            for axis, sigma in enumerate(TILT_SIGMA_RAD):
+                kick_rad = sigma * math.sqrt(1.0 - steady * steady)
+                self.tilt[axis] = self.tilt[axis] * steady + kick_rad * gauss(0.0, 1.0)
         self.down = self.down * keep + 0.4 * kick * gauss(0.0, 1.0)
         self.north = self._wander[0] + self._blind[0]
         self.east = self._wander[1] + self._blind[1]

@@ -42,6 +42,8 @@ class Craft:
     def receive(self, channel: Channel, data: bytes) -> None:
         """Take bytes that arrived on a link."""
         for message in channel.receive(data):
+            if self._recorder is not None:
+                self._log(message.frame)
             self._route(channel, message)
             dispatch(self.vehicle, message, channel)
 
@@ -81,14 +83,15 @@ class Craft:
             channel.parameters.clear()
             self.vehicle.voice.attach(channel)
 
+    def _log(self, frame: bytes) -> None:
+        if self._recorder is not None:
+            self._recorder.write(struct.pack(">Q", self.vehicle.unix_us) + frame)
+
     def record(self, file: BinaryIO, rate_hz: float = 4.0) -> None:
-        """Write everything the vehicle says on a link of its own to a tlog, with every stream at `rate_hz`."""
+        """Write a tlog: what the vehicle says on a link of its own, with every stream at `rate_hz`, and all it is told."""
         vehicle = self.vehicle
-
-        def tap(frame: bytes) -> None:
-            file.write(struct.pack(">Q", self.vehicle.unix_us) + frame)
-
-        channel = Channel(self.config.sysid, name="recorder", tap=tap, discard=True)
+        self._recorder = file
+        channel = Channel(self.config.sysid, name="recorder", tap=self._log, discard=True)
         vehicle.voice.attach(channel)
         for group in ALL_GROUPS:
             for name in GROUPS[group][1]:

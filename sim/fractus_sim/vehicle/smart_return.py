@@ -101,7 +101,7 @@ class SmartReturn(Flight):
         else:
             self.stage = SmartStage.DESCEND
             north, east, _ = self._leg.end
-            v.control.go_to(north, east, v.return_point()[2] - final_m)
+            v.control.go_to(north, east, v.return_point().base_down - final_m)
         self._leg = None
 
 

@@ -18,11 +18,12 @@ from fractus_sim.vehicle.failsafes import Failsafes
 from fractus_sim.vehicle.fence import Fence
 from fractus_sim.vehicle.flight import Flight
 from fractus_sim.vehicle.guided import Heading
-from fractus_sim.vehicle.mav import Landed, Mode, Severity
+from fractus_sim.vehicle.mav import ABSOLUTE_FRAMES, GLOBAL_FRAMES, TERRAIN_FRAMES, Landed, Mode, Severity
 from fractus_sim.vehicle.mission import Item, Mission
 from fractus_sim.vehicle.modes import FLIGHTS, ReturnToLaunch, new_flight
 from fractus_sim.vehicle.params import Parameters
-from fractus_sim.vehicle.plans import Plans
+from fractus_sim.vehicle.plans import Plans, ReturnPoint
+from fractus_sim.vehicle.readiness import arming_refusal
 from fractus_sim.vehicle.receiver import Receiver
 from fractus_sim.vehicle.sensors import Battery, Gps
 from fractus_sim.vehicle.settings import LIMIT_PREFIXES, set_battery, set_fence, set_limits, set_wind
@@ -63,6 +64,7 @@ class Vehicle:
         self.compid = 1
         self.start = config.start
         self.rng = random.Random(f"{config.seed}:{config.sysid}")  # noqa: S311 - a simulation, not a secret
+        self.noise_seed = config.seed * 251 + config.sysid
         self.channels: list[Channel] = []
         self.voice = Voice(self)
         self.params = Parameters(config.parameters, config.store)
@@ -173,6 +175,14 @@ class Vehicle:
         """Estimated height above the ground (flat, at the altitude of the start)."""
         return -self.est.down
 
+    def altitude_base_m(self, frame: int) -> float | None:
+        """What altitudes of a global frame count from, AMSL; None for another frame or where terrain is unknown."""
+        if frame in ABSOLUTE_FRAMES:
+            return 0.0
+        if frame in TERRAIN_FRAMES:
+            return self.start.alt_m if int(self.params["TERRAIN_ENABLE"]) else None
+        return (self.home or self.origin or self.start).alt_m if frame in GLOBAL_FRAMES else None
+
     @property
     def heading_cdeg(self) -> int:
         """Heading in hundredths of a degree."""
@@ -209,24 +219,7 @@ class Vehicle:
 
     def arming_refusal(self) -> str | None:
         """Why the vehicle would not arm now, or None."""
-        needs_position = FLIGHTS[self.mode].needs_position
-        volts, failsafes, north, east = self.battery.voltage_v, self.failsafes, self.est.north, self.est.east
-        checks = (
-            (not self.estimator.healthy, "AHRS: EKF3 not healthy"),
-            (needs_position and self.gps.fix_type < 3, "GPS 1: Bad fix"),
-            (not self.position_ok and (needs_position or self.fence.enabled), "Need Position Estimate"),
-            (not self.estimator.ready, "AHRS: waiting for home"),
-            (0.0 < volts < self.params["BATT_ARM_VOLT"], "Battery 1 below minimum arming voltage"),
-            (failsafes.battery, "Battery 1 low voltage failsafe"),
-            (volts < self.params["BATT_CRT_VOLT"], "Battery 1 critical voltage failsafe"),
-            (failsafes.gcs, "GCS failsafe on"),
-            (failsafes.radio, "Radio failsafe on"),
-            (
-                self.home is not None and bool(self.fence.outside(north, east, 0.0, self.home_xy)),
-                "Vehicle outside fence",
-            ),
-        )
-        return next((text for failed, text in checks if failed), None)
+        return arming_refusal(self, needs_position=FLIGHTS[self.mode].needs_position)
 
     # -- speaking ----------------------------------------------------------------------------------------------
 
@@ -369,8 +362,8 @@ class Vehicle:
         self.yaw.hold(control.target_yaw)
         return True
 
-    def return_point(self) -> tuple[float, float, float]:
-        """Where RTL goes (local): home or the nearest rally point, and the altitude to count from."""
+    def return_point(self) -> ReturnPoint:
+        """Where RTL goes: home or the nearest rally point."""
         origin = self.origin or self.start
         return self.plans.return_point(self.params, origin, self.home or origin, (self.est.north, self.est.east))
 

@@ -1,0 +1,30 @@
+"""Sensor noise as a function of seed and time: what one link asks for never changes what another one hears."""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+
+# Of ArduPilot's simulated sensors: what is there at rest, and what full throttle adds through the frame.
+ACCEL_MPS2, ACCEL_THROTTLE_MPS2 = 0.05, 0.25
+GYRO_RPS, GYRO_THROTTLE_RPS = 0.002, 0.007
+MAG_MGAUSS = 1.0
+
+
+def gaussian(seed: int, tick: int, axis: int) -> float:
+    """A standard normal number that belongs to this moment and axis.
+
+    A CRC, mixed twice, gives the pair of uniform numbers for a Box-Muller transform: far cheaper than seeding a generator
+    each time, and good enough for noise.
+    """
+    key = struct.pack("<QIB", seed & 0xFFFFFFFFFFFFFFFF, tick & 0xFFFFFFFF, axis & 0xFF)
+    one = _mixed(zlib.crc32(key))
+    two = _mixed(one ^ 0x9E3779B9)
+    return math.sqrt(-2.0 * math.log((one + 1.0) / 4294967297.0)) * math.cos(2.0 * math.pi * two / 4294967296.0)
+
+
+def _mixed(value: int) -> int:
+    value = (value ^ value >> 16) * 0x7FEB352D & 0xFFFFFFFF
+    value = (value ^ value >> 15) * 0x846CA68B & 0xFFFFFFFF
+    return value ^ value >> 16

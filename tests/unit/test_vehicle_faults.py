@@ -1,0 +1,238 @@
+"""Faults injected in flight, and what a real ArduCopter shows for each: the mode and the STATUSTEXT."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from fractus_sim.vehicle.mav import Command, Mode, Result, Severity
+from fractus_sim.vehicle.pilot import Pilot
+from fractus_sim.vehicle.vehicle import Vehicle
+from vehicle_world import START, airborne, alone, distance_m, upload
+
+HOME = {"command": 16, "frame": 0, "x": START.lat_e7, "y": START.lon_e7, "z": 150.0}
+
+
+def _in_order(texts: list[str], *wanted: str) -> bool:
+    """Whether the texts were said in that order (others may lie between)."""
+    rest = iter(texts)
+    return all(any(text.startswith(want) for text in rest) for want in wanted)
+
+
+def _waypoint(north_m: float, altitude_m: float = 10.0) -> dict[str, float]:
+    place = START.offset(north_m, 0.0)
+    return {"command": 16, "frame": 3, "x": place.lat_e7, "y": place.lon_e7, "z": altitude_m}
+
+
+def _in_mission(**parameters: float) -> tuple[Vehicle, Pilot]:
+    vehicle, pilot = airborne(10.0, **parameters)
+    assert upload(pilot, 0, [HOME, _waypoint(150.0), _waypoint(0.0)]) == 0
+    assert pilot.mode(Mode.AUTO) is Result.ACCEPTED
+    pilot.fly_on(3.0)
+    return vehicle, pilot
+
+
+@pytest.mark.parametrize("mode", [Mode.GUIDED, Mode.LOITER, Mode.RTL, Mode.AUTO])
+def test_gps_loss_lands_after_a_pause(mode: Mode):
+    vehicle, pilot = _in_mission() if mode is Mode.AUTO else airborne(15.0)
+    if mode is not Mode.AUTO:
+        pilot.mode(mode)
+    pilot.parameter("SIM_GPS1_ENABLE", 0)
+    pilot.wait(lambda: vehicle.mode is Mode.LAND, 12.0)
+    assert _in_order(
+        pilot.texts,
+        "EKF3 IMU0 stopped aiding",
+        "EKF variance: position lost",
+        "EKF Failsafe: changed to LAND Mode",
+    )
+    height_m = vehicle.height_m
+    pilot.fly_on(3.5)
+    assert vehicle.height_m == pytest.approx(height_m, abs=1.0), "a failsafe's landing waits four seconds"
+    pilot.wait(lambda: not vehicle.armed, 90.0)
+    assert not vehicle.body.crashed
+
+
+def test_gps_loss_may_hold_altitude_instead():
+    vehicle, pilot = airborne(15.0, FS_EKF_ACTION=2)
+    pilot.parameter("SIM_GPS1_ENABLE", 0)
+    pilot.wait(lambda: vehicle.mode is Mode.ALT_HOLD, 12.0)
+    assert "EKF Failsafe: changed to ALT_HOLD Mode" in pilot.texts
+    pilot.parameter("SIM_GPS1_ENABLE", 1)
+    pilot.wait(lambda: "EKF Failsafe Cleared" in pilot.texts, 10.0)
+    assert "EKF3 IMU0 is using GPS" in pilot.texts[-2:]
+    assert vehicle.mode is Mode.ALT_HOLD
+    assert pilot.mode(Mode.GUIDED) is Result.ACCEPTED
+
+
+def test_too_few_satellites_are_no_position():
+    vehicle, pilot = airborne(15.0)
+    pilot.parameter("SIM_GPS1_NUMSATS", 3)
+    pilot.wait(lambda: vehicle.mode is Mode.LAND, 12.0)
+    assert "EKF Failsafe: changed to LAND Mode" in pilot.texts
+
+
+@pytest.mark.parametrize(
+    ("setting", "mode", "text"),
+    [
+        (1, Mode.RTL, "GCS Failsafe"),
+        (2, Mode.RTL, "GCS Failsafe"),
+        (5, Mode.LAND, "GCS Failsafe"),
+        (6, Mode.RTL, "Trying RTL Mode"),
+        (7, Mode.BRAKE, "GCS Failsafe"),
+    ],
+)
+def test_a_node_without_power_is_a_companion_that_falls_silent(setting: int, mode: Mode, text: str):
+    vehicle, pilot = airborne(10.0, FS_GCS_ENABLE=setting)
+    pilot.go_to(40.0, 0.0, 10.0)
+    pilot.heartbeats = False
+    pilot.wait(lambda: vehicle.mode is mode, 8.0)
+    assert pilot.texts[-1] == text
+    pilot.heartbeats = True
+    pilot.wait(lambda: "GCS Failsafe Cleared" in pilot.texts, 3.0)
+    assert vehicle.mode is mode
+
+
+@pytest.mark.parametrize(
+    ("options", "mode", "stays", "text"),
+    [
+        (2, Mode.AUTO, True, "GCS Failsafe - Continuing Auto Mode"),
+        (0, Mode.AUTO, False, "GCS Failsafe"),
+        (8, Mode.LAND, True, "GCS Failsafe - Continuing Landing"),
+        (16, Mode.LOITER, True, "GCS Failsafe - Continuing Pilot Control"),
+        (0, Mode.LOITER, False, "GCS Failsafe"),
+    ],
+)
+def test_a_lost_link_leaves_what_fs_options_says(options: int, mode: Mode, stays: bool, text: str):
+    vehicle, pilot = _in_mission(FS_GCS_ENABLE=1, FS_OPTIONS=options)
+    pilot.mode(mode)
+    pilot.heartbeats = False
+    pilot.wait(lambda: vehicle.failsafes.gcs, 8.0)
+    assert text in pilot.texts
+    assert (vehicle.mode is mode) is stays
+
+
+@pytest.mark.parametrize(("setting", "mode"), [(1, Mode.RTL), (3, Mode.LAND), (7, Mode.BRAKE)])
+def test_a_lost_radio(setting: int, mode: Mode):
+    vehicle, pilot = airborne(10.0, FS_THR_ENABLE=setting)
+    pilot.go_to(30.0, 0.0, 10.0)
+    pilot.fly_on(3.0)
+    pilot.parameter("SIM_RC_FAIL", 1)
+    assert pilot.wait(lambda: vehicle.mode is mode, 3.0) == pytest.approx(1.0, abs=0.2)
+    assert pilot.texts[-1] == "Radio Failsafe"
+    pilot.parameter("SIM_RC_FAIL", 0)
+    pilot.wait(lambda: pilot.texts[-1] == "Radio Failsafe Cleared", 1.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "watched", "text"),
+    [(4, 1, "Radio Failsafe - Continuing Guided Mode"), (4, 0, "Radio Failsafe"), (0, 1, "Radio Failsafe")],
+)
+def test_guided_flight_may_go_on_without_radio_where_the_companion_is_watched(options: int, watched: int, text: str):
+    vehicle, pilot = airborne(10.0, FS_OPTIONS=options, FS_GCS_ENABLE=watched)
+    pilot.parameter("SIM_RC_FAIL", 1)
+    pilot.wait(lambda: vehicle.failsafes.radio, 3.0)
+    assert text in pilot.texts
+    assert (vehicle.mode is Mode.GUIDED) is text.endswith("Guided Mode")
+
+
+def test_a_lost_radio_on_the_ground_stops_the_motors_and_forbids_arming():
+    vehicle, pilot = alone()
+    pilot.wait(lambda: vehicle.arming_refusal() is None, 5.0)
+    pilot.mode(Mode.GUIDED)
+    pilot.command(Command.COMPONENT_ARM_DISARM, 1.0)
+    pilot.parameter("SIM_RC_FAIL", 1)
+    pilot.wait(lambda: not vehicle.armed, 3.0)
+    assert "Radio Failsafe - Disarming" in pilot.texts
+    assert pilot.command(Command.COMPONENT_ARM_DISARM, 1.0) is Result.FAILED
+    assert pilot.texts[-1] == "Arm: Radio failsafe on"
+
+
+@pytest.mark.parametrize(
+    ("setting", "mode"), [(0, Mode.GUIDED), (1, Mode.LAND), (2, Mode.RTL), (6, Mode.RTL), (7, Mode.BRAKE)]
+)
+def test_a_battery_that_drops(setting: int, mode: Mode):
+    vehicle, pilot = airborne(10.0, BATT_LOW_VOLT=11.5, BATT_FS_LOW_ACT=setting)
+    pilot.go_to(30.0, 0.0, 10.0)
+    pilot.fly_on(3.0)
+    pilot.parameter("SIM_BATT_VOLTAGE", 11.6)
+    pilot.wait(lambda: vehicle.failsafes.battery, 15.0)
+    assert vehicle.mode is mode
+    assert _in_order(pilot.texts, "Battery 1 is low 1", "Battery Failsafe")
+    assert (
+        pilot.last["HEARTBEAT"].integer("system_status") == 4 or pilot.expect("HEARTBEAT").integer("system_status") == 5
+    )
+
+
+def test_a_terminating_battery_failsafe_stops_the_motors():
+    vehicle, pilot = airborne(10.0, BATT_CRT_VOLT=11.5, BATT_FS_CRT_ACT=5)
+    pilot.parameter("SIM_BATT_VOLTAGE", 11.6)
+    pilot.wait(lambda: not vehicle.armed, 15.0)
+    assert _in_order(pilot.texts, "Battery 1 is critical 1", "Battery Failsafe", "Disarming motors")
+
+
+def test_a_landing_for_the_battery_is_not_undone_by_a_lost_link():
+    vehicle, pilot = airborne(25.0, BATT_CRT_VOLT=11.5, BATT_FS_CRT_ACT=1, FS_GCS_ENABLE=1, FS_OPTIONS=0)
+    pilot.parameter("SIM_BATT_VOLTAGE", 11.6)
+    pilot.wait(lambda: vehicle.mode is Mode.LAND, 15.0)
+    pilot.heartbeats = False
+    pilot.wait(lambda: vehicle.failsafes.gcs, 8.0)
+    assert pilot.texts[-1] == "GCS + Battery Failsafe - Continuing Landing"
+    assert vehicle.mode is Mode.LAND
+
+
+@pytest.mark.parametrize("motor", [0, 1, 2, 3])
+def test_a_dead_motor_ends_in_a_crash_that_disarms(motor: int):
+    vehicle, pilot = airborne(15.0)
+    pilot.parameter("SIM_ENGINE_MUL", 0.0)
+    pilot.parameter("SIM_ENGINE_FAIL", 1 << motor)
+    pilot.wait(lambda: not vehicle.armed, 30.0)
+    assert vehicle.body.crashed
+    assert _in_order(pilot.texts, "Crash: Disarming: AngErr=", "Disarming motors")
+
+
+def test_weak_motors_are_noticed_before_the_ground_is():
+    vehicle, pilot = airborne(30.0)
+    pilot.parameter("SIM_ENGINE_MUL", 0.36)
+    pilot.parameter("SIM_ENGINE_FAIL", 15)
+    pilot.wait(lambda: any(text.startswith("Potential Thrust Loss (") for text in pilot.texts), 15.0)
+    assert not vehicle.body.on_ground
+    assert pilot.last["STATUSTEXT"].integer("severity") == Severity.EMERGENCY
+
+
+def test_a_gust_is_leaned_against_and_changes_nothing_else():
+    vehicle, pilot = airborne(15.0)
+    said = len(pilot.texts)
+    pilot.parameter("SIM_WIND_DIR", 0)
+    pilot.parameter("SIM_WIND_SPD", 10)
+    worst = lean = 0.0
+    for step in range(1500):
+        if step == 600:
+            pilot.parameter("SIM_WIND_SPD", 0)
+        pilot.step()
+        worst = max(worst, distance_m(vehicle, 0.0, 0.0))
+        lean = max(lean, math.hypot(vehicle.est.roll, vehicle.est.pitch))
+    assert 0.3 < worst < 5.0
+    assert lean > math.radians(5)
+    assert distance_m(vehicle, 0.0, 0.0) < 0.8
+    assert (vehicle.mode, pilot.texts[said:]) == (Mode.GUIDED, [])
+
+
+def test_a_storm_carries_it_away_and_it_comes_back():
+    vehicle, pilot = airborne(30.0)
+    pilot.parameter("SIM_WIND_SPD", 45)
+    pilot.fly_on(8.0)
+    assert distance_m(vehicle, 0.0, 0.0) > 10.0
+    pilot.parameter("SIM_WIND_SPD", 0)
+    pilot.fly_on(40.0)
+    assert distance_m(vehicle, 0.0, 0.0) < 5.0
+    assert vehicle.mode is Mode.GUIDED
+    assert not vehicle.body.crashed
+
+
+def test_a_fence_that_is_far_behind_means_landing():
+    vehicle, pilot = airborne(10.0, FENCE_RADIUS=50, FENCE_ACTION=1)
+    pilot.go_to(200.0, 0.0, 10.0)
+    pilot.wait(lambda: vehicle.body.north > 190.0, 60.0)
+    assert pilot.command(Command.DO_FENCE_ENABLE, 1) is Result.ACCEPTED
+    pilot.wait(lambda: vehicle.mode is Mode.LAND, 3.0)
+    assert "Circle fence breached" in pilot.texts

@@ -1,0 +1,145 @@
+"""What the vehicle reports of itself: noise that is there and repeatable, frames it understands, logs it writes."""
+
+from __future__ import annotations
+
+import io
+import math
+import statistics
+import struct
+from dataclasses import replace
+
+import pytest
+from fractus_sim.vehicle.mav import Command, Mode, Result
+from fractus_sim.vehicle.noise import gaussian
+from fractus_sim.vehicle.pilot import Pilot
+from fractus_sim.vehicle.vehicle import Vehicle
+from fractus_sim.vehicle.wire import Message, Parser
+from vehicle_world import CONFIG, START, airborne, alone, distance_m, upload
+
+
+def _heard(pilot: Pilot, number: int, name: str, duration_s: float) -> list[Message]:
+    assert pilot.command(Command.SET_MESSAGE_INTERVAL, number, 20_000) is Result.ACCEPTED
+    return [m for _ in range(round(duration_s * 100)) for m in pilot.step() if m.name == name]
+
+
+def test_noise_is_normal_independent_and_repeatable():
+    one = [gaussian(1, tick, 0) for tick in range(4000)]
+    two = [gaussian(1, tick, 1) for tick in range(4000)]
+    assert statistics.fmean(one) == pytest.approx(0.0, abs=0.05)
+    assert statistics.stdev(one) == pytest.approx(1.0, abs=0.05)
+    assert abs(statistics.correlation(one, two)) < 0.05
+    assert abs(statistics.correlation(one[1:], one[:-1])) < 0.05
+    assert one[7] == gaussian(1, 7, 0) != gaussian(2, 7, 0)
+
+
+def test_inertial_sensors_are_noisy_and_more_so_in_flight():
+    still, pilot = alone(config=replace(CONFIG, seed=5))
+    pilot.fly_on(3.0)
+    at_rest = [m.integer("xacc") for m in _heard(pilot, 27, "RAW_IMU", 4.0)]
+    _, flying = airborne(10.0)
+    in_flight = [m.integer("xacc") for m in _heard(flying, 27, "RAW_IMU", 4.0)]
+    assert 0.0 < statistics.stdev(at_rest) < statistics.stdev(in_flight)
+    assert statistics.fmean(m.integer("zacc") for m in _heard(flying, 27, "RAW_IMU", 4.0)) == pytest.approx(
+        -1000, abs=25
+    )
+    assert still.ticks > 0
+
+
+def test_the_estimated_attitude_wanders_about_the_true_one():
+    vehicle, pilot = airborne(10.0)
+    errors = []
+    for _ in range(200):
+        pilot.fly_on(0.2)
+        true = vehicle.body.euler()
+        errors.append(max(abs(vehicle.est.roll - true[0]), abs(vehicle.est.pitch - true[1])))
+    assert 0.0 < max(errors) < math.radians(1.0)
+    assert math.hypot(*vehicle.est.quaternion) == pytest.approx(1.0, abs=1e-3)
+
+
+def _mask(pilot: Pilot, frame: int, mask: int, **values: float) -> None:
+    target = {"target_system": 1, "target_component": 1, "coordinate_frame": frame, "type_mask": mask}
+    pilot.send("SET_POSITION_TARGET_LOCAL_NED", target | values)
+
+
+def _flying_north() -> tuple[Vehicle, Pilot]:
+    vehicle, pilot = airborne(10.0)
+    pilot.go_to(200.0, 0.0, 10.0)
+    pilot.wait(lambda: vehicle.body.vn > 5.0, 10.0)
+    return vehicle, pilot
+
+
+@pytest.mark.parametrize(
+    ("frame", "mask"),
+    [
+        (1, 0x9FF),  # only a yaw
+        (1, 0x5FF),  # only a yaw rate
+        (1, 0xFFF),  # nothing
+        (1, 0xE00 | 0x03F),  # a force
+        (1, 0xC00 | 0x038),  # position and acceleration without velocity
+        (12, 0xDC7),  # a frame that ArduCopter does not know here
+        (3, 0xDF8),  # a global frame in a local message
+    ],
+)
+def test_a_target_that_is_not_understood_stops_the_vehicle(frame: int, mask: int):
+    vehicle, pilot = _flying_north()
+    _mask(pilot, frame, mask, vx=9.0, x=500.0, yaw=1.0)
+    pilot.fly_on(8.0)
+    assert abs(vehicle.body.vn) < 0.2
+
+
+def test_a_force_flag_without_acceleration_is_no_matter():
+    vehicle, pilot = airborne(10.0)
+    _mask(pilot, 1, 0xDF8 | 0x200, x=15.0, y=0.0, z=-10.0)
+    pilot.fly_on(10.0)
+    assert distance_m(vehicle, 15.0, 0.0) < 0.7
+
+
+@pytest.mark.parametrize(("known", "altitude_m"), [(1, 14.0), (0, 10.0)])
+def test_targets_above_terrain_need_terrain(known: int, altitude_m: float):
+    vehicle, pilot = airborne(10.0, TERRAIN_ENABLE=known)
+    place = START.offset(10.0, 0.0)
+    pilot.send(
+        "SET_POSITION_TARGET_GLOBAL_INT",
+        {
+            "target_system": 1,
+            "target_component": 1,
+            "coordinate_frame": 11,
+            "type_mask": 0xDF8,
+            "lat_int": place.lat_e7,
+            "lon_int": place.lon_e7,
+            "alt": 14.0,
+        },
+    )
+    pilot.fly_on(12.0)
+    assert vehicle.altitude_m == pytest.approx(altitude_m, abs=0.5)
+    values = {"frame": 11, "x": place.lat_e7, "y": place.lon_e7, "z": 12.0}
+    wanted = Result.ACCEPTED if known else Result.DENIED
+    assert pilot.command_int(Command.DO_REPOSITION, values) is wanted
+    assert vehicle.send(pilot.channel, "TERRAIN_REPORT") is bool(known)
+
+
+def test_a_mission_above_unknown_terrain_is_given_up():
+    vehicle, pilot = airborne(10.0, TERRAIN_ENABLE=0)
+    place = START.offset(60.0, 0.0)
+    home = {"command": 16, "frame": 0, "x": START.lat_e7, "y": START.lon_e7, "z": 150.0}
+    waypoint = {"command": 16, "frame": 10, "x": place.lat_e7, "y": place.lon_e7, "z": 12.0}
+    assert upload(pilot, 0, [home, waypoint]) == 0
+    pilot.mode(Mode.AUTO)
+    pilot.wait(lambda: vehicle.mode is Mode.RTL, 2.0)
+    assert "Failsafe: Terrain data missing" in pilot.texts
+
+
+def test_a_log_has_both_directions():
+    _, pilot = alone()
+    log = io.BytesIO()
+    pilot.craft.record(log)
+    pilot.send("COMMAND_LONG", {"target_system": 1, "target_component": 1, "command": 520, "param1": 1.0})
+    pilot.fly_on(2.0)
+    entries, data, at = [], log.getvalue(), 0
+    while at < len(data):
+        time_us, length = struct.unpack(">Q", data[at : at + 8])[0], data[at + 9] + 12
+        message = Parser().feed(data[at + 8 : at + 8 + length])[0]
+        entries.append((time_us, message.sysid, message.name))
+        at += 8 + length
+    assert entries == sorted(entries, key=lambda entry: entry[0])
+    assert {(255, "COMMAND_LONG"), (255, "HEARTBEAT"), (1, "HEARTBEAT"), (1, "ATTITUDE")} <= {e[1:] for e in entries}

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from fractus_agent.grants import GrantDirectory, GrantKeeper
 from fractus_agent.identity import Identity
 from fractus_agent.registration import Registration
+from fractus_agent.seals import Seals
 from fractus_agent.settings import MissingSetting, Settings
 from fractus_agent.status import Observed, StatusReporter
 from fractus_agent.store import Object, Store, Unavailable, connect
@@ -33,8 +34,15 @@ class Agent:
     def __init__(self, settings: Settings, store: Store) -> None:
         self._settings = settings
         node = settings.node
-        self.keeper = GrantKeeper(store, GrantDirectory(settings.grants), node)
         self.identity = Identity(store, settings.tls, node, _now, changed=self._poke)
+        self.keeper = GrantKeeper(
+            store,
+            GrantDirectory(settings.grants),
+            node,
+            Seals(settings.tls).check,
+            ask=self.identity.doubt_authority,
+        )
+        self._certificates = 0
         self.registration = Registration(store, settings.description, node, changed=self._poke)
         self._mobility = asyncio.Event()
         self._feed: TelemetryFeed | None = None
@@ -101,6 +109,9 @@ class Agent:
     def _poke(self) -> None:
         if self._has_mobility():
             self._mobility.set()
+        if self._certificates != self.identity.serial:
+            self._certificates = self.identity.serial
+            self.keeper.authority_changed()
         self.reporter.poke()
 
 

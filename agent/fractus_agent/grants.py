@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-from collections.abc import AsyncIterator, Mapping
+import time
+from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -14,6 +15,7 @@ from fractus_core.api.plans import Grant
 
 from fractus_agent.backoff import Backoff
 from fractus_agent.durable import remove_file, write_file
+from fractus_agent.seals import Undecided, Unsigned
 from fractus_agent.store import Changed, Conflict, Deleted, GrantEvent, Listed, Object, Rejected, Unavailable
 
 LOG = logging.getLogger(__name__)
@@ -23,6 +25,8 @@ ENDED: frozenset[str] = frozenset({"Complete", "Revoked", "Failed"})
 _OUTCOMES: dict[str, Phase] = {"complete": "Complete", "revoked": "Revoked", "failed": "Failed"}
 REVIEW_S = 60.0
 """Seconds after which reports and failed writes are looked at again, if nothing happens before."""
+HOLD_S = 120.0
+"""Seconds for which a Grant outlives a newer one whose authority is unknown: as long as the change of authorities takes."""
 
 
 class GrantStore(Protocol):
@@ -103,13 +107,35 @@ def status_of(grant: Grant, missions: Mapping[str, str], problem: str | None) ->
 class GrantKeeper:
     """Mirrors the node's grants to disk and reports their phases.
 
-    Files go only on word of the API server: a deletion, or absence from a complete list.
+    Files go only on word of the API server: a deletion, absence from a complete list, or a Grant that the operator did
+    not sign.
+
+    Args:
+        store: the API server.
+        directory: the disk.
+        node: whose grants.
+        check: raises Unsigned or Undecided for a Grant that is not to be stored.
+        ask: called when the authority that the node trusts may be out of date.
+        monotonic: seconds that never jump.
     """
 
-    def __init__(self, store: GrantStore, directory: GrantDirectory, node: str) -> None:
+    def __init__(
+        self,
+        store: GrantStore,
+        directory: GrantDirectory,
+        node: str,
+        check: Callable[[Grant], None],
+        *,
+        ask: Callable[[], None] = lambda: None,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._store = store
         self._directory = directory
         self._node = node
+        self._check = check
+        self._ask = ask
+        self._monotonic = monotonic
+        self._undecided: dict[str, tuple[Object, float]] = {}
         self._grants: dict[str, Grant] = {}
         self._unreadable: dict[str, dict[str, Any]] = {}
         self._unstored: dict[str, str] = {}
@@ -124,6 +150,12 @@ class GrantKeeper:
             self._missions = dict(missions)
             self._work.set()
 
+    def authority_changed(self) -> None:
+        """Look again at Grants whose authority was not known."""
+        for body, _ in tuple(self._undecided.values()):
+            self._put(body)
+        self._work.set()
+
     async def follow(self) -> None:
         """Keep the directory in step with the API server, for ever."""
         self._directory.open()
@@ -135,7 +167,8 @@ class GrantKeeper:
         match event:
             case Listed(grants):
                 names = {body["metadata"]["name"] for body in grants}
-                for gone in (self._directory.names() | set(self._grants)) - names:
+                known = self._directory.names().union(self._grants, self._unreadable, self._undecided)
+                for gone in known - names:
                     self._remove(gone)
                 for body in grants:
                     self._put(body)
@@ -151,6 +184,7 @@ class GrantKeeper:
         while True:
             delay_s = REVIEW_S
             self._work.clear()
+            self._give_up_undecided()
             try:
                 await self.report_once()
                 backoff.succeeded()
@@ -193,6 +227,17 @@ class GrantKeeper:
         if grant.metadata.deletion_timestamp is not None or grant.spec.node != self._node:
             self._remove(name)
             return
+        try:
+            self._check(grant)
+        except Undecided as doubt:
+            self._doubt(body, str(doubt))
+            return
+        except Unsigned as problem:
+            LOG.error("grant %s is not stored: %s", name, problem)  # noqa: TRY400
+            self._remove(name)
+            self._wait(body, str(problem))
+            return
+        self._undecided.pop(name, None)
         self._unreadable.pop(name, None)
         self._unremoved.discard(name)
         old = self._grants.get(name)
@@ -206,6 +251,30 @@ class GrantKeeper:
                 "observedGeneration": grant.status.observed_generation or 0,
             }
         self._write(grant)
+
+    def _doubt(self, body: Object, why: str) -> None:
+        """Keep what is stored for a while: the authority may be changing."""
+        name = body["metadata"]["name"]
+        if name not in self._undecided:
+            LOG.warning("grant %s is not stored yet: %s", name, why)
+        self._undecided[name] = (body, self._undecided.get(name, (body, self._monotonic()))[1])
+        if name not in self._grants:
+            self._wait(body, why)
+        self._ask()
+
+    def _give_up_undecided(self) -> None:
+        for name, (body, since_s) in tuple(self._undecided.items()):
+            if name in self._directory.names() and self._monotonic() - since_s > HOLD_S:
+                LOG.error("grant %s was replaced by one of an authority that nobody knows; it is removed", name)
+                self._remove(name)
+                self._doubt(body, "it is of an authority that this node does not know")
+
+    def _wait(self, body: Object, why: str) -> None:
+        self._unreadable[body["metadata"]["name"]] = {
+            "phase": "Pending",
+            "message": f"The agent of {self._node} waits for the operator's signature: {why}",
+            "observedGeneration": body["metadata"].get("generation", 0),
+        }
 
     def _write(self, grant: Grant) -> None:
         try:
@@ -223,7 +292,7 @@ class GrantKeeper:
             self._remove(name)
 
     def _remove(self, name: str) -> None:
-        for record in (self._grants, self._unreadable, self._unstored, self._reported):
+        for record in (self._grants, self._unreadable, self._unstored, self._reported, self._undecided):
             record.pop(name, None)
         self._unremoved.discard(name)
         try:

@@ -110,6 +110,7 @@ class Identity:
         self._jitter = int(hashlib.sha256(node.encode()).hexdigest()[:4], 16) / 0xFFFF / 30
         self._backoff = Backoff(0.5, 300.0)
         self._known: tuple[object, Validity | None] | None = None
+        self._doubted = False
         self.ready = asyncio.Event()
         self.serial = 0
         self.finding = Finding("Certified", "False", "Requested", "The node has no certificate yet.")
@@ -121,7 +122,8 @@ class Identity:
         while True:
             delay_s = LOOK_S
             try:
-                ask = loop.time() - asked_s >= ASK_CA_S or self._wanting()
+                ask = self._doubted or loop.time() - asked_s >= ASK_CA_S or self._wanting()
+                self._doubted = False
                 await self.step(ask)
                 if ask:
                     asked_s = loop.time()
@@ -139,6 +141,10 @@ class Identity:
                     LOG.debug("the certificate cannot be looked after now: %s", error)
                     asked_s = loop.time() - ASK_CA_S + 15.0
             await asyncio.sleep(delay_s)
+
+    def doubt_authority(self) -> None:
+        """Look at the published authority soon: somebody met another one."""
+        self._doubted = True
 
     async def step(self, ask: bool = True) -> None:
         """Look at files, authority and clock once, and do what is due.
@@ -259,6 +265,7 @@ class Identity:
         write_set(self._directory, files)
         self._known = None
         self.serial += 1
+        self._changed()
 
     def _usable(self, validity: Validity) -> None:
         self._find("True", "Issued", f"Valid until {validity.not_after:%F %T} UTC.")

@@ -14,6 +14,8 @@ from typing import Any
 import httpx2
 from agent_pki import TestAuthority
 from control_plane import ControlPlane, Refused, programs, wait_for
+from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric import ec
 
 FRACTUS = "/apis/fractus.dev/v1alpha1"
 REQUESTS = "/apis/certificates.k8s.io/v1/certificatesigningrequests"
@@ -37,7 +39,13 @@ RULES: list[dict[str, list[str]]] = [
 
 
 class ApiServer(ControlPlane):
-    """A control plane whose API server can go away and come back with its data."""
+    """A control plane whose API server can go away and come back with its data.
+
+    Attributes:
+        signer: key and certificate that grants are signed with.
+    """
+
+    signer: tuple[ec.EllipticCurvePrivateKey, x509.Certificate]
 
     def stop_apiserver(self, number: int = signal.SIGKILL) -> None:
         process = self._processes[1]

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,11 @@ from agent_pki import TestAuthority
 from agent_server import FRACTUS, REQUESTS, ApiServer, running
 from control_plane import free_port, wait_for
 from fractus_core.api.plans import Grant
+from fractus_core.policy.signatures import sign
 from fractus_proto.v1 import mobility_pb2_grpc
 from fractus_proto.v1.mobility_pb2 import SubscribeTelemetryRequest, Telemetry
 from fractus_proto.v1.types_pb2 import Position
+from mobility_rig import issue_signer
 
 pytestmark = pytest.mark.timeout(180)
 
@@ -37,6 +40,7 @@ def authority() -> TestAuthority:
 def server(tmp_path_factory: pytest.TempPathFactory, authority: TestAuthority) -> Iterator[ApiServer]:
     with running(tmp_path_factory.mktemp("plane")) as server:
         server.furnish(authority.pem)
+        server.signer = issue_signer(authority.certificate, authority.key)
         yield server
 
 
@@ -177,7 +181,7 @@ def add_grant(server: ApiServer, name: str, node: str = "drone-1", **spec: Any) 
         "metadata": {"name": name},
         "spec": {"node": node, "application": application, "component": "Navigator", "instance": f"app-{name}"} | spec,
     }
-    return server.post(f"{FRACTUS}/grants", body)
+    return server.post(f"{FRACTUS}/grants", sign(body, *server.signer, datetime.now(UTC)))
 
 
 def phase(server: ApiServer, name: str) -> str | None:
@@ -263,6 +267,7 @@ def test_grants_outlive_the_api_server(server: ApiServer, drone: Node) -> None:
     for name in ("one", "two", "three"):
         add_grant(server, name)
     drone.start()
+    drone.certify()
     wait_for(
         lambda: phase(server, "three") == "Active" and drone.grants() == {"one", "two", "three"}, "grants", timeout_s=30
     )
@@ -285,6 +290,21 @@ def test_grants_outlive_the_api_server(server: ApiServer, drone: Node) -> None:
     server.start_apiserver()
     server.delete(f"{FRACTUS}/grants/two")
     wait_for(lambda: drone.grants() == {"three", "four"}, "reconciled grants after a restart", timeout_s=40)
+
+
+def test_what_the_operator_did_not_sign_is_not_stored(server: ApiServer, drone: Node) -> None:
+    drone.describe()
+    add_grant(server, "mine", control="partial")
+    drone.start()
+    drone.certify()
+    wait_for(lambda: phase(server, "mine") == "Active" and drone.grants() == {"mine"}, "the grant", timeout_s=30)
+    path = f"{FRACTUS}/grants/mine"
+    good = (server.get(path) or {})["spec"]
+    server.admin.merge(path, {"spec": {"control": "full"}})
+    wait_for(lambda: phase(server, "mine") == "Pending" and not drone.grants(), "no grant", timeout_s=30)
+    assert "changed after it was signed" in (server.get(path) or {})["status"]["message"]
+    server.admin.merge(path, {"spec": good})
+    wait_for(lambda: phase(server, "mine") == "Active" and drone.grants() == {"mine"}, "the grant again", timeout_s=30)
 
 
 def test_a_denied_node_says_so(server: ApiServer, drone: Node) -> None:

@@ -119,7 +119,7 @@ def grant(name, size):
                  "instance": "i" * size}}
 directory = GrantDirectory(Path(sys.argv[1]))
 directory.open()
-keeper = GrantKeeper(None, directory, "n")
+keeper = GrantKeeper(None, directory, "n", lambda grant: None)
 print("ready", flush=True)
 turn = 0
 while True:

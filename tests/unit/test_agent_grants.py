@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 from fractus_agent.backoff import Backoff
-from fractus_agent.grants import GrantDirectory, GrantKeeper, outcome_of, status_of, stored_form
+from fractus_agent.grants import HOLD_S, GrantDirectory, GrantKeeper, outcome_of, status_of, stored_form
+from fractus_agent.seals import Undecided, Unsigned
 from fractus_agent.store import Changed, Deleted, GrantEvent, Listed, Unavailable
 from fractus_core.api.plans import Grant
 
@@ -44,6 +45,10 @@ class FakeStore:
         yield
 
 
+def believe(_grant: Grant) -> None:
+    """Every grant is as good as signed."""
+
+
 @pytest.fixture
 def store() -> FakeStore:
     return FakeStore()
@@ -53,7 +58,7 @@ def store() -> FakeStore:
 def keeper(store: FakeStore, tmp_path: Path) -> GrantKeeper:
     directory = GrantDirectory(tmp_path)
     directory.open()
-    return GrantKeeper(store, directory, "drone-1")
+    return GrantKeeper(store, directory, "drone-1", believe)
 
 
 def on_disk(path: Path) -> set[str]:
@@ -77,7 +82,7 @@ def test_a_new_agent_removes_what_a_full_list_lacks(store: FakeStore, tmp_path: 
     directory = GrantDirectory(tmp_path)
     directory.open()
     assert on_disk(tmp_path) == {"old.json"}
-    GrantKeeper(store, directory, "drone-1").take(Listed(()))
+    GrantKeeper(store, directory, "drone-1", believe).take(Listed(()))
     assert on_disk(tmp_path) == set()
 
 
@@ -159,6 +164,86 @@ async def test_a_grant_that_cannot_be_stored_is_pending_until_it_can(
     keeper._retry_disk()
     await keeper.report_once()
     assert store.statuses[-1][1]["phase"] == "Active"
+
+
+class Doubter:
+    """The operator's word on grants, which a test changes."""
+
+    def __init__(self) -> None:
+        self.error: Exception | None = None
+        self.asked = 0
+        self.now_s = 0.0
+
+    def check(self, _grant: Grant) -> None:
+        if self.error is not None:
+            raise self.error
+
+    def ask(self) -> None:
+        self.asked += 1
+
+
+@pytest.fixture
+def doubter() -> Doubter:
+    return Doubter()
+
+
+@pytest.fixture
+def doubting(store: FakeStore, doubter: Doubter, tmp_path: Path) -> GrantKeeper:
+    directory = GrantDirectory(tmp_path)
+    directory.open()
+    return GrantKeeper(store, directory, "drone-1", doubter.check, ask=doubter.ask, monotonic=lambda: doubter.now_s)
+
+
+async def test_a_grant_that_is_not_signed_is_not_stored_and_takes_away_the_one_before(
+    doubting: GrantKeeper, doubter: Doubter, store: FakeStore, tmp_path: Path
+) -> None:
+    doubting.take(Listed((manifest(),)))
+    doubter.error = Unsigned("it was changed after it was signed")
+    doubting.take(Changed(manifest(spec={"control": "full"})))
+    assert on_disk(tmp_path) == set()
+    await doubting.report_once()
+    name, status = store.statuses[-1]
+    assert (name, status["phase"]) == ("g1", "Pending"), "the operator signs it again; nothing has failed"
+    assert "changed after" in status["message"]
+    doubter.error = None
+    doubting.take(Changed(manifest()))
+    await doubting.report_once()
+    assert on_disk(tmp_path) == {"g1.json"}
+    assert store.statuses[-1][1]["phase"] == "Active"
+
+
+async def test_a_change_of_authorities_takes_no_grant_away(
+    doubting: GrantKeeper, doubter: Doubter, store: FakeStore, tmp_path: Path
+) -> None:
+    doubting.take(Listed((manifest(),)))
+    await doubting.report_once()
+    doubter.error = Undecided("it is of an authority that is not in ca.crt")
+    doubting.take(Changed(manifest(spec={"control": "full"})))
+    await doubting.report_once()
+    assert "control" not in json.loads((tmp_path / "g1.json").read_text())["spec"]
+    assert doubter.asked == 1
+    assert [s["phase"] for _, s in store.statuses] == ["Active"]
+    doubter.error = None
+    doubting.authority_changed()
+    assert json.loads((tmp_path / "g1.json").read_text())["spec"]["control"] == "full"
+
+
+def test_an_authority_that_stays_unknown_ends_the_grant(
+    doubting: GrantKeeper, doubter: Doubter, tmp_path: Path
+) -> None:
+    doubting.take(Listed((manifest(),)))
+    doubter.error = Undecided("it is of an authority that is not in ca.crt")
+    doubting.take(Changed(manifest(spec={"control": "full"})))
+    doubter.now_s = HOLD_S
+    doubting._give_up_undecided()
+    assert on_disk(tmp_path) == {"g1.json"}
+    doubter.now_s = HOLD_S + 1
+    doubting._give_up_undecided()
+    assert on_disk(tmp_path) == set()
+    doubting.take(Listed(()))
+    doubter.error = None
+    doubting.authority_changed()
+    assert on_disk(tmp_path) == set(), "what the API server has no more does not come back"
 
 
 def test_outcomes() -> None:

@@ -1,0 +1,374 @@
+"""What lies between the roads: fields, woods, meadows, houses with gardens, works, parks."""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely import affinity
+
+from fractus_sim.world.chance import dice, unit
+from fractus_sim.world.roads import SPACING_M, Road, Roads
+
+Points = NDArray[np.float64]
+Kind = Literal["fields", "meadow", "wood", "houses", "works", "park"]
+Colour = tuple[int, int, int]
+
+CROPS: tuple[Colour, ...] = (
+    (112, 172, 196),
+    (62, 118, 98),
+    (52, 98, 76),
+    (86, 112, 140),
+    (126, 166, 186),
+    (66, 176, 190),
+    (84, 142, 126),
+    (74, 128, 104),
+    (98, 124, 150),
+)
+_ROOFS: tuple[Colour, ...] = (
+    (74, 92, 150),
+    (66, 82, 132),
+    (84, 82, 82),
+    (78, 90, 118),
+    (96, 100, 106),
+    (62, 70, 122),
+    (88, 108, 152),
+)
+_HALLS: tuple[Colour, ...] = ((176, 178, 178), (150, 152, 150), (136, 124, 112), (190, 192, 190))
+_PAVEMENT: Colour = (142, 146, 148)
+_LAWN: Colour = (70, 116, 92)
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """A piece of ground of one kind.
+
+    Attributes:
+        outline: Its corners, metres, shape (n, 2).
+        colour: Blue, green, red.
+        rough: How uneven it looks, from 0 to 255.
+        rows_deg: The way that rows of a crop lead, clockwise from north; None where nothing is sown.
+    """
+
+    outline: Points
+    colour: Colour
+    rough: int
+    rows_deg: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Roof:
+    """A building from above.
+
+    Attributes:
+        corners: Four corners; the ridge is parallel to the side from the first to the second.
+        height_m: Above the ground, for its shadow.
+        colour: Blue, green, red.
+        gabled: Whether it has a ridge.
+    """
+
+    corners: Points
+    height_m: float
+    colour: Colour
+    gabled: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Parking:
+    """A place where a car stands."""
+
+    x: float
+    y: float
+    heading_deg: float
+
+
+@dataclass(slots=True)
+class Block:
+    """One mesh of the road network.
+
+    Attributes:
+        kind: What it is used for.
+        outline: The middle lines of the roads around it.
+        patches: Pieces of ground, those that lie above others last.
+        roofs: Buildings.
+        trees: x, y, radius of the crown in metres and a number that picks its looks, shape (n, 4).
+        parked: Standing cars.
+    """
+
+    kind: Kind
+    outline: Points
+    patches: list[Patch] = field(default_factory=list)
+    roofs: list[Roof] = field(default_factory=list)
+    trees: Points = field(default_factory=lambda: np.empty((0, 4)))
+    parked: list[Parking] = field(default_factory=list)
+
+
+class Blocks:
+    """The blocks of a seed; each is laid out when it is first asked for."""
+
+    def __init__(self, roads: Roads) -> None:
+        self.roads = roads
+        self.block = lru_cache(maxsize=1024)(self._block)
+
+    def kind(self, i: int, j: int) -> Kind:
+        """What a block is used for."""
+        draw = unit(self.roads.seed, 11, i, j)
+        if self.roads.town(i, j):
+            return "houses" if draw < 0.74 or (i, j) == (0, 0) else "works" if draw < 0.88 else "park"
+        return "fields" if draw < 0.66 else "wood" if draw < 0.82 else "meadow"
+
+    def _block(self, i: int, j: int) -> Block:
+        roll = dice(self.roads.seed, 12, i, j)
+        block = Block(self.kind(i, j), self.roads.outline(i, j))
+        inside = shapely.Polygon(block.outline).buffer(-self._verge_m(i, j))
+        if inside.is_empty or not isinstance(inside, shapely.Polygon):
+            return block
+        trees: list[tuple[float, float, float, float]] = []
+        {
+            "fields": _fields,
+            "meadow": _meadow,
+            "wood": _wood,
+            "houses": _houses,
+            "works": _works,
+            "park": _park,
+        }[block.kind](block, inside, trees, roll)
+        block.trees = np.array(trees).reshape(-1, 4)
+        return block
+
+    def _verge_m(self, i: int, j: int) -> float:
+        around = ((Road("east", j), i), (Road("east", j + 1), i), (Road("north", i), j), (Road("north", i + 1), j))
+        return max(self.roads.width_m(road, step) for road, step in around) / 2 + 3.0
+
+    def near(self, x0: float, y0: float, x1: float, y1: float) -> list[tuple[int, int]]:
+        """The blocks that may reach into a box."""
+        first_i, last_i = math.floor(x0 / SPACING_M - 0.8), math.ceil(x1 / SPACING_M + 0.8)
+        first_j, last_j = math.floor(y0 / SPACING_M - 0.8), math.ceil(y1 / SPACING_M + 0.8)
+        return [(i, j) for j in range(first_j, last_j + 1) for i in range(first_i, last_i + 1)]
+
+
+Trees = list[tuple[float, float, float, float]]
+
+
+def _fields(block: Block, inside: shapely.Polygon, trees: Trees, roll: random.Random) -> None:
+    """Strips of crops side by side, and a hedge here and there."""
+    sides = inside.minimum_rotated_rectangle.exterior.coords
+    heading = math.degrees(math.atan2(sides[1][0] - sides[0][0], sides[1][1] - sides[0][1]))
+    heading += 90.0 * (roll.random() < 0.5)
+    middle = inside.centroid
+    level = affinity.rotate(inside, heading, origin=middle)
+    west, south, east, north = level.bounds
+    count = roll.choice((1, 2, 2, 3, 3, 4))
+    cuts = sorted(
+        [west, east, *(west + (east - west) * (k + roll.uniform(-0.2, 0.2)) / count for k in range(1, count))]
+    )
+    for left, right in zip(cuts, cuts[1:], strict=False):
+        piece = level.intersection(shapely.box(left + 0.6, south, right - 0.6, north))
+        for part in shapely.get_parts(affinity.rotate(piece, -heading, origin=middle)):
+            if isinstance(part, shapely.Polygon) and part.area > 200.0:
+                crop = roll.choice(CROPS)
+                block.patches.append(Patch(_corners(part), _tinted(crop, roll, 8), 80, heading))
+        if right < east and roll.random() < 0.3:
+            hedge = affinity.rotate(shapely.LineString([(right, south), (right, north)]), -heading, origin=middle)
+            _hedge(hedge.intersection(inside), trees, roll)
+
+
+def _hedge(line: shapely.Geometry, trees: Trees, roll: random.Random) -> None:
+    at = 0.0
+    while at < line.length:
+        point = line.interpolate(at)
+        trees.append(
+            (
+                point.x + roll.uniform(-0.6, 0.6),
+                point.y + roll.uniform(-0.6, 0.6),
+                roll.uniform(1.0, 2.8),
+                roll.random(),
+            )
+        )
+        at += roll.uniform(2.0, 9.0)
+
+
+def _meadow(block: Block, inside: shapely.Polygon, trees: Trees, roll: random.Random) -> None:
+    block.patches.append(Patch(_corners(inside), _tinted((78, 130, 112), roll, 8), 130))
+    _scatter(inside, trees, roll, roll.randint(8, 40), (1.5, 5.0))
+
+
+def _wood(block: Block, inside: shapely.Polygon, trees: Trees, roll: random.Random) -> None:
+    block.patches.append(Patch(_corners(inside), (40, 64, 50), 160))
+    west, south, east, north = inside.bounds
+    step = 5.2
+    xs, ys = np.meshgrid(np.arange(west, east, step), np.arange(south, north, step))
+    shift = np.array([[roll.uniform(-2.2, 2.2) for _ in range(4)] for _ in range(xs.size)])
+    points = np.column_stack((xs.ravel(), ys.ravel())) + shift[:, :2]
+    keep = shapely.contains_xy(inside.buffer(-2.0), points)
+    for (x, y), (a, b) in zip(points[keep], shift[keep, 2:], strict=True):
+        trees.append((float(x), float(y), 3.1 + 0.45 * float(a), float(b) / 4.4 + 0.5))
+
+
+def _park(block: Block, inside: shapely.Polygon, trees: Trees, roll: random.Random) -> None:
+    """Lawn, a pitch, a pond, paths and trees."""
+    block.patches.append(Patch(_corners(inside), _LAWN, 90))
+    middle = inside.centroid
+    pond = shapely.Point(middle.x + roll.uniform(40, 60), middle.y + roll.uniform(-50, 50)).buffer(roll.uniform(14, 24))
+    pond = affinity.scale(pond, 1.5, 0.8).intersection(inside)
+    heading = roll.uniform(0.0, 180.0)
+    pitch = affinity.rotate(
+        shapely.box(middle.x - 85, middle.y - 45, middle.x + 5, middle.y + 15), heading, origin=middle
+    )
+    for x0, y0, x1, y1 in ((-120, -2, 120, 0), (0, -120, 2, 120)):
+        path = affinity.rotate(
+            shapely.box(middle.x + x0, middle.y + y0, middle.x + x1, middle.y + y1), heading + 20, origin=middle
+        )
+        part = path.intersection(inside)
+        if isinstance(part, shapely.Polygon):
+            block.patches.append(Patch(_corners(part), (150, 176, 188), 60))
+    if inside.contains(pitch):
+        block.patches.append(Patch(_corners(pitch), (76, 138, 100), 50, -heading))
+    if isinstance(pond, shapely.Polygon) and not pond.is_empty:
+        block.patches.append(Patch(_corners(pond), (110, 116, 100), 40))
+        block.patches.append(Patch(_corners(pond.buffer(-1.2)), (92, 78, 58), 14))
+    free = inside.difference(pond.buffer(6)).difference(pitch.buffer(5))
+    _scatter(free, trees, roll, 130, (2.0, 5.5))
+
+
+def _works(block: Block, inside: shapely.Polygon, trees: Trees, roll: random.Random) -> None:
+    """Halls on a paved yard with a car park."""
+    block.patches.append(Patch(_corners(inside), _tinted(_PAVEMENT, roll, 6), 50))
+    sides = inside.minimum_rotated_rectangle.exterior.coords
+    turn = math.degrees(math.atan2(sides[1][1] - sides[0][1], sides[1][0] - sides[0][0])) % 90.0
+    level = affinity.rotate(inside, -turn, origin=inside.centroid)
+    west, south, east, north = level.bounds
+    taken = shapely.Polygon()
+    for _ in range(12):
+        w, d = roll.uniform(28, 80), roll.uniform(24, 50)
+        x, y = roll.uniform(west, east - w), roll.uniform(south + 50, north - d)
+        hall = shapely.box(x, y, x + w, y + d)
+        if level.contains(hall.buffer(4)) and not hall.buffer(9).intersects(taken):
+            taken = taken.union(hall)
+            corners = _corners(affinity.rotate(hall, turn, origin=inside.centroid))
+            block.roofs.append(
+                Roof(corners, roll.uniform(6, 11), _tinted(roll.choice(_HALLS), roll, 8), roll.random() < 0.3)
+            )
+    _car_park(block, level, taken, turn, inside.centroid, roll)
+    rim = inside.difference(inside.buffer(-5.0))
+    _scatter(rim, trees, roll, 60, (1.2, 3.2))
+
+
+def _car_park(
+    block: Block,
+    level: shapely.Polygon,
+    taken: shapely.Geometry,
+    turn: float,
+    origin: shapely.Point,
+    roll: random.Random,
+) -> None:
+    west, south, east, _ = level.bounds
+    for row in range(4):
+        y = south + 16.0 + 8.5 * row
+        for bay in range(int((east - west) / 2.6)):
+            x = west + 2.6 * bay
+            place = shapely.box(x, y, x + 2.5, y + 5.0)
+            if not level.contains(place) or taken.intersects(place):
+                continue
+            shape = affinity.rotate(place, turn, origin=origin)
+            block.patches.append(Patch(_corners(shape), (108, 110, 112), 40))
+            if roll.random() < 0.42:
+                middle = shape.centroid
+                block.parked.append(Parking(middle.x, middle.y, -turn + 180.0 * (roll.random() < 0.4)))
+
+
+def _houses(block: Block, inside: shapely.Polygon, trees: Trees, roll: random.Random) -> None:
+    """Houses along the roads around, each with a drive and a garden behind."""
+    block.patches.append(Patch(_corners(inside), _tinted(_LAWN, roll, 6), 110))
+    ring = inside.exterior
+    at = roll.uniform(4.0, 12.0)
+    taken: list[shapely.Polygon] = []
+    while at < ring.length - 10.0:
+        lot = roll.uniform(19.0, 27.0)
+        _house(block, inside, ring, at + lot / 2, lot, taken, roll)
+        at += lot
+    solid = shapely.union_all([*taken, *(shapely.Polygon(p.outline) for p in block.patches[1:])]).buffer(1.6)
+    _scatter(inside.buffer(-1.0).difference(solid), trees, roll, 190, (0.7, 3.6))
+
+
+def _house(
+    block: Block,
+    inside: shapely.Polygon,
+    ring: shapely.LinearRing,
+    at: float,
+    lot: float,
+    taken: list[shapely.Polygon],
+    roll: random.Random,
+) -> None:
+    here, ahead = ring.interpolate(at - 1.0), ring.interpolate(at + 1.0)
+    dx, dy = (ahead.x - here.x) / 2.0, (ahead.y - here.y) / 2.0
+    length = math.hypot(dx, dy)
+    # Along the road and away from it.
+    ax, ay = dx / length, dy / length
+    nx, ny = (-ay, ax) if inside.contains(shapely.Point(here.x - ay * 6, here.y + ax * 6)) else (ay, -ax)
+
+    def shape(a0: float, n0: float, a1: float, n1: float) -> shapely.Polygon:
+        corners = ((a0, n0), (a1, n0), (a1, n1), (a0, n1))
+        return shapely.Polygon([(here.x + a * ax + n * nx, here.y + a * ay + n * ny) for a, n in corners])
+
+    wide, deep, back = roll.uniform(9.0, min(lot - 6.0, 14.0)), roll.uniform(8.0, 11.0), roll.uniform(5.0, 9.0)
+    house = shape(-wide / 2, back, wide / 2, back + deep)
+    if not inside.contains(house) or any(house.buffer(3.0).intersects(other) for other in taken):
+        return
+    taken.append(house)
+    block.roofs.append(
+        Roof(_corners(house), roll.uniform(4.5, 7.0), _tinted(roll.choice(_ROOFS), roll, 9), roll.random() < 0.88)
+    )
+    side = roll.choice((-1.0, 1.0))
+    drive = shape(side * (wide / 2 - 3.4), -3.0, side * (wide / 2 - 0.4), back)
+    block.patches.append(Patch(_corners(drive), _tinted((150, 152, 156), roll, 12), 40))
+    if roll.random() < 0.5:
+        nose = roll.random() < 0.5
+        middle = shape(side * (wide / 2 - 1.9) - 0.01, back - 5.0, side * (wide / 2 - 1.9) + 0.01, back - 1.2).centroid
+        block.parked.append(Parking(middle.x, middle.y, math.degrees(math.atan2(nx, ny)) + 180.0 * nose))
+    _garden(block, inside, shape, wide, back + deep, roll)
+
+
+def _garden(
+    block: Block, inside: shapely.Polygon, shape: object, wide: float, behind: float, roll: random.Random
+) -> None:
+    assert callable(shape)
+    terrace = shape(-wide / 4, behind, wide / 4, behind + 3.2)
+    if inside.contains(terrace):
+        block.patches.append(Patch(_corners(terrace), _tinted((150, 160, 172), roll, 10), 40))
+    pool = shape(-2.0, behind + 5.5, 5.5, behind + 9.2)
+    if roll.random() < 0.16 and inside.contains(pool):
+        block.patches.append(Patch(_corners(pool.buffer(0.9, join_style="mitre")), (186, 192, 196), 20))
+        block.patches.append(Patch(_corners(pool), (196, 168, 92), 10))
+    bed = shape(wide / 2 - 2.0, behind + 8.0, wide / 2 + 3.0, behind + 14.0)
+    if roll.random() < 0.4 and inside.contains(bed):
+        block.patches.append(Patch(_corners(bed), (72, 98, 116), 140))
+
+
+def _scatter(
+    area: shapely.Geometry, trees: Trees, roll: random.Random, count: int, radius_m: tuple[float, float]
+) -> None:
+    if area.is_empty:
+        return
+    west, south, east, north = area.bounds
+    shapely.prepare(area)
+    for _ in range(count):
+        x, y = roll.uniform(west, east), roll.uniform(south, north)
+        radius, looks = radius_m[0] + (radius_m[1] - radius_m[0]) * roll.random() ** 2, roll.random()
+        if shapely.contains_xy(area, x, y):
+            trees.append((x, y, radius, looks))
+
+
+def _corners(shape: shapely.Polygon) -> Points:
+    return np.array(shape.exterior.coords[:-1])
+
+
+def _tinted(colour: Colour, roll: random.Random, by: int) -> Colour:
+    shift = roll.randint(-by, by)
+    blue, green, red = (min(max(part + shift + roll.randint(-by // 3, by // 3), 0), 255) for part in colour)
+    return blue, green, red

@@ -1,0 +1,37 @@
+"""Chance that a seed decides: the same keys always give the same numbers, in whatever order they are asked for."""
+
+from __future__ import annotations
+
+import random
+
+_MASK = (1 << 64) - 1
+
+
+def mixed(*keys: int) -> int:
+    """A 64-bit number that looks random; Steele, Lea and Flood's splitmix64 over the keys."""
+    state = 0x9E3779B97F4A7C15
+    for key in keys:
+        state = (state ^ (key & _MASK)) * 0xBF58476D1CE4E5B9 & _MASK
+        state = (state ^ state >> 27) * 0x94D049BB133111EB & _MASK
+        state ^= state >> 31
+    return state
+
+
+def unit(*keys: int) -> float:
+    """A number from 0 to 1."""
+    return mixed(*keys) / 2**64
+
+
+def dice(*keys: int) -> random.Random:
+    """A source of random numbers of its own."""
+    return random.Random(mixed(*keys))  # noqa: S311 - a landscape, not a secret
+
+
+def smooth(seed: int, x: float, y: float) -> float:
+    """Value noise from 0 to 1 over a lattice of unit cells."""
+    i, j = int(x // 1), int(y // 1)
+    a, b = x - i, y - j
+    a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
+    low = unit(seed, i, j) * (1 - a) + unit(seed, i + 1, j) * a
+    high = unit(seed, i, j + 1) * (1 - a) + unit(seed, i + 1, j + 1) * a
+    return low * (1 - b) + high * b

@@ -1,0 +1,258 @@
+"""The procedural ground: paints a tile of any level straight from the layout of roads and blocks."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from fractus_core.geo import LocalFrame
+from numpy.typing import NDArray
+
+from fractus_sim.world.blocks import Block, Blocks, Patch, Roof
+from fractus_sim.world.canvas import SUN_SHADOW, Canvas, Colour, Noise
+from fractus_sim.world.roads import Road, Roads, strip
+from fractus_sim.world.tiles import TILE_PX, Picture
+
+Points = NDArray[np.float64]
+
+FINEST_M = 0.03125
+LEVELS = 12
+_GRASS: Colour = (82, 126, 110)
+_ASPHALT: Colour = (106, 106, 108)
+_KERB: Colour = (156, 160, 162)
+_TRACK: Colour = (128, 152, 166)
+_PAINT: Colour = (214, 218, 220)
+_TREES_DOWN_TO_M = 0.7
+_DETAIL_DOWN_TO_M = 4.1
+_SHADOW_DEPTH = 0.56
+_DASH_M, _DASH_EVERY_M, _JUNCTION_M = 3.0, 9.0, 11.0
+
+
+class Landscape:
+    """A ground that a seed makes; see `tiles.Ground`."""
+
+    def __init__(self, frame: LocalFrame, seed: int) -> None:
+        self.frame = frame
+        self.finest_m = FINEST_M
+        self.levels = LEVELS
+        self.roads = Roads(seed)
+        self.blocks = Blocks(self.roads)
+        self._noise = Noise(seed)
+
+    def tile(self, level: int, column: int, row: int) -> Picture:
+        """Paint one tile."""
+        pixel_m = FINEST_M * 2**level
+        extent = TILE_PX * pixel_m
+        canvas = Canvas(column * extent, -row * extent, pixel_m, TILE_PX, _GRASS)
+        west, south, east, north = canvas.box
+        near = self.blocks.near(west, south, east, north)
+        if pixel_m > _DETAIL_DOWN_TO_M:
+            self._from_afar(canvas, near)
+        else:
+            blocks = [self.blocks.block(i, j) for i, j in near]
+            blocks = [block for block in blocks if canvas.sees(block.outline, 12.0)]
+            for block in blocks:
+                _patches(canvas, block)
+            self._roads(canvas, near)
+            self._grain(canvas)
+            _stand_up(canvas, blocks)
+        self._light(canvas)
+        return canvas.colour
+
+    def _from_afar(self, canvas: Canvas, near: list[tuple[int, int]]) -> None:
+        """Only what shows from kilometres away."""
+        for i, j in near:
+            kind = self.blocks.kind(i, j)
+            outline = self.roads.outline(i, j)[::4]
+            if not canvas.sees(outline):
+                continue
+            colour: Colour = {"wood": (44, 72, 54), "houses": (88, 112, 112), "works": (140, 144, 146)}.get(
+                kind, _GRASS
+            )
+            if kind == "fields" and canvas.pixel_m < 40.0:
+                colour = self.blocks.block(i, j).patches[0].colour if self.blocks.block(i, j).patches else _GRASS
+            canvas.fill(outline, colour, 60)
+
+    def _roads(self, canvas: Canvas, near: list[tuple[int, int]]) -> None:
+        pieces = [(road, step) for i, j in near for road, step in ((Road("east", j), i), (Road("north", i), j))]
+        pieces = [piece for piece in pieces if canvas.sees(self.roads.edge(*piece), 8.0)]
+        for road, step in sorted(pieces, key=lambda piece: piece[0].main):
+            self._carriageway(canvas, road, step)
+        for road, step in pieces:
+            if road.main or self.roads.built_up(road, step):
+                width = self.roads.width_m(road, step)
+                x, y = self.roads.vertex(*road.vertex(step))
+                canvas.disc(x, y, width / 2 + 1.2, _ASPHALT, 36)
+        for road, step in pieces:
+            if road.main or self.roads.built_up(road, step):
+                _marks(canvas, self.roads.edge(road, step), self.roads.width_m(road, step), road.main)
+
+    def _carriageway(self, canvas: Canvas, road: Road, step: int) -> None:
+        edge, half = self.roads.edge(road, step), self.roads.width_m(road, step) / 2
+        if self.roads.built_up(road, step):
+            canvas.fill(strip(edge, half + 2.2, -half - 2.2), _KERB, 40)
+            canvas.fill(strip(edge, half + 0.15, -half - 0.15), (122, 126, 128), 30)
+            canvas.fill(strip(edge, half, -half), _ASPHALT, 36)
+        elif road.main:
+            canvas.fill(strip(edge, half + 1.6, -half - 1.6), (92, 136, 124), 130)
+            canvas.fill(strip(edge, half + 0.4, -half - 0.4), (112, 128, 134), 70)
+            canvas.fill(strip(edge, half, -half), _ASPHALT, 36)
+        else:
+            canvas.fill(strip(edge, half + 1.0, -half - 1.0), (84, 132, 116), 130)
+            canvas.fill(strip(edge, half, -half), _TRACK, 90)
+            canvas.fill(strip(edge, 0.45, -0.45), (96, 134, 128), 140)
+        if half > 2.0 and canvas.pixel_m < 0.3:
+            for wheel in (-0.72, -0.3, 0.3, 0.72):
+                canvas.line(edge[:, :2] + wheel * half * edge[:, 2:], (98, 98, 100), 0.5)
+
+    def _grain(self, canvas: Canvas) -> None:
+        """Uneven ground: clods, tufts and stains, as rough as each material is."""
+        at = (canvas.left_m, canvas.top_m, canvas.pixel_m, canvas.size)
+        fine = self._noise.between(0.0, 0.6, *at) * 6.5 + self._noise.between(1.0, 4.5, *at) * 5.5
+        shift = fine * (canvas.rough.astype(np.float32) / 128.0)
+        shift += self._noise.between(8.0, 70.0, *at) * 3.6
+        canvas.colour = np.clip(canvas.colour + shift[..., None] * np.float32([0.86, 1.0, 0.98]), 0, 255).astype(
+            np.uint8
+        )
+
+    def _light(self, canvas: Canvas) -> None:
+        """The colour of an afternoon; and large, faint differences."""
+        at = (canvas.left_m, canvas.top_m, canvas.pixel_m, canvas.size)
+        broad = self._noise.between(120.0, 300.0, *at)
+        gain = (1.0 + 0.018 * broad)[..., None] * np.float32([0.97, 1.0, 1.03])
+        canvas.colour = np.clip(canvas.colour * gain, 0, 255).astype(np.uint8)
+
+
+def _patches(canvas: Canvas, block: Block) -> None:
+    for patch in block.patches:
+        if not canvas.sees(patch.outline):
+            continue
+        canvas.fill(patch.outline, patch.colour, patch.rough)
+        if patch.rows_deg is not None and canvas.pixel_m < 1.2:
+            _rows(canvas, patch, patch.rows_deg)
+
+
+def _rows(canvas: Canvas, patch: Patch, heading_deg: float) -> None:
+    """Rows of a crop, swaths, and the tramlines that a tractor leaves every 18 m."""
+    mask = canvas.mask(patch.outline)
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if len(rows) == 0:
+        return
+    y0, y1, x0, x1 = int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+    across = math.radians(heading_deg + 90.0)
+    east = (canvas.left_m + (np.arange(x0, x1) + 0.5) * canvas.pixel_m) * math.sin(across)
+    north = (canvas.top_m - (np.arange(y0, y1) + 0.5) * canvas.pixel_m) * math.cos(across)
+    first = float(east.min() + north.min())
+    fine = max(canvas.pixel_m / 2, 0.02)
+    count = int((float(east.max() + north.max()) - first) / fine) + 2
+    profile = _profile(first + fine * np.arange(count), canvas.pixel_m)
+    index = ((east[None, :] + north[:, None] - first) / fine).astype(np.int32)
+    shift = profile[index] * (mask[y0:y1, x0:x1].astype(np.float32) / 255.0)
+    part = canvas.colour[y0:y1, x0:x1]
+    part[:] = np.clip(part + shift[..., None] * np.float32([0.8, 1.0, 1.0]), 0, 255).astype(np.uint8)
+
+
+def _profile(across_m: Points, pixel_m: float) -> NDArray[np.float32]:
+    """Brightness across the rows of a field."""
+    seen = np.clip(0.8 - pixel_m / 0.75, 0.0, 1.0)
+    rows = 7.0 * seen * np.sin(across_m * (2 * math.pi / 0.75))
+    swath = np.where((across_m // 6.0) % 2 < 1.0, 2.2, -2.2)
+    tram = across_m % 18.0
+    lines = np.where((np.abs(tram - 8.1) < 0.28) | (np.abs(tram - 9.9) < 0.28), -17.0, 0.0)
+    if pixel_m > 0.28:
+        lines = lines * 0.28 / pixel_m * (np.abs(tram - 9.0) < 1.2)
+    return np.asarray(rows + swath + lines, np.float32)
+
+
+def _marks(canvas: Canvas, edge: Points, width_m: float, main: bool) -> None:
+    """Lines along both sides of a main road, dashes in the middle."""
+    if canvas.pixel_m > 0.5:
+        return
+    way = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(edge[:, :2], axis=0), axis=1))))
+
+    def between(start_m: float, end_m: float, offset_m: float, count: int) -> Points:
+        at = np.linspace(start_m, end_m, count)
+        line = np.column_stack([np.interp(at, way, edge[:, k]) for k in range(4)])
+        points: Points = line[:, :2] + offset_m * line[:, 2:]
+        return points
+
+    length = float(way[-1])
+    if main:
+        for side in (-1.0, 1.0):
+            points = between(_JUNCTION_M, length - _JUNCTION_M, side * (width_m / 2 - 0.35), 48)
+            canvas.line(points, _PAINT, 0.14)
+    at = _JUNCTION_M
+    while at + _DASH_M < length - _JUNCTION_M:
+        dash = between(at, at + _DASH_M, 0.0, 3)
+        if canvas.sees(dash, 1.0):
+            canvas.line(dash, _PAINT, 0.14)
+        at += _DASH_EVERY_M
+
+
+def _stand_up(canvas: Canvas, blocks: list[Block]) -> None:
+    """What is higher than the ground, after its shadow."""
+    roofs = [roof for block in blocks for roof in block.roofs if canvas.sees(roof.corners, 10.0)]
+    trees = _trees(canvas, blocks) if canvas.pixel_m <= _TREES_DOWN_TO_M else np.empty((0, 4))
+    for roof in roofs:
+        canvas.shadow(roof.corners, roof.height_m)
+    for x, y, radius, _ in trees:
+        canvas.round_shadow(x, y, radius, 1.5 * radius)
+    canvas.cast(_SHADOW_DEPTH)
+    for roof in roofs:
+        _roof(canvas, roof)
+    for x, y, radius, looks in trees:
+        canvas.crown(x, y, radius, looks)
+
+
+def _trees(canvas: Canvas, blocks: list[Block]) -> Points:
+    west, south, east, north = canvas.box
+    margin = 9.0
+    found = [block.trees for block in blocks if len(block.trees)]
+    if not found:
+        return np.empty((0, 4))
+    trees = np.vstack(found)
+    x, y = trees[:, 0], trees[:, 1]
+    keep = (x > west - margin) & (x < east + margin) & (y > south - margin) & (y < north + margin)
+    keep &= trees[:, 2] > 1.1 * canvas.pixel_m
+    return np.asarray(trees[keep])
+
+
+def _roof(canvas: Canvas, roof: Roof) -> None:
+    a, b, c, d = roof.corners
+    if not roof.gabled:
+        canvas.fill(roof.corners, _lit(roof.colour, 1.12), 20)
+        middle = roof.corners.mean(axis=0)
+        canvas.fill(middle + (roof.corners - middle) * 0.95, roof.colour, 30)
+        for u, v in ((0.3, 0.35), (0.62, 0.6), (0.75, 0.3)):
+            at = a + u * (b - a) + v * (d - a)
+            box = at + np.array([(-0.9, -0.9), (0.9, -0.9), (0.9, 0.9), (-0.9, 0.9)])
+            canvas.fill(box + np.array(SUN_SHADOW) * 0.8, _lit(roof.colour, 0.62))
+            canvas.fill(box, (178, 178, 176))
+        return
+    start, end = (a + d) / 2, (b + c) / 2
+    for near, far in ((a, b), (d, c)):
+        outward = (near + far) / 2 - (start + end) / 2
+        facing = float(outward @ np.array(SUN_SHADOW)) / float(np.linalg.norm(outward))
+        half = np.array([near, far, end, start])
+        canvas.fill(half, _lit(roof.colour, 1.0 - 0.26 * facing))
+        if canvas.pixel_m < 0.07:
+            _courses(canvas, half, _lit(roof.colour, 0.9 - 0.26 * facing))
+    canvas.line(np.array([start, end]), _lit(roof.colour, 0.78), 0.16)
+    chimney = start + 0.3 * (end - start) + 0.18 * (d - a)
+    box = chimney + np.array([(-0.4, -0.4), (0.4, -0.4), (0.4, 0.4), (-0.4, 0.4)])
+    canvas.fill(np.vstack((box[:2] + np.array(SUN_SHADOW) * 1.2, box[2:])), _lit(roof.colour, 0.6))
+    canvas.fill(box, (92, 96, 112))
+
+
+def _courses(canvas: Canvas, half: Points, colour: Colour) -> None:
+    """The courses of tiles on one side of a roof, parallel to the ridge."""
+    near, far, end, start = half
+    count = int(np.linalg.norm(start - near) / 0.36)
+    for k in range(1, count):
+        share = k / count
+        canvas.line(np.array([near + share * (start - near), far + share * (end - far)]), colour, 0.05)
+
+
+def _lit(colour: Colour, factor: float) -> Colour:
+    blue, green, red = (min(max(int(part * factor), 0), 255) for part in colour)
+    return blue, green, red

@@ -1,0 +1,95 @@
+"""Tiles of a ground, made when a camera first sees them and kept while memory lasts."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from typing import Protocol
+
+import numpy as np
+from fractus_core.geo import LocalFrame
+from numpy.typing import NDArray
+
+Picture = NDArray[np.uint8]
+
+TILE_PX = 512
+
+
+class Ground(Protocol):
+    """What lies on the plane: a picture without borders, at levels of which each is half as fine as the one before.
+
+    Attributes:
+        frame: Metres east and north of the world's origin.
+        finest_m: Size of a pixel of level 0 on the ground, metres.
+        levels: Number of levels.
+    """
+
+    frame: LocalFrame
+    finest_m: float
+    levels: int
+
+    def tile(self, level: int, column: int, row: int) -> Picture:
+        """The tile (blue, green, red; row 0 is north) whose north-western corner is at `corner`."""
+
+
+def pixel_m(ground: Ground, level: int) -> float:
+    """Size of a pixel of a level on the ground, metres."""
+    return float(ground.finest_m * 2**level)
+
+
+class TileStore:
+    """Keeps the tiles last used, and the last mosaic of each level.
+
+    Args:
+        ground: Makes the tiles.
+        limit_bytes: What the tiles may take together.
+    """
+
+    def __init__(self, ground: Ground, limit_bytes: int = 160_000_000) -> None:
+        self.ground = ground
+        self.made = 0
+        self._limit = max(limit_bytes // (TILE_PX * TILE_PX * 3), 16)
+        self._tiles: OrderedDict[tuple[int, int, int], Picture] = OrderedDict()
+        self._mosaics: dict[int, tuple[tuple[int, int, int, int], Picture]] = {}
+        self._lock = threading.Lock()
+
+    def mosaic(self, level: int, window: tuple[int, int, int, int]) -> tuple[Picture, int, int]:
+        """Tiles side by side that cover a window of a level's pixels (left, top, right, bottom; x east, y south).
+
+        Returns:
+            The picture, and the level's pixel coordinates of its upper left corner.
+        """
+        left, top = window[0] // TILE_PX, window[1] // TILE_PX
+        right, bottom = -(-window[2] // TILE_PX), -(-window[3] // TILE_PX)
+        wanted = (left, top, right, bottom)
+        known = self._mosaics.get(level)
+        if known is not None and _covers(known[0], wanted):
+            return known[1], known[0][0] * TILE_PX, known[0][1] * TILE_PX
+        picture = np.empty(((bottom - top) * TILE_PX, (right - left) * TILE_PX, 3), np.uint8)
+        for row in range(top, bottom):
+            for column in range(left, right):
+                y, x = (row - top) * TILE_PX, (column - left) * TILE_PX
+                picture[y : y + TILE_PX, x : x + TILE_PX] = self._tile(level, column, row)
+        self._mosaics[level] = (wanted, picture)
+        while len(self._mosaics) > 8:
+            del self._mosaics[next(iter(self._mosaics))]
+        return picture, left * TILE_PX, top * TILE_PX
+
+    def _tile(self, level: int, column: int, row: int) -> Picture:
+        key = (level, column, row)
+        with self._lock:
+            tile = self._tiles.get(key)
+            if tile is not None:
+                self._tiles.move_to_end(key)
+                return tile
+        tile = self.ground.tile(level, column, row)
+        self.made += 1
+        with self._lock:
+            self._tiles[key] = tile
+            while len(self._tiles) > self._limit:
+                self._tiles.popitem(last=False)
+        return tile
+
+
+def _covers(have: tuple[int, int, int, int], wanted: tuple[int, int, int, int]) -> bool:
+    return have[0] <= wanted[0] and have[1] <= wanted[1] and have[2] >= wanted[2] and have[3] >= wanted[3]

@@ -1,0 +1,366 @@
+"""Signed grants: what breaks a signature and what does not, who may sign, and what a node remembers."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from cryptography import x509
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from fractus_core.api import Grant
+from fractus_core.api.plans import component_identity, node_identity
+from fractus_core.policy.signatures import (
+    SIGNATURE_ANNOTATION,
+    SIGNER_ANNOTATION,
+    BadSignature,
+    UnknownAuthority,
+    read_authorities,
+    sign,
+    verify,
+)
+from fractus_operator.authority import SIGNER_LIFE, Authority
+from fractus_operator.commands.grants import grants
+from fractus_operator.grantor import Grantor
+from fractus_operator.standalone import StandalonePki
+from fractus_services import seals as seals_module
+from fractus_services.seals import Seals
+from policy_world import spec
+
+NOW = datetime(2026, 6, 1, 12, 0, 0, 123456, tzinfo=UTC)
+CA = Authority.generate(NOW)
+OTHER_CA = Authority.generate(NOW)
+CAS = (CA.certificate,)
+SIGNER = CA.issue_signer(NOW)
+IDENTITY = Grant.from_body(
+    {"kind": "Grant", "metadata": {"name": "g"}, "spec": spec().to_dict()}
+).spec.identity  # fmt: skip
+
+
+def manifest(**changes: Any) -> dict[str, Any]:
+    metadata = {"name": "g", "uid": "u1"}
+    return {"kind": "Grant", "metadata": metadata, "spec": {**spec().to_dict(), **changes}}
+
+
+def signed(issued_at: datetime = NOW, **changes: Any) -> dict[str, Any]:
+    return sign(manifest(**changes), *SIGNER, issued_at)
+
+
+def grant(body: dict[str, Any]) -> Grant:
+    return Grant.from_body(body)
+
+
+def test_a_signature_holds_however_the_json_is_spelled() -> None:
+    body = json.loads(json.dumps(signed(limits={"maxAltitude": 60, "maxSpeed": 12})))
+    body["spec"]["limits"] = {"maxSpeed": 12.0, "maxAltitude": 60.0}
+    body["spec"]["policies"] = body["spec"].get("policies", [])
+    body["spec"] = dict(sorted(body["spec"].items()))
+    body["metadata"].update(resourceVersion="7", uid="another", labels={"a": "b"}, generation=3)
+    body["status"] = {"phase": "Active"}
+    assert verify(grant(body), CAS) == NOW
+
+
+def test_a_signature_holds_where_a_later_release_has_more_fields_or_writes_defaults_out() -> None:
+    bare = signed()
+    bare["spec"] = {key: value for key, value in bare["spec"].items() if value not in ([], None)}
+    assert verify(grant(bare), CAS) == NOW
+    full = grant(signed())
+    assert verify(grant({**full.to_dict(), "spec": full.spec.model_dump(mode="json", by_alias=True)}), CAS) == NOW
+
+
+CHANGES: list[Callable[[dict[str, Any]], Any]] = [
+    lambda body: body["metadata"].update(name="other"),
+    lambda body: body["spec"].update(node="drone-2"),
+    lambda body: body["spec"].update(component="Other"),
+    lambda body: body["spec"]["application"].update(uid="later"),
+    lambda body: body["spec"].update(policies=[]),
+    lambda body: body["spec"].update(operationArea=[]),
+    lambda body: body["spec"]["limits"].update(maxSpeed=12.000000000000002),
+    lambda body: body["spec"].update(issuedAt="2026-06-01T12:00:00.123457Z"),
+    lambda body: body["spec"].update(issuedAt=None),
+    lambda body: body["spec"].update(issuedAt="2026-06-01T12:00:00.123456"),
+    lambda body: body["metadata"]["annotations"].pop(SIGNATURE_ANNOTATION),
+    lambda body: body["metadata"]["annotations"].pop(SIGNER_ANNOTATION),
+    lambda body: body["metadata"]["annotations"].update({SIGNATURE_ANNOTATION: "bm9uc2Vuc2U="}),
+    lambda body: body["metadata"]["annotations"].update({SIGNATURE_ANNOTATION: "?"}),
+    lambda body: body["metadata"]["annotations"].update({SIGNER_ANNOTATION: "bm9uc2Vuc2U="}),
+    lambda body: body.update(metadata={"name": "g"}),
+]
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_nothing_can_be_changed(change: Callable[[dict[str, Any]], Any]) -> None:
+    policies = [{"name": "p", "spec": {"type": "LimitControl", "kind": "speed", "upperLimit": 5}}]
+    limits = {"maxAltitude": 60, "maxSpeed": 12}
+    body = json.loads(json.dumps(signed(policies=policies, limits=limits)))
+    assert verify(grant(body), CAS)
+    change(body)
+    with pytest.raises(BadSignature):
+        verify(grant(body), CAS)
+
+
+def of_data(data: dict[str, str]) -> tuple[ec.EllipticCurvePrivateKey, x509.Certificate]:
+    key = serialization.load_pem_private_key(base64.b64decode(data["tls.key"]), None)
+    assert isinstance(key, ec.EllipticCurvePrivateKey)
+    return key, x509.load_pem_x509_certificate(base64.b64decode(data["tls.crt"]))
+
+
+@pytest.mark.parametrize(
+    ("who", "why"),
+    [
+        (of_data(CA.issue_component(IDENTITY, NOW)), "not by the operator"),
+        (of_data(CA.issue_component("spiffe://fractus.dev/operator", NOW)), "not for signing Grants"),
+        (of_data(CA.issue_node("drone-1", NOW)), "not by the operator"),
+        ((CA.key, CA.certificate), "not for signing Grants"),
+        (OTHER_CA.issue_signer(NOW), "authority that is not in ca.crt"),
+        ((SIGNER[0], CA.issue_signer(NOW)[1]), "changed after it was signed"),
+    ],
+)
+def test_nobody_else_signs(who: tuple[ec.EllipticCurvePrivateKey, x509.Certificate], why: str) -> None:
+    with pytest.raises(BadSignature, match=why):
+        verify(grant(sign(manifest(), *who, NOW)), CAS)
+
+
+def test_no_certificate_for_tls_signs_and_none_for_signing_is_for_tls() -> None:
+    signing = SIGNER[1].extensions.get_extension_for_class(x509.KeyUsage).value
+    assert signing.content_commitment
+    assert not signing.digital_signature
+    for data in (CA.issue_component(IDENTITY, NOW), CA.issue_node("n", NOW)):
+        usage = of_data(data)[1].extensions.get_extension_for_class(x509.KeyUsage).value
+        assert not usage.content_commitment
+
+
+def test_the_moment_of_issue_counts_and_not_the_present_one() -> None:
+    assert verify(grant(signed(NOW)), CAS), "however old it is"
+    late = SIGNER[1].not_valid_after_utc
+    assert verify(grant(signed(late + timedelta(minutes=4))), CAS), "clocks differ"
+    for wrong in (late + timedelta(minutes=6), NOW - timedelta(hours=1)):
+        with pytest.raises(BadSignature, match="certificate was not valid"):
+            verify(grant(signed(wrong)), CAS)
+
+
+def test_several_authorities_while_one_takes_over() -> None:
+    both = read_authorities(OTHER_CA.certificate_pem + CA.certificate_pem)
+    assert verify(grant(signed()), both) == NOW
+
+
+# The operator
+
+
+def test_each_grant_is_issued_later_whatever_the_clock_does() -> None:
+    clock = [NOW]
+    grantor = Grantor(CA, lambda: clock[0])
+    first = grant(grantor.signed(manifest()))
+    second = grant(grantor.signed(manifest()))
+    clock[0] = NOW - timedelta(hours=1)
+    third = grant(grantor.signed(manifest(), second))
+    restarted = Grantor(CA, lambda: clock[0])
+    fourth = grant(restarted.signed(manifest(), third))
+    times = [g.spec.issued_at for g in (first, second, third, fourth)]
+    assert times == sorted(set(times), key=str)
+
+
+def test_the_signing_certificate_is_renewed_in_time() -> None:
+    clock = [NOW]
+    grantor = Grantor(CA, lambda: clock[0])
+    signers = set()
+    for _ in range(6):
+        body = grantor.signed(manifest())
+        signers.add(body["metadata"]["annotations"][SIGNER_ANNOTATION])
+        assert verify(grant(body), CAS)
+        clock[0] += SIGNER_LIFE / 2
+    assert len(signers) == 3
+    assert all(verify(grant(sign(manifest(), *SIGNER, NOW)), CAS) for _ in signers)
+
+
+def test_the_operator_knows_its_own() -> None:
+    grantor = Grantor(CA, lambda: NOW)
+    body = grantor.signed(manifest())
+    assert grantor.vouches(grant(body))
+    body["metadata"]["annotations"][SIGNATURE_ANNOTATION] = "bm9uc2Vuc2U="
+    assert not grantor.vouches(grant(body))
+    assert not grantor.vouches(grant(manifest()))
+    assert not Grantor(OTHER_CA, lambda: NOW).vouches(grant(signed()))
+    assert not grantor.vouches_for({"kind": "Grant", "metadata": {"name": "g"}, "spec": {"odd": 1}})
+
+
+# The node
+
+
+class Node:
+    """The directory of a node's service, which restarts at will."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.trust(CA)
+        self.seals = Seals(path, path / "seen.json")
+        self.seals.renewed()
+
+    def trust(self, *authorities: Authority) -> None:
+        (self.path / "ca.crt").write_bytes(b"".join(a.certificate_pem for a in authorities))
+
+    def restart(self) -> None:
+        content = self.seals.unsaved()
+        if content is not None:
+            self.seals.store(content)
+        self.seals = Seals(self.path, self.path / "seen.json")
+        self.seals.renewed()
+
+    def take(self, body: dict[str, Any]) -> str:
+        return self.seals.check(grant(body))
+
+
+@pytest.fixture
+def node(tmp_path: Path) -> Node:
+    return Node(tmp_path)
+
+
+def later(seconds: float = 1.0) -> datetime:
+    return NOW + timedelta(seconds=seconds)
+
+
+@pytest.mark.parametrize("restarts", [False, True])
+def test_an_older_grant_does_not_come_back(node: Node, restarts: bool) -> None:
+    old, new = signed(NOW), signed(later(), policies=[])
+    first = node.take(old)
+    assert node.take(old) == first, "read again, it is the same"
+    digest = node.take(new)
+    if restarts:
+        node.restart()
+    with pytest.raises(BadSignature, match=r"not after the one of 2026-06-01T12:00:01\.123456"):
+        node.take(old)
+    assert node.take(new) == digest
+    assert node.seals.holds(IDENTITY, digest)
+    assert not node.seals.holds(IDENTITY, first)
+
+
+@pytest.mark.parametrize("restarts", [False, True])
+def test_a_revoked_grant_does_not_come_back_and_a_later_one_does(node: Node, restarts: bool) -> None:
+    node.seals.revoke(IDENTITY, node.take(signed()))
+    if restarts:
+        node.restart()
+    with pytest.raises(BadSignature, match=r"that was revoked here; sign it again"):
+        node.take(signed())
+    assert node.take(signed(later()))
+
+
+def test_the_same_signature_under_another_uid_is_a_replay(node: Node) -> None:
+    body = signed()
+    node.take(body)
+    with pytest.raises(BadSignature, match="not after"):
+        node.take({**body, "metadata": {**body["metadata"], "uid": "u2"}})
+
+
+def test_what_was_verified_once_outlives_its_authority(node: Node) -> None:
+    body = signed()
+    digest = node.take(body)
+    node.trust(OTHER_CA)
+    assert node.seals.renewed()
+    assert node.take(body) == digest
+    node.restart()
+    assert node.take(body) == digest
+    with pytest.raises(UnknownAuthority):
+        node.take(signed(later()))
+    assert node.take(sign(manifest(), *OTHER_CA.issue_signer(NOW), later(2)))
+
+
+def test_without_an_authority_nothing_is_granted(node: Node) -> None:
+    (node.path / "ca.crt").unlink()
+    node.restart()
+    with pytest.raises(UnknownAuthority, match=r"there is no .*ca\.crt"):
+        node.take(signed())
+    node.trust(CA)
+    assert node.seals.renewed()
+    assert not node.seals.renewed()
+    assert node.take(signed())
+
+
+def test_a_broken_ca_file_keeps_the_one_before(node: Node) -> None:
+    (node.path / "ca.crt").write_text("nonsense")
+    assert not node.seals.renewed()
+    assert node.take(signed())
+
+
+@pytest.mark.parametrize("damage", [b"", b"{", b"[]", b'{"floor": 1}', b'{"floor": "", "seen": {"a": {"b": 1}}}'])
+def test_a_damaged_memory_is_forgotten(node: Node, damage: bytes) -> None:
+    node.take(signed(later()))
+    node.restart()
+    (node.path / "seen.json").write_bytes(damage)
+    node.restart()
+    assert node.take(signed())
+
+
+def test_a_full_disk_grants_on_and_remembers_when_there_is_room(
+    node: Node, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    node.take(signed())
+    content = node.seals.unsaved()
+    assert content is not None
+    assert node.seals.unsaved() is None
+    with monkeypatch.context() as patch:
+        patch.setattr("fractus_services.seals.os.fsync", full)
+        node.seals.store(content)
+    assert "No space left" in caplog.text
+    node.restart()
+    node.seals.revoke(IDENTITY, node.take(signed()))
+    node.restart()
+    with pytest.raises(BadSignature, match="revoked"):
+        node.take(signed())
+
+
+def test_the_memory_has_an_end_and_forgets_nothing_that_matters(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(seals_module, "MOST_KNOWN", 3)
+    for n in range(6):
+        node.take(signed(later(n), instance=f"i{n}"))
+    node.restart()
+    with pytest.raises(BadSignature, match="not after"):
+        node.take(signed(later(0), instance="i0"))
+    assert node.take(signed(later(7), instance="i0"))
+
+
+# Alone
+
+
+def test_alone(tmp_path: Path) -> None:
+    pki, to, file = tmp_path / "pki", tmp_path / "grants", tmp_path / "grant.json"
+    file.write_text(json.dumps(manifest()))
+    missing = CliRunner().invoke(grants, ["sign", str(file), "--tls", str(pki), "--to", str(to)])
+    assert missing.exit_code == 1
+    assert "fractus grants init" in missing.output
+    made = CliRunner().invoke(grants, ["init", str(pki), "--node", "drone-1"])
+    assert made.exit_code == 0, made.output
+    ca = (pki / "nodes" / "drone-1" / "ca.crt").read_bytes()
+    assert (pki / "authority" / "tls.key").stat().st_mode & 0o777 == 0o600
+    times = []
+    for _ in range(2):
+        done = CliRunner().invoke(grants, ["sign", str(file), "--tls", str(pki), "--to", str(to)])
+        assert done.exit_code == 0, done.output
+        times.append(verify(grant(json.loads((to / "g.json").read_bytes())), read_authorities(ca)))
+    assert times[0] < times[1]
+    file.write_text("kind: Grant\nmetadata: {name: g}\nspec: {node: 3}\n")
+    bad = CliRunner().invoke(grants, ["sign", str(file), "--tls", str(pki), "--to", str(to)])
+    assert bad.exit_code == 1
+    assert "grant.json" in bad.output
+
+
+def test_a_directory_of_keys_is_made_once(tmp_path: Path) -> None:
+    one = StandalonePki.create(tmp_path)
+    folder = one.component(component_identity("ns", "app", "Navigator", "app-navigator"))
+    assert folder.name == "ns.app-navigator"
+    before = (folder / "tls.crt").read_bytes()
+    two = StandalonePki.create(tmp_path)
+    assert (
+        two.component(component_identity("ns", "app", "Navigator", "app-navigator")) / "tls.crt"
+    ).read_bytes() == before
+    names = x509.load_pem_x509_certificate((two.node("d") / "tls.crt").read_bytes()).extensions
+    uris = names.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert node_identity("d") in uris.get_values_for_type(x509.UniformResourceIdentifier)

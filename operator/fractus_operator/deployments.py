@@ -8,9 +8,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 
-from fractus_core.api import Application, Component, Condition, InvalidObject, component_identity
+from fractus_core.api import Application, Component, Condition, Grant, InvalidObject, component_identity
 from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec, PlannedInstance
-from fractus_core.planning.inventory import Inventory, Settings
+from fractus_core.planning.growth import room_to_grow
+from fractus_core.planning.inventory import Flight, Inventory, Settings
 from fractus_core.planning.plan import Infeasible, plan
 from fractus_core.policy.grants import compile_grants, refresh
 from fractus_core.validation import check_application
@@ -36,6 +37,7 @@ from fractus_operator.missions import (
 )
 from fractus_operator.pods import PodView
 from fractus_operator.reading import SETTLED, Submitted
+from fractus_operator.rides import flights, may_come_along, ride_lost, ride_outcome
 from fractus_operator.store import Store, StoreError, Taken
 
 logger = logging.getLogger(__name__)
@@ -43,6 +45,9 @@ logger = logging.getLogger(__name__)
 RESYNC_S = 30.0
 _REFUSALS = frozenset({400, 403, 422})
 """HTTP statuses by which the API server says that it does not want an object: the user should know."""
+
+_OPTIONAL = frozenset({"NodeCordoned", "NodesAppeared"})
+"""Reasons for a new plan that can do without: what runs goes on where there is no other."""
 
 EXCLUSION = timedelta(minutes=5)
 """How long a node that the scheduler refused is left out of an application's plans."""
@@ -144,7 +149,10 @@ class Deployments:
                 # The last mission's grants must be gone before a new one begins.
                 return None, RESYNC_S if same else 1.0
         present = self._present(key, submitted.metadata.uid or "")
-        outcome = mission_outcome(submitted.metadata.uid, self._live.grants_of(key))
+        decided = self._live.plan_of(key, submitted.uid)
+        outcome = mission_outcome(submitted.uid, self._live.grants_of(key)) or (
+            ride_outcome(decided, *self._live.host_of(decided))
+        )
         if outcome is not None:
             # Reported before anything is removed: the grants are the only other record of it.
             await self._report(submitted, finished_standing(outcome, present), memory)
@@ -153,15 +161,16 @@ class Deployments:
         try:
             await self._refresh(key, submitted.uid)
             await self._give_up_lost_drone(key, submitted.uid)
+            await self._give_up_lost_ride(key, submitted)
             return await self._progress(key, submitted, memory)
         except Hindered as hindrance:
             return hindered_standing(hindrance, present), hindrance.again_s
 
     async def _refresh(self, key: Key, uid: str) -> None:
         """Bring the policies of what is granted up to date, whatever becomes of the application's next plan."""
-        inventory = self._live.snapshot(uid)
-        grants = [(grant, refresh(grant.spec, inventory)) for grant in self._live.grants_of(key, uid)]
-        stale = [(grant, spec) for grant, spec in grants if spec != grant.spec or not self._grantor.vouches(grant)]
+        inventory = self._live.snapshot(key, uid)
+        grants = [(grant, refresh(grant.spec, inventory)) for grant in self._vouched(key, uid)]
+        stale = [(grant, spec) for grant, spec in grants if spec != grant.spec]
         try:
             await self._children.refresh(stale)
         except StoreError as error:
@@ -169,6 +178,10 @@ class Deployments:
             logger.warning("%s/%s: grants are not up to date: %s", *key, error)
             if error.status not in _REFUSALS and not isinstance(error, Taken):
                 raise
+
+    def _vouched(self, key: Key, uid: str) -> list[Grant]:
+        """The grants of an application that are as they were signed: nothing of another one is ever signed again."""
+        return [grant for grant in self._live.grants_of(key, uid) if self._grantor.vouches(grant)]
 
     async def _give_up_lost_drone(self, key: Key, uid: str) -> None:
         """Take down an application whose drone is another's by an older grant, so that it is planned anew.
@@ -179,16 +192,37 @@ class Deployments:
         drone = self._live.has_lost_drone(key, uid)
         if drone is None:
             return
+        await self._begin_anew(key)
+        raise Hindered("Queued", "Planned", "DroneBusy", f"another application has {drone}", again_s=1.0)
+
+    async def _give_up_lost_ride(self, key: Key, submitted: Submitted) -> None:
+        """Take down an application that came along with a flight which is over or goes elsewhere; it is planned anew.
+
+        Raises:
+            Hindered: it has lost its ride.
+        """
+        decided, guest = self._live.plan_of(key, submitted.uid), submitted.application
+        if decided is None or decided.drone is None or decided.drone.shared_with is None or guest is None:
+            return
+        _, host_plan = self._live.host_of(decided)
+        flight = self._flights(key, guest).get(decided.drone.node)
+        lost = ride_lost(guest, decided, host_plan, flight, self._settings.safety_radius_m)
+        if lost is None:
+            return
+        await self._begin_anew(key)
+        raise Hindered("Queued", "Planned", "RideLost", lost, again_s=1.0)
+
+    async def _begin_anew(self, key: Key) -> None:
+        """Remove all that was made for an application, with its plan."""
         await self._clear(key)
         await self._children.remove(key, kinds.DEPLOYMENT_PLAN)
         self._live.forget(key)
-        raise Hindered("Queued", "Planned", "DroneBusy", f"another application has {drone}", again_s=1.0)
 
     async def _progress(self, key: Key, submitted: Submitted, memory: _Memory) -> tuple[Standing, float]:
         application = submitted.application
         if application is None:
             raise Hindered("Invalid", "Planned", "Invalid", str(submitted.error))
-        inventory = self._live.snapshot(submitted.uid)
+        inventory = self._live.snapshot(key, submitted.uid, self._flights(key, application))
         try:
             check_application(application, inventory.depots)
             decided, again_s = self._plan(application, inventory, memory)
@@ -198,7 +232,7 @@ class Deployments:
             phase: Phase = "Queued" if none.reason == "DroneBusy" else "Pending"
             raise Hindered(phase, "Planned", none.reason, none.message) from none
         try:
-            present = [grant.spec for grant in self._live.grants_of(key, submitted.uid)]
+            present = [grant.spec for grant in self._vouched(key, submitted.uid)]
             grants = compile_grants(application, decided, inventory, self._settings, present)
         except InvalidObject as error:
             raise Hindered("Pending", "Granted", "PolicyInvalid", str(error)) from error
@@ -227,13 +261,20 @@ class Deployments:
         stuck, again_s = stuck_nodes(previous, self._live.pods_of(key), now)
         aloft = self._aloft(previous)
         stuck = {node: why for node, why in stuck.items() if node != aloft}
-        reason = replan_reason(application, previous, inventory, stuck, aloft)
-        if previous is not None and reason is None:
-            return previous, again_s or RESYNC_S
         memory.excluded = {n: (until, why) for n, (until, why) in memory.excluded.items() if until > now}
         memory.excluded |= {node: (now + EXCLUSION, why) for node, why in stuck.items()}
         settings = replace(self._settings, excluded={n: why for n, (_, why) in memory.excluded.items()})
-        decided = plan(application, inventory, settings, previous)
+        reason = replan_reason(application, previous, inventory, stuck, aloft)
+        if previous is not None and reason is None:
+            if room_to_grow(application, inventory, settings, previous) is None:
+                return previous, again_s or RESYNC_S
+            reason = "NodesAppeared"
+        try:
+            decided = plan(application, inventory, settings, previous)
+        except Infeasible:
+            if previous is None or reason not in _OPTIONAL:
+                raise
+            return previous, RESYNC_S
         if previous is not None and aloft is not None and reason != "SpecChanged" and _flies(decided) != aloft:
             # Trouble elsewhere is no reason to leave a drone that flies.
             return previous, RESYNC_S
@@ -241,6 +282,14 @@ class Deployments:
         drone = f" with drone {decided.drone.node}" if decided.drone is not None else ""
         logger.info("%s/%s is planned (%s)%s", *key, reason, drone)
         return decided, RESYNC_S
+
+    def _flights(self, key: Key, application: Application | None) -> dict[str, Flight]:
+        """What claimed drones fly, for an application that may come along; nothing for others."""
+        if application is None or not may_come_along(application):
+            return {}
+        present = self._live.plan_of(key, application.metadata.uid or "")
+        flown = (host for host in self._live.flown() if host.application.key != key)
+        return flights(flown, self._live.depots_by_name(), self._settings.safety_radius_m, present)
 
     def _aloft(self, decided: DeploymentPlanSpec | None) -> str | None:
         """The drone of a plan, while it flies."""

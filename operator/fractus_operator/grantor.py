@@ -76,7 +76,7 @@ class Grantor:
         try:
             verify(grant, (self._authority.certificate,))
         except BadSignature as problem:
-            logger.warning("Grant %s is signed again: %s", grant.name, problem)
+            logger.warning("Grant %s does not count and is made anew: %s", grant.name, problem)
             return False
         self._good[fingerprint] = None
         for oldest in tuple(itertools.islice(self._good, max(len(self._good) - _KNOWN, 0))):

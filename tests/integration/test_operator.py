@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import base64
 import signal
+from datetime import datetime
 from typing import Any
 
 import pytest
 from control_plane import wait_for
 from cryptography import x509
+from fractus_core.api import Grant
+from fractus_core.policy.signatures import SIGNATURE_ANNOTATION, BadSignature, read_authorities, verify
 from operator_world import FRACTUS, OperatorProcess, World, at, component, navigator, ours, traffic, viewer
 
 INSTANCES = {
@@ -385,6 +388,38 @@ def test_a_new_policy_reaches_the_grants_of_a_running_application(
         "the policy",
     )
     assert world.status(namespace)["phase"] == "Running"
+
+
+def test_grants_are_signed_and_a_signature_that_is_touched_is_made_anew(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    def sound() -> bool:
+        try:
+            return all(verify(Grant.from_body(body), authorities) for body in world.grants(namespace))
+        except BadSignature:
+            return False
+
+    running(world, namespace)
+    published = world.api.get("/api/v1/namespaces/fractus-system/configmaps/fractus-ca") or {}
+    authorities = read_authorities(published["data"]["ca.crt"].encode())
+    assert world.grants(namespace)
+    assert sound()
+    path = f"{FRACTUS}/grants/{namespace}.traffic-navigator"
+
+    def issued() -> datetime:
+        seen.append(world.api.get(path) or {})
+        return datetime.fromisoformat(seen[-1]["spec"]["issuedAt"])
+
+    seen: list[dict[str, Any]] = []
+    first = issued()
+    world.api.merge(path, {"metadata": {"annotations": {SIGNATURE_ANNOTATION: "bm9uc2Vuc2U="}}})
+    assert not sound()
+    wait_for(sound, "a new signature")
+    second = issued()
+    assert second > first
+    world.api.merge(path, {"spec": {"limits": {"maxSpeed": 300}}})
+    wait_for(lambda: issued() > second and sound(), "what was granted")
+    assert seen[-1]["spec"]["limits"]["maxSpeed"] < 300, "what somebody else wrote is never signed"
 
 
 def test_nodes_get_location_labels(world: World, operator: OperatorProcess) -> None:

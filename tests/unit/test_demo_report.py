@@ -31,8 +31,8 @@ def written(record: Record, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_flight_is_measured(record: Record) -> None:
-    assert record.max_altitude_m == pytest.approx(50.0, abs=0.2)
-    assert record.distance_m == pytest.approx(796, abs=5), "the sum of the legs, geodesic"
+    assert record.track.max_altitude_m == pytest.approx(50.0, abs=0.2)
+    assert record.track.distance_m == pytest.approx(796, abs=5), "the sum of the legs, geodesic"
     assert record.takeoff_s == pytest.approx(demo_flight.TAKEOFF_S)
     assert record.landing_s is not None
     assert 100 < record.landing_s - record.takeoff_s < 110

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +14,33 @@ PURPLE, SKY, INK, GREY = "#CC79A7", "#56B4E9", "#222222", "#6B6B6B"
 
 CORRECTED = {"marker": "^", "markersize": 10, "color": ORANGE, "markeredgecolor": INK, "linestyle": "none"}
 REFUSED = {"marker": "X", "markersize": 10, "color": VERMILION, "markeredgecolor": INK, "linestyle": "none"}
+FAULT = {"marker": "D", "markersize": 8, "color": PURPLE, "markeredgecolor": INK, "linestyle": "none"}
+TRACK_COLOURS = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, "#8C6D1F", "#444444", "#7A4FA3", "#00685A")
+
+
+def legend(figure: Figure, *every: Any) -> None:
+    """One legend below the picture for all axes, each label once."""
+    entries = [entry for axes in every for entry in zip(*axes.get_legend_handles_labels(), strict=True)]
+    unique = {label: handle for handle, label in entries}
+    figure.legend(unique.values(), unique.keys(), loc="outside lower center", ncols=5, fontsize=8, frameon=False)
 
 
 def canvas(width_in: float, height_in: float) -> tuple[Figure, Any]:
     """A figure with one axes, outside pyplot's global state."""
-    figure = Figure(figsize=(width_in, height_in), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    axes.tick_params(labelsize=8, colors=INK)
+    figure, (axes,) = panels(width_in, (height_in,))
     return figure, axes
+
+
+def panels(width_in: float, heights_in: Sequence[float], *, sharex: bool = False) -> tuple[Figure, list[Any]]:
+    """A figure with axes above each other."""
+    figure = Figure(figsize=(width_in, sum(heights_in)), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    every = figure.subplots(len(heights_in), 1, sharex=sharex, squeeze=False, height_ratios=list(heights_in))[:, 0]
+    for axes in every:
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(False)
+        axes.tick_params(labelsize=8, colors=INK)
+    return figure, list(every)
 
 
 def number(axes: Any, text: str, x: float, y: float) -> None:

@@ -1,16 +1,13 @@
-"""The flight seen from above: path, zones, nodes and their reach, and the requests that policies changed."""
+"""Flights seen from above: paths, zones, nodes and their reach, and what happened where."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import shapely
-import shapely.geometry
-from fractus_core.api import EdgeNode, Policy, Zone
-from fractus_core.geo import polygon
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, PathPatch
@@ -18,39 +15,47 @@ from matplotlib.path import Path as Outline
 
 from fractus_sim.report.drawing import (
     BLUE,
-    CORRECTED,
     GREEN,
     GREY,
     INK,
     PURPLE,
-    REFUSED,
     SKY,
+    TRACK_COLOURS,
     VERMILION,
     canvas,
+    legend,
     number,
 )
-from fractus_sim.report.record import Record
+from fractus_sim.report.scene import MARKS, XY, Scene
+from fractus_sim.report.track import Track
 
 _MARGIN_M = 45.0
+_MARGIN_SHARE = 0.12
+_NAMED_TRACKS = 10
+_ASPECT = 1.35
 _ZONE_STYLES: Mapping[str, tuple[str, str, str]] = {
     "exclusion": (VERMILION, "///", "no-fly zone"),
     "denial": (PURPLE, "...", "calls denied"),
     "camera": (PURPLE, "\\\\\\", "privacy filter"),
     "inclusion": (GREEN, "", "stay inside"),
     "limit": (GREY, "", "limits hold"),
+    "other": (GREY, "", "zone"),
 }
-XY = tuple[float, float]
+Bounds = tuple[float, float, float, float]
 
 
-def draw_map(record: Record) -> Figure:
+def draw_map(scene: Scene) -> Figure:
     """Draw the map, in metres east and north of home."""
     figure, axes = canvas(9.0, 6.6)
-    bounds = _bounds(record)
-    _zones(axes, record, bounds)
-    _operation_area(axes, record)
-    _nodes(axes, record, bounds)
-    _path(axes, record, figure)
-    _requests(axes, record)
+    bounds = _bounds(scene)
+    _zones(axes, scene, bounds)
+    _operation_area(axes, scene)
+    _nodes(axes, scene, bounds)
+    if len(scene.tracks) == 1:
+        _path(axes, scene, figure)
+    else:
+        _paths(axes, scene)
+    _marks(axes, scene)
     axes.set_xlim(bounds[0], bounds[2])
     axes.set_ylim(bounds[1], bounds[3])
     axes.set_aspect("equal")
@@ -58,82 +63,58 @@ def draw_map(record: Record) -> Figure:
     axes.set_ylabel("metres north of home", fontsize=9)
     axes.grid(color="#EEEEEE", linewidth=0.6, zorder=0)
     axes.set_axisbelow(True)
-    drone = record.drone.name if record.drone else "no drone"
-    axes.set_title(f"{record.application.name}: {drone}, {record.distance_m:.0f} m", fontsize=11, loc="left")
-    handles, labels = axes.get_legend_handles_labels()
-    unique = dict(zip(labels, handles, strict=True))
-    figure.legend(unique.values(), unique.keys(), loc="outside lower center", ncols=5, fontsize=8, frameon=False)
+    axes.set_title(scene.title, fontsize=11, loc="left")
+    legend(figure, axes)
     return figure
 
 
-def _bounds(record: Record) -> tuple[float, float, float, float]:
-    """What is shown: path, operation area, requests, and the zones that close or deny; the rest is cut off."""
-    frame = record.frame
-    shown: list[XY] = [frame.xy(s.place.lat, s.place.lon) for s in record.samples]
-    shown += [frame.xy(j.asked.lat, j.asked.lon) for j in record.judgements if j.asked is not None]
-    area = _area_shape(record)
-    if area is not None and not area.is_empty:
-        shown += [(area.bounds[0], area.bounds[1]), (area.bounds[2], area.bounds[3])]
+def _bounds(scene: Scene) -> Bounds:
+    """What is shown: paths, operation area, marks, and the zones that close or deny; the rest is cut off."""
+    shown: list[XY] = [scene.frame.xy(s.place.lat, s.place.lon) for track in scene.tracks for s in track.samples]
+    shown += [mark.at for mark in scene.marks]
+    if scene.area is not None and not scene.area.is_empty:
+        shown += _corners(scene.area)
     core = shapely.box(*shapely.MultiPoint(shown or [(0.0, 0.0)]).buffer(150.0).bounds)
-    for zone, kind in _classified(record):
-        shape = polygon(frame, zone.spec.area)
-        if kind != "limit" and shape.intersects(core):
-            shown += [(shape.bounds[0], shape.bounds[1]), (shape.bounds[2], shape.bounds[3])]
+    for zone in scene.zones:
+        if zone.kind != "limit" and zone.shape.intersects(core):
+            shown += _corners(zone.shape)
     low_x, low_y, high_x, high_y = shapely.MultiPoint(shown or [(0.0, 0.0)]).bounds
-    return low_x - _MARGIN_M, low_y - _MARGIN_M, high_x + _MARGIN_M, high_y + _MARGIN_M
+    margin_m = min(_MARGIN_M, max(_MARGIN_SHARE * max(high_x - low_x, high_y - low_y), 5.0))
+    half_x, half_y = (high_x - low_x) / 2 + margin_m, (high_y - low_y) / 2 + margin_m
+    half_x, half_y = max(half_x, half_y * _ASPECT), max(half_y, half_x / _ASPECT)
+    x, y = (low_x + high_x) / 2, (low_y + high_y) / 2
+    return x - half_x, y - half_y, x + half_x, y + half_y
 
 
-def _area_shape(record: Record) -> Any:
-    if record.plan is None or record.plan.spec.operation_area is None:
-        return None
-    shape = shapely.geometry.shape(record.plan.spec.operation_area)
-    frame = record.frame
-
-    def metres(lonlat: np.ndarray) -> np.ndarray:
-        return np.array([frame.xy(lat, lon) for lon, lat in lonlat])
-
-    return shapely.transform(shape, metres)
+def _corners(shape: Any) -> list[XY]:
+    return [(shape.bounds[0], shape.bounds[1]), (shape.bounds[2], shape.bounds[3])]
 
 
-def _operation_area(axes: Any, record: Record) -> None:
-    shape = _area_shape(record)
-    if shape is None or shape.is_empty:
+def _operation_area(axes: Any, scene: Scene) -> None:
+    if scene.area is None or scene.area.is_empty:
         return
-    for part in getattr(shape, "geoms", [shape]):
+    for part in getattr(scene.area, "geoms", [scene.area]):
         _patch(axes, part, facecolor=SKY, alpha=0.25, edgecolor=BLUE, linewidth=0.8, label="operation area", zorder=2)
 
 
-def _classified(record: Record) -> Iterable[tuple[Zone, str]]:
-    """Each zone with the strictest kind of policy that holds there for this drone."""
-    for zone in record.zones:
-        kinds = [_kind(p) for p in record.policies_in_force if zone.name in p.spec.selector.zones]
-        order = [kind for kind in _ZONE_STYLES if kind in kinds]
-        if order:
-            yield zone, order[0]
-
-
-def _kind(policy: Policy) -> str:
-    return "limit" if policy.spec.type == "LimitControl" else policy.spec.kind
-
-
-def _zones(axes: Any, record: Record, bounds: tuple[float, float, float, float]) -> None:
-    window, area = shapely.box(*bounds), _area_shape(record)
-    for zone, kind in _classified(record):
-        colour, hatch, label = _ZONE_STYLES[kind]
-        shape = polygon(record.frame, zone.spec.area).intersection(window)
+def _zones(axes: Any, scene: Scene, bounds: Bounds) -> None:
+    window = shapely.box(*bounds)
+    for zone in scene.zones:
+        colour, hatch, label = _ZONE_STYLES[zone.kind]
+        shape = zone.shape.intersection(window)
         if shape.is_empty:
             continue
-        if kind == "limit":
-            x, y = bounds[0], bounds[3]
+        if zone.kind == "limit":
             axes.annotate(
-                f"zone {zone.name}: limits hold", (x, y), xytext=(6, -12), textcoords="offset points", fontsize=8,
-                color=GREY, style="italic",
+                f"zone {zone.name}: limits hold", (bounds[0], bounds[3]), xytext=(6, -12), textcoords="offset points",
+                fontsize=8, color=GREY, style="italic",
             )  # fmt: skip
             continue
         for part in getattr(shape, "geoms", [shape]):
             _patch(axes, part, facecolor=colour, alpha=0.13, edgecolor="none", zorder=1)
             _patch(axes, part, facecolor="none", edgecolor=colour, hatch=hatch, linewidth=1.2, label=label, zorder=1.5)
-        _zone_name(axes, zone.name, shape, colour, beside=area is not None and area.intersects(shape))
+        beside = scene.area is not None and scene.area.intersects(shape)
+        _zone_name(axes, zone.name, shape, colour, beside=beside)
 
 
 def _zone_name(axes: Any, name: str, shape: Any, colour: str, *, beside: bool) -> None:
@@ -156,34 +137,29 @@ def _patch(axes: Any, shape: Any, **style: Any) -> None:
     axes.add_patch(PathPatch(Outline(vertices, codes), **style))
 
 
-def _nodes(axes: Any, record: Record, bounds: tuple[float, float, float, float]) -> None:
-    used = {p.node for p in record.plan.spec.placements} if record.plan else set()
-    for node in record.edge_nodes:
-        at = record.frame.xy(node.spec.location.lat, node.spec.location.lon)
-        chosen = node.name in used
+def _nodes(axes: Any, scene: Scene, bounds: Bounds) -> None:
+    for node in scene.nodes:
+        at = node.at
         if not (bounds[0] < at[0] < bounds[2] and bounds[1] < at[1] < bounds[3]):
             _far_node(axes, node.name, at, bounds)
             continue
-        reach = _reach_m(node)
-        if reach is not None:
+        if node.reach_m is not None:
             axes.add_patch(
-                Circle(at, reach, fill=False, edgecolor=GREEN, linestyle=(0, (4, 3)), linewidth=1.0, zorder=3)
+                Circle(at, node.reach_m, fill=False, edgecolor=GREEN, linestyle=(0, (4, 3)), linewidth=1.0, zorder=3)
             )
             axes.plot([], [], color=GREEN, linestyle=(0, (4, 3)), linewidth=1.0, label="WiFi reach")
-        label = "edge node in use" if chosen else "edge node not used"
         axes.plot(
-            *at, marker="s", markersize=9, color=GREEN if chosen else "white", markeredgecolor=INK, linestyle="none",
-            label=label, zorder=6,
+            *at, marker="s", markersize=9, color=GREEN if node.used else "white", markeredgecolor=INK, linestyle="none",
+            label="edge node in use" if node.used else "edge node not used", zorder=6,
         )  # fmt: skip
         axes.annotate(
             node.name, at, xytext=(0, -15), textcoords="offset points", ha="center", fontsize=8.5, color=INK, zorder=6
         )
-    for depot in record.depots:
-        at = record.frame.xy(depot.spec.location.lat, depot.spec.location.lon)
+    for name, at in scene.depots:
         axes.plot(*at, marker="o", markersize=11, color="white", markeredgecolor=INK, markeredgewidth=1.5, zorder=6)
         axes.annotate("H", at, ha="center", va="center", fontsize=7.5, fontweight="bold", color=INK, zorder=7)
         axes.annotate(
-            depot.name, at, xytext=(0, -16), textcoords="offset points", ha="center", fontsize=8.5, color=INK, zorder=6
+            name, at, xytext=(0, -16), textcoords="offset points", ha="center", fontsize=8.5, color=INK, zorder=6
         )
 
 
@@ -202,15 +178,17 @@ def _far_node(axes: Any, name: str, at: XY, bounds: tuple[float, float, float, f
     )  # fmt: skip
 
 
-def _reach_m(node: EdgeNode) -> float | None:
-    return max((i.range for i in node.spec.interfaces if i.range is not None and i.pairing is not None), default=None)
+def _points(scene: Scene, track: Track) -> np.ndarray:
+    return np.array([scene.frame.xy(s.place.lat, s.place.lon) for s in track.samples])
 
 
-def _path(axes: Any, record: Record, figure: Figure) -> None:
-    if len(record.samples) < 2:
+def _path(axes: Any, scene: Scene, figure: Figure) -> None:
+    """The only track, coloured by altitude."""
+    (track,) = scene.tracks
+    if len(track.samples) < 2:
         return
-    points = np.array([record.frame.xy(s.place.lat, s.place.lon) for s in record.samples])
-    heights = np.array([s.place.alt_m for s in record.samples])
+    points = _points(scene, track)
+    heights = np.array([s.place.alt_m for s in track.samples])
     segments = np.stack([points[:-1], points[1:]], axis=1)
     axes.plot(points[:, 0], points[:, 1], color="white", linewidth=5.0, zorder=4, solid_capstyle="round")
     line = LineCollection(list(segments), cmap="viridis", linewidth=3.0, zorder=5, capstyle="round")
@@ -219,25 +197,47 @@ def _path(axes: Any, record: Record, figure: Figure) -> None:
     bar = figure.colorbar(line, ax=axes, shrink=0.6, pad=0.01, aspect=30)
     bar.set_label("metres above home", fontsize=9)
     bar.ax.tick_params(labelsize=8)
-    step = max(len(points) // 6, 1)
-    for i in range(step // 2, len(points) - 1, step):
-        ahead = points[min(i + 2, len(points) - 1)] - points[i]
-        if math.hypot(*ahead) > 1.0:
+    _arrows(axes, points)
+
+
+def _paths(axes: Any, scene: Scene) -> None:
+    """Several tracks, each with its own colour and its start."""
+    for index, track in enumerate(scene.tracks):
+        if len(track.samples) < 2:
+            continue
+        colour = TRACK_COLOURS[index % len(TRACK_COLOURS)]
+        points = _points(scene, track)
+        label = track.name if len(scene.tracks) <= _NAMED_TRACKS else None
+        axes.plot(points[:, 0], points[:, 1], color="white", linewidth=3.6, zorder=4, solid_capstyle="round")
+        axes.plot(points[:, 0], points[:, 1], color=colour, linewidth=2.0, zorder=5, label=label)
+        axes.plot(
+            *points[0], marker="o", markersize=6, color="white", markeredgecolor=colour, markeredgewidth=2.0, zorder=6
+        )
+        _arrows(axes, points, colour)
+
+
+def _arrows(axes: Any, points: np.ndarray, colour: str = INK) -> None:
+    """Arrowheads in the direction of flight, at even distances along the path."""
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    if along[-1] < 5.0:
+        return
+    for share in (0.1, 0.26, 0.42, 0.58, 0.74, 0.9):
+        i = int(np.searchsorted(along, share * along[-1]))
+        ahead = int(np.searchsorted(along, along[i] + max(along[-1] * 0.01, 1.0)))
+        if i < ahead < len(points):
             axes.annotate(
-                "", points[i] + ahead, xytext=points[i],
-                arrowprops={"arrowstyle": "-|>", "color": INK, "linewidth": 0, "mutation_scale": 13}, zorder=5.5,
+                "", points[ahead], xytext=points[i],
+                arrowprops={"arrowstyle": "-|>", "color": colour, "linewidth": 0, "mutation_scale": 13}, zorder=5.5,
             )  # fmt: skip
 
 
-def _requests(axes: Any, record: Record) -> None:
-    for index, judged in enumerate(record.judgements, 1):
-        place = judged.asked or judged.at
-        if place is None:
-            continue
-        x, y = record.frame.xy(place.lat, place.lon)
-        if judged.refused and judged.asked is not None and judged.at is not None:
-            start = record.frame.xy(judged.at.lat, judged.at.lon)
-            axes.plot([start[0], x], [start[1], y], color=VERMILION, linewidth=1.2, linestyle=":", zorder=6)
-        style = REFUSED if judged.refused else CORRECTED
-        axes.plot(x, y, **style, label="refused" if judged.refused else "corrected", zorder=8)
-        number(axes, str(index), x, y)
+def _marks(axes: Any, scene: Scene) -> None:
+    for mark in scene.marks:
+        if mark.kind == "refused" and mark.origin is not None:
+            axes.plot(
+                [mark.origin[0], mark.at[0]], [mark.origin[1], mark.at[1]], color=VERMILION, linewidth=1.2,
+                linestyle=":", zorder=6,
+            )  # fmt: skip
+        axes.plot(*mark.at, **MARKS[mark.kind], label=mark.label or mark.kind, zorder=8)
+        number(axes, mark.number, *mark.at)

@@ -1,99 +1,167 @@
-"""The flight seen from the side: altitude over time, the limits, and the requests that policies changed."""
+"""Flights seen from the side: altitude, speed and battery over time, limits, requests, and what happened when."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
 
 from matplotlib.figure import Figure
 
-from fractus_sim.report.drawing import BLUE, CORRECTED, GREY, INK, ORANGE, REFUSED, canvas, number
-from fractus_sim.report.record import Judgement, Record
+from fractus_sim.report.drawing import BLUE, GREY, INK, ORANGE, PURPLE, TRACK_COLOURS, legend, number, panels
+from fractus_sim.report.scene import MARKS
+from fractus_sim.report.track import Sample, Track
 
-_PHASES = {"GUIDED": "driver flies", "RTL": "flies home", "LAND": "lands"}
+Panel = Literal["altitude", "speed", "battery"]
+_NAMED_TRACKS = 10
+_HEADROOM = 1.18
 
 
-def draw_altitude(record: Record) -> Figure:
-    """Draw the profile; time runs from the takeoff."""
-    figure, axes = canvas(9.0, 4.2)
-    start = record.takeoff_s if record.takeoff_s is not None else record.times.get("applied", 0.0)
-    times = [s.time_s - start for s in record.samples]
-    heights = [s.place.alt_m for s in record.samples]
-    axes.fill_between(times, heights, color=BLUE, alpha=0.10, zorder=1)
-    axes.plot(times, heights, color=BLUE, linewidth=2.0, label="altitude", zorder=4)
-    end = times[-1] if times else 1.0
-    shown = [*heights, *_limits(axes, record)]
-    shown += _requests(axes, record, start)
-    _home_leg(axes, record, start)
-    axes.set_xlim(min(times[0] if times else 0.0, 0.0), end)
-    axes.set_ylim(0, max(shown, default=10.0) * 1.18 + 1.0)
-    axes.set_xlabel("seconds since takeoff", fontsize=9)
-    axes.set_ylabel("metres above home", fontsize=9)
-    axes.set_title(f"{record.application.name}: altitude", fontsize=11, loc="left")
-    axes.grid(color="#EEEEEE", linewidth=0.6, zorder=0)
-    handles, labels = axes.get_legend_handles_labels()
-    unique = dict(zip(labels, handles, strict=True))
-    figure.legend(unique.values(), unique.keys(), loc="outside lower center", ncols=5, fontsize=8, frameon=False)
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """A dashed line in a panel."""
+
+    panel: Panel
+    value: float
+    words: str
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """A shaded stretch of time; `fault` draws it as something that went wrong, with its number."""
+
+    begin_s: float
+    end_s: float
+    words: str
+    fault: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A request that policies changed: what altitude was asked, and what was flown instead."""
+
+    kind: Literal["refused", "corrected"]
+    number: str
+    time_s: float
+    altitude_m: float
+    label: str
+    flown_m: float | None = None
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Everything in one picture; times are on the tracks' clock, and shown since `start_s`."""
+
+    title: str
+    tracks: tuple[Track, ...]
+    start_s: float
+    panels: tuple[Panel, ...] = ("altitude", "speed", "battery")
+    limits: tuple[Limit, ...] = ()
+    spans: tuple[Span, ...] = ()
+    requests: tuple[Request, ...] = ()
+    axis: str = "seconds"
+
+
+_VALUES: Mapping[Panel, tuple[str, Callable[[Sample], float]]] = {
+    "altitude": ("metres above home", lambda s: s.place.alt_m),
+    "speed": ("metres per second", lambda s: s.speed_mps),
+    "battery": ("battery, %", lambda s: s.battery * 100.0),
+}
+
+
+def draw_profile(profile: Profile) -> Figure:
+    """Draw the panels above each other, on one axis of time."""
+    figure, every = panels(9.0, _heights(profile), sharex=True)
+    for axes, panel in zip(every, profile.panels, strict=True):
+        shown = _curves(axes, profile, panel) + _limits(axes, profile, panel)
+        if panel == "altitude":
+            shown += _requests(axes, profile)
+        _spans(axes, profile, top=axes is every[0])
+        _scale(axes, panel, shown)
+    first, last = _time_span(profile)
+    every[-1].set_xlim(first, max(last, first + 1.0))
+    every[-1].set_xlabel(profile.axis, fontsize=9)
+    raised = 14 * min(sum(span.fault for span in profile.spans), 1)
+    every[0].set_title(profile.title, fontsize=11, loc="left", pad=6 + raised)
+    legend(figure, *every)
     return figure
 
 
-def _limits(axes: Any, record: Record) -> list[float]:
-    """Dashed lines for altitude limits; which of them held where is in the summary."""
-    drawn: list[float] = []
-    for policy in record.policies_in_force:
-        spec = policy.spec
-        if spec.type != "LimitControl" or spec.kind != "altitude" or spec.altitude_reference != "home":
-            continue
-        for limit, word in ((spec.upper_limit, "at most"), (spec.lower_limit, "at least")):
-            if limit is None:
-                continue
-            drawn.append(limit)
-            axes.axhline(limit, color=INK, linestyle=(0, (5, 3)), linewidth=1.1, label="altitude limit", zorder=3)
-            axes.annotate(
-                f"{policy.name}: {word} {limit:g} m", (0.62, limit), xycoords=("axes fraction", "data"),
-                xytext=(0, 4), textcoords="offset points", ha="center", fontsize=8, color=INK,
-            )  # fmt: skip
-    return drawn
+def _heights(profile: Profile) -> tuple[float, ...]:
+    return (4.2,) if len(profile.panels) == 1 else (2.8, *[1.7] * (len(profile.panels) - 1))
 
 
-def _requests(axes: Any, record: Record, start: float) -> list[float]:
-    heights = []
-    for index, judged in enumerate(record.judgements, 1):
-        place = judged.asked or judged.at
-        if place is None:
-            continue
-        at = judged.time_s - start
-        if not judged.refused and _climbs(judged):
-            flown = judged.flown.alt_m if judged.flown is not None else place.alt_m
+def _time_span(profile: Profile) -> tuple[float, float]:
+    times = [s.time_s - profile.start_s for track in profile.tracks for s in (track.samples[:1] + track.samples[-1:])]
+    return min([*times, 0.0]), max([*times, 1.0])
+
+
+def _curves(axes: Any, profile: Profile, panel: Panel) -> list[float]:
+    value = _VALUES[panel][1]
+    shown: list[float] = []
+    for index, track in enumerate(profile.tracks):
+        times = [s.time_s - profile.start_s for s in track.samples]
+        values = [value(s) for s in track.samples]
+        shown += values
+        if len(profile.tracks) == 1:
+            axes.fill_between(times, values, color=BLUE, alpha=0.10, zorder=1)
+            axes.plot(
+                times, values, color=BLUE, linewidth=2.0, label=panel if len(profile.panels) == 1 else None, zorder=4
+            )
+        else:
+            colour = TRACK_COLOURS[index % len(TRACK_COLOURS)]
+            label = track.name if len(profile.tracks) <= _NAMED_TRACKS else None
+            axes.plot(times, values, color=colour, linewidth=1.5, label=label, zorder=4)
+    return shown
+
+
+def _limits(axes: Any, profile: Profile, panel: Panel) -> list[float]:
+    drawn = [limit for limit in profile.limits if limit.panel == panel]
+    for limit in drawn:
+        axes.axhline(limit.value, color=INK, linestyle=(0, (5, 3)), linewidth=1.1, label=f"{panel} limit", zorder=3)
+        axes.annotate(
+            limit.words, (0.62, limit.value), xycoords=("axes fraction", "data"), xytext=(0, 4),
+            textcoords="offset points", ha="center", fontsize=8, color=INK,
+        )  # fmt: skip
+    return [limit.value for limit in drawn]
+
+
+def _requests(axes: Any, profile: Profile) -> list[float]:
+    for request in profile.requests:
+        at = request.time_s - profile.start_s
+        if request.flown_m is not None:
             axes.annotate(
-                "", (at, flown), xytext=(at, place.alt_m),
+                "", (at, request.flown_m), xytext=(at, request.altitude_m),
                 arrowprops={"arrowstyle": "-|>", "color": ORANGE, "linewidth": 1.6, "shrinkA": 5, "shrinkB": 0},
                 zorder=5,
             )  # fmt: skip
-        style = REFUSED if judged.refused else CORRECTED
-        axes.plot(at, place.alt_m, **style, label="refused" if judged.refused else "asked, and corrected", zorder=8)
-        number(axes, str(index), at, place.alt_m)
-        heights.append(place.alt_m)
-    return heights
+        axes.plot(at, request.altitude_m, **MARKS[request.kind], label=request.label, zorder=8)
+        number(axes, request.number, at, request.altitude_m)
+    return [request.altitude_m for request in profile.requests]
 
 
-def _climbs(judged: Judgement) -> bool:
-    return judged.asked is not None and judged.flown is not None and abs(judged.asked.alt_m - judged.flown.alt_m) > 0.05
-
-
-def _home_leg(axes: Any, record: Record, start: float) -> None:
-    """Shade what the system flew."""
-    spans: list[tuple[float, float, str]] = []
-    for sample in record.samples:
-        if sample.mode not in {"RTL", "SMART_RTL", "LAND"} or not sample.in_air:
-            continue
-        at = sample.time_s - start
-        if spans and at - spans[-1][1] < 3.0:
-            spans[-1] = (spans[-1][0], at, spans[-1][2])
+def _spans(axes: Any, profile: Profile, *, top: bool) -> None:
+    for span in profile.spans:
+        begin, end = span.begin_s - profile.start_s, span.end_s - profile.start_s
+        if span.fault:
+            axes.axvspan(begin, end, color=PURPLE, alpha=0.16, linewidth=0, zorder=0.6)
+            axes.axvline(begin, color=PURPLE, linewidth=1.2, zorder=2)
+            place = {"xytext": (0, 3), "va": "bottom", "ha": "left"}
         else:
-            spans.append((at, at, _PHASES.get(sample.mode, "flies home")))
-    for begin, end, words in spans:
-        axes.axvspan(begin, end, color=GREY, alpha=0.13, linewidth=0, zorder=0.5)
-        axes.annotate(
-            f"the system {words}", ((begin + end) / 2, 1.0), xycoords=("data", "axes fraction"), xytext=(0, -12),
-            textcoords="offset points", ha="center", fontsize=8, color=INK,
-        )  # fmt: skip
+            axes.axvspan(begin, end, color=GREY, alpha=0.13, linewidth=0, zorder=0.5)
+            place = {"xytext": (0, -12), "ha": "center"}
+            begin = (begin + end) / 2
+        if top and span.words:
+            axes.annotate(
+                span.words, (begin, 1.0), xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8,
+                color=INK, **place,
+            )  # fmt: skip
+
+
+def _scale(axes: Any, panel: Panel, shown: list[float]) -> None:
+    axes.set_ylabel(_VALUES[panel][0], fontsize=9)
+    axes.grid(color="#EEEEEE", linewidth=0.6, zorder=0)
+    if panel == "battery":
+        axes.set_ylim(0, 105)
+    else:
+        axes.set_ylim(0, max(shown, default=10.0) * _HEADROOM + 1.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 from collections.abc import Iterable, Mapping
@@ -13,38 +12,14 @@ from typing import Any
 
 from fractus_core.api import Application, DeploymentPlan, Depot, Drone, EdgeNode, Policy, Resource, Zone
 from fractus_core.api.geometry import Point
-from fractus_core.geo import LocalFrame, geodesic_m
+from fractus_core.geo import LocalFrame
 from fractus_core.policy.grants import node_attributes, selects
+
+from fractus_sim.report.track import Place, Sample, Track
 
 OBJECTS, AUDIT, CAMERA_AUDIT = "objects.json", "audit.jsonl", "camera-audit.jsonl"
 _DECIDED = {"correct", "deny", "takeover"}
 _KINDS: tuple[type[Resource], ...] = (Application, DeploymentPlan, Depot, Drone, EdgeNode, Policy, Zone)
-
-
-@dataclass(frozen=True, slots=True)
-class Place:
-    """Degrees, and metres above home."""
-
-    lat: float
-    lon: float
-    alt_m: float
-
-    @property
-    def ground(self) -> Point:
-        """The same without the altitude."""
-        return Point(lat=self.lat, lon=self.lon)
-
-
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """The drone at one moment; `time_s` is Unix time."""
-
-    time_s: float
-    place: Place
-    speed_mps: float
-    mode: str
-    in_air: bool
-    battery: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,38 +142,24 @@ class Record:
         )
 
     @property
+    def track(self) -> Track:
+        """The drone's flight."""
+        return Track(self.drone.name if self.drone else "no drone", self.samples)
+
+    @property
     def home(self) -> Place | None:
         """Where the drone took off."""
-        airborne = self._first_airborne()
-        return self.samples[max(airborne - 1, 0)].place if airborne is not None else None
+        return self.track.home
 
     @property
     def takeoff_s(self) -> float | None:
         """When the drone left the ground."""
-        airborne = self._first_airborne()
-        return self.samples[airborne].time_s if airborne is not None else None
+        return self.track.takeoff_s
 
     @property
     def landing_s(self) -> float | None:
         """When it was down again; None while it flies."""
-        last = max((i for i, s in enumerate(self.samples) if s.in_air), default=None)
-        return self.samples[last + 1].time_s if last is not None and last + 1 < len(self.samples) else None
-
-    @property
-    def distance_m(self) -> float:
-        """Length of the path over ground."""
-        flown = [s.place.ground for s in self.samples]
-        return sum(geodesic_m(a, b) for a, b in itertools.pairwise(flown))
-
-    @property
-    def max_altitude_m(self) -> float:
-        """The highest that the drone was, above home."""
-        return max((s.place.alt_m for s in self.samples), default=0.0)
-
-    @property
-    def max_speed_mps(self) -> float:
-        """The fastest that it was, over ground."""
-        return max((s.speed_mps for s in self.samples), default=0.0)
+        return self.track.landing_s
 
     @property
     def frame(self) -> LocalFrame:
@@ -208,9 +169,6 @@ class Record:
             return LocalFrame(home.lat, home.lon)
         at = self.depots[0].spec.location if self.depots else Point(lat=0, lon=0)
         return LocalFrame.at(at)
-
-    def _first_airborne(self) -> int | None:
-        return next((i for i, s in enumerate(self.samples) if s.in_air), None)
 
 
 def _lines(path: Path) -> list[dict[str, Any]]:

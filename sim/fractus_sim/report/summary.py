@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from fractus_core.geo import geodesic_m
-
+from fractus_sim.report.page import clock, table
 from fractus_sim.report.record import Judgement, Record
 
 _ROLES = {
@@ -48,11 +47,11 @@ def figures(record: Record) -> dict[str, Any]:
         "corrected": sum(j.count for j in record.judgements if not j.refused),
         "refused": sum(j.count for j in record.judgements if j.refused),
         "flight_s": _round(_span(record.takeoff_s, record.landing_s)),
-        "distance_m": _round(record.distance_m),
-        "max_altitude_m": _round(record.max_altitude_m),
-        "max_speed_mps": _round(record.max_speed_mps),
+        "distance_m": _round(record.track.distance_m),
+        "max_altitude_m": _round(record.track.max_altitude_m),
+        "max_speed_mps": _round(record.track.max_speed_mps),
         "landed": record.landing_s is not None,
-        "landed_from_home_m": _round(_miss_m(record)),
+        "landed_from_home_m": _round(record.track.miss_m),
         "times": {name: _round(seconds) for name, seconds in _durations(record)},
         "judgements": [
             {
@@ -83,21 +82,21 @@ def _headline(record: Record) -> str:
         reason = (status.message if status else None) or ""
         who = record.drone.name if record.drone else "The drone"
         return f"**{phase}.** {who} did not fly. {reason}".strip()
-    miss = _miss_m(record)
+    miss = record.track.miss_m
     end = "is still in the air" if miss is None else f"landed {miss:.1f} m from where it took off"
-    took = f" in {_clock(flight_s)}" if flight_s is not None else ""
+    took = f" in {clock(flight_s)}" if flight_s is not None else ""
     corrected = sum(j.count for j in record.judgements if not j.refused)
     refused = sum(j.count for j in record.judgements if j.refused)
     return (
-        f"**{phase}.** {drone} flew {record.distance_m:.0f} m{took}, up to {record.max_altitude_m:.1f} m high and"
-        f" {record.max_speed_mps:.1f} m/s fast, and {end}. Of {record.calls} calls, policies corrected {corrected}"
+        f"**{phase}.** {drone} flew {record.track.distance_m:.0f} m{took}, up to {record.track.max_altitude_m:.1f} m high and"
+        f" {record.track.max_speed_mps:.1f} m/s fast, and {end}. Of {record.calls} calls, policies corrected {corrected}"
         f" and refused {refused}. {record.results} pictures were checked and kept."
     )
 
 
 def _figures(record: Record) -> str:
-    rows = [(name, _clock(seconds)) for name, seconds in _durations(record)]
-    return "## Times\n\n" + _table(("Since the apply", "After"), rows) if rows else ""
+    rows = [(name, clock(seconds)) for name, seconds in _durations(record)]
+    return "## Times\n\n" + table(("Since the apply", "After"), rows) if rows else ""
 
 
 def _durations(record: Record) -> list[tuple[str, float]]:
@@ -131,7 +130,7 @@ def _judged(judgements: Sequence[Judgement]) -> str:
         for number, j in enumerate(judgements, 1)
     ]
     head = ("No", "UTC", "Component", "Asked", "Outcome", "Policies", "Reason")
-    return "## What policies did\n\n" + _table(head, rows) + "\n\nNumbers are those of the pictures."
+    return "## What policies did\n\n" + table(head, rows) + "\n\nNumbers are those of the pictures."
 
 
 def _placements(record: Record) -> str:
@@ -145,10 +144,10 @@ def _placements(record: Record) -> str:
             why += f", adds {placed.coverage:.0%} of the operation area"
         count = f" x{placed.replicas}" if placed.replicas > 1 else ""
         rows.append((placed.component, (placed.node or "any cloud node") + count, why))
-    text = "## Where it ran\n\n" + _table(("Component", "Node", "Why"), rows)
+    text = "## Where it ran\n\n" + table(("Component", "Node", "Why"), rows)
     rejected = [(r.component, r.node, f"{r.reason}: {r.message}") for r in record.plan.spec.rejected]
     if rejected:
-        text += "\n\nDropped:\n\n" + _table(("Component", "Node", "Why not"), rejected)
+        text += "\n\nDropped:\n\n" + table(("Component", "Node", "Why not"), rejected)
     return text
 
 
@@ -157,7 +156,7 @@ def _pods(record: Record) -> str:
         (p.name, p.node, f"{p.running_s - p.created_s:.0f} s" if p.running_s is not None else "never", str(p.restarts))
         for p in record.pods
     ]
-    return "## Pods\n\n" + _table(("Pod", "Node", "To Running", "Restarts"), rows) if rows else ""
+    return "## Pods\n\n" + table(("Pod", "Node", "To Running", "Restarts"), rows) if rows else ""
 
 
 def _audit(record: Record) -> str:
@@ -168,27 +167,8 @@ def _audit(record: Record) -> str:
     return f"## Audit log\n\n{entries} entries on the drone, {record.audit.get('kept', 0)} of this mission; {verdict}."
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
-    return "\n".join(lines)
-
-
-def _miss_m(record: Record) -> float | None:
-    if record.home is None or record.landing_s is None:
-        return None
-    return geodesic_m(record.home.ground, record.samples[-1].place.ground)
-
-
 def _span(start: float | None, end: float | None) -> float | None:
     return end - start if start is not None and end is not None else None
-
-
-def _clock(seconds: float | None) -> str:
-    if seconds is None:
-        return "-"
-    whole = round(seconds)
-    return f"{seconds:.1f} s" if whole < 60 else f"{whole // 60} min {whole % 60:02d} s"
 
 
 def _stamp(time_s: float) -> str:

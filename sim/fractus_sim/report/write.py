@@ -10,7 +10,8 @@ import yaml
 from fractus_sim.report.drawing import save
 from fractus_sim.report.features import features
 from fractus_sim.report.flightmap import draw_map
-from fractus_sim.report.profile import draw_altitude
+from fractus_sim.report.mission import profile_of, scene_of
+from fractus_sim.report.profile import draw_profile
 from fractus_sim.report.record import Record
 from fractus_sim.report.summary import figures, summary
 
@@ -23,5 +24,5 @@ def write_report(record: Record, folder: Path) -> None:
     (folder / "flight.geojson").write_text(json.dumps(features(record)) + "\n")
     if record.plan is not None:
         (folder / "plan.yaml").write_text(yaml.safe_dump(record.plan.to_dict(), sort_keys=False))
-    save(draw_map(record), folder / "map.png")
-    save(draw_altitude(record), folder / "altitude.png")
+    save(draw_map(scene_of(record)), folder / "map.png")
+    save(draw_profile(profile_of(record)), folder / "altitude.png")

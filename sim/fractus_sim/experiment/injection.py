@@ -1,0 +1,180 @@
+"""Makes faults happen when they are due, and takes them away again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.experiment.faults import Fault, LinkLoss, NodePowerOff
+from fractus_sim.experiment.station import Station
+
+ANSWER_S = 1.0
+ATTEMPTS = 5
+
+
+class Breaker(Protocol):
+    """What can be cut on a stage besides parameters."""
+
+    def cut_link(self, vehicle: str) -> None:
+        """Let nothing pass on the vehicle's link of this mode."""
+
+    def heal_link(self, vehicle: str) -> None:
+        """Let everything pass again."""
+
+    def power_off(self, node: str) -> None:
+        """Pull a node's power."""
+
+    def power_on(self, node: str) -> None:
+        """Give it back."""
+
+
+@dataclass(frozen=True, slots=True)
+class Occurrence:
+    """A fault as it happened to one vehicle; seconds of the experiment.
+
+    Attributes:
+        vehicle: empty for a node without a vehicle.
+        end_s: None while it lasts.
+    """
+
+    kind: str
+    title: str
+    vehicle: str
+    begin_s: float
+    end_s: float | None = None
+
+
+@dataclass(slots=True)
+class _Running:
+    fault: Fault
+    vehicle: str
+    steps: Generator[None, None, None]
+    index: int | None = None
+    over: bool = False
+
+
+class Injector:
+    """All faults of an experiment.
+
+    Args:
+        faults: What is to happen.
+        observers: For each vehicle, a link that no fault cuts.
+        breaker: Cuts links and power.
+        tell: Gets a sentence when a fault begins or ends.
+    """
+
+    def __init__(
+        self,
+        faults: Sequence[Fault],
+        observers: dict[str, Station],
+        breaker: Breaker,
+        tell: Callable[[str], None],
+    ) -> None:
+        self.occurrences: list[Occurrence] = []
+        self.takeoffs_s: dict[str, float] = {}
+        self._observers, self._breaker, self._tell = observers, breaker, tell
+        self._now_s = 0.0
+        self._running = [self._prepare(fault, vehicle) for fault in faults for vehicle in self._victims(fault)]
+
+    def step(self, now_s: float) -> None:
+        """Go on; to be called at every poll, after the observers were polled.
+
+        Raises:
+            ExperimentError: a vehicle does not take a parameter.
+        """
+        self._now_s = now_s
+        for name, observer in self._observers.items():
+            if observer.state.flying and name not in self.takeoffs_s:
+                self.takeoffs_s[name] = now_s
+        for running in self._running:
+            if not running.over:
+                running.over = next(running.steps, StopIteration) is StopIteration
+
+    @property
+    def pending(self) -> bool:
+        """Whether a fault that can still happen has not ended."""
+        return any(not r.over and (r.index is not None or self._begin_s(r) is not None) for r in self._running)
+
+    def _victims(self, fault: Fault) -> Sequence[str]:
+        if isinstance(fault, NodePowerOff) and fault.node is not None:
+            return [""]
+        return fault.vehicles or tuple(self._observers)
+
+    def _prepare(self, fault: Fault, vehicle: str) -> _Running:
+        running = _Running(fault, vehicle, iter(()))  # type: ignore[arg-type]
+        running.steps = self._happen(running)
+        return running
+
+    def _begin_s(self, running: _Running) -> float | None:
+        if running.fault.since == "start":
+            return running.fault.at
+        takeoffs = self.takeoffs_s
+        first = takeoffs.get(running.vehicle) if running.vehicle else min(takeoffs.values(), default=None)
+        return None if first is None else first + running.fault.at
+
+    def _happen(self, running: _Running) -> Generator[None, None, None]:
+        fault = running.fault
+        while (begin_s := self._begin_s(running)) is None or self._now_s < begin_s:
+            yield
+        running.index = len(self.occurrences)
+        self.occurrences.append(Occurrence(fault.fault, fault.title, running.vehicle, self._now_s))
+        self._tell(f"{running.vehicle or 'cluster'}: {fault.title}")
+        before: dict[str, float] = {}
+        if isinstance(fault, LinkLoss | NodePowerOff):
+            self._break(fault, running.vehicle)
+        for after_s, values in fault.steps():
+            while self._now_s < begin_s + after_s:
+                yield
+            for name, value in values.items():
+                if name not in before and fault.duration is not None:
+                    before[name] = yield from self._read(running.vehicle, name)
+                yield from self._set(running.vehicle, name, value)
+        if fault.duration is None:
+            return
+        while self._now_s < begin_s + fault.duration:
+            yield
+        if isinstance(fault, LinkLoss | NodePowerOff):
+            self._mend(fault, running.vehicle)
+        for name, value in before.items():
+            yield from self._set(running.vehicle, name, value)
+        found = self.occurrences[running.index]
+        self.occurrences[running.index] = Occurrence(found.kind, found.title, found.vehicle, found.begin_s, self._now_s)
+        self._tell(f"{running.vehicle or 'cluster'}: {fault.title} is over")
+
+    def _break(self, fault: LinkLoss | NodePowerOff, vehicle: str) -> None:
+        if isinstance(fault, LinkLoss):
+            self._breaker.cut_link(vehicle)
+        else:
+            self._breaker.power_off(fault.node or vehicle)
+
+    def _mend(self, fault: LinkLoss | NodePowerOff, vehicle: str) -> None:
+        if isinstance(fault, LinkLoss):
+            self._breaker.heal_link(vehicle)
+        else:
+            self._breaker.power_on(fault.node or vehicle)
+
+    def _read(self, vehicle: str, name: str) -> Generator[None, None, float]:
+        observer = self._observers[vehicle]
+        for _ in range(ATTEMPTS):
+            observer.read_parameter(name)
+            if (yield from self._answered(observer, name)):
+                return observer.parameters[name]
+        raise ExperimentError(f"{vehicle}: the autopilot has no parameter {name}, which a fault needs")
+
+    def _set(self, vehicle: str, name: str, value: float) -> Generator[None, None, None]:
+        observer = self._observers[vehicle]
+        for _ in range(ATTEMPTS):
+            observer.set_parameter(name, value)
+            if (yield from self._answered(observer, name)):
+                return
+        raise ExperimentError(f"{vehicle}: the autopilot does not take {name} = {value:g}, which a fault needs")
+
+    def _answered(self, observer: Station, name: str) -> Generator[None, None, bool]:
+        deadline_s = self._now_s + ANSWER_S
+        while self._now_s < deadline_s:
+            yield
+            if name in observer.parameters:
+                return True
+        return False

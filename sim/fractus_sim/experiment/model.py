@@ -1,0 +1,321 @@
+"""An experiment as its file describes it: vehicles, surroundings, tasks, programs, faults in time, and checks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+import yaml
+from fractus_core.api.geometry import AltitudeBand, Area, Latitude, Longitude
+from fractus_core.api.model import InvalidObject, Model, Name
+from pydantic import Field, ValidationError, model_validator
+
+from fractus_sim.experiment.checks import (
+    ApplicationPhase,
+    CallJudged,
+    Check,
+    InsideZone,
+    OutsideZone,
+    ProgramEnded,
+    TaskDone,
+    VehicleCheck,
+)
+from fractus_sim.experiment.faults import LINK_OF_MODE, Fault, LinkLoss, NodePowerOff
+from fractus_sim.experiment.tasks import Step
+from fractus_sim.vehicle.earth import Place
+
+Mode = Literal["vehicles", "standalone", "cluster"]
+ParameterName = Annotated[str, Field(pattern=r"^[A-Z][A-Z0-9_]{0,15}$")]
+MAX_VEHICLES = 50
+
+
+class Home(Model):
+    """Where a vehicle stands."""
+
+    lat: Latitude
+    lon: Longitude
+    alt: float = Field(default=0, ge=-500, le=9000, description="Ground height, metres above mean sea level.")
+
+
+class Wind(Model):
+    """The wind from the beginning on."""
+
+    speed: float = Field(default=0, ge=0, lt=60, description="Metres per second.")
+    direction: float = Field(default=270, ge=0, lt=360, description="Degrees it comes from.")
+    turbulence: float = Field(default=0, ge=0, lt=30, description="Standard deviation, metres per second.")
+
+
+class CameraWorld(Model):
+    """What cameras see (mode standalone)."""
+
+    seed: int = Field(default=1, description="Of the generated ground.")
+    arguments: tuple[str, ...] = Field(default=(), description="Further arguments of `fractus camera-world`.")
+
+
+class VehicleEntry(Model):
+    """A vehicle, or a row of equal ones."""
+
+    name: Name = Field(description="With a count above 1, -1, -2, ... is appended.")
+    count: int = Field(default=1, ge=1, le=MAX_VEHICLES)
+    spacing: float = Field(default=10, gt=0, le=1000, description="Metres between the vehicles of a row.")
+    bearing: float = Field(default=90, ge=0, lt=360, description="Direction in which the row extends, degrees.")
+    home: Home | None = None
+    heading: float = Field(default=0, ge=0, lt=360, description="Degrees.")
+    parameters: dict[ParameterName, float] = Field(default_factory=dict, description="Of the autopilot.")
+    ready_after: float = Field(default=5, ge=1, le=120, description="Seconds until the autopilot is ready to arm.")
+    connection: str | None = Field(
+        default=None,
+        pattern=r"^tcp:[^:\s]+:\d{1,5}$",
+        description="tcp:HOST:PORT of an autopilot that runs already, such as ArduPilot's SITL (mode vehicles).",
+    )
+    camera: bool = Field(default=False, description="With a camera and its service (mode standalone).")
+    task: tuple[Step, ...] = Field(default=(), max_length=500, description="What the runner's ground station flies.")
+
+    @model_validator(mode="after")
+    def _stands_somewhere(self) -> Self:
+        if self.connection is not None and (self.count > 1 or self.home is not None or self.parameters):
+            raise InvalidObject("connection", "count, home and parameters are not ours to give to a running autopilot")
+        return self
+
+    def names(self) -> tuple[str, ...]:
+        """Names of its vehicles."""
+        return (self.name,) if self.count == 1 else tuple(f"{self.name}-{at + 1}" for at in range(self.count))
+
+
+class NamedZone(Model):
+    """A piece of air that checks and pictures speak of."""
+
+    name: Name
+    kind: Literal["exclusion", "inclusion", "other"] = "other"
+    area: Area
+    altitude: AltitudeBand | None = None
+
+
+class Program(Model):
+    """A program that runs beside the vehicles.
+
+    In mode vehicles it finds its vehicle's MAVLink connection in FRACTUS_VEHICLE; in mode standalone it runs as a
+    component of the application, with the environment of that component's pod.
+    """
+
+    name: Name
+    command: tuple[str, ...] = Field(min_length=1, description="Relative paths are relative to the file.")
+    vehicle: Name | None = Field(default=None, description="Mode vehicles: which vehicle it flies.")
+    component: str | None = Field(default=None, description="Mode standalone: which component it is.")
+    environment: dict[str, str] = Field(default_factory=dict)
+    background: bool = Field(default=False, description="Do not wait for its end; it is stopped at the end.")
+
+
+class ClusterPart(Model):
+    """The embedded cluster, and what is applied to it."""
+
+    file: str = Field(description="Cluster file, relative to the experiment's file.")
+    images: tuple[str, ...] = Field(default=(), description="Further targets of the Dockerfile to build.")
+    apply: tuple[str, ...] = Field(min_length=1, description="Manifests; the Applications among them are applied last.")
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleSetup:
+    """One vehicle, with the entry it comes from."""
+
+    name: str
+    system_id: int
+    entry: VehicleEntry
+    home: Home | None
+
+
+class Experiment(Model):
+    """One experiment."""
+
+    name: Name
+    description: str = ""
+    mode: Mode = Field(
+        default="vehicles",
+        description="vehicles: autopilots alone; standalone: with Fractus' services as local processes; cluster: on the"
+        " embedded Kubernetes cluster.",
+    )
+    seed: int = Field(default=1, ge=0, description="Of all noise.")
+    speedup: float | None = Field(
+        default=None,
+        ge=0,
+        le=100,
+        description="Times real time; 0 (mode vehicles, the default without programs): in lockstep, as fast as possible,"
+        " byte for byte repeatable.",
+    )
+    timeout: float = Field(default=300, gt=0, le=7200, description="Seconds of the experiment, at most.")
+    settle: float = Field(default=3, ge=0, le=600, description="Seconds to go on when all is done.")
+    wind: Wind = Wind()
+    world: CameraWorld = CameraWorld()
+    vehicles: tuple[VehicleEntry, ...] = Field(min_length=1, max_length=MAX_VEHICLES)
+    zones: tuple[NamedZone, ...] = ()
+    manifests: tuple[str, ...] = Field(
+        default=(), description="Mode standalone: Application, Policy, Zone, Depot and Drone files or directories."
+    )
+    programs: tuple[Program, ...] = ()
+    cluster: ClusterPart | None = None
+    faults: tuple[Fault, ...] = ()
+    checks: tuple[Check, ...] = ()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        _check_vehicles(self)
+        _check_mode(self)
+        _check_faults(self)
+        _check_checks(self)
+        return self
+
+    @property
+    def pace(self) -> float:
+        """Times real time; 0: lockstep."""
+        if self.speedup is not None:
+            return self.speedup
+        return 0.0 if self.mode == "vehicles" and not self.programs and not self.external else 1.0
+
+    @property
+    def external(self) -> bool:
+        """Whether a vehicle is not ours."""
+        return any(entry.connection is not None for entry in self.vehicles)
+
+    def setups(self) -> tuple[VehicleSetup, ...]:
+        """Every vehicle, rows spread out, with consecutive system ids."""
+        found: list[VehicleSetup] = []
+        for entry in self.vehicles:
+            for at, name in enumerate(entry.names()):
+                found.append(VehicleSetup(name, len(found) + 1, entry, _spread(entry, at)))
+        return tuple(found)
+
+    def zone(self, name: str) -> NamedZone:
+        """A zone by name."""
+        return next(zone for zone in self.zones if zone.name == name)
+
+
+def load(path: Path) -> Experiment:
+    """Read an experiment's file.
+
+    Raises:
+        InvalidObject: the file is missing, not YAML, or a field is wrong; the message names it.
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InvalidObject("", f"cannot read {path}: {error.strerror}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InvalidObject("", f"{path} is not YAML: {' '.join(str(error).split())}") from None
+    try:
+        return parse(content)
+    except InvalidObject as error:
+        raise InvalidObject("", f"{path}: {error}") from None
+
+
+def parse(content: object) -> Experiment:
+    """Make an experiment of parsed YAML.
+
+    Raises:
+        InvalidObject: a field is wrong; the message names it.
+    """
+    try:
+        return Experiment.model_validate(content)
+    except ValidationError as error:
+        raise InvalidObject.from_pydantic(error) from None
+
+
+def _spread(entry: VehicleEntry, at: int) -> Home | None:
+    if entry.home is None or at == 0:
+        return entry.home
+    bearing = math.radians(entry.bearing)
+    start = Place.from_degrees(entry.home.lat, entry.home.lon, entry.home.alt)
+    there = start.offset(at * entry.spacing * math.cos(bearing), at * entry.spacing * math.sin(bearing))
+    return Home(lat=there.lat_e7 / 1e7, lon=there.lon_e7 / 1e7, alt=entry.home.alt)
+
+
+def _check_vehicles(experiment: Experiment) -> None:
+    names = [name for entry in experiment.vehicles for name in entry.names()]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InvalidObject("vehicles", f"the name {twice[0]} is given twice; give each its own name")
+    if len(names) > MAX_VEHICLES:
+        raise InvalidObject("vehicles", f"there are {len(names)}; at most {MAX_VEHICLES} fly in one experiment")
+    for index, entry in enumerate(experiment.vehicles):
+        if entry.home is None and entry.connection is None and experiment.mode != "cluster":
+            raise InvalidObject(
+                f"vehicles[{index}].home", f"is needed in mode {experiment.mode}: where {entry.name} stands"
+            )
+        if entry.connection is not None and experiment.mode != "vehicles":
+            raise InvalidObject(f"vehicles[{index}].connection", "is for mode vehicles")
+        if entry.task and experiment.mode != "vehicles":
+            raise InvalidObject(
+                f"vehicles[{index}].task", f"is for mode vehicles; in mode {experiment.mode} applications fly the drone"
+            )
+        if entry.camera and experiment.mode != "standalone":
+            raise InvalidObject(f"vehicles[{index}].camera", "is for mode standalone")
+
+
+def _check_mode(experiment: Experiment) -> None:
+    mode = experiment.mode
+    if (experiment.cluster is not None) != (mode == "cluster"):
+        raise InvalidObject("cluster", "is needed in mode cluster, and only there")
+    if bool(experiment.manifests) != (mode == "standalone"):
+        raise InvalidObject("manifests", "are needed in mode standalone, and only there")
+    if mode == "cluster" and (experiment.speedup not in {None, 1.0} or experiment.programs):
+        raise InvalidObject("", "in mode cluster time is real and programs are pods: leave speedup and programs out")
+    if experiment.speedup == 0 and (mode != "vehicles" or experiment.programs or experiment.external):
+        raise InvalidObject("speedup", "0 (lockstep) is for mode vehicles without programs and connections")
+    names = {name for entry in experiment.vehicles for name in entry.names()}
+    for index, program in enumerate(experiment.programs):
+        wanted, field = (program.vehicle, "vehicle") if mode == "vehicles" else (program.component, "component")
+        if wanted is None:
+            raise InvalidObject(f"programs[{index}].{field}", f"is needed in mode {mode}")
+        if mode == "vehicles":
+            _known(f"programs[{index}].vehicle", [wanted], names, "vehicle")
+
+
+def _check_faults(experiment: Experiment) -> None:
+    names = {name for entry in experiment.vehicles for name in entry.names()}
+    for index, fault in enumerate(experiment.faults):
+        where = f"faults[{index}]"
+        _known(f"{where}.vehicles", fault.vehicles, names, "vehicle")
+        if isinstance(fault, LinkLoss) and fault.link not in {None, LINK_OF_MODE[experiment.mode]}:
+            raise InvalidObject(
+                f"{where}.link",
+                f"{fault.link} does not exist in mode {experiment.mode}; use {LINK_OF_MODE[experiment.mode]}",
+            )
+        if isinstance(fault, NodePowerOff):
+            if experiment.mode == "vehicles":
+                raise InvalidObject(f"{where}.fault", "nodePowerOff needs a node; use mode standalone or cluster")
+            if fault.node is not None and experiment.mode != "cluster":
+                raise InvalidObject(f"{where}.node", "is for mode cluster; name vehicles")
+
+
+def _check_checks(experiment: Experiment) -> None:
+    names = {name for entry in experiment.vehicles for name in entry.names()}
+    zones, programs = {zone.name for zone in experiment.zones}, {program.name for program in experiment.programs}
+    kinds = {fault.fault for fault in experiment.faults}
+    for index, check in enumerate(experiment.checks):
+        where = f"checks[{index}]"
+        if isinstance(check, VehicleCheck):
+            _known(f"{where}.vehicles", check.vehicles, names, "vehicle")
+        if isinstance(check, OutsideZone | InsideZone):
+            _known(f"{where}.zone", [check.zone], zones, "zone")
+        if isinstance(check, ProgramEnded):
+            _known(f"{where}.program", [check.program], programs, "program")
+        if isinstance(check, CallJudged) and experiment.mode == "vehicles":
+            raise InvalidObject(
+                f"{where}.check", "call is for modes standalone and cluster: vehicles alone judge nothing"
+            )
+        if isinstance(check, ApplicationPhase) and experiment.mode != "cluster":
+            raise InvalidObject(f"{where}.check", "phase is for mode cluster")
+        if isinstance(check, TaskDone) and not any(entry.task for entry in experiment.vehicles):
+            raise InvalidObject(f"{where}.check", "task: no vehicle has one")
+        after = getattr(check, "after", None)
+        if after is not None:
+            _known(f"{where}.after", [after], kinds, "fault")
+
+
+def _known(field: str, given: Iterable[str], there: Iterable[str], what: str) -> None:
+    for name in given:
+        if name not in there:
+            known = ", ".join(sorted(there)) or "none"
+            raise InvalidObject(field, f"there is no {what} {name}; there are: {known}")

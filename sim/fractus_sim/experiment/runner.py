@@ -1,0 +1,274 @@
+"""Plays an experiment from its file to its verdicts."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.experiment.flying import TaskFailed, fly
+from fractus_sim.experiment.injection import Injector, Occurrence
+from fractus_sim.experiment.judging import Evidence, Verdict, judge
+from fractus_sim.experiment.logbook import Flight, McapLog, Recorder
+from fractus_sim.experiment.model import Experiment, VehicleSetup
+from fractus_sim.experiment.stage import Findings, Moment, Stage
+from fractus_sim.experiment.vehicles import VehicleStage
+
+READY_S = 90.0
+LONG_AGO_S = 1e6
+SHOW_EVERY_S = 0.2
+
+
+def _silent(_line: str) -> None:
+    """Take a line of progress and drop it."""
+
+
+@dataclass
+class Progress:
+    """Where a run tells what happens.
+
+    Attributes:
+        tell: gets what happened, a line at a time.
+        show: gets the state of things a few times a second.
+    """
+
+    tell: Callable[[str], None] = _silent
+    show: Callable[[str], None] = _silent
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of an experiment; seconds of the experiment.
+
+    Attributes:
+        problem: why it could not be played to its end; empty when it could.
+        duration_s: how long it took, in the vehicles' time.
+        wall_s: how long it took here.
+        events: (seconds, vehicle or empty, text) of tasks and faults.
+    """
+
+    experiment: Experiment
+    folder: Path
+    flights: dict[str, Flight]
+    occurrences: tuple[Occurrence, ...]
+    verdicts: tuple[Verdict, ...]
+    findings: Findings
+    events: tuple[tuple[float, str, str], ...]
+    duration_s: float
+    wall_s: float
+    problem: str = ""
+
+    @property
+    def holds(self) -> bool:
+        """Whether it was played to its end and every check holds."""
+        return not self.problem and all(verdict.holds for verdict in self.verdicts)
+
+
+@dataclass
+class _Play:
+    """One run under way."""
+
+    experiment: Experiment
+    stage: Stage
+    flights: dict[str, Flight]
+    recorders: dict[str, Recorder]
+    log: McapLog
+    progress: Progress
+    injector: Injector = field(init=False)
+    tasks: dict[str, Generator[None, None, None]] = field(default_factory=dict)
+    events: list[tuple[float, str, str]] = field(default_factory=list)
+    start: Moment = field(default_factory=lambda: Moment(0.0, 0))
+    moment: Moment = field(default_factory=lambda: Moment(0.0, 0))
+    begun: bool = False
+    calm_since_s: float | None = None
+
+    @property
+    def now_s(self) -> float:
+        """Seconds of the experiment; negative before vehicles are ready."""
+        return self.moment.time_s - self.start.time_s if self.begun else self.moment.time_s - LONG_AGO_S
+
+    def tell(self, vehicle: str, text: str) -> None:
+        self.events.append((self.now_s, vehicle, text))
+        self.progress.tell(f"{self.now_s:6.1f} s  {vehicle + ': ' if vehicle else ''}{text}")
+        self.log.write("/events", "event", self.moment.unix_us, {"time_s": round(self.now_s, 3), "text": text})
+
+    def poll(self) -> None:
+        """Let a little time pass, and take in what vehicles say."""
+        self.moment = self.stage.tick()
+        for station in self.stage.pilots.values():
+            station.poll(self.now_s, self.moment.unix_us)
+        for name, observer in self.stage.observers.items():
+            messages = observer.poll(self.now_s, self.moment.unix_us)
+            if self.begun:
+                self.recorders[name].take(observer, messages, self.now_s, self.moment.unix_us)
+
+    def step_tasks(self) -> None:
+        for name, task in self.tasks.items():
+            if self.flights[name].task:
+                continue
+            try:
+                next(task)
+            except StopIteration:
+                self.flights[name].task = "done"
+                self.tell(name, "task done")
+            except TaskFailed as failure:
+                self.flights[name].task = str(failure)
+                self.tell(name, f"task broken off: {failure}")
+
+    def over(self) -> bool:
+        """Whether all is done and has been calm for as long as it should."""
+        states = {name: observer.state for name, observer in self.stage.observers.items()}
+        flown = self.injector.takeoffs_s
+        waiting = any(not self.flights[name].task for name in self.tasks)
+        idle = self.stage.flies and not any(name in flown for name in self.stage.flies)
+        moving = any(state.armed or state.flying for state in states.values())
+        if waiting or idle or moving or self.stage.busy or self.injector.pending:
+            self.calm_since_s = None
+            return False
+        self.calm_since_s = self.now_s if self.calm_since_s is None else self.calm_since_s
+        return self.now_s - self.calm_since_s >= self.experiment.settle
+
+
+def run(experiment: Experiment, out: Path, *, base: Path | None = None, progress: Progress | None = None) -> Outcome:
+    """Play an experiment and leave logs, tracks, pictures and report in a folder.
+
+    Args:
+        experiment: What to play; `fractus_sim.experiment.model.load` reads a file.
+        out: The folder; what an earlier run left there is overwritten.
+        base: What relative paths in the experiment are relative to; by default the working directory.
+        progress: Told what happens.
+
+    Raises:
+        ExperimentError: it could not be set up; the message says what to do.
+    """
+    from fractus_sim.experiment.reporting import write_outcome  # noqa: PLC0415 - matplotlib is slow to import
+
+    progress = progress or Progress()
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "logs").mkdir(exist_ok=True)
+    began_s = time.monotonic()
+    stage = _stage(experiment, out, base or Path.cwd(), progress)
+    log = McapLog(out / "logs" / f"{experiment.name}.mcap")
+    try:
+        flights = {setup.name: Flight(setup.name) for setup in experiment.setups()}
+        play = _Play(experiment, stage, flights, {n: Recorder(f, log) for n, f in flights.items()}, log, progress)
+        problem = _play(play)
+    finally:
+        log.close()
+        stage.close()
+    outcome = _outcome(play, out, problem, time.monotonic() - began_s)
+    write_outcome(outcome)
+    return outcome
+
+
+def _stage(experiment: Experiment, out: Path, base: Path, progress: Progress) -> Stage:
+    if experiment.mode == "vehicles":
+        return VehicleStage(experiment, out, base, progress.tell)
+    if experiment.mode == "standalone":
+        from fractus_sim.experiment.services import ServiceStage  # noqa: PLC0415 - imports most of Fractus
+
+        return ServiceStage(experiment, out, base, progress.tell)
+    from fractus_sim.experiment.clustered import ClusterStage  # noqa: PLC0415 - imports the embedded cluster
+
+    return ClusterStage(experiment, out, base, progress.tell)
+
+
+def _play(play: _Play) -> str:
+    """Set up, wait until vehicles are ready, and play; returns why it did not end as it should, or nothing.
+
+    Raises:
+        ExperimentError: it could not be set up.
+    """
+    stage, experiment, progress = play.stage, play.experiment, play.progress
+    stage.set_up()
+    for name, endpoint in stage.endpoints.items():
+        progress.tell(f"{name}: QGroundControl, Mission Planner or MAVProxy can attach to {endpoint}")
+    _wait_ready(play)
+    play.start, play.begun = play.moment, True
+    play.injector = Injector(experiment.faults, stage.observers, stage, lambda text: _tell_fault(play, text))
+    for setup in experiment.setups():
+        if setup.entry.task:
+            play.tasks[setup.name] = fly(stage.pilots[setup.name], setup.entry.task, _teller(play, setup))
+    play.tell("", "vehicles are ready")
+    try:
+        stage.begin()
+        problem = _until_over(play)
+    except ExperimentError as error:
+        problem = str(error)
+        play.tell("", problem)
+    stage.collect()
+    return problem
+
+
+def _wait_ready(play: _Play) -> None:
+    slowest_s = max(setup.entry.ready_after for setup in play.experiment.setups())
+    deadline_s = READY_S + slowest_s
+    while True:
+        play.poll()
+        waiting = [name for name, observer in play.stage.observers.items() if not observer.state.ready]
+        if not waiting:
+            return
+        if play.moment.time_s > deadline_s:
+            texts = play.stage.observers[waiting[0]].state.texts
+            said = texts[-1][2] if texts else "it says nothing"
+            raise ExperimentError(f"{waiting[0]} was not ready to arm within {deadline_s:.0f} s: {said}")
+
+
+def _until_over(play: _Play) -> str:
+    shown_s = 0.0
+    while play.now_s < play.experiment.timeout:
+        play.poll()
+        play.injector.step(play.now_s)
+        play.step_tasks()
+        if play.over():
+            return ""
+        if time.monotonic() - shown_s > SHOW_EVERY_S:
+            shown_s = time.monotonic()
+            play.progress.show(_status(play))
+    return f"it was not over after {play.experiment.timeout:g} s"
+
+
+def _status(play: _Play) -> str:
+    words = [f"{play.now_s:5.0f} s"]
+    for name, observer in list(play.stage.observers.items())[:4]:
+        state = observer.state
+        words.append(f"{name} {state.mode} {state.alt_m:.0f} m {state.speed_mps:.0f} m/s {state.battery:.0%}")
+    more = len(play.stage.observers) - 4
+    return "   ".join([*words, *([f"and {more} more"] if more > 0 else [])])
+
+
+def _teller(play: _Play, setup: VehicleSetup) -> Callable[[str], None]:
+    return lambda text: play.tell(setup.name, text)
+
+
+def _tell_fault(play: _Play, text: str) -> None:
+    vehicle, _, words = text.partition(": ")
+    play.tell("" if vehicle == "cluster" else vehicle, words)
+
+
+def _outcome(play: _Play, out: Path, problem: str, wall_s: float) -> Outcome:
+    findings, experiment = play.stage.findings, play.experiment
+    evidence = Evidence(
+        play.flights,
+        play.injector.occurrences,
+        {zone.name: zone for zone in experiment.zones},
+        findings.programs,
+        findings.calls,
+        findings.audit_problems,
+        findings.phases,
+    )
+    verdicts: Sequence[Verdict] = [verdict for check in experiment.checks for verdict in judge(check, evidence)]
+    return Outcome(
+        experiment,
+        out,
+        play.flights,
+        tuple(play.injector.occurrences),
+        tuple(verdicts),
+        findings,
+        tuple(play.events),
+        play.now_s,
+        wall_s,
+        problem,
+    )

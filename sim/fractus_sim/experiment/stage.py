@@ -1,0 +1,110 @@
+"""Where an experiment is played: the three modes, behind one interface."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from fractus_sim.experiment.model import Experiment
+from fractus_sim.experiment.station import Station
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """Seconds since the stage was set, on its own clock, and the time of day in microseconds."""
+
+    time_s: float
+    unix_us: int
+
+
+@dataclass
+class Findings:
+    """What only the stage knows, for checks and report.
+
+    Attributes:
+        programs: exit codes; None for one that had to be stopped.
+        calls: entries of the audit logs that are judgements.
+        audit_problems: by log; empty text for one that verifies.
+        phases: of each Application, in the order seen.
+        notes: sentences for the report.
+    """
+
+    programs: dict[str, int | None] = field(default_factory=dict)
+    calls: list[Mapping[str, Any]] = field(default_factory=list)
+    audit_problems: dict[str, str] = field(default_factory=dict)
+    phases: dict[str, list[str]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+class Stage(ABC):
+    """The vehicles of an experiment and what stands around them.
+
+    Attributes:
+        observers: for each vehicle a link that records, injects faults, and is never cut.
+        pilots: for each vehicle a ground station that flies its task; not in modes where applications fly.
+        endpoints: for each vehicle where QGroundControl or Mission Planner can attach.
+    """
+
+    def __init__(self, experiment: Experiment, folder: Path, base: Path, tell: Callable[[str], None]) -> None:
+        self.experiment, self.folder, self.base, self.tell = experiment, folder, base, tell
+        self.observers: dict[str, Station] = {}
+        self.pilots: dict[str, Station] = {}
+        self.endpoints: dict[str, str] = {}
+        self.findings = Findings()
+
+    @abstractmethod
+    def set_up(self) -> None:
+        """Bring everything up.
+
+        Raises:
+            ExperimentError: something did not come up.
+        """
+
+    @abstractmethod
+    def tick(self) -> Moment:
+        """Let a little time pass.
+
+        Raises:
+            ExperimentError: something that must run has ended.
+        """
+
+    @abstractmethod
+    def begin(self) -> None:
+        """Vehicles are ready: start programs, apply applications."""
+
+    @property
+    def busy(self) -> bool:
+        """Whether something that was begun is not over."""
+        return False
+
+    @property
+    def flies(self) -> Sequence[str]:
+        """Vehicles of which at least one must have flown before the experiment can be over."""
+        return ()
+
+    @abstractmethod
+    def cut_link(self, vehicle: str) -> None:
+        """Let nothing pass on the vehicle's link of this mode."""
+
+    @abstractmethod
+    def heal_link(self, vehicle: str) -> None:
+        """Let everything pass again."""
+
+    @abstractmethod
+    def power_off(self, node: str) -> None:
+        """Pull a node's power."""
+
+    @abstractmethod
+    def power_on(self, node: str) -> None:
+        """Give it back."""
+
+    @abstractmethod
+    def collect(self) -> None:
+        """Gather what is left for `findings`, before everything is taken down."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End everything that was started."""

@@ -1,0 +1,320 @@
+"""A ground station's end of a MAVLink link: heartbeats, commands, parameters, and what the vehicle says."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.experiment.tlog import TlogWriter
+from fractus_sim.vehicle.channel import Channel
+from fractus_sim.vehicle.mav import Command, Mode, ModeFlag
+from fractus_sim.vehicle.simulation import Craft
+from fractus_sim.vehicle.wire import Message, Parser, Value, encode, layout_named
+
+GROUND_STATION_ID = 255
+OBSERVER_ID = 254
+STATION_COMPONENT = 190
+HEARTBEAT_S = 1.0
+PREARM_CHECK = 1 << 28
+FLYING_STATES = frozenset({2, 3, 4})
+RATES_HZ: Mapping[str, float] = {
+    "GLOBAL_POSITION_INT": 5.0,
+    "ATTITUDE": 5.0,
+    "VFR_HUD": 2.0,
+    "SYS_STATUS": 2.0,
+    "BATTERY_STATUS": 1.0,
+    "GPS_RAW_INT": 2.0,
+    "EXTENDED_SYS_STATE": 5.0,
+    "EKF_STATUS_REPORT": 1.0,
+    "HOME_POSITION": 1.0,
+    "MISSION_CURRENT": 1.0,
+    "SYSTEM_TIME": 1.0,
+    "WIND": 2.0,
+}
+
+
+class Link(Protocol):
+    """Something that carries bytes to a vehicle and back, without waiting."""
+
+    def send(self, data: bytes) -> None:
+        """Send bytes."""
+
+    def receive(self) -> bytes:
+        """What has arrived since."""
+
+    def close(self) -> None:
+        """Close it."""
+
+
+class ChannelLink:
+    """A link to a vehicle in this process."""
+
+    def __init__(self, craft: Craft, name: str) -> None:
+        self._craft = craft
+        self._channel: Channel = craft.open(name)
+
+    def send(self, data: bytes) -> None:
+        """Hand bytes to the vehicle."""
+        self._craft.receive(self._channel, data)
+
+    def receive(self) -> bytes:
+        """What the vehicle has sent since."""
+        return self._channel.take()
+
+    def close(self) -> None:
+        """Close the channel."""
+        self._craft.close(self._channel)
+
+
+class TcpLink:
+    """A link over TCP."""
+
+    def __init__(self, connection: socket.socket, what: str) -> None:
+        self._socket = connection
+        self._what = what
+        self._socket.setblocking(False)
+
+    @classmethod
+    def connect(cls, host: str, port: int, timeout_s: float) -> TcpLink:
+        """Connect, trying again until the time is over.
+
+        Raises:
+            ExperimentError: nobody answered.
+        """
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                return cls(socket.create_connection((host, port), 2.0), f"tcp:{host}:{port}")
+            except OSError as error:
+                if time.monotonic() > deadline:
+                    raise ExperimentError(f"no autopilot answers at tcp:{host}:{port}: {error.strerror}") from None
+                time.sleep(0.1)
+
+    def send(self, data: bytes) -> None:
+        """Send bytes; what the socket does not take at once is lost, as on a radio.
+
+        Raises:
+            ExperimentError: the vehicle closed the link.
+        """
+        try:
+            self._socket.send(data)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            raise ExperimentError(f"link {self._what}: {error.strerror}") from None
+
+    def receive(self) -> bytes:
+        """What has arrived since.
+
+        Raises:
+            ExperimentError: the vehicle closed the link.
+        """
+        parts: list[bytes] = []
+        while True:
+            try:
+                data = self._socket.recv(65536)
+            except BlockingIOError:
+                return b"".join(parts)
+            except OSError as error:
+                raise ExperimentError(f"link {self._what}: {error.strerror}") from None
+            if not data:
+                raise ExperimentError(f"link {self._what}: the autopilot closed it")
+            parts.append(data)
+
+    def close(self) -> None:
+        """Close the socket."""
+        with contextlib.suppress(OSError):
+            self._socket.close()
+
+
+@dataclass(slots=True)
+class State:
+    """What the vehicle said last; degrees, metres, volts."""
+
+    heard: bool = False
+    mode: str = ""
+    armed: bool = False
+    ready: bool = False
+    flying: bool = False
+    lat: float = 0.0
+    lon: float = 0.0
+    alt_m: float = 0.0
+    amsl_m: float = 0.0
+    speed_mps: float = 0.0
+    climb_mps: float = 0.0
+    heading_deg: float = 0.0
+    battery: float = 1.0
+    voltage_v: float = 0.0
+    current_a: float = 0.0
+    fix: int = 0
+    satellites: int = 0
+    home: tuple[float, float] | None = None
+    texts: list[tuple[float, int, str]] = field(default_factory=list)
+
+
+class Station:
+    """One station and one vehicle.
+
+    Attributes:
+        now_s: time of the last poll, on the caller's clock.
+        state: what the vehicle said last.
+        cut: while True nothing passes, as without a radio.
+    """
+
+    def __init__(
+        self, link: Link, system_id: int, log: TlogWriter | None, *, own_id: int = GROUND_STATION_ID, beats: bool = True
+    ) -> None:
+        self.state = State()
+        self.cut = False
+        self.now_s = 0.0
+        self.acks: dict[int, int] = {}
+        self.parameters: dict[str, float] = {}
+        self.inbox: list[Message] = []
+        self._link, self._system_id, self._log = link, system_id, log
+        self._own_id, self._beats = own_id, beats
+        self._parser = Parser()
+        self._sequence = 0
+        self._unix_us = 0
+        self._next_beat_s = -1e9
+        self._asked = False
+
+    def poll(self, now_s: float, unix_us: int) -> list[Message]:
+        """Take in what the vehicle said, and beat the heart when it is time.
+
+        Raises:
+            ExperimentError: the link was closed.
+        """
+        self.now_s, self._unix_us = now_s, unix_us
+        data = self._link.receive()
+        messages = [] if self.cut else self._parser.feed(data)
+        self.inbox = [m for m in messages if m.sysid == self._system_id and m.compid == 1]
+        for message in messages:
+            if self._log is not None:
+                self._log.write(unix_us, message.frame)
+        for message in self.inbox:
+            reader = _READERS.get(message.name)
+            if reader is not None:
+                reader(self, message)
+        if self._beats and now_s >= self._next_beat_s:
+            self._next_beat_s = now_s + HEARTBEAT_S
+            self.send("HEARTBEAT", {"type": 6, "autopilot": 8, "mavlink_version": 3})
+        if self.state.heard and not self._asked:
+            self._asked = True
+            self._ask_for_streams()
+        return self.inbox
+
+    def send(self, name: str, values: Mapping[str, Value]) -> None:
+        """Send a message, unless the link is cut."""
+        frame = encode(
+            layout_named(name), values, sequence=self._sequence, sysid=self._own_id, compid=STATION_COMPONENT
+        )
+        self._sequence = (self._sequence + 1) & 0xFF
+        if self.cut:
+            return
+        if self._log is not None:
+            self._log.write(self._unix_us, frame)
+        self._link.send(frame)
+
+    def tell(self, name: str, values: Mapping[str, Value]) -> None:
+        """Send a message to the vehicle's autopilot."""
+        self.send(name, {**values, "target_system": self._system_id, "target_component": 1})
+
+    def command(self, command: int, *params: float) -> None:
+        """Send COMMAND_LONG; the answer will be in `acks`."""
+        self.acks.pop(command, None)
+        values: dict[str, Value] = {f"param{at}": float(value) for at, value in enumerate(params, start=1)}
+        self.tell("COMMAND_LONG", {**values, "command": command})
+
+    def ask_mode(self, mode: Mode) -> None:
+        """Ask for a flight mode; the answer will be in `acks`."""
+        self.command(Command.DO_SET_MODE, ModeFlag.CUSTOM, mode)
+
+    def read_parameter(self, name: str) -> None:
+        """Ask for a parameter; it will be in `parameters`."""
+        self.parameters.pop(name, None)
+        self.tell("PARAM_REQUEST_READ", {"param_id": name.encode("ascii"), "param_index": -1})
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """Set a parameter; what the vehicle made of it will be in `parameters`."""
+        self.parameters.pop(name, None)
+        self.tell("PARAM_SET", {"param_id": name.encode("ascii"), "param_value": value, "param_type": 9})
+
+    def close(self) -> None:
+        """Close link and log."""
+        self._link.close()
+        if self._log is not None:
+            self._log.close()
+
+    def _ask_for_streams(self) -> None:
+        for name, rate_hz in RATES_HZ.items():
+            self.command(Command.SET_MESSAGE_INTERVAL, layout_named(name).msgid, 1e6 / rate_hz)
+
+
+def _heartbeat(station: Station, message: Message) -> None:
+    state = station.state
+    state.heard = True
+    state.armed = bool(message.integer("base_mode") & ModeFlag.SAFETY_ARMED)
+    number = message.integer("custom_mode")
+    state.mode = Mode(number).name if number in Mode._value2member_map_ else f"MODE_{number}"
+
+
+def _position(station: Station, message: Message) -> None:
+    state = station.state
+    state.lat, state.lon = message.integer("lat") / 1e7, message.integer("lon") / 1e7
+    state.alt_m, state.amsl_m = message.integer("relative_alt") / 1000.0, message.integer("alt") / 1000.0
+    north, east = message.integer("vx") / 100.0, message.integer("vy") / 100.0
+    state.speed_mps = (north * north + east * east) ** 0.5
+    state.climb_mps = -message.integer("vz") / 100.0
+    state.heading_deg = message.integer("hdg") / 100.0
+
+
+def _sys_status(station: Station, message: Message) -> None:
+    state = station.state
+    state.ready = bool(message.integer("onboard_control_sensors_health") & PREARM_CHECK)
+    state.voltage_v = message.integer("voltage_battery") / 1000.0
+    state.current_a = message.integer("current_battery") / 100.0
+    remaining = message.integer("battery_remaining")
+    state.battery = remaining / 100.0 if remaining >= 0 else state.battery
+
+
+def _extended(station: Station, message: Message) -> None:
+    station.state.flying = message.integer("landed_state") in FLYING_STATES
+
+
+def _gps(station: Station, message: Message) -> None:
+    station.state.fix = message.integer("fix_type")
+    station.state.satellites = message.integer("satellites_visible")
+
+
+def _home(station: Station, message: Message) -> None:
+    station.state.home = (message.integer("latitude") / 1e7, message.integer("longitude") / 1e7)
+
+
+def _text(station: Station, message: Message) -> None:
+    station.state.texts.append((station.now_s, message.integer("severity"), message.text("text")))
+
+
+def _ack(station: Station, message: Message) -> None:
+    station.acks[message.integer("command")] = message.integer("result")
+
+
+def _parameter(station: Station, message: Message) -> None:
+    station.parameters[message.text("param_id")] = message.real("param_value")
+
+
+_READERS: Mapping[str, Callable[[Station, Message], None]] = {
+    "HEARTBEAT": _heartbeat,
+    "GLOBAL_POSITION_INT": _position,
+    "SYS_STATUS": _sys_status,
+    "EXTENDED_SYS_STATE": _extended,
+    "GPS_RAW_INT": _gps,
+    "HOME_POSITION": _home,
+    "STATUSTEXT": _text,
+    "COMMAND_ACK": _ack,
+    "PARAM_VALUE": _parameter,
+}

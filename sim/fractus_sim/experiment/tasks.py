@@ -1,0 +1,145 @@
+"""What a vehicle is told to fly, as an experiment's file spells it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from fractus_core.api.geometry import Latitude, Longitude
+from fractus_core.api.model import InvalidObject, Model
+from pydantic import Field, model_validator
+
+ModeName = Literal["STABILIZE", "ALT_HOLD", "AUTO", "GUIDED", "LOITER", "RTL", "LAND", "BRAKE", "SMART_RTL"]
+Altitude = Annotated[float, Field(ge=0, le=5000, description="Metres above home.")]
+
+
+class Place(Model):
+    """A place over the ground: degrees, or metres from the vehicle's own home."""
+
+    lat: Latitude | None = None
+    lon: Longitude | None = None
+    north: float | None = Field(default=None, ge=-50_000, le=50_000, description="Metres north of home.")
+    east: float | None = Field(default=None, ge=-50_000, le=50_000, description="Metres east of home.")
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        degrees, metres = {self.lat is None, self.lon is None}, {self.north is None, self.east is None}
+        if len(degrees) == 2 or len(metres) == 2 or degrees == metres:
+            raise InvalidObject("", "give lat and lon, or north and east")
+        return self
+
+    @property
+    def words(self) -> str:
+        """The place in words."""
+        if self.lat is not None and self.lon is not None:
+            return f"{self.lat:.6f}, {self.lon:.6f}"
+        return f"{self.north:g} m north, {self.east:g} m east"
+
+
+class Takeoff(Model):
+    """Arm in GUIDED and climb."""
+
+    do: Literal["takeoff"]
+    alt: Altitude
+
+    @property
+    def title(self) -> str:
+        """The step in a few words."""
+        return f"takeoff to {self.alt:g} m"
+
+
+class Goto(Place):
+    """Fly there and stop."""
+
+    do: Literal["goto"]
+    alt: Altitude
+    within: float = Field(default=1.5, gt=0, le=100, description="Metres that count as there.")
+
+    @property
+    def title(self) -> str:
+        """The step in a few words."""
+        return f"goto {self.words} at {self.alt:g} m"
+
+
+class Speed(Model):
+    """Fly at this speed from now on."""
+
+    do: Literal["speed"]
+    speed: float = Field(gt=0, le=50, description="Metres per second.")
+
+    @property
+    def title(self) -> str:
+        """The step in a few words."""
+        return f"speed {self.speed:g} m/s"
+
+
+class Hold(Model):
+    """Stay for a while."""
+
+    do: Literal["hold"]
+    seconds: float = Field(gt=0, le=3600)
+
+    @property
+    def title(self) -> str:
+        """The step in a few words."""
+        return f"hold {self.seconds:g} s"
+
+
+class SetMode(Model):
+    """Change the flight mode."""
+
+    do: Literal["mode"]
+    mode: ModeName
+
+    @property
+    def title(self) -> str:
+        """The step in a few words."""
+        return f"mode {self.mode}"
+
+
+class Waypoint(Place):
+    """A point of a mission."""
+
+    alt: Altitude
+    hold: float = Field(default=0, ge=0, le=3600, description="Seconds to stay.")
+
+
+class FlyMission(Model):
+    """Upload a mission, take off, and fly it in AUTO to its end."""
+
+    do: Literal["mission"]
+    takeoff: Altitude = Field(description="Metres above home to climb to first.")
+    waypoints: tuple[Waypoint, ...] = Field(min_length=1, max_length=500)
+    land: Literal["home", "last"] = Field(default="home", description="Return to launch, or land at the last waypoint.")
+
+    @property
+    def title(self) -> str:
+        """The step in a few words."""
+        return f"mission of {len(self.waypoints)} waypoints"
+
+
+class ReturnToLaunch(Model):
+    """Fly home and land."""
+
+    do: Literal["returnToLaunch"]
+
+    @property
+    def title(self) -> str:
+        """The step in a few words."""
+        return "return to launch"
+
+
+class Land(Model):
+    """Land here."""
+
+    do: Literal["land"]
+
+    @property
+    def title(self) -> str:
+        """The step in a few words."""
+        return "land"
+
+
+Step = Annotated[
+    Takeoff | Goto | Speed | Hold | SetMode | FlyMission | ReturnToLaunch | Land,
+    Field(discriminator="do"),
+]

@@ -69,10 +69,10 @@ def _datum_unknown(rule: Rule) -> Verdict:
 def forbids_height(patch: Patch, lower_m: float, upper_m: float, now: Situation, flat: bool) -> bool:
     """Whether the altitude limit of a zone does not allow all heights from lower to upper (above home)."""
     spec = patch.rule.spec
-    for edge, breaks in ((spec.upper_limit, upper_m.__gt__), (spec.lower_limit, lower_m.__lt__)):
+    for edge, reaches_m in ((spec.upper_limit, upper_m), (spec.lower_limit, lower_m)):
         if edge is not None:
             height = height_m(edge, spec.altitude_reference, now.home, flat)
-            if height is None or breaks(height):
+            if height is None or (reaches_m > height if edge is spec.upper_limit else reaches_m < height):
                 return True
     return False
 

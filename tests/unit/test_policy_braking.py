@@ -1,0 +1,95 @@
+"""Legs that a moving drone cannot begin: it stops first, where stop and leg are both legal."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from fractus_core.geo import area_of, corridor
+from fractus_core.policy.compiled import CompiledGrant
+from fractus_core.policy.engine import judge
+from fractus_core.policy.motion import stop_point
+from fractus_core.policy.values import GotoArgs, Situation
+from policy_world import FRAME, altitude, ask, at, box, compiled, exclusion, goto, inclusion
+
+
+def lane(radius_m: float, *points: tuple[float, float], **changes: Any) -> CompiledGrant:
+    from fractus_core.api.geometry import Point
+
+    line = [Point(lat=lat, lon=lon) for lat, lon in (FRAME.latlon(*p) for p in points)]
+    areas = [a.to_dict() for a in area_of(FRAME, corridor(FRAME, line, radius_m))]
+    return compiled(operationArea=areas, **changes)
+
+
+def test_a_turn_back_inside_a_narrow_corridor() -> None:
+    grant = lane(7.0, (0, 0), (0, 80), (60, 80))
+    assert judge(goto(50, 80), at(0.5, 79), grant).brake_first is False
+    hot = judge(goto(50, 80), at(0.5, 74, north_mps=5), grant)
+    assert (hot.action, hot.brake_first) == ("allow", True), "straight across it would cut the corner"
+    beyond = judge(goto(50, 80), at(0.5, 78, north_mps=5), grant)
+    assert (beyond.action, beyond.brake_first) == ("deny", False), "it cannot even stop inside"
+    earlier = at(0.5, 64, north_mps=5)
+    back = judge(goto(0, 10), earlier, grant)
+    assert (back.action, back.brake_first) == ("allow", False), "straight back is no turn"
+    turning = judge(goto(40, 80), at(0, 68, north_mps=5, east_mps=0.3), grant)
+    assert turning.permits
+    assert turning.brake_first
+    assert isinstance(turning.args, GotoArgs)
+
+
+def test_what_it_says_after_the_stop_is_what_it_would_say_then() -> None:
+    grant = compiled(exclusion(box(10, 15, 30, 30)), altitude(upperLimit=15))
+    moving = at(0, 0, east_mps=5)
+    verdict = ask(grant, goto(0, 60, 40), moving)
+    assert (verdict.action, verdict.code, verdict.brake_first) == ("correct", "AltitudeAboveLimit", True)
+    x, y = stop_point(moving, (0.0, 0.0))
+    again = ask(grant, goto(0, 60, 40), at(x, y))
+    assert (again.action, again.args, again.brake_first) == (verdict.action, verdict.args, False)
+
+
+def test_a_wide_turn_is_no_reason_to_take_the_drone_over() -> None:
+    grant = compiled(exclusion(box(10, 15, 30, 30), "land"))
+    assert ask(grant, goto(0, 60), at(0, 0, east_mps=5)).brake_first
+    through = ask(grant, goto(20, 60), at(0, 0, east_mps=5))
+    assert (through.action, through.takeover, through.brake_first) == ("takeover", "land", True)
+    assert ask(grant, goto(20, 20), at(0, 0)).brake_first is False
+
+
+def test_no_stop_that_breaks_a_fence_itself() -> None:
+    ahead = compiled(exclusion(box(12, -20, 30, 20)))
+    verdict = ask(ahead, goto(60, 60), at(0, 0, east_mps=9))
+    assert not verdict.permits
+    assert not verdict.brake_first
+
+
+def test_a_whole_leg_after_a_stop_beats_a_shortened_one() -> None:
+    grant = compiled(exclusion(box(10, 15, 30, 30), "adjust"))
+    verdict = ask(grant, goto(0, 60), at(0, 0, east_mps=5))
+    assert verdict.brake_first
+    assert verdict.action == "allow"
+    through = ask(grant, goto(20, 22), at(-10, 0))
+    assert (through.code, through.brake_first) == ("LegShortened", False)
+
+
+@pytest.mark.parametrize("speed", [0.6, 2.0, 5.0, 8.0])
+def test_every_stop_it_offers_ends_where_it_is_legal(speed: float) -> None:
+    grant = compiled(exclusion(box(10, 15, 30, 30)), inclusion(box(-40, -40, 60, 80)), operationArea=[])
+    offered = 0
+    for degrees in range(0, 360, 15):
+        heading = math.radians(degrees)
+        now: Situation = at(3, 3, east_mps=speed * math.cos(heading), north_mps=speed * math.sin(heading))
+        verdict = ask(grant, goto(0, 60), now)
+        if verdict.brake_first:
+            offered += 1
+            x, y = stop_point(now, (3.0, 3.0))
+            assert ask(grant, goto(0, 60), at(x, y)).action == "allow"
+    assert offered or speed != 5
+
+
+def test_a_faster_leg_needs_a_wider_turn() -> None:
+    grant = compiled(exclusion(box(6, 10, 30, 30)))
+    slow = ask(grant, goto(0, 60), at(0, -2, east_mps=1.5, speed_setpoint_mps=1.0))
+    assert (slow.action, slow.brake_first) == ("allow", False)
+    fast = ask(grant, goto(0, 60, speed_mps=15.0), at(0, -2, east_mps=1.5, speed_setpoint_mps=1.0))
+    assert fast.brake_first or not fast.permits

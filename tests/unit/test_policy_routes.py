@@ -1,0 +1,207 @@
+"""Legal ways around zones: legal by the engine's own word, and no longer than they must be."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import shapely
+from fractus_core.policy.compiled import CompiledGrant, for_transit
+from fractus_core.policy.engine import judge
+from fractus_core.policy.routes import ROOM_M, route
+from fractus_core.policy.values import Airframe, GotoArgs, Situation
+from policy_world import Corners, altitude, at, box, compiled, exclusion, goto, inclusion, policy, ring, spec, zone
+
+RETRACING = Airframe(retraces=True)
+Way = tuple[tuple[float, float], ...]
+
+
+def free(*policies: dict[str, Any]) -> CompiledGrant:
+    return compiled(*policies, operationArea=[])
+
+
+def find(grant: CompiledGrant, *ends: tuple[float, float], alt: float = 10.0, **state: Any) -> Way | None:
+    now = at(*ends[0], alt=alt, **{"airframe": RETRACING, **state})
+    return route(ends[0], ends[1], now, grant, alt)
+
+
+def length(start: tuple[float, float], way: Way) -> float:
+    return sum(math.dist(a, b) for a, b in itertools.pairwise((start, *way)))
+
+
+def legal(grant: CompiledGrant, start: tuple[float, float], way: Way, now: Situation) -> None:
+    """Every leg is permitted to a drone that stands within a metre of where the last one ended."""
+    for a, b in itertools.pairwise((start, *way)):
+        for dx, dy in ((0.0, 0.0), (0.7, 0.7), (-0.7, 0.7), (0.7, -0.7), (-0.7, -0.7)):
+            x, y = (a[0] + dx, a[1] + dy) if a != start else a
+            lat, lon = grant.frame.latlon(x, y)
+            verdict = judge(goto(*b, now.altitude_m), replace(now, lat=lat, lon=lon), grant)
+            assert verdict.action == "allow", (a, b, verdict)
+
+
+def test_nothing_in_the_way() -> None:
+    assert find(free(), (0, 0), (100, 50)) == ((100, 50),)
+    assert find(free(), (5, 5), (5, 5)) == ((5, 5),)
+
+
+def test_around_a_wall_by_the_shorter_side() -> None:
+    grant = free(exclusion(box(-100, 40, 30, 50)))
+    way = find(grant, (0, 0), (0, 100))
+    assert way is not None
+    assert len(way) == 3
+    assert way[-1] == (0, 100)
+    assert all(x > 30 for x, _ in way[:-1])
+    legal(grant, (0, 0), way, at(airframe=RETRACING))
+    assert find(grant, (0, 0), (0, 100)) == way, "the same again"
+
+
+def test_there_may_be_no_way() -> None:
+    hole = [(-10, 30), (10, 30), (10, 50), (-10, 50)]
+    area = ring([(-20, 20), (20, 20), (20, 60), (-20, 60)])
+    area["polygon"]["holes"] = [ring(hole)["polygon"]["exterior"]]  # type: ignore[list-item]
+    grant = free(exclusion(area))
+    assert find(grant, (0, 0), (0, 40)) is None, "the court inside the walls"
+    assert find(grant, (0, 40), (3, 42)) is not None
+    assert find(grant, (0, 0), (0, 25)) is None, "the wall itself"
+    assert find(grant, (0, 0), (0, 18.5)) is None, "too close to it"
+    assert find(grant, (0, 0), (math.nan, 0)) is None
+    assert find(grant, (0, 0), (0, -40), home=None) is None
+
+
+def test_bands_and_limits_of_altitude() -> None:
+    low = free(exclusion(box(-100, 40, 30, 50), upper=20))
+    assert find(low, (0, 0), (0, 100), alt=30) == ((0, 100),)
+    assert len(find(low, (0, 0), (0, 100), alt=21) or ()) == 3, "too close above it"
+    climbing = route((0, 0), (0, 100), at(airframe=RETRACING), low, 30.0, from_m=5.0)
+    assert len(climbing or ()) == 3, "it might climb too late"
+    limited = free(altitude(zones=[zone("low", box(-100, 40, 30, 50))], upperLimit=15))
+    assert find(limited, (0, 0), (0, 100)) == ((0, 100),)
+    assert len(find(limited, (0, 0), (0, 100), alt=30) or ()) == 3
+    above_terrain = free(
+        altitude(zones=[zone("low", box(-100, 40, 30, 50))], upperLimit=15, altitudeReference="terrain")
+    )
+    assert len(find(above_terrain, (0, 0), (0, 100)) or ()) == 3, "nobody knows how high that is"
+
+
+def test_inside_an_inclusion_zone() -> None:
+    corner: Corners = [(-20, -20), (100, -20), (100, 20), (20, 20), (20, 100), (-20, 100)]
+    grant = free(inclusion(ring(corner)))
+    way = find(grant, (0, 90), (90, 0))
+    assert way is not None
+    assert len(way) == 2
+    assert way[0][0] < 20 - 2.5
+    assert way[0][1] < 20 - 2.5
+    legal(grant, (0, 90), way, at(airframe=RETRACING))
+    banded = free(inclusion(ring(corner), upper=15))
+    assert find(banded, (0, 90), (90, 0), alt=20) is None
+
+
+def test_the_system_flies_the_corridor() -> None:
+    body = spec(
+        exclusion(box(10, -60, 30, 5)),
+        operationArea=[box(50, -20, 150, 20)], corridor=[box(-30, -30, 150, 30)], control="partial",
+        services=[{"service": "mobility", "methods": ["GetPosition"]}],
+    )  # fmt: skip
+    grant = for_transit(body)
+    now = at(airframe=RETRACING)
+    way = route((0, 0), (100, 0), now, grant, 10.0)
+    assert way is not None
+    assert len(way) > 1
+    legal(grant, (0, 0), way, now)
+    assert route((0, 0), (100, 40), now, grant, 10.0) is None, "outside"
+
+
+def test_a_straight_way_home_binds_every_waypoint() -> None:
+    wall = free(exclusion(box(-100, 40, 30, 50)))
+    assert find(wall, (60, 45), (0, 100), airframe=Airframe()) is None, "no way home from there"
+    assert find(wall, (60, 45), (0, 100)) is not None
+    island = free(exclusion(box(30, -10, 50, 10)))
+    way = find(island, (80, -60), (80, 60), airframe=Airframe())
+    assert way == ((80, 60),)
+
+
+def test_from_a_start_too_close_to_a_zone_the_first_leg_leads_away() -> None:
+    grant = free(exclusion(box(-30, 1, 30, 40)))
+    way = find(grant, (0, 0), (0, 60))
+    assert way is not None
+    assert way[0] == pytest.approx((0, -3.4), abs=0.5)
+    inside = find(free(exclusion(box(-30, -2, 30, 40))), (0, 0), (0, -60))
+    assert inside == ((0, -60),)
+
+
+def test_a_narrow_gap_is_used_when_there_is_no_wider_one() -> None:
+    gap = 2 * (2.5 + ROOM_M[1]) + 0.6
+    grant = free(exclusion(box(-500, 40, 0, 50), name="west"), exclusion(box(gap, 40, 500, 50), name="east"))
+    way = find(grant, (-30, 0), (-30, 100))
+    assert way is not None
+    assert length((-30, 0), way) < 130
+    shut = free(exclusion(box(-500, 40, 0, 50), name="west"), exclusion(box(4.9, 40, 500, 50), name="east"))
+    assert length((-30, 0), find(shut, (-30, 0), (-30, 100)) or ()) > 900, "all the way round"
+
+
+def _shortest(zones: list[Corners], start: tuple[float, float], to: tuple[float, float]) -> float:
+    """Dijkstra over all pairs of corners of finely buffered zones: slow, simple, and apart from the engine's search."""
+    walls = shapely.union_all([shapely.Polygon(z).buffer(2.5 + ROOM_M[0], quad_segs=4) for z in zones])
+    nodes = [start, to, *map(tuple, shapely.get_coordinates(walls.buffer(0.01)))]
+    inner = walls.buffer(-1e-3)
+    costs, done = {0: 0.0}, set()
+    while True:
+        at_ = min((n for n in costs if n not in done), key=costs.__getitem__)
+        if at_ == 1:
+            return costs[1]
+        done.add(at_)
+        others = [n for n in range(len(nodes)) if n not in done]
+        lines = shapely.linestrings([(nodes[at_], nodes[n]) for n in others])
+        for n, hit in zip(others, shapely.intersects(inner, lines), strict=True):
+            cost = costs[at_] + math.dist(nodes[at_], nodes[n])
+            if not hit and cost < costs.get(n, math.inf):
+                costs[n] = cost
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_way_is_much_longer_than_the_shortest(seed: int) -> None:
+    draw = random.Random(seed)
+    zones: list[Corners] = []
+    for x, y in itertools.product(range(20, 90, 34), repeat=2):
+        count, turn, radius = draw.randint(3, 5), draw.uniform(0, 6), draw.uniform(8, 14)
+        angles = [turn + 2 * math.pi * i / count for i in range(count)]
+        zones.append([(x + radius * math.cos(a), y + radius * math.sin(a)) for a in angles])
+    grant = free(*(exclusion(ring(z), name=f"z{i}") for i, z in enumerate(zones)))
+    way = find(grant, (0, 0), (110, 105))
+    assert way is not None
+    legal(grant, (0, 0), way, at(airframe=RETRACING))
+    best = _shortest(zones, (0, 0), (110, 105))
+    assert best * 0.999 <= length((0, 0), way) <= best * 1.02
+
+
+def test_a_thousand_zones() -> None:
+    draw = random.Random(3)
+    zones = []
+    for i, (x, y) in enumerate(itertools.product(range(-960, 961, 60), repeat=2)):
+        if math.hypot(x, y) > 40:
+            cx, cy, half = x + draw.uniform(-12, 12), y + draw.uniform(-12, 12), draw.uniform(8, 18)
+            zones.append(zone(f"z{i}", box(cx - half, cy - half, cx + half, cy + half)))
+    many = policy("many", "GeofenceControl", "exclusion", zones[:1000])
+    grant = free({**many, "zones": zones})
+    way = find(grant, (0, 0), (303, 273))
+    assert way is not None
+    assert length((0, 0), way) < 1.15 * math.hypot(303, 273)
+    legal(grant, (0, 0), way, at(airframe=RETRACING))
+
+
+def test_a_target_behind_a_wall_is_legal_for_a_drone_that_retraces_its_path() -> None:
+    wall = free(exclusion(box(-100, 40, 30, 50)))
+    behind = at(60, 100)
+    assert judge(goto(0, 100), behind, wall).code == "WayHomeBlocked"
+    retracing = replace(behind, airframe=RETRACING)
+    verdict = judge(goto(0, 100), retracing, wall)
+    assert verdict.action == "allow"
+    assert isinstance(verdict.args, GotoArgs)
+    court = inclusion(box(-300, 60, 300, 300), name="court")
+    shut = judge(goto(0, 100), retracing, free(exclusion(box(-100, 40, 30, 50)), court))
+    assert shut.code == "WayHomeBlocked"
+    assert "no legal way" in shut.reason

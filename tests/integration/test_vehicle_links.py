@@ -214,22 +214,56 @@ def test_messages_for_another_system_are_passed_on(fast: str):
     assert two.wait_for("COMMAND_LONG").command == 511
 
 
-def test_pseudo_terminal(tmp_path: Path):
+def test_a_serial_line_is_a_link_like_any_other(tmp_path: Path):
     path = tmp_path / "ttyVehicle"
     with running_vehicle(*FAST, links=(f"pty:{path}",)):
-        fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        try:
-            parser = dialect.MAVLink(None)
-            parser.robust_parsing = True
-            end = time.monotonic() + 5.0
-            seen: set[str] = set()
-            while "HEARTBEAT" not in seen and time.monotonic() < end:
-                if select.select([fd], [], [], 0.5)[0]:
-                    seen |= {m.get_type() for m in parser.parse_buffer(os.read(fd, 4096)) or ()}
-            assert "HEARTBEAT" in seen
-        finally:
-            os.close(fd)
+        client = Client(str(path))
+        client.wait_for("HEARTBEAT")
+        client.interval(30, 20)
+        client.wait_for("ATTITUDE")
+        client.link.mav.param_set_send(1, 1, b"RTL_ALT", 2100, 6)
+        assert client.wait_for("PARAM_VALUE").param_value == 2100
+        client.take_off(5.0)
+        client.close()
     assert not path.exists()
+
+
+def _send_udp(port: int, frames: list[bytes]) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for at, frame in enumerate(frames):
+            sender.sendto(frame, ("127.0.0.1", port))
+            if at % 100 == 0:
+                time.sleep(0.005)  # so that the kernel's buffer does not swallow them
+
+
+def _send_serial(path: Path, frames: list[bytes]) -> None:
+    fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        for frame in frames:
+            select.select([], [fd], [], 5.0)
+            os.write(fd, frame)
+            while select.select([fd], [], [], 0.0)[0]:
+                os.read(fd, 65536)
+    finally:
+        os.close(fd)
+
+
+@pytest.mark.parametrize("kind", ["udp", "serial"])
+def test_ten_thousand_bad_frames_on_other_links(kind: str, tmp_path: Path):
+    port, datagrams, path = free_port(), free_port(socket.SOCK_DGRAM), tmp_path / "tty"
+    links = (f"tcp:127.0.0.1:{port}", f"udpin:127.0.0.1:{datagrams}", f"pty:{path}")
+    with running_vehicle("--ready-after", "0.5", links=links) as process:
+        good = Client(f"tcp:127.0.0.1:{port}")
+        good.wait_for("HEARTBEAT")
+        before_mb = _resident_mb(process.pid)
+        frames = _noise(10_000)
+        if kind == "udp":
+            _send_udp(datagrams, frames)
+        else:
+            _send_serial(path, frames)
+        assert good.command(520, 1) == 0
+        assert good.command(512, 0) == 0
+        assert _resident_mb(process.pid) - before_mb < 10
 
 
 def test_several_vehicles_in_one_process():

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 from fractus_sim.vehicle.mav import Command, MissionResult, Mode, Result
 from fractus_sim.vehicle.pilot import Pilot
+from fractus_sim.vehicle.vehicle import Vehicle
 from vehicle_world import START, airborne, alone, distance_m, upload
 
 HOME = {"command": 16, "frame": 0, "x": START.lat_e7, "y": START.lon_e7, "z": 150.0}
@@ -50,11 +53,11 @@ def test_a_mission_is_flown_with_its_jump_and_return():
     for _ in range(20_000):
         messages = pilot.step()
         reached += [message.integer("seq") for message in messages if message.name == "MISSION_ITEM_REACHED"]
-        if 2 in reached[-1:] and vehicle.mode is Mode.AUTO:
+        if 3 in reached[-1:] and vehicle.mode is Mode.AUTO:
             fastest_after_change = max(fastest_after_change, abs(vehicle.body.ve))
         if not vehicle.armed:
             break
-    assert reached == [1, 2, 4, 2, 4, 6]
+    assert reached == [1, 2, 3, 4, 2, 3, 4, 6]
     assert vehicle.mission_state() == 5
     assert fastest_after_change < 4.4
     assert not vehicle.armed
@@ -188,3 +191,114 @@ def test_land_item_lands_and_loiter_time_waits():
     took = pilot.wait(lambda: not vehicle.armed, 90.0)
     assert 24.0 < took < 45.0
     assert distance_m(vehicle, 15.0, 0.0) < 1.0
+
+
+def _fly_mission(items: list[dict[str, float]], **parameters: float) -> tuple[Vehicle, Pilot, list[tuple[float, ...]]]:
+    """Fly a mission to its end; the way flown, with the speed."""
+    vehicle, pilot = airborne(10.0, **parameters)
+    assert upload(pilot, 0, [HOME, *items]) == MissionResult.ACCEPTED
+    assert pilot.mode(Mode.AUTO) is Result.ACCEPTED
+    way = []
+    for _ in range(12_000):
+        pilot.step()
+        body = vehicle.body
+        way.append((body.north, body.east, -body.down, math.hypot(body.vn, body.ve), pilot.simulation.time_s))
+        if vehicle.mission_state() == 5:
+            return vehicle, pilot, way
+    raise AssertionError(pilot.texts[-5:])
+
+
+def test_legs_are_straight_lines_in_space():
+    _, _, way = _fly_mission([_waypoint(60.0, 0.0, 30.0), _waypoint(60.0, 80.0, 12.0)])
+    for north, east, altitude, *_ in way:
+        if north < 55.0:
+            assert altitude == pytest.approx(10.0 + 20.0 * max(north, 0.0) / 60.0, abs=1.5)
+        elif 5.0 < east < 75.0:
+            assert altitude == pytest.approx(30.0 - 18.0 * east / 80.0, abs=1.5)
+
+
+def test_splines_bend_around_their_points_without_stopping():
+    points = ((40.0, 0.0), (70.0, 40.0), (40.0, 80.0), (0.0, 80.0))
+    items = [_waypoint(north, east, 10.0, command=82) for north, east in points]
+    _, pilot, way = _fly_mission(items)
+    passed = [min(math.dist(at[:2], point) for at in way) for point in points]
+    assert max(passed) < 2.0
+    middle = [at[3] for at in way if 20.0 < at[1] < 75.0]
+    assert min(middle) > 1.5, "it slows down in the bends but does not stop"
+    assert max(at[0] for at in way) > 68.0
+    straight = max(abs(at[0] - 40.0 - 30.0 * at[1] / 40.0) for at in way if 5.0 < at[1] < 35.0)
+    assert straight > 2.0, "it is a curve"
+    assert "Mission: 2 SplineWP" in pilot.texts
+
+
+def test_a_stay_at_a_spline_point_stops_there():
+    items = [_waypoint(40.0, 0.0, 10.0, command=82, param1=4.0), _waypoint(40.0, 40.0, 14.0, command=82)]
+    _, _, way = _fly_mission(items)
+    there = [at[3] for at in way if math.dist(at[:2], (40.0, 0.0)) < 2.0]
+    assert len(there) > 350
+    assert min(there) < 0.3
+    assert way[-1][2] == pytest.approx(14.0, abs=2.1)
+
+
+def test_conditions_hold_back_what_follows_and_not_the_flight():
+    items = [
+        _waypoint(5.0, 0.0, 10.0),
+        {"command": 112, "param1": 4.0},
+        {"command": 178, "param1": 1.0, "param2": 3.0},
+        {"command": 114, "param1": 10.0},
+        {"command": 178, "param1": 1.0, "param2": 1.5},
+        _waypoint(80.0, 0.0, 10.0),
+    ]
+    _, pilot, way = _fly_mission(items)
+    begun = next(at[4] for at in way if at[0] > 6.0)
+    assert max(at[3] for at in way if at[4] < begun + 3.0) > 4.5, "it flies while the delay lasts"
+    assert max(at[3] for at in way if 55.0 < at[0] < 68.0) < 3.4
+    assert max(at[3] for at in way if 75.0 < at[0] < 77.0) < 2.2
+    assert [text for text in pilot.texts if "ChangeSpeed" in text] == [
+        "Mission: 3 ChangeSpeed",
+        "Mission: 5 ChangeSpeed",
+    ]
+
+
+def test_a_part_of_a_mission_is_replaced():
+    vehicle, pilot = alone()
+    upload(pilot, 0, MISSION)
+    target = {"target_system": 1, "target_component": 1}
+    pilot.send("MISSION_WRITE_PARTIAL_LIST", target | {"start_index": 2, "end_index": 3})
+    for seq in (2, 3):
+        assert pilot.expect("MISSION_REQUEST").integer("seq") == seq
+        pilot.send("MISSION_ITEM_INT", target | {"seq": seq} | _waypoint(33.0, seq, 9.0))
+    assert pilot.expect("MISSION_ACK").integer("type") == MissionResult.ACCEPTED
+    assert len(vehicle.mission.items) == len(MISSION)
+    assert [item.z for item in vehicle.mission.items[2:4]] == [9.0, 9.0]
+    assert vehicle.mission.items[4].z == 15.0
+    pilot.send("MISSION_WRITE_PARTIAL_LIST", target | {"start_index": 5, "end_index": 50})
+    assert pilot.expect("MISSION_ACK").integer("type") == MissionResult.ERROR
+
+
+@pytest.mark.parametrize(("near_home", "include", "north"), [(True, 1, 0.0), (True, 0, 60.0), (False, 1, 60.0)])
+def test_home_counts_as_a_rally_point_where_it_is_included(near_home: bool, include: int, north: float):
+    vehicle, pilot = airborne(10.0, RALLY_INCL_HOME=include)
+    rally = START.offset(60.0, 0.0)
+    upload(pilot, 2, [{"command": 5100, "frame": 3, "x": rally.lat_e7, "y": rally.lon_e7, "z": 25.0}])
+    pilot.go_to(20.0 if near_home else 45.0, 0.0, 10.0)
+    pilot.fly_on(12.0)
+    pilot.command(Command.NAV_RETURN_TO_LAUNCH)
+    highest = 0.0
+    while vehicle.armed:
+        pilot.step()
+        highest = max(highest, vehicle.altitude_m)
+    assert distance_m(vehicle, north, 0.0) < 1.0
+    if north:
+        assert highest == pytest.approx(25.0, abs=0.6), "at the rally point's altitude"
+
+
+def test_a_rally_point_that_is_too_far_is_none():
+    vehicle, pilot = airborne(10.0, RALLY_LIMIT_KM=0.1, RALLY_INCL_HOME=0)
+    rally = START.offset(400.0, 0.0)
+    upload(pilot, 2, [{"command": 5100, "frame": 3, "x": rally.lat_e7, "y": rally.lon_e7, "z": 25.0}])
+    pilot.go_to(10.0, 0.0, 10.0)
+    pilot.fly_on(5.0)
+    pilot.command(Command.NAV_RETURN_TO_LAUNCH)
+    pilot.wait(lambda: not vehicle.armed, 90.0)
+    assert distance_m(vehicle, 0.0, 0.0) < 1.0

@@ -5,14 +5,20 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from fractus_sim.vehicle.breadcrumbs import Point
 from fractus_sim.vehicle.descent import descend
 from fractus_sim.vehicle.flight import Flight
 from fractus_sim.vehicle.leg import Leg
 from fractus_sim.vehicle.mav import Command, Mode, Severity
+from fractus_sim.vehicle.spline import SplineLeg
+from fractus_sim.vehicle.todo import Todo, item_target, title
 
 if TYPE_CHECKING:
     from fractus_sim.vehicle.mission import Item
     from fractus_sim.vehicle.vehicle import Vehicle
+
+# Legs that need not stop at their end.
+CURVES = frozenset({Command.NAV_WAYPOINT, Command.NAV_SPLINE_WAYPOINT})
 
 
 class AutoFlight(Flight):
@@ -25,9 +31,10 @@ class AutoFlight(Flight):
         self._started = False
         self._landing = False
         self._returning: Flight | None = None
-        self._wait_until_s = 0.0
         self.paused = False
-        self._leg: Leg | None = None
+        self._leg: Leg | SplineLeg | None = None
+        self._track: Point = (0.0, 0.0, 0.0)  # the direction in which the present leg arrives, if it does not stop
+        self._todo = Todo()
         self._circle_centre: tuple[float, float] | None = None
         self._turned = 0.0
         self._angle = 0.0
@@ -69,20 +76,21 @@ class AutoFlight(Flight):
         self._start_from(v, index)
 
     def _start_from(self, v: Vehicle, index: int | None) -> None:
-        """Run DO commands until a NAV command is reached, and begin that."""
+        """Begin the next NAV command; the DO and CONDITION commands before it run while it is flown."""
+        waiting: list[int] = []
         for _ in range(len(v.mission.items) + 1):
             if index is None or index >= len(v.mission.items):
+                self._todo.begin(v, waiting)
                 self._finish(v)
                 return
             item = v.mission.items[index]
-            v.mission.current = index
             if item.navigates:
-                v.say(Severity.INFO, f"Mission: {index} {_title(item)}")
+                v.mission.current = index
+                v.say(Severity.INFO, f"Mission: {index} {title(item)}")
                 self._begin_item(v, index, item)
+                self._todo.begin(v, waiting)
                 return
-            self._do(v, item)
-            if item.command == Command.CONDITION_DELAY:
-                self._wait_until_s = v.time_s + max(item.param1, 0.0)
+            waiting.append(index)
             index = v.mission.next_after(index)
 
     def _finish(self, v: Vehicle) -> None:
@@ -101,6 +109,7 @@ class AutoFlight(Flight):
         self._arrived_s = None
         self._landing = False
         self._returning = self._leg = None
+        track, self._track = self._track, (0.0, 0.0, 0.0)
         if item.has_place and v.altitude_base_m(item.frame) is None:
             v.say(Severity.CRITICAL, "Failsafe: Terrain data missing")
             if not v.set_mode(Mode.RTL):
@@ -123,30 +132,34 @@ class AutoFlight(Flight):
                 v.control.go_to(north, east, down)
             case Command.NAV_DELAY:
                 self._arrived_s = v.time_s
-            case Command.NAV_GUIDED_ENABLE:
-                self._arrived_s = v.time_s
+            case Command.NAV_SPLINE_WAYPOINT:
+                here = (v.control.pos[0], v.control.pos[1], v.control.pos[2])
+                self._track = self._arrival(v, item, here, (north, east, down))
+                self._leg = SplineLeg(v, (north, east, down), track, self._track)
             case Command.NAV_LAND:
                 v.control.go_to(north, east)
             case _:
+                here = (v.control.pos[0], v.control.pos[1], v.control.pos[2])
+                if self._following(v, item) is not None:
+                    self._track = (north - here[0], east - here[1], down - here[2])
                 self._leg = Leg(v, north, east, down)
 
-    def _do(self, v: Vehicle, item: Item) -> None:
-        match item.command:
-            case Command.DO_CHANGE_SPEED:
-                v.change_speed(int(item.param1), item.param2)
-            case Command.CONDITION_YAW:
-                v.turn_to(item.param1, item.param2, int(item.param3), relative=item.param4 > 0.5)
-            case Command.DO_SET_ROI | Command.DO_SET_ROI_LOCATION:
-                north, east, _ = self._place(v, item)
-                v.yaw.look_at((north, east) if item.has_place else None)
-            case Command.DO_SET_ROI_NONE:
-                v.yaw.look_at(None)
-            case Command.DO_FENCE_ENABLE:
-                v.params.assign("FENCE_ENABLE", 1.0 if item.param1 > 0.5 else 0.0)
-            case Command.DO_SET_HOME:
-                v.set_home_here() if item.param1 > 0.5 else v.set_home_at(item.x, item.y, item.z)
-            case _:
-                pass
+    def _following(self, v: Vehicle, item: Item) -> Item | None:
+        """The waypoint after this one, where it is a curve or begins one; a stay in between ends that."""
+        at = v.mission.peek_after(self._index)
+        if item.command not in CURVES or item.param1 > 0.0 or at is None:
+            return None
+        following = v.mission.items[at]
+        return following if following.command in CURVES else None
+
+    def _arrival(self, v: Vehicle, item: Item, start: Point, end: Point) -> Point:
+        """In which direction a curve ends: along a straight leg that follows, or past its end towards the next one."""
+        following = self._following(v, item)
+        if following is None:
+            return (0.0, 0.0, 0.0)
+        north, east, down = item_target(v, following)
+        base = start if following.command == Command.NAV_SPLINE_WAYPOINT else end
+        return (north - base[0], east - base[1], down - base[2])
 
     def step(self, v: Vehicle, dt: float) -> None:
         """Fly the current item and go on when it is done."""
@@ -159,8 +172,7 @@ class AutoFlight(Flight):
             self._returning.step(v, dt)
             self._finish_if_down(v)
             return
-        if v.time_s < self._wait_until_s:
-            return
+        self._todo.step(v)
         if self._leg is not None:
             self._leg.step(v)
         if item.command == Command.NAV_LAND:
@@ -212,40 +224,8 @@ class AutoFlight(Flight):
             return False
         if item.command == Command.NAV_DELAY:
             return v.time_s - (self._arrived_s or 0.0) >= max(item.param1, 0.0)
-        if item.command == Command.NAV_GUIDED_ENABLE:
-            return True
         if self._arrived_s is None:
-            dn, de = v.control.target[0] - v.est.north, v.control.target[1] - v.est.east
-            radius = max(v.params["WPNAV_RADIUS"] / 100.0, 0.3)
-            if math.sqrt(dn * dn + de * de + (v.control.target_down - v.est.down) ** 2) > radius:
+            if self._leg is None or not self._leg.reached(v, max(v.params["WPNAV_RADIUS"] / 100.0, 0.3)):
                 return False
             self._arrived_s = v.time_s
         return v.time_s - self._arrived_s >= max(item.param1, 0.0)
-
-
-def item_target(v: Vehicle, item: Item) -> tuple[float, float, float]:
-    """Where an item lies in the local frame; a missing position means here."""
-    origin = v.origin or v.start
-    base = v.altitude_base_m(item.frame)
-    if base is None:
-        base = (v.home or origin).alt_m
-    down = origin.alt_m - (base + item.z)
-    if not item.has_place:
-        return (v.control.target[0], v.control.target[1], down)
-    north, east, _ = origin.vector_to(type(origin)(item.x, item.y, 0.0))
-    return (north, east, down)
-
-
-def _title(item: Item) -> str:
-    names = {
-        Command.NAV_WAYPOINT: "WP",
-        Command.NAV_SPLINE_WAYPOINT: "SplineWP",
-        Command.NAV_TAKEOFF: "Takeoff",
-        Command.NAV_LAND: "Land",
-        Command.NAV_RETURN_TO_LAUNCH: "RTL",
-        Command.NAV_LOITER_UNLIM: "LoitUnlim",
-        Command.NAV_LOITER_TIME: "LoitTime",
-        Command.NAV_LOITER_TURNS: "LoitTurns",
-        Command.NAV_DELAY: "Delay",
-    }
-    return names.get(Command(item.command), "Cmd") if item.command in set(Command) else "Cmd"

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from fractus_sim.vehicle.auto import AutoFlight, item_target
+from fractus_sim.vehicle.auto import AutoFlight
 from fractus_sim.vehicle.channel import Channel
 from fractus_sim.vehicle.earth import valid_coordinates
 from fractus_sim.vehicle.guided import GuidedFlight
@@ -24,6 +24,7 @@ from fractus_sim.vehicle.mav import (
 )
 from fractus_sim.vehicle.mission import Item
 from fractus_sim.vehicle.streams import BUILDERS
+from fractus_sim.vehicle.todo import item_target
 from fractus_sim.vehicle.vehicle import Vehicle
 from fractus_sim.vehicle.wire import Message, layout_of
 

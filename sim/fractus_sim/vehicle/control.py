@@ -26,12 +26,16 @@ STOPPED_MPS = 0.05
 BRAKING_JERK_MPS3 = 10.0
 
 
+Vector = tuple[float, float, float]
+
+
 class Axis(Enum):
-    """What is controlled: a position, a velocity, or an attitude given from outside."""
+    """What is controlled: a position, a velocity, an attitude given from outside, or a trajectory given point by point."""
 
     POSITION = "position"
     VELOCITY = "velocity"
     ATTITUDE = "attitude"
+    PATH = "path"
 
 
 @dataclass(slots=True)
@@ -171,6 +175,12 @@ class Control:
         if vd is not None:
             self.climb(vd)
 
+    def track(self, position: Vector, velocity: Vector, acceleration: Vector) -> None:
+        """Follow a trajectory that somebody else shapes, from this point of it."""
+        self.horizontal = self.vertical = Axis.PATH
+        self._stopping = False
+        self.pos[:], self.vel[:], self.acc[:] = position, velocity, acceleration
+
     def climb(self, vd: float) -> None:
         """Follow a vertical speed (down positive)."""
         self.vertical = Axis.VELOCITY
@@ -203,7 +213,7 @@ class Control:
                 dt=dt,
                 feedforward=self.target_velocity,
             )
-        else:
+        elif self.horizontal is Axis.VELOCITY:
             accel = self._braking_mps2 if self._stopping else limits.accel_mps2
             jerk = BRAKING_JERK_MPS3 if self._stopping else limits.jerk_mps3
             acc[0], acc[1] = shape_velocity_xy(self.target_velocity, here, bend, accel_max=accel, jerk_max=jerk, dt=dt)
@@ -246,7 +256,7 @@ class Control:
                 jerk_max=limits.jerk_mps3,
                 dt=dt,
             )
-        else:
+        elif self.vertical is Axis.VELOCITY:
             acc[2] = shape_velocity(
                 self.target_vd, vel[2], acc[2], accel_max=limits.accel_z_mps2, jerk_max=limits.jerk_mps3, dt=dt
             )

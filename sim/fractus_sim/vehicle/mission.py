@@ -30,7 +30,6 @@ SUPPORTED = frozenset(
         Command.NAV_LAND,
         Command.NAV_TAKEOFF,
         Command.NAV_DELAY,
-        Command.NAV_GUIDED_ENABLE,
         Command.CONDITION_DELAY,
         Command.CONDITION_DISTANCE,
         Command.CONDITION_YAW,
@@ -364,6 +363,15 @@ class Mission:
         self.current = 0
         self.complete = False
         self._jumps.clear()
+
+    def peek_after(self, index: int) -> int | None:
+        """The next item that navigates, without counting jumps as done."""
+        jumps = dict(self._jumps)
+        at = self.next_after(index)
+        while at is not None and not self.items[at].navigates:
+            at = self.next_after(at)
+        self._jumps = jumps
+        return at
 
     def next_after(self, index: int) -> int | None:
         """The item to execute after `index`, jumps followed; None at the end."""

@@ -74,7 +74,10 @@ def granted_again(observed: Body, spec: GrantSpec) -> Body:
 
 def _unsigned(spec: GrantSpec) -> Body:
     """The spec without what is added when it is signed, so that what was signed before compares with it."""
-    return spec.model_copy(update={"issued_at": None}).to_dict()
+    unsigned = spec.model_copy(update={"issued_at": None})
+    # Without defaults: a field that a later release adds changes no Grant that does not use it, and services of the
+    # release before can still read those.
+    return unsigned.model_dump(mode="json", by_alias=True, exclude_defaults=True)
 
 
 def tls_secret(application: Application, placed: PlannedInstance, data: dict[str, str]) -> Body:

@@ -10,7 +10,7 @@ from fractus_core.api import Application, Grant, InvalidObject
 from fractus_core.api.plans import GrantSpec
 
 from fractus_operator import builders, kinds
-from fractus_operator.difference import digest, is_current, stamped
+from fractus_operator.difference import contains, digest, is_current, stamped
 from fractus_operator.grantor import Grantor
 from fractus_operator.inventory import LiveInventory
 from fractus_operator.kinds import Body, Key, Kind, key_of
@@ -84,7 +84,9 @@ class Children:
         async with self._parallel:
             observed = await self.observed(kind, key)
             current = is_current(desired, observed) or self._is_normalised(kind, key, desired, observed)
-            if current and (kind is not kinds.GRANT or observed is None or self._grantor.vouches_for(observed)):
+            if kind is kinds.GRANT and observed is not None:
+                current = (current or _says_the_same(observed, body)) and self._grantor.vouches_for(observed)
+            if current:
                 return
             if observed is not None and not _is_child(application, kind, observed):
                 raise NameTaken(f"{kind.name} {key[1]} exists and is not of this application; rename one of them")
@@ -158,6 +160,14 @@ def _readable(observed: Body | None) -> Grant | None:
         return read(Grant, observed) if observed is not None else None
     except InvalidObject:
         return None
+
+
+def _says_the_same(observed: Body, desired: Body) -> bool:
+    """Whether a Grant, however it is spelt, already says what is desired: a release that spells it in another way changes none."""
+    present = _readable(observed)
+    if present is None or not contains(observed["metadata"].get("labels"), desired["metadata"]["labels"]):
+        return False
+    return present.spec.model_copy(update={"issued_at": None}) == read(Grant, desired).spec
 
 
 def _moved(observed: Body, desired: Body) -> bool:

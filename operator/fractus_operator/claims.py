@@ -47,19 +47,26 @@ class OwnedPlan:
 def claims(plans: Mapping[Key, OwnedPlan], grants: Iterable[Grant]) -> dict[str, Claim]:
     """Claims by node name.
 
-    Who has the oldest grant on a node has it, whatever plans say; without any grant, plans do.
+    Who has the oldest grant on a node has it, whatever plans say; without any grant, plans do. An application that
+    comes along with another one claims nothing.
 
     Args:
         plans: Plans of applications whose mission is not over.
         grants: All grants.
     """
     found: dict[str, Claim] = {}
+    guests: set[tuple[str, str]] = set()
     for key, plan in sorted(plans.items(), key=lambda item: item[0]):
-        if plan.spec.drone is not None and plan.spec.drone.shared_with is None:
-            found.setdefault(plan.spec.drone.node, Claim(key, plan.uid))
+        drone = plan.spec.drone
+        if drone is not None and drone.shared_with is not None:
+            guests.add((plan.uid, drone.node))
+        elif drone is not None:
+            found.setdefault(drone.node, Claim(key, plan.uid))
     oldest: dict[str, tuple[datetime, Key, str]] = {}
     for grant in grants:
         owner, node = grant.spec.application, grant.spec.node
+        if (owner.uid, node) in guests:
+            continue
         rank = (grant.metadata.creation_timestamp or _LATEST, (owner.namespace, owner.name), owner.uid)
         oldest[node] = min(rank, oldest.get(node, rank))
     return found | {node: Claim(key, uid) for node, (_, key, uid) in oldest.items()}

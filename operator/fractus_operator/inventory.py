@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any
 
 from fractus_core.api import (
     DeploymentPlan,
@@ -16,25 +16,25 @@ from fractus_core.api import (
     EdgeNode,
     Grant,
     Policy,
-    Resource,
     Zone,
 )
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning.candidates import requests
-from fractus_core.planning.inventory import Host, Inventory
+from fractus_core.planning.inventory import Flight, Host, Inventory
+from fractus_core.planning.whereabouts import Whereabouts
 
 from fractus_operator import kinds
 from fractus_operator.claims import Claim, OwnedPlan, claims
+from fractus_operator.hosts import BookedHosts, Bookings, ByName, corrections
 from fractus_operator.kinds import Body, Key, Kind
 from fractus_operator.labels import APPLICATION_LABEL, MANAGED_SELECTOR, NAMESPACE_LABEL, label_value
 from fractus_operator.pods import PodView, read_host, read_pod
 from fractus_operator.reading import Broken, Submitted, keeping_broken, read_submitted, reader
 from fractus_operator.reflector import Reflector
+from fractus_operator.rides import Flown, host_key
 from fractus_operator.store import Store
 
 logger = logging.getLogger(__name__)
-
-R = TypeVar("R", bound=Resource)
 
 SIGNER = "fractus.dev/node"
 
@@ -70,7 +70,7 @@ class LiveInventory:
         self.pods = Reflector(store, kinds.POD, read_pod, self._pod_changed)
         self.drones = Reflector(store, kinds.DRONE, reader(Drone), self._drone_changed)
         self.edge_nodes = Reflector(store, kinds.EDGE_NODE, reader(EdgeNode), self._edge_node_changed)
-        self.depots = Reflector(store, kinds.DEPOT, reader(Depot), self._spec_changed(kinds.DEPOT))
+        self.depots = Reflector(store, kinds.DEPOT, reader(Depot), self._depot_changed)
         self.zones = Reflector(store, kinds.ZONE, keeping_broken(Zone), self._spec_changed(kinds.ZONE))
         self.policies = Reflector(store, kinds.POLICY, keeping_broken(Policy), self._spec_changed(kinds.POLICY))
         self.applications = Reflector(store, kinds.APPLICATION, read_submitted, self._application_changed)
@@ -91,7 +91,9 @@ class LiveInventory:
         self._grants: dict[Key, Grant] = {}
         self._last_claims: dict[str, Claim] = {}
         self._aloft: set[str] = set()
-        self._requested: dict[str, dict[str, float]] = {}
+        self._bookings = Bookings()
+        self._pods: dict[Key, dict[Key, PodView]] = {}
+        self._where = Whereabouts()
 
     # -- running --
 
@@ -112,7 +114,7 @@ class LiveInventory:
     @contextmanager
     def subscription(self, key: Key) -> Iterator[Subscription]:
         """Wake-up calls for one application, as long as the context lasts."""
-        place = (key[0], label_value(key[1]))
+        place = _place(key)
         subscription = self._subscriptions[place] = Subscription()
         try:
             yield subscription
@@ -122,23 +124,46 @@ class LiveInventory:
 
     # -- reading --
 
-    def snapshot(self, uid: str | None = None) -> Inventory:
-        """The input of planning and of grants, as of now.
+    def snapshot(
+        self, key: Key | None = None, uid: str | None = None, flights: Mapping[str, Flight] | None = None
+    ) -> Inventory:
+        """The input of planning and of grants, as of now; good until something is awaited.
 
         Args:
-            uid: The application that asks: claims under its name that are not its own show another holder.
+            key: The application that asks: what its own pods have is free for it.
+            uid: Its uid: claims under its name that are not its own show another holder.
+            flights: What drones that are claimed fly, for who may come along.
         """
+        own = _place(key) if key is not None else None
+        pods = (pod for pods in self._pods.values() for pod in pods.values())
         return Inventory(
-            hosts=self._hosts_with_requests(),
-            drones=_by_name(self.drones),
-            edge_nodes=_by_name(self.edge_nodes),
-            depots=_by_name(self.depots),
+            hosts=BookedHosts(self.hosts, self._bookings, corrections(self._planned(), pods, own)),
+            drones=ByName(self.drones),
+            edge_nodes=ByName(self.edge_nodes),
+            depots=ByName(self.depots),
             zones={z.name: z for z in self.zones.values() if isinstance(z, Zone)},
             policies={p.name: p for p in self.policies.values() if isinstance(p, Policy)},
             unreadable_zones={z.name: z.problem for z in self.zones.values() if isinstance(z, Broken)},
             unreadable_policies={p.name: p.problem for p in self.policies.values() if isinstance(p, Broken)},
             claimed={node: claim.holder(uid) for node, claim in self.claims().items()},
+            flights=flights or {},
+            whereabouts=self._where,
         )
+
+    def depots_by_name(self) -> Mapping[str, Depot]:
+        """The depots."""
+        return ByName(self.depots)
+
+    def flown(self) -> Iterator[Flown]:
+        """The applications that have a drone of their own, each by a plan that stands."""
+        owners = {(claim.uid, node) for node, claim in self.claims().items() if not claim.over}
+        for key, plan in self.plans().items():
+            submitted, drone = self.applications.get(key), plan.spec.drone
+            if drone is None or drone.shared_with is not None or (plan.uid, drone.node) not in owners:
+                continue
+            found = self.drones.get(("", drone.node))
+            if found is not None and submitted is not None and submitted.application is not None:
+                yield Flown(submitted.application, plan.spec, found, is_flying(found))
 
     def plans(self) -> dict[Key, OwnedPlan]:
         """The plan of every application whose mission is not over."""
@@ -148,6 +173,14 @@ class LiveInventory:
         """The plan of the application with this uid, unless the mission it was made for is over."""
         plan = self._decided.get(key) or self._plans.get(key)
         return plan.spec if plan is not None and plan.uid == uid and self._is_live(key, plan) else None
+
+    def host_of(self, plan: DeploymentPlanSpec | None) -> tuple[Submitted | None, DeploymentPlanSpec | None]:
+        """The application that a guest comes along with, and that one's plan; None each, if there is none any more."""
+        if plan is None or plan.drone is None or plan.drone.shared_with is None:
+            return None, None
+        key = host_key(plan.drone.shared_with)
+        submitted = self.applications.get(key)
+        return submitted, self.plan_of(key, submitted.uid) if submitted is not None else None
 
     def _is_live(self, key: Key, plan: OwnedPlan) -> bool:
         submitted = self.applications.get(key)
@@ -184,13 +217,7 @@ class LiveInventory:
 
     def pods_of(self, key: Key) -> list[PodView]:
         """The pods of an application."""
-        namespace, name = key
-        label = label_value(name)
-        return [
-            pod
-            for pod in self.pods.values()
-            if pod.namespace == namespace and pod.labels.get(APPLICATION_LABEL) == label
-        ]
+        return list(self._pods.get(_place(key), {}).values())
 
     def grants_of(self, key: Key, uid: str | None = None) -> list[Grant]:
         """The grants of an application; with a uid, only of the one that has it."""
@@ -229,7 +256,7 @@ class LiveInventory:
 
     def wake(self, key: Key) -> None:
         """Wake one application."""
-        subscription = self._subscriptions.get((key[0], label_value(key[1])))
+        subscription = self._subscriptions.get(_place(key))
         if subscription is not None:
             subscription.wake()
 
@@ -237,27 +264,50 @@ class LiveInventory:
 
     def _host_changed(self, key: Key, old: Host | None, new: Host | None) -> None:
         self._report(kinds.NODE, key)
+        if new is None:
+            self._where.remove_host(key[1])
+        else:
+            self._where.upsert_host(new.name, new.node_class)
         self.wake_all()
 
     def _pod_changed(self, key: Key, old: PodView | None, new: PodView | None) -> None:
-        for pod, sign in ((old, -1.0), (new, 1.0)):
-            if pod is not None and pod.node is not None and not pod.finished:
-                self._book(pod.node, pod.requests, sign)
-        pod = new or old
-        if pod is not None and APPLICATION_LABEL in pod.labels:
-            self.wake((pod.namespace, pod.labels[APPLICATION_LABEL]))
+        self._bookings.changed(old, new)
+        for pod in (old, new):
+            if pod is not None and pod.application is not None:
+                place = (pod.namespace, pod.application)
+                pods = self._pods.setdefault(place, {})
+                if pod is new:
+                    pods[key] = pod
+                elif pods.pop(key, None) is not None and not pods:
+                    del self._pods[place]
+                self.wake(place)
 
     def _drone_changed(self, key: Key, old: Drone | None, new: Drone | None) -> None:
         self._report(kinds.DRONE, key)
         if new is not None:
             (self._aloft.add if is_flying(new) else self._aloft.discard)(new.name)
+            if old is None or _stand(old) != _stand(new):
+                self._where.upsert_drone(new)
+        else:
+            self._where.remove_drone(key[1])
         if old is None or new is None or _planning_view(old) != _planning_view(new):
             self.wake_all()
 
     def _edge_node_changed(self, key: Key, old: EdgeNode | None, new: EdgeNode | None) -> None:
         self._report(kinds.EDGE_NODE, key)
+        if new is None:
+            self._where.remove_edge_node(key[1])
+        elif old is None or old.spec.location != new.spec.location:
+            self._where.upsert_edge_node(new)
         if old is None or new is None or old.spec != new.spec:
             self.wake_all()
+
+    def _depot_changed(self, key: Key, old: Depot | None, new: Depot | None) -> None:
+        if new is None:
+            self._where.remove_depot(key[1])
+        else:
+            self._where.upsert_depot(new)
+        self._spec_changed(kinds.DEPOT)(key, old, new)
 
     def _spec_changed(self, kind: Kind) -> Callable[[Key, Any, Any], None]:
         def changed(key: Key, old: Any, new: Any) -> None:
@@ -312,44 +362,16 @@ class LiveInventory:
 
     # -- bookings --
 
-    def _book(self, node: str, amounts: Mapping[str, float], sign: float) -> None:
-        booked = self._requested.setdefault(node, {})
-        for resource, amount in amounts.items():
-            booked[resource] = booked.get(resource, 0.0) + sign * amount
-
-    def _hosts_with_requests(self) -> dict[str, Host]:
-        """Hosts with what is booked on them: by pods that run, and by plans whose pods are yet to come."""
-        planned = dict(self._planned_amounts())
-        hosts = {}
-        for host in self.hosts.values():
-            booked = self._requested.get(host.name, {})
-            extra = planned.get(host.name)
-            if extra:
-                booked = {r: booked.get(r, 0.0) + extra.get(r, 0.0) for r in booked.keys() | extra.keys()}
-            hosts[host.name] = Host(
-                host.name, host.labels, host.allocatable, booked, ready=host.ready, schedulable=host.schedulable
-            )
-        return hosts
-
-    def _planned_amounts(self) -> Iterable[tuple[str, dict[str, float]]]:
-        """What planned instances without a bound pod will ask for, by node."""
-        bound = {
-            (pod.namespace, pod.instance, pod.node) for pod in self.pods.values() if pod.instance and not pod.finished
-        }
-        totals: dict[str, dict[str, float]] = {}
+    def _planned(self) -> Iterator[tuple[Key, str, str, Mapping[str, float]]]:
+        """Each planned instance on a node, with what it asks for."""
         for key, plan in self.plans().items():
             submitted = self.applications.get(key)
             if submitted is None or submitted.application is None:
                 continue
             components = {c.name: c for c in submitted.application.spec.components}
             for placed in plan.spec.placements:
-                if placed.node is None or (key[0], placed.instance, placed.node) in bound:
-                    continue
-                if placed.component in components:
-                    total = totals.setdefault(placed.node, {})
-                    for resource, amount in requests(components[placed.component]).items():
-                        total[resource] = total.get(resource, 0.0) + amount
-        return totals.items()
+                if placed.node is not None and placed.component in components:
+                    yield _place(key), placed.instance, placed.node, requests(components[placed.component])
 
     def _claim_on_record(self, drone: str) -> Claim:
         """Who flew the drone last, from the applications' statuses, for an operator that was restarted since."""
@@ -371,10 +393,15 @@ def _planning_view(drone: Drone) -> tuple[object, ...]:
     return (drone.spec, is_flying(drone), ready)
 
 
+def _stand(drone: Drone) -> tuple[object, ...]:
+    return (drone.spec.depot, drone.spec.home)
+
+
+def _place(key: Key) -> Key:
+    """The application as labels name it."""
+    return (key[0], label_value(key[1]))
+
+
 def _as_is(body: Body) -> Body:
     body["metadata"].pop("managedFields", None)
     return body
-
-
-def _by_name(reflector: Reflector[R | None]) -> dict[str, R]:
-    return {name: value for (_, name), value in reflector.items() if value is not None}

@@ -92,7 +92,7 @@ def replan_reason(
 ) -> str | None:
     """Why a (new) plan is needed, as a CamelCase reason; None while the present one stands.
 
-    A node that is out of reach is no reason: its pods run on, and it comes back.
+    A node that is out of reach is no reason: its pods run on, and it comes back. One that is cordoned is.
 
     Args:
         application: As submitted.
@@ -113,6 +113,9 @@ def replan_reason(
             return "NodeGone"
         if placed.node in stuck:
             return "NodeUnusable"
+    used = {placed.node for placed in plan.placements} - {None, aloft}
+    if any(not inventory.hosts[node].schedulable for node in used if node is not None):
+        return "NodeCordoned"
     return None
 
 
@@ -127,6 +130,8 @@ def stuck_nodes(
     nodes = {placed.instance: placed.node for placed in plan.placements} if plan is not None else {}
     stuck: dict[str, str] = {}
     wait_s: float | None = None
+    pods = tuple(pods)
+    leaving = {pod.node for pod in pods if pod.terminating}
     for pod in pods:
         node = nodes.get(pod.instance or "")
         if pod.unschedulable_since is None or node is None or pod.terminating:
@@ -135,7 +140,10 @@ def stuck_nodes(
         if pod.deployment != pod.instance:
             continue
         left = (pod.unschedulable_since + UNSCHEDULABLE_GRACE - now).total_seconds()
-        if left <= 0:
+        if left <= 0 and node in leaving:
+            # What its predecessor has is free when that has ended.
+            wait_s = min(1.0, wait_s or 1.0)
+        elif left <= 0:
             stuck[node] = f"the scheduler cannot place {pod.instance} on {node}: {pod.unschedulable_message}"
         else:
             wait_s = min(left, wait_s or left)

@@ -45,6 +45,11 @@ class PodView:
         return self.labels.get(INSTANCE_LABEL)
 
     @property
+    def application(self) -> str | None:
+        """The application that the pod belongs to, as its label says."""
+        return self.labels.get(APPLICATION_LABEL)
+
+    @property
     def component(self) -> str | None:
         """The component that the pod runs."""
         return self.labels.get(COMPONENT_LABEL)

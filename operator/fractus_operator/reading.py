@@ -39,6 +39,11 @@ class Submitted:
         return str(self.body["metadata"].get("uid", ""))
 
     @property
+    def phase(self) -> str:
+        """Where it stands, as its status says; empty before it has one."""
+        return str((self.body.get("status") or {}).get("phase") or "")
+
+    @property
     def settled_generation(self) -> int | None:
         """The generation whose mission is over; None while a mission goes on, or before the first."""
         status = self.body.get("status") or {}

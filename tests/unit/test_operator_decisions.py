@@ -118,6 +118,9 @@ def test_a_new_plan_is_made_for_a_reason() -> None:
     assert replan_reason(application(), PLAN, replace(INVENTORY, hosts={}), {}) == "NodeGone"
     assert replan_reason(application(), PLAN, replace(INVENTORY, edge_nodes={}), {}) == "NodeGone"
     assert replan_reason(application(), PLAN, INVENTORY, {"edge-1": "full"}) == "NodeUnusable"
+    cordoned = replace(INVENTORY, hosts={"edge-1": Host("edge-1", schedulable=False)})
+    assert replan_reason(application(), PLAN, cordoned, {}) == "NodeCordoned"
+    assert replan_reason(application(), PLAN, cordoned, {}, aloft="edge-1") is None
 
 
 def test_a_drone_in_the_air_keeps_its_plan() -> None:
@@ -143,6 +146,13 @@ def test_a_node_is_stuck_after_a_grace() -> None:
     leaving = view("a-1", terminating=True, unschedulable_since=NOW - timedelta(minutes=1))
     forged = view("a-1", deployment=None, unschedulable_since=NOW - timedelta(minutes=1))
     assert stuck_nodes(PLAN, [in_the_cloud, leaving, forged], NOW) == ({}, None)
+
+
+def test_a_node_is_not_stuck_while_the_pod_before_is_on_its_way_out() -> None:
+    waiting = view("a-1", unschedulable_since=NOW - timedelta(seconds=60), unschedulable_message="full")
+    leaving = replace(view("a-0", terminating=True), node="edge-1")
+    assert stuck_nodes(PLAN, [waiting, leaving], NOW) == ({}, 1.0)
+    assert set(stuck_nodes(PLAN, [waiting], NOW)[0]) == {"edge-1"}
 
 
 def test_readiness_counts_each_instance_up_to_its_replicas() -> None:

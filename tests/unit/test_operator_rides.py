@@ -1,0 +1,137 @@
+"""Guests on other applications' drones, and what planning sees of nodes and pods: pure decisions of the operator."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from fractus_core.api import Drone, Grant
+from fractus_core.api.plans import DeploymentPlanSpec, DroneChoice
+from fractus_core.planning import flight_of, plan
+from fractus_core.planning.flight import Flight
+from fractus_operator.claims import OwnedPlan, claims
+from fractus_operator.hosts import Bookings, corrections
+from fractus_operator.pods import PodView
+from fractus_operator.reading import read_submitted
+from fractus_operator.rides import Flown, flights, ride_lost, ride_outcome
+from test_planning import PATH, VIEWER, application, at, drone, inventory, manifest, navigator
+
+HOST = application(navigator(PATH))
+GUEST = application(VIEWER | {"egress": [], "pointsOfInterest": {"points": [at(120, 0), at(250, 0)]}})
+DEPOTS = inventory().depots
+OWN = DeploymentPlanSpec(application="traffic", drone=DroneChoice(node="d"))
+RIDE = DeploymentPlanSpec(application="guest", drone=DroneChoice(node="d", shared_with="default/traffic"))
+
+
+def flown(state: str = "inactive", x: float = 0.0, **more: Any) -> Flown:
+    status = {"flightState": state, "position": at(x, 0, 10)}
+    flying = Drone.from_body(manifest("Drone", "d", drone("d").spec.to_dict(), status=status))
+    return Flown(HOST, OWN, flying, aloft=state != "inactive", **more)
+
+
+def submitted(phase: str | None) -> Any:
+    status = {"phase": phase, "observedGeneration": 1} if phase else {}
+    body = {**manifest("Application", "traffic", {"components": []}), "status": status}
+    return read_submitted(body)
+
+
+def test_a_drone_that_has_not_begun_offers_its_whole_way() -> None:
+    assert flights([flown()], DEPOTS, 7.0, None) == {"d": flight_of(HOST, DEPOTS)}
+
+
+def test_a_drone_in_the_air_offers_what_lies_ahead_and_only_if_that_is_known() -> None:
+    begun = flights([flown("flying", 180)], DEPOTS, 7.0, None)["d"]
+    assert begun.legs[0][0].lon == pytest.approx(at(180, 0)["lon"])
+    assert flights([flown("flying", 900)], DEPOTS, 7.0, None) == {}
+    # Who is aboard already was promised the whole way.
+    assert flights([flown("flying", 900)], DEPOTS, 7.0, RIDE) == {"d": flight_of(HOST, DEPOTS)}
+
+
+def test_a_host_whose_manifest_was_changed_is_not_offered() -> None:
+    changed = HOST.model_copy(update={"metadata": HOST.metadata.model_copy(update={"generation": 2})})
+    assert flights([replace(flown(), application=changed)], DEPOTS, 7.0, None) == {}
+
+
+@pytest.mark.parametrize(
+    ("phase", "host_plan", "done"),
+    [("Completed", None, True), ("Completed", OWN, False), ("Failed", None, False), ("Running", OWN, False)],
+)
+def test_a_guest_is_done_when_its_host_has_completed(phase: str, host_plan: Any, done: bool) -> None:
+    outcome = ride_outcome(RIDE, submitted(phase), host_plan)
+    assert (outcome is not None and outcome.complete) is done
+    assert ride_outcome(OWN, submitted("Completed"), None) is None
+
+
+def test_a_guest_loses_its_ride_for_a_reason() -> None:
+    whole = flight_of(HOST, DEPOTS)
+    assert ride_lost(GUEST, RIDE, OWN, whole, 7.0) is None
+    assert ride_lost(GUEST, RIDE, OWN, None, 7.0) is None
+    assert ride_lost(GUEST, OWN, None, None, 7.0) is None
+    assert "does not fly d any more" in str(ride_lost(GUEST, RIDE, None, whole, 7.0))
+    other = OWN.model_copy(update={"drone": DroneChoice(node="e")})
+    assert "flies e now" in str(ride_lost(GUEST, RIDE, other, whole, 7.0))
+    elsewhere = Flight(("default", "traffic"), ((*whole.legs[0][:1],),))
+    assert "does not visit pointsOfInterest.points[0]" in str(ride_lost(GUEST, RIDE, OWN, elsewhere, 7.0))
+
+
+def grant(name: str, uid: str, created: str) -> Grant:
+    spec = {"node": "d", "application": {"namespace": "default", "name": name, "uid": uid}, "component": "C"}
+    body = manifest("Grant", name, spec | {"instance": name})
+    body["metadata"]["creationTimestamp"] = created
+    return Grant.from_body(body)
+
+
+def test_a_guest_claims_nothing_however_old_its_grant_is() -> None:
+    plans = {("default", "guest"): OwnedPlan("g", RIDE), ("default", "traffic"): OwnedPlan("t", OWN)}
+    old, new = grant("guest", "g", "2026-01-01T00:00:00Z"), grant("traffic", "t", "2026-01-02T00:00:00Z")
+    assert claims(plans, [old, new])["d"].uid == "t"
+    # One that has a drone of its own by now, or no plan any more, is no guest.
+    assert claims({}, [old, new])["d"].uid == "g"
+
+
+# -- bookings --
+
+
+def pod(name: str, node: str | None, cpu: float, **more: Any) -> PodView:
+    labels = {"fractus.dev/application": more.pop("app"), "fractus.dev/instance": name} if "app" in more else {}
+    values = {"ready": True, "finished": False, "terminating": False, "ip": None} | more
+    return PodView("ns", name, node, labels, {"cpu": cpu}, **values)
+
+
+def test_bookings_follow_pods_one_at_a_time() -> None:
+    rng = random.Random(4)
+    bookings, pods = Bookings(), {}
+    for _ in range(300):
+        name = f"p{rng.randrange(20)}"
+        new = pod(name, rng.choice([None, "a", "b"]), rng.choice([0.25, 0.5]), finished=rng.random() < 0.2)
+        new = None if rng.random() < 0.2 else new
+        bookings.changed(pods.get(name), new)
+        pods[name] = new
+        for node in "ab":
+            there = [p for p in pods.values() if p is not None and p.node == node and not p.finished]
+            assert bookings.on(node).get("cpu", 0.0) == sum(p.requests["cpu"] for p in there)
+
+
+def test_what_is_planned_is_booked_once_and_own_pods_are_free() -> None:
+    pods = [pod("mine", "a", 1.0, app="me"), pod("theirs", "a", 2.0, app="them"), pod("bare", "a", 4.0)]
+    planned = [
+        (("ns", "me"), "mine-2", "b", {"cpu": 8.0}),
+        (("ns", "them"), "theirs", "a", {"cpu": 2.0}),
+        (("ns", "them"), "theirs-2", "a", {"cpu": 16.0}),
+    ]
+    assert corrections(planned, pods, ("ns", "me")) == {"a": {"cpu": 15.0}}
+    assert corrections(planned, pods, None) == {"a": {"cpu": 16.0}, "b": {"cpu": 8.0}}
+
+
+def test_a_flight_that_a_guest_was_planned_on_is_the_one_it_is_judged_by() -> None:
+    shared = inventory(
+        [drone("d")],
+        claimed={"d": HOST.key},
+        flights={"d": replace(flight_of(HOST, DEPOTS), holder=("default", "host"))},
+    )
+    found = plan(GUEST, shared)
+    assert found.drone is not None
+    assert found.drone.shared_with == "default/host"
+    assert ride_lost(GUEST, found, OWN, shared.flights["d"], 7.0) is None

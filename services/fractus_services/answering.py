@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
@@ -21,24 +22,36 @@ CALLS_PER_S = 50.0
 BURST = 100.0
 """What one identity may ask of a service; a driver that streams setpoints stays far below it."""
 
+URGENT_PER_S = 20.0
+URGENT_BURST = 40.0
+"""The same for calls that only make things safer; these are counted apart, so that no other call uses them up."""
+
+OPEN_CALLS = 32
+"""So many calls of one identity may be under way at a time, streams included."""
+
+_MOST_COUNTED = 1_000
+
 
 class Allowance:
     """A token bucket for each caller: a flood costs its sender, not the drone."""
 
     def __init__(self, rate: float = CALLS_PER_S, burst: float = BURST) -> None:
-        self._rate = rate
+        self.rate = rate
         self._burst = burst
         self._left: dict[str, tuple[float, float]] = {}
 
-    def take(self, identity: str, time_s: float) -> bool:
-        """Use up one call; False when there is none left. Times are monotonic seconds."""
+    def take(self, identity: str, time_s: float) -> float:
+        """Use up one call; 0, or in how many seconds to try again when there is none left. Times are monotonic."""
         left, at = self._left.get(identity, (self._burst, time_s))
-        left = min(self._burst, left + max(time_s - at, 0.0) * self._rate)
+        left = min(self._burst, left + max(time_s - at, 0.0) * self.rate)
         if left < 1.0:
             self._left[identity] = (left, time_s)
-            return False
+            return (1.0 - left) / self.rate
         self._left[identity] = (left - 1.0, time_s)
-        return True
+        if len(self._left) > _MOST_COUNTED:
+            full_s = self._burst / self.rate
+            self._left = {name: entry for name, entry in self._left.items() if time_s - entry[1] < full_s}
+        return 0.0
 
 
 class Reception:
@@ -63,20 +76,27 @@ class Reception:
         self._translate = translate
         self._failed = failed
         self._allowance = Allowance()
+        self._urgent = Allowance(URGENT_PER_S, URGENT_BURST)
+        self._open: Counter[str] = Counter()
 
     @asynccontextmanager
-    async def call(self, context: Any, urgent: bool = False) -> AsyncIterator[Caller]:
+    async def call(self, context: Any, urgent: bool = False, lasting: bool = False) -> AsyncIterator[Caller]:
         """The caller of a call; exceptions inside end it with a status.
 
         Args:
             context: gRPC's context of the call.
-            urgent: the call only makes things safer, so no limit of rates holds it up.
+            urgent: the call only makes things safer: it needs no deadline, and no flood of other calls holds it up.
+            lasting: a stream that is the caller's sign of life, and needs no deadline either.
         """
+        admitted = ""
         try:
             caller = caller_of(context.auth_context(), self.clock())
-            if not urgent and not self._allowance.take(caller.identity, time.monotonic()):
-                reason = f"more than {CALLS_PER_S:.0f} calls a second; slow down"
-                raise Refused(grpc.StatusCode.RESOURCE_EXHAUSTED, Verdict("deny", None, "TooManyCalls", reason))
+            self._admit(caller.identity, self._urgent if urgent else self._allowance, urgent)
+            admitted = caller.identity
+            self._open[admitted] += 1
+            if not (urgent or lasting) and context.time_remaining() is None:
+                reason = "the call has no deadline; set a timeout, as the SDK does"
+                raise Refused(grpc.StatusCode.INVALID_ARGUMENT, Verdict("deny", None, "DeadlineMissing", reason))
             yield caller
         except NotAuthenticated as error:
             verdict = Verdict("deny", None, "NotAuthenticated", str(error))
@@ -93,6 +113,25 @@ class Reception:
             verdict = Verdict("deny", None, "InternalError", "the service failed; nothing was done", (), "hover")
             self._failed(verdict)
             await abort(context, Refused(grpc.StatusCode.INTERNAL, verdict))
+        finally:
+            if admitted:
+                self._open[admitted] -= 1
+                if not self._open[admitted]:
+                    del self._open[admitted]
+
+    def _admit(self, identity: str, allowance: Allowance, urgent: bool) -> None:
+        """Count a call.
+
+        Raises:
+            Refused: the caller asks too much.
+        """
+        again_s = allowance.take(identity, time.monotonic())
+        reason = f"more than {allowance.rate:.0f} calls a second; slow down"
+        if not again_s and not urgent and self._open[identity] >= OPEN_CALLS:
+            again_s, reason = 1.0, f"{OPEN_CALLS} calls are under way; end one before the next"
+        if again_s:
+            verdict = Verdict("deny", None, "TooManyCalls", reason)
+            raise Refused(grpc.StatusCode.RESOURCE_EXHAUSTED, verdict, again_s)
 
     def held(self, caller: Caller) -> Held:
         """The grant of a caller.

@@ -152,5 +152,9 @@ KEEPALIVE = (
     ("grpc.so_reuseport", 0),
     ("grpc.max_receive_message_length", 64 * 1024),
     ("grpc.max_concurrent_streams", 128),
+    ("grpc.max_metadata_size", 8 * 1024),
+    ("grpc.absolute_max_metadata_size", 16 * 1024),
+    ("grpc.server_handshake_timeout_ms", 5_000),
+    ("grpc.max_allowed_incoming_connections", 512),
 )
-"""Server options: a peer that does not answer pings is gone within four seconds."""
+"""Server options: a peer that does not answer pings is gone within four seconds, one that begins no TLS within five."""

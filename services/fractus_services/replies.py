@@ -27,12 +27,14 @@ class Refused(Exception):
     Attributes:
         status: the gRPC status code.
         verdict: what clients find in the status details.
+        again_s: in how many seconds the caller may try again; 0: trying again as such does not help.
     """
 
-    def __init__(self, status: grpc.StatusCode, verdict: Verdict) -> None:
+    def __init__(self, status: grpc.StatusCode, verdict: Verdict, again_s: float = 0.0) -> None:
         super().__init__(verdict.reason)
         self.status = status
         self.verdict = verdict
+        self.again_s = again_s
 
 
 def refused(verdict: Verdict) -> Refused:
@@ -65,15 +67,24 @@ def decision(verdict: Verdict) -> types_pb2.Decision:
 
 async def abort(context: Any, refusal: Refused) -> NoReturn:
     """End a call with the structured details of a refusal."""
-    packed, info = any_pb2.Any(), any_pb2.Any()
-    packed.Pack(decision(refusal.verdict))
-    info.Pack(
-        error_details_pb2.ErrorInfo(
-            reason=refusal.verdict.code, domain=DOMAIN, metadata={"policies": ",".join(refusal.verdict.policies)}
-        )
-    )
+    details = [decision(refusal.verdict), _error_info(refusal.verdict)]
+    if refusal.again_s:
+        again = error_details_pb2.RetryInfo()
+        again.retry_delay.FromNanoseconds(int(refusal.again_s * 1e9))
+        details.append(again)
     number = code_pb2.Code.Value(refusal.status.name)
-    status = status_pb2.Status(code=number, message=refusal.verdict.reason, details=[packed, info])
+    status = status_pb2.Status(code=number, message=refusal.verdict.reason, details=map(_packed, details))
     rich = rpc_status.to_status(status)
     await context.abort(rich.code, rich.details, rich.trailing_metadata)
     raise AssertionError("abort always raises")
+
+
+def _error_info(verdict: Verdict) -> Any:
+    policies = {"policies": ",".join(verdict.policies)}
+    return error_details_pb2.ErrorInfo(reason=verdict.code, domain=DOMAIN, metadata=policies)
+
+
+def _packed(message: Any) -> any_pb2.Any:
+    packed = any_pb2.Any()
+    packed.Pack(message)
+    return packed

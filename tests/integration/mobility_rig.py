@@ -428,7 +428,7 @@ def _drive(address: str, files: str) -> None:
         events = stub.GetControl(pb.GetControlRequest())
         for event in events:
             if event.state == pb.ControlEvent.STATE_GRANTED:
-                stub.Arm(pb.ArmRequest())
+                stub.Arm(pb.ArmRequest(), timeout=10)
                 list(stub.Takeoff(pb.TakeoffRequest(altitude_m=10)))
 
 

@@ -1,39 +1,115 @@
-"""Limits of rates: they hold up requests, never what makes things safer."""
+"""What every call must have, and how much of a service one caller may take."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AsyncExitStack
 from typing import Any, cast
 
 import grpc
 import pytest
+from fractus_proto.v1 import types_pb2
 from fractus_services import answering
-from fractus_services.answering import BURST, Reception
+from fractus_services.answering import BURST, OPEN_CALLS, URGENT_BURST, Reception
 from fractus_services.auth import Caller
+from google.protobuf import any_pb2
+from google.rpc import error_details_pb2, status_pb2
 
 
 class Aborted(Exception):
     """Stands for gRPC's end of a call."""
 
+    def __init__(self, code: grpc.StatusCode, text: str, details: status_pb2.Status) -> None:
+        super().__init__(f"{code.name}: {text}")
+        self.details = details
+
+    def find(self, kind: Any) -> Any:
+        """The detail of a kind."""
+        for detail in self.details.details:
+            if detail.Is(kind.DESCRIPTOR):
+                found = kind()
+                cast("any_pb2.Any", detail).Unpack(found)
+                return found
+        return None
+
 
 class Context:
     """A call of one caller."""
 
+    def __init__(self, remaining_s: float | None = 5.0) -> None:
+        self.remaining_s = remaining_s
+
     def auth_context(self) -> dict[str, Any]:
         return {}
 
-    async def abort(self, code: grpc.StatusCode, _details: str, _metadata: Any) -> None:
-        raise Aborted(code)
+    def time_remaining(self) -> float | None:
+        return self.remaining_s
+
+    async def abort(self, code: grpc.StatusCode, text: str, metadata: Any) -> None:
+        status = status_pb2.Status()
+        status.ParseFromString(dict(metadata)["grpc-status-details-bin"])
+        raise Aborted(code, text, status)
 
 
-async def test_an_urgent_call_is_let_through_a_flood(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def reception(monkeypatch: pytest.MonkeyPatch) -> Reception:
     monkeypatch.setattr(answering, "caller_of", lambda _context, _time: Caller("spiffe://fractus.dev/a", 0.0, 1e12))
     monkeypatch.setattr(answering.time, "monotonic", lambda: 1.0)
-    reception = Reception(cast("Any", None), lambda: 0.0)
+    return Reception(cast("Any", None), lambda: 0.0)
+
+
+async def test_an_urgent_call_is_let_through_a_flood_and_no_flood_of_its_own(reception: Reception) -> None:
     for _ in range(int(BURST)):
         async with reception.call(Context()):
             pass
-    with pytest.raises(Aborted, match="RESOURCE_EXHAUSTED"):
+    with pytest.raises(Aborted, match="RESOURCE_EXHAUSTED: more than 50 calls a second") as refusal:
         async with reception.call(Context()):
             pass
-    async with reception.call(Context(), urgent=True) as caller:
-        assert caller.identity == "spiffe://fractus.dev/a"
+    assert refusal.value.find(error_details_pb2.RetryInfo).retry_delay.nanos == 20_000_000
+    assert refusal.value.find(error_details_pb2.ErrorInfo).reason == "TooManyCalls"
+    assert refusal.value.find(types_pb2.Decision).action == types_pb2.Decision.ACTION_DENY
+    for _ in range(int(URGENT_BURST)):
+        async with reception.call(Context(), urgent=True) as caller:
+            assert caller.identity == "spiffe://fractus.dev/a"
+    with pytest.raises(Aborted, match="RESOURCE_EXHAUSTED: more than 20 calls a second"):
+        async with reception.call(Context(), urgent=True):
+            pass
+
+
+async def test_only_so_many_calls_at_a_time(reception: Reception) -> None:
+    async with AsyncExitStack() as stack:
+        for _ in range(OPEN_CALLS):
+            await stack.enter_async_context(reception.call(Context(), lasting=True))
+        with pytest.raises(Aborted, match=f"RESOURCE_EXHAUSTED: {OPEN_CALLS} calls are under way"):
+            async with reception.call(Context()):
+                pass
+        async with reception.call(Context(), urgent=True):
+            pass
+    async with reception.call(Context()):
+        pass
+    assert not reception._open
+
+
+@pytest.mark.parametrize(("urgent", "lasting"), [(True, False), (False, True)])
+async def test_a_call_needs_a_deadline(reception: Reception, urgent: bool, lasting: bool) -> None:
+    with pytest.raises(Aborted, match="INVALID_ARGUMENT: the call has no deadline; set a timeout") as refusal:
+        async with reception.call(Context(None)):
+            pass
+    assert refusal.value.find(error_details_pb2.ErrorInfo).reason == "DeadlineMissing"
+    assert refusal.value.find(error_details_pb2.RetryInfo) is None
+    async with reception.call(Context(None), urgent, lasting):
+        pass
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError, RecursionError, MemoryError])
+async def test_whatever_breaks_refuses_and_is_told(
+    error: Callable[[], Exception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(answering, "caller_of", lambda _context, _time: Caller("a", 0.0, 1e12))
+    told: list[str] = []
+    reception = Reception(cast("Any", None), lambda: 0.0, failed=lambda verdict: told.append(verdict.code))
+    with pytest.raises(Aborted, match="INTERNAL: the service failed; nothing was done"):
+        async with reception.call(Context()):
+            raise error()
+    assert told == ["InternalError"]
+    assert not reception._open

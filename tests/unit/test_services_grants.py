@@ -178,7 +178,14 @@ def test_a_listener_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
 
 def test_a_flood_runs_dry_and_fills_again() -> None:
     allowance = Allowance(rate=10, burst=5)
-    assert [allowance.take("a", 0.0) for _ in range(7)] == [True] * 5 + [False] * 2
-    assert allowance.take("b", 0.0), "others are not concerned"
-    assert [allowance.take("a", 0.2) for _ in range(3)] == [True, True, False]
-    assert [allowance.take("a", 100.0) for _ in range(6)] == [True] * 5 + [False]
+    assert [allowance.take("a", 0.0) for _ in range(7)] == [0.0] * 5 + [0.1] * 2
+    assert allowance.take("b", 0.0) == 0.0, "others are not concerned"
+    assert [allowance.take("a", 0.25) for _ in range(3)] == [0.0, 0.0, pytest.approx(0.05)]
+    assert [allowance.take("a", 100.0) for _ in range(6)] == [0.0] * 5 + [0.1]
+
+
+def test_those_who_ask_no_more_are_not_counted_for_ever() -> None:
+    allowance = Allowance(rate=10, burst=5)
+    for n in range(2500):
+        allowance.take(f"caller-{n}", n * 0.01)
+    assert len(allowance._left) < 1100

@@ -60,7 +60,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def GetControl(self, _request: Any, context: Any) -> None:  # noqa: N802 - the protocol's name
         """See mobility.proto."""
-        async with self._reception.call(context) as caller:
+        async with self._reception.call(context, lasting=True) as caller:
             held = self._held(caller)
             self._service.allow(Call("GetControl"), held)
             try:
@@ -126,13 +126,13 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def Takeoff(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context) as caller:
+        async with self._reception.call(context, lasting=True) as caller:
             progress = self._service.take_off(self._held(caller), TakeoffArgs(request.altitude_m))
             await self._report(progress, context)
 
     async def Goto(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context) as caller:
+        async with self._reception.call(context, lasting=True) as caller:
             args = _goto(request)
             progress = self._service.goto(self._held(caller), args, _finite(request.acceptance_radius_m))
             await self._report(progress, context)
@@ -165,7 +165,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def SubscribeTelemetry(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context) as caller:
+        async with self._reception.call(context, lasting=True) as caller:
             node = caller.identity == self._node
             interval = (
                 request.interval_s if math.isfinite(request.interval_s) and request.interval_s > 0 else USUAL_INTERVAL_S

@@ -1,10 +1,8 @@
-"""The audit log: one JSON object a line, each carrying the hash of the one before it."""
+"""The audit log: one JSON object a line, each carrying the hash of the one before it, in segments of bounded size."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import hashlib
 import json
 import logging
 import math
@@ -20,28 +18,36 @@ from typing import Any
 
 import click
 
+from fractus_services.chain import (
+    PRUNED,
+    Link,
+    canonical,
+    digest,
+    first_of,
+    last_link,
+    lines_of,
+    logs,
+    segment,
+    segments,
+    verify,
+)
+
 log = logging.getLogger(__name__)
 
-GENESIS = "0" * 64
 SYNC_S = 0.5
 """Entries that do not decide anything are on disk after this time at the latest."""
 
+SEGMENT_BYTES = 16_000_000
+"""A file of this size is closed, and the chain goes on in the next one."""
+
+KEPT_SEGMENTS = 32
+"""So many closed files are kept; the oldest goes, and an entry tells that it went."""
 
 MOST_WAITING = 10_000
 """So many entries wait for a disk that does not take them."""
 
 HUNG_S = 2.0
 """A write that takes longer counts as failed until it comes back."""
-
-
-def digest(entry: dict[str, Any]) -> str:
-    """SHA-256 over the canonical JSON of an entry without its own hash."""
-    body = {key: value for key, value in entry.items() if key != "hash"}
-    return hashlib.sha256(_canonical(body)).hexdigest()
-
-
-def _canonical(value: dict[str, Any]) -> bytes:
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
 
 
 def _plain(value: Any) -> Any:
@@ -73,11 +79,23 @@ class AuditLog:
     Args:
         path: the file; a chain that it holds is continued, a last line torn by a crash is cut off and noted.
         clock: Unix time in seconds.
+        segment_bytes: when the file is closed and the next one begun.
+        keep: how many closed files are kept.
     """
 
-    def __init__(self, path: Path, clock: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        clock: Callable[[], float],
+        *,
+        segment_bytes: int = SEGMENT_BYTES,
+        keep: int = KEPT_SEGMENTS,
+    ) -> None:
         self._path = path
         self._clock = clock
+        self._segment_bytes = segment_bytes
+        self._keep = keep
+        self._doomed: list[Path] = []
         self._waiting: deque[_Waiting] = deque()
         self._lost = 0
         self._news = threading.Condition()
@@ -88,11 +106,23 @@ class AuditLog:
         self._sound_bytes: int | None = None
         path.parent.mkdir(parents=True, exist_ok=True)
         torn = _cut_torn_line(path)
-        self._sequence, self._previous = _last_link(path)
+        self._end = self._found()
         self._thread = threading.Thread(target=self._write, name="audit", daemon=True)
         self._thread.start()
         if torn:
             self.append("recovered", {"torn_bytes": torn})
+
+    def _found(self) -> Link:
+        """Where the chain on disk ends."""
+        for path in (self._path, *reversed(segments(self._path))):
+            try:
+                end = last_link(path)
+            except ValueError:
+                log.critical("the last entry of %s cannot be read; a new chain begins after it", path)
+                return Link()
+            if end is not None:
+                return end
+        return Link()
 
     @property
     def failure(self) -> str:
@@ -110,9 +140,8 @@ class AuditLog:
             content: JSON values.
             now: whether it must reach the disk at once.
         """
-        moment = datetime.fromtimestamp(self._clock(), UTC).isoformat(timespec="milliseconds")
-        entry = _Waiting(moment, kind, _plain(content))
-        _canonical(entry.content)  # what is no JSON is the caller's error, not the thread's
+        entry = _Waiting(self._moment(), kind, _plain(content))
+        canonical(entry.content)  # what is no JSON is the caller's error, not the thread's
         with self._news:
             if len(self._waiting) >= MOST_WAITING:
                 self._lost += 1
@@ -143,6 +172,7 @@ class AuditLog:
             written = not batch or self._flush(batch)
             if written and batch:
                 self._forget(len(batch))
+                self._tidy()
             with self._news:
                 if closing and (not written or not self._waiting):
                     return
@@ -153,18 +183,18 @@ class AuditLog:
             for _ in range(written):
                 self._waiting.popleft()
             if self._lost:
-                moment = datetime.fromtimestamp(self._clock(), UTC).isoformat(timespec="milliseconds")
-                self._waiting.append(_Waiting(moment, "lost", {"entries": self._lost}))
+                self._waiting.append(_Waiting(self._moment(), "lost", {"entries": self._lost}))
                 self._lost, self._urgent = 0, True
 
     def _flush(self, batch: Iterable[_Waiting]) -> bool:
         """Append and sync; what could not be written is tried again."""
-        lines, sequence, previous = [], self._sequence, self._previous
+        lines, end = [], self._end
         for waiting in batch:
-            sequence += 1
-            entry = {"seq": sequence, "time": waiting.time, "kind": waiting.kind, **waiting.content, "prev": previous}
-            previous = entry["hash"] = digest(entry)
-            lines.append(_canonical(entry) + b"\n")
+            sequence = end.sequence + 1
+            entry = {"seq": sequence, "time": waiting.time, "kind": waiting.kind, **waiting.content, "prev": end.hash}
+            entry["hash"] = digest(entry)
+            end = Link(sequence, entry["hash"])
+            lines.append(canonical(entry) + b"\n")
         self._busy_since_s = time.monotonic()
         try:
             self._store(b"".join(lines))
@@ -176,8 +206,45 @@ class AuditLog:
         finally:
             self._busy_since_s = None
         self._problem = ""
-        self._sequence, self._previous = sequence, previous
+        self._end = end
         return True
+
+    def _tidy(self) -> None:
+        """Close a full file, and remove the oldest closed ones once the chain tells of it."""
+        self._busy_since_s = time.monotonic()
+        try:
+            while self._doomed:
+                self._doomed[0].unlink(missing_ok=True)
+                del self._doomed[0]
+            if self._path.stat().st_size >= self._segment_bytes:
+                self._path.rename(segment(self._path, self._first_entry()))
+                self._announce_pruning()
+        except (OSError, ValueError) as error:
+            log.warning("cannot close a segment of the audit log %s: %s", self._path, error)
+        finally:
+            self._busy_since_s = None
+
+    def _first_entry(self) -> int:
+        """The number of the first entry in the present file."""
+        with self._path.open("rb") as file:
+            return int(json.loads(file.readline())["seq"])
+
+    def _announce_pruning(self) -> None:
+        closed = segments(self._path)
+        surplus = closed[: max(len(closed) - self._keep, 0)]
+        if not surplus:
+            return
+        end = last_link(surplus[-1])
+        if end is None:
+            return
+        content = {"first": first_of(surplus[0]), "last": end.sequence, "last_hash": end.hash}
+        with self._news:
+            self._waiting.append(_Waiting(self._moment(), PRUNED, content))
+            self._urgent = True
+        self._doomed = list(surplus)
+
+    def _moment(self) -> str:
+        return datetime.fromtimestamp(self._clock(), UTC).isoformat(timespec="milliseconds")
 
     def _store(self, data: bytes) -> None:
         """Have bytes at the end of the file and on disk, or leave the file as it was.
@@ -223,78 +290,46 @@ def _cut_torn_line(path: Path) -> int:
     return data_end - at
 
 
-def _last_link(path: Path) -> tuple[int, str]:
-    """Sequence number and hash of the last entry."""
-    last = b""
-    with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
-        file.seek(0, os.SEEK_END)
-        size = file.tell()
-        file.seek(max(size - 1_000_000, 0))
-        lines = file.read().splitlines()
-        last = lines[-1] if lines else b""
-    if not last:
-        return 0, GENESIS
-    try:
-        entry = json.loads(last)
-        return int(entry["seq"]), str(entry["hash"])
-    except (ValueError, KeyError, TypeError):
-        log.critical("the last entry of %s cannot be read; a new chain begins after it", path)
-        return 0, GENESIS
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """What verification found.
-
-    Attributes:
-        entries: how many entries are sound.
-        line: number of the first bad line; 0 when all are sound.
-        problem: what is wrong with it; empty when all are sound.
-        torn: the last line is incomplete, as after a crash or while one is being written.
-    """
-
-    entries: int
-    line: int = 0
-    problem: str = ""
-    torn: bool = False
-
-
-def verify(lines: Iterable[bytes]) -> Finding:
-    """Check the chain of an audit log, line by line."""
-    previous, sequence, count = GENESIS, 0, 0
-    for number, line in enumerate(lines, 1):
-        if not line.endswith(b"\n"):
-            return Finding(count, torn=True)
-        problem = ""
-        try:
-            entry = json.loads(line)
-            if entry["prev"] != previous:
-                problem = "does not continue the line before it: something was removed, inserted or reordered"
-            elif entry["seq"] != sequence + 1:
-                problem = f"is number {entry['seq']}, where {sequence + 1} was expected"
-            elif digest(entry) != entry["hash"] or _canonical(entry) + b"\n" != line:
-                problem = "was changed after it was written"
-            previous, sequence = str(entry["hash"]), int(entry["seq"])
-        except (ValueError, KeyError, TypeError):
-            problem = "is not an audit entry"
-        if problem:
-            return Finding(count, number, problem)
-        count += 1
-    return Finding(count)
-
-
 @click.group()
 def audit() -> None:
     """Audit logs of node services."""
 
 
 @audit.command("verify")
-@click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
-def verify_command(file: Path) -> None:
-    """Check that no entry of FILE was changed, removed or inserted."""
-    with file.open("rb") as stream:
-        finding = verify(stream)
+@click.argument("paths", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+def verify_command(paths: tuple[Path, ...]) -> None:
+    """Check that no entry of the audit logs in PATHS was changed, removed or inserted.
+
+    PATHS are directories, logs (with their segments), or single segments.
+    """
+    found = logs(paths)
+    if not found:
+        raise click.ClickException(f"{', '.join(map(str, paths))}: there is no audit log (*.jsonl)")
+    for name, files in found.items():
+        _check(name, files)
+
+
+def _check(name: Path, files: list[Path]) -> None:
+    begins: list[tuple[int, Path]] = []
+
+    def lines() -> Iterable[bytes]:
+        for total, (path, number, line) in enumerate(lines_of(files)):
+            if number == 1:
+                begins.append((total, path))
+            yield line
+
+    part = name not in files
+    finding = verify(lines(), part)
     if finding.problem:
-        raise click.ClickException(f"{file}: line {finding.line} {finding.problem}")
-    torn = "; the last line is incomplete (a crash, or it is being written)" if finding.torn else ""
-    click.echo(f"{file}: {finding.entries} entries, chain sound{torn}")
+        before, path = next(begin for begin in reversed(begins) if begin[0] < finding.line)
+        raise click.ClickException(f"{path}: line {finding.line - before} {finding.problem}")
+    said = [f"{finding.entries} entries, chain sound"]
+    if len(files) > 1:
+        said.append(f"{len(files)} files")
+    if finding.before:
+        said.append(f"the {finding.before} before were removed to make room")
+    if part:
+        said.append("a part of the log, so what came before and after is not judged")
+    if finding.torn:
+        said.append("the last line is incomplete (a crash, or it is being written)")
+    click.echo(f"{files[0] if part else name}: {'; '.join(said)}")

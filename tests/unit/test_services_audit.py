@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 from fractus_services.audit import AuditLog, audit, verify
+from fractus_services.chain import digest, segments
 
 
 async def written(path: Path, count: int, begin: int = 0) -> list[bytes]:
@@ -52,8 +53,6 @@ async def test_no_entry_can_be_touched(tmp_path: Path, which: str) -> None:
     elif which == "reformat":
         lines[2] = json.dumps(json.loads(lines[2])).encode() + b"\n"
     elif which == "rehash":
-        from fractus_services.audit import digest
-
         entry = json.loads(lines[2])
         entry["n"] = 99
         entry["hash"] = digest(entry)
@@ -182,6 +181,97 @@ async def test_what_is_no_json_is_the_callers_error(tmp_path: Path) -> None:
     log.append("call", {"n": 1})
     await log.close()
     assert verify(read(tmp_path / "audit.jsonl")).entries == 1
+
+
+async def filled(path: Path, count: int, **bounds: int) -> None:
+    """A log written entry by entry, so that it is closed as often as it can be."""
+    log = AuditLog(path, lambda: 0.0, **bounds)
+    for n in range(count):
+        log.append("call", {"n": n})
+        await until(lambda: not log._waiting)
+    await log.close()
+    assert not log.failure
+
+
+def verified(*paths: Path) -> tuple[int, str]:
+    done = CliRunner().invoke(audit, ["verify", *map(str, paths)])
+    return done.exit_code, done.output.strip()
+
+
+async def test_the_chain_goes_on_through_segments_and_restarts(tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    await filled(path, 7, segment_bytes=600)
+    assert len(segments(path)) >= 2
+    await filled(path, 4, segment_bytes=600)
+    files = [*segments(path), path]
+    every = [line for file in files if file.exists() for line in read(file)]
+    assert [json.loads(line)["seq"] for line in every] == list(range(1, 12))
+    assert all(file.stat().st_size < 900 for file in files if file.exists())
+    code, said = verified(tmp_path)
+    assert code == 0
+    assert "11 entries, chain sound" in said
+    assert verified(files[0])[1].endswith("what came before and after is not judged")
+
+
+async def test_a_log_that_was_just_closed_is_continued(tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    await filled(path, 3, segment_bytes=1)
+    assert not path.exists()
+    await filled(path, 1)
+    assert [json.loads(line)["seq"] for line in read(path)] == [4]
+    assert verified(path)[0] == 0
+
+
+async def test_the_oldest_segments_go_and_the_log_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    await filled(path, 30, segment_bytes=500, keep=2)
+    await until(lambda: len(segments(path)) <= 3)
+    code, said = verified(path)
+    assert code == 0, said
+    assert "before were removed to make room" in said
+    segments(path)[0].unlink()
+    code, said = verified(path)
+    assert code == 1
+    assert "what came before was removed by somebody" in said
+
+
+@pytest.mark.parametrize("which", ["middle", "change", "torn"])
+async def test_segments_cannot_be_touched(tmp_path: Path, which: str) -> None:
+    path = tmp_path / "audit.jsonl"
+    await filled(path, 12, segment_bytes=500)
+    second = segments(path)[1]
+    if which == "middle":
+        second.unlink()
+        second = segments(path)[1]
+    elif which == "change":
+        second.write_bytes(second.read_bytes().replace(b'"kind":"call"', b'"kind":"cool"', 1))
+    else:
+        second.write_bytes(second.read_bytes()[:-5])
+    code, said = verified(tmp_path)
+    assert code == 1
+    assert f"{second}: line" in said
+
+
+async def test_several_logs_at_once(tmp_path: Path) -> None:
+    for name in ("mobility", "camera"):
+        await filled(tmp_path / f"{name}.jsonl", 2)
+    code, said = verified(tmp_path)
+    assert (code, said.count("2 entries, chain sound")) == (0, 2)
+    code, said = verified(tmp_path / "mobility.jsonl", tmp_path / "camera.jsonl")
+    assert (code, said.count("2 entries, chain sound")) == (0, 2)
+    assert verified(tmp_path.parent / tmp_path.name)[0] == 0
+
+
+async def test_a_segment_that_cannot_be_closed_costs_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr("fractus_services.audit.Path.rename", refuse)
+    await filled(tmp_path / "audit.jsonl", 4, segment_bytes=1)
+    assert "cannot close a segment" in caplog.text
+    assert verify(read(tmp_path / "audit.jsonl")).entries == 4
 
 
 async def test_the_command(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 from fractus_core.api.plans import node_identity
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_proto.v1 import types_pb2
-from fractus_services.audit import verify
+from fractus_services.chain import verify
 from mobility_rig import (
     DRIVER,
     NODE,

@@ -8,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from fractus_services.audit import Finding, verify
+from fractus_services.chain import Finding, verify
 
 from fractus_sim.demo.kube import NAMESPACE, SYSTEM, DemoError, Kube, Object
 from fractus_sim.demo.watch import Mission

@@ -1,0 +1,212 @@
+"""Mode standalone: drones with Fractus' services as local processes, planned and granted from manifests."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from fractus_core.api import API_VERSION, Drone
+from fractus_core.api.plans import GrantSpec
+from fractus_core.planning import Settings
+from fractus_core.policy.grants import compile_grants
+from fractus_operator.commands.manifests import BadManifest, Manifests, read_manifests
+from fractus_operator.commands.plan import plan_all
+from fractus_services.chain import verify
+
+from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.experiment.model import Experiment, Program, VehicleSetup
+from fractus_sim.experiment.stage import Findings, Moment, Stage
+from fractus_sim.experiment.standalone import CameraSetup, DroneSetup, Standalone
+from fractus_sim.experiment.station import OBSERVER_ID, Station, TcpLink
+from fractus_sim.experiment.tlog import TlogWriter
+from fractus_sim.experiment.vehicles import command_of
+
+TICK_S = 0.02
+CONNECT_S = 10.0
+JUDGED = frozenset({"call", "monitor", "takeover"})
+
+
+class ServiceStage(Stage):
+    """Drones with their services; programs run as the components that they are in the manifests."""
+
+    def __init__(self, experiment: Experiment, folder: Path, base: Path, tell: Callable[[str], None]) -> None:
+        super().__init__(experiment, folder, base, tell)
+        for name in ("pki", *(setup.name for setup in experiment.setups())):
+            shutil.rmtree(folder / name, ignore_errors=True)
+        for log in (folder / "logs").glob("*.log"):
+            log.unlink()
+        self._manifests = _read(experiment, base)
+        self._ground = Standalone(folder)
+        self._identities: dict[str, str] = {}
+        self._began_s = time.monotonic()
+
+    def set_up(self) -> None:
+        """Plan the applications, bring the drones up, and grant what was planned.
+
+        Raises:
+            ExperimentError: an application cannot be planned, or a process did not come up.
+        """
+        grants = list(_grants(self._manifests))
+        described = self._manifests.of(Drone)
+        for setup in self.experiment.setups():
+            drone = self._ground.add_drone(self._setup(setup, described.get(setup.name)))
+            host, port = drone.station_link.split(":")[1:]
+            watch = TlogWriter(self.folder / "logs" / f"{setup.name}-observer.tlog")
+            link = TcpLink.connect(host, int(port), CONNECT_S)
+            self.observers[setup.name] = Station(link, setup.system_id, watch, own_id=OBSERVER_ID, beats=False)
+            self.endpoints[setup.name] = drone.guest_link
+        for spec in grants:
+            if spec.node in self._ground.drones:
+                self._identities[spec.component] = self._ground.grant(_manifest(spec))
+        self._began_s = time.monotonic()
+
+    def tick(self) -> Moment:
+        """Wait for 20 ms.
+
+        Raises:
+            ExperimentError: a vehicle or a service has ended.
+        """
+        time.sleep(TICK_S)
+        self._ground.check()
+        return Moment((time.monotonic() - self._began_s) * self.experiment.pace, time.time_ns() // 1000)
+
+    def begin(self) -> None:
+        """Start the programs, each as its component."""
+        addresses = {
+            program.component: f"127.0.0.1:{program.port}"
+            for program in self.experiment.programs
+            if program.component is not None and program.port is not None
+        }
+        for program in self.experiment.programs:
+            self._start(program, addresses)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a program runs that is waited for."""
+        return any(self._ground.processes.running(p.name) for p in self.experiment.programs if not p.background)
+
+    @property
+    def flies(self) -> list[str]:
+        """All vehicles, unless the end of programs says when it is over."""
+        return [] if any(not p.background for p in self.experiment.programs) else list(self.observers)
+
+    def cut_link(self, vehicle: str) -> None:
+        """Cut companion computer and autopilot apart."""
+        self._ground.drones[vehicle].cut_link()
+
+    def heal_link(self, vehicle: str) -> None:
+        """Join them again."""
+        self._ground.drones[vehicle].heal_link()
+
+    def power_off(self, node: str) -> None:
+        """Kill services and programs of a drone."""
+        self._ground.power_off(node)
+
+    def power_on(self, node: str) -> None:
+        """Start them again."""
+        self._ground.power_on(node, wait=False)
+
+    def collect(self) -> None:
+        """End programs and services, and read what they wrote into their audit logs."""
+        for program in self.experiment.programs:
+            self.findings.programs[program.name] = self._ground.processes.exit_code(program.name)
+        self._ground.stop_services()
+        for drone in self._ground.drones.values():
+            for path in (drone.audit, drone.audit.with_name("camera.jsonl")):
+                if path.exists():
+                    _read_audit(path, f"{drone.name}/{path.name}", self.findings)
+
+    def close(self) -> None:
+        """End every process."""
+        for observer in self.observers.values():
+            observer.close()
+        self._ground.close()
+
+    def _setup(self, setup: VehicleSetup, described: Drone | None) -> DroneSetup:
+        if described is None:
+            raise ExperimentError(f"the manifests have no Drone {setup.name}; add one, so that it can be planned for")
+        if setup.home is None:
+            raise ExperimentError(f"{setup.name} stands nowhere; give it a home")
+        entry, wind, world = setup.entry, self.experiment.wind, self.experiment.world
+        camera = CameraSetup(("--seed", str(world.seed), *world.arguments)) if entry.camera else None
+        return DroneSetup(
+            setup.name,
+            (setup.home.lat, setup.home.lon, setup.home.alt),
+            heading_deg=entry.heading,
+            system_id=setup.system_id,
+            seed=self.experiment.seed,
+            speedup=self.experiment.pace,
+            ready_after_s=entry.ready_after,
+            parameters=entry.parameters,
+            description=described.spec.to_dict(),
+            camera=camera,
+            vehicle_arguments=("--wind", f"{wind.speed},{wind.direction},{wind.turbulence}"),
+        )
+
+    def _start(self, program: Program, addresses: Mapping[str, str]) -> None:
+        others = {name: address for name, address in addresses.items() if name != program.component}
+        own = {"PORT": str(program.port)} if program.port is not None else {}
+        identity = self._identities.get(program.component or "")
+        environment = {**own, **program.environment}
+        if identity is not None:
+            self._ground.run(
+                program.name, command_of(program), identity, environment=environment, services=others, folder=self.base
+            )
+            return
+        known = {component.name for app in self._manifests.applications() for component in app.spec.components}
+        if program.component not in known:
+            raise ExperimentError(
+                f"program {program.name}: no application has a component {program.component}; there are:"
+                f" {', '.join(sorted(known))}"
+            )
+        self._ground.run_beside(
+            program.name, command_of(program), environment=environment, services=others, folder=self.base
+        )
+
+
+def _read(experiment: Experiment, base: Path) -> Manifests:
+    try:
+        return read_manifests([base / path for path in experiment.manifests])
+    except BadManifest as error:
+        raise ExperimentError(str(error)) from None
+
+
+def _grants(manifests: Manifests) -> Iterable[GrantSpec]:
+    """What the operator would grant.
+
+    Raises:
+        ExperimentError: an application cannot be planned.
+    """
+    settings = Settings()
+    try:
+        decided = plan_all(manifests, settings)
+    except BadManifest as error:
+        raise ExperimentError(str(error)) from None
+    for answer in decided:
+        name = answer.application.name
+        if answer.plan is None:
+            raise ExperimentError(f"Application {name} cannot be planned: {answer.refusal}")
+        yield from compile_grants(answer.application, answer.plan, manifests.inventory(), settings)
+
+
+def _manifest(spec: GrantSpec) -> dict[str, Any]:
+    metadata = {"name": spec.instance, "uid": f"uid-{spec.instance}"}
+    return {"apiVersion": API_VERSION, "kind": "Grant", "metadata": metadata, "spec": spec.to_dict()}
+
+
+def _read_audit(path: Path, name: str, findings: Findings) -> None:
+    """Verify an audit log, and keep its judgements."""
+    lines = path.read_bytes().splitlines(keepends=True)
+    finding = verify(lines)
+    findings.audit_problems[name] = f"line {finding.line} {finding.problem}" if finding.problem else ""
+    for line in lines:
+        try:
+            entry = json.loads(line)
+        except ValueError:  # what verify has found wrong already
+            continue
+        if entry.get("kind") in JUDGED:
+            findings.calls.append(entry)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Literal
@@ -14,7 +16,7 @@ from numpy.typing import NDArray
 from shapely import affinity
 
 from fractus_sim.world.chance import dice, unit
-from fractus_sim.world.roads import SPACING_M, Road, Roads
+from fractus_sim.world.roads import Road, Roads, cell
 
 Points = NDArray[np.float64]
 Kind = Literal["fields", "meadow", "wood", "houses", "works", "park"]
@@ -41,6 +43,9 @@ _ROOFS: tuple[Colour, ...] = (
     (88, 108, 152),
 )
 _HALLS: tuple[Colour, ...] = ((176, 178, 178), (150, 152, 150), (136, 124, 112), (190, 192, 190))
+_REACH = 0.5 + 0.2 + 0.1
+"""How far from its middle a block may reach, in cells: half a cell, the jitter of vertices, the curve of roads."""
+_STREET: Colour = (110, 110, 112)
 _PAVEMENT: Colour = (142, 146, 148)
 _LAWN: Colour = (70, 116, 92)
 
@@ -129,16 +134,9 @@ class Blocks:
         inside = shapely.Polygon(block.outline).buffer(-self._verge_m(i, j))
         if inside.is_empty or not isinstance(inside, shapely.Polygon):
             return block
-        trees: list[tuple[float, float, float, float]] = []
-        {
-            "fields": _fields,
-            "meadow": _meadow,
-            "wood": _wood,
-            "houses": _houses,
-            "works": _works,
-            "park": _park,
-        }[block.kind](block, inside, trees, roll)
-        block.trees = np.array(trees).reshape(-1, 4)
+        site = _Site(block, inside, roll)
+        _LAY_OUT[block.kind](site)
+        block.trees = np.array(site.trees).reshape(-1, 4)
         return block
 
     def _verge_m(self, i: int, j: int) -> float:
@@ -147,16 +145,48 @@ class Blocks:
 
     def near(self, x0: float, y0: float, x1: float, y1: float) -> list[tuple[int, int]]:
         """The blocks that may reach into a box."""
-        first_i, last_i = math.floor(x0 / SPACING_M - 0.8), math.ceil(x1 / SPACING_M + 0.8)
-        first_j, last_j = math.floor(y0 / SPACING_M - 0.8), math.ceil(y1 / SPACING_M + 0.8)
-        return [(i, j) for j in range(first_j, last_j + 1) for i in range(first_i, last_i + 1)]
+        (west, south), (east, north) = cell(x0, y0), cell(x1, y1)
+        columns = range(math.ceil(west - _REACH), math.floor(east + _REACH) + 1)
+        return [(i, j) for j in range(math.ceil(south - _REACH), math.floor(north + _REACH) + 1) for i in columns]
 
 
-Trees = list[tuple[float, float, float, float]]
+@dataclass(slots=True)
+class _Site:
+    """A block being laid out.
+
+    Attributes:
+        block: What there is so far.
+        inside: Its ground without roads and verges.
+        roll: Its chance.
+        trees: As in `Block`, still a list.
+        built: Where houses stand.
+    """
+
+    block: Block
+    inside: shapely.Polygon
+    roll: random.Random
+    trees: list[tuple[float, float, float, float]] = field(default_factory=list)
+    built: list[shapely.Polygon] = field(default_factory=list)
 
 
-def _fields(block: Block, inside: shapely.Polygon, trees: Trees, roll: random.Random) -> None:
+@dataclass(frozen=True, slots=True)
+class _Frontage:
+    """A point at a road, with the directions along it and away from it into the block."""
+
+    origin: tuple[float, float]
+    along: tuple[float, float]
+    away: tuple[float, float]
+
+    def box(self, a0: float, n0: float, a1: float, n1: float) -> shapely.Polygon:
+        """A rectangle between two distances along the road and two away from it."""
+        (x, y), (ax, ay), (nx, ny) = self.origin, self.along, self.away
+        corners = ((a0, n0), (a1, n0), (a1, n1), (a0, n1))
+        return shapely.Polygon([(x + a * ax + n * nx, y + a * ay + n * ny) for a, n in corners])
+
+
+def _fields(site: _Site) -> None:
     """Strips of crops side by side, and a hedge here and there."""
+    block, inside, roll = site.block, site.inside, site.roll
     sides = inside.minimum_rotated_rectangle.exterior.coords
     heading = math.degrees(math.atan2(sides[1][0] - sides[0][0], sides[1][1] - sides[0][1]))
     heading += 90.0 * (roll.random() < 0.5)
@@ -167,7 +197,7 @@ def _fields(block: Block, inside: shapely.Polygon, trees: Trees, roll: random.Ra
     cuts = sorted(
         [west, east, *(west + (east - west) * (k + roll.uniform(-0.2, 0.2)) / count for k in range(1, count))]
     )
-    for left, right in zip(cuts, cuts[1:], strict=False):
+    for left, right in itertools.pairwise(cuts):
         piece = level.intersection(shapely.box(left + 0.6, south, right - 0.6, north))
         for part in shapely.get_parts(affinity.rotate(piece, -heading, origin=middle)):
             if isinstance(part, shapely.Polygon) and part.area > 200.0:
@@ -175,30 +205,28 @@ def _fields(block: Block, inside: shapely.Polygon, trees: Trees, roll: random.Ra
                 block.patches.append(Patch(_corners(part), _tinted(crop, roll, 8), 80, heading))
         if right < east and roll.random() < 0.3:
             hedge = affinity.rotate(shapely.LineString([(right, south), (right, north)]), -heading, origin=middle)
-            _hedge(hedge.intersection(inside), trees, roll)
+            _hedge(site, hedge.intersection(inside), (1.0, 2.8), (2.0, 9.0))
 
 
-def _hedge(line: shapely.Geometry, trees: Trees, roll: random.Random) -> None:
+def _hedge(site: _Site, line: shapely.Geometry, radius_m: tuple[float, float], gap_m: tuple[float, float]) -> None:
+    """Bushes along a line."""
+    roll = site.roll
     at = 0.0
     while at < line.length:
         point = line.interpolate(at)
-        trees.append(
-            (
-                point.x + roll.uniform(-0.6, 0.6),
-                point.y + roll.uniform(-0.6, 0.6),
-                roll.uniform(1.0, 2.8),
-                roll.random(),
-            )
-        )
-        at += roll.uniform(2.0, 9.0)
+        shift = (roll.uniform(-0.2, 0.2) * radius_m[1], roll.uniform(-0.2, 0.2) * radius_m[1])
+        site.trees.append((point.x + shift[0], point.y + shift[1], roll.uniform(*radius_m), roll.random()))
+        at += roll.uniform(*gap_m)
 
 
-def _meadow(block: Block, inside: shapely.Polygon, trees: Trees, roll: random.Random) -> None:
+def _meadow(site: _Site) -> None:
+    block, inside, roll = site.block, site.inside, site.roll
     block.patches.append(Patch(_corners(inside), _tinted((78, 130, 112), roll, 8), 130))
-    _scatter(inside, trees, roll, roll.randint(8, 40), (1.5, 5.0))
+    _scatter(site, inside, roll.randint(8, 40), (1.5, 5.0))
 
 
-def _wood(block: Block, inside: shapely.Polygon, trees: Trees, roll: random.Random) -> None:
+def _wood(site: _Site) -> None:
+    block, inside, roll = site.block, site.inside, site.roll
     block.patches.append(Patch(_corners(inside), (40, 64, 50), 160))
     west, south, east, north = inside.bounds
     step = 5.2
@@ -207,11 +235,12 @@ def _wood(block: Block, inside: shapely.Polygon, trees: Trees, roll: random.Rand
     points = np.column_stack((xs.ravel(), ys.ravel())) + shift[:, :2]
     keep = shapely.contains_xy(inside.buffer(-2.0), points)
     for (x, y), (a, b) in zip(points[keep], shift[keep, 2:], strict=True):
-        trees.append((float(x), float(y), 3.1 + 0.45 * float(a), float(b) / 4.4 + 0.5))
+        site.trees.append((float(x), float(y), 3.1 + 0.45 * float(a), float(b) / 4.4 + 0.5))
 
 
-def _park(block: Block, inside: shapely.Polygon, trees: Trees, roll: random.Random) -> None:
+def _park(site: _Site) -> None:
     """Lawn, a pitch, a pond, paths and trees."""
+    block, inside, roll = site.block, site.inside, site.roll
     block.patches.append(Patch(_corners(inside), _LAWN, 90))
     middle = inside.centroid
     pond = shapely.Point(middle.x + roll.uniform(40, 60), middle.y + roll.uniform(-50, 50)).buffer(roll.uniform(14, 24))
@@ -233,11 +262,12 @@ def _park(block: Block, inside: shapely.Polygon, trees: Trees, roll: random.Rand
         block.patches.append(Patch(_corners(pond), (110, 116, 100), 40))
         block.patches.append(Patch(_corners(pond.buffer(-1.2)), (92, 78, 58), 14))
     free = inside.difference(pond.buffer(6)).difference(pitch.buffer(5))
-    _scatter(free, trees, roll, 130, (2.0, 5.5))
+    _scatter(site, free, 130, (2.0, 5.5))
 
 
-def _works(block: Block, inside: shapely.Polygon, trees: Trees, roll: random.Random) -> None:
+def _works(site: _Site) -> None:
     """Halls on a paved yard with a car park."""
+    block, inside, roll = site.block, site.inside, site.roll
     block.patches.append(Patch(_corners(inside), _tinted(_PAVEMENT, roll, 6), 50))
     sides = inside.minimum_rotated_rectangle.exterior.coords
     turn = math.degrees(math.atan2(sides[1][1] - sides[0][1], sides[1][0] - sides[0][0])) % 90.0
@@ -254,19 +284,13 @@ def _works(block: Block, inside: shapely.Polygon, trees: Trees, roll: random.Ran
             block.roofs.append(
                 Roof(corners, roll.uniform(6, 11), _tinted(roll.choice(_HALLS), roll, 8), roll.random() < 0.3)
             )
-    _car_park(block, level, taken, turn, inside.centroid, roll)
+    _car_park(site, level, taken, turn)
     rim = inside.difference(inside.buffer(-5.0))
-    _scatter(rim, trees, roll, 60, (1.2, 3.2))
+    _scatter(site, rim, 60, (1.2, 3.2))
 
 
-def _car_park(
-    block: Block,
-    level: shapely.Polygon,
-    taken: shapely.Geometry,
-    turn: float,
-    origin: shapely.Point,
-    roll: random.Random,
-) -> None:
+def _car_park(site: _Site, level: shapely.Polygon, taken: shapely.Geometry, turn: float) -> None:
+    block, roll, origin = site.block, site.roll, site.inside.centroid
     west, south, east, _ = level.bounds
     for row in range(4):
         y = south + 16.0 + 8.5 * row
@@ -282,77 +306,94 @@ def _car_park(
                 block.parked.append(Parking(middle.x, middle.y, -turn + 180.0 * (roll.random() < 0.4)))
 
 
-def _houses(block: Block, inside: shapely.Polygon, trees: Trees, roll: random.Random) -> None:
-    """Houses along the roads around, each with a drive and a garden behind."""
+def _houses(site: _Site) -> None:
+    """Rows of houses along the roads around and along streets between them, each with a drive and a garden behind."""
+    block, inside, roll = site.block, site.inside, site.roll
     block.patches.append(Patch(_corners(inside), _tinted(_LAWN, roll, 6), 110))
-    ring = inside.exterior
+    whole = shapely.Polygon(block.outline)
+    sides = inside.minimum_rotated_rectangle.exterior.coords
+    turn = math.degrees(math.atan2(sides[1][1] - sides[0][1], sides[1][0] - sides[0][0]))
+    west, south, east, north = affinity.rotate(inside, -turn, origin=inside.centroid).bounds
+    rows: shapely.Geometry = inside
+    count = max(round((north - south) / 88.0), 1)
+    for k in range(1, count):
+        y = south + (north - south) * k / count
+        for half, colour in ((4.6, (150, 154, 157)), (2.8, _STREET)):
+            street = affinity.rotate(
+                shapely.box(west - 40, y - half, east + 40, y + half), turn, origin=inside.centroid
+            )
+            part = street.intersection(whole)
+            if isinstance(part, shapely.Polygon):
+                block.patches.append(Patch(_corners(part), colour, 36))
+            rows = rows.difference(street.buffer(0.4) if half > 4 else street)
+    for row in shapely.get_parts(rows):
+        if isinstance(row, shapely.Polygon) and row.area > 600.0:
+            _row(site, row)
+    solid = [*site.built, *(shapely.Polygon(patch.outline) for patch in block.patches[1:])]
+    _scatter(site, inside.buffer(-1.0).difference(shapely.union_all(solid).buffer(1.6)), 330, (0.6, 3.4))
+
+
+def _row(site: _Site, ground: shapely.Polygon) -> None:
+    """Houses around a piece of ground."""
+    ring, roll = ground.exterior, site.roll
     at = roll.uniform(4.0, 12.0)
-    taken: list[shapely.Polygon] = []
     while at < ring.length - 10.0:
-        lot = roll.uniform(19.0, 27.0)
-        _house(block, inside, ring, at + lot / 2, lot, taken, roll)
+        lot = roll.uniform(17.0, 25.0)
+        _house(site, ground, _frontage(ring, at + lot / 2), lot)
+        if roll.random() < 0.4:
+            front = _frontage(ring, at)
+            (x, y), (nx, ny) = front.origin, front.away
+            hedge = shapely.LineString([(x + nx * 3, y + ny * 3), (x + nx * 26, y + ny * 26)])
+            _hedge(site, hedge.intersection(ground), (0.5, 0.9), (0.8, 1.2))
         at += lot
-    solid = shapely.union_all([*taken, *(shapely.Polygon(p.outline) for p in block.patches[1:])]).buffer(1.6)
-    _scatter(inside.buffer(-1.0).difference(solid), trees, roll, 190, (0.7, 3.6))
 
 
-def _house(
-    block: Block,
-    inside: shapely.Polygon,
-    ring: shapely.LinearRing,
-    at: float,
-    lot: float,
-    taken: list[shapely.Polygon],
-    roll: random.Random,
-) -> None:
-    here, ahead = ring.interpolate(at - 1.0), ring.interpolate(at + 1.0)
-    dx, dy = (ahead.x - here.x) / 2.0, (ahead.y - here.y) / 2.0
-    length = math.hypot(dx, dy)
-    # Along the road and away from it.
-    ax, ay = dx / length, dy / length
-    nx, ny = (-ay, ax) if inside.contains(shapely.Point(here.x - ay * 6, here.y + ax * 6)) else (ay, -ax)
+def _frontage(line: shapely.LinearRing, at_m: float) -> _Frontage:
+    """The point so far along a ring that runs counter-clockwise or clockwise; `away` leads inside."""
+    here, ahead = line.interpolate(at_m - 1.0), line.interpolate(at_m + 1.0)
+    length = max(math.hypot(ahead.x - here.x, ahead.y - here.y), 1e-6)
+    ax, ay = (ahead.x - here.x) / length, (ahead.y - here.y) / length
+    side = 1.0 if line.is_ccw else -1.0
+    return _Frontage((here.x, here.y), (ax, ay), (-ay * side, ax * side))
 
-    def shape(a0: float, n0: float, a1: float, n1: float) -> shapely.Polygon:
-        corners = ((a0, n0), (a1, n0), (a1, n1), (a0, n1))
-        return shapely.Polygon([(here.x + a * ax + n * nx, here.y + a * ay + n * ny) for a, n in corners])
 
+def _house(site: _Site, ground: shapely.Polygon, front: _Frontage, lot: float) -> None:
+    block, roll = site.block, site.roll
     wide, deep, back = roll.uniform(9.0, min(lot - 6.0, 14.0)), roll.uniform(8.0, 11.0), roll.uniform(5.0, 9.0)
-    house = shape(-wide / 2, back, wide / 2, back + deep)
-    if not inside.contains(house) or any(house.buffer(3.0).intersects(other) for other in taken):
+    house = front.box(-wide / 2, back, wide / 2, back + deep)
+    room = house.buffer(3.0, quad_segs=1)
+    if not ground.contains(house) or any(room.intersects(other) for other in site.built):
         return
-    taken.append(house)
-    block.roofs.append(
-        Roof(_corners(house), roll.uniform(4.5, 7.0), _tinted(roll.choice(_ROOFS), roll, 9), roll.random() < 0.88)
-    )
+    site.built.append(house)
+    gabled = roll.random() < 0.94
+    colour = _tinted(roll.choice(_ROOFS) if gabled else (132, 134, 134), roll, 9)
+    block.roofs.append(Roof(_corners(house), roll.uniform(4.5, 7.0), colour, gabled))
     side = roll.choice((-1.0, 1.0))
-    drive = shape(side * (wide / 2 - 3.4), -3.0, side * (wide / 2 - 0.4), back)
-    block.patches.append(Patch(_corners(drive), _tinted((150, 152, 156), roll, 12), 40))
+    near, far = sorted((side * (wide / 2 - 3.4), side * (wide / 2 - 0.4)))
+    block.patches.append(Patch(_corners(front.box(near, -3.0, far, back)), _tinted((150, 152, 156), roll, 12), 40))
     if roll.random() < 0.5:
-        nose = roll.random() < 0.5
-        middle = shape(side * (wide / 2 - 1.9) - 0.01, back - 5.0, side * (wide / 2 - 1.9) + 0.01, back - 1.2).centroid
-        block.parked.append(Parking(middle.x, middle.y, math.degrees(math.atan2(nx, ny)) + 180.0 * nose))
-    _garden(block, inside, shape, wide, back + deep, roll)
+        middle = front.box(near, back - 5.0, far, back - 1.2).centroid
+        heading = math.degrees(math.atan2(front.away[0], front.away[1]))
+        block.parked.append(Parking(middle.x, middle.y, heading + 180.0 * (roll.random() < 0.5)))
+    _garden(site, front, wide, back + deep)
 
 
-def _garden(
-    block: Block, inside: shapely.Polygon, shape: object, wide: float, behind: float, roll: random.Random
-) -> None:
-    assert callable(shape)
-    terrace = shape(-wide / 4, behind, wide / 4, behind + 3.2)
+def _garden(site: _Site, front: _Frontage, wide: float, behind: float) -> None:
+    block, roll, inside = site.block, site.roll, site.inside
+    terrace = front.box(-wide / 4, behind, wide / 4, behind + 3.2)
     if inside.contains(terrace):
         block.patches.append(Patch(_corners(terrace), _tinted((150, 160, 172), roll, 10), 40))
-    pool = shape(-2.0, behind + 5.5, 5.5, behind + 9.2)
+    pool = front.box(-2.0, behind + 5.5, 5.5, behind + 9.2)
     if roll.random() < 0.16 and inside.contains(pool):
         block.patches.append(Patch(_corners(pool.buffer(0.9, join_style="mitre")), (186, 192, 196), 20))
         block.patches.append(Patch(_corners(pool), (196, 168, 92), 10))
-    bed = shape(wide / 2 - 2.0, behind + 8.0, wide / 2 + 3.0, behind + 14.0)
+    bed = front.box(wide / 2 - 2.0, behind + 8.0, wide / 2 + 3.0, behind + 14.0)
     if roll.random() < 0.4 and inside.contains(bed):
         block.patches.append(Patch(_corners(bed), (72, 98, 116), 140))
 
 
-def _scatter(
-    area: shapely.Geometry, trees: Trees, roll: random.Random, count: int, radius_m: tuple[float, float]
-) -> None:
+def _scatter(site: _Site, area: shapely.Geometry, count: int, radius_m: tuple[float, float]) -> None:
+    roll = site.roll
     if area.is_empty:
         return
     west, south, east, north = area.bounds
@@ -361,7 +402,7 @@ def _scatter(
         x, y = roll.uniform(west, east), roll.uniform(south, north)
         radius, looks = radius_m[0] + (radius_m[1] - radius_m[0]) * roll.random() ** 2, roll.random()
         if shapely.contains_xy(area, x, y):
-            trees.append((x, y, radius, looks))
+            site.trees.append((x, y, radius, looks))
 
 
 def _corners(shape: shapely.Polygon) -> Points:
@@ -372,3 +413,13 @@ def _tinted(colour: Colour, roll: random.Random, by: int) -> Colour:
     shift = roll.randint(-by, by)
     blue, green, red = (min(max(part + shift + roll.randint(-by // 3, by // 3), 0), 255) for part in colour)
     return blue, green, red
+
+
+_LAY_OUT: dict[Kind, Callable[[_Site], None]] = {
+    "fields": _fields,
+    "meadow": _meadow,
+    "wood": _wood,
+    "houses": _houses,
+    "works": _works,
+    "park": _park,
+}

@@ -32,11 +32,11 @@ class Noise:
         random = np.random.default_rng(mixed(seed, 77))
         self._lattices = [random.standard_normal((_LATTICE, _LATTICE)).astype(np.float32) for _ in range(_OCTAVES)]
 
-    def octave(self, octave: int, left_m: float, top_m: float, pixel_m: float, size: int) -> NDArray[np.float32]:
+    def octave(self, octave: int, canvas: Canvas) -> NDArray[np.float32]:
         """One octave over a square tile, standard deviation below 1."""
         cell = _FINEST_OCTAVE_M * 2**octave
-        scale = pixel_m / cell
-        x, y = (left_m / cell) % _LATTICE, (-top_m / cell) % _LATTICE
+        scale, size = canvas.pixel_m / cell, canvas.size
+        x, y = (canvas.left_m / cell) % _LATTICE, (-canvas.top_m / cell) % _LATTICE
         matrix = np.array([[scale, 0.0, x + scale / 2], [0.0, scale, y + scale / 2]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         return np.asarray(
@@ -44,15 +44,13 @@ class Noise:
             np.float32,
         )
 
-    def between(
-        self, finest_m: float, coarsest_m: float, left_m: float, top_m: float, pixel_m: float, size: int
-    ) -> NDArray[np.float32]:
-        """The sum of the octaves from one size of cell to another, those below a pixel left out."""
-        total = np.zeros((size, size), np.float32)
+    def between(self, finest_m: float, coarsest_m: float, canvas: Canvas) -> NDArray[np.float32]:
+        """The sum over a tile of the octaves from one size of cell to another, those below a pixel left out."""
+        total = np.zeros((canvas.size, canvas.size), np.float32)
         for octave in range(_OCTAVES):
             cell = _FINEST_OCTAVE_M * 2**octave
-            if max(finest_m, pixel_m * 0.9) <= cell <= coarsest_m:
-                total += self.octave(octave, left_m, top_m, pixel_m, size)
+            if max(finest_m, canvas.pixel_m * 0.9) <= cell <= coarsest_m:
+                total += self.octave(octave, canvas)
         return total
 
 

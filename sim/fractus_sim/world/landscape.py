@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fractus_sim.world.blocks import Block, Blocks, Patch, Roof
 from fractus_sim.world.canvas import SUN_SHADOW, Canvas, Colour, Noise
-from fractus_sim.world.roads import Road, Roads, strip
+from fractus_sim.world.roads import Road, Roads, lengthened, strip
 from fractus_sim.world.tiles import TILE_PX, Picture
 
 Points = NDArray[np.float64]
@@ -76,49 +76,51 @@ class Landscape:
     def _roads(self, canvas: Canvas, near: list[tuple[int, int]]) -> None:
         pieces = [(road, step) for i, j in near for road, step in ((Road("east", j), i), (Road("north", i), j))]
         pieces = [piece for piece in pieces if canvas.sees(self.roads.edge(*piece), 8.0)]
-        for road, step in sorted(pieces, key=lambda piece: piece[0].main):
-            self._carriageway(canvas, road, step)
+        pieces = sorted(pieces, key=lambda piece: piece[0].main)
+        for paved in (False, True):
+            for road, step in pieces:
+                self._carriageway(canvas, road, step, paved=paved)
         for road, step in pieces:
             if road.main or self.roads.built_up(road, step):
-                width = self.roads.width_m(road, step)
                 x, y = self.roads.vertex(*road.vertex(step))
-                canvas.disc(x, y, width / 2 + 1.2, _ASPHALT, 36)
+                canvas.disc(x, y, self.roads.width_m(road, step) / 2 + 2.0, _ASPHALT, 36)
         for road, step in pieces:
             if road.main or self.roads.built_up(road, step):
                 _marks(canvas, self.roads.edge(road, step), self.roads.width_m(road, step), road.main)
 
-    def _carriageway(self, canvas: Canvas, road: Road, step: int) -> None:
-        edge, half = self.roads.edge(road, step), self.roads.width_m(road, step) / 2
-        if self.roads.built_up(road, step):
-            canvas.fill(strip(edge, half + 2.2, -half - 2.2), _KERB, 40)
-            canvas.fill(strip(edge, half + 0.15, -half - 0.15), (122, 126, 128), 30)
+    def _carriageway(self, canvas: Canvas, road: Road, step: int, *, paved: bool) -> None:
+        """One piece of road: first what lies beside it, then, over the verges of its neighbours, its surface."""
+        edge, half = lengthened(self.roads.edge(road, step), 2.5), self.roads.width_m(road, step) / 2
+        built_up = self.roads.built_up(road, step)
+        if not paved:
+            if built_up:
+                canvas.fill(strip(edge, half + 2.2, -half - 2.2), _KERB, 40)
+                canvas.fill(strip(edge, half + 0.15, -half - 0.15), (122, 126, 128), 30)
+            elif road.main:
+                canvas.fill(strip(edge, half + 1.6, -half - 1.6), (92, 136, 124), 130)
+                canvas.fill(strip(edge, half + 0.4, -half - 0.4), (112, 128, 134), 70)
+            else:
+                canvas.fill(strip(edge, half + 1.0, -half - 1.0), (84, 132, 116), 130)
+                canvas.fill(strip(edge, half, -half), _TRACK, 90)
+                canvas.fill(strip(edge, 0.45, -0.45), (96, 134, 128), 140)
+        elif built_up or road.main:
             canvas.fill(strip(edge, half, -half), _ASPHALT, 36)
-        elif road.main:
-            canvas.fill(strip(edge, half + 1.6, -half - 1.6), (92, 136, 124), 130)
-            canvas.fill(strip(edge, half + 0.4, -half - 0.4), (112, 128, 134), 70)
-            canvas.fill(strip(edge, half, -half), _ASPHALT, 36)
-        else:
-            canvas.fill(strip(edge, half + 1.0, -half - 1.0), (84, 132, 116), 130)
-            canvas.fill(strip(edge, half, -half), _TRACK, 90)
-            canvas.fill(strip(edge, 0.45, -0.45), (96, 134, 128), 140)
-        if half > 2.0 and canvas.pixel_m < 0.3:
-            for wheel in (-0.72, -0.3, 0.3, 0.72):
-                canvas.line(edge[:, :2] + wheel * half * edge[:, 2:], (98, 98, 100), 0.5)
+            if canvas.pixel_m < 0.3:
+                for wheel in (-0.72, -0.3, 0.3, 0.72):
+                    canvas.line(edge[:, :2] + wheel * half * edge[:, 2:], (98, 98, 100), 0.5)
 
     def _grain(self, canvas: Canvas) -> None:
         """Uneven ground: clods, tufts and stains, as rough as each material is."""
-        at = (canvas.left_m, canvas.top_m, canvas.pixel_m, canvas.size)
-        fine = self._noise.between(0.0, 0.6, *at) * 6.5 + self._noise.between(1.0, 4.5, *at) * 5.5
+        fine = self._noise.between(0.0, 0.6, canvas) * 6.5 + self._noise.between(1.0, 4.5, canvas) * 5.5
         shift = fine * (canvas.rough.astype(np.float32) / 128.0)
-        shift += self._noise.between(8.0, 70.0, *at) * 3.6
+        shift += self._noise.between(8.0, 70.0, canvas) * 3.6
         canvas.colour = np.clip(canvas.colour + shift[..., None] * np.float32([0.86, 1.0, 0.98]), 0, 255).astype(
             np.uint8
         )
 
     def _light(self, canvas: Canvas) -> None:
         """The colour of an afternoon; and large, faint differences."""
-        at = (canvas.left_m, canvas.top_m, canvas.pixel_m, canvas.size)
-        broad = self._noise.between(120.0, 300.0, *at)
+        broad = self._noise.between(120.0, 300.0, canvas)
         gain = (1.0 + 0.018 * broad)[..., None] * np.float32([0.97, 1.0, 1.03])
         canvas.colour = np.clip(canvas.colour * gain, 0, 255).astype(np.uint8)
 

@@ -16,10 +16,23 @@ Points = NDArray[np.float64]
 Family = Literal["east", "north"]
 
 SPACING_M = 300.0
+SHIFT_M = (-80.0, -95.0)
+"""Where the middle of block (0, 0) is, so that two main roads cross near the world's origin."""
+_CROSSING = (1, 1)
 _JITTER = 0.2
 _MAIN_EVERY = 3
 EDGE_POINTS = 33
-TOWN_RADIUS_M = 420.0
+TOWN_RADIUS_M = 480.0
+
+
+def centre(i: float, j: float) -> tuple[float, float]:
+    """The middle of a cell of the lattice, metres east and north of the world's origin."""
+    return i * SPACING_M + SHIFT_M[0], j * SPACING_M + SHIFT_M[1]
+
+
+def cell(x: float, y: float) -> tuple[float, float]:
+    """Lattice coordinates of a place; the inverse of `centre`."""
+    return (x - SHIFT_M[0]) / SPACING_M, (y - SHIFT_M[1]) / SPACING_M
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +50,7 @@ class Road:
     @property
     def main(self) -> bool:
         """Whether it is paved also between towns and has a marked middle."""
-        return self.index % _MAIN_EVERY == 0
+        return self.index % _MAIN_EVERY == 1
 
     def vertex(self, step: int) -> tuple[int, int]:
         """Lattice coordinates of its vertices."""
@@ -54,8 +67,11 @@ class Roads:
         self.town = lru_cache(maxsize=65536)(self._town)
 
     def _vertex(self, i: int, j: int) -> tuple[float, float]:
+        x, y = centre(i - 0.5, j - 0.5)
+        if (i, j) == _CROSSING:
+            return x, y
         dx, dy = unit(self.seed, 1, i, j) - 0.5, unit(self.seed, 2, i, j) - 0.5
-        return (i - 0.5 + 2 * _JITTER * dx) * SPACING_M, (j - 0.5 + 2 * _JITTER * dy) * SPACING_M
+        return x + 2 * _JITTER * dx * SPACING_M, y + 2 * _JITTER * dy * SPACING_M
 
     def _town(self, i: int, j: int) -> bool:
         x, y = i * SPACING_M, j * SPACING_M
@@ -108,3 +124,12 @@ class Roads:
 def strip(edge: Points, left_m: float, right_m: float) -> Points:
     """The polygon between two parallels of a line; both distances count to the left."""
     return np.vstack((edge[:, :2] + left_m * edge[:, 2:], (edge[:, :2] + right_m * edge[:, 2:])[::-1]))
+
+
+def lengthened(edge: Points, by_m: float) -> Points:
+    """A line that goes on straight for a little at both ends, so that the pieces of a crossing meet."""
+    ends = []
+    for last, way in ((edge[0], edge[0] - edge[1]), (edge[-1], edge[-1] - edge[-2])):
+        step = way[:2] / math.hypot(way[0], way[1]) * by_m
+        ends.append(np.concatenate((last[:2] + step, last[2:])))
+    return np.vstack((ends[0], edge, ends[1]))

@@ -7,9 +7,12 @@ import threading
 import cv2
 from fractus_core.geo import LocalFrame
 
+from fractus_sim.world.billboards import Everywhere
 from fractus_sim.world.landscape import Landscape
 from fractus_sim.world.optics import Intrinsics, Mount, Pose, View
+from fractus_sim.world.population import Townsfolk
 from fractus_sim.world.render import Band, render_ground
+from fractus_sim.world.staging import Stage
 from fractus_sim.world.survey import Sheet, draw_sheet
 from fractus_sim.world.tiles import Ground, Picture, TileStore
 from fractus_sim.world.truth import Truth
@@ -26,12 +29,12 @@ class World:
 
     Args:
         ground: What the earth looks like from above.
-        seed: Decides who is where.
+        stage: What stands and moves on it.
     """
 
-    def __init__(self, ground: Ground, seed: int) -> None:
+    def __init__(self, ground: Ground, stage: Stage) -> None:
         self.ground = ground
-        self.seed = seed
+        self._stage = stage
         self._store = TileStore(ground)
         self._lock = threading.Lock()
         cv2.setNumThreads(1)
@@ -39,7 +42,8 @@ class World:
     @classmethod
     def procedural(cls, lat: float, lon: float, seed: int = 7) -> World:
         """A world made up from a seed, around a place."""
-        return cls(Landscape(LocalFrame(lat, lon), seed), seed)
+        land = Landscape(LocalFrame(lat, lon), seed)
+        return cls(land, Stage(Townsfolk(land.roads, land.blocks), Everywhere(land.roads, land.blocks)))
 
     @property
     def frame(self) -> LocalFrame:
@@ -58,6 +62,7 @@ class World:
         mount: Mount = DEFAULT_MOUNT,
         time_s: float = 0.0,
         band: Band = "rgb",
+        hidden: frozenset[str] = frozenset(),
     ) -> Picture:
         """The picture that a camera takes.
 
@@ -67,17 +72,22 @@ class World:
             mount: How the camera sits on the airframe.
             time_s: Any clock's seconds; everything that moves is a function of it.
             band: Daylight or thermal.
+            hidden: Ids of objects to leave out.
 
         Returns:
             Shape (height, width, 3); blue, green, red.
         """
         with self._lock:
-            return render_ground(self.view(pose, intrinsics, mount), self._store, band)
+            view = self.view(pose, intrinsics, mount)
+            picture = render_ground(view, self._store, band)
+            self._stage.draw(picture, view, self._stage.actors(view, time_s, hidden), band)
+            return picture
 
     def truth(self, pose: Pose, intrinsics: Intrinsics, *, mount: Mount = DEFAULT_MOUNT, time_s: float = 0.0) -> Truth:
         """What the picture of the same arguments shows."""
         with self._lock:
-            return Truth(pose, (), ())
+            view = self.view(pose, intrinsics, mount)
+            return Truth(pose, *self._stage.truth(view, self._stage.actors(view, time_s), self.frame))
 
     def map(self, sheet: Sheet) -> Picture:
         """The ground on a sheet of a map, without what moves, shape (pixels, pixels, 3)."""

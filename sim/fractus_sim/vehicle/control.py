@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 from fractus_sim.vehicle.body import GRAVITY, Airframe
 from fractus_sim.vehicle.shaping import (
@@ -52,8 +53,7 @@ class Limits:
     yaw_rate_rps: float = math.radians(60.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Estimate:
+class Estimate(NamedTuple):
     """What the estimator tells the controllers: local NED position and velocity, attitude and body rates."""
 
     north: float

@@ -30,6 +30,8 @@ class Battery:
         self.used_j = 0.0
         self.current_a = IDLE_CURRENT_A
         self.voltage_v = full_v
+        self._rest_v = full_v
+        self._rest_for: tuple[float, float] | None = None
 
     @property
     def left(self) -> float:
@@ -42,7 +44,14 @@ class Battery:
         return round(self.left * 100.0)
 
     def _rest_voltage(self) -> float:
-        left = self.left
+        """Voltage without load; looked up anew for each thousandth of the charge."""
+        left = round(self.left, 3)
+        if self._rest_for != (left, self.full_v):
+            self._rest_for = (left, self.full_v)
+            self._rest_v = self._curve(left)
+        return self._rest_v
+
+    def _curve(self, left: float) -> float:
         for (low, low_v), (high, high_v) in itertools.pairwise(_CELL_CURVE):
             if left <= high:
                 return self.full_v / 4.2 * (low_v + (high_v - low_v) * (left - low) / (high - low))

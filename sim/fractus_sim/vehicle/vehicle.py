@@ -424,7 +424,6 @@ class Vehicle:
             self.flight.step(self, CONTROL_STEP_S)
             self._check_idle()
         self._move()
-        self.est = self.estimator.estimate(self.body)
         if self.plans.transfers.upload is not None and self.plans.transfers.step(self.time_s) is not None:
             self.say(Severity.WARNING, "Mission upload timeout")
         for channel in self.channels:
@@ -441,6 +440,7 @@ class Vehicle:
             idle = (spin, spin, spin, spin)
             self.battery.step(CONTROL_STEP_S, 4.0 * spin / (body.airframe.mass_kg * 9.8))
             body.step(dt, idle, (0.0, 0.0, 0.0))
+            self.est = self.estimator.estimate(body)
             return
         for _ in range(PHYSICS_PER_CONTROL):
             air = self.wind.step(dt, self.rng, -body.down)

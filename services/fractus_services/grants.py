@@ -28,7 +28,7 @@ class Held:
 
     Attributes:
         key: names the mission: the grant object's uid, or the identity where nobody gave it one.
-        digest: of what was signed.
+        digest: of the grant with its signature.
     """
 
     key: str

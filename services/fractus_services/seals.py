@@ -12,7 +12,15 @@ from pathlib import Path
 
 from cryptography import x509
 from fractus_core.api.plans import Grant
-from fractus_core.policy.signatures import BadSignature, UnknownAuthority, canonical, read_authorities, verify
+from fractus_core.policy.signatures import (
+    SIGNATURE_ANNOTATION,
+    SIGNER_ANNOTATION,
+    BadSignature,
+    UnknownAuthority,
+    canonical,
+    read_authorities,
+    verify,
+)
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +36,7 @@ class _Seen:
 
     Attributes:
         issued_at: when it was signed, ISO 8601 in UTC.
-        digest: of what was signed.
+        digest: of the grant with its signature.
         revoked: it was taken away on this node, and counts no more.
     """
 
@@ -75,7 +83,7 @@ class Seals:
         return True
 
     def check(self, grant: Grant) -> str:
-        """Take a grant as the last one of its instance; the digest of what is signed.
+        """Take a grant as the last one of its instance; the digest of it with its signature.
 
         Raises:
             BadSignature: the operator did not sign it, or there was a later one here, or it was revoked here.
@@ -161,5 +169,8 @@ def _iso(moment: datetime) -> str:
 
 
 def _digest(grant: Grant) -> str:
-    uid = (grant.metadata.uid or "").encode()
-    return hashlib.sha256(uid + b"\n" + canonical(grant)).hexdigest()
+    said = [
+        grant.metadata.uid,
+        *(grant.metadata.annotations.get(key) for key in (SIGNATURE_ANNOTATION, SIGNER_ANNOTATION)),
+    ]
+    return hashlib.sha256(json.dumps(said).encode() + canonical(grant)).hexdigest()

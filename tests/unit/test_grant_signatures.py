@@ -302,7 +302,8 @@ def test_a_full_disk_grants_on_and_remembers_when_there_is_room(
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")
 
-    node.take(signed())
+    body = signed()
+    node.take(body)
     content = node.seals.unsaved()
     assert content is not None
     assert node.seals.unsaved() is None
@@ -311,10 +312,17 @@ def test_a_full_disk_grants_on_and_remembers_when_there_is_room(
         node.seals.store(content)
     assert "No space left" in caplog.text
     node.restart()
-    node.seals.revoke(IDENTITY, node.take(signed()))
+    node.seals.revoke(IDENTITY, node.take(body))
     node.restart()
     with pytest.raises(BadSignature, match="revoked"):
-        node.take(signed())
+        node.take(body)
+
+
+def test_a_signature_that_is_taken_off_takes_the_grant_away(node: Node) -> None:
+    body = signed()
+    node.take(body)
+    with pytest.raises(BadSignature, match="is not signed"):
+        node.take({**body, "metadata": {"name": "g", "uid": "u1"}})
 
 
 def test_the_memory_has_an_end_and_forgets_nothing_that_matters(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:

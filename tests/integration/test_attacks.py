@@ -1,0 +1,405 @@
+"""Attacks on the services of a drone, with real gRPC and real certificates: nothing unsafe happens, and the answer is clear."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import resource
+import socket
+import ssl
+import sys
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+from cryptography.hazmat.primitives import serialization
+from fractus_core.api.plans import OPERATOR_IDENTITY, node_identity, node_server_name
+from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, mobility_pb2_grpc, types_pb2
+from fractus_proto.v1 import mobility_pb2 as pb
+from fractus_services.answering import BURST, CALLS_PER_S
+from fractus_services.chain import verify
+from google.rpc import error_details_pb2
+from grpc_status import rpc_status
+from mobility_rig import (
+    DRIVER,
+    NODE,
+    PASSENGER,
+    Authority,
+    Driver,
+    Rig,
+    altitude_limit,
+    denied,
+    flown,
+    grant,
+    issue_signer,
+    passenger_grant,
+)
+
+Status = grpc.StatusCode
+ASK = pb.GetSpeedRequest()
+LOST = pb.ControlEvent.STATE_LOST
+FLOOD_PER_S = 500.0
+
+
+@pytest.fixture
+async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
+    rig = Rig(tmp_path)
+    try:
+        yield rig
+    finally:
+        await rig.close()
+
+
+async def served(rig: Rig, identity: str = DRIVER) -> mobility_pb2_grpc.MobilityServiceStub:
+    """The stub of a caller who is served."""
+    stub = rig.stub(identity)
+    await stub.GetSpeed(ASK, timeout=20, wait_for_ready=True)
+    return stub
+
+
+async def flying(rig: Rig, *policies: dict[str, Any]) -> Driver:
+    rig.write_grant(grant(*policies))
+    rig.start_service()
+    rig.start_vehicle()
+    driver = Driver(rig)
+    await driver.up()
+    return driver
+
+
+async def until(condition: Callable[[], object], what: str, timeout_s: float = 15.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, what
+        await asyncio.sleep(0.05)
+
+
+# Certificates
+
+
+async def test_certificates_of_others(rig: Rig) -> None:
+    rig.write_grant(grant())
+    rig.start_service()
+    stub = await served(rig)
+
+    async def asked(identity: str, **how: Any) -> tuple[grpc.StatusCode, str]:
+        code, why = await denied(rig.stub(identity, **how).GetSpeed(ASK, timeout=5))
+        return code, why.code
+
+    stranger = Authority(rig.directory, "ca")
+    assert (await asked(DRIVER, authority=stranger))[0] == Status.UNAVAILABLE, "of an authority of the same name"
+    assert (await asked(DRIVER, seconds=-10.0, begun=-3600.0))[0] == Status.UNAVAILABLE, "expired"
+    assert (await asked(DRIVER, begun=1800.0))[0] == Status.UNAVAILABLE, "not valid yet"
+    no_grant = (Status.PERMISSION_DENIED, "NoGrant")
+    assert await asked(DRIVER.replace("/ns/default/", "/ns/tenant-b/")) == no_grant
+    assert await asked(DRIVER.replace("/app/app/", "/app/other/")) == no_grant
+    assert await asked(DRIVER.replace("instance/app-navigator", "instance/app-navigator-2")) == no_grant
+    assert await asked(DRIVER + "/") == no_grant
+    assert await asked(DRIVER.upper().replace("SPIFFE://FRACTUS.DEV", "spiffe://fractus.dev")) == no_grant
+    assert await asked(node_identity("drone-2")) == no_grant
+    assert await asked(OPERATOR_IDENTITY) == no_grant, "who signs grants flies no drone"
+    assert (await asked("https://fractus.dev/operator"))[0] == Status.UNAUTHENTICATED, "no SPIFFE id"
+    await stub.GetSpeed(ASK, timeout=5)
+
+
+async def test_the_certificate_that_signs_grants_opens_no_connection(rig: Rig) -> None:
+    rig.write_grant(grant())
+    rig.start_service()
+    await served(rig)
+    key, certificate = issue_signer(rig.authority.certificate, rig.authority._key, DRIVER)
+    pem = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    credentials = grpc.ssl_channel_credentials(
+        rig.authority.pem, pem, certificate.public_bytes(serialization.Encoding.PEM)
+    )
+    options = [("grpc.ssl_target_name_override", node_server_name(NODE))]
+    async with grpc.aio.secure_channel(rig.address, credentials, options) as channel:
+        with pytest.raises(grpc.aio.AioRpcError) as refusal:
+            await mobility_pb2_grpc.MobilityServiceStub(channel).GetSpeed(ASK, timeout=5)
+    assert refusal.value.code() == Status.UNAVAILABLE
+
+
+async def test_a_stolen_certificate_is_of_no_use_once_its_instance_is_gone(rig: Rig) -> None:
+    path = rig.write_grant(grant())
+    stale = path.read_bytes()
+    rig.start_service()
+    stub = await served(rig)
+    path.unlink()
+    await until(lambda: [e for e in rig.entries("grant") if e["change"] == "removed"], "the grant's end")
+    code, why = await denied(stub.GetSpeed(ASK, timeout=5))
+    assert (code, why.code) == (Status.PERMISSION_DENIED, "NoGrant"), "on the connection that was open"
+    path.write_bytes(stale)
+    await until(lambda: [e for e in rig.entries("grant") if e["change"] == "refused"], "the replay's refusal")
+    assert "was revoked here" in rig.entries("grant")[-1]["reason"]
+    code, why = await denied(rig.stub(DRIVER).GetSpeed(ASK, timeout=5))
+    assert (code, why.code) == (Status.PERMISSION_DENIED, "NoGrant")
+    rig.kill("service")
+    rig.start_service()
+    code, why = await denied(rig.stub(DRIVER).GetSpeed(ASK, timeout=20, wait_for_ready=True))
+    assert (code, why.code) == (Status.PERMISSION_DENIED, "NoGrant"), "a restart forgets nothing"
+    rig.write_grant(grant())
+    await until(lambda: rig.entries("grant")[-1]["change"] == "added", "the new grant")
+    await stub.GetSpeed(ASK, timeout=20, wait_for_ready=True)
+
+
+CLOCK = """
+import time, pathlib
+_real, _file = time.time, pathlib.Path({file!r})
+def _shifted():
+    try:
+        return _real() + float(_file.read_text() or 0)
+    except (OSError, ValueError):
+        return _real()
+time.time = _shifted
+"""
+
+
+async def test_a_clock_that_is_set_back_revives_no_certificate(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    shift = rig.directory / "shift"
+    shift.write_text("0")
+    (rig.directory / "sitecustomize.py").write_text(CLOCK.format(file=str(shift)))
+    monkeypatch.setenv("PYTHONPATH", str(rig.directory))
+    rig.write_grant(grant())
+    rig.start_service()
+    await served(rig)
+    stub = rig.stub(DRIVER, seconds=600.0)
+    await stub.GetSpeed(ASK, timeout=5)
+    shift.write_text("900")
+    code, why = await denied(stub.GetSpeed(ASK, timeout=5))
+    assert (code, why.code) == (Status.UNAUTHENTICATED, "NotAuthenticated")
+    assert "expired" in why.reason
+    shift.write_text("-3600")
+    code, why = await denied(stub.GetSpeed(ASK, timeout=5))
+    assert (code, why.code) == (Status.UNAUTHENTICATED, "NotAuthenticated")
+    # A grant does not hang on the node's clock.
+    rig.write_grant(grant(altitude_limit(5, 15)))
+    await until(lambda: [e for e in rig.entries("grant") if e["change"] == "changed"], "the new grant")
+
+
+# Methods
+
+
+async def test_nobody_calls_anothers_methods(rig: Rig) -> None:
+    rig.write_grant(grant())
+    rig.write_grant(passenger_grant(services=[{"service": "camera", "methods": ["ListImages"]}]))
+    rig.start_service()
+    camera = rig.start_camera()
+    await served(rig)
+    stub = rig.stub(PASSENGER)
+    unary: list[Awaitable[Any]] = [
+        stub.Arm(pb.ArmRequest(), timeout=5), stub.Disarm(pb.DisarmRequest(), timeout=5),
+        stub.Hover(pb.HoverRequest(), timeout=5), stub.SetSpeed(pb.SetSpeedRequest(speed_mps=1), timeout=5),
+        stub.GetSpeed(ASK, timeout=5), stub.GetPosition(pb.GetPositionRequest(), timeout=5),
+        stub.ReturnControl(pb.ReturnControlRequest(), timeout=5),
+    ]  # fmt: skip
+    streams = [
+        stub.GetControl(pb.GetControlRequest(), timeout=5), stub.Takeoff(pb.TakeoffRequest(altitude_m=5), timeout=5),
+        stub.Goto(pb.GotoRequest(target=types_pb2.Position()), timeout=5), stub.Land(pb.LandRequest(), timeout=5),
+        stub.ReturnToLaunch(pb.ReturnToLaunchRequest(), timeout=5),
+        stub.SubscribeTelemetry(pb.SubscribeTelemetryRequest(), timeout=5),
+    ]  # fmt: skip
+    for call in [*unary, *(stream.read() for stream in streams)]:
+        code, why = await denied(call)
+        assert code == Status.PERMISSION_DENIED
+        assert why.code in {"MethodNotGranted", "NotADriver"}
+        assert why.action == types_pb2.Decision.ACTION_DENY
+        assert why.reason
+
+    pictures = camera_pb2_grpc.CameraServiceStub(rig.channel(PASSENGER, address=camera))
+    await pictures.ListImages(camera_pb2.ListImagesRequest(), timeout=20, wait_for_ready=True)
+    for call in (
+        pictures.CaptureImage(camera_pb2.CaptureImageRequest(), timeout=5),
+        pictures.DeleteImage(camera_pb2.DeleteImageRequest(name="x"), timeout=5),
+        pictures.RetrieveImage(camera_pb2.RetrieveImageRequest(name="x"), timeout=5).read(),
+    ):
+        code, why = await denied(call)
+        assert (code, why.code) == (Status.PERMISSION_DENIED, "MethodNotGranted")
+
+
+async def test_what_is_no_proper_call(rig: Rig) -> None:
+    rig.write_grant(grant())
+    rig.start_service()
+    stub = await served(rig)
+    code, why = await denied(stub.GetSpeed(ASK))
+    assert (code, why.code) == (Status.INVALID_ARGUMENT, "DeadlineMissing")
+    assert "set a timeout" in why.reason
+    channel = rig.channel(DRIVER)
+    huge = channel.unary_unary("/fractus.v1.MobilityService/GetSpeed")(b"\x0a" * 100_000, timeout=5)
+    with pytest.raises(grpc.aio.AioRpcError) as refusal:
+        await huge
+    assert refusal.value.code() == Status.RESOURCE_EXHAUSTED
+    garbage = channel.unary_unary("/fractus.v1.MobilityService/GetSpeed")(b"\xff\xff\xff", timeout=5)
+    with pytest.raises(grpc.aio.AioRpcError) as refusal:
+        await garbage
+    assert refusal.value.code() in {Status.INTERNAL, Status.UNKNOWN, Status.INVALID_ARGUMENT}
+    with pytest.raises(grpc.aio.AioRpcError) as refusal:
+        await channel.unary_unary("/fractus.v1.MobilityService/FlyAway")(b"", timeout=5)
+    assert refusal.value.code() == Status.UNIMPLEMENTED
+    with pytest.raises(grpc.aio.AioRpcError) as refusal:
+        await stub.GetSpeed(ASK, timeout=5, metadata=[("x-large", "x" * 60_000)])
+    assert refusal.value.code() in {Status.RESOURCE_EXHAUSTED, Status.UNAVAILABLE}
+    async with grpc.aio.insecure_channel(rig.address) as plain:
+        with pytest.raises(grpc.aio.AioRpcError) as refusal:
+            await mobility_pb2_grpc.MobilityServiceStub(plain).GetSpeed(ASK, timeout=5)
+    assert refusal.value.code() == Status.UNAVAILABLE
+    await stub.GetSpeed(ASK, timeout=5, wait_for_ready=True)
+
+
+# Floods
+
+
+async def _flood(address: str, pem: list[bytes], until_s: float) -> None:
+    """The attacker's process: calls at a steady rate, whatever the answers; prints how they ended."""
+    ca, key, certificate = pem
+    ended: dict[str, int] = {}
+    hints = 0
+
+    async def one(stub: Any) -> None:
+        nonlocal hints
+        try:
+            await stub.GetSpeed(ASK, timeout=5)
+            ended["OK"] = ended.get("OK", 0) + 1
+        except grpc.aio.AioRpcError as error:
+            ended[error.code().name] = ended.get(error.code().name, 0) + 1
+            status = rpc_status.from_call(error)
+            hints += status is not None and any(d.Is(error_details_pb2.RetryInfo.DESCRIPTOR) for d in status.details)
+
+    options = [("grpc.ssl_target_name_override", node_server_name(NODE))]
+    credentials = grpc.ssl_channel_credentials(ca, key, certificate)
+    async with grpc.aio.secure_channel(address, credentials, options) as channel:
+        stub = mobility_pb2_grpc.MobilityServiceStub(channel)
+        begin, sent, calls = time.monotonic(), 0, set()
+        while (now := time.monotonic()) < begin + until_s:
+            while sent < (now - begin) * FLOOD_PER_S:
+                calls.add(asyncio.create_task(one(stub)))
+                sent += 1
+            await asyncio.sleep(0.005)
+        await asyncio.gather(*calls)
+    print(json.dumps({"sent": sent, "ended": ended, "hints": hints}))
+
+
+async def test_a_flood_of_one_leaves_the_others_served(rig: Rig) -> None:
+    rig.write_grant(grant())
+    rig.write_grant(passenger_grant())
+    rig.start_service()
+    stub = await served(rig)
+    key, certificate = rig.authority.issue(PASSENGER)
+    for name, data in (("key", key), ("crt", certificate), ("ca", rig.authority.pem)):
+        (rig.directory / f"flood.{name}").write_bytes(data)
+    attacker = await asyncio.create_subprocess_exec(
+        sys.executable, __file__, rig.address, str(rig.directory / "flood"), "3.0", stdout=asyncio.subprocess.PIPE
+    )
+    answers = []
+    while attacker.returncode is None:
+        begun = time.monotonic()
+        await stub.GetSpeed(ASK, timeout=5)
+        answers.append(time.monotonic() - begun)
+        await asyncio.sleep(0.05)
+    output, _ = await attacker.communicate()
+    told = json.loads(output)
+    print(f"flood {told}; the other's calls {len(answers)}, slowest {max(answers) * 1000:.0f} ms")
+    assert told["sent"] > 2 * FLOOD_PER_S
+    assert told["ended"]["OK"] <= BURST + 8 * CALLS_PER_S, "as many as anybody gets in this time, and no more"
+    assert told["ended"]["RESOURCE_EXHAUSTED"] > told["sent"] / 2
+    assert told["hints"] == told["ended"]["RESOURCE_EXHAUSTED"], "each is told when to try again"
+    assert set(told["ended"]) == {"OK", "RESOURCE_EXHAUSTED"}
+    assert len(answers) > 10
+
+
+async def test_a_flood_of_connections_leaves_the_others_served(rig: Rig) -> None:
+    rig.write_grant(grant())
+    rig.start_service()
+    stub = await served(rig)
+    host, _, port = rig.address.partition(":")
+    stranger = Authority(rig.directory, "stranger")
+    key, certificate = stranger.issue(DRIVER)
+    for name, data in (("key", key), ("crt", certificate)):
+        (rig.directory / f"stranger.{name}").write_bytes(data)
+    wrong = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    wrong.check_hostname, wrong.verify_mode = False, ssl.CERT_NONE
+    wrong.load_cert_chain(rig.directory / "stranger.crt", rig.directory / "stranger.key")
+    silent: list[socket.socket] = []
+    try:
+        for n in range(300):
+            silent.append(socket.create_connection((host, int(port)), timeout=5))
+            if n % 10 == 0:
+                silent[-1].sendall(b"GET / HTTP/1.1\r\n\r\n" * 50)
+                await stub.GetSpeed(ASK, timeout=5)
+        for _ in range(50):
+            with socket.create_connection((host, int(port)), timeout=5) as raw:
+                try:
+                    with wrong.wrap_socket(raw, server_hostname=node_server_name(NODE)) as tls:
+                        tls.recv(1)
+                except OSError:
+                    continue
+        await stub.GetSpeed(ASK, timeout=5)
+        await served(rig)
+        await until(lambda: _closed(silent[-1]), "the end of a connection that says nothing", 20)
+    finally:
+        for one in silent:
+            one.close()
+
+
+def _closed(connection: socket.socket) -> bool:
+    connection.settimeout(0.01)
+    try:
+        return connection.recv(65536) == b""
+    except TimeoutError:
+        return False
+    except ConnectionError:
+        return True
+
+
+# In flight
+
+
+@pytest.mark.parametrize("how", ["unsigned", "older"])
+async def test_a_forged_grant_in_flight_brings_the_drone_home(rig: Rig, how: str) -> None:
+    first = rig.authority.sign(grant())
+    driver = await flying(rig, altitude_limit(5, 15))
+    path = rig.grants / "app-navigator.json"
+    forged = json.loads(path.read_text())
+    if how == "unsigned":
+        forged["metadata"]["annotations"] = {}
+    else:
+        forged = first
+    fresh = path.with_suffix(".new")
+    fresh.write_text(json.dumps(forged))
+    fresh.replace(path)
+    await driver.next(LOST, 5)
+    await rig.until(lambda t: t.mode == "RTL" and t.controller == "system", 10)
+    refused = [e for e in rig.entries("grant") if e["change"] == "refused"]
+    because = {"unsigned": "is not signed", "older": "not after the one of"}
+    assert because[how] in refused[-1]["reason"]
+    code, why = await denied(flown(driver.going(0, 20)))
+    assert (code, why.code) == (Status.PERMISSION_DENIED, "NoGrant")
+
+
+async def test_a_full_disk_ends_no_flight_and_begins_none(rig: Rig) -> None:
+    driver = await flying(rig)
+    before = len(rig.entries())
+    full = (0, resource.RLIM_INFINITY)
+    resource.prlimit(rig.pid("service"), resource.RLIMIT_FSIZE, full)
+    await driver.goto(0, 30)
+    code, why = await denied(flown(driver.going(0, 150)))
+    assert (code, why.code) == (Status.PERMISSION_DENIED, "OutsideOperationArea"), "judged as before"
+    await driver.stub.Hover(pb.HoverRequest(), timeout=5)
+    await flown(driver.stub.Land(pb.LandRequest(), timeout=60))
+    await rig.until(lambda t: not t.armed, 30, "landing")
+    code, why = await denied(driver.arm())
+    assert code == Status.FAILED_PRECONDITION
+    assert why.code in {"AuditUnavailable", "JournalUnavailable"}
+    assert why.reason
+    resource.prlimit(rig.pid("service"), resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    await until(
+        lambda: any(e.get("code") == "OutsideOperationArea" for e in rig.entries("call")), "what was written late"
+    )
+    assert len(rig.entries()) > before
+    with rig.audit.open("rb") as log:
+        assert not verify(log).problem
+
+
+if __name__ == "__main__":
+    files = [Path(f"{sys.argv[2]}.{name}").read_bytes() for name in ("ca", "key", "crt")]
+    asyncio.run(_flood(sys.argv[1], files, float(sys.argv[3])))

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import http.server
+import io
+import threading
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +17,7 @@ import pytest
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
 from fractus_services.audit import verify
 from mobility_rig import DRIVER, FRAME, HOME, NODE, PASSENGER, Driver, Rig, area, denied, grant, passenger_grant
+from PIL import Image
 
 ALL = ["CaptureImage", "RetrieveImage", "ListImages", "DeleteImage"]
 CAMERA = [{"service": "camera", "methods": ALL}]
@@ -23,7 +27,25 @@ kind: EdgeNode
 metadata: {{name: {NODE}}}
 spec:
   location: {{lat: {HOME[0]}, lon: {HOME[1]}, alt: {HOME[2]}, altitudeReference: amsl}}
-  services: {{camera: {{model: test, resolution: 640x480, methods: [CaptureImage, RetrieveImage]}}}}
+  services:
+    camera:
+      model: test
+      resolution: 640x480
+      horizontalFieldOfView: 60
+      mount: {{pitch: -90, height: 4}}
+      methods: [CaptureImage, RetrieveImage]
+"""
+DRONE = f"""
+apiVersion: fractus.dev/v1alpha1
+kind: Drone
+metadata: {{name: {NODE}}}
+spec:
+  services:
+    camera:
+      resolution: 640x480
+      horizontalFieldOfView: 50
+      mount: {{pitch: -90, stabilised: true}}
+      methods: [CaptureImage, RetrieveImage]
 """
 
 
@@ -49,9 +71,9 @@ async def capture(camera: Any, **size: int) -> camera_pb2.CaptureImageResponse:
     return await camera.CaptureImage(camera_pb2.CaptureImageRequest(**size), wait_for_ready=True, timeout=20)
 
 
-async def retrieve(camera: Any, name: str) -> bytes:
+async def retrieve(camera: Any, name: str, action: Any = types_pb2.Decision.ACTION_ALLOW) -> bytes:
     chunks = [c async for c in camera.RetrieveImage(camera_pb2.RetrieveImageRequest(name=name), timeout=20)]
-    assert chunks[0].decision.action == types_pb2.Decision.ACTION_ALLOW
+    assert chunks[0].decision.action == action
     assert all(len(c.data) <= 256 * 1024 for c in chunks)
     return b"".join(c.data for c in chunks)
 
@@ -90,29 +112,113 @@ async def test_pictures_of_an_edge_node(rig: Rig) -> None:
         assert not verify(log).problem
 
 
-@pytest.mark.parametrize(("action", "code"), [("refuse", "PrivacyZone"), ("blurFaces", "FilterUnavailable")])
-async def test_privacy_fails_closed(rig: Rig, action: str, code: str) -> None:
-    free = passenger_grant(services=CAMERA, operationArea=[], **{"class": None})
-    rig.write_grant(free)
+async def until_refused(call: Any) -> tuple[grpc.StatusCode, types_pb2.Decision]:
+    for _ in range(200):
+        try:
+            await call()
+        except grpc.aio.AioRpcError:
+            return await denied(call())
+        await asyncio.sleep(0.05)
+    raise AssertionError("the new policy has no effect")
+
+
+async def test_policies_that_come_later_hold_for_pictures_from_before(rig: Rig) -> None:
+    def write(*policies: dict[str, Any]) -> None:
+        bound = passenger_grant(*policies, services=CAMERA, operationArea=[], **{"class": None})
+        rig.write_grant(bound)
+
+    write()
     camera = stub(rig, rig.start_camera(description=EDGE))
-    taken = await capture(camera, width=64, height=64)
-    bound = passenger_grant(
-        services=CAMERA, operationArea=[], policies=[privacy(action, -20, -20, 20, 20)], **{"class": None}
-    )
-    rig.write_grant(bound)
-
-    async def until_refused(call: Any) -> tuple[grpc.StatusCode, types_pb2.Decision]:
-        for _ in range(200):
-            try:
-                await call()
-            except grpc.aio.AioRpcError:
-                return await denied(call())
-        raise AssertionError("the new policy has no effect")
-
-    status, why = await until_refused(lambda: retrieve(camera, taken.image.name))
-    assert (status, why.code) == (grpc.StatusCode.PERMISSION_DENIED, code)
+    taken = await capture(camera)
+    plain = await retrieve(camera, taken.image.name)
+    exif = Image.open(io.BytesIO(plain)).getexif().get_ifd(0x8825)
+    assert float(exif[2][0]) == int(HOME[0])
+    write(privacy("blurFaces", -20, -20, 20, 20))
+    for _ in range(200):
+        chunks = [
+            c async for c in camera.RetrieveImage(camera_pb2.RetrieveImageRequest(name=taken.image.name), timeout=20)
+        ]
+        if chunks[0].decision.action == types_pb2.Decision.ACTION_CORRECT:
+            break
+        await asyncio.sleep(0.05)
+    assert list(chunks[0].decision.policies) == ["privacy"]
+    assert "blurAverage instead" in chunks[0].decision.reason, "4 m up, 640 pixels: too few for faces"
+    blurred = b"".join(c.data for c in chunks)
+    assert len(blurred) == chunks[0].image.size_bytes < len(plain)
+    assert not chunks[0].image.HasField("position")
+    assert b"Exif" not in blurred
+    again = await capture(camera)
+    assert again.decision.action == types_pb2.Decision.ACTION_CORRECT
+    write(privacy("refuse", -20, -20, 20, 20))
+    status, why = await until_refused(lambda: retrieve(camera, taken.image.name, types_pb2.Decision.ACTION_CORRECT))
+    assert (status, why.code) == (grpc.StatusCode.PERMISSION_DENIED, "PrivacyZone")
     status, why = await denied(capture(camera))
-    assert (status, why.code, list(why.policies)) == (grpc.StatusCode.PERMISSION_DENIED, code, ["privacy"])
+    assert (status, why.code, list(why.policies)) == (grpc.StatusCode.PERMISSION_DENIED, "PrivacyZone", ["privacy"])
+
+
+async def test_an_ip_camera_that_breaks_and_comes_back(rig: Rig) -> None:
+    viewer = passenger_grant(services=CAMERA, operationArea=[], **{"class": None})
+    rig.write_grant(viewer)
+    asked: list[str] = []
+
+    class Snapshots(http.server.BaseHTTPRequestHandler):
+        broken = ""
+
+        def do_GET(self) -> None:
+            asked.append(self.path)
+            if self.broken == "503":
+                self.send_error(503, "no pose")
+                return
+            picture = np.full((90, 160, 3), 200, np.uint8)
+            data = b"no picture" if self.broken else cv2.imencode(".png", picture)[1].tobytes()
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(data)
+
+        def log_message(self, *_: Any) -> None:
+            """Tests are quiet."""
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Snapshots)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        url = f"http://user:secret@127.0.0.1:{server.server_address[1]}/snapshot.jpg"
+        camera = stub(rig, rig.start_camera("--camera", url, description=EDGE))
+        taken = await capture(camera, width=320, height=320)
+        assert asked == ["/snapshot.jpg?width=427&height=320"], "in the camera's own proportions"
+        data = await retrieve(camera, taken.image.name)
+        shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert shown.shape == (320, 320, 3)
+        assert abs(float(shown.mean()) - 200) < 3
+        for broken, sentence in (("503", "503"), ("text", "no picture")):
+            Snapshots.broken = broken
+            code, why = await denied(capture(camera))
+            assert (code, why.code) == (grpc.StatusCode.UNAVAILABLE, "CameraFailed")
+            assert sentence in why.reason
+            assert "secret" not in why.reason
+        Snapshots.broken = ""
+        await capture(camera)
+    finally:
+        server.shutdown()
+        server.server_close()
+    code, why = await denied(capture(camera))
+    assert (code, why.code) == (grpc.StatusCode.UNAVAILABLE, "CameraFailed")
+    listed = await camera.ListImages(camera_pb2.ListImagesRequest(), timeout=5)
+    assert len(listed.images) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("--face-model", "/nowhere.onnx"), "there is no such file"),
+        (("--camera", "gopher://x"), "names no camera"),
+    ],
+)
+async def test_what_cannot_work_is_refused_at_start(rig: Rig, arguments: tuple[str, ...], sentence: str) -> None:
+    rig.start_camera(*arguments, description=EDGE)
+    assert await asyncio.to_thread(rig._processes["camera"].wait, 30) == 1
+    said = rig.log("camera")
+    assert sentence in said
+    assert "Traceback" not in said
 
 
 async def test_a_drone_takes_pictures_in_its_area_and_not_over_private_ground(rig: Rig) -> None:
@@ -121,7 +227,7 @@ async def test_a_drone_takes_pictures_in_its_area_and_not_over_private_ground(ri
     rig.write_grant(passenger_grant(stripe, services=CAMERA))
     rig.start_service()
     rig.start_vehicle()
-    camera = stub(rig, rig.start_camera())
+    camera = stub(rig, rig.start_camera(description=DRONE))
     driver = Driver(rig)
     await driver.up()
     over = await capture(camera, width=64, height=64)

@@ -1,67 +1,128 @@
-"""The camera between judging and keeping: the drone moves, callers wait, applications are replaced."""
+"""The camera between judging and keeping: the drone moves, callers wait, policies change, cameras break."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from fractus_core.policy.values import CaptureArgs, Situation
+from fractus_core.policy.values import Attitude, CaptureArgs, Lens, Situation
 from fractus_services.audit import AuditLog
 from fractus_services.camera import service as camera
 from fractus_services.camera.album import Album
-from fractus_services.camera.service import MAX_WAITING, CameraService
+from fractus_services.camera.drivers import CameraFailed, Wanted
+from fractus_services.camera.faces import Box
+from fractus_services.camera.imaging import Pixels, decoded
+from fractus_services.camera.service import MAX_OF_ONE, Body, CameraService
+from fractus_services.camera.shots import Shot
+from fractus_services.camera.shutter import Shutter
 from fractus_services.grants import Held
 from fractus_services.replies import Refused
 from policy_world import FRAME, NOW, at, box, compiled, policy, spec, zone
 
-PRIVATE = policy("p", "PrivacyControl", "camera", [zone("z", box(-20, -20, 20, 20))], action="refuse")
+SEEING = Lens(60.0, 60.0, stabilised=True, error_deg=0.0)
+
+
+def private(action: str = "refuse", name: str = "p", **fields: Any) -> dict[str, Any]:
+    return policy(name, "PrivacyControl", "camera", [zone("z", box(-20, -20, 20, 20))], action=action, **fields)
 
 
 class Drone:
     """Whereabouts that a test moves."""
 
     def __init__(self) -> None:
-        self.x, self.y = 0.0, 80.0
+        self.x, self.y, self.alt = 0.0, 80.0, 10.0
 
     def situation(self, time_s: float) -> Situation:
-        return at(self.x, self.y, time_s=time_s)
+        return at(self.x, self.y, alt=self.alt, time_s=time_s, lens=SEEING, attitude=Attitude(0, 0, 0, 0, 0))
 
     async def run(self) -> None:
         """Nothing to follow."""
 
 
-def held(uid: str = "u1") -> Held:
+class Scene:
+    """A camera that shows noise, and lets a test act during the exposure."""
+
+    def __init__(self) -> None:
+        self.taken: list[Wanted] = []
+        self.during: Callable[[], None] = lambda: None
+        self._begun = threading.Event()
+
+    async def begun(self) -> None:
+        assert await asyncio.to_thread(self._begun.wait, 10)
+
+    def capture(self, wanted: Wanted) -> Pixels:
+        self.taken.append(wanted)
+        self._begun.set()
+        self.during()
+        noise = np.random.default_rng(1).integers(0, 256, (wanted.height, wanted.width, 3))
+        return noise.astype(np.uint8)
+
+    def close(self) -> None:
+        """Nothing to let go of."""
+
+
+class Finder:
+    """A detector that finds what a test says."""
+
+    name = "test"
+    least_px = 40.0
+
+    def __init__(self) -> None:
+        self.boxes: list[Box] = []
+
+    def find(self, picture: Pixels, smallest_px: float, *, upright: bool) -> list[Box]:
+        assert smallest_px >= self.least_px
+        assert not upright
+        return self.boxes
+
+
+def held(*policies: dict[str, Any], uid: str = "u1", instance: str = "app-navigator") -> Held:
     fields: dict[str, Any] = {
         "application": {"namespace": "default", "name": "app", "uid": uid},
-        "services": [{"service": "camera", "methods": ["CaptureImage", "ListImages"]}],
+        "instance": instance,
+        "services": [{"service": "camera", "methods": ["CaptureImage", "RetrieveImage", "ListImages"]}],
     }
-    return Held(uid, "g", spec(PRIVATE, **fields), compiled(PRIVATE, **fields))
+    chosen = policies or (private(),)
+    return Held(uid, "g", spec(*chosen, **fields), compiled(*chosen, **fields))
+
+
+class World:
+    """A service with all that it stands on."""
+
+    def __init__(self, directory: Path, resolution: tuple[int, int] = (64, 64)) -> None:
+        self.directory = directory / "album"
+        self.drone, self.scene, self.finder = Drone(), Scene(), Finder()
+        self.shutter = Shutter(self.scene, timeout_s=5.0)
+        self.audit = AuditLog(directory / "audit.jsonl", lambda: NOW)
+        self.album = Album(self.directory, 50, 10**9)
+        self.service = CameraService(
+            self.drone, self.shutter, Body(resolution), detector=self.finder, album=self.album, audit=self.audit,
+            clock=lambda: NOW,
+        )  # fmt: skip
+
+    async def capture(self, grant: Held, **size: int) -> Shot:
+        return (await self.service.capture(grant, CaptureArgs(**size)))[1]
+
+    async def pixels(self, grant: Held, shot: Shot) -> Pixels:
+        source = (await self.service.retrieve(grant, shot.name))[2]
+        return decoded(source if isinstance(source, bytes) else source.read_bytes())
+
+    def stored(self, grant: Held, shot: Shot) -> Pixels:
+        return decoded(self.album.path(camera.owner_of(grant), shot.name).read_bytes())
 
 
 @pytest.fixture
-def drone() -> Drone:
-    return Drone()
-
-
-@pytest.fixture
-def service(tmp_path: Path, drone: Drone) -> CameraService:
-    log = AuditLog(tmp_path / "audit.jsonl", lambda: NOW)
-    return CameraService(drone, Album(tmp_path / "album", 50, 10**9), log, lambda: NOW, (64, 64))
-
-
-def exposing(monkeypatch: pytest.MonkeyPatch, during: Callable[[], None]) -> list[tuple[Any, ...]]:
-    taken: list[tuple[Any, ...]] = []
-
-    def render(*given: Any) -> bytes:
-        taken.append(given)
-        during()
-        return b"jpeg"
-
-    monkeypatch.setattr(camera, "render", render)
-    return taken
+def world(tmp_path: Path) -> Iterator[World]:
+    world = World(tmp_path)
+    yield world
+    world.shutter.close()
 
 
 async def refusal(work: Any) -> str:
@@ -70,61 +131,195 @@ async def refusal(work: Any) -> str:
     return caught.value.verdict.code
 
 
-async def test_a_drone_that_flies_over_private_ground_during_the_exposure_keeps_no_picture(
-    service: CameraService, drone: Drone, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    taken = exposing(monkeypatch, lambda: setattr(drone, "y", 0.0))
-    assert await refusal(service.capture(held(), CaptureArgs())) == "PrivacyZone"
-    drone.y = 80.0
-    assert len(taken) == 1
-    assert (await service.list(held()))[1] == ()
+def grain(picture: Pixels) -> float:
+    """How much neighbouring pixels differ."""
+    return float(np.abs(np.diff(picture.astype(float), axis=1)).mean())
 
 
-async def test_those_who_wait_are_judged_and_placed_when_it_is_their_turn(
-    service: CameraService, drone: Drone, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    taken = exposing(monkeypatch, lambda: None)
-    async with service._shutter:
-        waiting = [asyncio.create_task(service.capture(held(), CaptureArgs())) for _ in range(MAX_WAITING)]
-        await asyncio.sleep(0)
-        assert await refusal(service.capture(held(), CaptureArgs())) == "ShutterBusy"
-        drone.y = 60.0
-    shots = [shot for _, shot in await asyncio.gather(*waiting)]
-    assert len(taken) == MAX_WAITING
+async def test_a_drone_that_flies_over_private_ground_during_the_exposure_keeps_no_picture(world: World) -> None:
+    world.scene.during = lambda: setattr(world.drone, "y", 0.0)
+    assert await refusal(world.service.capture(held(), CaptureArgs())) == "PrivacyZone"
+    world.drone.y = 80.0
+    assert len(world.scene.taken) == 1
+    assert (await world.service.list(held()))[1] == ()
+
+
+async def test_a_drone_that_crosses_private_ground_during_the_exposure_keeps_no_picture(world: World) -> None:
+    world.scene.during = lambda: setattr(world.drone, "y", -80.0)
+    assert await refusal(world.service.capture(held(), CaptureArgs())) == "PrivacyZone"
+
+
+async def test_those_who_wait_are_judged_and_placed_when_it_is_their_turn(world: World) -> None:
+    held_up = threading.Event()
+    world.scene.during = lambda: held_up.wait(10) and None
+    waiting = [asyncio.create_task(world.capture(held())) for _ in range(MAX_OF_ONE)]
+    await world.scene.begun()
+    assert await refusal_of_queue(world.capture(held()))
+    other = asyncio.create_task(world.capture(held(instance="other")))
+    await asyncio.sleep(0)
+    world.drone.y = 60.0
+    held_up.set()
+    shots = await asyncio.gather(*waiting)
+    assert (await other).name == sorted(s.name for s in [*shots, await other])[1], "callers take turns"
     for shot in shots:
-        assert shot.lat is not None
-        assert shot.lon is not None
-        assert FRAME.xy(shot.lat, shot.lon)[1] == pytest.approx(60.0, abs=0.01)
+        assert FRAME.xy(shot.after.lat or 0, shot.after.lon or 0)[1] == pytest.approx(60.0, abs=0.01)
 
 
-async def test_a_caller_that_hangs_up_does_not_free_the_shutter(
-    service: CameraService, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    exposing(monkeypatch, lambda: None)
-    async with service._shutter:
-        task = asyncio.create_task(service.capture(held(), CaptureArgs()))
-        await asyncio.sleep(0)
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-        assert len(service._exposing) == 1
+async def refusal_of_queue(work: Any) -> bool:
+    with pytest.raises(Exception, match="under way") as caught:
+        await work
+    translated = camera.known(caught.value)
+    return translated is not None and translated.verdict.code == "ShutterBusy"
 
 
-async def test_a_grant_that_ends_while_its_caller_waits_takes_no_picture(
-    service: CameraService, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    taken = exposing(monkeypatch, lambda: None)
+async def test_a_caller_that_hangs_up_does_not_free_the_shutter(world: World) -> None:
+    held_up = threading.Event()
+    world.scene.during = lambda: held_up.wait(10) and None
+    task = asyncio.create_task(world.service.capture(held(), CaptureArgs()))
+    await world.scene.begun()
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    assert world.service._exposing.busy
+    held_up.set()
+    await world.capture(held())
+    assert len((await world.service.list(held()))[1]) == 2
 
+
+async def test_a_grant_that_ends_while_its_caller_waits_takes_no_picture(world: World) -> None:
     def gone() -> Held:
         raise camera.refused(camera.Verdict("deny", None, "NoGrant", "gone"))
 
-    assert await refusal(service.capture(held(), CaptureArgs(), gone)) == "NoGrant"
-    assert not taken
+    assert await refusal(world.service.capture(held(), CaptureArgs(), gone)) == "NoGrant"
+    assert not world.scene.taken
 
 
-async def test_an_application_of_the_same_name_does_not_inherit_pictures(
-    service: CameraService, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    exposing(monkeypatch, lambda: None)
-    await service.capture(held(), CaptureArgs())
-    assert len((await service.list(held()))[1]) == 1
-    assert (await service.list(held("u2")))[1] == ()
+async def test_an_application_of_the_same_name_does_not_inherit_pictures(world: World) -> None:
+    await world.capture(held())
+    assert len((await world.service.list(held()))[1]) == 1
+    assert (await world.service.list(held(uid="u2")))[1] == ()
+
+
+# Filters
+
+
+@pytest.mark.parametrize("action", ["black", "blurAverage", "blurMedian", "removeBackground"])
+async def test_a_filtered_picture_is_never_on_disk_without_its_filter(world: World, action: str) -> None:
+    world.drone.y = 0.0
+    grant = held(private(action))
+    verdict, shot = await world.service.capture(grant, CaptureArgs())
+    assert (verdict.action, verdict.code, verdict.policies) == ("correct", "PrivacyFilter", ("p",))
+    assert len(world.scene.taken) == (3 if action == "removeBackground" else 1)
+    kept = world.stored(grant, shot)
+    assert grain(kept) < 12
+    assert np.array_equal(await world.pixels(grant, shot), kept), "it is not filtered twice"
+    data = world.album.path(camera.owner_of(grant), shot.name).read_bytes()
+    assert b"Exif" not in data
+    assert b"Camera:" not in data
+
+
+async def test_a_picture_is_judged_again_by_where_it_was_taken(world: World) -> None:
+    free, bound = held(policy("q", "PrivacyControl", "camera", [zone("far", box(500, 500, 510, 510))],
+                              action="refuse")), held(private("blurAverage"))  # fmt: skip
+    world.drone.y = 0.0
+    shot = await world.capture(free)
+    assert grain(world.stored(free, shot)) > 30
+    world.drone.y = 150.0
+    verdict, shown, _ = await world.service.retrieve(bound, shot.name)
+    assert (verdict.action, verdict.policies) == ("correct", ("p",))
+    assert shown.filters
+    assert grain(await world.pixels(bound, shot)) < 12
+    assert await refusal(world.service.retrieve(held(), shot.name)) == "PrivacyZone"
+    assert grain(await world.pixels(free, shot)) > 30
+
+
+async def test_a_picture_from_elsewhere_is_judged_by_where_the_camera_is_now(world: World) -> None:
+    shot = await world.capture(held(private("black")))
+    world.drone.y = 0.0
+    assert (await world.pixels(held(private("black")), shot)).max() == 0
+
+
+async def test_faces_are_hidden_where_they_are_large_enough_to_be_found(tmp_path: Path) -> None:
+    world = World(tmp_path, (1600, 1600))
+    world.drone.y, world.drone.alt = 0.0, 2.0
+    world.finder.boxes = [(700, 700, 100, 100)]
+    grant = held(private("blurFaces"))
+    kept = world.stored(grant, await world.capture(grant))
+    assert grain(kept[700:800, 700:800]) < 12
+    assert grain(kept[:600]) > 30
+    world.drone.alt = 40.0
+    verdict, shot = await world.service.capture(grant, CaptureArgs())
+    assert "blurAverage instead" in verdict.reason
+    assert grain(world.stored(grant, shot)) < 12
+    strict = held(private("blurFaces", fallback="refuse"))
+    assert await refusal(world.service.capture(strict, CaptureArgs())) == "FacesNotFound"
+    assert grain(await world.pixels(held(private("black")), shot)) == 0
+    world.shutter.close()
+
+
+async def test_without_a_lens_nobody_knows_how_small_faces_are(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = world.drone.situation
+    monkeypatch.setattr(world.drone, "situation", lambda time_s: replace(plain(time_s), lens=None))
+    verdict, _ = await world.service.capture(held(private("blurFaces")), CaptureArgs())
+    assert "nobody knows how small" in verdict.reason
+    assert verdict.policies == ("p",), "80 m away, but who knows what the camera sees"
+
+
+# Cameras that break
+
+
+async def test_a_camera_that_hangs_is_reported_and_comes_back(tmp_path: Path) -> None:
+    scene, stuck = Scene(), threading.Event()
+    scene.during = lambda: stuck.wait(20) and None
+    shutter = Shutter(scene, timeout_s=0.2)
+    wanted = Wanted(8, 8, (8, 8), "RGB", at())
+    with pytest.raises(CameraFailed, match="gave no picture in"):
+        await shutter.expose(wanted)
+    begun = time.monotonic()
+    with pytest.raises(CameraFailed, match="has not answered for"):
+        await shutter.expose(wanted)
+    assert time.monotonic() - begun < 5, "at once, not after another wait"
+    stuck.set()
+    for _ in range(500):
+        try:
+            assert len(await shutter.expose(wanted)) == 1
+            break
+        except CameraFailed:
+            await asyncio.sleep(0.01)
+    else:
+        raise AssertionError("the camera does not come back")
+    shutter.close()
+
+
+async def test_a_driver_that_breaks_does_not_take_the_service_along(world: World) -> None:
+    def broken() -> None:
+        raise CameraFailed("no light")
+
+    world.scene.during = broken
+    with pytest.raises(CameraFailed):
+        await world.capture(held())
+    world.scene.during = lambda: None
+    await world.capture(held())
+
+
+# The album
+
+
+async def test_the_album_forgets_what_a_crash_left_and_makes_room(tmp_path: Path) -> None:
+    world = World(tmp_path)
+    shot = await world.capture(held())
+    folder = next(path for path in world.directory.iterdir() if path.is_dir())
+    (folder / "20260101000000000-0001.jpg").write_bytes(b"half")
+    (folder / "20260101000000000-0002.jpg.new").write_bytes(b"half")
+    (folder / "20260101000000000-0003.json").write_text('{"name": "old"}')
+    album = Album(world.directory, 50, 10**9)
+    assert [s.name for s in album.list(camera.owner_of(held()))] == [shot.name]
+    assert len(list(folder.glob("*.jpg*"))) == 1
+    assert album.list(camera.owner_of(held())) == (shot,), "a shot survives its record"
+
+    living = [camera.owner_of(held(instance="other"))]
+    small = Album(world.directory, 50, 10**9, 1000, lambda: living)
+    assert small.room(living[0]) == "", "pictures of those who are gone make room"
+    assert not folder.exists()
+    small.add(living[0], replace(shot, name="20260101000000000-0009.jpg"), b"x" * 2000)
+    assert "--keep-total-mb" in small.room(living[0])
+    world.shutter.close()

@@ -314,7 +314,7 @@ def _check_privacy(spec: PolicySpec) -> None:
     if spec.action not in {"refuse", "black", "blurAverage", "blurMedian", "blurFaces", "removeBackground"}:
         raise InvalidObject(
             "action",
-            "PrivacyControl needs refuse, or an image filter: black, blurAverage, blurMedian, blurFaces or removeBackground",
+            "PrivacyControl needs an image filter (black, blurAverage, blurMedian, blurFaces, removeBackground), or refuse",
         )
 
 

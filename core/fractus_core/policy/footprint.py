@@ -96,7 +96,7 @@ def footprint(now: Situation, frame: LocalFrame) -> Footprint | None:
     half = _widened(now.lens, now.lens.error_deg + (0.0 if now.lens.stabilised else attitude.tilt_error_deg))
     if half is None:
         return _everything(at, now)
-    axis, right, up = _axes(now.lens, attitude)
+    axis, right, up = camera_axes(now.lens, attitude)
     corners = [
         (
             axis[0] + sx * half[0] * right[0] + sy * half[1] * up[0],
@@ -163,7 +163,7 @@ def _widened(lens: Lens, error_deg: float) -> tuple[float, float] | None:
     return math.tan(wider), math.tan(taller)
 
 
-def _axes(lens: Lens, attitude: Attitude) -> tuple[Vector, Vector, Vector]:
+def camera_axes(lens: Lens, attitude: Attitude) -> tuple[Vector, Vector, Vector]:
     """Where the camera looks, and where right and up of its pictures point: north, east, down."""
     pitch, yaw = math.radians(lens.pitch_deg), math.radians(lens.yaw_deg)
     cp, sp, cy, sy = math.cos(pitch), math.sin(pitch), math.cos(yaw), math.sin(yaw)

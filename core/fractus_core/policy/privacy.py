@@ -9,7 +9,7 @@ import shapely
 
 from fractus_core.policy.compiled import Air, CompiledGrant, Patch, Patches, Rule, height_m
 from fractus_core.policy.footprint import Footprint, footprint
-from fractus_core.policy.values import Fallback, Filter, FilterAction, Situation, Verdict, deny
+from fractus_core.policy.values import FaceMethod, Fallback, Filter, FilterAction, Situation, Verdict, deny
 
 _IN_ORDER: tuple[FilterAction, ...] = ("blurFaces", "removeBackground", "blurMedian", "blurAverage", "black")
 """Filters from the mildest to the strictest, which is also the order in which they are applied."""
@@ -40,7 +40,7 @@ def judge_privacy(now: Situation, grant: CompiledGrant, until: Situation | None 
 def filter_of(rule: Rule) -> Filter:
     """What a rule asks for; one that names no filter blacks the picture out."""
     spec = rule.spec
-    action = next((known for known in _IN_ORDER if known == spec.action), "black")
+    action: FilterAction = next((known for known in _IN_ORDER if known == spec.action), "black")
     return Filter(action, spec.faces or "pixelate", spec.fallback or "blurAverage")
 
 
@@ -61,7 +61,7 @@ def compose(filters: Iterable[Filter]) -> tuple[Filter, ...]:
 
 
 def _strictest(alike: list[Filter]) -> Filter:
-    method = "gaussian" if all(one.faces == "gaussian" for one in alike) else "pixelate"
+    method: FaceMethod = "gaussian" if all(one.faces == "gaussian" for one in alike) else "pixelate"
     return Filter(alike[0].action, method, max((one.fallback for one in alike), key=_FALLBACKS.index))
 
 

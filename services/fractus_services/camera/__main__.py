@@ -26,6 +26,11 @@ class Options:
     listen: str
     keep: int
     keep_mb: int
+    keep_total_mb: int
+    camera: str | None
+    face_model: Path | None
+    face_px: float
+    relief: float
 
 
 _PATH = click.Path(path_type=Path)
@@ -83,6 +88,33 @@ def camera() -> None:
     show_default=True,
     help="Megabytes of pictures kept for each component instance.",
 )
+@click.option(
+    "--keep-total-mb",
+    type=click.IntRange(min=1),
+    default=2000,
+    show_default=True,
+    help="Megabytes of pictures kept altogether; those of components that are gone make room.",
+)
+@click.option(
+    "--camera",
+    help="Where pictures come from: http://HOST/snapshot.jpg, v4l2:/dev/video0, picamera2:0, directory:/PATH or test:;"
+    " by default what the description says.",
+)
+@click.option("--face-model", type=_PATH, help="Face detector (YuNet, ONNX) to use instead of OpenCV's cascades.")
+@click.option(
+    "--face-px",
+    type=click.FloatRange(min=12, max=1000),
+    default=40,
+    show_default=True,
+    help="Width in pixels from which on faces are found reliably; where they may be smaller, a policy's fallback applies.",
+)
+@click.option(
+    "--relief",
+    type=click.FloatRange(min=0, max=5000),
+    default=0.0,
+    show_default=True,
+    help="How many metres the ground around may lie below home; pictures are judged by what they may show of it.",
+)
 def serve(**given: object) -> None:
     """Serve until stopped; waits for certificates."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
@@ -90,7 +122,9 @@ def serve(**given: object) -> None:
 
 
 async def _until_signalled(options: Options) -> None:
-    from fractus_services.camera.server import run  # noqa: PLC0415 - the command line stays quick
+    from fractus_services.camera.drivers import BadConnection  # noqa: PLC0415 - the command line stays quick
+    from fractus_services.camera.faces import BadModel  # noqa: PLC0415
+    from fractus_services.camera.server import run  # noqa: PLC0415
 
     loop = asyncio.get_running_loop()
     stop = asyncio.Event()
@@ -100,6 +134,8 @@ async def _until_signalled(options: Options) -> None:
         await run(options, stop)
     except InvalidObject as error:
         raise click.ClickException(f"{options.description}: {error}") from None
+    except (BadConnection, BadModel) as error:
+        raise click.ClickException(str(error)) from None
 
 
 if __name__ == "__main__":

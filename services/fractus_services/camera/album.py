@@ -1,50 +1,31 @@
-"""Pictures on disk, one folder for each component instance, within a quota."""
+"""Pictures on disk, one folder for each component instance, within quotas."""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
+import logging
 import os
 import re
-from dataclasses import asdict, dataclass
+import shutil
+import threading
+from collections.abc import Callable, Iterable
 from pathlib import Path
+
+from fractus_services.camera.shots import Shot
+
+log = logging.getLogger(__name__)
 
 _NAME = re.compile(r"^[0-9]{17}-[0-9]{4}\.jpg$")
 
 
 class AlbumFull(Exception):
-    """The quota of an instance is used up."""
+    """A quota is used up."""
 
 
 class NoSuchImage(Exception):
     """An instance has no picture of that name."""
-
-
-@dataclass(frozen=True, slots=True)
-class Shot:
-    """A picture that was taken.
-
-    Attributes:
-        name: unique within its instance.
-        time_s: Unix time.
-        width: pixels.
-        height: pixels.
-        size_bytes: of the file.
-        lat: where the camera was; None when that was unknown.
-        lon: as lat.
-        altitude_m: above home.
-        position_error_m: bound of the error of lat and lon.
-    """
-
-    name: str
-    time_s: float
-    width: int
-    height: int
-    size_bytes: int
-    lat: float | None
-    lon: float | None
-    altitude_m: float
-    position_error_m: float = 10.0
 
 
 class Album:
@@ -54,49 +35,76 @@ class Album:
         directory: where they are kept.
         keep: pictures that one instance may have.
         keep_bytes: bytes that the pictures of one instance may take.
+        keep_total_bytes: bytes that all pictures may take; pictures of owners that are gone make room.
+        owners: owners that have a grant at present.
     """
 
-    def __init__(self, directory: Path, keep: int, keep_bytes: int) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        keep: int,
+        keep_bytes: int,
+        keep_total_bytes: int = 10**13,
+        owners: Callable[[], Iterable[str]] = tuple,
+    ) -> None:
         self._directory = directory
         self._keep = keep
         self._keep_bytes = keep_bytes
+        self._keep_total_bytes = keep_total_bytes
+        self._owners = owners
+        self._lock = threading.Lock()
+        self._tidy()
 
     def _folder(self, owner: str) -> Path:
         return self._directory / hashlib.sha256(owner.encode()).hexdigest()[:32]
 
     def list(self, owner: str) -> tuple[Shot, ...]:
         """The pictures of an instance, oldest first."""
-        return tuple(Shot(**json.loads(path.read_bytes())) for path in sorted(self._folder(owner).glob("*.json")))
+        shots = []
+        for path in sorted(self._folder(owner).glob("*.json")):
+            try:
+                shots.append(Shot.parse(json.loads(path.read_bytes())))
+            except FileNotFoundError:
+                continue
+            except ValueError as error:
+                log.warning("%s cannot be read, so its picture is not handed out: %s", path, error)
+        return tuple(shots)
 
     def room(self, owner: str) -> str:
         """Why an instance may not add a picture; empty when it may."""
         shots = self.list(owner)
         used = sum(shot.size_bytes for shot in shots)
         if len(shots) >= self._keep:
-            return f"{len(shots)} pictures are kept, as many as allowed; delete some"
+            return f"{len(shots)} pictures are kept, as many as allowed; delete some with DeleteImage"
         if used >= self._keep_bytes:
-            return f"{used / 1e6:.0f} MB of pictures are kept, as much as allowed; delete some"
+            return f"{used / 1e6:.0f} MB of pictures are kept, as much as allowed; delete some with DeleteImage"
+        if self._total() >= self._keep_total_bytes and not self._make_room():
+            return (
+                f"the pictures on this node take {self._keep_total_bytes / 1e6:.0f} MB, as much as allowed; delete some"
+                " with DeleteImage, or let the node's operator raise --keep-total-mb"
+            )
         return ""
 
     def add(self, owner: str, shot: Shot, data: bytes) -> None:
         """Keep a picture.
 
         Raises:
-            AlbumFull: the quota is used up.
+            AlbumFull: a quota is used up.
             OSError: the disk is full.
         """
-        problem = self.room(owner)
-        if problem:
-            raise AlbumFull(problem)
-        folder = self._folder(owner)
-        folder.mkdir(parents=True, exist_ok=True)
-        picture = folder / shot.name
-        try:
-            _write(picture, data)
-            _write(picture.with_suffix(".json"), json.dumps(asdict(shot)).encode())
-        except OSError:
-            picture.unlink(missing_ok=True)
-            raise
+        with self._lock:
+            problem = self.room(owner)
+            if problem:
+                raise AlbumFull(problem)
+            folder = self._folder(owner)
+            folder.mkdir(parents=True, exist_ok=True)
+            picture = folder / shot.name
+            try:
+                _write(picture, data)
+                _write(picture.with_suffix(".json"), json.dumps(shot.to_json()).encode())
+            except OSError:
+                picture.unlink(missing_ok=True)
+                raise
 
     def find(self, owner: str, name: str) -> Shot:
         """What is known of a picture.
@@ -104,19 +112,20 @@ class Album:
         Raises:
             NoSuchImage: there is none of that name.
         """
-        path = self._folder(owner) / name
-        if not _NAME.match(name) or not path.with_suffix(".json").is_file():
-            raise NoSuchImage(f"there is no picture {name[:64]!r} of this component; ListImages tells which there are")
-        return Shot(**json.loads(path.with_suffix(".json").read_bytes()))
+        missing = NoSuchImage(f"there is no picture {name[:64]!r} of this component; ListImages tells which there are")
+        if not _NAME.match(name):
+            raise missing
+        try:
+            return Shot.parse(json.loads((self._folder(owner) / name).with_suffix(".json").read_bytes()))
+        except FileNotFoundError:
+            raise missing from None
+        except ValueError as error:
+            log.warning("picture %s cannot be handed out: %s", name, error)
+            raise missing from None
 
-    def read(self, owner: str, name: str) -> bytes:
-        """A picture's bytes.
-
-        Raises:
-            NoSuchImage: there is none of that name.
-        """
-        self.find(owner, name)
-        return (self._folder(owner) / name).read_bytes()
+    def path(self, owner: str, name: str) -> Path:
+        """The file of a picture that `find` knows."""
+        return self._folder(owner) / name
 
     def delete(self, owner: str, name: str) -> None:
         """Remove a picture.
@@ -126,8 +135,34 @@ class Album:
         """
         self.find(owner, name)
         path = self._folder(owner) / name
+        # Without its record a picture is never handed out.
+        path.with_suffix(".json").unlink(missing_ok=True)
         path.unlink(missing_ok=True)
-        path.with_suffix(".json").unlink()
+
+    def _total(self) -> int:
+        total = 0
+        for path in self._directory.glob("*/*.jpg"):
+            with contextlib.suppress(FileNotFoundError):
+                total += path.stat().st_size
+        return total
+
+    def _make_room(self) -> bool:
+        """Remove pictures of owners that are gone, oldest folder first, until there is room."""
+        kept = {self._folder(owner) for owner in self._owners()}
+        gone = [path for path in self._directory.iterdir() if path.is_dir() and path not in kept]
+        for folder in sorted(gone, key=lambda path: path.stat().st_mtime):
+            log.warning("removing the pictures in %s: their component is gone, and room is needed", folder)
+            shutil.rmtree(folder, ignore_errors=True)
+            if self._total() < self._keep_total_bytes:
+                return True
+        return False
+
+    def _tidy(self) -> None:
+        """Remove what a crash left: files that were being written, and pictures without a record."""
+        for path in self._directory.glob("*/*"):
+            orphan = path.suffix == ".jpg" and not path.with_suffix(".json").exists()
+            if orphan or path.suffix == ".new":
+                path.unlink(missing_ok=True)
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import AsyncIterator
+from pathlib import Path
 from typing import Any
 
 from fractus_core.policy.values import CaptureArgs
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
 
 from fractus_services.answering import Reception
-from fractus_services.camera.album import Shot
+from fractus_services.camera.album import NoSuchImage
 from fractus_services.camera.service import CameraService
+from fractus_services.camera.shots import Shot
 from fractus_services.replies import decision
 
 CHUNK_BYTES = 256 * 1024
+READ_BYTES = 4 * CHUNK_BYTES
 
 
 class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
@@ -33,11 +38,12 @@ class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
     async def RetrieveImage(self, request: Any, context: Any) -> None:  # noqa: N802
         """See camera.proto."""
         async with self._reception.call(context) as caller:
-            verdict, shot, data = await self._service.retrieve(self._reception.held(caller), request.name)
-            first = camera_pb2.ImageChunk(decision=decision(verdict), image=_info(shot), data=data[:CHUNK_BYTES])
-            await context.write(first)
-            for at in range(CHUNK_BYTES, len(data), CHUNK_BYTES):
-                await context.write(camera_pb2.ImageChunk(data=data[at : at + CHUNK_BYTES]))
+            verdict, shot, source = await self._service.retrieve(self._reception.held(caller), request.name)
+            head: dict[str, Any] = {"decision": decision(verdict), "image": _info(shot)}
+            async for piece in _pieces(source, request.name):
+                for at in range(0, len(piece), CHUNK_BYTES):
+                    await context.write(camera_pb2.ImageChunk(data=piece[at : at + CHUNK_BYTES], **head))
+                    head = {}
 
     async def ListImages(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See camera.proto."""
@@ -52,12 +58,31 @@ class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
             return camera_pb2.DeleteImageResponse(decision=decision(verdict))
 
 
+async def _pieces(source: bytes | Path, name: str) -> AsyncIterator[bytes]:
+    """The bytes of a picture; a file is read bit by bit, so that slow readers cost no memory.
+
+    Raises:
+        NoSuchImage: it was deleted meanwhile.
+    """
+    if isinstance(source, bytes):
+        yield source
+        return
+    try:
+        file = await asyncio.to_thread(source.open, "rb")
+    except FileNotFoundError:
+        raise NoSuchImage(f"picture {name[:64]!r} was deleted") from None
+    with file:
+        while piece := await asyncio.to_thread(file.read, READ_BYTES):
+            yield piece
+
+
 def _info(shot: Shot) -> camera_pb2.ImageInfo:
     info = camera_pb2.ImageInfo(
         name=shot.name, width=shot.width, height=shot.height, size_bytes=shot.size_bytes, media_type="image/jpeg"
     )
     info.time.FromNanoseconds(int(shot.time_s * 1e9))
-    if shot.lat is not None and shot.lon is not None:
-        info.position.latitude_deg, info.position.longitude_deg = shot.lat, shot.lon
-        info.position.altitude_m = shot.altitude_m
+    taken = shot.after
+    if taken.lat is not None and taken.lon is not None and not shot.filters:
+        info.position.latitude_deg, info.position.longitude_deg = taken.lat, taken.lon
+        info.position.altitude_m = taken.altitude_m
     return info

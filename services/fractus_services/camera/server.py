@@ -13,14 +13,18 @@ import grpc
 import yaml
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.nodes import Drone, EdgeNode
+from fractus_core.policy.footprint import lens_of
 from fractus_proto.v1 import camera_pb2_grpc
 
 from fractus_services.answering import Reception
 from fractus_services.audit import AuditLog
 from fractus_services.auth import KEEPALIVE, TlsFiles
 from fractus_services.camera.album import Album
+from fractus_services.camera.drivers import driver_for
+from fractus_services.camera.faces import CascadeDetector, Detector, ModelDetector
 from fractus_services.camera.handlers import CameraHandlers
-from fractus_services.camera.service import CameraService, Whereabouts, known
+from fractus_services.camera.service import Body, CameraService, Whereabouts, known, owner_of
+from fractus_services.camera.shutter import Shutter
 from fractus_services.camera.whereabouts import Airborne, Fixed
 from fractus_services.clock import Clock
 from fractus_services.grants import GrantFiles
@@ -32,7 +36,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 STOP_S = 2.0
-DEFAULT_RESOLUTION = (1280, 720)
 
 
 def describe(path: Path) -> Drone | EdgeNode | None:
@@ -51,13 +54,29 @@ def describe(path: Path) -> Drone | EdgeNode | None:
     return kind.from_body(body)
 
 
-def resolution_of(description: Drone | EdgeNode | None) -> tuple[int, int]:
-    """The camera's own pixels."""
+def body_of(description: Drone | EdgeNode | None) -> Body:
+    """The camera's own properties."""
     camera = description.spec.services.camera if description is not None else None
-    if camera is None:
-        return DEFAULT_RESOLUTION
-    width, height = camera.resolution.split("x")
-    return int(width), int(height)
+    fixed = isinstance(description, EdgeNode)
+    return Body(camera.pixels, camera.model, camera.sensor_type, fixed) if camera is not None else Body(fixed=fixed)
+
+
+def detector_of(options: Options) -> Detector:
+    """What finds faces.
+
+    Raises:
+        BadModel: the model that was named cannot be used.
+    """
+    if options.face_model is not None:
+        return ModelDetector(options.face_model, options.face_px)
+    return CascadeDetector(options.face_px)
+
+
+def _whereabouts(options: Options, description: Drone | EdgeNode | None, node: str, tls: TlsFiles) -> Whereabouts:
+    if isinstance(description, EdgeNode):
+        return Fixed.of(description.spec, options.relief)
+    lens = lens_of(description.spec.services.camera) if description is not None else None
+    return Airborne(options.mobility, node, tls, time.monotonic, lens=lens, relief_m=options.relief)
 
 
 async def run(options: Options, stop: asyncio.Event) -> None:
@@ -71,13 +90,19 @@ async def run(options: Options, stop: asyncio.Event) -> None:
         options.grants, node, Seals(options.tls, options.state / "grants-seen.json"), refused=audit.refused_grant
     )
     grants.scan()
-    whereabouts: Whereabouts
-    if isinstance(description, EdgeNode):
-        whereabouts = Fixed.of(description.spec)
-    else:
-        whereabouts = Airborne(options.mobility, node, tls, time.monotonic)
-    album = Album(options.state, options.keep, options.keep_mb * 1_000_000)
-    service = CameraService(whereabouts, album, audit, clock, resolution_of(description))
+    camera = description.spec.services.camera if description is not None else None
+    shutter = Shutter(driver_for(options.camera or (camera.connection if camera is not None else "test:")))
+    whereabouts = _whereabouts(options, description, node, tls)
+    album = Album(
+        options.state,
+        options.keep,
+        options.keep_mb * 1_000_000,
+        options.keep_total_mb * 1_000_000,
+        lambda: [owner_of(held) for held in grants.held.values()],
+    )
+    service = CameraService(
+        whereabouts, shutter, body_of(description), detector=detector_of(options), album=album, audit=audit, clock=clock
+    )
     handlers = CameraHandlers(service, Reception(grants, clock, known))
     audit.append("started", {"node": node})
     async with asyncio.TaskGroup() as tasks:
@@ -87,6 +112,7 @@ async def run(options: Options, stop: asyncio.Event) -> None:
         await stop.wait()
         for task in running:
             task.cancel()
+    shutter.close()
     await audit.close()
 
 

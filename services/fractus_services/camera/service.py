@@ -1,23 +1,32 @@
-"""The camera service: judge, take, keep, hand out."""
+"""The camera service: judge, take, filter, keep, hand out."""
 
 from __future__ import annotations
 
 import asyncio
 import itertools
 import logging
-from collections.abc import Callable
-from dataclasses import asdict, replace
+from collections.abc import Callable, Coroutine
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Literal, Protocol, TypeVar
 
 import grpc
-from fractus_core.policy.access import judge_privacy
 from fractus_core.policy.engine import judge
-from fractus_core.policy.values import Call, CaptureArgs, Situation, Verdict
+from fractus_core.policy.footprint import footprint
+from fractus_core.policy.privacy import compose, judge_privacy, remaining
+from fractus_core.policy.values import Call, CaptureArgs, Filter, Situation, Verdict
 
 from fractus_services.audit import AuditLog
-from fractus_services.camera.album import Album, AlbumFull, NoSuchImage, Shot
-from fractus_services.camera.pictures import render
+from fractus_services.camera.album import Album, AlbumFull, NoSuchImage
+from fractus_services.camera.darkroom import NotHidden, Recipe, developed, is_upright, recipe
+from fractus_services.camera.drivers import CameraFailed, Wanted
+from fractus_services.camera.faces import BadModel, Detector, smallest_face_px
+from fractus_services.camera.imaging import NotAPicture, Pixels, decoded, encoded, fitted, source_size
+from fractus_services.camera.metadata import tagged
+from fractus_services.camera.shots import Pose, Shot, facts
+from fractus_services.camera.shutter import Shutter
+from fractus_services.camera.turns import QueueFull, Turns
 from fractus_services.grants import Held
 from fractus_services.replies import Refused, refused
 
@@ -25,7 +34,13 @@ log = logging.getLogger(__name__)
 
 MAX_PX = 8192
 MAX_WAITING = 8
-"""So many pictures may be under way or wait for the shutter."""
+"""So many pictures may be under way or wait for the shutter, of one component and of all."""
+MAX_OF_ONE = 4
+MAX_DEVELOPING = 8
+APART_S = 0.25
+"""Between the pictures that tell what moves."""
+
+_T = TypeVar("_T")
 
 
 def owner_of(held: Held) -> str:
@@ -43,103 +58,207 @@ class Whereabouts(Protocol):
         """Keep it present."""
 
 
+@dataclass(frozen=True, slots=True)
+class Body:
+    """The camera's own properties.
+
+    Attributes:
+        resolution: its width and height.
+        model: make and model; may be empty.
+        sensor: what it sees.
+        fixed: it does not move.
+    """
+
+    resolution: tuple[int, int] = (1280, 720)
+    model: str = ""
+    sensor: Literal["RGB", "IR"] = "RGB"
+    fixed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Exposed:
+    """What came out of an exposure, judged."""
+
+    held: Held
+    verdict: Verdict
+    before: Situation
+    after: Situation
+    pictures: list[Pixels]
+    whole_width: int
+
+
 class CameraService:
     """Table 8.2 of the thesis, for callers whose grant is known.
 
-    A privacy policy that asks for a filter which is not built in refuses the picture.
+    A picture is filtered before it is kept: without filters it is never on disk where a policy asks for them.
 
     Args:
         whereabouts: where the camera is.
+        shutter: the camera.
+        body: its properties.
+        detector: finds faces.
         album: where pictures are kept.
         audit: where decisions are written.
         clock: Unix time.
-        resolution: the camera's own width and height.
     """
 
     def __init__(
         self,
         whereabouts: Whereabouts,
+        shutter: Shutter,
+        body: Body,
+        *,
+        detector: Detector,
         album: Album,
         audit: AuditLog,
         clock: Callable[[], float],
-        resolution: tuple[int, int],
     ) -> None:
         self._whereabouts = whereabouts
+        self._shutter = shutter
+        self._body = body
+        self._detector = detector
         self._album = album
         self._audit = audit
         self._clock = clock
-        self._resolution = resolution
         self._numbers = itertools.count()
-        self._shutter = asyncio.Lock()
-        self._exposing: set[asyncio.Task[tuple[Verdict, Shot]]] = set()
+        self._exposing = Turns(MAX_OF_ONE, MAX_WAITING)
+        self._developing = Turns(MAX_OF_ONE, MAX_DEVELOPING)
+        self._tasks: set[asyncio.Task[Any]] = set()
 
     async def capture(
         self, held: Held, args: CaptureArgs, present: Callable[[], Held] | None = None
     ) -> tuple[Verdict, Shot]:
         """Take a picture and keep it.
 
-        It is judged when the shutter is free, and again when the picture is taken: the drone moves meanwhile, and grants
-        change.
+        It is judged when the shutter is free, and again when the picture is taken, together with all that the camera saw
+        on the way: the drone moves meanwhile, and grants change.
 
         Args:
             held: the caller's grant.
             args: pixels; 0 means the camera's own.
             present: the caller's grant at a later moment; raises when there is none any more.
         """
-        width, height = args.width or self._resolution[0], args.height or self._resolution[1]
+        width, height = args.width or self._body.resolution[0], args.height or self._body.resolution[1]
         if width > MAX_PX or height > MAX_PX or width < 16 or height < 16:
-            reason = f"{width}x{height} pixels is not between 16x16 and {MAX_PX}x{MAX_PX}"
+            reason = f"{width}x{height} pixels is not between 16x16 and {MAX_PX}x{MAX_PX}; ask for another size"
             raise refused(Verdict("deny", None, "InvalidArgument", reason))
-        if len(self._exposing) >= MAX_WAITING:
-            reason = f"{MAX_WAITING} pictures are waiting to be taken; try again"
-            raise Refused(grpc.StatusCode.RESOURCE_EXHAUSTED, Verdict("deny", None, "ShutterBusy", reason))
-        work = self._in_turn(replace(args, width=width, height=height), present or (lambda: held))
-        task = asyncio.get_running_loop().create_task(work)
-        self._exposing.add(task)
-        task.add_done_callback(self._exposed)
         # A caller that hangs up does not free the shutter before the picture is done.
+        return await self._finished(
+            self._taken(owner_of(held), replace(args, width=width, height=height), present or (lambda: held))
+        )
+
+    async def _finished(self, work: Coroutine[Any, Any, _T]) -> _T:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._done)
         return await asyncio.shield(task)
 
-    def _exposed(self, task: asyncio.Task[tuple[Verdict, Shot]]) -> None:
-        self._exposing.discard(task)
+    def _done(self, task: asyncio.Task[Any]) -> None:
+        self._tasks.discard(task)
         if not task.cancelled() and task.exception() is not None:
             log.debug("no picture: %s", task.exception())
 
-    async def _in_turn(self, args: CaptureArgs, present: Callable[[], Held]) -> tuple[Verdict, Shot]:
-        async with self._shutter:
-            held, call = present(), Call("CaptureImage", args)
-            now = self._whereabouts.situation(self._clock())
+    async def _taken(self, owner: str, args: CaptureArgs, present: Callable[[], Held]) -> tuple[Verdict, Shot]:
+        call = Call("CaptureImage", args)
+        expected = judge_privacy(self._whereabouts.situation(self._clock()), present().compiled)
+        if not expected.filters:
+            exposed = await self._exposed(owner, call, present)
+            if not exposed.verdict.filters:
+                return await self._kept(call, exposed)
+            async with self._developing.turn(owner):
+                return await self._kept(call, exposed)
+        # The picture must not wait in memory for its filters, so the turn for these comes first.
+        async with self._developing.turn(owner):
+            return await self._kept(call, await self._exposed(owner, call, present))
+
+    async def _exposed(self, owner: str, call: Call, present: Callable[[], Held]) -> _Exposed:
+        args = call.args
+        if not isinstance(args, CaptureArgs):
+            raise TypeError("CaptureImage without its arguments")
+        async with self._exposing.turn(owner):
+            held, now = present(), self._whereabouts.situation(self._clock())
             verdict = self._allow(call, held, now)
-            problem = await asyncio.to_thread(self._album.room, owner_of(held))
+            problem = await asyncio.to_thread(self._album.room, owner)
             if problem:
                 raise AlbumFull(problem)
-            lines = (
-                held.spec.node,
-                f"{now.lat:.7f} {now.lon:.7f} {now.altitude_m:.1f} m" if now.lat is not None else "no fix",
-            )
-            data = await asyncio.to_thread(render, args.width, args.height, lines, now.time_s)
-            after = self._whereabouts.situation(self._clock())
-            held = present()
-            self._allow(call, held, after, always=False)
-            moment = datetime.fromtimestamp(now.time_s, UTC).strftime("%Y%m%d%H%M%S%f")[:17]
-            name = f"{moment}-{next(self._numbers) % 10000:04d}.jpg"
-            shot = Shot(
-                name, float(now.time_s), args.width, args.height, len(data), now.lat, now.lon, now.altitude_m,
-                now.position_error_m,
-            )  # fmt: skip
-            await asyncio.to_thread(self._album.add, owner_of(held), shot, data)
-        return verdict, shot
+            width, height = source_size(args.width, args.height, self._body.resolution)
+            wanted = Wanted(width, height, self._body.resolution, self._body.sensor, now, held.spec.node)
+            three = any(one.action == "removeBackground" for one in verdict.filters)
+            pictures = await self._shutter.expose(wanted, 3 if three else 1, APART_S)
+            after, held = self._whereabouts.situation(self._clock()), present()
+            verdicts = [
+                verdict,
+                self._allow(call, held, after, always=False),
+                self._checked(call, held, judge_privacy(now, held.compiled, after), after),
+            ]
+            return _Exposed(held, _together(verdicts), now, after, pictures, width)
 
-    async def retrieve(self, held: Held, name: str) -> tuple[Verdict, Shot, bytes]:
-        """A picture; policies hold for where it was taken and for where the camera is now."""
-        now = self._whereabouts.situation(self._clock())
-        verdict = self._allow(Call("RetrieveImage"), held, now)
-        shot = await asyncio.to_thread(self._album.find, owner_of(held), name)
-        then = replace(
-            now, lat=shot.lat, lon=shot.lon, altitude_m=shot.altitude_m, position_error_m=shot.position_error_m
-        )
-        self._check(Call("RetrieveImage"), held, judge_privacy(then, held.compiled), then)
-        return verdict, shot, await asyncio.to_thread(self._album.read, owner_of(held), name)
+    async def _kept(self, call: Call, exposed: _Exposed) -> tuple[Verdict, Shot]:
+        args, held, verdict = call.args, exposed.held, exposed.verdict
+        if not isinstance(args, CaptureArgs):
+            raise TypeError("CaptureImage without its arguments")
+        face_px = self._face_px(exposed)
+        chosen = self._recipe(call, held, verdict, face_px, exposed.before)
+        before, after = Pose.of(exposed.before), Pose.of(exposed.after)
+        moment_s = float(exposed.after.time_s)
+        upright = is_upright(exposed.before.lens, exposed.before)
+
+        def work() -> bytes:
+            pictures = [fitted(one, args.width, args.height) for one in exposed.pictures]
+            exposed.pictures.clear()
+            picture = developed(pictures, chosen, self._detector, face_px, upright=upright, fixed=self._body.fixed)
+            data = encoded(picture)
+            if verdict.filters:
+                return data
+            return tagged(data, facts(after, moment_s, self._body.model, exposed.whole_width))
+
+        data = await asyncio.to_thread(work)
+        name = datetime.fromtimestamp(moment_s, UTC).strftime("%Y%m%d%H%M%S%f")[:17]
+        shot = Shot(
+            f"{name}-{next(self._numbers) % 10000:04d}.jpg", moment_s, args.width, args.height, len(data), before, after,
+            face_px, chosen.filters,
+        )  # fmt: skip
+        await asyncio.to_thread(self._album.add, owner_of(held), shot, data)
+        return _noted(verdict, chosen), shot
+
+    def _face_px(self, exposed: _Exposed) -> float:
+        """Width of the smallest face that the picture may show; 0 when nobody knows."""
+        views = [footprint(now, exposed.held.compiled.frame) for now in (exposed.before, exposed.after)]
+        farthest_m = max((view.farthest_m if view is not None else float("inf")) for view in views)
+        return smallest_face_px(exposed.before.lens, farthest_m, exposed.whole_width)
+
+    def _recipe(self, call: Call, held: Held, verdict: Verdict, face_px: float, now: Situation) -> Recipe:
+        try:
+            return recipe(verdict.filters, face_px, self._detector)
+        except NotHidden as error:
+            denied = Verdict("deny", None, "FacesNotFound", f"{verdict.reason}; {error}", verdict.policies)
+            self._checked(call, held, denied, now)
+            raise AssertionError("a denial always raises") from error
+
+    async def retrieve(self, held: Held, name: str) -> tuple[Verdict, Shot, bytes | Path]:
+        """A picture; policies hold for where it was taken and for where the camera is now, whichever asks for more."""
+        call, now = Call("RetrieveImage"), self._whereabouts.situation(self._clock())
+        verdict = self._allow(call, held, now)
+        owner = owner_of(held)
+        shot = await asyncio.to_thread(self._album.find, owner, name)
+        before, after = shot.before.at(now), shot.after.at(now)
+        then = self._checked(call, held, judge_privacy(before, held.compiled, after), after)
+        verdict = _together([verdict, then])
+        todo = remaining(verdict.filters, shot.filters)
+        path = self._album.path(owner, name)
+        if not todo:
+            return verdict, shot, path
+        chosen = self._recipe(call, held, replace(verdict, filters=todo), shot.face_px, after)
+        data = await self._finished(self._redeveloped(owner, path, chosen, shot, is_upright(after.lens, after)))
+        return _noted(verdict, chosen), replace(shot, size_bytes=len(data), filters=(*shot.filters, *todo)), data
+
+    async def _redeveloped(self, owner: str, path: Path, chosen: Recipe, shot: Shot, upright: bool) -> bytes:
+        def work() -> bytes:
+            picture = decoded(path.read_bytes())
+            return encoded(developed([picture], chosen, self._detector, shot.face_px, upright=upright))
+
+        async with self._developing.turn(owner):
+            return await asyncio.to_thread(work)
 
     async def list(self, held: Held) -> tuple[Verdict, tuple[Shot, ...]]:
         """The pictures of the caller."""
@@ -158,20 +277,18 @@ class CameraService:
         except Exception:
             log.exception("the policy engine failed on %s; refused", call.method)
             verdict = Verdict("deny", None, "InternalError", f"the policy engine failed on {call.method}")
-        return self._check(call, held, verdict, now, always)
+        return self._checked(call, held, verdict, now, always)
 
-    def _check(self, call: Call, held: Held, verdict: Verdict, now: Situation, always: bool = False) -> Verdict:
-        """Refuse what is denied, and what needs a filter that we do not have."""
-        if verdict.filters:
-            reason = f"{verdict.reason}, and this camera cannot do that; no picture is handed out"
-            verdict = Verdict("deny", None, "FilterUnavailable", reason, verdict.policies)
+    def _checked(self, call: Call, held: Held, verdict: Verdict, now: Situation, always: bool = False) -> Verdict:
+        """Refuse what is denied; write down what is decided."""
         if always or not verdict.permits:
             self._audit.append(
                 "call",
                 {
                     "caller": held.identity, "method": call.method, "args": asdict(call.args) if call.args else {},
                     "action": verdict.action, "code": verdict.code, "reason": verdict.reason,
-                    "policies": list(verdict.policies), "lat": now.lat, "lon": now.lon, "alt": now.altitude_m,
+                    "policies": list(verdict.policies), "filters": [one.action for one in verdict.filters],
+                    "lat": now.lat, "lon": now.lon, "alt": now.altitude_m,
                 },
             )  # fmt: skip
         if not verdict.permits:
@@ -179,13 +296,37 @@ class CameraService:
         return verdict
 
 
+def _together(verdicts: list[Verdict]) -> Verdict:
+    """What several verdicts that permit a picture ask for together."""
+    filters: tuple[Filter, ...] = compose(one for verdict in verdicts for one in verdict.filters)
+    if not filters:
+        return verdicts[0]
+    names = tuple(dict.fromkeys(name for verdict in verdicts for name in verdict.policies))
+    reason = f"policy {names[0]} asks for {', '.join(one.action for one in filters)}" if names else ""
+    return replace(verdicts[0], action="correct", code="PrivacyFilter", reason=reason, policies=names, filters=filters)
+
+
+def _noted(verdict: Verdict, chosen: Recipe) -> Verdict:
+    return replace(verdict, reason=f"{verdict.reason}; {chosen.note}") if chosen.note else verdict
+
+
+_EXHAUSTED = grpc.StatusCode.RESOURCE_EXHAUSTED
+_KNOWN: dict[type[Exception], tuple[grpc.StatusCode, str]] = {
+    AlbumFull: (_EXHAUSTED, "AlbumFull"),
+    QueueFull: (_EXHAUSTED, "ShutterBusy"),
+    NoSuchImage: (grpc.StatusCode.NOT_FOUND, "NoSuchImage"),
+    CameraFailed: (grpc.StatusCode.UNAVAILABLE, "CameraFailed"),
+    BadModel: (grpc.StatusCode.FAILED_PRECONDITION, "FilterUnavailable"),
+    NotAPicture: (grpc.StatusCode.FAILED_PRECONDITION, "FilterUnavailable"),
+}
+
+
 def known(error: Exception) -> Refused | None:
-    """Failures of the album as refusals."""
-    if isinstance(error, AlbumFull):
-        return Refused(grpc.StatusCode.RESOURCE_EXHAUSTED, Verdict("deny", None, "AlbumFull", str(error)))
-    if isinstance(error, NoSuchImage):
-        return Refused(grpc.StatusCode.NOT_FOUND, Verdict("deny", None, "NoSuchImage", str(error)))
+    """Failures of album and camera as refusals."""
+    for kind, (status, code) in _KNOWN.items():
+        if isinstance(error, kind):
+            return Refused(status, Verdict("deny", None, code, str(error)))
     if isinstance(error, OSError):
-        reason = f"the picture cannot be stored: {error.strerror or error}"
-        return Refused(grpc.StatusCode.RESOURCE_EXHAUSTED, Verdict("deny", None, "StorageFailed", reason))
+        reason = f"the picture cannot be stored: {error.strerror or error}; delete pictures, or make room on the node"
+        return Refused(_EXHAUSTED, Verdict("deny", None, "StorageFailed", reason))
     return None

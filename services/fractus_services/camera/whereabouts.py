@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import grpc
 from fractus_core.api.nodes import EdgeNodeSpec
 from fractus_core.api.plans import node_server_name
-from fractus_core.policy.values import Home, Situation
+from fractus_core.policy.footprint import lens_of
+from fractus_core.policy.values import Attitude, Home, Lens, Situation
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
 from fractus_services.auth import TlsFiles
@@ -23,6 +24,11 @@ STALE_S = 1.0
 RETRY_S = 1.0
 UNTOLD_ERROR_M = 10.0
 """Position error of a mobility service that tells none."""
+TILT_ERROR_DEG = 4.0
+YAW_ERROR_DEG = 15.0
+"""Bounds of an autopilot's attitude errors in calm flight: both tilts together, and the compass."""
+TURN_DEG_S = 60.0
+"""How fast an airframe turns at most while nobody looks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,17 +38,31 @@ class Fixed:
     lat: float
     lon: float
     amsl_m: float
+    height_m: float = 0.0
+    lens: Lens | None = None
+    relief_m: float = 0.0
 
     @classmethod
-    def of(cls, spec: EdgeNodeSpec) -> Fixed:
-        """The place that a description gives."""
-        return cls(spec.location.lat, spec.location.lon, spec.location.alt or 0.0)
+    def of(cls, spec: EdgeNodeSpec, relief_m: float = 0.0) -> Fixed:
+        """The place that a description gives; without the camera's height nobody knows what it sees."""
+        camera = spec.services.camera
+        height_m = camera.mount.height if camera is not None and camera.mount is not None else None
+        lens = lens_of(camera) if height_m is not None else None
+        return cls(spec.location.lat, spec.location.lon, spec.location.alt or 0.0, height_m or 0.0, lens, relief_m)
 
     def situation(self, time_s: float) -> Situation:
         """The state as the engine judges it: the node stands on its own home."""
-        home = Home(self.lat, self.lon, self.amsl_m)
         return Situation(
-            time_s=time_s, lat=self.lat, lon=self.lon, home=home, position_error_m=0.5, altitude_error_m=0.5
+            time_s=time_s,
+            lat=self.lat,
+            lon=self.lon,
+            altitude_m=self.height_m,
+            home=Home(self.lat, self.lon, self.amsl_m),
+            position_error_m=0.5,
+            altitude_error_m=0.5,
+            attitude=Attitude(0.0, 0.0, 0.0, 0.0, 0.0),
+            lens=self.lens,
+            relief_m=self.relief_m,
         )
 
     async def run(self) -> None:
@@ -57,13 +77,26 @@ class Airborne:
         node: name of the node.
         tls: the node's certificate.
         now: monotonic seconds.
+        lens: what the camera sees; None when nobody knows.
+        relief_m: how far the ground around may lie below home.
     """
 
-    def __init__(self, address: str, node: str, tls: TlsFiles, now: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        address: str,
+        node: str,
+        tls: TlsFiles,
+        now: Callable[[], float],
+        *,
+        lens: Lens | None = None,
+        relief_m: float = 0.0,
+    ) -> None:
         self._address = address
         self._server_name = node_server_name(node)
         self._tls = tls
         self._now = now
+        self._lens = lens
+        self._relief_m = relief_m
         self._latest: mobility_pb2.Telemetry | None = None
         self._heard_at = 0.0
 
@@ -71,7 +104,7 @@ class Airborne:
         """The state as the engine judges it; unknown when the mobility service is silent."""
         message, age_s = self._latest, self._now() - self._heard_at
         if message is None or age_s > STALE_S or not message.HasField("position"):
-            return Situation(time_s=time_s)
+            return Situation(time_s=time_s, lens=self._lens, relief_m=self._relief_m)
         speed_mps = math.hypot(message.velocity.north_mps, message.velocity.east_mps)
         home = None
         if message.HasField("home"):
@@ -88,6 +121,9 @@ class Airborne:
             armed=message.armed,
             in_air=message.in_air,
             position_error_m=(message.position_error_m or UNTOLD_ERROR_M) + speed_mps * max(age_s, 0.0),
+            attitude=_attitude(message, age_s),
+            lens=self._lens,
+            relief_m=self._relief_m,
         )
 
     async def run(self) -> None:
@@ -107,3 +143,16 @@ class Airborne:
             except OSError as error:
                 log.warning("no certificate for %s: %s", self._address, error)
             await asyncio.sleep(RETRY_S)
+
+
+def _attitude(message: mobility_pb2.Telemetry, age_s: float) -> Attitude | None:
+    if not message.HasField("attitude"):
+        return None
+    turned_deg = TURN_DEG_S * max(age_s, 0.0)
+    return Attitude(
+        message.attitude.roll_deg,
+        message.attitude.pitch_deg,
+        message.attitude.yaw_deg,
+        TILT_ERROR_DEG + turned_deg,
+        YAW_ERROR_DEG + turned_deg,
+    )

@@ -1,0 +1,90 @@
+"""Where pictures come from: one module for each kind of camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol
+
+from fractus_core.policy.values import Situation
+
+from fractus_services.camera.imaging import Pixels
+
+TIMEOUT_S = 5.0
+"""A camera that takes longer for a picture is broken."""
+
+
+class CameraFailed(Exception):
+    """The camera gives no picture; says why, and what to look at."""
+
+
+class BadConnection(Exception):
+    """A connection that names no camera."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What is asked of a camera.
+
+    Attributes:
+        width: pixels, in the camera's own proportions; it may give others.
+        height: as width.
+        native: the camera's own width and height.
+        sensor: what it sees.
+        now: where the camera is.
+        label: what a drawn picture says.
+    """
+
+    width: int
+    height: int
+    native: tuple[int, int]
+    sensor: Literal["RGB", "IR"]
+    now: Situation
+    label: str = ""
+
+
+class Driver(Protocol):
+    """A camera. Its methods block, and are called from one thread, never two at a time."""
+
+    def capture(self, wanted: Wanted) -> Pixels:
+        """A picture of the present moment.
+
+        Raises:
+            CameraFailed: the camera gives none.
+        """
+
+    def close(self) -> None:
+        """Let go of the camera."""
+
+
+def driver_for(connection: str) -> Driver:
+    """The driver of a connection as manifests spell it.
+
+    Raises:
+        BadConnection: it names no kind of camera.
+    """
+    kind, _, rest = connection.partition(":")
+    if kind in {"http", "https"}:
+        from fractus_services.camera.drivers.snapshot import Snapshot  # noqa: PLC0415 - only the one that is used
+
+        return Snapshot(connection)
+    if kind == "v4l2" and rest:
+        from fractus_services.camera.drivers.v4l2 import VideoDevice  # noqa: PLC0415
+
+        return VideoDevice(rest)
+    if kind == "picamera2" and rest.isdigit():
+        from fractus_services.camera.drivers.raspberry import RaspberryCamera  # noqa: PLC0415
+
+        return RaspberryCamera(int(rest))
+    if kind == "directory" and rest:
+        from fractus_services.camera.drivers.directory import GeotaggedDirectory  # noqa: PLC0415
+
+        return GeotaggedDirectory(Path(rest))
+    if connection == "test:":
+        from fractus_services.camera.drivers.rendered import Rendered  # noqa: PLC0415
+
+        return Rendered()
+    raise BadConnection(
+        f"{connection!r} names no camera; give http://HOST/snapshot.jpg, v4l2:/dev/video0, picamera2:0,"
+        " directory:/PATH or test:"
+    )

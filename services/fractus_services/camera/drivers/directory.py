@@ -1,0 +1,93 @@
+"""Geotagged pictures of a directory instead of a camera: the one that was taken nearest to where the camera is."""
+
+from __future__ import annotations
+
+import logging
+import math
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from fractus_core.geo import LocalFrame
+
+from fractus_services.camera.drivers import CameraFailed, Wanted
+from fractus_services.camera.imaging import NotAPicture, Pixels, decoded
+
+log = logging.getLogger(__name__)
+
+_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"})
+_GPS = 0x8825
+_MOST_FILES = 100_000
+
+
+class GeotaggedDirectory:
+    """Pictures with a position in their EXIF data, found by it; altitudes count where they are known.
+
+    Args:
+        path: the directory; it is looked through again when it changes.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._stamp: int | None = None
+        self._files: list[Path] = []
+        self._places: npt.NDArray[np.float64] = np.empty((0, 3))
+
+    def capture(self, wanted: Wanted) -> Pixels:
+        """See `Driver`."""
+        now = wanted.now
+        if now.lat is None or now.lon is None:
+            raise CameraFailed("the camera's position is unknown, so no picture of the directory is nearest")
+        self._look()
+        frame = LocalFrame(now.lat, now.lon)
+        flat = frame.xy_array(self._places[:, 0], self._places[:, 1])
+        amsl_m = now.home.amsl_m + now.altitude_m if now.home is not None else math.nan
+        up = np.nan_to_num(self._places[:, 2] - amsl_m, nan=0.0)
+        nearest = int(np.argmin(np.square(flat).sum(axis=1) + np.square(up)))
+        try:
+            return decoded(self._files[nearest].read_bytes())
+        except (OSError, NotAPicture) as error:
+            self._stamp = None
+            raise CameraFailed(f"{self._files[nearest]} cannot be read: {error}") from None
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def _look(self) -> None:
+        try:
+            stamp = self._path.stat().st_mtime_ns
+            if stamp == self._stamp:
+                return
+            files = sorted(p for p in self._path.iterdir() if p.suffix.lower() in _SUFFIXES)[:_MOST_FILES]
+        except OSError as error:
+            raise CameraFailed(f"{self._path} cannot be read: {error.strerror or error}") from None
+        found = [(file, place) for file in files if (place := position_of(file)) is not None]
+        if not found:
+            raise CameraFailed(f"none of the {len(files)} pictures in {self._path} has a GPS position in its EXIF data")
+        self._files = [file for file, _ in found]
+        self._places = np.array([place for _, place in found])
+        self._stamp = stamp
+
+
+def position_of(file: Path) -> tuple[float, float, float] | None:
+    """Latitude, longitude, and metres above mean sea level (NaN where unknown) from a picture's EXIF data."""
+    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415 - only this camera needs it
+
+    try:
+        with Image.open(file) as picture:
+            tags = picture.getexif().get_ifd(_GPS)
+        lat, lon = _degrees(tags[2]), _degrees(tags[4])
+        lat, lon = (-lat if tags.get(1) == "S" else lat), (-lon if tags.get(3) == "W" else lon)
+        alt = float(tags[6]) if 6 in tags else math.nan
+        below = tags.get(5) in {1, b"\x01"}
+    except (OSError, UnidentifiedImageError, KeyError, TypeError, ValueError, ZeroDivisionError, SyntaxError) as error:
+        log.debug("%s has no position: %s", file, error)
+        return None
+    if not (-90 <= lat <= 90 and -180 <= lon <= 180):
+        return None
+    return lat, lon, -alt if below else alt
+
+
+def _degrees(parts: tuple[float, float, float]) -> float:
+    degrees, minutes, seconds = (float(part) for part in parts)
+    return degrees + minutes / 60 + seconds / 3600

@@ -1,0 +1,160 @@
+"""Filters that take people and places out of pictures for good: nothing brings back what they remove."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from fractus_core.policy.values import FaceMethod
+
+from fractus_services.camera.faces import Box
+from fractus_services.camera.imaging import Pixels, opencv
+
+Mask = npt.NDArray[np.bool_]
+
+CELLS = 16
+"""So many averages are left of the longer side of a blurred picture: a face that fills its height keeps nine across,
+below what people and programs recognise anybody by."""
+FACE_CELLS = 4
+"""So many colours are left across a hidden face."""
+MARGIN = 0.35
+"""Share of a face's width that is hidden around it."""
+_SAMPLES = 33
+"""Pixels across which a median is taken, of a picture reduced to so many for each cell."""
+
+MOTION_PX = 1280
+"""Motion is looked for in pictures of this width at most."""
+MOTION_LEVELS = 25
+MOST_MOTION = 0.5
+"""If more of a picture moves, the camera's own motion was not made out."""
+_FEATURES = 1500
+_LEAST_MATCHES = 25
+
+
+def black(picture: Pixels) -> Pixels:
+    """Nothing."""
+    return np.zeros_like(picture)
+
+
+def blur_average(picture: Pixels) -> Pixels:
+    """Averages over squares, 16 along the longer side, with soft transitions."""
+    cv2 = opencv()
+    return _grown(cv2.resize(picture, _cells(picture), interpolation=cv2.INTER_AREA), picture)
+
+
+def blur_median(picture: Pixels) -> Pixels:
+    """Medians over squares, 16 along the longer side, with soft transitions."""
+    cv2 = opencv()
+    columns, rows = _cells(picture)
+    samples = (columns * _SAMPLES, rows * _SAMPLES)
+    smooth = cv2.medianBlur(cv2.resize(picture, samples, interpolation=cv2.INTER_NEAREST), _SAMPLES)
+    middle = _SAMPLES // 2
+    return _grown(np.ascontiguousarray(smooth[middle::_SAMPLES, middle::_SAMPLES]), picture)
+
+
+def _cells(picture: Pixels) -> tuple[int, int]:
+    rows, columns = picture.shape[:2]
+    cell = max(rows, columns) / CELLS
+    return max(round(columns / cell), 1), max(round(rows / cell), 1)
+
+
+def _grown(cells: Pixels, picture: Pixels) -> Pixels:
+    cv2 = opencv()
+    rows, columns = picture.shape[:2]
+    return np.asarray(cv2.resize(cells, (columns, rows), interpolation=cv2.INTER_LINEAR), np.uint8)
+
+
+def hide_faces(picture: Pixels, boxes: Sequence[Box], method: FaceMethod) -> Pixels:
+    """Each face and a margin around it, reduced to four colours across: as pixels, or as a soft blur."""
+    cv2 = opencv()
+    hidden = picture.copy()
+    rows, columns = picture.shape[:2]
+    for left, top, width, height in boxes:
+        x0, y0 = max(int(left - MARGIN * width), 0), max(int(top - MARGIN * height), 0)
+        x1, y1 = min(int(left + (1 + MARGIN) * width) + 1, columns), min(int(top + (1 + MARGIN) * height) + 1, rows)
+        if x1 <= x0 or y1 <= y0:
+            continue
+        region = picture[y0:y1, x0:x1]
+        # The region is wider than the face by both margins, and so many cells wider.
+        cells = max(round(FACE_CELLS * (1 + 2 * MARGIN)), 1)
+        few = cv2.resize(region, (min(cells, x1 - x0), min(cells, y1 - y0)), interpolation=cv2.INTER_AREA)
+        if method == "gaussian":
+            soft = cv2.resize(few, (x1 - x0, y1 - y0), interpolation=cv2.INTER_CUBIC)
+            hidden[y0:y1, x0:x1] = cv2.GaussianBlur(soft, (0, 0), max((x1 - x0) / cells, 0.8))
+        else:
+            hidden[y0:y1, x0:x1] = cv2.resize(few, (x1 - x0, y1 - y0), interpolation=cv2.INTER_NEAREST)
+    return hidden
+
+
+def remove_background(picture: Pixels, mask: Mask | None) -> Pixels:
+    """What moves, on black; all black where nobody knows what moves."""
+    if mask is None:
+        return black(picture)
+    kept = picture.copy()
+    kept[~mask] = 0
+    return kept
+
+
+def moving(before: Pixels, picture: Pixels, after: Pixels, *, fixed: bool) -> Mask | None:
+    """What moves over the ground in a picture, with a margin; the camera's own motion does not count.
+
+    Pictures from before and after are laid over the one between by the features that most of them share (ORB, RANSAC
+    over a homography). What differs from both of them moves.
+
+    Args:
+        before: taken a moment before, same size.
+        picture: the one that is asked about.
+        after: taken a moment after, same size.
+        fixed: the camera does not move.
+
+    Returns:
+        True where something moves; None when the pictures could not be laid over each other.
+    """
+    cv2 = opencv()
+    scale = min(MOTION_PX / picture.shape[1], 1.0)
+    small = [
+        cv2.cvtColor(cv2.resize(one, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2GRAY)
+        for one in (before, picture, after)
+    ]
+    differs = [_difference(other, small[1], fixed) for other in (small[0], small[2])]
+    if differs[0] is None or differs[1] is None:
+        return None
+    mask = (differs[0] & differs[1]).astype(np.uint8)
+    mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    if mask.mean() > MOST_MOTION:
+        return None
+    mask = cv2.dilate(mask, np.ones((max(mask.shape[1] // 50, 3),) * 2, np.uint8))
+    size = (picture.shape[1], picture.shape[0])
+    return np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0)
+
+
+def _difference(other: npt.NDArray[np.uint8], gray: npt.NDArray[np.uint8], fixed: bool) -> Mask | None:
+    """Where a picture differs from another that is laid over it; what only one of them shows does not."""
+    cv2 = opencv()
+    shown = np.full(gray.shape, 255, np.uint8)
+    if not fixed:
+        matrix = _overlay(other, gray)
+        if matrix is None:
+            return None
+        size = (gray.shape[1], gray.shape[0])
+        other, shown = cv2.warpPerspective(other, matrix, size), cv2.warpPerspective(shown, matrix, size)
+    difference = cv2.absdiff(cv2.GaussianBlur(other, (5, 5), 0), cv2.GaussianBlur(gray, (5, 5), 0))
+    return np.asarray((difference > MOTION_LEVELS) & (cv2.erode(shown, np.ones((7, 7), np.uint8)) == 255))
+
+
+def _overlay(other: npt.NDArray[np.uint8], gray: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64] | None:
+    cv2 = opencv()
+    detector = cv2.ORB_create(nfeatures=_FEATURES)
+    (points, features), (there, wanted) = (detector.detectAndCompute(one, None) for one in (other, gray))
+    if features is None or wanted is None:
+        return None
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(features, wanted)
+    if len(pairs) < _LEAST_MATCHES:
+        return None
+    source = np.array([points[p.queryIdx].pt for p in pairs], np.float32)
+    target = np.array([there[p.trainIdx].pt for p in pairs], np.float32)
+    matrix, inliers = cv2.findHomography(source, target, cv2.RANSAC, 2.0)
+    if matrix is None or inliers is None or int(inliers.sum()) < max(_LEAST_MATCHES, len(pairs) // 3):
+        return None
+    return np.asarray(matrix, np.float64)

@@ -1,0 +1,82 @@
+"""Pictures as arrays: OpenCV on demand, decoding with bounds, cropping, JPEG."""
+
+from __future__ import annotations
+
+import functools
+import os
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Pixels = npt.NDArray[np.uint8]
+"""Height, width, and blue, green, red: 8 bits each."""
+
+QUALITY = 90
+MOST_PIXELS = 100_000_000
+MOST_BYTES = 64_000_000
+
+
+class NotAPicture(Exception):
+    """Bytes that hold no picture, or one that is too large."""
+
+
+@functools.cache
+def opencv() -> Any:
+    """OpenCV, on one thread: 30 MB that a service which takes no picture does without."""
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MOST_PIXELS))
+    import cv2  # noqa: PLC0415 - see above
+
+    cv2.setNumThreads(1)
+    return cv2
+
+
+def decoded(data: bytes) -> Pixels:
+    """The pixels of a JPEG, PNG or the like, turned upright; whatever else the file tells is dropped.
+
+    Raises:
+        NotAPicture: it cannot be decoded.
+    """
+    cv2 = opencv()
+    if not data or len(data) > MOST_BYTES:
+        raise NotAPicture(f"{len(data)} bytes are no picture; at most {MOST_BYTES // 1_000_000} MB are read")
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error as error:
+        raise NotAPicture(f"the picture cannot be decoded: {error.err}") from None
+    if picture is None:
+        raise NotAPicture(f"the {len(data)} bytes are not a picture in a format that OpenCV reads")
+    return np.asarray(picture, np.uint8)
+
+
+def encoded(picture: Pixels) -> bytes:
+    """A JPEG of the pixels and of nothing else.
+
+    Raises:
+        NotAPicture: it cannot be encoded.
+    """
+    cv2 = opencv()
+    done, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    if not done:
+        raise NotAPicture(f"a picture of {picture.shape[1]}x{picture.shape[0]} pixels cannot be encoded")
+    return bytes(data)
+
+
+def source_size(width: int, height: int, native: tuple[int, int]) -> tuple[int, int]:
+    """Pixels to ask a camera for, in its own proportions, so that they can be cropped to a width and height."""
+    scale = max(width / native[0], height / native[1])
+    return max(round(native[0] * scale), width), max(round(native[1] * scale), height)
+
+
+def fitted(picture: Pixels, width: int, height: int) -> Pixels:
+    """The middle of a picture in other proportions and of another size; never more than it shows."""
+    cv2 = opencv()
+    rows, columns = picture.shape[:2]
+    scale = max(width / columns, height / rows)
+    kept_columns, kept_rows = min(round(width / scale), columns), min(round(height / scale), rows)
+    left, top = (columns - kept_columns) // 2, (rows - kept_rows) // 2
+    middle = picture[top : top + kept_rows, left : left + kept_columns]
+    if middle.shape[:2] == (height, width):
+        return np.ascontiguousarray(middle)
+    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(middle, (width, height), interpolation=how), np.uint8)

@@ -86,7 +86,8 @@ def status(name: str | None) -> None:
 
 
 def _well(node: NodeStatus) -> bool:
-    return node.powered and node.linked and node.ready is True and node.vehicle_running is not False
+    hardware = node.vehicle_running is not False and node.camera_running is not False
+    return node.powered and node.linked and node.ready is True and hardware
 
 
 def _words(node: NodeStatus) -> str:
@@ -96,6 +97,8 @@ def _words(node: NodeStatus) -> str:
         words.append("link cut")
     if node.vehicle_running is not None:
         words.append("vehicle runs" if node.vehicle_running else "vehicle dead")
+    if node.camera_running is not None:
+        words.append("camera runs" if node.camera_running else "camera dead")
     return ", ".join(words)
 
 

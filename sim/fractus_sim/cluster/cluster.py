@@ -78,6 +78,7 @@ class NodeStatus:
         linked: Whether its uplink is up.
         ready: What the API server says of it; None when that cannot be asked.
         vehicle_running: Whether its vehicle runs; None when it has none.
+        camera_running: Whether its simulated camera runs; None when it has none.
     """
 
     name: str
@@ -87,6 +88,7 @@ class NodeStatus:
     linked: bool
     ready: bool | None
     vehicle_running: bool | None
+    camera_running: bool | None
 
 
 class Cluster:
@@ -169,7 +171,7 @@ class Cluster:
         branch = cluster_branch(self.name)
         wiring = self._wiring(memory)
         return [
-            Node(spec, memory.indexes[spec.name], wiring, self._state, branch)
+            Node(spec, memory.indexes[spec.name], wiring, self._state, branch, self.spec.world_origin)
             for spec in self.spec.nodes
             if spec.name in memory.indexes
         ]
@@ -190,7 +192,7 @@ class Cluster:
     def up(self, *, images: Sequence[str] = ()) -> None:
         """Make the cluster be as described, whatever state it is in; a no-op when it is.
 
-        Dead processes are started again, nodes switched on, links healed, dead vehicles replaced.
+        Dead processes are started again, nodes switched on, links healed, dead vehicles and cameras replaced.
 
         Args:
             images: Images in the machine's store that every node gets before it starts pods.
@@ -221,11 +223,11 @@ class Cluster:
                 since = datetime.now(UTC).replace(microsecond=0)
                 started_nodes = {node.name for node in nodes if node.power_on()}
                 for node in nodes:
-                    node.start_vehicle()
+                    node.start_hardware()
                 self._write_kubeconfig(authority, memory)
                 self._wait_nodes(api, [(node, since if node.name in started_nodes else None) for node in nodes])
             self._wait_dns(memory)
-            self._check_vehicles(nodes)
+            self._check_hardware(nodes)
             store.deliver(wanted, nodes)
         self._report(f"cluster {self.name} is up: {len(nodes)} nodes, {time.monotonic() - started:.1f} s")
 
@@ -264,6 +266,7 @@ class Cluster:
                 node.index not in cut,
                 None if ready is None else ready.get(node.name, False),
                 node.vehicle_running,
+                node.camera_running,
             )
             for node in self.nodes
         ]
@@ -445,12 +448,13 @@ class Cluster:
                 raise ClusterError(f"not Ready within {_READY_TIMEOUT_S:.0f} s: {names}; see the logs in {self.logs}")
             time.sleep(_POLL_S)
 
-    def _check_vehicles(self, nodes: Sequence[Node]) -> None:
+    def _check_hardware(self, nodes: Sequence[Node]) -> None:
         for node in nodes:
-            if node.vehicle_running is False:
-                log = self.logs / node.name / "vehicle.log"
-                last = log.read_text(errors="replace").splitlines()[-1:] if log.exists() else []
-                raise ClusterError(f"the vehicle of node {node.name} ended at once: {' '.join(last)} (see {log})")
+            for name, runs in (("vehicle", node.vehicle_running), ("camera", node.camera_running)):
+                if runs is False:
+                    log = self.logs / node.name / f"{name}.log"
+                    last = log.read_text(errors="replace").splitlines()[-1:] if log.exists() else []
+                    raise ClusterError(f"the {name} of node {node.name} ended at once: {' '.join(last)} (see {log})")
 
     def _wait_dns(self, memory: Memory) -> None:
         address = str(Addressing(memory.block).control_plane)

@@ -20,11 +20,11 @@ from fractus_sim.cluster.cgroups import Branch
 from fractus_sim.cluster.commands import run
 from fractus_sim.cluster.controlplane import server_url
 from fractus_sim.cluster.errors import ClusterError
-from fractus_sim.cluster.hardware import vehicle_command, vehicle_environment
+from fractus_sim.cluster.hardware import hardware_commands, hardware_environment
 from fractus_sim.cluster.pki import Authority, write_private
 from fractus_sim.cluster.prerequisites import machine, plugin_directory
 from fractus_sim.cluster.processes import kill, read_record, spawn, write_record
-from fractus_sim.cluster.spec import NodeSpec
+from fractus_sim.cluster.spec import NodeSpec, Place
 from fractus_sim.cluster.state import StateDirectory
 
 _PROGRAMS = ("kubelet", "kube-proxy")
@@ -60,6 +60,7 @@ class Node:
         wiring: The cluster's network.
         state: The cluster's state directory.
         branch: The cluster's control groups.
+        world_origin: The middle of the landscape that the cluster's cameras see.
     """
 
     spec: NodeSpec
@@ -67,6 +68,7 @@ class Node:
     wiring: network.Wiring
     state: StateDirectory
     branch: Branch
+    world_origin: Place | None = None
 
     @property
     def name(self) -> str:
@@ -92,9 +94,15 @@ class Node:
     @property
     def vehicle_running(self) -> bool | None:
         """Whether the node's vehicle runs; None when it has none."""
-        if self.spec.vehicle() is None:
-            return None
-        record = read_record(self.state.process(f"vehicle.{self.name}"))
+        return None if self.spec.vehicle() is None else self._runs("vehicle")
+
+    @property
+    def camera_running(self) -> bool | None:
+        """Whether the node's simulated camera runs; None when it has none."""
+        return None if self.spec.hardware.camera is None else self._runs("camera")
+
+    def _runs(self, hardware: str) -> bool:
+        record = read_record(self.state.process(f"{hardware}.{self.name}"))
         return record is not None and record.alive
 
     @property
@@ -175,37 +183,38 @@ class Node:
         write_record(self.state.process(f"node.{self.name}"), record)
         return True
 
-    def start_vehicle(self) -> None:
-        """Put the node's vehicle in place; a no-op when it runs or the node has none.
+    def start_hardware(self) -> None:
+        """Put the node's vehicle and camera in place; a no-op for what runs or the node has not.
 
         Raises:
             ClusterError: The simulator is not installed, or nothing says where the vehicle stands.
         """
-        command = vehicle_command(self.spec)
-        if command is None or self.vehicle_running:
-            return
-        record = spawn(
-            ["nsenter", f"--net={self.wiring.namespace_path(self.name)}", *command],
-            log=self.state.logs / self.name / "vehicle.log",
-            cgroup_files=self._hardware_cgroup.create(),
-            env=vehicle_environment(),
-        )
-        write_record(self.state.process(f"vehicle.{self.name}"), record)
+        for name, command in hardware_commands(self.spec, self.world_origin).items():
+            if self._runs(name):
+                continue
+            record = spawn(
+                ["nsenter", f"--net={self.wiring.namespace_path(self.name)}", *command],
+                log=self.state.logs / self.name / f"{name}.log",
+                cgroup_files=self._hardware_cgroup.create(),
+                env=hardware_environment(),
+            )
+            write_record(self.state.process(f"{name}.{self.name}"), record)
 
-    def stop_vehicle(self) -> None:
-        """Take the node's vehicle away."""
-        path = self.state.process(f"vehicle.{self.name}")
-        record = read_record(path)
-        if record is not None:
-            kill(record)
-        path.unlink(missing_ok=True)
+    def stop_hardware(self) -> None:
+        """Take the node's vehicle and camera away."""
+        for name in ("vehicle", "camera"):
+            path = self.state.process(f"{name}.{self.name}")
+            record = read_record(path)
+            if record is not None:
+                kill(record)
+            path.unlink(missing_ok=True)
         self._hardware_cgroup.kill_all()
         self._hardware_cgroup.remove()
 
     def remove(self) -> None:
         """Remove the node from the machine: processes, network namespace and files."""
         self.power_off()
-        self.stop_vehicle()
+        self.stop_hardware()
         network.unwire_node(self.wiring, self.name, self.index)
         shutil.rmtree(self.directory, ignore_errors=True)
         shutil.rmtree(self.state.logs / self.name, ignore_errors=True)

@@ -6,6 +6,7 @@ import re
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
 
 import yaml
 from fractus_core.api import API_VERSION, Drone, EdgeNode, InvalidObject, Resource
@@ -79,10 +80,32 @@ class VehicleHardware(_Value):
     arguments: tuple[str, ...] = ()
 
 
+class Place(_Value):
+    """A point on the ground, degrees (WGS 84)."""
+
+    lat: Annotated[float, Field(ge=-85, le=85)]
+    lon: Annotated[float, Field(ge=-180, le=180)]
+
+
+class CameraHardware(_Value):
+    """The simulated camera of a drone or edge node; it sees what `description.services.camera` says.
+
+    Attributes:
+        origin: Middle of the landscape; by default all cameras of a cluster share the place of the first.
+        seed: Of the landscape and of all that moves; cameras that share a world have the same.
+        arguments: Further arguments of `fractus-camera-world`.
+    """
+
+    origin: Place | None = None
+    seed: int = 7
+    arguments: tuple[str, ...] = ()
+
+
 class Hardware(_Value):
     """What stands beside a node and does not lose power with it."""
 
     vehicle: VehicleHardware | None = None
+    camera: CameraHardware | None = None
 
 
 class NodeSpec(_Value):
@@ -123,7 +146,26 @@ class NodeSpec(_Value):
     def _hardware_fits(self) -> NodeSpec:
         if self.hardware.vehicle is not None and self.node_class != "drone":
             raise ValueError(f"node {self.name}: hardware.vehicle is for nodes of class drone")
+        if self.hardware.camera is not None:
+            self._camera_fits()
         return self
+
+    def _camera_fits(self) -> None:
+        if self.node_class == "cloud":
+            raise ValueError(f"node {self.name}: hardware.camera is for drones and edge nodes")
+        if self.vehicle() is None and self.place() is None:
+            raise ValueError(f"node {self.name}: hardware.camera needs a vehicle or description.location")
+        height = _dig(self.description, "services", "camera", "mount", "height")
+        if self.node_class == "edge" and height is None:
+            raise ValueError(
+                f"node {self.name}: hardware.camera hangs nowhere; "
+                "give description.services.camera.mount.height, metres above the ground"
+            )
+        if camera_address(self.camera_url) is None:
+            raise ValueError(
+                f"node {self.name}: hardware.camera serves http://127.0.0.1:8090/snapshot.jpg; "
+                f"write that as description.services.camera.connection, which is {self.camera_url!r}"
+            )
 
     @model_validator(mode="after")
     def _description_fits(self) -> NodeSpec:
@@ -172,6 +214,17 @@ class NodeSpec(_Value):
             )
         return home, listen, given.arguments
 
+    @property
+    def camera_url(self) -> str:
+        """Where the node's camera service gets its pictures from."""
+        url = _dig(self.description, "services", "camera", "connection")
+        return url if isinstance(url, str) else "test:"
+
+    def place(self) -> Home | None:
+        """Where the node is at the start; None when nothing says so."""
+        given = self.hardware.vehicle
+        return (given.home if given is not None else None) or self._location()
+
     def _location(self) -> Home | None:
         location = _dig(self.description, "location")
         if not isinstance(location, dict) or "lat" not in location or "lon" not in location:
@@ -192,6 +245,14 @@ class ClusterSpec(_Value):
         if twice:
             raise ValueError(f"nodes: the name {', '.join(twice)} is given twice")
         return self
+
+    @property
+    def world_origin(self) -> Place | None:
+        """The middle of the landscape that the cameras see; None when no node has one."""
+        seeing = [node for node in self.nodes if node.hardware.camera is not None]
+        given = [node.hardware.camera.origin for node in seeing if node.hardware.camera is not None]
+        places = [Place(lat=home.lat, lon=home.lon) for home in (node.place() for node in seeing) if home is not None]
+        return next((origin for origin in given if origin is not None), places[0] if places else None)
 
     @classmethod
     def placeholder(cls, name: str) -> ClusterSpec:
@@ -236,6 +297,17 @@ def load_spec(path: Path) -> ClusterSpec:
     except yaml.YAMLError as error:
         raise ClusterError(f"{path} is not YAML: {error}") from error
     return parse_spec(content, source=str(path))
+
+
+def camera_address(url: str) -> tuple[str, int] | None:
+    """Host and port of a snapshot URL that a program on the same node can serve; None for any other."""
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname, parts.port or 80
+    except ValueError:
+        return None
+    local = parts.scheme == "http" and host in ("127.0.0.1", "localhost", "::1") and parts.path == "/snapshot.jpg"
+    return ("127.0.0.1" if host == "localhost" else str(host), port) if local else None
 
 
 def _dig(tree: object, *keys: str) -> object:

@@ -79,7 +79,7 @@ class StateDirectory:
         return self.path / "nodes" / name
 
     def process(self, name: str) -> Path:
-        """Return the record of a process: `control-plane`, `node.NAME` or `vehicle.NAME`."""
+        """Return the record of a process: `control-plane`, `node.NAME`, `vehicle.NAME` or `camera.NAME`."""
         return self.path / "processes" / f"{name}.json"
 
     def read_memory(self) -> Memory | None:

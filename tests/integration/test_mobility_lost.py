@@ -90,14 +90,14 @@ async def test_a_service_that_stays_dead_leaves_it_to_the_autopilot(rig: Rig) ->
     await flying(rig, speedup=2.0)
     rig.kill("service")
     # The autopilot's failsafe acts after five of its seconds; then the service must not hand the drone back.
-    await until_mode(rig.link, 6)
+    await until_mode(rig.link, 21)
     rig.start_service()
     late = Driver(rig)
     code, why = await denied(first(late))
     assert code == grpc.StatusCode.FAILED_PRECONDITION
     assert why.code == "ControlLost"
     state = await rig.telemetry()
-    assert state.mode == "RTL" or not state.armed
+    assert state.mode == "SMART_RTL" or not state.armed
     assert outcome(state).startswith("failed:")
     await rig.until(lambda t: not t.armed, 60, "landing")
 
@@ -150,7 +150,7 @@ async def test_a_zone_around_the_drone_with_a_takeover(rig: Rig) -> None:
     event = await driver.next(LOST, 2)
     assert time.monotonic() - written < 1.0
     assert "new" in event.reason
-    state = await rig.until(lambda t: t.mode == "RTL", 5)
+    state = await rig.until(lambda t: t.mode == "SMART_RTL", 5, "return on its own path: home is in the zone, too")
     assert outcome(state).startswith("revoked:")
     _, why = await denied(driver.stub.Hover(pb.HoverRequest(), timeout=5))
     assert why.code == "NotInControl"
@@ -308,7 +308,7 @@ async def test_landing_on_the_way_does_not_move_home(rig: Rig) -> None:
 
 
 async def test_a_service_that_lost_its_journal_brings_the_drone_home(rig: Rig) -> None:
-    await flying(rig)
+    await flying(rig, speedup=1.0)
     rig.kill("service")
     for path in (rig.directory / "state").glob("journal*"):
         path.unlink()

@@ -42,7 +42,7 @@ async def test_a_mission_through_the_sdk(rig: Rig) -> None:
     )
     patient = ("--driver-grace", "15")  # a restart takes seconds on a busy machine
     rig.start_service(*patient)
-    rig.start_vehicle()
+    rig.start_vehicle(1.0)  # five of its seconds after the service went it flies home
     async with Mobility(endpoint(rig)) as drone:
         with pytest.raises(ControlLost):
             async with drone.control() as control:

@@ -26,6 +26,7 @@ class Options:
     autopilot: str | None
     listen: str
     driver_grace: float
+    boarding: float
     flat_terrain: bool
 
 
@@ -82,6 +83,13 @@ def mobility() -> None:
     default=15.0,
     show_default=True,
     help="Seconds a lost driver may take to come back.",
+)
+@click.option(
+    "--boarding",
+    type=click.FloatRange(min=0),
+    default=60.0,
+    show_default=True,
+    help="Seconds a drone without a driver waits for the first call of its passengers.",
 )
 @click.option(
     "--flat-terrain",

@@ -9,6 +9,7 @@ from fractus_core.geo import LocalFrame
 from fractus_services.grants import Held
 from fractus_services.mobility.autopilot import AutopilotError, Permit
 from fractus_services.mobility.control import Control
+from fractus_services.mobility.failsafes import choose_return
 from fractus_services.mobility.journal import Mission
 from fractus_services.mobility.motions import distance_m
 from fractus_services.mobility.vehicle import GUIDED
@@ -16,6 +17,8 @@ from fractus_services.replies import precondition
 
 ARMED_S = 3.0
 WAIT_S = 0.5
+FENCE_S = 15.0
+HOME_M = 5.0
 STRAY_M = 50.0
 """A drone that stands further than this from the home of its grant would be brought to the wrong place."""
 
@@ -32,7 +35,7 @@ async def arm(control: Control, held: Held, permit: Permit) -> None:
         Refused: a failsafe is not verified, audit log or journal cannot be written, or the caller may no more.
         AutopilotError: the autopilot refuses.
     """
-    await asyncio.shield(control.keep(_arm(control, held, permit)))
+    await asyncio.shield(control.tasks.keep(_arm(control, held, permit)))
 
 
 async def _arm(control: Control, held: Held, permit: Permit) -> None:
@@ -45,6 +48,8 @@ async def _arm(control: Control, held: Held, permit: Permit) -> None:
     if control.journal.failure:
         raise precondition("JournalUnavailable", control.journal.failure)
     permit()
+    await _prepare_ways_home(control, held, home)
+    permit()
     helm.arming = True
     try:
         await helm.change_mode(GUIDED, permit)
@@ -56,14 +61,33 @@ async def _arm(control: Control, held: Held, permit: Permit) -> None:
                     raise AutopilotError("the autopilot accepted to arm and did not")
                 await autopilot.update(WAIT_S)
             await autopilot.set_home(*home)
-            await control.attempt(autopilot.ask_home())
+            await control.tasks.attempt(autopilot.ask_home())
             permit()
         except Exception:
             if not autopilot.vehicle.in_air:
-                await control.attempt(autopilot.disarm())
+                await control.tasks.attempt(autopilot.disarm())
             raise
     finally:
         helm.arming = False
+
+
+async def _prepare_ways_home(control: Control, held: Held, home: tuple[float, float, float]) -> None:
+    """Choose how the autopilot comes home by itself, and raise its own fence around the mission.
+
+    A vehicle remembers its path from where it was armed last: armed elsewhere than at home, it must not go back on it.
+    """
+    autopilot, vehicle = control.autopilot, control.autopilot.vehicle
+    at_home = distance_m(LocalFrame(home[0], home[1]), vehicle.lat, vehicle.lon) <= HOME_M
+    if control.checked is not None:
+        control.checked = await choose_return(autopilot, control.checked, retrace=at_home)
+        _check(control)
+    try:
+        async with asyncio.timeout(FENCE_S):
+            await control.backstop.raise_around(held.spec, retraces=control.retraces)
+    except (AutopilotError, OSError) as error:
+        said = str(error) or f"it takes longer than {FENCE_S:.0f} s"
+        why = f"the vehicle's own fence cannot be raised around the operation area: {said}"
+        raise precondition("FenceNotRaised", why) from error
 
 
 def _check(control: Control) -> None:

@@ -6,7 +6,8 @@ import asyncio
 import logging
 import math
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from fractus_services.mobility.dialect import Codec, message
@@ -32,11 +33,11 @@ _SET_HOME = 179
 _SET_MODE, _ARM, _TAKEOFF, _SPEED, _REPOSITION, _YAW, _INTERVAL, _REQUEST = 176, 400, 22, 178, 192, 115, 511, 512
 _ACCEPTED, _TEMPORARILY_REJECTED, _IN_PROGRESS = 0, 1, 5
 _RESULTS = {1: "temporarily rejected", 2: "denied", 3: "unsupported", 4: "failed", 6: "cancelled"}
-_VELOCITY_ONLY = 0x0DC7
+_VELOCITY_ONLY, _VELOCITY_AND_YAW = 0x0DC7, 0x09C7
 _LOCAL_NED = 1
 
 # Message ids and their rates in Hz on the ground and in the air.
-STREAMS = {33: (4.0, 20.0), 245: (2.0, 5.0), 1: (1.0, 1.0), 24: (1.0, 2.0), 242: (0.2, 0.2)}
+STREAMS = {33: (4.0, 20.0), 30: (2.0, 10.0), 245: (2.0, 5.0), 1: (1.0, 1.0), 24: (1.0, 2.0), 242: (0.2, 0.2)}
 
 
 Permit = Callable[[], None]
@@ -81,6 +82,7 @@ class Autopilot:
         self._updated = asyncio.Event()
         self._acks: dict[int, asyncio.Queue[Any]] = {}
         self._params: dict[str, asyncio.Queue[float]] = {}
+        self._listeners: list[tuple[frozenset[str], asyncio.Queue[Any]]] = []
         self._locks: dict[int, asyncio.Lock] = {}
         self._flying_rates: bool | None = None
 
@@ -193,6 +195,9 @@ class Autopilot:
             name = _text(incoming.param_id)
             if name in self._params:
                 self._params[name].put_nowait(float(incoming.param_value))
+        for kinds, queue in self._listeners:
+            if kind in kinds:
+                queue.put_nowait(incoming)
         self.on_message(incoming)
         if kind in {"GLOBAL_POSITION_INT", "HEARTBEAT", "EXTENDED_SYS_STATE"}:
             self._updated.set()
@@ -207,6 +212,26 @@ class Autopilot:
         except TimeoutError:
             return False
         return True
+
+    @contextmanager
+    def listening(self, *kinds: str) -> Iterator[asyncio.Queue[Any]]:
+        """The vehicle's messages of some kinds, from now until the block ends."""
+        listener = frozenset(kinds), asyncio.Queue[Any]()
+        self._listeners.append(listener)
+        try:
+            yield listener[1]
+        finally:
+            self._listeners.remove(listener)
+
+    def address(self) -> dict[str, int]:
+        """The vehicle, as messages name their target.
+
+        Raises:
+            AutopilotError: it is not connected.
+        """
+        if self._target is None or not self.connected:
+            raise AutopilotError("the autopilot is not connected", link=True)
+        return {"target_system": self._target[0], "target_component": self._target[1]}
 
     # Commands
 
@@ -254,11 +279,8 @@ class Autopilot:
         place: tuple[float, float, float] | None,
         frame: int,
     ) -> Any:
-        target = self._target
-        if target is None or not self.connected:
-            raise AutopilotError("the autopilot is not connected", link=True)
+        address = self.address()
         values = {f"param{i}": float(value) for i, value in enumerate(params, 1)}
-        address = {"target_system": target[0], "target_component": target[1]}
         if place is None:
             return message("COMMAND_LONG", command=number, confirmation=attempt, **address, **values)
         return message(
@@ -326,11 +348,16 @@ class Autopilot:
 
     def stop(self) -> None:
         """Brake and hold: a velocity of zero; GUIDED keeps the position when it times out."""
+        self.fly(0.0, 0.0, 0.0)
+
+    def fly(self, north_mps: float, east_mps: float, down_mps: float, yaw_deg: float | None = None) -> None:
+        """Fly with a velocity over ground, which the autopilot gives up after three seconds by itself."""
         target = self._target
         if target is not None:
             self.send(
                 message(
-                    "SET_POSITION_TARGET_LOCAL_NED", type_mask=_VELOCITY_ONLY, coordinate_frame=_LOCAL_NED,
+                    "SET_POSITION_TARGET_LOCAL_NED", coordinate_frame=_LOCAL_NED, vx=north_mps, vy=east_mps, vz=down_mps,
+                    type_mask=_VELOCITY_ONLY if yaw_deg is None else _VELOCITY_AND_YAW, yaw=math.radians(yaw_deg or 0.0),
                     target_system=target[0], target_component=target[1],
                 )
             )  # fmt: skip

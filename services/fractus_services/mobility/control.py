@@ -8,32 +8,29 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Callable, Coroutine
-from contextlib import aclosing
-from typing import Any, Literal
+from typing import Literal
 
 from fractus_core.geo import LocalFrame
-from fractus_core.policy.compiled import CompiledGrant
+from fractus_core.policy.compiled import CompiledGrant, for_transit
 from fractus_core.policy.values import Takeover, Verdict
 
 from fractus_services.audit import AuditLog
 from fractus_services.grants import GrantFiles, Held
 from fractus_services.mobility.autopilot import Autopilot, AutopilotError, Permit, always
+from fractus_services.mobility.background import Background
+from fractus_services.mobility.backstop import Backstop
 from fractus_services.mobility.failsafes import Checked
 from fractus_services.mobility.helm import Helm
 from fractus_services.mobility.journal import Journal, Mission
-from fractus_services.mobility.leases import Lease, Motion, News, State
+from fractus_services.mobility.leases import Lease, Motion, News, Regime, State
 from fractus_services.mobility.motions import distance_m
-from fractus_services.replies import Refused, aborted, precondition, refused, unavailable
+from fractus_services.replies import Refused, aborted, precondition, unavailable
 
 log = logging.getLogger(__name__)
 
 Hands = Literal["driver", "system", "pilot"]
-Transit = Callable[[Held], CompiledGrant]
-"""Makes the grant under which the system flies for a waiting driver."""
 
 WAYPOINT_M = 5.0
-WAIT_S = 0.5
 
 
 class Control:
@@ -44,26 +41,36 @@ class Control:
         journal: what survives a restart.
         grants: grants of this node.
         audit: where takeovers are written.
+        backstop: the vehicle's own fence.
         grace_s: how long a lost driver may take to come back.
 
     Attributes:
         decided: whether it is settled who has the vehicle, since its link came up last.
+        regime: the fences under which the system flies an application's drone; None while it does not.
+        touring: key of the mission without a driver that the system is flying.
     """
 
     def __init__(
-        self, autopilot: Autopilot, journal: Journal, grants: GrantFiles, audit: AuditLog, grace_s: float
+        self,
+        autopilot: Autopilot,
+        journal: Journal,
+        grants: GrantFiles,
+        audit: AuditLog,
+        *,
+        backstop: Backstop,
+        grace_s: float,
     ) -> None:
         self.autopilot = autopilot
+        self.backstop = backstop
         self.journal = journal
         self.hands: Hands = "system"
         self.lease: Lease | None = None
         self.motion: Motion | None = None
         self.checked: Checked | None = None
-        self.chauffeur: Callable[[Lease, Mission], AsyncIterator[str]] | None = None
         self.speed_mps: float | None = None
         self.homeward = False
-        self.chauffeured: CompiledGrant | None = None
-        self._transit: Transit | None = None
+        self.regime: Regime | None = None
+        self.touring: str | None = None
         self._grants = grants
         self.audit = audit
         self._grace_s = grace_s
@@ -72,7 +79,9 @@ class Control:
         self.was_armed: bool | None = None
         self.system: asyncio.Task[None] | None = None
         self._grace: asyncio.Task[None] | None = None
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._removed: Held | None = None
+        self._transit: tuple[Held, CompiledGrant] | None = None
+        self.tasks = Background()
         self._changed = asyncio.Event()
         grants.listen(self._grant_changed)
 
@@ -92,88 +101,36 @@ class Control:
         held = self._grants.of(mission.identity) if mission is not None else None
         return held if held is not None and mission is not None and held.key == mission.key else None
 
-    # The driver's stream
+    @property
+    def last_grant(self) -> Held | None:
+        """The grant whose fences hold on the way home: the mission's, or what it was before it was taken away."""
+        return self.mission_grant or self._removed
 
-    async def drive(self, held: Held) -> AsyncIterator[News]:
-        """The events of a driver's stream; the driver has the drone from GRANTED until this is closed.
+    @property
+    def retraces(self) -> bool:
+        """Whether the autopilot can fly home on the path that it came."""
+        capable = self.checked is not None and self.checked.airframe.retraces
+        return capable and not self.autopilot.vehicle.path_lost
 
-        Raises:
-            Refused: this caller does not get the drone.
-        """
-        mission = self._admit(held)
-        if self.lease is not None:
-            self.lease.tell(News(State.LOST, reason="another stream of the same instance took over"))
-        lease = self.lease = Lease(held)
-        try:
-            while self.lease is lease and not lease.granted:
-                async with aclosing(self._until_ready(lease, mission)) as waiting:  # type: ignore[type-var]
-                    async for reason in waiting:
-                        yield News(State.WAITING, mission.points_done, reason)
-                if self.lease is lease and self._not_ready(lease) is None:
-                    yield self._hand_over(lease, mission)
-            while True:
-                try:
-                    news = await lease.next(timeout_s=5.0)
-                except TimeoutError:
-                    continue
-                if news is None:
-                    return
-                yield news
-                if news.final:
-                    return
-        finally:
-            self._left(lease)
+    # Who may have the drone
 
-    def _admit(self, held: Held) -> Mission:
-        if held.spec.class_ != "driver":
-            raise refused(Verdict("deny", None, "NotADriver", "only a driver gets control; passengers ride along"))
-        mission = self.journal.mission(held)
-        if mission.outcome == "complete":
-            raise precondition("MissionComplete", "the mission is complete")
-        if mission.outcome:
-            raise precondition("ControlLost", f"the mission has ended ({mission.outcome})")
-        other = self.lease
-        if other is not None and other.key != held.key and not other.granted and self._flies_for(held.key):
-            self.lose("another application has the drone")
-        if (self.lease is not None and self.lease.key != held.key) or self._taken(held.key):
-            raise _held_by_another()
-        return mission
-
-    def _flies_for(self, key: str) -> bool:
+    def flies_for(self, key: str) -> bool:
+        """Whether the drone flies for a mission."""
         return self.autopilot.vehicle.armed and self.journal.active == key
 
-    def _taken(self, key: str) -> bool:
-        """Whether the drone flies for another mission."""
+    def taken(self, key: str) -> bool:
+        """Whether the drone flies for another mission than this."""
         flying = self.journal.flying
         return flying is not None and flying.key != key and self.autopilot.vehicle.armed
 
-    async def _until_ready(self, lease: Lease, mission: Mission) -> AsyncIterator[str]:
-        said = ""
-        while self.lease is lease:
-            reason = self._not_ready(lease)
-            if self._taken(lease.key):
-                raise _held_by_another()
-            if reason is None:
-                if self.chauffeur is None or lease.held.spec.control != "partial":
-                    return
-                lease.transit = True
-                async with aclosing(self.chauffeur(lease, mission)) as flying:  # type: ignore[type-var]
-                    async for news in flying:
-                        yield news
-                return
-            if reason != said:
-                said = reason
-                yield reason
-            await self._wait(WAIT_S)
-
-    def _not_ready(self, lease: Lease) -> str | None:
-        """Why the drone cannot be handed to a driver now."""
+    def hindrance(self, key: str) -> str | None:
+        """Why the drone cannot fly for a mission now; None when it can."""
         vehicle = self.autopilot.vehicle
         why = next((t for t in reversed(vehicle.texts) if t.startswith("PreArm")), "")
         reasons = (
             (not self.autopilot.connected, "the autopilot is not connected"),
             (not self.decided, "it is not known yet what the drone does"),
-            (self._taken(lease.key), "another application has the drone"),
+            (self.taken(key), "another application has the drone"),
             (self.checked is None, "the autopilot's failsafes are being set"),
             (self.hands == "pilot", f"a human pilot has the drone ({vehicle.mode_name})"),
             (self.homeward, "the system brings the drone home"),
@@ -182,7 +139,8 @@ class Control:
         )
         return next((reason for holds, reason in reasons if holds), None)
 
-    async def _wait(self, timeout_s: float) -> None:
+    async def wait(self, timeout_s: float) -> None:
+        """Wait until something changed that drivers wait for, or for so long."""
         try:
             async with asyncio.timeout(timeout_s):
                 await self._changed.wait()
@@ -190,36 +148,24 @@ class Control:
             return
 
     def wake(self) -> None:
-        """Let waiting drivers look again."""
+        """Let who waits look again."""
         self._changed.set()
         self._changed = asyncio.Event()
 
-    def _hand_over(self, lease: Lease, mission: Mission) -> News:
-        self.drop(self._grace)
-        self.drop(self.system)
+    def hand_over(self, lease: Lease, mission: Mission) -> News:
+        """The driver has the drone from now on."""
+        self.stop_system()
         self.hands = "driver"
         lease.granted = True
-        self.journal.active = mission.key
-        self.journal.save_soon()
+        self.adopt(mission)
         self.note("granted", lease.held.identity, f"control point {mission.points_done}")
         return News(State.GRANTED, mission.points_done, "", mission.waypoints)
 
-    def _left(self, lease: Lease) -> None:
-        """A driver's stream is over; without ReturnControl that means the driver is lost."""
-        if self.lease is not lease:
-            return
-        self.lease = None
-        mission = self.journal.missions.get(lease.key)
-        if mission is None or not (lease.granted or lease.transit):
-            return
-        self.hands = "system"
-        self.note("driver lost", lease.held.identity, "its stream broke")
-        log.warning("driver %s is lost", lease.held.identity)
-        coming_down = self.motion is not None and self.motion.kind in {"Land", "ReturnToLaunch"}
-        self.stop_motion(precondition("ControlLost", "the driver's stream broke"))
-        if self.autopilot.vehicle.armed and not coming_down:
-            self.start("hover")
-        self.begin_grace(mission, "driver lost")
+    def adopt(self, mission: Mission) -> None:
+        """The drone flies for this mission."""
+        self._removed = None
+        self.journal.active = mission.key
+        self.journal.save_soon()
 
     def valid(self, held: Held) -> bool:
         """Whether a grant is still in force."""
@@ -276,20 +222,34 @@ class Control:
                 mission.waypoints += 1
                 self.journal.save_soon()
 
-    # The chauffeur
+    # The system flies for an application
 
-    def begin_transit(self, lease: Lease, mission: Mission, transit: Transit) -> None:
-        """The system flies for a waiting driver."""
-        self.drop(self._grace)
-        self.drop(self.system)
-        self._transit = transit
-        self.hands, self.chauffeured = "system", transit(lease.held)
-        self.journal.active = mission.key
-        self.journal.save_soon()
+    def stop_system(self) -> None:
+        """End what the system does with the drone, and a lost driver's grace."""
+        self.tasks.drop(self._grace)
+        self.tasks.drop(self.system)
 
-    def end_transit(self) -> None:
-        """The drone is at the control point, or the way there failed."""
-        self.chauffeured = self._transit = None
+    def begin_transit(self, held: Held, mission: Mission) -> Regime:
+        """The system flies for an application, under its fences."""
+        self.stop_system()
+        self.hands = "system"
+        self.adopt(mission)
+        return self.under(held)
+
+    def under(self, held: Held) -> Regime:
+        """What the system flies from now on keeps to the fences of a grant, as they are at each moment."""
+        self.regime = Regime(held, self._for_transit(held))
+        return self.regime
+
+    def relieve(self, regime: Regime) -> None:
+        """The system has stopped flying under a regime."""
+        if self.regime is regime:
+            self.regime = None
+
+    def _for_transit(self, held: Held) -> CompiledGrant:
+        if self._transit is None or self._transit[0] is not held:
+            self._transit = held, for_transit(held.spec, flat_terrain=held.compiled.flat_terrain)
+        return self._transit[1]
 
     # Motions
 
@@ -307,7 +267,7 @@ class Control:
     def cancelled(self, motion: Motion) -> None:
         """The caller of a motion gave it up: hover, unless the driver is gone and the drone comes home anyway."""
         if self.motion is motion:
-            self.spawn(self._hover_after(motion))
+            self.tasks.spawn(self._hover_after(motion))
 
     async def _hover_after(self, motion: Motion) -> None:
         if motion.kind in {"Land", "ReturnToLaunch"}:
@@ -315,17 +275,22 @@ class Control:
         if self.motion is motion and self.hands == "driver":
             self.motion = None
             motion.stop(aborted("Cancelled", "the call was cancelled"))
-            await self.attempt(self.hold(lambda: self._still("driver")))
+            await self.tasks.attempt(self.hold(self.still))
 
     def failed(self, motion: Motion) -> None:
         """A motion ended with an error, and the autopilot may fly on for it: hover."""
         if self.motion is motion:
             self.motion = None
             if self.hands == "driver" and self.autopilot.vehicle.in_air:
-                self.spawn(self.attempt(self.hold(lambda: self._still("driver"))))
+                self.tasks.spawn(self.tasks.attempt(self.hold(self.still)))
 
-    def _still(self, hands: Hands) -> None:
-        if self.motion is not None or self.hands != hands:
+    def still(self) -> None:
+        """Permits what a driver's drone does after its motion: nothing else has begun.
+
+        Raises:
+            AutopilotError: somebody else flies by now.
+        """
+        if self.motion is not None or self.hands != "driver":
             raise AutopilotError("somebody else flies by now")
 
     def stop_motion(self, why: Refused) -> None:
@@ -337,7 +302,7 @@ class Control:
     async def hold(self, permit: Permit = always) -> None:
         """Brake and hover."""
         await self.helm.hold(permit)
-        self.spawn(self.helm.settle())
+        self.tasks.spawn(self.helm.settle())
 
     # The system
 
@@ -346,7 +311,7 @@ class Control:
         self.note("brake", self.controller, verdict.reason, verdict.code, policies=verdict.policies)
         self.stop_motion(aborted(verdict.code, verdict.reason, verdict.policies))
         self.autopilot.stop()
-        self.spawn(self.helm.settle())
+        self.tasks.spawn(self.helm.settle())
 
     def take_over(self, verdict: Verdict) -> None:
         """The system takes the drone from its driver, as a policy or the monitor says."""
@@ -371,16 +336,17 @@ class Control:
         """Take the lease from the driver and tell it why."""
         lease, self.lease = self.lease, None
         self.stop_motion(precondition("ControlLost", reason))
-        self.drop(self._grace)
+        self.tasks.drop(self._grace)
         if lease is not None:
             lease.tell(News(State.LOST, reason=reason))
         self.wake()
 
     def start(self, action: Takeover) -> None:
         """Begin what the system wants of the drone; what it did before ends."""
-        self.drop(self.system)
+        self.tasks.drop(self.system)
+        self.touring = None
         self.homeward = action != "hover" and self.autopilot.vehicle.armed
-        self.system = self.spawn(self.act(action))
+        self.system = self.tasks.spawn(self.act(action))
 
     async def act(self, action: Takeover) -> None:
         """Carry out what the system wants, as long as it has the drone."""
@@ -396,9 +362,9 @@ class Control:
 
     def begin_grace(self, mission: Mission, why: str) -> None:
         """Give a lost driver its time to come back; then the mission has failed."""
-        self.drop(self._grace)
+        self.tasks.drop(self._grace)
         if mission.flown or self.autopilot.vehicle.armed:
-            self._grace = self.spawn(self._give_up(mission, why))
+            self._grace = self.tasks.spawn(self._give_up(mission, why))
 
     async def _give_up(self, mission: Mission, why: str) -> None:
         await asyncio.sleep(self._grace_s)
@@ -424,17 +390,18 @@ class Control:
         if old is not None and new is not None and old.key == new.key:
             if self.lease is not None and self.lease.key == new.key:
                 self.lease.held = new
-                if self._transit is not None:
-                    self.chauffeured = self._transit(new)
+            if self.regime is not None and self.regime.held.key == new.key:
+                self.regime.held, self.regime.grant = new, self._for_transit(new)
             return
-        if old is None or old.spec.class_ != "driver":
+        self.wake()
+        if old is None or not (old.spec.class_ == "driver" or old.spec.tour):
             return
         mission = self.journal.missions.get(old.key)
         concerned = (self.lease is not None and self.lease.key == old.key) or self.journal.active == old.key
         if mission is None or mission.outcome or not concerned:
             return
         verdict = Verdict("takeover", None, "GrantRevoked", "the grant was removed", (), "revoke")
-        self.journal.active = self.journal.active or old.key
+        self.journal.active, self._removed = self.journal.active or old.key, old
         if self.hands == "pilot":
             mission.outcome = "revoked: the grant was removed"
             self.journal.save_soon()
@@ -455,38 +422,3 @@ class Control:
                 "lat": vehicle.lat, "lon": vehicle.lon, "alt": vehicle.altitude_m,
             },
         )  # fmt: skip
-
-    async def attempt(self, work: Coroutine[Any, Any, None]) -> None:
-        """Await something of the autopilot that may fail without harm."""
-        try:
-            await work
-        except AutopilotError as error:
-            log.warning("%s", error)
-
-    def spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Run something in the background; failures are logged."""
-        task = asyncio.get_running_loop().create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._ended)
-        return task
-
-    def keep(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Run something that its caller waits for, and that goes on when the caller does not."""
-        task = asyncio.get_running_loop().create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-        return task
-
-    def _ended(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
-        if not task.cancelled() and task.exception() is not None:
-            log.error("a task of the drone's control failed", exc_info=task.exception())
-
-    def drop(self, task: asyncio.Task[None] | None) -> None:
-        """Cancel a task, unless it is the one that asks."""
-        if task is not None and task is not asyncio.current_task():
-            task.cancel()
-
-
-def _held_by_another() -> Refused:
-    return precondition("ControlHeld", "another application has the drone; try again when it is back")

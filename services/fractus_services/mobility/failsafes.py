@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from fractus_core.policy.values import Airframe
 
@@ -37,12 +37,23 @@ _OLD_NAME, _NEW_NAME = "SYSID_MYGCS", "MAV_GCS_SYSID"
 
 SETTINGS = (
     Setting((_OLD_NAME, _NEW_NAME), SYSTEM_ID, frozenset(), True, _LISTENS),
-    Setting(("FS_GCS_ENABLE",), 1, frozenset({1.0}), True, "returns to launch when the companion falls silent"),
     Setting(("FS_GCS_TIMEOUT",), 5, frozenset(), False, "after five seconds of silence"),
-    Setting(("BATT_FS_LOW_ACT",), 2, frozenset({1.0, 2.0}), False, "returns to launch on a low battery"),
     Setting(("BATT_FS_CRT_ACT",), 1, frozenset({1.0}), False, "lands on a critical battery"),
     Setting(("FS_EKF_ACTION",), 1, frozenset({1.0, 3.0}), False, "lands when it no longer knows where it is"),
 )
+
+STRAIGHT = (
+    Setting(("FS_GCS_ENABLE",), 1, frozenset(), True, "returns to launch when the companion falls silent"),
+    Setting(("BATT_FS_LOW_ACT",), 2, frozenset({1.0, 2.0}), False, "returns to launch on a low battery"),
+)
+RETRACING = (
+    Setting(("FS_GCS_ENABLE",), 3, frozenset({4.0}), True, "goes back the way it came when the companion falls silent"),
+    Setting(("BATT_FS_LOW_ACT",), 3, frozenset({1.0, 4.0}), False, "goes back the way it came on a low battery"),
+)
+"""The failsafes that bring the drone home, straight or on its own path (SmartRTL)."""
+
+PATH_POINTS = 100.0
+"""A vehicle that remembers fewer points of its path (SRTL_POINTS) is not relied on to find back on it."""
 
 RANGE = Setting(("MAV_GCS_SYSID_HI",), 0, frozenset(float(n) for n in range(1, SYSTEM_ID + 1)), False, _LISTENS)
 """Releases that know the new name can take a whole range of systems for the companion."""
@@ -55,6 +66,7 @@ class Checked:
     Attributes:
         problem: why nothing may arm; empty when every needed failsafe was read back.
         missing: optional ones that the vehicle does not offer.
+        remembers: whether the vehicle can go back the way it came; `airframe.retraces` says that its failsafes will.
         airframe: how it moves, from its own parameters.
         speed_mps: the speed it flies legs with.
     """
@@ -63,6 +75,7 @@ class Checked:
     missing: tuple[str, ...]
     airframe: Airframe
     speed_mps: float
+    remembers: bool = False
 
 
 async def configure(autopilot: Autopilot) -> Checked:
@@ -71,25 +84,50 @@ async def configure(autopilot: Autopilot) -> Checked:
     Raises:
         AutopilotError: the link broke.
     """
-    problems, missing = [], []
+    problems: list[str] = []
+    missing: list[str] = []
     for setting in SETTINGS:
         name, problem = await _establish(autopilot, setting)
         if not name:
             missing.append(setting.names[0])
-            if setting.needed:
-                problems.append(f"the autopilot has no {' or '.join(setting.names)} ({setting.why})")
-        elif problem:
-            problems.append(problem)
+        problems.extend(filter(None, [problem]))
         if name == _NEW_NAME:
             problems.extend(filter(None, [(await _establish(autopilot, RANGE))[1]]))
+    remembers = (await autopilot.read_parameter("SRTL_POINTS", attempts=2) or 0.0) >= PATH_POINTS
+    retraces, wrong = await _choose(autopilot, retrace=remembers)
+    problems += wrong
     airframe, speed, unsound = await _airframe(autopilot)
     problems.extend(f"{name} is not a number" for name in unsound)
-    checked = Checked("; ".join(problems), tuple(missing), airframe, speed)
+    airframe = replace(airframe, retraces=retraces)
+    checked = Checked("; ".join(problems), tuple(missing), airframe, speed, remembers)
     if checked.problem:
         log.error("failsafes are not verified, arming is refused: %s", checked.problem)
     else:
         log.info("failsafes are set and read back%s", f"; not offered: {', '.join(missing)}" if missing else "")
     return checked
+
+
+async def choose_return(autopilot: Autopilot, checked: Checked, *, retrace: bool) -> Checked:
+    """Let the failsafes bring the drone home straight, or, where the vehicle can, on the path that it came.
+
+    Raises:
+        AutopilotError: the link broke.
+    """
+    retrace = retrace and checked.remembers
+    if retrace == checked.airframe.retraces or checked.problem:
+        return checked
+    retraces, problems = await _choose(autopilot, retrace=retrace)
+    return replace(checked, problem="; ".join(problems), airframe=replace(checked.airframe, retraces=retraces))
+
+
+async def _choose(autopilot: Autopilot, *, retrace: bool) -> tuple[bool, list[str]]:
+    """Whether the failsafes retrace the path now, and what does not hold."""
+    if retrace:
+        problems = [problem for setting in RETRACING if (problem := (await _establish(autopilot, setting))[1])]
+        if not problems:
+            return True, []
+        log.warning("the drone will fly home straight: %s", "; ".join(problems))
+    return False, [problem for setting in STRAIGHT if (problem := (await _establish(autopilot, setting))[1])]
 
 
 async def _establish(autopilot: Autopilot, setting: Setting) -> tuple[str, str]:
@@ -105,7 +143,7 @@ async def _establish(autopilot: Autopilot, setting: Setting) -> tuple[str, str]:
             log.info("set %s from %g to %g: the autopilot %s", name, found, setting.value, setting.why)
             return name, ""
         return name, f"{name} is {found:g} and cannot be set to {setting.value:g} (the autopilot {setting.why})"
-    return "", ""
+    return "", f"the autopilot has no {' or '.join(setting.names)} ({setting.why})" if setting.needed else ""
 
 
 async def _airframe(autopilot: Autopilot) -> tuple[Airframe, float, list[str]]:

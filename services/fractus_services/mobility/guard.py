@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
+from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.engine import judge
 from fractus_core.policy.values import Airframe, Call, Situation, Verdict
@@ -13,6 +14,7 @@ from fractus_core.policy.values import Airframe, Call, Situation, Verdict
 from fractus_services.audit import AuditLog
 from fractus_services.grants import Held
 from fractus_services.mobility.control import Control
+from fractus_services.mobility.motions import distance_m
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +38,8 @@ class Guard:
         autopilot = self._control.autopilot
         checked = self._control.checked
         airframe = checked.airframe if checked is not None else Airframe()
+        if airframe.retraces and not self._control.retraces:
+            airframe = replace(airframe, retraces=False)
         speed = self._control.speed_mps or (checked.speed_mps if checked is not None else 5.0)
         motion = self._control.motion
         vertical = motion is not None and motion.kind in {"Takeoff", "Land", "ReturnToLaunch"}
@@ -52,10 +56,21 @@ class Guard:
             speed_setpoint_mps=speed,
         )
 
-    def judge(self, call: Call, held: Held, grant: CompiledGrant | None = None) -> Verdict:
+    def distance_m(self, lat: float, lon: float) -> float:
+        """How far away a place is over ground; infinite while the drone's position is unknown."""
+        vehicle = self._control.autopilot.vehicle
+        return distance_m(LocalFrame(lat, lon), vehicle.lat, vehicle.lon)
+
+    def judge(self, call: Call, held: Held, grant: CompiledGrant | None = None, *, kind: str = "call") -> Verdict:
         """The verdict on a call, written to the audit log.
 
         An internal error refuses the call and, for a caller that flies, holds the drone where it is.
+
+        Args:
+            call: method and arguments.
+            held: the caller's grant.
+            grant: what it is judged under instead, when the system flies.
+            kind: of the audit entry; `check` when the call is not carried out.
         """
         now = self.situation()
         try:
@@ -71,13 +86,13 @@ class Guard:
                 "hover",
             )
         if call.method not in QUIET or not verdict.permits:
-            self.record(call, held.identity, verdict, now)
+            self.record(call, held.identity, verdict, now, kind=kind)
         return verdict
 
-    def record(self, call: Call, caller: str, verdict: Verdict, now: Situation) -> None:
+    def record(self, call: Call, caller: str, verdict: Verdict, now: Situation, *, kind: str = "call") -> None:
         """Write one decision."""
         self._audit.append(
-            "call",
+            kind,
             {
                 "caller": caller,
                 "method": call.method,

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import aclosing
 from typing import Any
 
-from fractus_core.api.geometry import Reference
 from fractus_core.api.plans import node_identity
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, Verdict
-from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc, types_pb2
+from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
 from fractus_services.answering import Reception
+from fractus_services.auth import Caller
 from fractus_services.clock import Clock
-from fractus_services.grants import GrantFiles
+from fractus_services.grants import GrantFiles, Held
+from fractus_services.mobility.arguments import call_of, checked, goto_args, velocity_args
 from fractus_services.mobility.autopilot import AutopilotError
 from fractus_services.mobility.control import Control
 from fractus_services.mobility.leases import News, State
 from fractus_services.mobility.service import MobilityService, Progress
+from fractus_services.mobility.streams import Streams
 from fractus_services.mobility.telemetry import located, position_of, telemetry_of, velocity_of
 from fractus_services.replies import Refused, decision, precondition, refused, unavailable
 
@@ -27,13 +29,9 @@ LEAST_INTERVAL_S, USUAL_INTERVAL_S = 0.05, 0.2
 JUDGED_S = 0.5
 """A stream is judged again so often: what was revoked ends it within a second."""
 
-_REFERENCES: dict[int, Reference] = {
-    types_pb2.ALTITUDE_REFERENCE_HOME: "home",
-    types_pb2.ALTITUDE_REFERENCE_AMSL: "amsl",
-    types_pb2.ALTITUDE_REFERENCE_TERRAIN: "terrain",
-}
 _STATES = {
     State.WAITING: mobility_pb2.ControlEvent.STATE_WAITING,
+    State.RIDING: mobility_pb2.ControlEvent.STATE_RIDING,
     State.GRANTED: mobility_pb2.ControlEvent.STATE_GRANTED,
     State.LOST: mobility_pb2.ControlEvent.STATE_LOST,
     State.COMPLETE: mobility_pb2.ControlEvent.STATE_COMPLETE,
@@ -41,15 +39,42 @@ _STATES = {
 
 
 class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
-    """The service on the wire."""
+    """The service on the wire.
 
-    def __init__(self, service: MobilityService, control: Control, grants: GrantFiles, node: str, clock: Clock) -> None:
+    Args:
+        service: carries out.
+        control: who has the drone.
+        streams: of who asks for control.
+        grants: grants of this node.
+        node: its name.
+        clock: Unix time.
+        heard: told whose grant each call is made under.
+    """
+
+    def __init__(
+        self,
+        service: MobilityService,
+        control: Control,
+        streams: Streams,
+        *,
+        grants: GrantFiles,
+        node: str,
+        clock: Clock,
+        heard: Callable[[Held], None] = lambda _held: None,
+    ) -> None:
         self._service = service
         self._control = control
+        self._streams = streams
+        self._heard = heard
         self._node = node_identity(node)
         self._clock = clock
         self._reception = Reception(grants, clock, _known, self._failed)
-        self._held = self._reception.held
+
+    def _held(self, caller: Caller) -> Held:
+        """The grant of a caller, who thereby shows that it is there."""
+        held = self._reception.held(caller)
+        self._heard(held)
+        return held
 
     def _failed(self, verdict: Verdict) -> None:
         """Something in here broke: hold the drone of a driver where it is."""
@@ -66,7 +91,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
             try:
                 async with (
                     asyncio.timeout(max(caller.valid_until_s - self._clock(), 0.0)),
-                    aclosing(self._control.drive(held)) as events,  # type: ignore[type-var]
+                    aclosing(self._streams.follow(held)) as events,  # type: ignore[type-var]
                 ):
                     async for news in events:
                         await context.write(_event(news))
@@ -111,6 +136,20 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
             speed = self._control.autopilot.vehicle.speed_mps
             return mobility_pb2.GetSpeedResponse(decision=decision(verdict), speed_mps=speed)
 
+    async def SetVelocity(self, request: Any, context: Any) -> Any:  # noqa: N802
+        """See mobility.proto."""
+        async with self._reception.call(context) as caller:
+            verdict, flown = await self._service.set_velocity(self._held(caller), velocity_args(request))
+            reply = mobility_pb2.SetVelocityResponse(decision=decision(verdict))
+            reply.velocity.north_mps, reply.velocity.east_mps = flown.north_mps, flown.east_mps
+            reply.velocity.down_mps = flown.down_mps
+            return reply
+
+    async def CheckCall(self, request: Any, context: Any) -> Any:  # noqa: N802
+        """See mobility.proto."""
+        async with self._reception.call(context) as caller:
+            return checked(self._service.check(call_of(request), self._held(caller)))
+
     async def GetPosition(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context) as caller:
@@ -133,7 +172,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     async def Goto(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context, lasting=True) as caller:
-            args = _goto(request)
+            args = goto_args(request)
             progress = self._service.goto(self._held(caller), args, _finite(request.acceptance_radius_m))
             await self._report(progress, context)
 
@@ -197,21 +236,6 @@ def _event(news: News) -> Any:
         control_point=news.control_point,
         reason=news.reason,
         waypoints_reached=news.waypoints_reached,
-    )
-
-
-def _goto(request: Any) -> GotoArgs:
-    if not request.HasField("target"):
-        raise refused(Verdict("deny", None, "InvalidArgument", "goto needs a target"))
-    target = request.target
-    if target.altitude_reference not in _REFERENCES:
-        raise refused(Verdict("deny", None, "InvalidArgument", "the target's altitude reference is not known here"))
-    return GotoArgs(
-        lat=target.latitude_deg,
-        lon=target.longitude_deg,
-        alt=target.altitude_m,
-        reference=_REFERENCES[target.altitude_reference],
-        yaw_deg=request.yaw_deg if request.HasField("yaw_deg") else None,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 
 from fractus_core.policy.values import Takeover
 
@@ -31,12 +31,14 @@ class Helm:
         expected: the mode that the autopilot is in by our doing, or that we know of.
         changing: how many changes are under way.
         arming: whether the motors are being started by us.
+        approach: flies to where the autopilot's own return is legal, and says in which mode it does the rest.
     """
 
     def __init__(self, autopilot: Autopilot, moving: Callable[[], bool]) -> None:
         self.expected: int | None = None
         self.changing = 0
         self.arming = False
+        self.approach: Callable[[Callable[[], bool]], Awaitable[int]] = _straight
         self._autopilot = autopilot
         self._moving = moving
 
@@ -111,14 +113,24 @@ class Helm:
                 if (vehicle.standing or not vehicle.in_air) and not refused:
                     refused = not await self.disarm()
                 else:
-                    self._autopilot.stop()
-                    await self.change_mode(LAND if action == "land" or tries >= RTL_TRIES else RTL)
-                    while vehicle.armed and vehicle.mode in HOMEWARD:
-                        await self._autopilot.update(1.0)
+                    await self._come_down(action, tries, wanted)
             except AutopilotError as error:
                 tries += 0 if error.link else 1
                 log.warning("cannot %s yet: %s", action, error)
             await asyncio.sleep(AGAIN_S)
+
+    async def _come_down(self, action: Takeover, tries: int, wanted: Callable[[], bool]) -> None:
+        """Land here, or bring the drone home: by the autopilot's own doing, where that has begun, or else by ours first."""
+        vehicle = self._autopilot.vehicle
+        returning = action != "land" and vehicle.mode in HOMEWARD and self.expected == vehicle.mode
+        if not returning:
+            self._autopilot.stop()
+            mode = LAND
+            if action != "land" and tries < RTL_TRIES:
+                mode = await self.approach(wanted) if tries == 0 else RTL
+            await self.change_mode(mode, lambda: _check(wanted))
+        while vehicle.armed and vehicle.mode in HOMEWARD:
+            await self._autopilot.update(1.0)
 
     async def _hover(self) -> None:
         """Hold at once, and again when a takeoff under way gets off the ground."""
@@ -128,3 +140,12 @@ class Helm:
         if self._autopilot.vehicle.armed:
             await self.hold()
             await self.settle()
+
+
+async def _straight(_wanted: Callable[[], bool]) -> int:
+    return RTL
+
+
+def _check(wanted: Callable[[], bool]) -> None:
+    if not wanted():
+        raise AutopilotError("the system does not have the drone any more")

@@ -1,10 +1,12 @@
-"""Who holds the drone: the lease that a driver's stream keeps alive, and the motion that runs under it."""
+"""Who holds the drone: the lease that a driver's stream keeps alive, the motion that runs, the fences it keeps to."""
 
 from __future__ import annotations
 
 import asyncio
 from dataclasses import dataclass
 from enum import Enum
+
+from fractus_core.policy.compiled import CompiledGrant
 
 from fractus_services.grants import Held
 from fractus_services.replies import Refused
@@ -15,6 +17,7 @@ class State(Enum):
 
     WAITING = "waiting"
     GRANTED = "granted"
+    RIDING = "riding"
     LOST = "lost"
     COMPLETE = "complete"
 
@@ -66,6 +69,14 @@ class Lease:
         """
         async with asyncio.timeout(timeout_s):
             return await self._news.get()
+
+
+@dataclass(eq=False, slots=True)
+class Regime:
+    """The fences under which the system flies an application's drone; they follow the grant when it changes."""
+
+    held: Held
+    grant: CompiledGrant
 
 
 class Motion:

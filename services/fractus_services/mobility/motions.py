@@ -7,10 +7,11 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass
 
 from fractus_core.geo import LocalFrame
-from fractus_core.policy.values import GotoArgs
+from fractus_core.policy.values import STANDING_MPS, GotoArgs
 
 from fractus_services.mobility.autopilot import Autopilot, Permit
 from fractus_services.mobility.leases import Motion
+from fractus_services.mobility.vehicle import Vehicle
 from fractus_services.replies import aborted, unavailable
 
 REACHED_M = 1.0
@@ -18,6 +19,11 @@ HEIGHT_REACHED_M = 0.8
 REPORT_S = 0.2
 STUCK_S = 6.0
 RESENDS = 3
+TURNED_DEG, TURN_S = 8.0, 8.0
+"""A leg with a heading is complete when the nose points there, or had so long to turn."""
+
+REST_S, REST_AGAIN_S = 12.0, 0.4
+FRESH_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,11 +62,16 @@ async def fly_to(
     frame = LocalFrame(args.lat, args.lon)
     await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg, permit)
     sent, resends, best = autopilot.now, 0, math.inf
+    there: float | None = None
     while True:
         vehicle = autopilot.vehicle
         away = distance_m(frame, vehicle.lat, vehicle.lon)
         rise = abs(altitude - vehicle.altitude_m)
         done = away <= reached_m and rise <= HEIGHT_REACHED_M
+        if done and args.yaw_deg is not None:
+            there = autopilot.now if there is None else there
+            sent = autopilot.now
+            done = _turned(vehicle, args.yaw_deg) or autopilot.now - there > TURN_S
         yield Step(math.hypot(away, rise), done)
         if done:
             return
@@ -81,6 +92,39 @@ async def come_down(autopilot: Autopilot, motion: Motion) -> AsyncIterator[Step]
         yield Step(max(vehicle.altitude_m, 0.0), complete=False)
         await _tick(autopilot, motion)
     yield Step(0.0, complete=True)
+
+
+async def come_to_rest(autopilot: Autopilot, motion: Motion, permit: Permit) -> None:
+    """Brake until the drone stands, so that its next leg begins on the spot.
+
+    Raises:
+        Refused: the motion was stopped, or the drone does not come to rest.
+    """
+    deadline, sent = autopilot.now + REST_S, -math.inf
+    while not at_rest(autopilot):
+        if autopilot.now > deadline:
+            raise aborted(
+                "NotStopping", f"the drone does not stop; it still flies {autopilot.vehicle.speed_mps:.1f} m/s"
+            )
+        if autopilot.now - sent >= REST_AGAIN_S:
+            permit()
+            autopilot.stop()
+            sent = autopilot.now
+        motion.check()
+        if not await autopilot.update(REPORT_S) and not autopilot.connected:
+            raise unavailable("the autopilot is no longer heard; it flies home by its own failsafe")
+    motion.check()
+
+
+def at_rest(autopilot: Autopilot) -> bool:
+    """Whether the drone surely stands, in the sense of the policy engine."""
+    vehicle = autopilot.vehicle
+    known = autopilot.now - vehicle.position_at <= FRESH_S
+    return known and vehicle.speed_mps < STANDING_MPS and abs(vehicle.down_mps) < STANDING_MPS
+
+
+def _turned(vehicle: Vehicle, yaw_deg: float) -> bool:
+    return abs((vehicle.yaw_deg - yaw_deg + 180.0) % 360.0 - 180.0) <= TURNED_DEG
 
 
 def distance_m(frame: LocalFrame, lat: float | None, lon: float | None) -> float:

@@ -35,7 +35,7 @@ class Observer:
         self._control.decided = False
         self._resume()
         self._control.decided = True
-        self._control.spawn(self._prepare())
+        self._control.tasks.spawn(self._prepare())
 
     async def _prepare(self) -> None:
         autopilot = self._control.autopilot
@@ -45,12 +45,19 @@ class Observer:
                 self._control.checked = await configure(autopilot)
                 self._control.wake()
                 if autopilot.vehicle.home is None:
-                    await self._control.attempt(autopilot.ask_home())
+                    await self._control.tasks.attempt(autopilot.ask_home())
+                if not autopilot.vehicle.armed and self._control.journal.flying is None:
+                    await self._lower()
             except AutopilotError as error:
                 log.warning("cannot prepare the autopilot yet: %s", error)
                 await asyncio.sleep(RETRY_S)
             else:
                 return
+
+    async def _lower(self) -> None:
+        """Put back the fence that the vehicle's owner had; what fails is tried again at the next occasion."""
+        if self._control.backstop.raised:
+            await self._control.tasks.attempt(self._control.backstop.lower())
 
     def _resume(self) -> None:
         """Decide who has a vehicle that was there before us, or comes back from a broken link."""
@@ -59,7 +66,7 @@ class Observer:
         if self._control.was_armed is None:
             self._control.was_armed = vehicle.armed
         lease = self._control.lease
-        if lease is not None and (lease.granted or self._control.chauffeured is not None):
+        if lease is not None and (lease.granted or self._control.regime is not None):
             return
         self._control.helm.expected = vehicle.mode
         if vehicle.armed and self._control.hands == "pilot":
@@ -80,7 +87,7 @@ class Observer:
                 mission.outcome = "failed: the autopilot flew home by itself while the mobility service was away"
                 self._control.journal.save_soon()
             self._control.note("homeward", "system", f"found the drone in {vehicle.mode_name}", kind="takeover")
-            self._control.system = self._control.spawn(
+            self._control.system = self._control.tasks.spawn(
                 self._control.act("returnToLaunch" if vehicle.mode != LAND else "land")
             )
         else:
@@ -123,12 +130,12 @@ class Observer:
     def _armed(self) -> None:
         if self._control.hands != "driver" and not self._control.helm.arming:
             self._pilot("armed the drone")
-        self._control.spawn(self._control.attempt(self._control.autopilot.set_rates(flying=True)))
+        self._control.tasks.spawn(self._control.tasks.attempt(self._control.autopilot.set_rates(flying=True)))
 
     def _landed(self) -> None:
         """The motors stopped."""
         mission = self._control.journal.flying
-        self._control.drop(self._control.system)
+        self._control.tasks.drop(self._control.system)
         self._control.homeward = False
         if self._control.hands == "pilot" and mission is not None and mission.flown and not mission.outcome:
             mission.outcome = "failed: a human pilot took the drone and landed it"
@@ -136,9 +143,10 @@ class Observer:
             self._control.hands = "system"
             if mission is None or mission.outcome:
                 self._control.journal.active = None
+                self._control.tasks.spawn(self._lower())
         self._control.note("landed", self._control.controller, "the motors are stopped")
         self._control.journal.save_soon()
-        self._control.spawn(self._control.attempt(self._control.autopilot.set_rates(flying=False)))
+        self._control.tasks.spawn(self._control.tasks.attempt(self._control.autopilot.set_rates(flying=False)))
         self._control.wake()
 
     def _foreign_mode(self, mode: int) -> None:
@@ -157,8 +165,10 @@ class Observer:
                 self._control.journal.save_soon()
             self._control.lose(reason)
             self._control.hands, self._control.homeward = "system", True
-            self._control.drop(self._control.system)
-            self._control.system = self._control.spawn(self._control.act("land" if mode == LAND else "returnToLaunch"))
+            self._control.tasks.drop(self._control.system)
+            self._control.system = self._control.tasks.spawn(
+                self._control.act("land" if mode == LAND else "returnToLaunch")
+            )
         elif self._control.hands == "pilot" and mode == GUIDED and self._control.journal.flying is not None:
             self._control.note("hover", "system", "the pilot handed the drone back", kind="takeover")
             self._control.hands = "system"
@@ -172,7 +182,7 @@ class Observer:
         log.warning("%s", reason)
         if self._control.hands != "pilot":
             self._control.note("pilot", "pilot", reason, "PilotTookOver", kind="takeover")
-        self._control.drop(self._control.system)
+        self._control.tasks.drop(self._control.system)
         self._control.homeward = False
         self._control.lose(reason)
         self._control.hands = "pilot"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fractus_services.grants import Held
 from fractus_services.mobility.autopilot import Permit
 from fractus_services.mobility.control import Control
-from fractus_services.mobility.leases import Lease, Motion
+from fractus_services.mobility.leases import Lease, Motion, Regime
 from fractus_services.replies import precondition
 
 
@@ -35,5 +35,16 @@ def transit_permit(control: Control, lease: Lease, motion: Motion) -> Permit:
         motion.check()
         if control.lease is not lease or control.hands != "system" or not control.valid(lease.held):
             raise precondition("ControlLost", "the driver is gone")
+
+    return check
+
+
+def tour_permit(control: Control, regime: Regime, motion: Motion) -> Permit:
+    """What the system flies for passengers goes only while nobody else has the drone."""
+
+    def check() -> None:
+        motion.check()
+        if control.regime is not regime or control.hands != "system" or not control.valid(regime.held):
+            raise precondition("ControlLost", "the system does not fly this mission any more")
 
     return check

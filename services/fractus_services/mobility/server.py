@@ -17,14 +17,19 @@ from fractus_services.auth import KEEPALIVE, TlsFiles
 from fractus_services.clock import Clock
 from fractus_services.grants import GrantFiles
 from fractus_services.mobility.autopilot import Autopilot
+from fractus_services.mobility.backstop import Backstop
 from fractus_services.mobility.chauffeur import Chauffeur
 from fractus_services.mobility.control import Control
+from fractus_services.mobility.courses import Courses
 from fractus_services.mobility.guard import Guard
 from fractus_services.mobility.handlers import MobilityHandlers
+from fractus_services.mobility.homing import Homing
 from fractus_services.mobility.journal import Journal
 from fractus_services.mobility.observer import Observer
 from fractus_services.mobility.service import MobilityService
+from fractus_services.mobility.streams import Streams
 from fractus_services.mobility.supervisor import Supervisor
+from fractus_services.mobility.tours import Tours
 from fractus_services.mobility.watch import Watch
 from fractus_services.seals import Seals
 
@@ -63,9 +68,14 @@ async def run(options: Options, stop: asyncio.Event) -> None:
     grants = GrantFiles(options.grants, node, seals, options.flat_terrain, audit.refused_grant)
     journal = Journal(options.state)
     autopilot = Autopilot(url)
-    control = Control(autopilot, journal, grants, audit, options.driver_grace)
+    backstop = Backstop(autopilot, options.state)
+    control = Control(autopilot, journal, grants, audit, backstop=backstop, grace_s=options.driver_grace)
     guard = Guard(control, audit, clock)
-    control.chauffeur = Chauffeur(control, guard).bring
+    homing = Homing(control, guard)
+    control.helm.approach = homing.approach
+    courses = Courses(control, guard)
+    chauffeur = Chauffeur(control, guard, courses)
+    tours = Tours(control, grants, chauffeur, courses, options.boarding)
     supervisor = Supervisor(control)
     autopilot.alive = supervisor.alive
     watch = Watch(control, guard, audit, supervisor)
@@ -75,12 +85,20 @@ async def run(options: Options, stop: asyncio.Event) -> None:
     audit.append("started", {"node": node, "autopilot": url})
     grants.listen(lambda old, new: _record_grant(audit, old, new))
     grants.scan()
-    service = MobilityService(control, guard)
-    handlers = MobilityHandlers(service, control, grants, node, clock)
+    service = MobilityService(control, guard, homing)
+    streams = Streams(control, chauffeur.bring)
+    handlers = MobilityHandlers(service, control, streams, grants=grants, node=node, clock=clock, heard=tours.heard)
     async with asyncio.TaskGroup() as tasks:
         running = [
             tasks.create_task(part)
-            for part in (autopilot.run(), grants.run(), watch.run(), watch.record(), _serve(options, tls, handlers))
+            for part in (
+                autopilot.run(),
+                grants.run(),
+                watch.run(),
+                watch.record(),
+                tours.run(),
+                _serve(options, tls, handlers),
+            )
         ]
         await stop.wait()
         log.info("stopping; a drone in the air flies home by its autopilot's failsafe")

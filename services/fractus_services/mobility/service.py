@@ -7,22 +7,28 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import aclosing
 from dataclasses import dataclass
 
-from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, Verdict
+from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, VelocityArgs, Verdict
 
 from fractus_services.grants import Held
 from fractus_services.mobility.arming import arm
-from fractus_services.mobility.autopilot import Autopilot
+from fractus_services.mobility.autopilot import Autopilot, Permit
 from fractus_services.mobility.control import Control
+from fractus_services.mobility.courses import Trip
 from fractus_services.mobility.guard import Guard
+from fractus_services.mobility.homing import Homing
 from fractus_services.mobility.leases import Motion
-from fractus_services.mobility.motions import REACHED_M, Step, climb, come_down, fly_to
+from fractus_services.mobility.motions import REACHED_M, Step, climb, come_down, come_to_rest, fly_to
 from fractus_services.mobility.permits import driver_permit
-from fractus_services.mobility.vehicle import GUIDED, LAND, RTL
-from fractus_services.replies import precondition, refused
+from fractus_services.mobility.steering import Steering
+from fractus_services.mobility.vehicle import GUIDED, LAND, RTL, SMART_RTL
+from fractus_services.replies import Refused, aborted, precondition, refused
 
 MAX_REACHED_M = 50.0
 JUDGE_AGAIN_S = 0.05
 """A goto whose command waited for longer is judged again, at the place where the drone is by then."""
+
+JUDGEMENTS = 6
+"""So often a call is judged before it is given up: a drone that does not come to rest cannot begin its leg."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +39,20 @@ class Progress:
     step: Step
 
 
+MOVING = frozenset(
+    {"Arm", "Disarm", "Takeoff", "Land", "Goto", "ReturnToLaunch", "Hover", "SetSpeed", "SetVelocity", "ReturnControl"}
+)
+"""Methods that only who drives may call."""
+
+
 class MobilityService:
     """Table 8.2 of the thesis, for callers whose grant is known."""
 
-    def __init__(self, control: Control, guard: Guard) -> None:
+    def __init__(self, control: Control, guard: Guard, homing: Homing) -> None:
         self._control = control
         self._guard = guard
+        self._homing = homing
+        self._steering = Steering(control)
         self._autopilot: Autopilot = control.autopilot
 
     def allow(self, call: Call, held: Held) -> Verdict:
@@ -52,12 +66,21 @@ class MobilityService:
             raise refused(verdict)
         return verdict
 
+    def check(self, call: Call, held: Held) -> Verdict:
+        """The verdict on a call that is not carried out."""
+        if held.spec.class_ != "driver" and call.method in MOVING:
+            return self._not_a_driver(call, held, kind="check")
+        return self._guard.judge(call, held, kind="check")
+
+    def _not_a_driver(self, call: Call, held: Held, *, kind: str = "call") -> Verdict:
+        verdict = Verdict("deny", None, "NotADriver", f"passengers ride along; only a driver may {call.method}")
+        self._guard.record(call, held.identity, verdict, self._guard.situation(), kind=kind)
+        return verdict
+
     def _allow_motion(self, call: Call, held: Held) -> Verdict:
         """Judge a call that moves the drone, of a driver that has it; a takeover happens here."""
         if held.spec.class_ != "driver":
-            verdict = Verdict("deny", None, "NotADriver", f"passengers ride along; only a driver may {call.method}")
-            self._guard.record(call, held.identity, verdict, self._guard.situation())
-            raise refused(verdict)
+            raise refused(self._not_a_driver(call, held))
         verdict = self._guard.judge(call, held)
         if verdict.code == "MethodNotGranted":
             raise refused(verdict)
@@ -121,21 +144,12 @@ class MobilityService:
         """Fly straight to a point."""
         verdict = self._allow_motion(Call("Goto", args), held)
         self._flying("Goto")
-        target = verdict.args if isinstance(verdict.args, GotoArgs) else args
         radius = min(max(reached_m, 0.3), MAX_REACHED_M) if reached_m > 0 else REACHED_M
 
         async def steps(motion: Motion) -> AsyncIterator[Progress]:
-            permit, final, goal = driver_permit(self._control, held, motion), verdict, target
-            begun = self._autopilot.now
-            await self._control.helm.change_mode(GUIDED, permit)
-            speed = goal.speed_mps or self._control.speed_mps
-            if speed is not None:
-                await self._autopilot.set_speed(speed, permit)
-            if self._autopilot.now - begun > JUDGE_AGAIN_S:
-                permit()
-                lease = self._control.require(held)
-                final = self._allow_motion(Call("Goto", args), lease.held)
-                goal = final.args if isinstance(final.args, GotoArgs) else args
+            permit = driver_permit(self._control, held, motion)
+            final = await self._settled(Call("Goto", args), held, verdict, motion, permit)
+            goal = final.args if isinstance(final.args, GotoArgs) else args
             async for step in fly_to(self._autopilot, motion, goal, radius, permit):
                 if step.complete:
                     self._control.reached(held, args.lat, args.lon)
@@ -143,24 +157,82 @@ class MobilityService:
 
         return self._run("Goto", steps)
 
+    async def _settled(self, call: Call, held: Held, verdict: Verdict, motion: Motion, permit: Permit) -> Verdict:
+        """The verdict to carry out, given where the drone is once it may be: in GUIDED, and standing if need be.
+
+        Raises:
+            Refused: the call is not legal from there, or the drone does not come to rest.
+        """
+        flown_mps: float | None = None
+        for _ in range(JUDGEMENTS):
+            begun = self._autopilot.now
+            await self._control.helm.change_mode(GUIDED, permit)
+            if verdict.brake_first:
+                await come_to_rest(self._autopilot, motion, permit)
+            elif isinstance(verdict.args, GotoArgs):
+                speed = verdict.args.speed_mps or self._control.speed_mps
+                if speed is not None and speed != flown_mps:
+                    await self._autopilot.set_speed(speed, permit)
+                    flown_mps = speed
+            if not verdict.brake_first and self._autopilot.now - begun <= JUDGE_AGAIN_S:
+                return verdict
+            permit()
+            verdict = self._allow_motion(call, self._control.require(held).held)
+        raise aborted("NotStopping", "the drone does not come to rest, and could not begin its leg otherwise")
+
+    async def set_velocity(self, held: Held, args: VelocityArgs) -> tuple[Verdict, VelocityArgs]:
+        """Fly with a velocity until the next one, or until its hold is over."""
+        verdict = self._allow_motion(Call("SetVelocity", args), held)
+        self._flying("SetVelocity")
+        motion = self._steering.motion()
+        permit = driver_permit(self._control, held, motion)
+        try:
+            final = await self._settled(Call("SetVelocity", args), held, verdict, motion, permit)
+            setpoint = final.args if isinstance(final.args, VelocityArgs) else args
+            self._steering.steer(setpoint, motion, permit)
+        except BaseException:
+            self._control.failed(motion)
+            raise
+        return final, setpoint
+
     def land(self, held: Held) -> AsyncIterator[Progress]:
         """Come down here."""
-        return self._descend("Land", LAND, held)
-
-    def return_to_launch(self, held: Held) -> AsyncIterator[Progress]:
-        """Fly home and land."""
-        return self._descend("ReturnToLaunch", RTL, held)
-
-    def _descend(self, method: str, mode: int, held: Held) -> AsyncIterator[Progress]:
-        verdict = self._allow_motion(Call(method), held)
-        self._flying(method)
+        verdict = self._allow_motion(Call("Land"), held)
+        self._flying("Land")
 
         async def steps(motion: Motion) -> AsyncIterator[Progress]:
-            await self._control.helm.change_mode(mode, driver_permit(self._control, held, motion))
+            await self._control.helm.change_mode(LAND, driver_permit(self._control, held, motion))
             async for step in come_down(self._autopilot, motion):
                 yield Progress(verdict, step)
 
-        return self._run(method, steps)
+        return self._run("Land", steps)
+
+    def return_to_launch(self, held: Held) -> AsyncIterator[Progress]:
+        """Fly home, around what is in the way, and land."""
+        verdict = self._allow_motion(Call("ReturnToLaunch"), held)
+        self._flying("ReturnToLaunch")
+
+        async def steps(motion: Motion) -> AsyncIterator[Progress]:
+            control = self._control
+            permit = driver_permit(control, held, motion)
+            regime = control.under(control.require(held).held)
+            try:
+                trip = Trip(regime, motion.kind, lambda _motion: permit)
+                async with aclosing(self._homing.around(trip, motion)) as legs:  # type: ignore[type-var]
+                    async for step in legs:
+                        yield Progress(verdict, step)
+                mode = RTL
+            except Refused as refusal:
+                if refusal.verdict.code != "NoLegalWay" or not control.retraces:
+                    raise
+                mode = SMART_RTL
+            finally:
+                control.relieve(regime)
+            await control.helm.change_mode(mode, permit)
+            async for step in come_down(self._autopilot, motion):
+                yield Progress(verdict, step)
+
+        return self._run("ReturnToLaunch", steps)
 
     def _flying(self, method: str) -> None:
         if not self._autopilot.vehicle.in_air:

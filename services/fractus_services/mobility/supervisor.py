@@ -55,13 +55,14 @@ class Supervisor:
         )
 
     def _orphaned(self) -> bool:
-        """Whether the motors run for nobody: no pilot, no driver, no chauffeur, no grace, nothing that brings it home."""
+        """Whether the motors run for nobody: no pilot, no driver, no chauffeur, no tour, no grace, no way home."""
         control, lease = self._control, self._control.lease
         if not control.autopilot.vehicle.armed or control.helm.arming or control.hands == "pilot" or control.graced:
             return False
-        if lease is not None and (control.drives(lease) or control.chauffeured is not None):
+        if lease is not None and (control.drives(lease) or control.regime is not None):
             return False
-        return not control.homeward or control.system is None or control.system.done()
+        at_work = control.system is not None and not control.system.done()
+        return not (at_work and (control.homeward or control.touring is not None))
 
     def _adopt(self) -> None:
         control, mission = self._control, self._control.journal.flying

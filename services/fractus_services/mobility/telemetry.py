@@ -63,6 +63,9 @@ def telemetry_of(control: Control, time_s: float, missions: bool) -> Any:
         message.position.CopyFrom(position_of(vehicle))
         message.velocity.CopyFrom(velocity_of(vehicle))
         message.position_error_m = vehicle.position_error_m + vehicle.speed_mps * max(position_age_s(control), 0.0)
+    if control.autopilot.now - vehicle.attitude_at <= STALE_S:
+        message.attitude.roll_deg, message.attitude.pitch_deg = vehicle.roll_deg, vehicle.pitch_deg
+        message.attitude.yaw_deg = vehicle.heading_deg
     if vehicle.home is not None:
         message.home.latitude_deg, message.home.longitude_deg = vehicle.home.lat, vehicle.home.lon
         message.home.altitude_m = vehicle.home.amsl_m

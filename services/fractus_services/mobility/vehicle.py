@@ -35,6 +35,8 @@ class Vehicle:
     """The streamed state; times are monotonic seconds.
 
     Attributes:
+        yaw_deg: heading as the position says it; `heading_deg` is the attitude's.
+        path_lost: whether the autopilot has given up remembering its path since it was armed.
         located: whether GPS has a three-dimensional fix of some accuracy; positions without one are not taken.
     """
 
@@ -47,6 +49,10 @@ class Vehicle:
     down_mps: float = 0.0
     yaw_deg: float = 0.0
     position_at: float = -math.inf
+    roll_deg: float = 0.0
+    pitch_deg: float = 0.0
+    heading_deg: float = 0.0
+    attitude_at: float = -math.inf
     home: Home | None = None
     mode: int = -1
     armed: bool = False
@@ -62,6 +68,7 @@ class Vehicle:
     located: bool = False
     position_error_m: float = _UNTOLD_ERROR_M
     texts: list[str] = field(default_factory=list)
+    path_lost: bool = False
     failsafe_text: str = ""
     failsafe_text_at: float = -math.inf
 
@@ -135,6 +142,7 @@ def _heartbeat(vehicle: Vehicle, message: Any, now: float) -> None:
     vehicle.heartbeat_at = now
     vehicle.mode = message.custom_mode
     vehicle.armed = bool(message.base_mode & _ARMED)
+    vehicle.path_lost = vehicle.path_lost and vehicle.armed
     vehicle.failsafe = message.system_status in {_CRITICAL, _EMERGENCY}
 
 
@@ -149,6 +157,13 @@ def _position(vehicle: Vehicle, message: Any, now: float) -> None:
     if message.hdg != 0xFFFF:
         vehicle.yaw_deg = message.hdg / 100
     vehicle.position_at = now
+
+
+def _attitude(vehicle: Vehicle, message: Any, now: float) -> None:
+    angles = [math.degrees(radians) for radians in (message.roll, message.pitch, message.yaw)]
+    if all(map(math.isfinite, angles)):
+        vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg = angles[0], angles[1], angles[2] % 360.0
+        vehicle.attitude_at = now
 
 
 def _home(vehicle: Vehicle, message: Any, _now: float) -> None:
@@ -181,6 +196,8 @@ def _text(vehicle: Vehicle, message: Any, now: float) -> None:
     text = raw.decode("utf-8", "replace")
     vehicle.texts.append(text)
     del vehicle.texts[:-20]
+    if text.startswith("SmartRTL deactivated"):
+        vehicle.path_lost = True
     if ("ailsafe" in text and "leared" not in text) or "Fence" in text:
         vehicle.failsafe_text, vehicle.failsafe_text_at = text, now
 
@@ -188,6 +205,7 @@ def _text(vehicle: Vehicle, message: Any, now: float) -> None:
 _HANDLERS = {
     "HEARTBEAT": _heartbeat,
     "GLOBAL_POSITION_INT": _position,
+    "ATTITUDE": _attitude,
     "HOME_POSITION": _home,
     "EXTENDED_SYS_STATE": _landed,
     "SYS_STATUS": _status,

@@ -60,12 +60,13 @@ class Watch:
 
     def look(self) -> None:
         """One check."""
-        control = self._control
-        held = control.mission_grant
-        if held is None or control.hands == "pilot" or control.homeward or control.autopilot.vehicle.mode != GUIDED:
+        control, held = self._control, self._control.mission_grant
+        grant = control.regime.grant if control.regime is not None else held.compiled if held is not None else None
+        coming = control.homeward and control.regime is None
+        if grant is None or control.hands == "pilot" or coming or control.autopilot.vehicle.mode != GUIDED:
             self._alarm = ""
             return
-        verdict = monitor(self._guard.situation(), control.chauffeured or held.compiled)
+        verdict = monitor(self._guard.situation(), grant)
         if verdict is None:
             self._alarm = ""
             return
@@ -73,16 +74,25 @@ class Watch:
         if fresh:
             self._alarm, self._alarm_at = verdict.code, control.autopilot.now
             log.warning("%s: %s", verdict.code, verdict.reason)
-        if verdict.action == "takeover":
-            if control.hands == "driver" or verdict.takeover != "hover":
-                control.take_over(verdict)
-        elif verdict.action == "deny":
-            if fresh:
-                control.brake(verdict)
-            else:
-                control.autopilot.stop()
+        ours = control.homeward or (control.hands != "driver" and verdict.takeover == "hover")
+        if verdict.action == "takeover" and not ours:
+            control.take_over(verdict)
+        elif verdict.action in {"takeover", "deny"}:
+            self._stop(verdict, fresh)
         elif fresh:
             self._correct(verdict)
+
+    def _stop(self, verdict: Verdict, fresh: bool) -> None:
+        """End the motion that makes things worse; the system then looks for another way.
+
+        Where it flies itself and is in a zone already, its way leads out.
+        """
+        if verdict.action == "takeover" and verdict.code != "ExclusionZoneAhead":
+            return
+        if fresh:
+            self._control.brake(verdict)
+        else:
+            self._control.autopilot.stop()
 
     def _correct(self, verdict: Verdict) -> None:
         self._audit.append(

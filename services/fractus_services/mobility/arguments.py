@@ -1,0 +1,131 @@
+"""Calls on the wire and calls of the policy engine: one from the other, both ways."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from fractus_core.api.geometry import Reference
+from fractus_core.policy.values import Args, Call, GotoArgs, SetSpeedArgs, TakeoffArgs, VelocityArgs, Verdict
+from fractus_proto.v1 import mobility_pb2, types_pb2
+
+from fractus_services.replies import Refused, decision, refused
+
+HOLD_S = 0.5
+"""How long a velocity holds when the caller does not say."""
+
+_REFERENCES: dict[int, Reference] = {
+    types_pb2.ALTITUDE_REFERENCE_HOME: "home",
+    types_pb2.ALTITUDE_REFERENCE_AMSL: "amsl",
+    types_pb2.ALTITUDE_REFERENCE_TERRAIN: "terrain",
+}
+
+
+def goto_args(request: mobility_pb2.GotoRequest) -> GotoArgs:
+    """Read a goto.
+
+    Raises:
+        Refused: it has no target, or an altitude reference that nobody knows.
+    """
+    if not request.HasField("target"):
+        raise _invalid("target is missing; give the position to fly to")
+    target = request.target
+    if target.altitude_reference not in _REFERENCES:
+        raise _invalid(f"target.altitude_reference {target.altitude_reference} is unknown; use home, amsl or terrain")
+    return GotoArgs(
+        lat=target.latitude_deg,
+        lon=target.longitude_deg,
+        alt=target.altitude_m,
+        reference=_REFERENCES[target.altitude_reference],
+        yaw_deg=request.yaw_deg if request.HasField("yaw_deg") else None,
+        speed_mps=request.speed_mps if request.speed_mps != 0.0 else None,
+    )
+
+
+def velocity_args(request: mobility_pb2.SetVelocityRequest) -> VelocityArgs:
+    """Read a velocity setpoint.
+
+    Raises:
+        Refused: it has no velocity.
+    """
+    if not request.HasField("velocity"):
+        raise _invalid("velocity is missing; give north, east and down in m/s")
+    return VelocityArgs(
+        north_mps=request.velocity.north_mps,
+        east_mps=request.velocity.east_mps,
+        down_mps=request.velocity.down_mps,
+        yaw_deg=request.yaw_deg if request.HasField("yaw_deg") else None,
+        hold_s=request.hold_s if request.hold_s != 0.0 else HOLD_S,
+    )
+
+
+def call_of(request: mobility_pb2.CheckCallRequest) -> Call:
+    """The call that somebody wants to have judged.
+
+    Raises:
+        Refused: it names no method, or lacks an argument.
+    """
+    which = request.WhichOneof("call")
+    if which is None:
+        raise _invalid("call is missing; name the method to check")
+    read = _ARGUMENTS.get(which)
+    return Call(_METHODS[which], None if read is None else read(getattr(request, which)))
+
+
+def checked(verdict: Verdict) -> mobility_pb2.CheckCallResponse:
+    """The answer to who wanted to know."""
+    reply = mobility_pb2.CheckCallResponse(
+        decision=decision(verdict), takeover=verdict.takeover or "", brake_first=verdict.brake_first
+    )
+    args = verdict.args if verdict.permits else None
+    if isinstance(args, TakeoffArgs):
+        reply.takeoff.altitude_m = args.altitude_m
+    elif isinstance(args, SetSpeedArgs):
+        reply.set_speed.speed_mps = args.speed_mps
+    elif isinstance(args, GotoArgs):
+        _write_goto(reply.goto, args)
+    elif isinstance(args, VelocityArgs):
+        _write_velocity(reply.set_velocity, args)
+    return reply
+
+
+def _write_goto(message: mobility_pb2.GotoRequest, args: GotoArgs) -> None:
+    message.target.latitude_deg, message.target.longitude_deg = args.lat, args.lon
+    message.target.altitude_m = args.alt or 0.0
+    message.speed_mps = args.speed_mps or 0.0
+    if args.yaw_deg is not None:
+        message.yaw_deg = args.yaw_deg
+
+
+def _write_velocity(message: mobility_pb2.SetVelocityRequest, args: VelocityArgs) -> None:
+    message.velocity.north_mps, message.velocity.east_mps = args.north_mps, args.east_mps
+    message.velocity.down_mps, message.hold_s = args.down_mps, args.hold_s
+    if args.yaw_deg is not None:
+        message.yaw_deg = args.yaw_deg
+
+
+def _invalid(reason: str) -> Refused:
+    return refused(Verdict("deny", None, "InvalidArgument", reason))
+
+
+_ARGUMENTS: dict[str, Callable[[Any], Args]] = {
+    "takeoff": lambda request: TakeoffArgs(request.altitude_m),
+    "goto": goto_args,
+    "set_speed": lambda request: SetSpeedArgs(request.speed_mps),
+    "set_velocity": velocity_args,
+}
+_METHODS = {
+    "arm": "Arm",
+    "disarm": "Disarm",
+    "takeoff": "Takeoff",
+    "land": "Land",
+    "goto": "Goto",
+    "return_to_launch": "ReturnToLaunch",
+    "hover": "Hover",
+    "set_speed": "SetSpeed",
+    "set_velocity": "SetVelocity",
+    "get_speed": "GetSpeed",
+    "get_position": "GetPosition",
+    "get_control": "GetControl",
+    "return_control": "ReturnControl",
+}

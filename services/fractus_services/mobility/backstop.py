@@ -1,0 +1,210 @@
+"""The vehicle's own fence as the last line: raised around a mission's outer bounds, and put back as it was after it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from fractus_core.api.plans import GrantSpec
+
+from fractus_services.mobility.autopilot import Autopilot, AutopilotError
+from fractus_services.mobility.bounds import Bounds, bounds_of
+from fractus_services.mobility.itemlists import Item, NoLists, download, upload
+
+log = logging.getLogger(__name__)
+
+ENABLE, TYPE, ALTITUDE, ACTION, OPTIONS = "FENCE_ENABLE", "FENCE_TYPE", "FENCE_ALT_MAX", "FENCE_ACTION", "FENCE_OPTIONS"
+PARAMETERS = (TYPE, ALTITUDE, ACTION, OPTIONS, ENABLE)
+"""In the order in which they are set: the fence is switched on last."""
+
+_WITNESS = "FS_GCS_ENABLE"
+_TOP, _POLYGON = 1, 4
+_RETURN, _RETRACE = 1.0, 3.0
+_UNION = 2
+_CLOSE_E7 = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Owned:
+    """The fence that the vehicle's owner left.
+
+    Attributes:
+        parameters: those that the vehicle has.
+        items: its polygons and circles.
+    """
+
+    parameters: dict[str, float]
+    items: tuple[Item, ...]
+
+    @property
+    def enabled(self) -> bool:
+        """Whether it was in force."""
+        return self.parameters.get(ENABLE, 0.0) != 0.0
+
+
+class Backstop:
+    """Raises and lowers the vehicle's fence. What the owner had is on disk before anything is changed.
+
+    Where the owner's own fence is in force, it stays so: the mission's is added, and the lower ceiling counts.
+
+    Args:
+        autopilot: the link.
+        directory: the service's state directory.
+
+    Attributes:
+        missing: why there is no fence; empty when the autopilot offers one.
+    """
+
+    def __init__(self, autopilot: Autopilot, directory: Path) -> None:
+        self._autopilot = autopilot
+        self._path = directory / "fence.json"
+        self._lock = asyncio.Lock()
+        self.missing = ""
+
+    @property
+    def raised(self) -> bool:
+        """Whether the vehicle has a fence of ours."""
+        return self._path.exists()
+
+    async def raise_around(self, spec: GrantSpec, *, retraces: bool) -> None:
+        """Load the outer bounds of a grant, switch the fence on, and read all of it back.
+
+        An autopilot without fences is left as it is, see `missing`.
+
+        Args:
+            spec: the grant.
+            retraces: whether the vehicle that breaches it is to fly back the way it came.
+
+        Raises:
+            AutopilotError: the fence does not stand; the text says why.
+            OSError: what the owner had cannot be stored.
+        """
+        bounds = bounds_of(spec)
+        if bounds is None:
+            return
+        async with self._lock:
+            if not await self._offered():
+                return
+            try:
+                await self._raise(bounds, _RETRACE if retraces else _RETURN)
+            except NoLists as error:
+                self._lacks(str(error))
+
+    async def lower(self) -> None:
+        """Put back what the owner had, if anything was changed.
+
+        Raises:
+            AutopilotError: it cannot be; it is tried again next time.
+        """
+        async with self._lock:
+            owned = await asyncio.to_thread(self._load)
+            if owned is None:
+                return
+            first = {} if owned.enabled else {ENABLE: 0.0}
+            await self._set(first)
+            await self._write(owned.items)
+            await self._set(owned.parameters)
+            await asyncio.to_thread(self._path.unlink, True)
+            log.info("the vehicle's own fence is as its owner left it")
+
+    async def _offered(self) -> bool:
+        """Whether the autopilot knows fences; only one that answers other questions surely does not."""
+        if await self._autopilot.read_parameter(ENABLE) is not None:
+            self.missing = ""
+            return True
+        if await self._autopilot.read_parameter(_WITNESS) is None:
+            raise AutopilotError("the autopilot stopped answering while its fence was asked for", link=True)
+        self._lacks(f"the autopilot has no {ENABLE}")
+        return False
+
+    def _lacks(self, why: str) -> None:
+        self.missing = why
+        log.warning("the vehicle has no fence of its own as a last line: %s", why)
+
+    async def _raise(self, bounds: Bounds, action: float) -> None:
+        owned = await asyncio.to_thread(self._load)
+        if owned is None:
+            owned = await self._read()
+            await asyncio.to_thread(self._store, owned)
+        kept = owned.items if owned.enabled else ()
+        await self._write((*kept, *bounds.items))
+        await self._set(_wanted(owned, bounds, action))
+        log.info("the vehicle's own fence stands: %d vertices, ceiling %s", len(bounds.items), bounds.altitude_m)
+
+    async def _read(self) -> Owned:
+        found = {name: await self._autopilot.read_parameter(name) for name in PARAMETERS}
+        parameters = {name: value for name, value in found.items() if value is not None}
+        return Owned(parameters, await download(self._autopilot))
+
+    async def _write(self, items: Sequence[Item]) -> None:
+        await upload(self._autopilot, items)
+        stored = await download(self._autopilot)
+        if not _same(stored, items):
+            raise AutopilotError(
+                f"the autopilot stores {len(stored)} fence items that are not the {len(items)} it was sent"
+            )
+
+    async def _set(self, values: dict[str, float]) -> None:
+        for name in PARAMETERS:
+            if name not in values or await self._autopilot.read_parameter(name) == values[name]:
+                continue
+            after = await self._autopilot.write_parameter(name, values[name])
+            if after is None or abs(after - values[name]) > 1e-3 * max(1.0, abs(values[name])):
+                raise AutopilotError(f"{name} cannot be set to {values[name]:g}; it stays {after}")
+
+    def _load(self) -> Owned | None:
+        try:
+            stored = json.loads(self._path.read_bytes())
+            return Owned(dict(stored["parameters"]), tuple(Item(**item) for item in stored["items"]))
+        except FileNotFoundError:
+            return None
+        except (ValueError, KeyError, TypeError) as error:
+            log.critical("%s cannot be read, so the owner's fence is not put back: %s", self._path, error)
+            return None
+
+    def _store(self, owned: Owned) -> None:
+        number, name = tempfile.mkstemp(prefix="fence.", suffix=".new", dir=self._path.parent)
+        try:
+            with os.fdopen(number, "w", encoding="utf-8") as file:
+                json.dump(asdict(owned), file)
+                file.flush()
+                os.fsync(file.fileno())
+            Path(name).replace(self._path)
+        except OSError:
+            Path(name).unlink(missing_ok=True)
+            raise
+
+
+def _wanted(owned: Owned, bounds: Bounds, action: float) -> dict[str, float]:
+    """The parameters of a fence around some bounds, beside the owner's own where that is in force."""
+    had = owned.parameters
+    kinds = (_TOP if bounds.altitude_m is not None else 0) | (_POLYGON if bounds.items else 0)
+    values = {ENABLE: 1.0, TYPE: float(kinds), ACTION: action}
+    ceiling = bounds.altitude_m
+    if owned.enabled:
+        before = int(had.get(TYPE, 0))
+        values[TYPE] = float(before | kinds)
+        values[ACTION] = had.get(ACTION, 0.0) or action
+        if before & _TOP and ALTITUDE in had:
+            ceiling = had[ALTITUDE] if ceiling is None else min(ceiling, had[ALTITUDE])
+    if ceiling is not None:
+        values[ALTITUDE] = ceiling
+    if int(had.get(OPTIONS, 0)) & _UNION:
+        values[OPTIONS] = float(int(had[OPTIONS]) & ~_UNION)
+    return {name: value for name, value in values.items() if name in had or name == ENABLE}
+
+
+def _same(stored: Sequence[Item], sent: Sequence[Item]) -> bool:
+    return len(stored) == len(sent) and all(
+        a.command == b.command
+        and abs(a.param1 - b.param1) < 1e-3
+        and abs(a.lat_e7 - b.lat_e7) <= _CLOSE_E7
+        and abs(a.lon_e7 - b.lon_e7) <= _CLOSE_E7
+        for a, b in zip(stored, sent, strict=True)
+    )

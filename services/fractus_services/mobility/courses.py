@@ -1,0 +1,167 @@
+"""Flights by the system: the legal shortest way to a place, leg by leg, around what appears on it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncIterator, Callable, Iterable
+from contextlib import aclosing
+from dataclasses import dataclass, replace
+
+import grpc
+from fractus_core.policy.compiled import height_m
+from fractus_core.policy.motion import XY
+from fractus_core.policy.routes import route
+from fractus_core.policy.values import Call, GotoArgs, Situation
+
+from fractus_services.mobility.autopilot import Permit
+from fractus_services.mobility.control import Control
+from fractus_services.mobility.guard import Guard
+from fractus_services.mobility.leases import Motion, Regime
+from fractus_services.mobility.motions import REACHED_M, Step, at_rest, come_to_rest, fly_to
+from fractus_services.replies import Refused, aborted, precondition, unavailable
+
+log = logging.getLogger(__name__)
+
+REPLANS = 5
+"""So often a way is looked for again after the monitor stopped the drone on it."""
+
+MAX_LEGS = 60
+
+STOPPED = frozenset(
+    {"ExclusionZoneAhead", "InsideExclusionZone", "OutsideInclusionZone", "OutsideOperationArea", "AltitudeAboveLimit"}
+)
+"""Codes with which the monitor stops a leg that has become illegal."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trip:
+    """A flight by the system.
+
+    Attributes:
+        regime: the fences it keeps to.
+        kind: what its motions are called.
+        permit: for each motion, what its commands are asked for before they are sent.
+    """
+
+    regime: Regime
+    kind: str
+    permit: Callable[[Motion], Permit]
+
+
+def stopped_by_monitor(refusal: Refused) -> bool:
+    """Whether a leg ended because it had become illegal, so that another way may exist."""
+    return refusal.status is grpc.StatusCode.ABORTED and refusal.verdict.code in STOPPED
+
+
+def first_leg(goal: XY, heights_m: Iterable[float], now: Situation, trip: Trip) -> tuple[GotoArgs, bool, float] | None:
+    """The first leg of the shortest legal way to a place from where the drone stands.
+
+    Args:
+        goal: in metres of the grant's frame.
+        heights_m: altitudes above home to fly at, in the order of preference.
+        now: the state of the drone; its position is known.
+        trip: whose fences.
+
+    Returns:
+        The leg, whether it is the last one, and the altitude of the way; None when there is no way.
+    """
+    grant = trip.regime.grant
+    at = grant.frame.xy(now.lat or 0.0, now.lon or 0.0)
+    for height in dict.fromkeys(heights_m):
+        way = route(at, goal, now, grant, height, from_m=now.altitude_m)
+        if way is not None:
+            lat, lon = grant.frame.latlon(*way[0])
+            return GotoArgs(lat, lon, height), len(way) == 1, height
+    return None
+
+
+class Courses:
+    """Flies the system's trips."""
+
+    def __init__(self, control: Control, guard: Guard) -> None:
+        self._control = control
+        self._guard = guard
+
+    async def fly(self, trip: Trip, target: GotoArgs) -> AsyncIterator[Step]:
+        """Fly to a place; a way that becomes illegal under the flying drone is replaced by another.
+
+        Raises:
+            Refused: there is no legal way, or the trip is over.
+            AutopilotError: the autopilot refuses.
+        """
+        for attempt in range(REPLANS + 1):
+            motion = self._control.begin(trip.kind)
+            try:
+                async with aclosing(self._along(trip, motion, target)) as steps:  # type: ignore[type-var]
+                    async for step in steps:
+                        yield step
+            except Refused as refusal:
+                if attempt == REPLANS or not stopped_by_monitor(refusal):
+                    raise
+                log.info("looking for another way: %s", refusal)
+            else:
+                return
+            finally:
+                self._control.finish(motion)
+
+    async def _along(self, trip: Trip, motion: Motion, target: GotoArgs) -> AsyncIterator[Step]:
+        autopilot, permit = self._control.autopilot, trip.permit(motion)
+        for _ in range(MAX_LEGS):
+            if not at_rest(autopilot):
+                await come_to_rest(autopilot, motion, permit)
+            leg, last = self._next(trip, target)
+            leg = await self._allowed(trip, leg, permit)
+            if last:
+                leg = replace(leg, yaw_deg=target.yaw_deg)
+            async for step in fly_to(autopilot, motion, leg, REACHED_M, permit):
+                yield Step(step.distance_m, step.complete and last)
+            if last:
+                return
+        raise aborted("NotFollowing", f"the drone did not arrive within {MAX_LEGS} legs")
+
+    def _next(self, trip: Trip, target: GotoArgs) -> tuple[GotoArgs, bool]:
+        now, grant = self._guard.situation(), trip.regime.grant
+        if now.lat is None or now.lon is None:
+            raise unavailable("the drone's position is not known")
+        wanted = now.altitude_m
+        if target.alt is not None:
+            known = height_m(target.alt, target.reference, now.home, grant.flat_terrain)
+            if known is None:
+                raise precondition(
+                    "TerrainUnknown", "the altitude is given above terrain, and no terrain model is loaded"
+                )
+            wanted = known
+        goal = grant.frame.xy(target.lat, target.lon)
+        found = first_leg(goal, (wanted, now.altitude_m), now, trip)
+        if found is None:
+            raise self._unreachable(trip, target)
+        leg, last, height = found
+        if last and height != wanted:
+            if self._arrived(leg):
+                raise self._unreachable(trip, target)
+            last = False
+        return leg, last
+
+    def _arrived(self, leg: GotoArgs) -> bool:
+        """Whether the drone is at the end of a leg already, so that flying it changes nothing."""
+        return self._guard.distance_m(leg.lat, leg.lon) <= 2 * REACHED_M
+
+    def _unreachable(self, trip: Trip, target: GotoArgs) -> Refused:
+        """No way is found: what the policies say of the straight one tells why."""
+        verdict = self._guard.judge(Call("Goto", target), trip.regime.held, trip.regime.grant)
+        why = verdict.reason or "no way around the zones is found"
+        return precondition("NoLegalWay", f"the system cannot fly to {target.lat:.6f}, {target.lon:.6f}: {why}")
+
+    async def _allowed(self, trip: Trip, leg: GotoArgs, permit: Permit) -> GotoArgs:
+        """A leg as the policies allow it; its speed is set when they change it."""
+        args = self._judged(trip, leg)
+        if args.speed_mps is None:
+            return args
+        await self._control.autopilot.set_speed(args.speed_mps, permit)
+        return self._judged(trip, leg)
+
+    def _judged(self, trip: Trip, leg: GotoArgs) -> GotoArgs:
+        verdict = self._guard.judge(Call("Goto", leg), trip.regime.held, trip.regime.grant)
+        if not verdict.permits or not isinstance(verdict.args, GotoArgs):
+            raise precondition("NoLegalWay", f"the system cannot fly there: {verdict.reason}")
+        return verdict.args

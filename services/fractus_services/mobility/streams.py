@@ -1,0 +1,164 @@
+"""The streams of GetControl: drivers wait for the drone, drive it and leave; passengers ride along."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncIterator, Callable
+from contextlib import aclosing
+
+from fractus_core.policy.values import Verdict
+
+from fractus_services.grants import Held
+from fractus_services.mobility.control import Control
+from fractus_services.mobility.journal import Mission
+from fractus_services.mobility.leases import Lease, News, State
+from fractus_services.mobility.vehicle import HOMEWARD
+from fractus_services.replies import precondition, refused
+
+log = logging.getLogger(__name__)
+
+WAIT_S = 0.5
+TOLD_S = 5.0
+
+
+class Streams:
+    """Who asks for control, and what it is told.
+
+    Args:
+        control: the state machine of the drone.
+        bring: flies the drone to where a driver with partial control takes over, and says what it does meanwhile.
+    """
+
+    def __init__(self, control: Control, bring: Callable[[Lease, Mission], AsyncIterator[str]]) -> None:
+        self._control = control
+        self._bring = bring
+
+    async def follow(self, held: Held) -> AsyncIterator[News]:
+        """The events of a caller's stream.
+
+        Raises:
+            Refused: this caller gets neither the drone nor a ride.
+        """
+        events = self._ride(held) if held.spec.tour else self._drive(held)
+        async with aclosing(events) as running:  # type: ignore[type-var]
+            async for news in running:
+                yield news
+
+    # Drivers
+
+    async def _drive(self, held: Held) -> AsyncIterator[News]:
+        """A driver has the drone from GRANTED until this is closed."""
+        control = self._control
+        mission = self._admit(held)
+        if control.lease is not None:
+            control.lease.tell(News(State.LOST, reason="another stream of the same instance took over"))
+        lease = control.lease = Lease(held)
+        try:
+            while control.lease is lease and not lease.granted:
+                async with aclosing(self._until_ready(lease, mission)) as waiting:  # type: ignore[type-var]
+                    async for reason in waiting:
+                        yield News(State.WAITING, mission.points_done, reason)
+                if control.lease is lease and control.hindrance(lease.key) is None:
+                    yield control.hand_over(lease, mission)
+            while True:
+                try:
+                    news = await lease.next(TOLD_S)
+                except TimeoutError:
+                    continue
+                if news is None:
+                    return
+                yield news
+                if news.final:
+                    return
+        finally:
+            self._left(lease)
+
+    def _admit(self, held: Held) -> Mission:
+        control = self._control
+        if held.spec.class_ != "driver":
+            raise refused(Verdict("deny", None, "NotADriver", "only a driver gets control; passengers ride along"))
+        mission = control.journal.mission(held)
+        _open(mission)
+        other = control.lease
+        if other is not None and other.key != held.key and not other.granted and control.flies_for(held.key):
+            control.lose("another application has the drone")
+        if (control.lease is not None and control.lease.key != held.key) or control.taken(held.key):
+            raise precondition("ControlHeld", "another application has the drone; try again when it is back")
+        return mission
+
+    async def _until_ready(self, lease: Lease, mission: Mission) -> AsyncIterator[str]:
+        control, said = self._control, ""
+        while control.lease is lease:
+            reason = control.hindrance(lease.key)
+            if control.taken(lease.key):
+                raise precondition("ControlHeld", "another application has the drone; try again when it is back")
+            if reason is None:
+                if lease.held.spec.control != "partial":
+                    return
+                lease.transit = True
+                async with aclosing(self._bring(lease, mission)) as flying:  # type: ignore[type-var]
+                    async for news in flying:
+                        yield news
+                return
+            if reason != said:
+                said = reason
+                yield reason
+            await control.wait(WAIT_S)
+
+    def _left(self, lease: Lease) -> None:
+        """A driver's stream is over; without ReturnControl that means the driver is lost."""
+        control = self._control
+        if control.lease is not lease:
+            return
+        control.lease = None
+        mission = control.journal.missions.get(lease.key)
+        if mission is None or not (lease.granted or lease.transit):
+            return
+        control.hands = "system"
+        control.note("driver lost", lease.held.identity, "its stream broke")
+        log.warning("driver %s is lost", lease.held.identity)
+        leaving = control.motion is not None and control.motion.kind in {"Land", "ReturnToLaunch"}
+        coming_down = leaving and control.autopilot.vehicle.mode in HOMEWARD
+        control.stop_motion(precondition("ControlLost", "the driver's stream broke"))
+        if control.autopilot.vehicle.armed and not coming_down:
+            control.start("hover")
+        control.begin_grace(mission, "driver lost")
+
+    # Passengers
+
+    async def _ride(self, held: Held) -> AsyncIterator[News]:
+        """A passenger whose points of interest the system visits is told how far it is; leaving changes nothing."""
+        control = self._control
+        mission = control.journal.mission(held)
+        _open(mission)
+        said: News | None = None
+        while True:
+            news = self._ridden(held, mission)
+            if news != said:
+                said = news
+                yield news
+            if news.final:
+                return
+            await control.wait(WAIT_S)
+
+    def _ridden(self, held: Held, mission: Mission) -> News:
+        done = mission.waypoints
+        if mission.outcome == "complete":
+            return News(State.COMPLETE, done, "every point of interest was visited", done)
+        if mission.outcome:
+            return News(State.LOST, done, mission.outcome, done)
+        if self._control.touring == held.key:
+            return News(State.RIDING, done, "the system flies through the points of interest", done)
+        return News(State.WAITING, done, self._control.hindrance(held.key) or "the system is about to take off", done)
+
+
+def _open(mission: Mission) -> None:
+    """Refuse who asks for a mission that is over.
+
+    Raises:
+        Refused: it is.
+    """
+    if mission.outcome == "complete":
+        raise precondition("MissionComplete", "the mission is complete")
+    if mission.outcome:
+        raise precondition("ControlLost", f"the mission has ended ({mission.outcome})")

@@ -1,0 +1,144 @@
+"""Missions without a driver: the system flies passengers through their points of interest, and home."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+
+import grpc
+
+from fractus_services.grants import GrantFiles, Held
+from fractus_services.mobility.autopilot import AutopilotError
+from fractus_services.mobility.chauffeur import Chauffeur, target_of
+from fractus_services.mobility.control import Control
+from fractus_services.mobility.courses import Courses, Trip
+from fractus_services.mobility.journal import Mission
+from fractus_services.mobility.permits import tour_permit
+from fractus_services.replies import Refused
+
+log = logging.getLogger(__name__)
+
+LOOK_S = 0.5
+STAY_S = 5.0
+"""At a point of interest that is the only place where passengers may use services the drone stays this long."""
+
+
+class Tours:
+    """Begins a tour when its grant is there, the drone is ready and its passengers are aboard; goes on after a restart.
+
+    Args:
+        control: the state machine of the drone.
+        grants: grants of this node.
+        chauffeur: arms and takes off.
+        courses: flies the legs.
+        boarding_s: a passenger that never calls the mobility service is flown this long after its grant came.
+    """
+
+    def __init__(
+        self, control: Control, grants: GrantFiles, chauffeur: Chauffeur, courses: Courses, boarding_s: float
+    ) -> None:
+        self._control = control
+        self._grants = grants
+        self._chauffeur = chauffeur
+        self._courses = courses
+        self._boarding_s = boarding_s
+        self._since: dict[str, float] = {}
+        self._aboard: set[str] = set()
+
+    def heard(self, held: Held) -> None:
+        """A component called: the passengers of its application are aboard."""
+        uid = held.spec.application.uid
+        if uid not in self._aboard:
+            self._aboard.add(uid)
+            self._control.wake()
+
+    async def run(self) -> None:
+        """Look for tours to fly until cancelled."""
+        control = self._control
+        while True:
+            held = self._due()
+            if held is not None:
+                control.stop_system()
+                control.touring = held.key
+                control.system = control.tasks.spawn(self._fly(held))
+            await control.wait(LOOK_S)
+
+    def _due(self) -> Held | None:
+        """The grant whose tour is to begin, or to go on."""
+        control = self._control
+        touring = [held for held in self._grants.held.values() if held.spec.tour]
+        self._since = {held.key: self._since.get(held.key, control.autopilot.now) for held in touring}
+        if control.lease is not None or control.touring is not None:
+            return None
+        return next((held for held in sorted(touring, key=lambda h: h.key) if self._may_begin(held)), None)
+
+    def _may_begin(self, held: Held) -> bool:
+        control, vehicle = self._control, self._control.autopilot.vehicle
+        mission = control.journal.missions.get(held.key)
+        if mission is not None and mission.outcome:
+            return False
+        other = control.journal.flying
+        if other is not None and other.key != held.key and not other.outcome:
+            return False
+        if control.hindrance(held.key) is not None or (vehicle.armed and not control.flies_for(held.key)):
+            return False
+        aboard = held.spec.application.uid in self._aboard
+        begun = mission is not None and mission.flown
+        return aboard or begun or control.autopilot.now - self._since[held.key] >= self._boarding_s
+
+    async def _fly(self, held: Held) -> None:
+        control = self._control
+        mission = control.journal.mission(held)
+        control.note("tour", "system", f"{len(held.spec.tour)} points of interest for {held.identity}")
+        try:
+            await self._visit(held, mission)
+            self._end(mission, "complete")
+        except (Refused, AutopilotError) as error:
+            if mission.outcome or control.hands != "system" or control.touring != held.key:
+                return  # somebody else has taken the drone and has said why
+            if _passing(error) and mission.flown:
+                log.warning("the tour of %s waits: %s", held.identity, error)
+                control.start("hover")
+                control.begin_grace(mission, str(error))
+                return
+            self._end(mission, f"failed: {error}")
+        finally:
+            if control.touring == held.key:
+                control.touring = None
+            control.wake()
+
+    async def _visit(self, held: Held, mission: Mission) -> None:
+        """Fly to each point that was not visited yet."""
+        control = self._control
+        regime = control.begin_transit(held, mission)
+        trip = Trip(regime, "Tour", lambda motion: tour_permit(control, regime, motion))
+        access = held.spec.points_of_interest
+        stay_s = STAY_S if access is not None and access.service_access == "points" else 0.0
+        places = held.spec.tour
+        try:
+            async for doing in self._chauffeur.lift(trip, places[min(mission.waypoints, len(places) - 1)]):
+                log.info("%s", doing)
+            for number in range(mission.waypoints, len(places)):
+                async for _ in self._courses.fly(trip, target_of(places[number])):
+                    pass
+                mission.waypoints = number + 1
+                control.journal.save_soon()
+                control.wake()
+                await asyncio.sleep(stay_s)
+        finally:
+            control.relieve(regime)
+
+    def _end(self, mission: Mission, outcome: str) -> None:
+        control = self._control
+        log.info("the tour of %s ends: %s", mission.identity, outcome)
+        mission.outcome = outcome
+        control.note("returnToLaunch", "system", outcome, kind="control")
+        control.journal.save_soon()
+        control.start("returnToLaunch")
+
+
+def _passing(error: Refused | AutopilotError) -> bool:
+    """Whether what ended a leg may be over in a moment: the autopilot was not heard."""
+    if isinstance(error, AutopilotError):
+        return error.link
+    return error.status is grpc.StatusCode.UNAVAILABLE

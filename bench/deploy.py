@@ -1,0 +1,528 @@
+"""Deploying on 100 to 5,000 simulated nodes: the operator against a real API server, scheduler and kwok.
+
+The traffic-monitoring example is applied as it stands, beside thousands of nodes elsewhere: how long until every pod is
+bound, what the operator takes in CPU and memory, how soon after its start it plans, and that 50 applications applied at
+once all end bound or queued. The comparator creates the same Deployments without Fractus: what Kubernetes takes anyway.
+
+Takes about ten minutes; --quick, with 100 and 1,000 nodes, about two. Needs no root.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import pathlib
+import random
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any
+
+import httpx2
+import yaml
+from fractus_core.api import KINDS
+from fractus_core.api.crd import crd
+from fractus_sim.cluster.loopback import LoopbackCluster, free_port, simulated_node, wait_until
+
+EXAMPLE = pathlib.Path(__file__).parents[1] / "examples" / "traffic-monitoring"
+API = "/apis/fractus.dev/v1alpha1"
+SYSTEM = "fractus-system"
+READY = {"type": "Ready", "status": "True", "reason": "Simulated", "lastTransitionTime": "2026-01-01T00:00:00Z"}
+AT_DEPOT = 40
+AT_ONCE = 50
+SEED = 5000
+NODE = {"cpu": "64", "memory": "64Gi", "pods": "500", "fractus.dev/gpu": "500"}
+
+Body = dict[str, Any]
+
+
+class Api:
+    """The API server, for many threads."""
+
+    def __init__(self, cluster: LoopbackCluster) -> None:
+        import ssl  # noqa: PLC0415
+
+        context = ssl.create_default_context(cafile=str(cluster.ca))
+        context.load_cert_chain(*map(str, cluster.credential))
+        limits = httpx2.Limits(max_connections=16)
+        self._http = httpx2.Client(
+            base_url=cluster.server, verify=context, timeout=60.0, limits=limits, trust_env=False
+        )
+
+    def call(self, method: str, path: str, body: Body | None = None, kind: str = "application/json", **q: str) -> Body:
+        """Send a request; the object in the answer, empty for one that is not found."""
+        content = None if body is None else json.dumps(body)
+        answer = self._http.request(method, path, params=q, content=content, headers={"Content-Type": kind})
+        if answer.status_code == httpx2.codes.NOT_FOUND:
+            return {}
+        if answer.status_code >= httpx2.codes.BAD_REQUEST:
+            raise RuntimeError(f"{method} {path}: {answer.text[:300]}")
+        return answer.json()
+
+    def apply(self, path: str, body: Body) -> None:
+        """Server-side apply."""
+        self.call("PATCH", path, body, "application/apply-patch+yaml", fieldManager="bench", force="true")
+
+    def items(self, path: str, **q: str) -> list[Body]:
+        """A whole collection."""
+        return self.call("GET", path, **q)["items"]
+
+    def watch(self, path: str, version: str) -> Iterator[Body]:
+        """Events of a collection."""
+        q = {"watch": "true", "resourceVersion": version}
+        with self._http.stream("GET", path, params=q, timeout=httpx2.Timeout(10.0, read=600.0)) as answer:
+            for line in answer.iter_lines():
+                yield json.loads(line)
+
+
+# -- the scene --
+
+
+def documents(name: str) -> list[Body]:
+    """The manifests of a file of the example."""
+    return [d for d in yaml.safe_load_all((EXAMPLE / name).read_text()) if d]
+
+
+def path_of(body: Body, namespace: str = "default") -> str:
+    """Where the API server keeps an object of ours."""
+    kind = next(k for k in KINDS if body["kind"] == k.KIND)
+    scope = f"/namespaces/{namespace}" if kind.NAMESPACED else ""
+    return f"{API}{scope}/{kind.PLURAL}/{body['metadata']['name']}"
+
+
+def elsewhere(rng: random.Random, depot: Body) -> Body:
+    """A place 5 to 100 km from the example's."""
+    bearing, distance_m = rng.uniform(0, 2 * math.pi), math.sqrt(rng.uniform(5e3**2, 1e5**2))
+    lat = depot["lat"] + distance_m * math.cos(bearing) / 111_000
+    lon = depot["lon"] + distance_m * math.sin(bearing) / (111_000 * math.cos(math.radians(lat)))
+    return {"lat": round(lat, 6), "lon": round(lon, 6)}
+
+
+class Scene:
+    """Nodes, drones and edge nodes; it only grows."""
+
+    def __init__(self, api: Api) -> None:
+        self._api = api
+        self._rng = random.Random(SEED)
+        self._drone, (self._depot,) = documents("drone.yaml")[0], documents("depot.yaml")
+        self._edges = documents("edge-nodes.yaml")
+        self.nodes = 0
+        for name in (SYSTEM, "plain"):
+            self._api.apply(
+                f"/api/v1/namespaces/{name}", {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": name}}
+            )
+        for body in (self._depot, *documents("zones.yaml"), *documents("policies.yaml")):
+            self._api.apply(path_of(body), body)
+        self._add([("cloud", f"cloud-{i}", None) for i in range(3)])
+        self._add([("edge", e["metadata"]["name"], e["spec"]) for e in self._edges])
+
+    def grow(self, nodes: int) -> None:
+        """So many nodes in all: up to 40 drones in the example's depot, and the rest elsewhere, one drone for five."""
+        made = []
+        for i in range(self.nodes, nodes):
+            if i % 6 == 0:
+                near = i // 6 < AT_DEPOT
+                place = (
+                    {"depot": self._depot["metadata"]["name"]}
+                    if near
+                    else {"depot": None, "home": elsewhere(self._rng, self._depot["spec"]["location"])}
+                )
+                made.append(("drone", f"drone-{i:05d}", {k: v for k, v in (self._drone["spec"] | place).items() if v}))
+            else:
+                spec = self._edges[0]["spec"] | {"location": elsewhere(self._rng, self._depot["spec"]["location"])}
+                made.append(("edge", f"edge-{i:05d}", spec))
+        self._add(made)
+
+    def _add(self, made: list[tuple[str, str, Body | None]]) -> None:
+        with ThreadPoolExecutor(8) as pool:
+            for _ in pool.map(self._add_one, made):
+                pass
+        self.nodes += len(made)
+        names = {name for _, name, _ in made}
+        wait_until(lambda: names <= self._ready(), "nodes to be Ready", timeout_s=300, pause_s=1.0)
+
+    def _ready(self) -> set[str]:
+        return {
+            n["metadata"]["name"]
+            for n in self._api.items("/api/v1/nodes", resourceVersion="0")
+            if any(c["type"] == "Ready" and c["status"] == "True" for c in n["status"].get("conditions", ()))
+        }
+
+    def _add_one(self, made: tuple[str, str, Body | None]) -> None:
+        node_class, name, spec = made
+        self._api.call("POST", "/api/v1/nodes", simulated_node(name, node_class, NODE))
+        if spec is None:
+            return
+        kind = "Drone" if node_class == "drone" else "EdgeNode"
+        body = {"apiVersion": "fractus.dev/v1alpha1", "kind": kind, "metadata": {"name": name}, "spec": spec}
+        self._api.apply(path_of(body), body)
+        if kind == "Drone":
+            status = {"flightState": "inactive", "battery": {"remaining": 1.0}, "conditions": [READY]}
+            self._api.call("PATCH", path_of(body) + "/status", {"status": status}, "application/merge-patch+json")
+
+
+# -- the operator --
+
+
+@dataclass
+class Operator:
+    """The operator as a process."""
+
+    cluster: LoopbackCluster
+    log: pathlib.Path
+    started: float = 0.0
+    _process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """Start it."""
+        env = {**os.environ, "KUBECONFIG": str(self.cluster.kubeconfig)}
+        env["FRACTUS_HEALTH"] = f"http://127.0.0.1:{free_port()}/healthz"
+        self.started = time.monotonic()
+        with self.log.open("ab") as log:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "fractus_operator"], env=env, stdout=log, stderr=log
+            )
+
+    def stop(self) -> None:
+        """End it."""
+        if self._process is not None:
+            self._process.send_signal(signal.SIGTERM)
+            self._process.wait(30)
+            self._process = None
+
+    def cpu_s(self) -> float:
+        """Seconds of CPU that it has taken."""
+        assert self._process is not None
+        fields = pathlib.Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def memory_mb(self, what: str = "VmRSS") -> float:
+        """Resident memory, or its peak (VmHWM)."""
+        assert self._process is not None
+        text = pathlib.Path(f"/proc/{self._process.pid}/status").read_text()
+        return next(int(line.split()[1]) / 1024 for line in text.splitlines() if line.startswith(what))
+
+
+class Bound:
+    """When each pod was seen to be bound, by namespace; follows the API server in a thread of its own."""
+
+    def __init__(self, api: Api) -> None:
+        self._api = api
+        self.at: dict[str, dict[str, float]] = {}
+        version = api.call("GET", "/api/v1/pods", limit="1")["metadata"]["resourceVersion"]
+        threading.Thread(target=self._follow, args=(version,), daemon=True).start()
+
+    def _follow(self, version: str) -> None:
+        with contextlib.suppress(httpx2.HTTPError):
+            for event in self._api.watch("/api/v1/pods", version):
+                pod = event["object"]
+                if event["type"] != "DELETED" and pod.get("spec", {}).get("nodeName"):
+                    seen = self.at.setdefault(pod["metadata"]["namespace"], {})
+                    seen.setdefault(pod["metadata"]["name"], time.monotonic())
+
+
+# -- measuring --
+
+
+@dataclass
+class Measured:
+    """What was seen at one number of nodes."""
+
+    nodes: int
+    first_plan_s: float = 0.0
+    fractus_s: list[float] = field(default_factory=list)
+    plain_s: list[float] = field(default_factory=list)
+    cpu_per_deploy_s: float = 0.0
+    idle_cpu: float = 0.0
+    memory_mb: float = 0.0
+    peak_mb: float = 0.0
+    at_once_s: float = 0.0
+    at_once_cpu_s: float = 0.0
+    at_once: dict[str, int] = field(default_factory=dict)
+    faults: list[str] = field(default_factory=list)
+
+
+def application(name: str, namespace: str) -> Body:
+    """The example's application."""
+    (body,) = documents("application.yaml")
+    return body | {"metadata": {"name": name, "namespace": namespace}}
+
+
+class Bench:
+    """Measures one number of nodes after another on one control plane."""
+
+    def __init__(self, cluster: LoopbackCluster, directory: pathlib.Path) -> None:
+        self._api = Api(cluster)
+        for kind in KINDS:
+            body = crd(kind)
+            self._api.apply(f"/apis/apiextensions.k8s.io/v1/customresourcedefinitions/{body['metadata']['name']}", body)
+        wait_until(self._kinds_served, "the kinds to be served", timeout_s=60)
+        self.scene = Scene(self._api)
+        self.operator = Operator(cluster, directory / "operator.log")
+        self._bound = Bound(self._api)
+        self._count = 0
+
+    def _kinds_served(self) -> bool:
+        try:
+            return all("items" in self._api.call("GET", f"{API}/{kind.PLURAL}", limit="1") for kind in KINDS)
+        except RuntimeError:
+            return False
+
+    def measure(self, nodes: int, times: int) -> Measured:
+        """Measure at so many nodes."""
+        self.scene.grow(nodes)
+        found = Measured(self.scene.nodes)
+        # Once, so that nodes have their location labels, as they have where the operator is only started again.
+        self.operator.start()
+        self._labelled()
+        self.operator.stop()
+        found.first_plan_s = self._first_plan()
+        self._quiet()
+        cpu = self.operator.cpu_s()
+        for _ in range(times):
+            found.fractus_s.append(self._deploy())
+        found.cpu_per_deploy_s = (self.operator.cpu_s() - cpu) / times
+        for _ in range(times):
+            found.plain_s.append(self._plainly())
+        found.idle_cpu = self._quiet()
+        self._at_once(found)
+        found.memory_mb, found.peak_mb = self.operator.memory_mb(), self.operator.memory_mb("VmHWM")
+        self.operator.stop()
+        return found
+
+    def _labelled(self) -> None:
+        def all_labelled() -> bool:
+            nodes = self._api.items("/api/v1/nodes", resourceVersion="0")
+            return all(
+                "fractus.dev/geohash" in n["metadata"]["labels"]
+                for n in nodes
+                if n["metadata"]["labels"]["fractus.dev/class"] != "cloud"
+            )
+
+        wait_until(all_labelled, "nodes to be labelled", timeout_s=300, pause_s=1.0)
+
+    def _first_plan(self) -> float:
+        """From the start of the operator to the plan of an application that waits for it."""
+        namespace = self._namespace()
+        self._api.apply(path_of(application("first", namespace), namespace), application("first", namespace))
+        plan = f"{API}/namespaces/{namespace}/deploymentplans/first"
+        self.operator.start()
+        wait_until(lambda: bool(self._api.call("GET", plan)), "the first plan", timeout_s=120, pause_s=0.02)
+        taken = time.monotonic() - self.operator.started
+        self._gone(namespace, ["first"])
+        return taken
+
+    def _quiet(self, seconds: float = 5.0) -> float:
+        """Let what was begun come to rest; the share of a core that the operator takes when nothing happens."""
+        time.sleep(2.0)
+        before = self.operator.cpu_s()
+        time.sleep(seconds)
+        return (self.operator.cpu_s() - before) / seconds
+
+    def _deploy(self) -> float:
+        """From apply to the last pod bound."""
+        namespace = self._namespace()
+        began = time.monotonic()
+        self._api.apply(path_of(application("traffic", namespace), namespace), application("traffic", namespace))
+        self._phase(namespace, {"traffic"}, {"Running"})
+        taken = max(self._bound.at[namespace].values()) - began
+        self._gone(namespace, ["traffic"])
+        return taken
+
+    def _plainly(self) -> float:
+        """The same Deployments, created at once by hand: from the first to the last pod bound."""
+        if not hasattr(self, "_templates"):
+            namespace = self._namespace()
+            self._api.apply(path_of(application("traffic", namespace), namespace), application("traffic", namespace))
+            self._phase(namespace, {"traffic"}, {"Running"})
+            self._templates = self._api.items(f"/apis/apps/v1/namespaces/{namespace}/deployments")
+            self._gone(namespace, ["traffic"])
+        namespace = self._namespace()
+        bodies = [
+            {
+                "apiVersion": "apps/v1",
+                "kind": "Deployment",
+                "metadata": {"name": d["metadata"]["name"]},
+                "spec": d["spec"],
+            }
+            for d in self._templates
+        ]
+        wanted = sum(body["spec"]["replicas"] for body in bodies)
+        began = time.monotonic()
+        with ThreadPoolExecutor(8) as pool:
+            list(
+                pool.map(
+                    lambda b: self._api.call("POST", f"/apis/apps/v1/namespaces/{namespace}/deployments", b), bodies
+                )
+            )
+        wait_until(lambda: len(self._bound.at.get(namespace, ())) == wanted, "plain pods", timeout_s=60, pause_s=0.01)
+        taken = max(self._bound.at[namespace].values()) - began
+        self._api.call("DELETE", f"/api/v1/namespaces/{namespace}")
+        return taken
+
+    def _at_once(self, found: Measured) -> None:
+        """Fifty applications at once: who ends bound, who waits, and whether anything was lost or made twice."""
+        namespace, names = self._namespace(), [f"app-{i:02d}" for i in range(AT_ONCE)]
+        cpu, began = self.operator.cpu_s(), time.monotonic()
+        with ThreadPoolExecutor(8) as pool:
+            for _ in pool.map(
+                lambda n: self._api.apply(path_of(application(n, namespace), namespace), application(n, namespace)),
+                names,
+            ):
+                pass
+        self._phase(namespace, set(names), {"Running", "Queued"})
+        found.at_once_s = max(self._bound.at[namespace].values()) - began
+        found.at_once_cpu_s = self.operator.cpu_s() - cpu
+        found.faults = self._audit(namespace, names, found)
+        self._gone(namespace, names)
+
+    def _audit(self, namespace: str, names: list[str], found: Measured) -> list[str]:
+        faults = []
+        applications = {
+            a["metadata"]["name"]: a["status"] for a in self._api.items(f"{API}/namespaces/{namespace}/applications")
+        }
+        plans = {
+            p["metadata"]["name"]: p["spec"] for p in self._api.items(f"{API}/namespaces/{namespace}/deploymentplans")
+        }
+        pods = self._api.items(f"/api/v1/namespaces/{namespace}/pods")
+        phases = [status["phase"] for status in applications.values()]
+        found.at_once = {phase: phases.count(phase) for phase in sorted(set(phases))}
+        if set(applications) != set(names):
+            faults.append("applications were lost")
+        drones = [plan["drone"]["node"] for plan in plans.values()]
+        if len(drones) != len(set(drones)) or len(drones) != found.at_once.get("Running", 0):
+            faults.append(f"{len(drones)} plans have {len(set(drones))} drones")
+        wanted = {
+            (p["instance"], p.get("node")): p.get("replicas", 1) for plan in plans.values() for p in plan["placements"]
+        }
+        seen: dict[tuple[str, str | None], int] = {}
+        for pod in pods:
+            instance = pod["metadata"]["labels"]["fractus.dev/instance"]
+            node = pod["spec"].get("nodeName")
+            key = (instance, node) if (instance, node) in wanted else (instance, None)
+            seen[key] = seen.get(key, 0) + 1
+            if node is None:
+                faults.append(f"{instance} is not bound")
+        if seen != wanted:
+            faults.append(f"{sum(seen.values())} pods for {sum(wanted.values())} planned")
+        expected = min(AT_ONCE, sum(i % 6 == 0 for i in range(self.scene.nodes)), AT_DEPOT)
+        if found.at_once.get("Running", 0) < expected - 1:
+            faults.append(f"{found.at_once} with {expected} drones")
+        return faults
+
+    # -- waiting --
+
+    def _namespace(self) -> str:
+        self._count += 1
+        name = f"bench-{self._count}"
+        self._api.apply(
+            f"/api/v1/namespaces/{name}", {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": name}}
+        )
+        return name
+
+    def _phase(self, namespace: str, names: set[str], phases: set[str]) -> None:
+        def reached() -> bool:
+            items = self._api.items(f"{API}/namespaces/{namespace}/applications", resourceVersion="0")
+            there = {a["metadata"]["name"] for a in items if a.get("status", {}).get("phase") in phases}
+            return there == names
+
+        wait_until(reached, f"{len(names)} applications of {namespace}", timeout_s=180, pause_s=0.1)
+
+    def _gone(self, namespace: str, names: Iterable[str]) -> None:
+        """Delete applications, and wait until nothing is left of them."""
+        for name in names:
+            self._api.call("DELETE", f"{API}/namespaces/{namespace}/applications/{name}")
+        collections = (f"{API}/namespaces/{namespace}/applications", f"/api/v1/namespaces/{namespace}/pods")
+        wait_until(lambda: not any(self._api.items(c) for c in collections), "deletion", timeout_s=180, pause_s=0.2)
+        self._api.call("DELETE", f"/api/v1/namespaces/{namespace}")
+
+
+# -- reporting --
+
+
+def table(rows: Iterable[Measured]) -> Iterator[str]:
+    """The figures as text."""
+    yield f"{'nodes':>6} {'first plan':>10} {'bound p50':>10} {'p95':>7} {'plain p50':>10} {'CPU each':>9} {'idle':>6} {'RSS MB':>7} {'peak MB':>8} {'50 at once':>11} {'CPU':>6}  ended"
+    for r in rows:
+        p95 = sorted(r.fractus_s)[max(0, math.ceil(0.95 * len(r.fractus_s)) - 1)]
+        yield (
+            f"{r.nodes:6d} {r.first_plan_s:8.2f} s {statistics.median(r.fractus_s):8.3f} s {p95:6.2f}s"
+            f" {statistics.median(r.plain_s):8.3f} s {r.cpu_per_deploy_s:7.2f} s {r.idle_cpu:6.1%} {r.memory_mb:7.0f}"
+            f" {r.peak_mb:8.0f} {r.at_once_s:9.1f} s {r.at_once_cpu_s:5.1f}s  {r.at_once}"
+        )
+
+
+def claims(rows: list[Measured]) -> list[dict[str, object]]:
+    """What must hold at the largest number of nodes, and whether it does."""
+    last = rows[-1]
+    bound, plain = statistics.median(last.fractus_s), statistics.median(last.plain_s)
+    faults = [f"{r.nodes} nodes: {fault}" for r in rows for fault in r.faults]
+    for fault in faults:
+        print(f"FAULT {fault}")
+
+    def claim(
+        name: str, ours: float, theirs: float | None, unit: str, target: str, *, holds: bool
+    ) -> dict[str, object]:
+        ratio = theirs / ours if theirs and ours else None
+        return {
+            "name": name,
+            "ours": ours,
+            "theirs": theirs,
+            "unit": unit,
+            "ratio": ratio,
+            "target": target,
+            "holds": holds,
+        }
+
+    at = f"at {last.nodes} nodes"
+    return [
+        claim(f"apply to all pods bound, p50 {at} (theirs: the same Deployments by hand)", bound, plain, "s", "< 0.5 s", holds=bound < 0.5),
+        claim(f"operator start to first plan {at}", last.first_plan_s, None, "s", "< 5 s", holds=last.first_plan_s < 5),
+        claim(f"operator memory, peak {at}", last.peak_mb, None, "MB", "< 200 MB", holds=last.peak_mb < 200),
+        claim(f"{AT_ONCE} applications at once: lost, doubled or unbound", float(len(faults)), None, "faults", "0", holds=not faults),
+    ]  # fmt: skip
+
+
+def main() -> int:
+    """Run and print; 1 if a claim does not hold."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="100 and 1,000 nodes, and few repetitions")
+    parser.add_argument("--json", type=pathlib.Path, help="write the claims to this file")
+    parser.add_argument("--keep", type=pathlib.Path, help="directory for logs, instead of one that is removed")
+    arguments = parser.parse_args()
+    sizes, times = ((100, 1_000), 5) if arguments.quick else ((100, 1_000, 5_000), 11)
+    with contextlib.ExitStack() as stack:
+        directory = arguments.keep or pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        directory.mkdir(parents=True, exist_ok=True)
+        cluster = LoopbackCluster(directory, report=print)
+        stack.callback(cluster.stop)
+        cluster.start()
+        bench = Bench(cluster, directory)
+        stack.callback(bench.operator.stop)
+        rows = []
+        for size in sizes:
+            rows.append(bench.measure(size, times))
+            print("\n".join(table(rows[-1:])), flush=True)
+            cluster.check()
+    found = claims(rows)
+    for c in found:
+        ratio = f" {c['ratio']:.2f}x" if c["ratio"] is not None else ""
+        print(f"{'holds ' if c['holds'] else 'FAILS '} {c['name']}: {c['ours']:.4g} {c['unit']} ({c['target']}){ratio}")
+    if arguments.json:
+        arguments.json.parent.mkdir(parents=True, exist_ok=True)
+        arguments.json.write_text(json.dumps({"claims": found}, indent=2) + "\n")
+    return 0 if all(c["holds"] for c in found) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -16,9 +16,12 @@ from fractus.errors import (
     Unavailable,
 )
 from fractus.pictures import Camera, camera
+from fractus.questions import CanI
 from fractus.values import (
     Action,
     AltitudeReference,
+    Attitude,
+    Check,
     ControlPoint,
     Decision,
     ImageInfo,
@@ -26,15 +29,20 @@ from fractus.values import (
     PositionResult,
     Progress,
     Result,
+    Ride,
     SpeedResult,
     Telemetry,
     Velocity,
+    VelocityResult,
 )
 
 __all__ = [
     "Action",
     "AltitudeReference",
+    "Attitude",
     "Camera",
+    "CanI",
+    "Check",
     "Control",
     "ControlLost",
     "ControlPoint",
@@ -54,10 +62,12 @@ __all__ = [
     "PositionResult",
     "Progress",
     "Result",
+    "Ride",
     "SpeedResult",
     "Telemetry",
     "Unavailable",
     "Velocity",
+    "VelocityResult",
     "camera",
     "control_points",
     "egress",

@@ -16,17 +16,21 @@ from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 from fractus.channel import CALL_TIMEOUT_S, PATIENCE_S, ServiceChannel, backoff
 from fractus.control import Control
 from fractus.environment import Endpoint, endpoint
-from fractus.errors import Corrected, FractusError, translate
+from fractus.errors import ControlLost, Corrected, FractusError, translate
+from fractus.questions import CanI, goto_request, velocity_request
 from fractus.values import (
     AltitudeReference,
+    Check,
     Decision,
     Position,
     PositionResult,
     Progress,
     Result,
+    Ride,
     SpeedResult,
     Telemetry,
     Velocity,
+    VelocityResult,
 )
 
 R = TypeVar("R", bound=Result)
@@ -158,6 +162,8 @@ class Mobility:
         )
         self._strict = strict
         self._control: Control | None = None
+        self.can_i = CanI(self._check)
+        """Dry runs: `await drone.can_i.goto(lat, lon, 20)`."""
 
     async def __aenter__(self) -> Self:
         return self
@@ -203,6 +209,34 @@ class Mobility:
         reply = await self._call("SetSpeed", mobility_pb2.SetSpeedRequest(speed_mps=speed_mps))
         return self._judged(SpeedResult(decision=Decision.from_proto(reply.decision), speed_mps=reply.speed_mps))
 
+    async def set_velocity(
+        self,
+        north_mps: float,
+        east_mps: float,
+        down_mps: float = 0.0,
+        *,
+        yaw_deg: float | None = None,
+        hold_s: float = 0.0,
+    ) -> VelocityResult:
+        """Fly with this velocity over ground until the next one is set.
+
+        When no other follows in time, the drone hovers: call this again and again, ten times a second say.
+
+        Args:
+            north_mps: metres per second.
+            east_mps: metres per second.
+            down_mps: metres per second, positive down.
+            yaw_deg: heading in degrees clockwise from true north; unset leaves it to the autopilot.
+            hold_s: seconds until the drone hovers, 2 at most; 0 leaves it to the service (0.5 s).
+
+        Returns:
+            The velocity in force, after correction.
+        """
+        request = velocity_request(Velocity(north_mps, east_mps, down_mps), yaw_deg, hold_s)
+        reply = await self._call("SetVelocity", request)
+        decision, velocity = Decision.from_proto(reply.decision), Velocity.from_proto(reply.velocity)
+        return self._judged(VelocityResult(decision=decision, velocity=velocity))
+
     async def speed(self) -> SpeedResult:
         """The speed over ground, as measured."""
         reply = await self._call("GetSpeed", mobility_pb2.GetSpeedRequest())
@@ -239,6 +273,7 @@ class Mobility:
         *,
         reference: AltitudeReference = AltitudeReference.HOME,
         yaw_deg: float | None = None,
+        speed_mps: float | None = None,
         acceptance_radius_m: float = 0.0,
         progress: OnProgress | None = None,
         timeout_s: float | None = None,
@@ -251,15 +286,13 @@ class Mobility:
             alt: metres above `reference`.
             reference: what `alt` is measured from; by default the drone's home.
             yaw_deg: heading in degrees clockwise from true north; unset leaves it to the autopilot.
+            speed_mps: horizontal speed of this leg; unset keeps the speed in force.
             acceptance_radius_m: how near counts as reached; 0 leaves it to the service (1 m).
             progress: called with each step of the way.
             timeout_s: gives up, and hovers, after this long.
         """
-        request = mobility_pb2.GotoRequest(
-            target=Position(lat, lon, alt, reference).to_proto(),
-            yaw_deg=yaw_deg,
-            acceptance_radius_m=acceptance_radius_m,
-        )
+        request = goto_request(Position(lat, lon, alt, reference), yaw_deg, speed_mps)
+        request.acceptance_radius_m = acceptance_radius_m
         return self._motion("Goto", request, progress, timeout_s)
 
     async def telemetry(self, interval_s: float = 0.2) -> AsyncGenerator[Telemetry, None]:
@@ -268,25 +301,54 @@ class Mobility:
         Raises:
             Unavailable: the service is away, and did not come back.
         """
-        loop = asyncio.get_running_loop()
         request = mobility_pb2.SubscribeTelemetryRequest(interval_s=interval_s)
+        async with aclosing(self._stream("SubscribeTelemetry", request)) as samples:
+            async for message in samples:
+                yield Telemetry.from_proto(message)
+
+    async def ride(self) -> AsyncGenerator[Ride, None]:
+        """For a passenger of an application without a driver: how far the system is with its points of interest.
+
+        The iteration ends when all were visited; the drone then flies home.
+
+        Raises:
+            ControlLost: the mission ended before.
+            MissionComplete: it was complete before this began.
+            Unavailable: the service is away, and did not come back.
+        """
+        states = mobility_pb2.ControlEvent
+        async with aclosing(self._stream("GetControl", mobility_pb2.GetControlRequest())) as events:
+            async for event in events:
+                if event.state == states.STATE_LOST:
+                    raise ControlLost(event.reason)
+                complete = event.state == states.STATE_COMPLETE
+                yield Ride(event.state == states.STATE_RIDING, event.waypoints_reached, complete, event.reason)
+                if complete:
+                    return
+
+    async def _stream(self, method: str, request: Any) -> AsyncGenerator[Any, None]:
+        """The messages of a stream that is opened again after the service restarts."""
+        loop = asyncio.get_running_loop()
         give_up, delays = loop.time() + self._channel.patience_s, backoff()
         while True:
             async with self._channel.stub() as stub:
-                call = stub.SubscribeTelemetry(request)
+                call = getattr(stub, method)(request)
                 try:
                     async for message in call:
-                        yield Telemetry.from_proto(message)
+                        yield message
                         give_up, delays = loop.time() + self._channel.patience_s, backoff()
                 except grpc.aio.AioRpcError as error:
                     delay = next(delays)
                     if error.code() is not grpc.StatusCode.UNAVAILABLE or loop.time() + delay > give_up:
-                        raise translate(error, "SubscribeTelemetry", self._channel.address) from None
+                        raise translate(error, method, self._channel.address) from None
                 else:
                     return
                 finally:
                     call.cancel()
             await asyncio.sleep(delay)
+
+    async def _check(self, request: mobility_pb2.CheckCallRequest) -> Check:
+        return Check.from_proto(await self._channel.unary("CheckCall", request))
 
     def _motion(self, method: str, request: Any, progress: OnProgress | None, timeout_s: float | None) -> Motion:
         return Motion(

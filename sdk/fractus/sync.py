@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable, Coroutine
+from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
@@ -13,10 +13,29 @@ from fractus import pictures as _pictures
 from fractus.control import Control as _AsyncControl
 from fractus.environment import Endpoint
 from fractus.errors import FractusError
-from fractus.values import AltitudeReference, ImageInfo, PositionResult, Progress, Result, SpeedResult
+from fractus.questions import CanI as _AsyncCanI
+from fractus.values import (
+    AltitudeReference,
+    Check,
+    ImageInfo,
+    PositionResult,
+    Progress,
+    Result,
+    Ride,
+    SpeedResult,
+    Telemetry,
+    VelocityResult,
+)
 
 T = TypeVar("T")
 OnProgress = Callable[[Progress], None]
+
+
+class _End:
+    """Nothing follows."""
+
+
+_END = _End()
 
 
 class _Loop:
@@ -35,6 +54,18 @@ class _Loop:
         except BaseException:
             future.cancel()
             raise
+
+    def iterate(self, items: AsyncGenerator[T, None]) -> Iterator[T]:
+        """The items, one by one; leaving the iteration ends it there, too."""
+
+        async def following() -> T | _End:
+            return await anext(items, _END)
+
+        try:
+            while not isinstance(item := self.run(following()), _End):
+                yield item
+        finally:
+            self.run(items.aclose())
 
     def close(self) -> None:
         """Stop the loop and its thread."""
@@ -89,6 +120,77 @@ class Control:
             raise self._control.lost
 
 
+class CanI:
+    """Dry runs of calls; see `fractus.CanI`."""
+
+    def __init__(self, loop: _Loop, can_i: _AsyncCanI) -> None:
+        self._loop = loop
+        self._can_i = can_i
+
+    def arm(self) -> Check:
+        """Start the motors?"""
+        return self._loop.run(self._can_i.arm())
+
+    def disarm(self) -> Check:
+        """Stop the motors?"""
+        return self._loop.run(self._can_i.disarm())
+
+    def takeoff(self, altitude_m: float) -> Check:
+        """Climb to an altitude above home?"""
+        return self._loop.run(self._can_i.takeoff(altitude_m))
+
+    def land(self) -> Check:
+        """Land here?"""
+        return self._loop.run(self._can_i.land())
+
+    def return_to_launch(self) -> Check:
+        """Fly home and land there?"""
+        return self._loop.run(self._can_i.return_to_launch())
+
+    def hover(self) -> Check:
+        """Stop and stay?"""
+        return self._loop.run(self._can_i.hover())
+
+    def goto(
+        self,
+        lat: float,
+        lon: float,
+        alt: float,
+        *,
+        reference: AltitudeReference = AltitudeReference.HOME,
+        yaw_deg: float | None = None,
+        speed_mps: float | None = None,
+    ) -> Check:
+        """Fly straight to a position?"""
+        asked = self._can_i.goto(lat, lon, alt, reference=reference, yaw_deg=yaw_deg, speed_mps=speed_mps)
+        return self._loop.run(asked)
+
+    def set_speed(self, speed_mps: float) -> Check:
+        """Fly at this speed?"""
+        return self._loop.run(self._can_i.set_speed(speed_mps))
+
+    def set_velocity(
+        self,
+        north_mps: float,
+        east_mps: float,
+        down_mps: float = 0.0,
+        *,
+        yaw_deg: float | None = None,
+        hold_s: float = 0.0,
+    ) -> Check:
+        """Fly with this velocity?"""
+        asked = self._can_i.set_velocity(north_mps, east_mps, down_mps, yaw_deg=yaw_deg, hold_s=hold_s)
+        return self._loop.run(asked)
+
+    def position(self) -> Check:
+        """Ask where the drone is?"""
+        return self._loop.run(self._can_i.position())
+
+    def speed(self) -> Check:
+        """Ask how fast the drone is?"""
+        return self._loop.run(self._can_i.speed())
+
+
 class Mobility:
     """The mobility service of this node; see `fractus.Mobility`."""
 
@@ -96,6 +198,8 @@ class Mobility:
         drone = _drone.mobility(endpoint, strict=strict)
         self._loop = _Loop()
         self._drone = drone
+        self.can_i = CanI(self._loop, drone.can_i)
+        """Dry runs: `drone.can_i.goto(lat, lon, 20)`."""
 
     def __enter__(self) -> Self:
         return self
@@ -130,6 +234,27 @@ class Mobility:
         """Fly at this speed over ground from now on."""
         return self._loop.run(self._drone.set_speed(speed_mps))
 
+    def set_velocity(
+        self,
+        north_mps: float,
+        east_mps: float,
+        down_mps: float = 0.0,
+        *,
+        yaw_deg: float | None = None,
+        hold_s: float = 0.0,
+    ) -> VelocityResult:
+        """Fly with this velocity until the next one, or until `hold_s` is over; see `fractus.Mobility.set_velocity`."""
+        flying = self._drone.set_velocity(north_mps, east_mps, down_mps, yaw_deg=yaw_deg, hold_s=hold_s)
+        return self._loop.run(flying)
+
+    def telemetry(self, interval_s: float = 0.2) -> Iterator[Telemetry]:
+        """The drone's state, every `interval_s` seconds, until the iteration is left."""
+        return self._loop.iterate(self._drone.telemetry(interval_s))
+
+    def ride(self) -> Iterator[Ride]:
+        """For a passenger of an application without a driver; see `fractus.Mobility.ride`."""
+        return self._loop.iterate(self._drone.ride())
+
     def speed(self) -> SpeedResult:
         """The speed over ground, as measured."""
         return self._loop.run(self._drone.speed())
@@ -160,6 +285,7 @@ class Mobility:
         *,
         reference: AltitudeReference = AltitudeReference.HOME,
         yaw_deg: float | None = None,
+        speed_mps: float | None = None,
         acceptance_radius_m: float = 0.0,
         progress: OnProgress | None = None,
         timeout_s: float | None = None,
@@ -172,6 +298,7 @@ class Mobility:
                 alt,
                 reference=reference,
                 yaw_deg=yaw_deg,
+                speed_mps=speed_mps,
                 acceptance_radius_m=acceptance_radius_m,
                 progress=progress,
                 timeout_s=timeout_s,

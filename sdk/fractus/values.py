@@ -64,6 +64,24 @@ class Velocity:
         """Read the wire form."""
         return cls(message.north_mps, message.east_mps, message.down_mps)
 
+    def to_proto(self) -> types_pb2.Velocity:
+        """Write the wire form."""
+        return types_pb2.Velocity(north_mps=self.north, east_mps=self.east, down_mps=self.down)
+
+
+@dataclass(frozen=True, slots=True)
+class Attitude:
+    """Orientation of the airframe in degrees: right side down, nose up, clockwise from true north."""
+
+    roll_deg: float
+    pitch_deg: float
+    yaw_deg: float
+
+    @classmethod
+    def from_proto(cls, message: types_pb2.Attitude) -> Attitude:
+        """Read the wire form."""
+        return cls(message.roll_deg, message.pitch_deg, message.yaw_deg)
+
 
 class Action(enum.Enum):
     """What the policy checker did with a call."""
@@ -147,9 +165,80 @@ class PositionResult(Result):
     velocity: Velocity
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VelocityResult(Result):
+    """The velocity in force, after correction."""
+
+    velocity: Velocity
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Check(Result):
+    """What would become of a call now. Nothing was done; a moment later the answer may be another.
+
+    Attributes:
+        position: where a goto would lead, after correction.
+        altitude_m: how high a takeoff would climb, after correction.
+        speed_mps: the speed that would be in force, after correction.
+        velocity: the velocity that would be in force, after correction.
+        takeover: what the system would do with the drone: hover, land, returnToLaunch or revoke; empty: it would not take it.
+        brake_first: whether the drone would be stopped first, to turn on the spot.
+    """
+
+    position: Position | None = None
+    altitude_m: float | None = None
+    speed_mps: float | None = None
+    velocity: Velocity | None = None
+    takeover: str = ""
+    brake_first: bool = False
+
+    @property
+    def allowed(self) -> bool:
+        """Whether the call would be carried out, as asked or corrected."""
+        return self.decision.action in {Action.ALLOW, Action.CORRECT}
+
+    def __bool__(self) -> bool:
+        return self.allowed
+
+    @classmethod
+    def from_proto(cls, message: mobility_pb2.CheckCallResponse) -> Check:
+        """Read the wire form."""
+        which = message.WhichOneof("result")
+        goto = message.goto if which == "goto" else None
+        speed = message.set_speed if which == "set_speed" else goto
+        return cls(
+            decision=Decision.from_proto(message.decision),
+            position=Position.from_proto(goto.target) if goto is not None else None,
+            altitude_m=message.takeoff.altitude_m if which == "takeoff" else None,
+            speed_mps=(speed.speed_mps or None) if speed is not None else None,
+            velocity=Velocity.from_proto(message.set_velocity.velocity) if which == "set_velocity" else None,
+            takeover=message.takeover,
+            brake_first=message.brake_first,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Ride:
+    """How far the system is with the points of interest of a passenger.
+
+    Attributes:
+        flying: whether it is on the tour; until then `reason` says what it waits for.
+        visited: how many points the drone was at.
+        complete: whether that was all of them.
+    """
+
+    flying: bool
+    visited: int
+    complete: bool
+    reason: str
+
+
 @dataclass(frozen=True, slots=True)
 class Telemetry:
-    """One sample of the drone's state; altitudes of `position` and `home` are above home and AMSL."""
+    """One sample of the drone's state; altitudes of `position` and `home` are above home and AMSL.
+
+    `attitude` is None while nobody knows it.
+    """
 
     time: datetime
     position: Position
@@ -164,6 +253,7 @@ class Telemetry:
     home: Position
     flight_state: str
     controller: str
+    attitude: Attitude | None = None
 
     @classmethod
     def from_proto(cls, message: mobility_pb2.Telemetry) -> Telemetry:
@@ -182,6 +272,7 @@ class Telemetry:
             home=Position.from_proto(message.home),
             flight_state=message.flight_state,
             controller=message.controller,
+            attitude=Attitude.from_proto(message.attitude) if message.HasField("attitude") else None,
         )
 
 

@@ -1,0 +1,200 @@
+"""The vehicle's own fence around a mission: what is loaded, beside what, and what happens when it cannot be."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import shapely
+from fractus_core.api.plans import GrantSpec
+from fractus_core.geo import LocalFrame
+from fractus_services.mobility import backstop as module
+from fractus_services.mobility.autopilot import AutopilotError
+from fractus_services.mobility.backstop import Backstop
+from fractus_services.mobility.bounds import ROOM_M, bounds_of
+from fractus_services.mobility.itemlists import Item, NoLists
+
+FRAME = LocalFrame(39.36, 22.95)
+
+
+def area(x0: float, y0: float, x1: float, y1: float) -> dict[str, Any]:
+    corners = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+    return {"polygon": {"exterior": [dict(zip(("lat", "lon"), FRAME.latlon(x, y), strict=True)) for x, y in corners]}}
+
+
+def spec(*areas: dict[str, Any], **more: Any) -> GrantSpec:
+    body: dict[str, Any] = {
+        "node": "drone-1",
+        "application": {"namespace": "default", "name": "app", "uid": "u1"},
+        "component": "Navigator",
+        "instance": "app-navigator",
+        "operationArea": list(areas),
+        **more,
+    }
+    return GrantSpec.model_validate(body)
+
+
+def outline(items: tuple[Item, ...]) -> Any:
+    return shapely.Polygon([FRAME.xy(i.lat_e7 / 1e7, i.lon_e7 / 1e7) for i in items])
+
+
+class Vehicle:
+    """An autopilot that has parameters and one list of items."""
+
+    def __init__(self, **values: float) -> None:
+        self.values = {"FENCE_ENABLE": 0.0, "FENCE_TYPE": 7.0, "FENCE_ALT_MAX": 100.0, "FENCE_ACTION": 2.0} | values
+        self.values |= {"FS_GCS_ENABLE": 1.0, "FENCE_OPTIONS": 1.0}
+        self.items: tuple[Item, ...] = ()
+        self.written: list[str] = []
+
+    async def read_parameter(self, name: str, attempts: int = 4) -> float | None:
+        del attempts
+        return self.values.get(name)
+
+    async def write_parameter(self, name: str, value: float) -> float | None:
+        self.written.append(name)
+        self.values[name] = value
+        return value
+
+
+@pytest.fixture
+def vehicle(monkeypatch: pytest.MonkeyPatch) -> Vehicle:
+    vehicle = Vehicle()
+
+    async def upload(_autopilot: Any, items: Any) -> None:
+        vehicle.items = tuple(items)
+
+    async def download(_autopilot: Any) -> tuple[Item, ...]:
+        return vehicle.items
+
+    monkeypatch.setattr(module, "upload", upload)
+    monkeypatch.setattr(module, "download", download)
+    return vehicle
+
+
+LIMITS = {"limits": {"maxAltitude": 60, "maxSpeed": 12}}
+
+
+def test_bounds_lie_outside_of_what_is_granted() -> None:
+    bounds = bounds_of(spec(area(-50, -50, 50, 50), corridor=[area(0, -120, 10, 0)], **LIMITS))
+    assert bounds is not None
+    assert bounds.altitude_m == 65.0
+    whole = shapely.union(shapely.box(-50, -50, 50, 50), shapely.box(0, -120, 10, 0))
+    assert outline(bounds.items).contains(whole.buffer(ROOM_M - 0.5, join_style="mitre"))
+    assert outline(bounds.items).area < whole.buffer(3 * ROOM_M).area
+    assert {i.param1 for i in bounds.items} == {float(len(bounds.items))}
+
+
+def test_areas_apart_become_one_polygon() -> None:
+    bounds = bounds_of(spec(area(0, 0, 50, 50), area(200, 0, 250, 50)))
+    assert bounds is not None
+    assert bounds.altitude_m is None
+    assert outline(bounds.items).contains(shapely.box(0, 0, 250, 50))
+
+
+def test_a_round_area_has_few_vertices() -> None:
+    circle = {"circle": {"center": {"lat": 39.36, "lon": 22.95}, "radius": 5000}}
+    bounds = bounds_of(spec(circle))
+    assert bounds is not None
+    assert 4 <= len(bounds.items) <= 60
+    assert outline(bounds.items).contains(shapely.Point(0, 0).buffer(5000))
+
+
+def test_nothing_bounded_nothing_loaded() -> None:
+    assert bounds_of(spec()) is None
+
+
+async def test_a_fence_is_raised_and_put_back(vehicle: Vehicle, tmp_path: Path) -> None:
+    before = dict(vehicle.values)
+    vehicle.items = (Item(5003, 30.0, 1, 2),)
+    backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
+    await backstop.raise_around(spec(area(-50, -50, 50, 50), **LIMITS), retraces=True)
+    assert vehicle.written[-1] == "FENCE_ENABLE", "it is switched on when all else stands"
+    assert vehicle.values["FENCE_TYPE"] == 5.0
+    assert vehicle.values["FENCE_ACTION"] == 3.0
+    assert vehicle.values["FENCE_ALT_MAX"] == 65.0
+    assert {i.command for i in vehicle.items} == {5001}, (
+        "what the owner had stored and not enabled stays out of the way"
+    )
+    again = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
+    assert again.raised, "a service that was restarted knows"
+    await again.raise_around(spec(area(-10, -10, 10, 10)), retraces=False)
+    await again.lower()
+    assert vehicle.values == before
+    assert vehicle.items == (Item(5003, 30.0, 1, 2),)
+    assert not again.raised
+
+
+async def test_the_owners_own_fence_stays_in_force(vehicle: Vehicle, tmp_path: Path) -> None:
+    vehicle.values |= {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 3.0, "FENCE_ALT_MAX": 40.0, "FENCE_OPTIONS": 3.0}
+    vehicle.items = (Item(5003, 30.0, 1, 2),)
+    backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
+    await backstop.raise_around(spec(area(-50, -50, 50, 50), **LIMITS), retraces=True)
+    assert vehicle.items[0] == Item(5003, 30.0, 1, 2)
+    assert len(vehicle.items) == 5
+    assert vehicle.values["FENCE_ALT_MAX"] == 40.0
+    assert vehicle.values["FENCE_TYPE"] == 7.0
+    assert vehicle.values["FENCE_ACTION"] == 2.0
+    assert vehicle.values["FENCE_OPTIONS"] == 1.0, "a union of inclusion areas would weaken both"
+
+
+async def test_a_vehicle_without_fences_is_left_alone(vehicle: Vehicle, tmp_path: Path) -> None:
+    del vehicle.values["FENCE_ENABLE"]
+    backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
+    await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+    assert "FENCE_ENABLE" in backstop.missing
+    assert not vehicle.written
+    vehicle.values.clear()
+    with pytest.raises(AutopilotError, match="stopped answering"):
+        await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+
+
+async def test_a_vehicle_without_item_lists_is_left_alone(
+    vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def unsupported(*_: Any) -> tuple[Item, ...]:
+        raise NoLists("the autopilot keeps no fence items")
+
+    monkeypatch.setattr(module, "download", unsupported)
+    backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
+    await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+    assert backstop.missing
+    assert not backstop.raised
+
+
+async def test_what_is_read_back_must_be_what_was_sent(
+    vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def forgetful(_autopilot: Any, items: Any) -> None:
+        vehicle.items = tuple(items)[:-1]
+
+    monkeypatch.setattr(module, "upload", forgetful)
+    backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
+    with pytest.raises(AutopilotError, match="stores 3 fence items"):
+        await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+
+
+async def test_a_parameter_that_stays_as_it_is_is_told(vehicle: Vehicle, tmp_path: Path) -> None:
+    async def stubborn(name: str, _value: float) -> float:
+        return vehicle.values[name]
+
+    vehicle.write_parameter = stubborn  # type: ignore[method-assign]
+    with pytest.raises(AutopilotError, match="FENCE_TYPE cannot be set to 4"):
+        await Backstop(vehicle, tmp_path).raise_around(spec(area(-50, -50, 50, 50)), retraces=False)  # type: ignore[arg-type]
+
+
+async def test_nothing_is_changed_before_the_owners_fence_is_stored(vehicle: Vehicle, tmp_path: Path) -> None:
+    backstop = Backstop(vehicle, tmp_path / "gone")  # type: ignore[arg-type]
+    with pytest.raises(OSError, match="gone"):
+        await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+    assert not vehicle.written
+    assert not vehicle.items
+
+
+async def test_a_damaged_memory_of_the_owners_fence_is_no_memory(vehicle: Vehicle, tmp_path: Path) -> None:
+    await asyncio.to_thread((tmp_path / "fence.json").write_text, json.dumps({"items": 3}))
+    await Backstop(vehicle, tmp_path).lower()  # type: ignore[arg-type]
+    assert not vehicle.written

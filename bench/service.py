@@ -123,6 +123,7 @@ def side_by_side(folder: Path, seconds: float, stream_rate: int) -> dict[str, tu
             ),
         }  # fmt: skip
         wait_for(lambda: "mobility service on" in processes.log("service"), "the service")
+        wait_for(lambda: "failsafes are set" in processes.log("service"), "the service's link")
         wait_for(lambda: "Detected vehicle" in processes.log("mavproxy"), "MAVProxy")
         time.sleep(15.0)
         processes.check()
@@ -139,7 +140,7 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="ten seconds")
     parser.add_argument("--seconds", type=float, default=60.0, help="how long to watch")
     parser.add_argument(
-        "--stream-rate", type=int, default=10, help="messages a second that MAVProxy asks for (-1: none)"
+        "--stream-rate", type=int, default=4, help="messages a second that MAVProxy asks for; 4 unless told"
     )
     parser.add_argument("--json", type=Path, help="write the claims to a file")
     options = parser.parse_args()

@@ -179,7 +179,7 @@ def _mission(station: Station, step: FlyMission) -> Flight:
     yield from _enter(station, Mode.AUTO)
     yield from _command(station, Command.MISSION_START, 0, 0)
     while station.state.armed:
-        if station.state.mode not in {"AUTO", "RTL", "LAND"}:
+        if station.state.mode != "AUTO":
             raise TaskFailed(f"the autopilot changed to {station.state.mode}")
         yield
 

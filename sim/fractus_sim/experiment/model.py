@@ -105,6 +105,12 @@ class Program(Model):
     command: tuple[str, ...] = Field(min_length=1, description="Relative paths are relative to the file.")
     vehicle: Name | None = Field(default=None, description="Mode vehicles: which vehicle it flies.")
     component: str | None = Field(default=None, description="Mode standalone: which component it is.")
+    port: int | None = Field(
+        default=None,
+        ge=1024,
+        le=65535,
+        description="Mode standalone: where it listens; others find it by its component.",
+    )
     environment: dict[str, str] = Field(default_factory=dict)
     background: bool = Field(default=False, description="Do not wait for its end; it is stopped at the end.")
 

@@ -73,6 +73,7 @@ def profile_of(outcome: Outcome) -> Profile:
         Span(o.begin_s, o.end_s if o.end_s is not None else end_s, f"{number} {o.title}", fault=True)
         for number, o in enumerate(_numbered(outcome), 1)
     ]
+    sagging = any(o.kind == "batteryDrop" for o in outcome.occurrences)
     limits: list[Limit] = []
     for check in outcome.experiment.checks:
         if isinstance(check, AltitudeBand):
@@ -85,6 +86,7 @@ def profile_of(outcome: Outcome) -> Profile:
         title=f"{outcome.experiment.name}: altitude, speed, battery",
         tracks=tracks,
         start_s=0.0,
+        panels=("altitude", "speed", "voltage" if sagging else "battery"),
         limits=tuple(limits),
         spans=tuple(spans),
         axis="seconds since the vehicles were ready",

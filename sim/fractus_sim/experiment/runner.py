@@ -18,6 +18,7 @@ from fractus_sim.experiment.vehicles import VehicleStage
 
 READY_S = 90.0
 LONG_AGO_S = 1e6
+DOWN_S = 5.0
 SHOW_EVERY_S = 0.2
 
 
@@ -83,6 +84,7 @@ class _Play:
     moment: Moment = field(default_factory=lambda: Moment(0.0, 0))
     begun: bool = False
     calm_since_s: float | None = None
+    down_since_s: dict[str, float] = field(default_factory=dict)
 
     @property
     def now_s(self) -> float:
@@ -105,8 +107,16 @@ class _Play:
                 self.recorders[name].take(observer, messages, self.now_s, self.moment.unix_us)
 
     def step_tasks(self) -> None:
+        """Go on with every task; one whose vehicle has landed by itself is over."""
         for name, task in self.tasks.items():
             if self.flights[name].task:
+                continue
+            state = self.stage.observers[name].state
+            if state.armed or state.flying or name not in self.injector.takeoffs_s:
+                self.down_since_s.pop(name, None)
+            elif self.now_s - self.down_since_s.setdefault(name, self.now_s) > DOWN_S:
+                self.flights[name].task = "the vehicle landed by itself"
+                self.tell(name, f"task broken off: {self.flights[name].task}")
                 continue
             try:
                 next(task)

@@ -145,8 +145,11 @@ class RunningDrone:
             self._await("world", self._world_port)
         self.power_on()
 
-    def power_on(self) -> None:
+    def power_on(self, *, wait: bool = True) -> None:
         """Start its companion computer: mobility service and camera service.
+
+        Args:
+            wait: return when they listen.
 
         Raises:
             ExperimentError: one did not come up.
@@ -154,8 +157,9 @@ class RunningDrone:
         self._processes.start(self.process("mobility"), self._mobility_command(), _environment())
         if self._camera_port is not None:
             self._processes.start(self.process("camera"), self._camera_command(), _environment())
-        self._await("mobility", self._mobility_port)
-        if self._camera_port is not None:
+        if wait:
+            self._await("mobility", self._mobility_port)
+        if wait and self._camera_port is not None:
             self._await("camera", self._camera_port)
 
     def power_off(self) -> None:
@@ -219,7 +223,7 @@ class RunningDrone:
         lat, lon, alt = self.setup.home
         return [
             *_module("fractus_sim.world"), "--vehicle", self.station_link, "--listen", f"{LOOPBACK}:{self._world_port}",
-            "--origin", f"{lat:.7f},{lon:.7f},{alt:g}", *further,
+            "--origin", f"{lat:.7f},{lon:.7f}", "--ground", f"{alt:g}", *further,
         ]  # fmt: skip
 
     def _mobility_command(self) -> list[str]:
@@ -374,6 +378,33 @@ class Standalone:
         self.processes.start(name, program.command, program.environment, program.folder)
         self._programs[name] = program
 
+    def run_beside(
+        self,
+        name: str,
+        command: Sequence[str],
+        *,
+        environment: Mapping[str, str] | None = None,
+        services: Mapping[str, str] | None = None,
+        folder: Path | None = None,
+    ) -> None:
+        """Start a program that uses no system service, such as a component in the cloud.
+
+        Args:
+            name: of the program.
+            command: the program and its arguments.
+            environment: further variables.
+            services: see `environment`.
+            folder: its working directory.
+
+        Raises:
+            ExperimentError: it cannot be started.
+        """
+        variables = {f"FRACTUS_SERVICE_{_variable(c)}": address for c, address in (services or {}).items()}
+        variables |= {"FRACTUS_HOST_IP": LOOPBACK, "FRACTUS_INSTANCE": name}
+        program = _Program("", tuple(command), {**_environment(), **variables, **(environment or {})}, folder)
+        self.processes.start(name, program.command, program.environment, program.folder)
+        self._programs[name] = program
+
     def power_off(self, node: str) -> None:
         """Pull the power of a drone's companion computer: services and programs die at once, the vehicle flies on.
 
@@ -385,14 +416,18 @@ class Standalone:
         self.processes.stop(*programs, kill=True)
         self._drone(node).power_off()
 
-    def power_on(self, node: str) -> None:
+    def power_on(self, node: str, *, wait: bool = True) -> None:
         """Give the power back: services start again, and the programs that ran when it went.
+
+        Args:
+            node: the drone.
+            wait: start the programs when services listen, rather than at once.
 
         Raises:
             ExperimentError: one did not come up.
         """
         drone = self._drone(node)
-        drone.power_on()
+        drone.power_on(wait=wait)
         for name in self._off.pop(node, ()):
             program = self._programs[name]
             self.processes.start(name, program.command, program.environment, program.folder)
@@ -410,6 +445,12 @@ class Standalone:
         for name, code in self.processes.dead().items():
             if name not in self._programs and not any(name.startswith(f"{node}-") for node in self._off):
                 raise ExperimentError(f"{name} ended with {code}: {self.processes.last_words(name)}")
+
+    def stop_services(self) -> None:
+        """End programs and services in good order, so that their logs are complete; vehicles go on."""
+        self.processes.stop(*self._programs)
+        for drone in self.drones.values():
+            self.processes.stop(drone.process("camera"), drone.process("mobility"))
 
     def close(self) -> None:
         """End every process: programs first, then services, then vehicles."""

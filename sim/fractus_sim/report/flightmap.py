@@ -32,7 +32,8 @@ from fractus_sim.report.track import Track
 _MARGIN_M = 45.0
 _MARGIN_SHARE = 0.12
 _NAMED_TRACKS = 10
-_ASPECT = 1.35
+_ASPECT = 1.25
+_NEAR_M = 150.0
 _ZONE_STYLES: Mapping[str, tuple[str, str, str]] = {
     "exclusion": (VERMILION, "///", "no-fly zone"),
     "denial": (PURPLE, "...", "calls denied"),
@@ -74,7 +75,7 @@ def _bounds(scene: Scene) -> Bounds:
     shown += [mark.at for mark in scene.marks]
     if scene.area is not None and not scene.area.is_empty:
         shown += _corners(scene.area)
-    core = shapely.box(*shapely.MultiPoint(shown or [(0.0, 0.0)]).buffer(150.0).bounds)
+    core = shapely.box(*_grown(_corners(shapely.MultiPoint(shown or [(0.0, 0.0)])), _NEAR_M))
     for zone in scene.zones:
         if zone.kind != "limit" and zone.shape.intersects(core):
             shown += _corners(zone.shape)
@@ -84,6 +85,11 @@ def _bounds(scene: Scene) -> Bounds:
     half_x, half_y = max(half_x, half_y * _ASPECT), max(half_y, half_x / _ASPECT)
     x, y = (low_x + high_x) / 2, (low_y + high_y) / 2
     return x - half_x, y - half_y, x + half_x, y + half_y
+
+
+def _grown(corners: list[XY], by_m: float) -> Bounds:
+    (low_x, low_y), (high_x, high_y) = corners
+    return low_x - by_m, low_y - by_m, high_x + by_m, high_y + by_m
 
 
 def _corners(shape: Any) -> list[XY]:

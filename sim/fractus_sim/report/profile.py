@@ -12,9 +12,11 @@ from fractus_sim.report.drawing import BLUE, GREY, INK, ORANGE, PURPLE, TRACK_CO
 from fractus_sim.report.scene import MARKS
 from fractus_sim.report.track import Sample, Track
 
-Panel = Literal["altitude", "speed", "battery"]
+Panel = Literal["altitude", "speed", "battery", "voltage"]
 _NAMED_TRACKS = 10
 _HEADROOM = 1.18
+_ROW_POINTS = 12
+_CHARACTER_SHARE = 0.0085  # of the axis, for a letter of the size of a fault's words
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +68,7 @@ _VALUES: Mapping[Panel, tuple[str, Callable[[Sample], float]]] = {
     "altitude": ("metres above home", lambda s: s.place.alt_m),
     "speed": ("metres per second", lambda s: s.speed_mps),
     "battery": ("battery, %", lambda s: s.battery * 100.0),
+    "voltage": ("battery, volts", lambda s: s.voltage_v or 0.0),
 }
 
 
@@ -81,8 +84,8 @@ def draw_profile(profile: Profile) -> Figure:
     first, last = _time_span(profile)
     every[-1].set_xlim(first, max(last, first + 1.0))
     every[-1].set_xlabel(profile.axis, fontsize=9)
-    raised = 14 * min(sum(span.fault for span in profile.spans), 1)
-    every[0].set_title(profile.title, fontsize=11, loc="left", pad=6 + raised)
+    rows = max((row + 1 for span, row in _rows(profile) if span.fault), default=0)
+    every[0].set_title(profile.title, fontsize=11, loc="left", pad=6 + _ROW_POINTS * rows)
     legend(figure, *every)
     return figure
 
@@ -140,13 +143,29 @@ def _requests(axes: Any, profile: Profile) -> list[float]:
     return [request.altitude_m for request in profile.requests]
 
 
+def _rows(profile: Profile) -> list[tuple[Span, int]]:
+    """Spans with the row that a fault's words go to, so that those of neighbours do not overlap."""
+    first, last = _time_span(profile)
+    ends: list[float] = []
+    placed = []
+    for span in sorted(profile.spans, key=lambda span: span.begin_s):
+        if not span.fault:
+            placed.append((span, 0))
+            continue
+        row = next((at for at, end in enumerate(ends) if end <= span.begin_s), len(ends))
+        width_s = (last - first) * len(span.words) * _CHARACTER_SHARE
+        ends[row : row + 1] = [span.begin_s + width_s]
+        placed.append((span, row))
+    return placed
+
+
 def _spans(axes: Any, profile: Profile, *, top: bool) -> None:
-    for span in profile.spans:
+    for span, row in _rows(profile):
         begin, end = span.begin_s - profile.start_s, span.end_s - profile.start_s
         if span.fault:
             axes.axvspan(begin, end, color=PURPLE, alpha=0.16, linewidth=0, zorder=0.6)
             axes.axvline(begin, color=PURPLE, linewidth=1.2, zorder=2)
-            place = {"xytext": (0, 3), "va": "bottom", "ha": "left"}
+            place = {"xytext": (0, 3 + _ROW_POINTS * row), "va": "bottom", "ha": "left"}
         else:
             axes.axvspan(begin, end, color=GREY, alpha=0.13, linewidth=0, zorder=0.5)
             place = {"xytext": (0, -12), "ha": "center"}

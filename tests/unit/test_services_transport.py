@@ -1,8 +1,10 @@
-"""UDP links to an autopilot: who is heard, and who is spoken to."""
+"""UDP and serial links to an autopilot: who is heard, who is spoken to, and what a line does that breaks."""
 
 from __future__ import annotations
 
 import asyncio
+import os
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -64,3 +66,75 @@ def test_a_listening_link_belongs_to_the_first_autopilot(monkeypatch: pytest.Mon
 def test_listening_to_other_hosts_is_refused(host: str) -> None:
     with pytest.raises(BadUrl, match=r"use udpin:127\.0\.0\.1"):
         asyncio.run(open_link(f"udpin:{host}:14550", lambda _data: None, lambda _error: None))
+
+
+class Line:
+    """A pseudoterminal: we are the autopilot at its far end."""
+
+    def __init__(self) -> None:
+        self.far, near = os.openpty()
+        self.name = os.ttyname(near)
+        os.close(near)
+        self.heard: list[bytes] = []
+        self.closed: list[Exception | None] = []
+        self.news = asyncio.Event()
+
+    async def open(self, speed: int = 115200) -> Any:
+        return await open_link(f"serial:{self.name}:{speed}", self._hear, self._close)
+
+    def _hear(self, data: bytes) -> None:
+        self.heard.append(data)
+        self.news.set()
+
+    def _close(self, error: Exception | None) -> None:
+        self.closed.append(error)
+        self.news.set()
+
+    async def until(self, condition: Any) -> None:
+        async with asyncio.timeout(20):
+            while not condition():
+                self.news.clear()
+                await self.news.wait()
+
+
+async def test_a_serial_line_carries_bytes_both_ways() -> None:
+    line = Line()
+    link = await line.open()
+    sent = bytes(range(256))  # with what terminals make of control characters left alone
+    os.write(line.far, sent)
+    await line.until(lambda: b"".join(line.heard) == sent)
+    link.write(sent)
+    assert os.read(line.far, 1000) == sent
+    link.close()
+    link.close()
+    os.close(line.far)
+    assert not line.closed
+
+
+async def test_a_serial_line_that_is_unplugged_breaks_once() -> None:
+    line = Line()
+    link = await line.open()
+    os.close(line.far)
+    await line.until(lambda: line.closed)
+    link.write(b"too late")
+    assert len(line.closed) == 1
+
+
+async def test_a_serial_line_that_takes_nothing_holds_nobody_up() -> None:
+    line = Line()
+    link = await line.open()
+    for _ in range(100):
+        link.write(b"x" * 4096)
+    assert not line.closed
+    link.close()
+    os.close(line.far)
+
+
+async def test_no_serial_line(tmp_path: Path) -> None:
+    plain = tmp_path / "file"
+    plain.touch()
+    for device in (plain, tmp_path / "gone"):
+        with pytest.raises(OSError, match=r".+"):
+            await open_link(f"serial:{device}:115200", lambda _data: None, lambda _error: None)
+    with pytest.raises(BadUrl, match="serial speed 12345"):
+        await Line().open(12345)

@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable
 from fractus_core.policy.values import Takeover
 
 from fractus_services.mobility.autopilot import Autopilot, AutopilotError, Permit, always
+from fractus_services.mobility.motions import FRESH_S, at_rest
 from fractus_services.mobility.vehicle import GUIDED, HOMEWARD, LAND, RTL
 
 log = logging.getLogger(__name__)
@@ -16,8 +17,8 @@ log = logging.getLogger(__name__)
 AGAIN_S = 0.5
 RTL_TRIES = 4
 SETTLE_S = 10.0
+BRAKE_S, BRAKE_AGAIN_S = 8.0, 0.1
 STANDING_MPS = 0.2
-FRESH_S = 1.0
 
 
 class Helm:
@@ -124,13 +125,24 @@ class Helm:
         vehicle = self._autopilot.vehicle
         returning = action != "land" and vehicle.mode in HOMEWARD and self.expected == vehicle.mode
         if not returning:
-            self._autopilot.stop()
+            await self._brake(wanted)
             mode = LAND
             if action != "land" and tries < RTL_TRIES:
                 mode = await self.approach(wanted) if tries == 0 else RTL
             await self.change_mode(mode, lambda: _check(wanted))
         while vehicle.armed and vehicle.mode in HOMEWARD:
             await self._autopilot.update(1.0)
+
+    async def _brake(self, wanted: Callable[[], bool]) -> None:
+        """Bring the drone to rest where that is ours to do, so that it turns home on the spot and not in a wide arc."""
+        autopilot, vehicle = self._autopilot, self._autopilot.vehicle
+        deadline = autopilot.now + BRAKE_S
+        autopilot.stop()
+        while wanted() and vehicle.in_air and vehicle.mode == GUIDED and autopilot.now < deadline:
+            if at_rest(autopilot) or autopilot.now - vehicle.position_at > FRESH_S:
+                return
+            autopilot.stop()
+            await autopilot.update(BRAKE_AGAIN_S)
 
     async def _hover(self) -> None:
         """Hold at once, and again when a takeoff under way gets off the ground."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import ipaddress
 import logging
 import os
@@ -134,10 +135,11 @@ class _Serial:
         self._closed = closed
         self._loop = asyncio.get_running_loop()
         self._fd = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        tty.setraw(self._fd)
-        settings = termios.tcgetattr(self._fd)
-        settings[4] = settings[5] = speed
-        termios.tcsetattr(self._fd, termios.TCSANOW, settings)
+        try:
+            _configure(self._fd, speed)
+        except termios.error as error:
+            os.close(self._fd)
+            raise OSError(*error.args) from error
         self._loop.add_reader(self._fd, self._readable)
 
     def _readable(self) -> None:
@@ -171,6 +173,16 @@ class _Serial:
             self._loop.remove_reader(self._fd)
             os.close(self._fd)
             self._fd = -1
+
+
+def _configure(fd: int, speed: int) -> None:
+    """Raw bytes at a speed, without modem lines, and for nobody else: an autopilot has one owner."""
+    tty.setraw(fd)
+    settings = termios.tcgetattr(fd)
+    settings[2] = (settings[2] | termios.CLOCAL | termios.CREAD) & ~termios.CRTSCTS
+    settings[4] = settings[5] = speed
+    termios.tcsetattr(fd, termios.TCSANOW, settings)
+    fcntl.ioctl(fd, termios.TIOCEXCL)
 
 
 async def open_link(url: str, receive: Receive, closed: Closed) -> Transport:

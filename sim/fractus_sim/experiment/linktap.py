@@ -35,8 +35,8 @@ class LinkTap:
     that are opened meanwhile hear nothing.
     """
 
-    def __init__(self, port: int, target_port: int, log: Path) -> None:
-        self._target = ("127.0.0.1", target_port)
+    def __init__(self, port: int, target: tuple[str, int], log: Path) -> None:
+        self._target = target
         self._log = TlogWriter(log)
         self._cut = threading.Event()
         self._stop = threading.Event()

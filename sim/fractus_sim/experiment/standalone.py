@@ -70,6 +70,7 @@ class DroneSetup:
         camera: None: neither camera world nor camera service.
         vehicle_arguments: further arguments of `fractus-vehicle`, such as `("--wind", "4,270,1")`.
         service_arguments: further arguments of `fractus mobility serve`.
+        autopilot: `tcp:HOST:PORT` of one that runs already; None: a simulated one is started.
     """
 
     name: str
@@ -84,6 +85,7 @@ class DroneSetup:
     camera: CameraSetup | None = None
     vehicle_arguments: Sequence[str] = ()
     service_arguments: Sequence[str] = ()
+    autopilot: str | None = None
 
 
 class RunningDrone:
@@ -136,10 +138,10 @@ class RunningDrone:
         for folder in (self.grants, self.folder / "state"):
             folder.mkdir(parents=True, exist_ok=True)
         self._describe()
-        name = self.process("vehicle")
-        self._processes.start(name, self._vehicle_command(), _environment())
-        self._await("vehicle", self._vehicle_port)
-        self._tap = LinkTap(self._tap_port, self._vehicle_port, self.tlog)
+        if self.setup.autopilot is None:
+            self._processes.start(self.process("vehicle"), self._vehicle_command(), _environment())
+            self._await("vehicle", self._vehicle_port)
+        self._tap = LinkTap(self._tap_port, self._autopilot(), self.tlog)
         if self._world_port is not None:
             self._processes.start(self.process("world"), self._world_command(), _environment())
             self._await("world", self._world_port)
@@ -202,6 +204,12 @@ class RunningDrone:
         manifest = {"apiVersion": API_VERSION, "kind": "Drone", "metadata": {"name": self.name}, "spec": spec}
         Drone.from_body(manifest)
         (self.folder / "node.yaml").write_text(yaml.safe_dump(manifest, sort_keys=False))
+
+    def _autopilot(self) -> tuple[str, int]:
+        if self.setup.autopilot is None:
+            return LOOPBACK, self._vehicle_port
+        host, _, port = self.setup.autopilot.removeprefix("tcp:").rpartition(":")
+        return host, int(port)
 
     def _vehicle_command(self) -> list[str]:
         setup = self.setup

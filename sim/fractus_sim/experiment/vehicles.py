@@ -168,7 +168,7 @@ class VehicleStage(Stage):
 
     def _tap(self, vehicle: str, program: str, link: str) -> str:
         port = self._ports.take()
-        tap = LinkTap(port, int(link.rpartition(":")[2]), self._logs / f"{vehicle}-{program}.tlog")
+        tap = LinkTap(port, ("127.0.0.1", int(link.rpartition(":")[2])), self._logs / f"{vehicle}-{program}.tlog")
         self._taps.setdefault(vehicle, []).append(tap)
         return f"tcp:127.0.0.1:{port}"
 

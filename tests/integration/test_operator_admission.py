@@ -230,6 +230,21 @@ def test_an_agent_registers_its_own_node_only(world: World, agents: dict[str, Ap
     denied(lambda: agents["edge-1"].delete(f"{FRACTUS}/edgenodes/edge-1"), "cannot delete")
 
 
+def test_an_agent_makes_its_node_nothing_else_than_its_label_says(world: World, agents: dict[str, Api]) -> None:
+    def refused(node: str, kind: Body, label: str) -> bool:
+        path = f"{FRACTUS}/{kind['kind'].lower()}s?dryRun=All"
+        try:
+            agents[node].call("POST", path, kind)
+        except Refused as error:
+            return error.code == 403 and f"has the label fractus.dev/class={label}; its agent" in str(error)
+        return False
+
+    drone, edge = ours("Drone", "edge-1", {"services": {}}), ours("EdgeNode", "drone-1", {"location": at(0, 0)})
+    wait_for(lambda: refused("edge-1", drone, "edge"), "the refusal of a drone")
+    wait_for(lambda: refused("drone-1", edge, "drone"), "the refusal of an edge node")
+    world.api.call("POST", f"{FRACTUS}/drones?dryRun=All", drone)
+
+
 def _grant(world: World, node: str) -> str:
     name = f"t.{uuid.uuid4().hex[:8]}"
     owner = {"namespace": "t", "name": "a", "uid": "u"}

@@ -7,6 +7,7 @@ import selectors
 import socket
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,24 +30,35 @@ class _End:
 
 
 class LinkTap:
-    """Listens on a port of the loopback device and connects each client to a server, in a thread of its own.
+    """Connects each client of a listening socket to a server, in a thread of its own.
 
     While the link is cut, connections stay open and what arrives is dropped, as on a radio out of reach; connections
     that are opened meanwhile hear nothing.
+
+    Args:
+        listener: a listening socket; closed with the tap.
+        connect: connects to the server.
+        log: file of the tlog.
     """
 
-    def __init__(self, port: int, target: tuple[str, int], log: Path) -> None:
-        self._target = target
+    def __init__(self, listener: socket.socket, connect: Callable[[], socket.socket], log: Path) -> None:
+        self._connect = connect
         self._log = TlogWriter(log)
         self._cut = threading.Event()
         self._stop = threading.Event()
         self._selector = selectors.DefaultSelector()
-        self._listener = socket.create_server(("127.0.0.1", port))
+        self._listener = listener
         self._listener.setblocking(False)
         self._selector.register(self._listener, selectors.EVENT_READ)
         self._ends: set[_End] = set()
-        self._thread = threading.Thread(target=self._run, name=f"tap-{port}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="link-tap", daemon=True)
         self._thread.start()
+
+    @classmethod
+    def between(cls, port: int, target: tuple[str, int], log: Path) -> LinkTap:
+        """A tap between a port of the loopback device and a server."""
+        listener = socket.create_server(("127.0.0.1", port))
+        return cls(listener, lambda: socket.create_connection(target, CONNECT_S), log)
 
     def cut(self) -> None:
         """Let nothing pass from now on."""
@@ -83,7 +95,7 @@ class LinkTap:
         except OSError:
             return
         try:
-            server = socket.create_connection(self._target, CONNECT_S)
+            server = self._connect()
         except OSError:
             client.close()
             return

@@ -153,6 +153,10 @@ class Ports:
                 self._given.add(port)
                 return port
 
+    def listen(self) -> socket.socket:
+        """A socket that listens on a free port."""
+        return socket.create_server(("127.0.0.1", self.take()))
+
 
 def listening(port: int) -> bool:
     """Whether somebody accepts connections on a port of the loopback device."""

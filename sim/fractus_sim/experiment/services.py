@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -15,11 +14,11 @@ from fractus_core.planning import Settings
 from fractus_core.policy.grants import compile_grants
 from fractus_operator.commands.manifests import BadManifest, Manifests, read_manifests
 from fractus_operator.commands.plan import plan_all
-from fractus_services.chain import verify
 
+from fractus_sim.experiment.audits import read_audit
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.model import Experiment, Program, VehicleSetup
-from fractus_sim.experiment.stage import Findings, Moment, Stage
+from fractus_sim.experiment.stage import Moment, Stage
 from fractus_sim.experiment.standalone import CameraSetup, DroneSetup, Standalone
 from fractus_sim.experiment.station import OBSERVER_ID, Station, TcpLink
 from fractus_sim.experiment.tlog import TlogWriter
@@ -27,7 +26,6 @@ from fractus_sim.experiment.vehicles import command_of
 
 TICK_S = 0.02
 CONNECT_S = 10.0
-JUDGED = frozenset({"call", "monitor", "takeover"})
 
 
 class ServiceStage(Stage):
@@ -118,7 +116,7 @@ class ServiceStage(Stage):
         for drone in self._ground.drones.values():
             for path in (drone.audit, drone.audit.with_name("camera.jsonl")):
                 if path.exists():
-                    _read_audit(path, f"{drone.name}/{path.name}", self.findings)
+                    read_audit(path, f"{drone.name}/{path.name}", self.findings)
 
     def close(self) -> None:
         """End every process."""
@@ -196,17 +194,3 @@ def _grants(manifests: Manifests) -> Iterable[GrantSpec]:
 def _manifest(spec: GrantSpec) -> dict[str, Any]:
     metadata = {"name": spec.instance, "uid": f"uid-{spec.instance}"}
     return {"apiVersion": API_VERSION, "kind": "Grant", "metadata": metadata, "spec": spec.to_dict()}
-
-
-def _read_audit(path: Path, name: str, findings: Findings) -> None:
-    """Verify an audit log, and keep its judgements."""
-    lines = path.read_bytes().splitlines(keepends=True)
-    finding = verify(lines)
-    findings.audit_problems[name] = f"line {finding.line} {finding.problem}" if finding.problem else ""
-    for line in lines:
-        try:
-            entry = json.loads(line)
-        except ValueError:  # what verify has found wrong already
-            continue
-        if entry.get("kind") in JUDGED:
-            findings.calls.append(entry)

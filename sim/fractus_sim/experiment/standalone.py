@@ -141,7 +141,7 @@ class RunningDrone:
         if self.setup.autopilot is None:
             self._processes.start(self.process("vehicle"), self._vehicle_command(), _environment())
             self._await("vehicle", self._vehicle_port)
-        self._tap = LinkTap(self._tap_port, self._autopilot(), self.tlog)
+        self._tap = LinkTap.between(self._tap_port, self._autopilot(), self.tlog)
         if self._world_port is not None:
             self._processes.start(self.process("world"), self._world_command(), _environment())
             self._await("world", self._world_port)

@@ -168,7 +168,9 @@ class VehicleStage(Stage):
 
     def _tap(self, vehicle: str, program: str, link: str) -> str:
         port = self._ports.take()
-        tap = LinkTap(port, ("127.0.0.1", int(link.rpartition(":")[2])), self._logs / f"{vehicle}-{program}.tlog")
+        tap = LinkTap.between(
+            port, ("127.0.0.1", int(link.rpartition(":")[2])), self._logs / f"{vehicle}-{program}.tlog"
+        )
         self._taps.setdefault(vehicle, []).append(tap)
         return f"tcp:127.0.0.1:{port}"
 

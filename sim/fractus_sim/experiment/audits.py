@@ -1,0 +1,26 @@
+"""Reads the audit logs that services leave."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from fractus_services.chain import verify
+
+from fractus_sim.experiment.stage import Findings
+
+JUDGED = frozenset({"call", "monitor", "takeover"})
+
+
+def read_audit(path: Path, name: str, findings: Findings) -> None:
+    """Verify an audit log, and keep its judgements."""
+    lines = path.read_bytes().splitlines(keepends=True)
+    finding = verify(lines)
+    findings.audit_problems[name] = f"line {finding.line} {finding.problem}" if finding.problem else ""
+    for line in lines:
+        try:
+            entry = json.loads(line)
+        except ValueError:  # what verify has found wrong already
+            continue
+        if entry.get("kind") in JUDGED:
+            findings.calls.append(entry)

@@ -1,0 +1,233 @@
+"""Mode cluster: the embedded Kubernetes cluster with Fractus on it, its drones' vehicles beside their nodes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from fractus_sim.cluster import Cluster, ClusterError
+from fractus_sim.cluster.binaries import ensure_binaries
+from fractus_sim.cluster.images.build import build_images
+from fractus_sim.cluster.spec import ClusterSpec, NodeSpec, VehicleHardware, load_spec
+from fractus_sim.demo.kube import DemoError, Kube
+from fractus_sim.demo.place import ROOT, documents
+from fractus_sim.demo.watch import wait_ready
+from fractus_sim.experiment.audits import read_audit
+from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.experiment.linktap import LinkTap
+from fractus_sim.experiment.model import ClusterPart, Experiment, VehicleSetup
+from fractus_sim.experiment.netns import connect_in, listen_in
+from fractus_sim.experiment.processes import Ports
+from fractus_sim.experiment.stage import Moment, Stage
+from fractus_sim.experiment.station import OBSERVER_ID, Station, TcpLink
+from fractus_sim.experiment.tlog import TlogWriter
+
+TICK_S = 0.05
+POLL_S = 1.0
+CONNECT_S = 10.0
+DRONE_READY_S = 180.0
+BEHIND_TAP_PORT = 5770
+OWN_TARGETS = ("operator", "agent", "services")
+RELEASES = ("fractus-crds", "fractus")
+ENDED = frozenset({"Completed", "Failed", "Invalid"})
+AUDIT_LOGS = ("mobility.jsonl", "camera.jsonl")
+
+
+class ClusterStage(Stage):
+    """A cluster of the experiment's own; taken down at the end unless it ran before."""
+
+    def __init__(self, experiment: Experiment, folder: Path, base: Path, tell: Callable[[str], None]) -> None:
+        super().__init__(experiment, folder, base, tell)
+        if experiment.cluster is None:
+            raise ExperimentError("mode cluster needs a cluster")
+        self._part: ClusterPart = experiment.cluster
+        self._spec = _spec(experiment, base / self._part.file)
+        self._cluster = Cluster(self._spec, report=tell)
+        self._was_running = self._cluster.running
+        self._applications, self._surroundings = _manifests(self._part, base)
+        self._kube: Kube | None = None
+        self._taps: list[LinkTap] = []
+        self._ports = Ports()
+        self._watcher = threading.Thread(target=self._watch, name="phases", daemon=True)
+        self._stop = threading.Event()
+        self._phase: dict[str, str] = {}
+        self._began_s = time.monotonic()
+
+    def set_up(self) -> None:
+        """Build images, bring the cluster up with Fractus on it, and wait until its drone is ready.
+
+        Raises:
+            ExperimentError: something did not come up.
+        """
+        try:
+            images = build_images(ROOT, targets=(*OWN_TARGETS, *self._part.images), report=self.tell)
+            self._cluster.up(images=images)
+            programs = ensure_binaries(("kubectl", "helm"), report=self.tell)
+            self._kube = Kube(programs["kubectl"], programs["helm"], self._cluster.kubeconfig)
+            for setup in self.experiment.setups():
+                self._attach(setup)
+            for release in RELEASES:
+                self._kube.install(release, ROOT / "charts" / release)
+            self._kube.apply(self._surroundings)
+            wait_ready(self._kube, DRONE_READY_S, lambda _line: None)
+        except (ClusterError, DemoError) as error:
+            raise ExperimentError(str(error)) from None
+        self._began_s = time.monotonic()
+
+    def tick(self) -> Moment:
+        """Wait for 50 ms."""
+        time.sleep(TICK_S)
+        return Moment(time.monotonic() - self._began_s, time.time_ns() // 1000)
+
+    def begin(self) -> None:
+        """Apply the Applications.
+
+        Raises:
+            ExperimentError: the API server refused one.
+        """
+        try:
+            self._running_kube().apply(self._applications)
+        except DemoError as error:
+            raise ExperimentError(str(error)) from None
+        self._watcher.start()
+
+    @property
+    def busy(self) -> bool:
+        """Whether an Application is not over."""
+        return any(self._phase.get(body["metadata"]["name"]) not in ENDED for body in self._applications)
+
+    def cut_link(self, vehicle: str) -> None:
+        """Cut the node's uplink; services and vehicle go on."""
+        self._cluster.node(vehicle).cut_link()
+
+    def heal_link(self, vehicle: str) -> None:
+        """Give the node its uplink back."""
+        self._cluster.node(vehicle).heal_link()
+
+    def power_off(self, node: str) -> None:
+        """Pull the node's power; its vehicle flies on."""
+        self._cluster.set_power(node, on=False)
+
+    def power_on(self, node: str) -> None:
+        """Give it back."""
+        self._cluster.set_power(node, on=True)
+
+    def collect(self) -> None:
+        """Read the audit logs from the drones' disks."""
+        self._stop.set()
+        for setup in self.experiment.setups():
+            folder = self._cluster.node(setup.name).directory / "var-lib" / "fractus" / "audit"
+            for name in AUDIT_LOGS:
+                if (folder / name).exists():
+                    read_audit(folder / name, f"{setup.name}/{name}", self.findings)
+
+    def close(self) -> None:
+        """Take the cluster down, or only what was applied, if it ran before."""
+        self._stop.set()
+        for observer in self.observers.values():
+            observer.close()
+        for tap in self._taps:
+            tap.close()
+        if not self._was_running:
+            self._cluster.down()
+        elif self._kube is not None:
+            self._kube.delete(self._applications, DRONE_READY_S)
+
+    def _attach(self, setup: VehicleSetup) -> None:
+        """Put a tap between the vehicle and whoever flies it, and attach to the vehicle."""
+        node = self._cluster.node(setup.name)
+        namespace = node.wiring.namespace_path(setup.name)
+        logs = self.folder / "logs"
+        port = _port(load_spec(self.base / self._part.file), setup.name)
+
+        def connect() -> Any:
+            return connect_in(namespace, BEHIND_TAP_PORT, CONNECT_S)
+
+        self._taps.append(LinkTap(listen_in(namespace, port), connect, logs / f"{setup.name}.tlog"))
+        guest = self._ports.listen()
+        self._taps.append(LinkTap(guest, connect, logs / f"{setup.name}-guest.tlog"))
+        self.endpoints[setup.name] = f"tcp:127.0.0.1:{guest.getsockname()[1]}"
+        watch = TlogWriter(logs / f"{setup.name}-observer.tlog")
+        link = TcpLink(connect(), f"to the vehicle of {setup.name}")
+        self.observers[setup.name] = Station(link, setup.system_id, watch, own_id=OBSERVER_ID, beats=False)
+
+    def _watch(self) -> None:
+        """Follow the Applications' phases; what the API server does not answer is asked again."""
+        while not self._stop.wait(POLL_S):
+            try:
+                found = self._running_kube().objects("applications")
+            except DemoError:
+                continue
+            for body in found:
+                name, phase = body["metadata"]["name"], (body.get("status") or {}).get("phase", "")
+                if phase and self._phase.get(name) != phase:
+                    self._phase[name] = phase
+                    self.findings.phases.setdefault(name, []).append(phase)
+
+    def _running_kube(self) -> Kube:
+        if self._kube is None:
+            raise ExperimentError("the cluster is not up")
+        return self._kube
+
+
+def _spec(experiment: Experiment, path: Path) -> ClusterSpec:
+    """The cluster with seed, wind and parameters for its vehicles, which listen behind our tap.
+
+    Raises:
+        ExperimentError: it cannot be read, or a vehicle of the experiment is none of its.
+    """
+    try:
+        spec = load_spec(path)
+    except ClusterError as error:
+        raise ExperimentError(str(error)) from None
+    flying = {node.name for node in spec.nodes if node.vehicle() is not None}
+    setups = {setup.name: setup for setup in experiment.setups()}
+    for name in setups:
+        if name not in flying:
+            raise ExperimentError(f"{path} has no drone {name} with a vehicle; it has {', '.join(sorted(flying))}")
+    nodes = [_prepared(node, setups[node.name], experiment) if node.name in setups else node for node in spec.nodes]
+    return spec.model_copy(update={"nodes": tuple(nodes)})
+
+
+def _prepared(node: NodeSpec, setup: VehicleSetup, experiment: Experiment) -> NodeSpec:
+    found = node.vehicle()
+    if found is None:
+        return node
+    home, _, arguments = found
+    wind, entry = experiment.wind, setup.entry
+    given = [
+        "--seed", str(experiment.seed), "--sysid", str(setup.system_id), "--ready-after", f"{entry.ready_after:g}",
+        "--wind", f"{wind.speed},{wind.direction},{wind.turbulence}",
+    ]  # fmt: skip
+    for name, value in entry.parameters.items():
+        given += ["--param", f"{name}={value:.9g}"]
+    if entry.home is not None:
+        home = type(home)(lat=entry.home.lat, lon=entry.home.lon, alt=entry.home.alt)
+    listen = f"tcp:127.0.0.1:{BEHIND_TAP_PORT}"
+    update = {"home": home, "listen": listen, "arguments": (*arguments, *given)}
+    vehicle = (node.hardware.vehicle or VehicleHardware()).model_copy(update=update)
+    return node.model_copy(update={"hardware": node.hardware.model_copy(update={"vehicle": vehicle})})
+
+
+def _port(spec: ClusterSpec, name: str) -> int:
+    """The port at which the node's services expect its autopilot."""
+    node = next(node for node in spec.nodes if node.name == name)
+    found = node.vehicle()
+    listen = found[1] if found is not None else ""
+    kind, _, rest = listen.partition(":")
+    if kind != "tcp":
+        raise ExperimentError(f"{name}: its vehicle listens on {listen}; experiments need tcp:HOST:PORT")
+    return int(rest.rpartition(":")[2])
+
+
+def _manifests(part: ClusterPart, base: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """The Applications, and everything else that is applied before."""
+    try:
+        every: list[Mapping[str, Any]] = [body for path in part.apply for body in documents(base / path)]
+    except DemoError as error:
+        raise ExperimentError(str(error)) from None
+    applications = [dict(body) for body in every if body.get("kind") == "Application"]
+    return applications, [dict(body) for body in every if body.get("kind") != "Application"]

@@ -1,0 +1,39 @@
+"""AerialViewer: takes and fetches a picture every PERIOD_S seconds; where that is not allowed, it waits for the next."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+
+import fractus
+
+log = logging.getLogger("viewer")
+
+
+async def watch(period_s: float) -> None:
+    """Take pictures until SIGTERM."""
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    loop.add_signal_handler(signal.SIGTERM, stop.set)
+    due_s = loop.time()
+    async with fractus.camera(patience_s=1.0) as camera:
+        while not stop.is_set():
+            try:
+                info = await camera.capture()
+                log.info("%s: %d bytes", info.name, len(await camera.retrieve(info.name)))
+            except fractus.PolicyDenied as refusal:
+                log.info("no picture here: %s", refusal)
+            except fractus.FractusError as error:
+                log.warning("no picture: %s", error)
+            due_s += period_s
+            try:
+                await asyncio.wait_for(stop.wait(), max(due_s - loop.time(), 0.0))
+            except TimeoutError:
+                continue
+
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
+    asyncio.run(watch(float(os.environ.get("PERIOD_S", "10"))))

@@ -1,0 +1,90 @@
+"""`make scenario-field`: flies the field experiment and leaves its pictures, table and figures."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.report.drawing import save
+from fractus_sim.scenarios.field.drawing import draw_altitudes, draw_ground
+from fractus_sim.scenarios.field.evidence import Evidence
+from fractus_sim.scenarios.field.expectations import Check, Judge
+from fractus_sim.scenarios.field.flight import RUNS, Autopilot, fly
+from fractus_sim.scenarios.field.page import figures, summary
+from fractus_sim.scenarios.field.place import EXAMPLE, Field, dump
+from fractus_sim.scenarios.field.probe import look
+
+FAILED_EXPECTATIONS = 2
+
+
+@click.command()
+@click.option("--out", type=click.Path(path_type=Path), default=Path("out/field"), show_default=True)
+@click.option(
+    "--autopilot",
+    metavar="tcp:HOST:PORT",
+    help="Fly with an ArduCopter that runs already (SITL or a vehicle) instead of simulated ones.",
+)
+@click.option(
+    "--speedup",
+    type=click.FloatRange(0.2, 8.0),
+    default=2.0,
+    show_default=True,
+    help="Times real time; for an autopilot that runs already: how fast that one runs.",
+)
+@click.option("--run", "names", multiple=True, type=click.Choice([run.name for run in RUNS]), help="Only these runs.")
+def field(*, out: Path, autopilot: str | None, speedup: float, names: tuple[str, ...]) -> None:
+    """Fly the field experiment three times: normally, against policies, and without them.
+
+    Exit code: 0 if everything came out as expected, 2 if something did not, 1 if it could not be flown.
+    """
+    try:
+        checks = experiment(out, Autopilot(autopilot, speedup), names)
+    except ExperimentError as error:
+        raise click.ClickException(str(error)) from None
+    failed = [check for check in checks if not check.holds]
+    for check in failed:
+        click.echo(f"NOT AS EXPECTED, {check.run}: {check.text} ({check.seen})", err=True)
+    click.echo(f"{len(checks) - len(failed)} of {len(checks)} expectations hold; see {out / 'summary.md'}")
+    if failed:
+        sys.exit(FAILED_EXPECTATIONS)
+
+
+def experiment(out: Path, autopilot: Autopilot, names: tuple[str, ...] = ()) -> list[Check]:
+    """Fly the runs and write the report; the checks.
+
+    Raises:
+        ExperimentError: a run could not be flown.
+    """
+    ground, words = Field.read(EXAMPLE), "simulated vehicles"
+    if autopilot.link is not None:
+        standing = look(autopilot.link, _tell)
+        ground = Field.read(EXAMPLE, standing.home)
+        words = f"vehicle {standing.system_id} at {autopilot.link}"
+    out.mkdir(parents=True, exist_ok=True)
+    runs: list[Evidence] = []
+    checks: list[Check] = []
+    for run in RUNS:
+        if names and run.name not in names:
+            continue
+        _tell(f"run: {run.title}")
+        flown = fly(run, ground, autopilot, out / run.name, _tell)
+        judge = Judge(ground, flown)
+        checks += {"normal": judge.normal, "guarded": judge.guarded, "unguarded": judge.unguarded}[run.name]()
+        runs.append(flown)
+    area = ground.operation_area(ground.grants(ground.write(out), policies=True))
+    save(draw_ground(ground, area, runs), out / "map.png")
+    save(draw_altitudes(runs), out / "altitude.png")
+    (out / "summary.md").write_text(summary(ground, runs, checks, words))
+    (out / "report.json").write_text(dump(figures(ground, runs, checks, words)))
+    return checks
+
+
+def _tell(text: str) -> None:
+    click.echo(f"  {text}" if not text.startswith("run:") else text)
+
+
+if __name__ == "__main__":
+    field.main(prog_name="scenario-field")

@@ -1,0 +1,190 @@
+"""What one run left behind, read from its logs: the link to the autopilot, and the audit logs of both services."""
+
+from __future__ import annotations
+
+import bisect
+import json
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from fractus_sim.report.track import Place, Sample, Track
+from fractus_sim.vehicle.mav import Mode, ModeFlag
+from fractus_sim.vehicle.wire import INCOMPAT_SIGNED, MAGIC_V1, SIGNATURE_LENGTH, Message, Parser
+
+_STAMP = struct.Struct(">Q")
+_SAMPLE_S = 0.2
+_FLYING = frozenset({2, 3, 4})
+SYSTEM = "system"
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """A call that was judged, or something that the system did on its own.
+
+    Attributes:
+        time_s: on the autopilot's clock.
+        who: the component, or `system`.
+        method: of the service; for what the system did, the takeover or the kind of control.
+        action: allow, correct or deny; empty for what the system did.
+        asked: where to, for Goto.
+        flown: where to in the end.
+        at: where the drone was.
+    """
+
+    time_s: float
+    who: str
+    method: str
+    action: str
+    code: str
+    reason: str
+    policies: tuple[str, ...]
+    asked: Place | None
+    flown: Place | None
+    at: Place | None
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """One run."""
+
+    name: str
+    title: str
+    policies: bool
+    track: Track
+    calls: tuple[Call, ...]
+    texts: tuple[str, ...]
+
+    def gotos(self) -> list[Call]:
+        """The Goto calls, those of the system on its way among them."""
+        return [c for c in self.calls if c.method == "Goto" and c.asked is not None]
+
+    def pictures(self, *, taken: bool) -> list[Call]:
+        """The CaptureImage calls that were carried out, or refused for what they would have shown."""
+        asked = [c for c in self.calls if c.method == "CaptureImage" and c.at is not None]
+        if taken:
+            return [c for c in asked if c.action != "deny"]
+        return [c for c in asked if c.action == "deny" and c.code != "OutsideOperationArea"]
+
+    def takeover(self) -> Call | None:
+        """When the system took the drone for good."""
+        return next((c for c in self.calls if c.who == SYSTEM and c.method in ("revoke", "returnToLaunch")), None)
+
+
+def read_evidence(name: str, title: str, *, policies: bool, tlog: Path, audits: tuple[Path, ...]) -> Evidence:
+    """Read a run.
+
+    Raises:
+        OSError: a log is missing.
+        ValueError: the tlog has nothing of a flight.
+    """
+    samples, clock, texts = _flight(tlog)
+    calls = [call for path in audits for entry in _entries(path) if (call := _call(entry, clock)) is not None]
+    return Evidence(
+        name, title, policies, Track(title, samples), tuple(sorted(calls, key=lambda c: c.time_s)), tuple(texts)
+    )
+
+
+class _Clock:
+    """From the time of day to the autopilot's clock, which a faster simulation makes run faster."""
+
+    def __init__(self) -> None:
+        self._unix: list[float] = []
+        self._boot: list[float] = []
+
+    def note(self, unix_s: float, boot_s: float) -> None:
+        """Take a pair of times that belong together."""
+        if not self._unix or unix_s > self._unix[-1]:
+            self._unix.append(unix_s)
+            self._boot.append(boot_s)
+
+    def boot_s(self, unix_s: float) -> float:
+        """The autopilot's time, between or beyond the pairs."""
+        if len(self._unix) < 2:
+            raise ValueError("the log of the link to the autopilot has no positions")
+        high = min(max(bisect.bisect(self._unix, unix_s), 1), len(self._unix) - 1)
+        first, last = self._unix[high - 1], self._unix[high]
+        share = (unix_s - first) / (last - first)
+        return self._boot[high - 1] + share * (self._boot[high] - self._boot[high - 1])
+
+
+def _frames(path: Path) -> Iterator[tuple[float, Message]]:
+    """The messages of a tlog with their Unix times."""
+    data = path.read_bytes()
+    at, parser = 0, Parser()
+    while at + _STAMP.size + 3 <= len(data):
+        (stamp_us,) = _STAMP.unpack_from(data, at)
+        begin = at + _STAMP.size
+        old = data[begin] == MAGIC_V1
+        length = data[begin + 1] + (8 if old else 12)
+        if not old and data[begin + 2] & INCOMPAT_SIGNED:
+            length += SIGNATURE_LENGTH
+        for message in parser.feed(data[begin : begin + length]):
+            yield stamp_us / 1e6, message
+        at = begin + length
+
+
+def _flight(path: Path) -> tuple[tuple[Sample, ...], _Clock, list[str]]:
+    clock, samples, texts = _Clock(), list[Sample](), list[str]()
+    mode, armed, landed, battery = "", False, 0, 1.0
+    for unix_s, message in _frames(path):
+        if message.compid != 1:
+            continue
+        if message.name == "HEARTBEAT":
+            number = message.integer("custom_mode")
+            mode = Mode(number).name if number in set(Mode) else f"MODE {number}"
+            armed = bool(message.integer("base_mode") & ModeFlag.SAFETY_ARMED)
+        elif message.name == "EXTENDED_SYS_STATE":
+            landed = message.integer("landed_state")
+        elif message.name == "SYS_STATUS":
+            battery = max(message.integer("battery_remaining"), 0) / 100.0
+        elif message.name == "STATUSTEXT":
+            texts.append(message.text("text"))
+        elif message.name == "GLOBAL_POSITION_INT":
+            boot_s = message.integer("time_boot_ms") / 1000.0
+            clock.note(unix_s, boot_s)
+            if samples and boot_s - samples[-1].time_s < _SAMPLE_S:
+                continue
+            height = message.integer("relative_alt") / 1000.0
+            place = Place(message.integer("lat") / 1e7, message.integer("lon") / 1e7, height)
+            speed = (message.integer("vx") ** 2 + message.integer("vy") ** 2) ** 0.5 / 100.0
+            in_air = armed and (landed in _FLYING if landed else height > 0.5)
+            samples.append(Sample(boot_s, place, speed, mode, in_air, battery))
+    return tuple(samples), clock, texts
+
+
+def _entries(path: Path) -> Iterator[Mapping[str, Any]]:
+    for line in path.read_text().splitlines():
+        try:
+            entry = json.loads(line)
+        except ValueError:  # the last line of a service that was stopped
+            continue
+        if entry.get("kind") in ("call", "takeover", "control"):
+            yield entry
+
+
+def _call(entry: Mapping[str, Any], clock: _Clock) -> Call | None:
+    mine = entry["kind"] == "call"
+    caller = str(entry.get("caller", ""))
+    who = caller.split("/component/", 1)[-1].split("/", 1)[0] if mine and caller else SYSTEM
+    return Call(
+        time_s=clock.boot_s(datetime.fromisoformat(entry["time"]).timestamp()),
+        who=who,
+        method=str(entry["method"] if mine else entry.get("action", "")),
+        action=str(entry.get("action", "")) if mine else "",
+        code=str(entry.get("code", "")),
+        reason=str(entry.get("reason", "")),
+        policies=tuple(entry.get("policies", ())),
+        asked=_place(entry.get("args") or {}),
+        flown=_place(entry.get("result") or {}),
+        at=_place(entry),
+    )
+
+
+def _place(values: Mapping[str, Any]) -> Place | None:
+    if values.get("lat") is None or values.get("lon") is None:
+        return None
+    return Place(float(values["lat"]), float(values["lon"]), float(values.get("alt") or 0.0))

@@ -1,0 +1,145 @@
+"""Flies one run: vehicle, services and the example's two programs as processes, until the drone is home."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.experiment.standalone import CameraSetup, DroneSetup, RunningDrone, Standalone
+from fractus_sim.scenarios.field.evidence import Evidence, read_evidence
+from fractus_sim.scenarios.field.place import DRONE, EXAMPLE, NAVIGATOR, VIEWER, ZIGZAG, Field, as_text
+
+PERIOD_S = 10.0
+FLIGHT_TIMEOUT_S = 600.0
+READY_TIMEOUT_S = 90.0
+POLL_S = 0.25
+# Of our own vehicle: as fast as the drone's description says, so that the service has nothing to correct there.
+PARAMETERS: Mapping[str, float] = {"WPNAV_SPEED": 500.0}
+WIND = "2,240,0.5"
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One of the three flights.
+
+    Attributes:
+        violates: whether the program asks for what policies forbid.
+        policies: whether there are any.
+    """
+
+    name: str
+    title: str
+    violates: bool
+    policies: bool
+
+
+RUNS = (
+    Run("normal", "normal", violates=False, policies=True),
+    Run("guarded", "violating, with policies", violates=True, policies=True),
+    Run("unguarded", "violating, without policies", violates=True, policies=False),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Autopilot:
+    """What flies.
+
+    Attributes:
+        link: of an autopilot that is there already, such as `tcp:127.0.0.1:5760`; None: a simulated one for each run.
+        speedup: times real time that it runs.
+    """
+
+    link: str | None
+    speedup: float
+
+
+def fly(run: Run, field: Field, autopilot: Autopilot, folder: Path, tell: Callable[[str], None]) -> Evidence:
+    """Fly one run and read what it left.
+
+    Raises:
+        ExperimentError: something did not come up, or the drone did not come home in time.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    manifests = field.write(folder)
+    grants = field.grants(manifests, policies=run.policies)
+    with Standalone(folder) as ground:
+        drone = ground.add_drone(_setup(field, autopilot))
+        identities = {grant["spec"]["component"]: ground.grant(grant) for grant in grants}
+        extra = _environment(run, field)
+        programs = {NAVIGATOR: "navigator", VIEWER: "aerial_viewer"}
+        period = {"PERIOD_S": f"{PERIOD_S / autopilot.speedup:.3f}"}
+        for component, program in programs.items():
+            command = [sys.executable, str(EXAMPLE.absolute() / f"{program}.py")]
+            ground.run(program, command, identities[component], environment={**extra, **period})
+        _wait_home(ground, drone, autopilot, tell)
+        ground.stop_services()
+    audits = (drone.audit, drone.audit.with_name("camera.jsonl"))
+    return read_evidence(run.name, run.title, policies=run.policies, tlog=drone.tlog, audits=audits)
+
+
+def _environment(run: Run, field: Field) -> dict[str, str]:
+    """What the Navigator is told: the manifest's own, and what makes it ask for too much."""
+    own = {ZIGZAG: field.environment[ZIGZAG]}
+    if not run.violates:
+        return own
+    outside = field.places
+    detours = f"2:{as_text(outside['WP-E1'])}; 7:{as_text(outside['WP-E2'])}"
+    return {**own, "ALTITUDES": "1:20,3:20,6:4", "DETOURS": detours}
+
+
+def _setup(field: Field, autopilot: Autopilot) -> DroneSetup:
+    simulated = autopilot.link is None
+    return DroneSetup(
+        DRONE,
+        field.home,
+        speedup=autopilot.speedup,
+        parameters=PARAMETERS,
+        description=field.drone.spec.to_dict(),
+        # A camera world follows the drone over a link of its own, which somebody else's autopilot may not have.
+        camera=CameraSetup(("--seed", "3")) if simulated else CameraSetup(None),
+        vehicle_arguments=("--wind", WIND),
+        autopilot=autopilot.link,
+    )
+
+
+def _wait_home(ground: Standalone, drone: RunningDrone, autopilot: Autopilot, tell: Callable[[str], None]) -> None:
+    """Wait until the mobility service says that the drone has landed.
+
+    Raises:
+        ExperimentError: it did not take off, or not come home, in time; or a process ended.
+    """
+    began_s, said, flown = time.monotonic(), 0, False
+    while True:
+        entries = [e for e in _lines(drone.audit) if e.get("kind") in ("control", "takeover")]
+        for entry in entries[said:]:
+            tell(f"{entry.get('action')}{': ' + entry['reason'] if entry.get('reason') else ''}")
+        said = len(entries)
+        flown = flown or any(e.get("in_air") for e in _lines(drone.audit) if e.get("kind") == "state")
+        if flown and any(e.get("action") == "landed" for e in entries):
+            return
+        waited_s = time.monotonic() - began_s
+        if not flown and waited_s > READY_TIMEOUT_S:
+            raise ExperimentError(
+                f"the drone did not take off within {READY_TIMEOUT_S:.0f} s: {ground.processes.last_words('navigator')}"
+            )
+        if waited_s > READY_TIMEOUT_S + FLIGHT_TIMEOUT_S / autopilot.speedup:
+            raise ExperimentError(f"the drone was not home within {waited_s:.0f} s; its last word: {entries[-1:]}")
+        ground.check()
+        time.sleep(POLL_S)
+
+
+def _lines(path: Path) -> list[dict[str, Any]]:
+    found = []
+    for line in path.read_text().splitlines() if path.exists() else ():
+        try:
+            found.append(json.loads(line))
+        except ValueError:  # a line that is being written
+            break
+    return found

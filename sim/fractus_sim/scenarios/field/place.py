@@ -1,0 +1,206 @@
+"""Where the experiment is flown: the manifests, moved to where the drone stands, its named places, and the Grants."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import yaml
+from fractus_core.api import API_VERSION, Application, Drone, Policy, Zone
+from fractus_core.api.plans import GrantSpec
+from fractus_core.geo import LocalFrame, polygon
+from fractus_core.planning import Settings
+from fractus_core.policy.grants import compile_grants
+from fractus_operator.commands.manifests import BadManifest, read_manifests
+from fractus_operator.commands.plan import plan_all
+
+from fractus_sim.experiment.errors import ExperimentError
+
+EXAMPLE = Path("examples/field")
+NAVIGATOR, VIEWER = "Navigator", "AerialViewer"
+DRONE = "drone-1"
+ZIGZAG = "ZIGZAG"
+# Without policies the Grants end here, metres from home: nowhere that anybody flies to.
+EVERYWHERE_M = 1000.0
+# Metres east and north of home of what the violating program asks for.
+ASKED_OUTSIDE = {"WP-E1": (62.0, 130.0), "WP-E2": (226.0, 60.0)}
+ALTITUDE_M = 10.0
+Place = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Field:
+    """The experiment on its ground.
+
+    Attributes:
+        documents: the manifests as they are applied.
+        home: latitude, longitude, altitude above mean sea level of the ground.
+    """
+
+    documents: tuple[Mapping[str, Any], ...]
+    home: Place
+
+    @classmethod
+    def read(cls, folder: Path, home: Place | None = None) -> Field:
+        """Read the manifests, and move them so that the depot lies at `home`.
+
+        Raises:
+            ExperimentError: a file cannot be read, or the manifests have no depot.
+        """
+        documents: list[Any] = []
+        for path in sorted(folder.glob("*.yaml")):
+            try:
+                documents += [d for d in yaml.safe_load_all(path.read_text()) if d]
+            except (OSError, yaml.YAMLError) as error:
+                raise ExperimentError(f"{path}: {error}") from None
+        depot = next((d["spec"]["location"] for d in documents if d["kind"] == "Depot"), None)
+        if depot is None:
+            raise ExperimentError(f"{folder} has no Depot; it says where home is")
+        if home is None:
+            return cls(tuple(documents), (depot["lat"], depot["lon"], 25.0))
+        moved = _Shift((depot["lat"], depot["lon"]), home[:2])
+        return cls(tuple(moved.apply(d) for d in documents), home)
+
+    def write(self, folder: Path) -> Path:
+        """Write the manifests as they are flown; the file's path."""
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / "manifests.yaml"
+        path.write_text(yaml.safe_dump_all(self.documents, sort_keys=False, width=120))
+        return path
+
+    def objects(self, kind: str) -> list[Mapping[str, Any]]:
+        """The manifests of a kind."""
+        return [d for d in self.documents if d["kind"] == kind]
+
+    @cached_property
+    def application(self) -> Application:
+        """The application."""
+        return Application.from_body(self.objects("Application")[0])
+
+    @cached_property
+    def drone(self) -> Drone:
+        """The drone."""
+        return Drone.from_body(self.objects("Drone")[0])
+
+    @cached_property
+    def policies(self) -> tuple[Policy, ...]:
+        """The policies."""
+        return tuple(Policy.from_body(d) for d in self.objects("Policy"))
+
+    @cached_property
+    def frame(self) -> LocalFrame:
+        """Metres east and north of home."""
+        return LocalFrame(self.home[0], self.home[1])
+
+    def zone(self, name: str) -> Any:
+        """A zone's shape in metres."""
+        body = next(d for d in self.objects("Zone") if d["metadata"]["name"] == name)
+        return polygon(self.frame, Zone.from_body(body).spec.area)
+
+    @cached_property
+    def environment(self) -> dict[str, str]:
+        """What the Navigator's container gets."""
+        component = next(c for c in self.objects("Application")[0]["spec"]["components"] if c["name"] == NAVIGATOR)
+        return {variable["name"]: variable["value"] for variable in component["container"]["env"]}
+
+    @cached_property
+    def places(self) -> dict[str, Place]:
+        """CTRL1, WP1 to WP9, CTRL2, WP-E1, WP-E2: degrees, and metres above home."""
+        component = next(c for c in self.application.spec.components if c.name == NAVIGATOR)
+        found: dict[str, Place] = {}
+        waypoints: list[Place] = []
+        for number, point in enumerate(component.control_points, start=1):
+            start = point.point.position if point.point is not None else None
+            if start is not None:
+                found[f"CTRL{number}"] = (start.lat, start.lon, start.alt or ALTITUDE_M)
+            waypoints += [(p.lat, p.lon, p.alt or ALTITUDE_M) for p in point.path or ()]
+        for part in self.environment[ZIGZAG].split(";"):
+            lat, lon, alt = (float(value) for value in part.split(","))
+            waypoints.append((lat, lon, alt))
+        found |= {f"WP{number}": place for number, place in enumerate(waypoints, start=1)}
+        for name, (east, north) in ASKED_OUTSIDE.items():
+            lat, lon = self.frame.latlon(east, north)
+            found[name] = (lat, lon, ALTITUDE_M)
+        return found
+
+    def grants(self, manifests: Path, *, policies: bool) -> list[dict[str, Any]]:
+        """The Grants that the operator would write; without policies they allow everything everywhere.
+
+        Raises:
+            ExperimentError: the application cannot be planned.
+        """
+        settings = Settings()
+        try:
+            read = read_manifests([manifests])
+            (answer,) = plan_all(read, settings)
+        except BadManifest as error:
+            raise ExperimentError(str(error)) from None
+        if answer.plan is None:
+            raise ExperimentError(f"the application cannot be planned: {answer.refusal}")
+        specs = compile_grants(answer.application, answer.plan, read.inventory(), settings)
+        return [_manifest(spec if policies else self._unbound(spec)) for spec in specs]
+
+    def operation_area(self, grants: Sequence[Mapping[str, Any]]) -> list[Any]:
+        """Shapes of the operation area that the Grants name, in metres."""
+        spec = GrantSpec.model_validate(grants[0]["spec"])
+        return [polygon(self.frame, area) for area in spec.operation_area]
+
+    def _unbound(self, spec: GrantSpec) -> GrantSpec:
+        body = spec.to_dict()
+        everywhere = [{"circle": {"center": {"lat": self.home[0], "lon": self.home[1]}, "radius": EVERYWHERE_M}}]
+        body |= {"policies": [], "operationArea": everywhere, "corridor": everywhere}
+        return GrantSpec.model_validate(body)
+
+
+def _manifest(spec: GrantSpec) -> dict[str, Any]:
+    metadata = {"name": spec.instance, "uid": f"uid-{spec.instance}"}
+    return {"apiVersion": API_VERSION, "kind": "Grant", "metadata": metadata, "spec": spec.to_dict()}
+
+
+@dataclass(frozen=True, slots=True)
+class _Shift:
+    """Moves positions from one home to another; distances and bearings stay what they are."""
+
+    old: tuple[float, float]
+    new: tuple[float, float]
+
+    def apply(self, value: Any) -> Any:
+        """Move every position in a manifest: mappings with lat and lon, and texts of `lat,lon,alt`."""
+        if isinstance(value, Mapping):
+            moved = {key: self.apply(part) for key, part in value.items()}
+            if "lat" in moved and "lon" in moved:
+                moved["lat"], moved["lon"] = self.point(value["lat"], value["lon"])
+            return moved
+        if isinstance(value, list):
+            return [self.apply(part) for part in value]
+        if isinstance(value, str):
+            return _PLACES.sub(self._in_text, value)
+        return value
+
+    def point(self, lat: float, lon: float) -> tuple[float, float]:
+        """Move one point."""
+        stretch = math.cos(math.radians(self.old[0])) / math.cos(math.radians(self.new[0]))
+        return round(self.new[0] + lat - self.old[0], 7), round(self.new[1] + (lon - self.old[1]) * stretch, 7)
+
+    def _in_text(self, found: re.Match[str]) -> str:
+        lat, lon = self.point(float(found[1]), float(found[2]))
+        return f"{lat:.7f},{lon:.7f},{found[3]}"
+
+
+_PLACES = re.compile(r"(-?\d+\.\d+),\s*(-?\d+\.\d+),\s*(-?\d+(?:\.\d+)?)")
+
+
+def as_text(place: Place) -> str:
+    """A place as programs read it: `lat,lon,alt`."""
+    return f"{place[0]:.7f},{place[1]:.7f},{place[2]:g}"
+
+
+def dump(value: Any) -> str:
+    """JSON for people."""
+    return json.dumps(value, indent=2) + "\n"

@@ -1,0 +1,109 @@
+"""Looks at an autopilot that is there already: who it is, where it stands, and whether it is ready to fly."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.experiment.station import OBSERVER_ID, STATION_COMPONENT, TcpLink
+from fractus_sim.vehicle.mav import AUTOPILOT_ARDUPILOTMEGA, Command, ModeFlag
+from fractus_sim.vehicle.wire import Message, Parser, Value, encode, layout_named
+
+CONNECT_S = 10.0
+HEARTBEAT_S = 15.0
+READY_S = 120.0
+ASK_S = 1.0
+POLL_S = 0.05
+FIX_3D = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """Where an autopilot stands: latitude, longitude, and altitude above mean sea level."""
+
+    system_id: int
+    home: tuple[float, float, float]
+
+
+def parse_link(text: str) -> tuple[str, int]:
+    """Host and port of `tcp:HOST:PORT`.
+
+    Raises:
+        ExperimentError: the text is something else.
+    """
+    kind, _, rest = text.partition(":")
+    host, _, port = rest.rpartition(":")
+    if kind != "tcp" or not host or not port.isdigit() or not 0 < int(port) < 65536:
+        raise ExperimentError(f"autopilot {text!r}: expected tcp:HOST:PORT")
+    return host, int(port)
+
+
+def look(link: str, tell: Callable[[str], None]) -> Standing:
+    """Wait until an ArduPilot vehicle on the ground knows where it is, and leave the link again.
+
+    Raises:
+        ExperimentError: nobody answers, it is no ArduPilot, it flies, or it has no position in time.
+    """
+    host, port = parse_link(link)
+    visitor = _Visitor(TcpLink.connect(host, port, CONNECT_S))
+    try:
+        heartbeat = visitor.wait(lambda m: m.name == "HEARTBEAT" and m.compid == 1, HEARTBEAT_S, "no heartbeat")
+        if heartbeat.integer("autopilot") != AUTOPILOT_ARDUPILOTMEGA:
+            raise ExperimentError(f"the autopilot at {link} is no ArduPilot")
+        if heartbeat.integer("base_mode") & ModeFlag.SAFETY_ARMED:
+            raise ExperimentError(f"the vehicle at {link} is armed; land and disarm it first")
+        visitor.system_id = heartbeat.sysid
+        tell(f"vehicle {heartbeat.sysid} at {link}; waiting for its position")
+        visitor.ask("GPS_RAW_INT")
+        visitor.wait(
+            lambda m: m.name == "GPS_RAW_INT" and m.integer("fix_type") >= FIX_3D, READY_S, "no GPS fix", "GPS_RAW_INT"
+        )
+        home = visitor.wait(lambda m: m.name == "HOME_POSITION", READY_S, "no home position", "HOME_POSITION")
+    finally:
+        visitor.close()
+    place = (home.integer("latitude") / 1e7, home.integer("longitude") / 1e7, home.integer("altitude") / 1000.0)
+    return Standing(heartbeat.sysid, place)
+
+
+class _Visitor:
+    """A short talk over one link."""
+
+    def __init__(self, link: TcpLink) -> None:
+        self.system_id = 0
+        self._link = link
+        self._parser = Parser()
+        self._sequence = 0
+
+    def ask(self, name: str) -> None:
+        """Ask for one message of a kind."""
+        values: dict[str, Value] = {"command": int(Command.REQUEST_MESSAGE), "param1": float(layout_named(name).msgid)}
+        values |= {"target_system": self.system_id, "target_component": 1}
+        frame = encode(
+            layout_named("COMMAND_LONG"), values, sequence=self._sequence, sysid=OBSERVER_ID, compid=STATION_COMPONENT
+        )
+        self._sequence = (self._sequence + 1) & 0xFF
+        self._link.send(frame)
+
+    def wait(self, wanted: Callable[[Message], bool], timeout_s: float, missing: str, asking: str = "") -> Message:
+        """The first message that is wanted; `asking` repeats the request each second.
+
+        Raises:
+            ExperimentError: it did not come in time.
+        """
+        deadline = time.monotonic() + timeout_s
+        next_ask = time.monotonic()
+        while time.monotonic() < deadline:
+            if asking and time.monotonic() >= next_ask:
+                next_ask += ASK_S
+                self.ask(asking)
+            for message in self._parser.feed(self._link.receive()):
+                if wanted(message):
+                    return message
+            time.sleep(POLL_S)
+        raise ExperimentError(f"{missing} from the autopilot within {timeout_s:.0f} s")
+
+    def close(self) -> None:
+        """Leave the link."""
+        self._link.close()

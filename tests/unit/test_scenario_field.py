@@ -1,0 +1,272 @@
+"""The field experiment's ground, how its logs are read, and that its expectations fail when they should."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from fractus_core.api.geometry import Point
+from fractus_core.geo import geodesic_m
+from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.report.track import Place, Sample, Track
+from fractus_sim.scenarios.field.drawing import draw_altitudes, draw_ground
+from fractus_sim.scenarios.field.evidence import Call, Evidence, read_evidence
+from fractus_sim.scenarios.field.expectations import Check, Judge
+from fractus_sim.scenarios.field.page import figures, summary
+from fractus_sim.scenarios.field.place import Field, as_text
+from fractus_sim.scenarios.field.probe import parse_link
+from vehicle_world import alone
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "field"
+CANBERRA = (-35.3632621, 149.1652374, 584.0)
+FIELD = Field.read(EXAMPLE)
+
+
+def test_the_ground_moves_with_home_and_keeps_its_shape():
+    moved = Field.read(EXAMPLE, CANBERRA)
+    assert moved.home == CANBERRA
+    for name, (lat, lon, alt) in FIELD.places.items():
+        there = moved.places[name]
+        assert there[2] == alt
+        here_m = geodesic_m(Point(lat=FIELD.home[0], lon=FIELD.home[1]), Point(lat=lat, lon=lon))
+        there_m = geodesic_m(Point(lat=CANBERRA[0], lon=CANBERRA[1]), Point(lat=there[0], lon=there[1]))
+        assert there_m == pytest.approx(here_m, rel=0.01), name
+    assert moved.zone("no-fly").area == pytest.approx(FIELD.zone("no-fly").area, rel=0.01)
+    assert "39.37" not in json.dumps(moved.documents), "nothing stays behind"
+
+
+def test_grants_hold_the_policies_or_none(tmp_path: Path):
+    manifests = FIELD.write(tmp_path)
+    bound, free = FIELD.grants(manifests, policies=True), FIELD.grants(manifests, policies=False)
+    assert {g["spec"]["component"] for g in bound} == {"Navigator", "AerialViewer"}
+    for grant in bound:
+        assert [p["name"] for p in grant["spec"]["policies"]] == [
+            "keep-away",
+            "low-flight",
+            "no-pictures-of-the-stripe",
+        ]
+    for grant in free:
+        assert not grant["spec"].get("policies")
+        assert grant["spec"]["operationArea"][0]["circle"]["radius"] == 1000.0
+    assert len(FIELD.operation_area(bound)) == 2
+
+
+@pytest.mark.parametrize("text", ["udp:1.2.3.4:14550", "tcp:host", "tcp::5760", "tcp:host:99999", "5760"])
+def test_autopilots_are_named_as_tcp_host_port(text: str):
+    with pytest.raises(ExperimentError, match="expected tcp:HOST:PORT"):
+        parse_link(text)
+    assert parse_link("tcp:127.0.0.1:5760") == ("127.0.0.1", 5760)
+
+
+def test_logs_are_read_on_the_clock_of_the_autopilot(tmp_path: Path):
+    vehicle, pilot = alone()
+    path = tmp_path / "drone.tlog"
+    with path.open("wb") as file:
+        pilot.craft.record(file)
+        pilot.craft.vehicle.channels[-1].set_interval("EXTENDED_SYS_STATE", 0.5)
+        pilot.take_off(8.0)
+        pilot.go_to(10.0, 0.0, 8.0)
+        pilot.fly_on(8.0)
+    moment = datetime.fromtimestamp((vehicle.config.epoch_us / 1e6) + 12.5, UTC)
+    entry = {
+        "kind": "call", "time": moment.isoformat(), "caller": "spiffe://x/ns/d/app/f/component/Navigator/instance/n",
+        "method": "Goto", "action": "correct", "code": "AltitudeAboveLimit", "policies": ["low-flight"], "reason": "r",
+        "args": {"lat": 48.2, "lon": 16.37, "alt": 20.0}, "result": {"lat": 48.2, "lon": 16.37, "alt": 15.0},
+        "lat": 48.2, "lon": 16.37, "alt": 8.0,
+    }  # fmt: skip
+    audit = tmp_path / "mobility.jsonl"
+    audit.write_text(json.dumps(entry) + "\n" + json.dumps({"kind": "state"}) + '\n{"kind": "ca')
+    read = read_evidence("normal", "normal", policies=True, tlog=path, audits=(audit,))
+    (call,) = read.calls
+    assert call.time_s == pytest.approx(12.5, abs=0.05)
+    assert (call.who, call.method) == ("Navigator", "Goto")
+    assert call.asked == Place(48.2, 16.37, 20.0) and call.flown == Place(48.2, 16.37, 15.0)
+    assert read.track.max_altitude_m == pytest.approx(8.0, abs=0.5)
+    assert read.track.takeoff_s is not None
+    assert any("Arming motors" in text for text in read.texts)
+
+
+# -- expectations on made-up flights ---------------------------------------------------------------------------
+
+
+def _samples(stops: list[tuple[float, float, float, str]]) -> tuple[Sample, ...]:
+    """A flight at 5 m/s through (east, north, altitude, mode), from the ground and back to it."""
+    samples, time_s, at = [], 0.0, (0.0, 0.0, 0.0)
+    for east, north, alt, mode in [*stops, (0.0, 0.0, 15.0, "RTL"), (0.0, 0.0, 0.0, "RTL")]:
+        steps = max(1, round(math.dist(at, (east, north, alt)) / 1.0))
+        for step in range(1, steps + 1):
+            now = tuple(a + (b - a) * step / steps for a, b in zip(at, (east, north, alt), strict=True))
+            time_s += 0.2
+            lat, lon = FIELD.frame.latlon(now[0], now[1])
+            samples.append(Sample(time_s, Place(lat, lon, now[2]), 5.0, mode, now[2] > 0.3, 0.9))
+        at = (east, north, alt)
+    ground = replace(samples[-1], time_s=time_s + 1.0, in_air=False)
+    return (replace(samples[0], time_s=0.0, in_air=False), *samples, ground)
+
+
+def _at(name: str, alt: float | None = None) -> tuple[float, float, float, str]:
+    lat, lon, usual = FIELD.places[name]
+    return (*FIELD.frame.xy(lat, lon), usual if alt is None else alt, "GUIDED")
+
+
+def _when(samples: tuple[Sample, ...], name: str) -> float:
+    lat, lon, _ = FIELD.places[name]
+    return min(samples, key=lambda s: (s.place.lat - lat) ** 2 + (s.place.lon - lon) ** 2).time_s
+
+
+def _goto(
+    time_s: float, name: str, action: str, asked: float = 10.0, flown: float | None = None, why: str = ""
+) -> Call:
+    lat, lon, _ = FIELD.places[name]
+    result = Place(lat, lon, asked if flown is None else flown) if action != "deny" else None
+    return Call(time_s, "Navigator", "Goto", action, why, why, (why,), Place(lat, lon, asked), result, None)
+
+
+def _picture(samples: tuple[Sample, ...], time_s: float, action: str) -> Call:
+    at = min(samples, key=lambda s: abs(s.time_s - time_s)).place
+    policies = ("no-pictures-of-the-stripe",) if action == "deny" else ()
+    return Call(time_s, "AerialViewer", "CaptureImage", action, "Privacy", "", policies, None, None, at)
+
+
+def _system(time_s: float, what: str, code: str = "") -> Call:
+    return Call(time_s, "system", what, "", code, "because", (), None, None, None)
+
+
+def _pictures(samples: tuple[Sample, ...]) -> list[Call]:
+    """One at each of five waypoints, and one refused over the stripe."""
+    found = [_picture(samples, _when(samples, name), "allow") for name in ("WP1", "WP2", "WP3", "WP4", "WP5")]
+    stripe, frame = FIELD.zone("no-photo"), FIELD.frame
+    middle = stripe.centroid
+    over = min(samples, key=lambda s: math.dist(frame.xy(s.place.lat, s.place.lon), (middle.x, middle.y)))
+    return [*found, _picture(samples, over.time_s, "deny")]
+
+
+def _run(name: str, samples: tuple[Sample, ...], calls: list[Call], *, policies: bool = True) -> Evidence:
+    ordered = tuple(sorted(calls, key=lambda c: c.time_s))
+    return Evidence(name, name, policies, Track(name, samples), ordered, ())
+
+
+UP = (0.0, 0.0, 10.0, "GUIDED")
+
+
+def _normal() -> Evidence:
+    samples = _samples(
+        [UP, _at("CTRL1"), *[_at(f"WP{n}") for n in range(1, 5)], _at("CTRL2"), *[_at(f"WP{n}") for n in range(5, 10)]]
+    )
+    calls = [_system(_when(samples, "CTRL1"), "granted"), _system(_when(samples, "WP9"), "over", "x")]
+    return _run("normal", samples, [*calls, *_pictures(samples)])
+
+
+def _guarded() -> Evidence:
+    stops = [
+        UP,
+        _at("CTRL1"),
+        _at("WP1", 15.0),
+        _at("WP2"),
+        _at("WP3", 15.0),
+        _at("WP4"),
+        _at("CTRL2"),
+        _at("WP5"),
+        _at("WP6", 5.0),
+        _at("WP7"),
+    ]
+    samples = _samples(stops)
+    end = _when(samples, "WP7")
+    calls = [
+        _system(_when(samples, "CTRL1") + 0.1, "granted"),
+        _goto(_when(samples, "CTRL1") + 0.2, "WP1", "correct", 20.0, 15.0, "low-flight"),
+        _goto(_when(samples, "WP2"), "WP-E1", "deny", why="operation-area"),
+        _goto(_when(samples, "WP2") + 0.2, "WP3", "correct", 20.0, 15.0, "low-flight"),
+        _goto(_when(samples, "WP5"), "WP6", "correct", 4.0, 5.0, "low-flight"),
+        _goto(end, "WP-E2", "deny", why="keep-away"),
+        _system(end + 0.1, "revoke", "InsideExclusionZone"),
+    ]
+    return _run("guarded", samples, [*calls, *_pictures(samples)])
+
+
+def _unguarded() -> Evidence:
+    stops = [
+        UP,
+        _at("CTRL1"),
+        _at("WP1", 20.0),
+        _at("WP2"),
+        _at("WP-E1"),
+        _at("WP3", 20.0),
+        _at("WP4"),
+        _at("CTRL2"),
+        _at("WP5"),
+        _at("WP6", 4.0),
+        _at("WP7"),
+        _at("WP-E2"),
+        _at("WP8"),
+        _at("WP9"),
+    ]
+    samples = _samples(stops)
+    pictures = [_picture(samples, call.time_s, "allow") for call in _pictures(samples)]
+    return _run("unguarded", samples, pictures, policies=False)
+
+
+def _failed(checks: list[Check]) -> list[str]:
+    return [check.text for check in checks if not check.holds]
+
+
+def test_flights_as_they_should_be_fulfil_every_expectation():
+    assert _failed(Judge(FIELD, _normal()).normal()) == []
+    assert _failed(Judge(FIELD, _guarded()).guarded()) == []
+    assert _failed(Judge(FIELD, _unguarded()).unguarded()) == []
+
+
+def test_an_unguarded_flight_fails_what_is_expected_of_a_guarded_one():
+    failed = _failed(Judge(FIELD, _unguarded()).guarded())
+    for part in ("WP1, asked for", "WP6, asked for", "above 15", "WP-E1 is", "WP-E2", "no-fly", "none of them above"):
+        assert any(part in text for text in failed), part
+
+
+def _without(run: Evidence, *methods: str) -> Evidence:
+    return replace(run, calls=tuple(c for c in run.calls if c.method not in methods))
+
+
+def _changed(run: Evidence, place: str, **changes: object) -> Evidence:
+    lat, lon, _ = FIELD.places[place]
+    calls = [
+        replace(c, **changes) if c.asked is not None and (c.asked.lat, c.asked.lon) == (lat, lon) else c  # type: ignore[arg-type]
+        for c in run.calls
+    ]
+    return replace(run, calls=tuple(calls))
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "text"),
+    [
+        (_without(_guarded(), "revoke"), "revokes access"),
+        (_without(_guarded(), "CaptureImage"), "pictures are taken"),
+        (_changed(_guarded(), "WP-E1", action="allow"), "discarded"),
+        (_changed(_guarded(), "WP3", action="deny"), "goes on"),
+        (_changed(_guarded(), "WP1", flown=Place(0.0, 0.0, 17.0)), "WP1, asked for"),
+        (_changed(_guarded(), "WP6", flown=Place(0.0, 0.0, 4.2)), "WP6, asked for"),
+        (replace(_guarded(), track=Track("x", _guarded().track.samples[:-40])), "lands at home"),
+    ],
+)
+def test_each_expectation_can_fail(spoilt: Evidence, text: str):
+    assert any(text in failed for failed in _failed(Judge(FIELD, spoilt).guarded()))
+
+
+def test_the_page_and_the_pictures(tmp_path: Path):
+    runs = [_normal(), _guarded(), _unguarded()]
+    checks = Judge(FIELD, runs[1]).guarded()
+    page = summary(FIELD, runs, checks, "made-up vehicles")
+    assert f"All {len(checks)} expectations hold" in page
+    assert "| guarded | WP6 | 4 m | 5.0 m |" in page
+    assert figures(FIELD, runs, checks, "x")["runs"][1]["corrected"] == 3
+    area = FIELD.operation_area(FIELD.grants(FIELD.write(tmp_path), policies=True))
+    for figure in (draw_ground(FIELD, area, runs), draw_altitudes(runs)):
+        figure.savefig(tmp_path / "picture.png")
+        assert (tmp_path / "picture.png").stat().st_size > 20_000
+
+
+def test_places_as_text():
+    assert as_text((39.37, 22.93, 10.0)) == "39.3700000,22.9300000,10"

@@ -37,24 +37,44 @@ class Children:
         self._parallel = asyncio.Semaphore(_PARALLEL)
         self._normalised: dict[tuple[Kind, Key], tuple[object, ...] | None] = {}
 
-    async def observed(self, kind: Kind, key: Key) -> Body | None:
-        """The object as the watch last showed it; where it showed none, as the API server has it."""
+    async def look_around(self, namespace: str) -> Mapping[Kind, set[str]]:
+        """Names of all that is in a namespace of the kinds that are made there: one look instead of one an object."""
+        made_there = [kind for kind in kinds.CHILDREN if kind.namespaced]
+        found = await asyncio.gather(*(self._store.names(kind, namespace) for kind in made_there))
+        return dict(zip(made_there, found, strict=True))
+
+    async def observed(self, kind: Kind, key: Key, taken: Mapping[Kind, set[str]] | None = None) -> Body | None:
+        """The object as the watch last showed it; where it showed none, as the API server has it.
+
+        Args:
+            kind: Its kind.
+            key: Its namespace and name.
+            taken: Names that are known to be in use there, if somebody has just looked.
+        """
         cached = self._live.children[kind].get(key)
         if cached is not None:
             return cached
+        if taken is not None and kind in taken and key[1] not in taken[kind]:
+            return None
         try:
             return await self._store.get(kind, key[1], key[0])
         except NotFound:
             return None
 
-    async def apply(self, application: Application, kind: Kind, bodies: Sequence[Body]) -> None:
-        """Apply those objects of a kind that are not as they should be.
+    async def apply(
+        self,
+        application: Application,
+        wanted: Mapping[Kind, Sequence[Body]],
+        taken: Mapping[Kind, set[str]] | None = None,
+    ) -> None:
+        """Apply those objects that are not as they should be; `taken` as for `observed`.
 
         Raises:
             NameTaken: somebody else's object has the name of one of them.
         """
         results = await asyncio.gather(
-            *(self._apply_one(application, kind, body) for body in bodies), return_exceptions=True
+            *(self._apply_one(application, kind, body, taken) for kind, bodies in wanted.items() for body in bodies),
+            return_exceptions=True,
         )
         for result in results:
             if isinstance(result, BaseException):
@@ -78,11 +98,13 @@ class Children:
         async with self._parallel:
             self._live.children[kinds.GRANT].note(key, await self._store.apply(kinds.GRANT, body))
 
-    async def _apply_one(self, application: Application, kind: Kind, body: Body) -> None:
+    async def _apply_one(
+        self, application: Application, kind: Kind, body: Body, taken: Mapping[Kind, set[str]] | None
+    ) -> None:
         key = key_of(body)
         desired = stamped(body)
         async with self._parallel:
-            observed = await self.observed(kind, key)
+            observed = await self.observed(kind, key, taken)
             current = is_current(desired, observed) or self._is_normalised(kind, key, desired, observed)
             if kind is kinds.GRANT and observed is not None:
                 current = (current or _says_the_same(observed, body)) and self._grantor.vouches_for(observed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 
@@ -46,6 +46,13 @@ RESYNC_S = 30.0
 _REFUSALS = frozenset({400, 403, 422})
 """HTTP statuses by which the API server says that it does not want an object: the user should know."""
 
+_WAVES = (
+    (kinds.GRANT, kinds.DEPLOYMENT_PLAN),
+    (kinds.SECRET, kinds.SERVICE, kinds.ENDPOINT_SLICE),
+    (kinds.DEPLOYMENT,),
+)
+"""What is applied together, one after the other: what an object in the way of another must not stop comes first."""
+
 _OPTIONAL = frozenset({"NodeCordoned", "NodesAppeared"})
 """Reasons for a new plan that can do without: what runs goes on where there is no other."""
 
@@ -65,6 +72,10 @@ class _Memory:
     excluded: dict[str, tuple[datetime, str]] = field(default_factory=dict)
     status: tuple[str, Body] | None = None
     """(uid, status) as last written: the watch may be behind."""
+    refreshed: tuple[object, ...] | None = None
+    """Of what the grants were found to be up to date."""
+    compiled: tuple[tuple[object, ...], DeploymentPlanSpec, tuple[GrantSpec, ...]] | None = None
+    """Grants as they were compiled last, from what, for which plan."""
 
 
 class Deployments:
@@ -159,18 +170,23 @@ class Deployments:
             await self._clear(key)
             return None, RESYNC_S
         try:
-            await self._refresh(key, submitted.uid)
+            await self._refresh(key, submitted.uid, memory)
             await self._give_up_lost_drone(key, submitted.uid)
             await self._give_up_lost_ride(key, submitted)
             return await self._progress(key, submitted, memory)
         except Hindered as hindrance:
             return hindered_standing(hindrance, present), hindrance.again_s
 
-    async def _refresh(self, key: Key, uid: str) -> None:
+    async def _refresh(self, key: Key, uid: str, memory: _Memory) -> None:
         """Bring the policies of what is granted up to date, whatever becomes of the application's next plan."""
+        vouched = self._vouched(key, uid)
+        basis = self._basis(vouched)
+        if memory.refreshed == basis:
+            return
         inventory = self._live.snapshot(key, uid)
-        grants = [(grant, refresh(grant.spec, inventory)) for grant in self._vouched(key, uid)]
+        grants = [(grant, refresh(grant.spec, inventory)) for grant in vouched]
         stale = [(grant, spec) for grant, spec in grants if spec != grant.spec]
+        memory.refreshed = None if stale else basis
         try:
             await self._children.refresh(stale)
         except StoreError as error:
@@ -182,6 +198,28 @@ class Deployments:
     def _vouched(self, key: Key, uid: str) -> list[Grant]:
         """The grants of an application that are as they were signed: nothing of another one is ever signed again."""
         return [grant for grant in self._live.grants_of(key, uid) if self._grantor.vouches(grant)]
+
+    def _basis(self, grants: Sequence[Grant], *more: object) -> tuple[object, ...]:
+        """What tells that nothing changed of which grants are made, nor they themselves."""
+        versions = sorted((g.name, g.metadata.uid or "", g.metadata.resource_version or "") for g in grants)
+        return (self._live.rules_revision, *versions, *more)
+
+    def _compiled(
+        self, application: Application, decided: DeploymentPlanSpec, inventory: Inventory, memory: _Memory
+    ) -> tuple[GrantSpec, ...]:
+        """The grants of a plan; those of the last look while nothing changed.
+
+        Raises:
+            InvalidObject: nothing can be granted.
+        """
+        present = self._vouched(application.key, application.metadata.uid or "")
+        basis = self._basis(present, application.metadata.uid, application.metadata.generation)
+        known = memory.compiled
+        if known is not None and known[0] == basis and known[1] is decided:
+            return known[2]
+        grants = compile_grants(application, decided, inventory, self._settings, [grant.spec for grant in present])
+        memory.compiled = (basis, decided, grants)
+        return grants
 
     async def _give_up_lost_drone(self, key: Key, uid: str) -> None:
         """Take down an application whose drone is another's by an older grant, so that it is planned anew.
@@ -232,8 +270,7 @@ class Deployments:
             phase: Phase = "Queued" if none.reason == "DroneBusy" else "Pending"
             raise Hindered(phase, "Planned", none.reason, none.message) from none
         try:
-            present = [grant.spec for grant in self._vouched(key, submitted.uid)]
-            grants = compile_grants(application, decided, inventory, self._settings, present)
+            grants = self._compiled(application, decided, inventory, memory)
         except InvalidObject as error:
             raise Hindered("Pending", "Granted", "PolicyInvalid", str(error)) from error
         try:
@@ -318,11 +355,13 @@ class Deployments:
             wanted[kinds.DEPLOYMENT].append(builders.deployment(application, placed, drone))
         secrets = {builders.secret_name(placed.instance): placed for placed in decided.placements}
         await self._children.prune(application, wanted, keep_secrets=secrets.keys())
+        new = not self._live.children_of(application.key, kinds.DEPLOYMENT)
+        taken = await self._children.look_around(application.key[0]) if new else None
         for placed in secrets.values():
-            wanted[kinds.SECRET].append(await self._certificate(application, placed))
+            wanted[kinds.SECRET].append(await self._certificate(application, placed, taken))
         wanted[kinds.DEPLOYMENT] = [body for body in wanted[kinds.DEPLOYMENT] if not self._in_the_air(body, decided)]
-        for kind in kinds.CHILDREN:
-            await self._children.apply(application, kind, wanted[kind])
+        for wave in _WAVES:
+            await self._children.apply(application, {kind: wanted[kind] for kind in wave}, taken)
 
     def _in_the_air(self, desired: Body, decided: DeploymentPlanSpec) -> bool:
         """Whether a Deployment is left alone: its drone flies, and its owner has asked for no change.
@@ -337,11 +376,14 @@ class Deployments:
         present = (observed["metadata"].get("annotations") or {}).get(CAUSE_ANNOTATION)
         return cause == present and cause.rpartition("@")[2] == drone
 
-    async def _certificate(self, application: Application, placed: PlannedInstance) -> Body:
+    async def _certificate(
+        self, application: Application, placed: PlannedInstance, taken: Mapping[Kind, set[str]] | None
+    ) -> Body:
         """The Secret of an instance: the present certificate while it is good, so that a restart renews nothing."""
         namespace, name = application.key
         identity = component_identity(namespace, name, placed.component, placed.instance)
-        observed = await self._children.observed(kinds.SECRET, (namespace, builders.secret_name(placed.instance)))
+        place = (namespace, builders.secret_name(placed.instance))
+        observed = await self._children.observed(kinds.SECRET, place, taken)
         data = dict((observed or {}).get("data") or {})
         now = self._clock()
         if not self._authority.still_good(data, identity, now):

@@ -19,7 +19,10 @@ from fractus_operator.store import StoreError
 
 logger = logging.getLogger(__name__)
 
-_DEBOUNCE_S = 0.05
+_SHORTEST_S, _LONGEST_S = 0.02, 1.0
+_REST = 2.0
+"""After a reconcile the next one waits this many times as long as that took: where many are busy, each looks less often."""
+
 _BACKOFF_S = (0.5, 30.0)
 _RETRY_S = 5.0
 
@@ -67,9 +70,11 @@ def _by_address(info: kopf.ConnectionInfo | None) -> kopf.ConnectionInfo | None:
 async def follow(live: LiveInventory, deployments: Deployments, key: Key, stopped: kopf.DaemonStopped) -> None:
     """Reconcile an application whenever one of its inputs changes, until it is deleted."""
     failures = 0
+    loop = asyncio.get_running_loop()
     await live.synced()
     with live.subscription(key) as inputs:
         while not stopped:
+            began = loop.time()
             try:
                 again_s = await deployments.reconcile(key)
                 failures = 0
@@ -80,9 +85,10 @@ async def follow(live: LiveInventory, deployments: Deployments, key: Key, stoppe
                 low, high = _BACKOFF_S
                 again_s = min(high, low * 2.0 ** min(failures, 8)) * random.uniform(0.5, 1.0)  # noqa: S311  (jitter)
                 logger.warning("%s/%s: %s; again in %.1f s", *key, error, again_s)
+            took_s = loop.time() - began
             if await inputs.changed(again_s):
                 # Changes come in bursts, such as the pods of a plan: one reconcile for all.
-                await asyncio.sleep(_DEBOUNCE_S)
+                await asyncio.sleep(min(max(_SHORTEST_S, _REST * took_s), _LONGEST_S))
 
 
 def configure(settings: kopf.OperatorSettings) -> None:

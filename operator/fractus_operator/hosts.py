@@ -15,6 +15,9 @@ T = TypeVar("T")
 
 Amounts = dict[str, float]
 
+Asked = tuple[Key, str, str, Mapping[str, float]]
+"""A planned instance: its application as labels name it, its name, its node, and what it asks of it."""
+
 
 class Bookings:
     """What pods have asked for, by node; kept current one pod at a time."""
@@ -108,15 +111,13 @@ class ByName(Mapping[str, T]):
         return sum(value is not None for value in self._objects.values())
 
 
-def corrections(
-    planned: Iterable[tuple[Key, str, str, Mapping[str, float]]], pods: Iterable[PodView], own: Key | None
-) -> dict[str, Amounts]:
+def corrections(planned: Iterable[Asked], pods: Iterable[PodView], own: Key | None) -> dict[str, Amounts]:
     """What to add to the bookings of nodes for a plan of the application `own`.
 
     Planned instances whose pods are not bound yet count as if they were; the application's own pods do not count.
 
     Args:
-        planned: (application, instance, node, requests) of each planned instance.
+        planned: Every planned instance on a node.
         pods: The pods of applications.
         own: (namespace, application label) of who is planned.
     """

@@ -25,7 +25,7 @@ from fractus_core.planning.whereabouts import Whereabouts
 
 from fractus_operator import kinds
 from fractus_operator.claims import Claim, OwnedPlan, claims
-from fractus_operator.hosts import BookedHosts, Bookings, ByName, corrections
+from fractus_operator.hosts import Asked, BookedHosts, Bookings, ByName, corrections
 from fractus_operator.kinds import Body, Key, Kind
 from fractus_operator.labels import APPLICATION_LABEL, MANAGED_SELECTOR, NAMESPACE_LABEL, label_value
 from fractus_operator.pods import PodView, read_host, read_pod
@@ -82,7 +82,14 @@ class LiveInventory:
             selectors={"fieldSelector": f"spec.signerName={SIGNER}"},
         )
         self.children: dict[Kind, Reflector[Body]] = {
-            kind: Reflector(store, kind, _as_is, self._child_changed, selectors=managed) for kind in kinds.CHILDREN
+            kind: Reflector(
+                store,
+                kind,
+                _without_status if kind is kinds.DEPLOYMENT else _as_is,
+                self._child_changed,
+                selectors=managed,
+            )
+            for kind in kinds.CHILDREN
         }
         self._subscriptions: dict[Key, Subscription] = {}
         self._listeners: dict[Kind, list[Callable[[Key], None]]] = {}
@@ -94,6 +101,8 @@ class LiveInventory:
         self._bookings = Bookings()
         self._pods: dict[Key, dict[Key, PodView]] = {}
         self._where = Whereabouts()
+        self._asked: dict[Key, tuple[OwnedPlan, Submitted, tuple[Asked, ...]]] = {}
+        self.rules_revision = 0
 
     # -- running --
 
@@ -290,6 +299,8 @@ class LiveInventory:
                 self._where.upsert_drone(new)
         else:
             self._where.remove_drone(key[1])
+        if old is None or new is None or old.spec != new.spec or old.metadata.labels != new.metadata.labels:
+            self.rules_revision += 1
         if old is None or new is None or _planning_view(old) != _planning_view(new):
             self.wake_all()
 
@@ -299,10 +310,12 @@ class LiveInventory:
             self._where.remove_edge_node(key[1])
         elif old is None or old.spec.location != new.spec.location:
             self._where.upsert_edge_node(new)
-        if old is None or new is None or old.spec != new.spec:
+        if old is None or new is None or old.spec != new.spec or old.metadata.labels != new.metadata.labels:
+            self.rules_revision += 1
             self.wake_all()
 
     def _depot_changed(self, key: Key, old: Depot | None, new: Depot | None) -> None:
+        self.rules_revision += 1
         if new is None:
             self._where.remove_depot(key[1])
         else:
@@ -311,6 +324,7 @@ class LiveInventory:
 
     def _spec_changed(self, kind: Kind) -> Callable[[Key, Any, Any], None]:
         def changed(key: Key, old: Any, new: Any) -> None:
+            self.rules_revision += 1
             self._report(kind, key)
             if old is None or new is None or type(old) is not type(new) or old.spec != new.spec:
                 self.wake_all()
@@ -362,16 +376,19 @@ class LiveInventory:
 
     # -- bookings --
 
-    def _planned(self) -> Iterator[tuple[Key, str, str, Mapping[str, float]]]:
+    def _planned(self) -> Iterator[Asked]:
         """Each planned instance on a node, with what it asks for."""
-        for key, plan in self.plans().items():
+        plans = self.plans()
+        for gone in self._asked.keys() - plans.keys():
+            del self._asked[gone]
+        for key, plan in plans.items():
             submitted = self.applications.get(key)
-            if submitted is None or submitted.application is None:
+            if submitted is None:
                 continue
-            components = {c.name: c for c in submitted.application.spec.components}
-            for placed in plan.spec.placements:
-                if placed.node is not None and placed.component in components:
-                    yield _place(key), placed.instance, placed.node, requests(components[placed.component])
+            known = self._asked.get(key)
+            if known is None or known[0] is not plan or known[1] is not submitted:
+                known = self._asked[key] = (plan, submitted, tuple(_asked(key, plan, submitted)))
+            yield from known[2]
 
     def _claim_on_record(self, drone: str) -> Claim:
         """Who flew the drone last, from the applications' statuses, for an operator that was restarted since."""
@@ -393,6 +410,13 @@ def _planning_view(drone: Drone) -> tuple[object, ...]:
     return (drone.spec, is_flying(drone), ready)
 
 
+def _asked(key: Key, plan: OwnedPlan, submitted: Submitted) -> Iterator[Asked]:
+    components = {c.name: c for c in submitted.application.spec.components} if submitted.application else {}
+    for placed in plan.spec.placements:
+        if placed.node is not None and placed.component in components:
+            yield _place(key), placed.instance, placed.node, requests(components[placed.component])
+
+
 def _stand(drone: Drone) -> tuple[object, ...]:
     return (drone.spec.depot, drone.spec.home)
 
@@ -400,6 +424,16 @@ def _stand(drone: Drone) -> tuple[object, ...]:
 def _place(key: Key) -> Key:
     """The application as labels name it."""
     return (key[0], label_value(key[1]))
+
+
+def _without_status(body: Body) -> Body:
+    """A Deployment without what changes all the time while its pods come up."""
+    kept = {name: value for name, value in body.items() if name != "status"}
+    kept["metadata"] = {n: v for n, v in body["metadata"].items() if n not in {"managedFields", "resourceVersion"}}
+    annotations = dict(kept["metadata"].get("annotations") or {})
+    annotations.pop("deployment.kubernetes.io/revision", None)
+    kept["metadata"]["annotations"] = annotations
+    return kept
 
 
 def _as_is(body: Body) -> Body:

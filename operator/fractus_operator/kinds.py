@@ -75,7 +75,7 @@ ENDPOINT_SLICE = Kind("discovery.k8s.io/v1", "EndpointSlice", "endpointslices", 
 SIGNING_REQUEST = Kind("certificates.k8s.io/v1", "CertificateSigningRequest", "certificatesigningrequests", False)
 
 CHILDREN: tuple[Kind, ...] = (GRANT, DEPLOYMENT_PLAN, SECRET, SERVICE, ENDPOINT_SLICE, DEPLOYMENT)
-"""What the operator makes for an Application, in the order in which it is applied: what an object in the way of another must not stop comes first."""
+"""What the operator makes for an Application, in the order in which it is applied."""
 
 
 def key_of(body: Body) -> Key:

@@ -22,6 +22,7 @@ from fractus_operator.kinds import EVENT, Body, Key, Kind
 FIELD_MANAGER = "fractus-operator"
 _REQUEST_TIMEOUT_S = 15.0
 _PAGE = 500
+_NAMES_ONLY = "application/json;as=PartialObjectMetadataList;g=meta.k8s.io;v=v1"
 
 
 class StoreError(Exception):
@@ -129,6 +130,18 @@ class Store:
             page = await self.list_page(kind, selectors=selectors, continue_=page.continue_)
             items += page.items
         return items
+
+    async def names(self, kind: Kind, namespace: str) -> set[str]:
+        """Names of all objects of a kind in a namespace; nothing else of them is read."""
+        found: set[str] = set()
+        continue_ = ""
+        while True:
+            params = {"limit": str(_PAGE), **({"continue": continue_} if continue_ else {})}
+            page = Page(await self._send("GET", kind.path(namespace), params=params, accept=_NAMES_ONLY))
+            found.update(item["metadata"]["name"] for item in page.items)
+            continue_ = page.continue_
+            if not continue_:
+                return found
 
     async def watch(
         self,
@@ -286,14 +299,16 @@ class Store:
         params: Mapping[str, str] | None = None,
         body: Body | None = None,
         content_type: str = "application/json",
+        accept: str = "application/json",
     ) -> Body:
+        headers = {"Accept": accept, **({"Content-Type": content_type} if body is not None else {})}
         try:
             response = await self._client.request(
                 method,
                 path,
                 params=params,
                 content=None if body is None else json.dumps(body),
-                headers=None if body is None else {"Content-Type": content_type},
+                headers=headers,
             )
         except httpx2.HTTPError as error:
             raise StoreError(0, "Unreachable", f"{method} {path}: {type(error).__name__}: {error}") from error

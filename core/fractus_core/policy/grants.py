@@ -54,6 +54,7 @@ def compile_grants(
     settings = settings or Settings()
     before = {(grant.instance, grant.node): grant for grant in present}
     area = operation_area(application.spec, inventory.depots, settings.safety_radius_m)
+    aboard: GrantSpec | None = None
     grants = []
     for placed in plan.placements:
         component = application.spec.component(placed.component)
@@ -67,7 +68,9 @@ def compile_grants(
             grants.append(refresh(last, inventory))
             continue
         if placed.placement == "drone" and area is not None:
-            grant = _drone_grant(application, component, placed, inventory, area)
+            # All of them are on one drone.
+            aboard = aboard or _drone_grant(application, component, placed, inventory, area)
+            grant = _granted_aboard(aboard, component, placed, inventory)
             grant = grant.model_copy(update={"tour": area.route}) if guides else grant
         else:
             grant = _edge_grant(application, component, placed, inventory)
@@ -107,22 +110,33 @@ def _drone_grant(
     base = ground(home) if home is not None else depot.spec.location if depot is not None else area.start
     stand = Area(circle=Circle(center=base, radius=depot.spec.radius if depot is not None else 30.0))
     way = shapely.union(area.shape, polygon(area.frame, stand)).convex_hull
-    driver = component.class_ == "driver"
     return GrantSpec(
         node=drone.name,
         application=_owner(application),
         component=component.name,
         instance=placed.instance,
-        class_=component.class_,
-        control=(component.control or "full") if driver else None,
-        control_points=_opened(component, inventory) if driver else (),
-        points_of_interest=component.points_of_interest,
-        services=component.services,
         operation_area=area_of(area.frame, area.shape),
         corridor=area_of(area.frame, way),
         depot=depot.spec.location if depot is not None else None,
         home=home,
         limits=GrantedLimits(max_altitude=mobility.max_altitude, max_speed=mobility.max_speed) if mobility else None,
+    )
+
+
+def _granted_aboard(
+    aboard: GrantSpec, component: Component, placed: PlannedInstance, inventory: Inventory
+) -> GrantSpec:
+    driver = component.class_ == "driver"
+    return aboard.model_copy(
+        update={
+            "component": component.name,
+            "instance": placed.instance,
+            "class_": component.class_,
+            "control": (component.control or "full") if driver else None,
+            "control_points": _opened(component, inventory) if driver else (),
+            "points_of_interest": component.points_of_interest,
+            "services": component.services,
+        }
     )
 
 

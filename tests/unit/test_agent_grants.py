@@ -246,6 +246,23 @@ def test_an_authority_that_stays_unknown_ends_the_grant(
     assert on_disk(tmp_path) == set(), "what the API server has no more does not come back"
 
 
+async def test_an_api_server_that_is_gone_for_a_month_takes_no_grant_away(
+    doubting: GrantKeeper, doubter: Doubter, store: FakeStore, tmp_path: Path
+) -> None:
+    doubting.take(Listed((manifest("g1"), manifest("g2"))))
+    store.down = True
+    doubter.error = Undecided("there is no ca.crt any more")
+    for _ in range(30):
+        doubter.now_s += 86_400
+        doubting.missions_changed({"u1": f"failed: {doubter.now_s}"})
+        doubting._give_up_undecided()
+        doubting._retry_disk()
+        doubting.authority_changed()
+        with pytest.raises(Unavailable):
+            await doubting.report_once()
+    assert on_disk(tmp_path) == {"g1.json", "g2.json"}
+
+
 def test_outcomes() -> None:
     grant = Grant.from_body(manifest())
     assert outcome_of(grant, {}) is None

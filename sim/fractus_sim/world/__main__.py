@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+from pathlib import Path
 
 import click
 
@@ -99,6 +100,21 @@ def _origin(_context: click.Context, _option: click.Parameter, text: str | None)
     metavar="LAT,LON",
     help="Middle of the landscape; cameras that share a world share it.  [default: the first position, to 0.1 degrees]",
 )
+@click.option(
+    "--orthophoto",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Your own aerial picture instead of the landscape: a GeoTIFF, or a PNG or JPEG with a world file.",
+)
+@click.option(
+    "--crs",
+    help="System of the orthophoto's world file: EPSG:4326 (the default), a UTM zone such as EPSG:32633, or local "
+    "(metres from --origin).",
+)
+@click.option(
+    "--photos",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Geotagged pictures instead of a world: the one taken nearest is served; thermal ones in ir/ or named *_ir.",
+)
 def camera_world(**given: object) -> None:
     """Serve what a camera above a simulated world sees: /snapshot.jpg, /truth.json, /orthophoto.png."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
@@ -118,18 +134,29 @@ def _serve(
     stabilised: bool,
     seed: int,
     origin: tuple[float, float] | None,
+    orthophoto: Path | None,
+    crs: str | None,
+    photos: Path | None,
 ) -> None:
-    from fractus_sim.world.server import CameraServer, Studio  # noqa: PLC0415 - the command line stays quick
+    from fractus_sim.world.photos import Photos  # noqa: PLC0415 - the command line stays quick
+    from fractus_sim.world.raster import read_raster  # noqa: PLC0415
+    from fractus_sim.world.server import CameraServer  # noqa: PLC0415
+    from fractus_sim.world.studio import Studio  # noqa: PLC0415
     from fractus_sim.world.whereabouts import Fixed, Vehicle, parse_address  # noqa: PLC0415
-    from fractus_sim.world.world import WorldAround  # noqa: PLC0415
+    from fractus_sim.world.world import World, WorldAround  # noqa: PLC0415
 
     try:
         intrinsics = Intrinsics(*resolution, fov_deg)
         mount = Mount(mount_pitch_deg, mount_yaw_deg, stabilised)
-        whereabouts = Fixed(pose) if pose is not None else Vehicle(parse_address(vehicle), ground_amsl_m)
+        whereabouts: Vehicle | Fixed = Vehicle(parse_address(vehicle), ground_amsl_m)
+        if pose is not None:
+            whereabouts = Fixed(pose, ground_amsl_m or 0.0)
+        own = None if orthophoto is None else World.on(read_raster(orthophoto, crs, origin), seed)
+        album = None if photos is None else Photos.of(photos)
     except ValueError as error:
         raise click.ClickException(str(error)) from error
-    studio = Studio(WorldAround(seed, origin), whereabouts, intrinsics, mount, time.time)
+    world = WorldAround(seed, origin, own)
+    studio = Studio(world, whereabouts, intrinsics, mount, now=time.time, photos=album)
     try:
         server = CameraServer(listen, studio)
     except OSError as error:

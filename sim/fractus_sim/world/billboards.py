@@ -163,7 +163,8 @@ def _portrait(variation: int) -> Picture:
     from skimage import data  # noqa: PLC0415 - only worlds with faces in sight pay for it
 
     left, top, right, bottom = _CROP
-    picture = np.asarray(data.astronaut()[top:bottom, left:right, ::-1], np.float64) / 255.0
+    picture = np.asarray(data.astronaut()[top:bottom, left:right, ::-1], np.float64)  # type: ignore[no-untyped-call]
+    picture = picture / 255.0
     if variation % 2:
         picture = picture[:, ::-1]
     gain = np.array([1.0 - 0.05 * (variation // 2 % 3), 1.0, 1.0 + 0.03 * (variation // 2 % 3 - 1)])

@@ -128,13 +128,17 @@ class Blocks:
             return "houses" if draw < 0.74 or (i, j) == (0, 0) else "works" if draw < 0.88 else "park"
         return "fields" if draw < 0.66 else "wood" if draw < 0.82 else "meadow"
 
+    def crop(self, i: int, j: int) -> Colour:
+        """What grows on the first of a block's fields."""
+        return CROPS[int(len(CROPS) * unit(self.roads.seed, 13, i, j))]
+
     def _block(self, i: int, j: int) -> Block:
         roll = dice(self.roads.seed, 12, i, j)
         block = Block(self.kind(i, j), self.roads.outline(i, j))
         inside = shapely.Polygon(block.outline).buffer(-self._verge_m(i, j))
         if inside.is_empty or not isinstance(inside, shapely.Polygon):
             return block
-        site = _Site(block, inside, roll)
+        site = _Site(block, inside, roll, self.crop(i, j))
         _LAY_OUT[block.kind](site)
         block.trees = np.array(site.trees).reshape(-1, 4)
         return block
@@ -158,6 +162,7 @@ class _Site:
         block: What there is so far.
         inside: Its ground without roads and verges.
         roll: Its chance.
+        crop: What grows on its first field.
         trees: As in `Block`, still a list.
         built: Where houses stand.
     """
@@ -165,6 +170,7 @@ class _Site:
     block: Block
     inside: shapely.Polygon
     roll: random.Random
+    crop: Colour
     trees: list[tuple[float, float, float, float]] = field(default_factory=list)
     built: list[shapely.Polygon] = field(default_factory=list)
 
@@ -201,7 +207,7 @@ def _fields(site: _Site) -> None:
         piece = level.intersection(shapely.box(left + 0.6, south, right - 0.6, north))
         for part in shapely.get_parts(affinity.rotate(piece, -heading, origin=middle)):
             if isinstance(part, shapely.Polygon) and part.area > 200.0:
-                crop = roll.choice(CROPS)
+                crop = roll.choice(CROPS) if block.patches else site.crop
                 block.patches.append(Patch(_corners(part), _tinted(crop, roll, 8), 80, heading))
         if right < east and roll.random() < 0.3:
             hedge = affinity.rotate(shapely.LineString([(right, south), (right, north)]), -heading, origin=middle)

@@ -166,8 +166,8 @@ def _bus(paint: Colour, moving: bool) -> tuple[Part, ...]:
         Part(_prism(base, 1.2, roof, 2.6), _GLASS, 130),
         Part(_prism(roof, 2.6, roof, 3.0), _shaded(paint, 0.8), 150),
         Part(_at(roof, 3.05), paint, 160),
-        Part(_at(_outline(2.6, 1.7, nose=2.6), 3.2), _shaded(paint, 0.82), 190 if moving else 160, detail=True),
-        Part(_at(_outline(1.8, 1.5, nose=-3.4), 3.2), _shaded(paint, 0.82), 220 if moving else 160, detail=True),
+        Part(_at(_outline(2.6, 1.7, nose=2.6), 3.1), _shaded(paint, 0.82), 190 if moving else 160, detail=True),
+        Part(_at(_outline(1.8, 1.5, nose=-3.4), 3.1), _shaded(paint, 0.82), 220 if moving else 160, detail=True),
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from fractus_core.geo import LocalFrame
 from numpy.typing import NDArray
 
-from fractus_sim.world.blocks import Block, Blocks, Patch, Roof
+from fractus_sim.world.blocks import Block, Blocks, Kind, Patch, Roof
 from fractus_sim.world.canvas import SUN_SHADOW, Canvas, Colour, Noise
 from fractus_sim.world.roads import Road, Roads, lengthened, strip
 from fractus_sim.world.tiles import TILE_PX, Picture
@@ -23,8 +23,17 @@ _KERB: Colour = (156, 160, 162)
 _TRACK: Colour = (128, 152, 166)
 _PAINT: Colour = (214, 218, 220)
 _TREES_DOWN_TO_M = 0.7
-_DETAIL_DOWN_TO_M = 4.1
+_DETAIL_DOWN_TO_M = 2.1
+_AFAR: dict[Kind, Colour] = {
+    "wood": (44, 72, 54),
+    "houses": (92, 112, 112),
+    "works": (140, 144, 146),
+    "park": (72, 116, 92),
+    "meadow": (78, 130, 112),
+}
 _SHADOW_DEPTH = 0.56
+_EARTHY, _LEAFY = np.array([0.86, 1.0, 0.98], np.float32), np.array([0.8, 1.0, 1.0], np.float32)
+_WARM = np.array([0.97, 1.0, 1.03], np.float32)
 _DASH_M, _DASH_EVERY_M, _JUNCTION_M = 3.0, 9.0, 11.0
 
 
@@ -48,6 +57,7 @@ class Landscape:
         near = self.blocks.near(west, south, east, north)
         if pixel_m > _DETAIL_DOWN_TO_M:
             self._from_afar(canvas, near)
+            self._grain(canvas)
         else:
             blocks = [self.blocks.block(i, j) for i, j in near]
             blocks = [block for block in blocks if canvas.sees(block.outline, 12.0)]
@@ -60,18 +70,17 @@ class Landscape:
         return canvas.colour
 
     def _from_afar(self, canvas: Canvas, near: list[tuple[int, int]]) -> None:
-        """Only what shows from kilometres away."""
+        """Only what shows from kilometres away: what each block is used for, with straight borders."""
+        vertex = self.roads.vertex
         for i, j in near:
             kind = self.blocks.kind(i, j)
-            outline = self.roads.outline(i, j)[::4]
-            if not canvas.sees(outline):
-                continue
-            colour: Colour = {"wood": (44, 72, 54), "houses": (88, 112, 112), "works": (140, 144, 146)}.get(
-                kind, _GRASS
-            )
-            if kind == "fields" and canvas.pixel_m < 40.0:
-                colour = self.blocks.block(i, j).patches[0].colour if self.blocks.block(i, j).patches else _GRASS
-            canvas.fill(outline, colour, 60)
+            colour = self.blocks.crop(i, j) if kind == "fields" else _AFAR[kind]
+            outline = np.array([vertex(i, j), vertex(i + 1, j), vertex(i + 1, j + 1), vertex(i, j + 1)])
+            canvas.fill(outline, colour, 90)
+        for i, j in near if canvas.pixel_m < 10.0 else ():
+            for road, corner in ((Road("east", j), (i + 1, j)), (Road("north", i), (i, j + 1))):
+                if road.main:
+                    canvas.line(np.array([vertex(i, j), vertex(*corner)]), _ASPHALT, 9.0)
 
     def _roads(self, canvas: Canvas, near: list[tuple[int, int]]) -> None:
         pieces = [(road, step) for i, j in near for road, step in ((Road("east", j), i), (Road("north", i), j))]
@@ -114,14 +123,12 @@ class Landscape:
         fine = self._noise.between(0.0, 0.6, canvas) * 6.5 + self._noise.between(1.0, 4.5, canvas) * 5.5
         shift = fine * (canvas.rough.astype(np.float32) / 128.0)
         shift += self._noise.between(8.0, 70.0, canvas) * 3.6
-        canvas.colour = np.clip(canvas.colour + shift[..., None] * np.float32([0.86, 1.0, 0.98]), 0, 255).astype(
-            np.uint8
-        )
+        canvas.colour = np.clip(canvas.colour + shift[..., None] * _EARTHY, 0, 255).astype(np.uint8)
 
     def _light(self, canvas: Canvas) -> None:
         """The colour of an afternoon; and large, faint differences."""
         broad = self._noise.between(120.0, 300.0, canvas)
-        gain = (1.0 + 0.018 * broad)[..., None] * np.float32([0.97, 1.0, 1.03])
+        gain = (1.0 + 0.018 * broad)[..., None] * _WARM
         canvas.colour = np.clip(canvas.colour * gain, 0, 255).astype(np.uint8)
 
 
@@ -151,10 +158,10 @@ def _rows(canvas: Canvas, patch: Patch, heading_deg: float) -> None:
     index = ((east[None, :] + north[:, None] - first) / fine).astype(np.int32)
     shift = profile[index] * (mask[y0:y1, x0:x1].astype(np.float32) / 255.0)
     part = canvas.colour[y0:y1, x0:x1]
-    part[:] = np.clip(part + shift[..., None] * np.float32([0.8, 1.0, 1.0]), 0, 255).astype(np.uint8)
+    part[:] = np.clip(part + shift[..., None] * _LEAFY, 0, 255).astype(np.uint8)
 
 
-def _profile(across_m: Points, pixel_m: float) -> NDArray[np.float32]:
+def _profile(across_m: NDArray[np.floating], pixel_m: float) -> NDArray[np.float32]:
     """Brightness across the rows of a field."""
     seen = np.clip(0.8 - pixel_m / 0.75, 0.0, 1.0)
     rows = 7.0 * seen * np.sin(across_m * (2 * math.pi / 0.75))

@@ -125,7 +125,7 @@ def camera_rotation(pose: Pose, mount: Mount) -> Matrix:
     body = _about_z(pose.yaw_deg)
     if not mount.stabilised:
         body = body @ _about_y(pose.pitch_deg) @ _about_x(pose.roll_deg)
-    return _TO_ENU @ body @ _about_z(mount.yaw_deg) @ _about_y(mount.pitch_deg) @ _AXES
+    return np.asarray(_TO_ENU @ body @ _about_z(mount.yaw_deg) @ _about_y(mount.pitch_deg) @ _AXES)
 
 
 def plane_turn(frame: LocalFrame, lat: float, lon: float) -> Matrix:

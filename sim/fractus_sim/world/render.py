@@ -19,7 +19,7 @@ Band = Literal["rgb", "ir"]
 CELL_PX = 16
 """Detail and haze are worked out once for a cell of so many pixels."""
 VISIBILITY_M = 9000.0
-FARTHEST_M = 60_000.0
+FARTHEST_M = 25_000.0
 MAX_MOSAIC_PX = 24_000_000
 _NOTHING = -1
 _LEVEL_BIAS = 0.35
@@ -146,7 +146,7 @@ def _on_ground(view: View, corners: Matrix) -> Matrix:
     ground: Matrix = points[:, :2] / depth[:, None]
     away = ground - view.place
     far = np.linalg.norm(away, axis=1)
-    return view.place + away * np.minimum(1.0, FARTHEST_M / np.maximum(far, 1e-9))[:, None]
+    return np.asarray(view.place + away * np.minimum(1.0, FARTHEST_M / np.maximum(far, 1e-9))[:, None])
 
 
 def _add_air(picture: Picture, cells: _Cells, sky: Sky) -> None:

@@ -39,10 +39,12 @@ class Sighting:
 
     Attributes:
         pose: Of the airframe.
+        ground_amsl_m: Altitude of the ground above mean sea level.
         mount: What a gimbal reports; None when there is none.
     """
 
     pose: Pose
+    ground_amsl_m: float = 0.0
     mount: Mount | None = None
 
 
@@ -58,10 +60,11 @@ class Fixed:
     """A camera on a mast."""
 
     pose: Pose
+    ground_amsl_m: float = 0.0
 
     def now(self) -> Sighting | None:
         """Always the same."""
-        return Sighting(self.pose)
+        return Sighting(self.pose, self.ground_amsl_m)
 
 
 @dataclass(slots=True)
@@ -110,7 +113,10 @@ class Vehicle:
         if now_s - min(heard.position_s, heard.attitude_s) > STALE_S:
             return None
         mount = heard.mount if now_s - heard.mount_s < STALE_S else None
-        return Sighting(_pose(heard.position, heard.attitude, now_s - heard.position_s, self._ground_amsl_m), mount)
+        ground_m = self._ground_amsl_m
+        if ground_m is None:
+            ground_m = (heard.position.real("alt") - heard.position.real("relative_alt")) / 1000.0
+        return Sighting(_pose(heard.position, heard.attitude, now_s - heard.position_s, ground_m), ground_m, mount)
 
     def _run(self) -> None:
         wait_s = RETRY_S[0]
@@ -174,14 +180,12 @@ class Vehicle:
                 self._heard.mount, self._heard.mount_s = _gimbal(message, self._heard.attitude), now_s
 
 
-def _pose(position: Message, attitude: Message, age_s: float, ground_amsl_m: float | None) -> Pose:
+def _pose(position: Message, attitude: Message, age_s: float, ground_amsl_m: float) -> Pose:
     north, east = position.real("vx") / 100.0 * age_s, position.real("vy") / 100.0 * age_s
     lat = position.real("lat") * 1e-7
     shrink = max(math.cos(math.radians(lat)), 0.01)
     lon = position.real("lon") * 1e-7 + math.degrees(east / 6_378_137.0) / shrink
-    above_m = position.real("relative_alt") / 1000.0
-    if ground_amsl_m is not None:
-        above_m = position.real("alt") / 1000.0 - ground_amsl_m
+    above_m = position.real("alt") / 1000.0 - ground_amsl_m
     return Pose(
         min(max(lat + math.degrees(north / 6_371_000.0), -90.0), 90.0),
         (lon + 180.0) % 360.0 - 180.0,

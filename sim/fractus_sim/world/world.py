@@ -7,10 +7,10 @@ import threading
 import cv2
 from fractus_core.geo import LocalFrame
 
-from fractus_sim.world.billboards import Everywhere
+from fractus_sim.world.billboards import AroundOrigin, Everywhere
 from fractus_sim.world.landscape import Landscape
 from fractus_sim.world.optics import Intrinsics, Mount, Pose, View
-from fractus_sim.world.population import Townsfolk
+from fractus_sim.world.population import Nobody, Townsfolk
 from fractus_sim.world.render import Band, render_ground
 from fractus_sim.world.staging import Stage
 from fractus_sim.world.survey import Sheet, draw_sheet
@@ -18,10 +18,6 @@ from fractus_sim.world.tiles import Ground, Picture, TileStore
 from fractus_sim.world.truth import Truth
 
 DEFAULT_MOUNT = Mount()
-
-
-class WorldError(ValueError):
-    """A world that cannot be made from what was given."""
 
 
 class World:
@@ -44,6 +40,11 @@ class World:
         """A world made up from a seed, around a place."""
         land = Landscape(LocalFrame(lat, lon), seed)
         return cls(land, Stage(Townsfolk(land.roads, land.blocks), Everywhere(land.roads, land.blocks)))
+
+    @classmethod
+    def on(cls, ground: Ground, seed: int = 7) -> World:
+        """A world on a ground of the user's, whose roads nobody knows: billboards with faces near its middle, no traffic."""
+        return cls(ground, Stage(Nobody(), AroundOrigin(seed)))
 
     @property
     def frame(self) -> LocalFrame:
@@ -102,12 +103,13 @@ class WorldAround:
         seed: Of the landscape and of who is where.
         origin: Latitude and longitude; None: those of the first place to a tenth of a degree, which cameras near each
             other share.
+        world: The world itself, when it is known already.
     """
 
-    def __init__(self, seed: int, origin: tuple[float, float] | None = None) -> None:
+    def __init__(self, seed: int, origin: tuple[float, float] | None = None, world: World | None = None) -> None:
         self._seed = seed
         self._lock = threading.Lock()
-        self._world = None if origin is None else World.procedural(*origin, seed)
+        self._world = world if origin is None or world is not None else World.procedural(*origin, seed)
 
     def seen_from(self, pose: Pose | None) -> World | None:
         """The world; None as long as there is no place to make it around."""

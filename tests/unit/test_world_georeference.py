@@ -1,0 +1,168 @@
+"""Where pixels of the user's pictures lie: world files, GeoTIFF tags, UTM."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from fractus_core.api.geometry import Point
+from fractus_core.geo import LocalFrame, geodesic_m
+from fractus_sim.world.georeference import GeoreferenceError, Utm, parse_system, read_world_file
+from fractus_sim.world.optics import Intrinsics, Pose
+from fractus_sim.world.raster import NOTHING, read_raster
+from fractus_sim.world.survey import Sheet
+from fractus_sim.world.world import World
+
+LENS = Intrinsics(640, 480, 60.0)
+
+
+@pytest.mark.parametrize(
+    ("zone", "north", "lat", "lon", "east", "northing"),
+    [
+        (33, True, 52.0, 15.0, 500_000.0, 5_761_038.2125),
+        (17, True, 43.642566, -79.387139, 630_084.303, 4_833_438.475),
+        (32, True, 0.0, 9.0, 500_000.0, 0.0),
+    ],
+)
+def test_utm_knows_published_places(
+    zone: int, north: bool, lat: float, lon: float, east: float, northing: float
+) -> None:
+    plane = Utm(zone, north).to_plane(np.array([lat]), np.array([lon]))
+    assert plane[0] == pytest.approx((east, northing), abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("lat", "lon", "zone"), [(80.0, 17.0, 33), (-45.0, 179.9, 60), (-1e-9, -177.0, 1), (60.0, -179.9, 60)]
+)
+def test_utm_there_and_back(lat: float, lon: float, zone: int) -> None:
+    system = Utm(zone, lat >= 0)
+    x, y = system.to_plane(np.array([lat]), np.array([lon]))[0]
+    back = system.to_degrees(float(x), float(y))
+    assert geodesic_m(Point(lat=back[0], lon=back[1]), Point(lat=lat, lon=lon)) < 1e-3
+
+
+def marked(size: int = 400) -> tuple[np.ndarray, list[tuple[int, int]]]:
+    """A grey picture with white squares of three pixels around known pixels."""
+    picture = np.full((size, size, 3), 60, np.uint8)
+    marks = [(100, 100), (300, 120), (210, 290)]
+    for column, row in marks:
+        picture[row - 1 : row + 2, column - 1 : column + 2] = 255
+    return picture, marks
+
+
+def middles(picture: np.ndarray) -> list[tuple[float, float]]:
+    """Middles of bright spots, in pixels whose origin is the picture's corner."""
+    count, _, _, centres = cv2.connectedComponentsWithStats((picture[..., 1] > 150).astype(np.uint8))
+    return [(float(x) + 0.5, float(y) + 0.5) for x, y in centres[1:count]]
+
+
+def check(world: World, places: list[tuple[float, float]], height_m: float) -> None:
+    """Every marked place shows where the geometry says, within a pixel."""
+    frame = world.frame
+    pose = Pose(frame.lat, frame.lon, height_m, yaw_deg=30.0)
+    view = world.view(pose, LENS)
+    picture = world.render(pose, LENS, hidden=frozenset(f"face-{n}" for n in range(6)))
+    seen = middles(picture)
+    for lat, lon in places:
+        (expected,), _ = view.project(np.array([[*frame.xy(lat, lon), 0.0]]))
+        assert min(np.hypot(x - expected[0], y - expected[1]) for x, y in seen) < 1.0, (lat, lon)
+
+
+@pytest.mark.parametrize(("lat", "lon"), [(50.86, 4.68), (80.0, 25.0), (-12.0, 180.0)])
+def test_png_with_world_file_in_degrees(tmp_path: Path, lat: float, lon: float) -> None:
+    """Also where a degree of longitude is short, and where longitudes jump by 360."""
+    picture, marks = marked()
+    cv2.imwrite(str(tmp_path / "map.png"), picture)
+    sheet = Sheet(lat, lon, 200.0, 400)
+    (tmp_path / "map.pgw").write_text(sheet.world_file())
+    east, south = sheet.step_deg
+    places = [(lat - (row - 199.5) * south, (lon + (column - 199.5) * east + 180) % 360 - 180) for column, row in marks]
+    check(World.on(read_raster(tmp_path / "map.png")), places, 200.0)
+
+
+def test_geotiff_in_utm(tmp_path: Path) -> None:
+    picture, marks = marked()
+    corner, size = (533_000.0, 5_640_000.0), 0.5
+    keys = (1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, 32631)
+    tags = [
+        (33550, "d", 3, (size, size, 0.0), True),
+        (33922, "d", 6, (0.0, 0.0, 0.0, *corner, 0.0), True),
+        (34735, "H", len(keys), keys, True),
+    ]
+    tifffile.imwrite(tmp_path / "map.tif", picture[..., ::-1], photometric="rgb", extratags=tags)
+    system = Utm(31, north=True)
+    places = [system.to_degrees(corner[0] + (c + 0.5) * size, corner[1] - (r + 0.5) * size) for c, r in marks]
+    check(World.on(read_raster(tmp_path / "map.tif")), places, 200.0)
+
+
+def test_local_metres_need_an_origin(tmp_path: Path) -> None:
+    picture, marks = marked()
+    cv2.imwrite(str(tmp_path / "map.png"), picture)
+    (tmp_path / "map.pgw").write_text("0.5\n0\n0\n-0.5\n-99.75\n99.75\n")
+    with pytest.raises(GeoreferenceError, match="origin"):
+        read_raster(tmp_path / "map.png", "local")
+    frame = LocalFrame(47.0, 11.0)
+    places = [frame.latlon((c - 199.5) * 0.5, (199.5 - r) * 0.5) for c, r in marks]
+    check(World.on(read_raster(tmp_path / "map.png", "local", (47.0, 11.0))), places, 200.0)
+
+
+def test_outside_the_picture_is_nothing(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "map.png"), np.full((100, 100, 3), 200, np.uint8))
+    (tmp_path / "map.pgw").write_text(Sheet(50.0, 4.0, 50.0, 100).world_file())
+    world = World.on(read_raster(tmp_path / "map.png"))
+    far = world.frame.latlon(3000.0, 0.0)
+    assert tuple(world.render(Pose(*far, 50.0), LENS)[240, 320]) == NOTHING
+    assert world.render(Pose(50.0, 4.0, 20.0), LENS, hidden=frozenset({"face-0"}))[240, 320].max() >= 198
+
+
+def test_a_map_of_a_map_is_the_map(tmp_path: Path) -> None:
+    """The map that the server exports has its marks where the world file says."""
+    picture, marks = marked()
+    cv2.imwrite(str(tmp_path / "map.png"), picture)
+    (tmp_path / "map.pgw").write_text(Sheet(50.0, 4.0, 200.0, 400).world_file())
+    again = World.on(read_raster(tmp_path / "map.png")).map(Sheet(50.0, 4.0, 200.0, 400))
+    seen = middles(again)
+    for column, row in marks:
+        assert min(np.hypot(x - column - 0.5, y - row - 0.5) for x, y in seen) < 0.6
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("map.png", None, "map.pgw"),
+        ("map.png", "1\n2\n3\n", "six lines"),
+        ("map.png", "0\n0\n0\n0\n4\n50\n", "no size on the ground"),
+        ("map.png", "0.5\n0\n0\n-0.5\n533000\n5640000\n", "EPSG:4326"),
+        ("map.tif", None, "can be read"),
+        ("none.png", None, "can be read"),
+    ],
+)
+def test_bad_pictures_are_named(tmp_path: Path, name: str, content: str | None, message: str) -> None:
+    if name == "map.png":
+        cv2.imwrite(str(tmp_path / name), np.zeros((10, 10, 3), np.uint8))
+    elif name == "map.tif":
+        (tmp_path / name).write_bytes(b"II*\0nonsense")
+    if content is not None:
+        (tmp_path / "map.pgw").write_text(content)
+    with pytest.raises(GeoreferenceError, match=message):
+        read_raster(tmp_path / name)
+
+
+@pytest.mark.parametrize(("crs", "message"), [("EPSG:3857", "not supported"), ("mercator", "expected local")])
+def test_unknown_systems_are_named(crs: str, message: str) -> None:
+    with pytest.raises(GeoreferenceError, match=message):
+        parse_system(crs, None)
+
+
+def test_sixteen_bit_tiff_is_refused(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "deep.tif", np.zeros((10, 10, 3), np.uint16), photometric="rgb")
+    with pytest.raises(GeoreferenceError, match="8 bits"):
+        read_raster(tmp_path / "deep.tif")
+
+
+def test_jpeg_looks_for_its_own_world_file(tmp_path: Path) -> None:
+    with pytest.raises(GeoreferenceError, match=r"map\.jgw"):
+        read_world_file(tmp_path / "map.jpg", parse_system("EPSG:4326", None))

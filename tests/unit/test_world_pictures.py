@@ -1,0 +1,242 @@
+"""Pictures of the simulated world: the same every time, and what the truth says is what they show."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+from fractus_sim.world.billboards import VARIATIONS, face_box, portrait
+from fractus_sim.world.bodies import parts_of
+from fractus_sim.world.optics import Intrinsics, Mount, Pose
+from fractus_sim.world.population import Thing
+from fractus_sim.world.truth import Seen, SeenFace, Truth
+from fractus_sim.world.world import World, WorldAround
+
+LAT, LON = 50.8637, 4.6785
+LENS = Intrinsics(640, 360, 62.2)
+TIME_S = 1_795_000_000.0
+CROSSING = (70.0, 55.0)
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return World.procedural(LAT, LON, 7)
+
+
+def above(world: World, east_m: float, north_m: float, height_m: float, yaw_deg: float = 20.0) -> Pose:
+    return Pose(*world.frame.latlon(east_m, north_m), height_m, yaw_deg=yaw_deg)
+
+
+def digest(picture: np.ndarray) -> str:
+    return hashlib.sha256(picture.tobytes()).hexdigest()
+
+
+def test_same_seed_pose_and_time_give_the_same_bytes(world: World) -> None:
+    """In whatever order the pictures are taken, and whichever world takes them."""
+    poses = [above(world, 60.0, 50.0, 60.0), above(world, 200.0, 50.0, 90.0)]
+    first = [digest(world.render(pose, LENS, time_s=TIME_S)) for pose in poses]
+    other = World.procedural(LAT, LON, 7)
+    assert [digest(other.render(pose, LENS, time_s=TIME_S)) for pose in reversed(poses)] == first[::-1]
+    assert digest(World.procedural(LAT, LON, 8).render(poses[0], LENS, time_s=TIME_S)) != first[0]
+
+
+def test_time_moves_the_traffic_and_nothing_else(world: World) -> None:
+    pose = above(world, *CROSSING, 150.0)
+    then, now = world.truth(pose, LENS, time_s=TIME_S), world.truth(pose, LENS, time_s=TIME_S + 2.0)
+    places = {seen.id: (seen.lat, seen.lon) for seen in then.objects}
+    moved = [seen for seen in now.objects if seen.id in places]
+    assert any(seen.speed_mps > 5 for seen in moved)
+    for seen in moved:
+        north = (seen.lat - places[seen.id][0]) * 111_200
+        east = (seen.lon - places[seen.id][1]) * 111_320 * np.cos(np.radians(LAT))
+        assert np.hypot(east, north) == pytest.approx(2.0 * seen.speed_mps, rel=0.1, abs=0.05)
+        if seen.speed_mps > 5:
+            assert np.cos(np.arctan2(east, north) - np.radians(seen.heading_deg)) > 0.98
+
+
+def test_vehicles_of_a_lane_keep_apart(world: World) -> None:
+    """None drives into another on the same road in the same direction, at any of many times."""
+    for time_s in (0.0, 1e3, TIME_S):
+        pose = above(world, 0.0, 0.0, 900.0)
+        lanes: dict[str, list[tuple[float, float]]] = {}
+        for seen in world.truth(pose, LENS, time_s=time_s).objects:
+            if seen.id.startswith("vehicle"):
+                lane = seen.id.rstrip("0123456789") if seen.id[-1].isdigit() else seen.id
+                lanes.setdefault(lane, []).append(world.frame.xy(seen.lat, seen.lon))
+        assert sum(len(lane) for lane in lanes.values()) > 10
+        for lane in lanes.values():
+            assert all(np.hypot(a[0] - b[0], a[1] - b[1]) > 12.5 for a, b in itertools.combinations(lane, 2))
+
+
+def difference(world: World, pose: Pose, mount: Mount, name: str) -> tuple[int, int, int, int]:
+    """The box of the pixels that an object changes, its shadow apart: thermal pictures have none."""
+    arguments = {"mount": mount, "time_s": TIME_S}
+    with_it = world.render(pose, LENS, band="ir", **arguments)
+    without = world.render(pose, LENS, band="ir", hidden=frozenset({name}), **arguments)
+    changed = np.abs(with_it.astype(int) - without.astype(int)).max(axis=2) > 12
+    rows, columns = np.flatnonzero(changed.any(axis=1)), np.flatnonzero(changed.any(axis=0))
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+
+@pytest.mark.parametrize(
+    ("height_m", "mount"), [(60.0, Mount()), (45.0, Mount(-50.0)), (40.0, Mount(-35.0, 90.0, stabilised=False))]
+)
+def test_boxes_are_where_the_pixels_change(world: World, height_m: float, mount: Mount) -> None:
+    pose = Pose(*world.frame.latlon(40.0, 20.0), height_m, 4.0, -3.0, 40.0)
+    truth = world.truth(pose, LENS, mount=mount, time_s=TIME_S)
+    whole = [seen for seen in truth.objects if seen.in_frame == 1.0 and seen.visible > 0.995]
+    whole = [seen for seen in whole if seen.box[2] - seen.box[0] > 6]
+    assert len(whole) >= 3, "the scene lost its traffic; choose another time"
+    for seen in whole:
+        changed = difference(world, pose, mount, seen.id)
+        assert np.abs(np.array(changed) - np.array(seen.box)).max() < 2.0, seen
+
+
+def test_a_known_place_of_an_object_is_inside_its_box(world: World) -> None:
+    pose = above(world, *CROSSING, 80.0)
+    view = world.view(pose, LENS)
+    for seen in world.truth(pose, LENS, time_s=TIME_S).objects:
+        if seen.in_frame == 1.0:
+            (pixel,), _ = view.project(np.array([[*world.frame.xy(seen.lat, seen.lon), 0.5]]))
+            assert seen.box[0] - 1 <= pixel[0] <= seen.box[2] + 1
+            assert seen.box[1] - 1 <= pixel[1] <= seen.box[3] + 1
+
+
+def test_cut_objects_say_so(world: World) -> None:
+    """Many pictures: boxes stay in the frame, shares between 0 and 1, and what is cut is less than whole."""
+    for east in range(0, 200, 25):
+        truth = world.truth(above(world, float(east), 40.0, 50.0), LENS, mount=Mount(-60.0), time_s=TIME_S)
+        for seen in (*truth.objects, *truth.faces):
+            left, top, right, bottom = seen.box
+            assert 0 <= left < right <= LENS.width
+            assert 0 <= top < bottom <= LENS.height
+            assert 0 <= seen.visible <= seen.in_frame <= 1
+            touching = left == 0 or top == 0 or right == LENS.width or bottom == LENS.height
+            assert touching or seen.in_frame == 1.0
+
+
+def face(truth: Truth, name: str) -> SeenFace:
+    return next(found for found in truth.faces if found.id == name)
+
+
+def faces_near(world: World, pose: Pose) -> list[SeenFace]:
+    return [found for found in world.truth(pose, LENS, time_s=TIME_S).faces if not found.standing]
+
+
+def test_lying_face_is_the_photograph(world: World) -> None:
+    """From straight above, the pixels in a face's box are those of the photograph."""
+    wide = faces_near(world, above(world, 0.0, 0.0, 120.0))[0]
+    east, north = world.frame.xy(wide.lat, wide.lon)
+    pose = above(world, east, north, 14.0, yaw_deg=0.0)
+    found = face(world.truth(pose, LENS, time_s=TIME_S), wide.id)
+    assert found.visible > 0.95
+    assert found.height_px > 40
+    left, top, right, bottom = (round(edge) for edge in found.box)
+    seen = world.render(pose, LENS, time_s=TIME_S)[top:bottom, left:right]
+    # Skin: more red than blue, and not grass, nearly everywhere.
+    assert (seen[..., 2] > seen[..., 0].astype(int) + 8).mean() > 0.6
+
+
+def test_standing_face_is_hidden_from_behind(world: World) -> None:
+    overview = world.truth(above(world, 0.0, 0.0, 120.0), Intrinsics(1280, 720, 90.0), time_s=TIME_S)
+    board = next(found for found in overview.faces if found.standing)
+    east, north = world.frame.xy(board.lat, board.lon)
+    shares = {}
+    for bearing in range(0, 360, 30):
+        angle = np.radians(bearing)
+        pose = above(world, east - 25 * np.sin(angle), north - 25 * np.cos(angle), 9.0, float(bearing))
+        truth = world.truth(pose, LENS, mount=Mount(-15.0), time_s=TIME_S)
+        shares[bearing] = next((found.visible for found in truth.faces if found.id == board.id), 0.0)
+    assert max(shares.values()) > 0.9
+    assert min(shares.values()) == 0.0
+    assert 3 <= sum(share > 0.0 for share in shares.values()) <= 7
+
+
+def test_every_variation_shows_its_face_where_it_says() -> None:
+    """A face detector that nobody here wrote finds it there."""
+    cascade = pytest.importorskip("skimage.feature").Cascade
+    from skimage import data
+
+    detector = cascade(data.lbp_frontal_face_cascade_filename())
+    for variation in range(VARIATIONS):
+        picture = portrait(variation, 0)
+        found = detector.detect_multi_scale(picture[..., ::-1], 1.2, 1.0, (60, 60), (200, 200))
+        assert found, f"no face in variation {variation}"
+        left, top, right, bottom = face_box(variation)
+        height, width = picture.shape[:2]
+        x, y = found[0]["c"] + found[0]["width"] / 2, found[0]["r"] + found[0]["height"] / 2
+        assert left * width < x < right * width
+        assert top * height < y < bottom * height
+
+
+def test_people_and_engines_are_warm(world: World) -> None:
+    pose = above(world, *CROSSING, 60.0)
+    picture = world.render(pose, LENS, time_s=TIME_S, band="ir")
+    assert np.array_equal(picture[..., 0], picture[..., 2]), "a thermal picture has no colours"
+    ground = float(np.median(picture))
+    things = [seen for seen in world.truth(pose, LENS, time_s=TIME_S).objects if seen.visible == 1.0]
+    assert things
+    for seen in things:
+        left, top, right, bottom = (round(edge) for edge in seen.box)
+        assert picture[top:bottom, left:right].max() > ground + 60, seen
+
+
+def test_horizon_and_sky(world: World) -> None:
+    picture = world.render(above(world, 0.0, 0.0, 100.0), LENS, mount=Mount(0.0), time_s=TIME_S)
+    assert picture[5, 320, 0] > picture[5, 320, 2] + 20, "the sky is blue"
+    assert picture[350, 320, 1] >= picture[350, 320, 0], "the ground is not"
+    up = world.render(above(world, 0.0, 0.0, 100.0), LENS, mount=Mount(60.0), time_s=TIME_S)
+    assert world.truth(above(world, 0.0, 0.0, 100.0), LENS, mount=Mount(60.0), time_s=TIME_S).objects == ()
+    assert (up[..., 0] > up[..., 2]).all()
+
+
+@pytest.mark.parametrize("height_m", [-3.0, 0.0, 0.3, 3000.0, 40_000.0])
+def test_extreme_heights_render(world: World, height_m: float) -> None:
+    for mount in (Mount(), Mount(-20.0)):
+        picture = world.render(above(world, 5.0, 5.0, height_m), Intrinsics(160, 90), mount=mount)
+        assert picture.shape == (90, 160, 3)
+
+
+def test_shape_of_every_kind_fits_its_size() -> None:
+    for kind in ("car", "van", "truck", "bus", "person"):
+        thing = Thing("x", kind, 0.0, 0.0, 0.0, 1.0, 12345)
+        points = np.vstack([part.points for part in parts_of(thing)])
+        length, width, height = thing.size_m
+        extent = points.max(axis=0) - points.min(axis=0)
+        assert extent[0] <= length + 0.45, kind
+        assert extent[1] <= width + 0.2, kind
+        assert points[:, 2].max() == pytest.approx(height, abs=0.1)
+        assert points[:, 2].min() >= 0
+
+
+def test_cameras_near_each_other_share_a_world() -> None:
+    one, other = WorldAround(7), WorldAround(7)
+    assert one.seen_from(None) is None
+    first, second = one.seen_from(Pose(50.86, 4.67, 10.0)), other.seen_from(Pose(50.87, 4.66, 3.0))
+    assert first is not None
+    assert second is not None
+    assert (first.frame.lat, first.frame.lon) == (second.frame.lat, second.frame.lon)
+
+
+def test_tiles_of_a_level_meet_without_a_seam(world: World) -> None:
+    """The last column of a tile and the first of its neighbour differ no more than columns within a tile do."""
+    ground = world.ground
+    left, right = ground.tile(2, 0, -1).astype(int), ground.tile(2, 1, -1).astype(int)
+    across = np.abs(left[:, -1] - right[:, 0]).mean()
+    within = np.abs(left[:, -2] - left[:, -1]).mean()
+    assert across < 2.0 * within + 1.0
+
+
+def seen_ids(truth: Truth) -> set[str]:
+    return {seen.id for seen in truth.objects if isinstance(seen, Seen)}
+
+
+def test_moving_away_and_back_changes_nothing(world: World) -> None:
+    pose = above(world, *CROSSING, 70.0)
+    before = world.truth(pose, LENS, time_s=TIME_S)
+    world.render(above(world, 5000.0, -4000.0, 100.0), Intrinsics(160, 90), time_s=TIME_S)
+    assert seen_ids(world.truth(pose, LENS, time_s=TIME_S)) == seen_ids(before)
+    assert cv2.getNumThreads() == 1

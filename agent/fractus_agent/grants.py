@@ -75,8 +75,12 @@ class GrantDirectory:
 
 
 def stored_form(grant: Grant) -> bytes:
-    """The manifest as services read it: without what changes when only the status does."""
+    """The manifest as services read it: without what changes when only the status does.
+
+    Defaults are left out, so that an agent which knows a new field does not write it for services that do not.
+    """
     body = grant.to_dict()
+    body["spec"] = grant.spec.model_dump(mode="json", by_alias=True, exclude_defaults=True)
     body.pop("status", None)
     body["metadata"].pop("resourceVersion", None)
     return json.dumps(body, sort_keys=True, indent=1).encode() + b"\n"

@@ -283,7 +283,10 @@ def test_the_stored_form_is_stable() -> None:
     one = Grant.from_body(manifest(version="1"))
     two = Grant.from_body(manifest(version="2", status={"phase": "Active"}))
     assert stored_form(one) == stored_form(two)
-    assert json.loads(stored_form(one))["metadata"]["uid"] == "u1"
+    stored = json.loads(stored_form(one))
+    assert stored["metadata"]["uid"] == "u1"
+    assert Grant.from_body(stored).spec == one.spec
+    assert "policies" not in stored["spec"], "services of an earlier release meet no field that is not used"
 
 
 def test_backoff_doubles_to_its_cap_and_starts_again() -> None:

@@ -10,8 +10,8 @@ from typing import Literal
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Inclusion, Patch
-from fractus_core.policy.motion import XY, Leg
+from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Inclusion, Patch, band_meets
+from fractus_core.policy.motion import XY, Leg, stop_altitude_m
 from fractus_core.policy.values import Situation, Takeover, Verdict, deny
 
 FenceAction = Literal["ignore", "adjust", "hover", "returnToLaunch", "land", "revoke"]
@@ -142,11 +142,28 @@ def _exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Ite
     for patch in grant.exclusions.near(air, now, grant.flat_terrain):
         shape = patch.shape
         clearance_m = _clearance_outside(shape, leg.unavoidable)
-        if clearance_m < margin_m and _leads_out(shape, leg, margin_m, clearance_m):
+        level = _is_level_with(patch, now, grant)
+        if (
+            clearance_m < margin_m
+            and (level or not _comes_level(patch, leg, now, grant))
+            and _leads_out(shape, leg, margin_m, clearance_m)
+        ):
             continue
         # What the drone does anyway is not the request's doing.
-        enters = clearance_m > 0 and shape.intersects(air.ground)
+        enters = (clearance_m > 0 or not level) and shape.intersects(air.ground)
         yield _exclusion_breach(patch, leg, margin_m, enters)
+
+
+def _is_level_with(patch: Patch, now: Situation, grant: CompiledGrant) -> bool:
+    """Whether the drone is, or comes to rest, between the altitudes of a zone."""
+    rest_m = stop_altitude_m(now)
+    low, high = min(now.altitude_m, rest_m), max(now.altitude_m, rest_m)
+    return band_meets(patch.band, low, high, now.home, grant.flat_terrain)
+
+
+def _comes_level(patch: Patch, leg: Leg, now: Situation, grant: CompiledGrant) -> bool:
+    """Whether a leg comes between the altitudes of a zone."""
+    return band_meets(patch.band, leg.lower_m, leg.upper_m, now.home, grant.flat_terrain)
 
 
 def _exclusion_breach(patch: Patch, leg: Leg, margin_m: float, enters: bool) -> Breach:

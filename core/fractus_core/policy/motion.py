@@ -10,7 +10,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from fractus_core.geo import LocalFrame
-from fractus_core.policy.values import STANDING_MPS, Situation, VelocityArgs
+from fractus_core.policy.values import STANDING_MPS, Airframe, Situation, VelocityArgs
 
 XY = tuple[float, float]
 
@@ -59,14 +59,51 @@ def at_rest(now: Situation, grant_frame: LocalFrame, at: XY) -> Situation:
     return replace(now, lat=lat, lon=lon, altitude_m=stop_altitude_m(now), north_mps=0.0, east_mps=0.0, down_mps=0.0)
 
 
+@dataclass(frozen=True, slots=True)
+class Surge:
+    """What a drone does before a command takes effect.
+
+    Attributes:
+        speed_mps: how fast it is when the change begins.
+        run_m: how far it went by then, the time included that the brakes take to bite.
+    """
+
+    speed_mps: float
+    run_m: float
+
+
+def surge(situation: Situation) -> Surge:
+    """How far a drone flies on, and how much faster it may get, before it does what it is told.
+
+    A drone that speeds up goes on speeding up for the latency, and then as long as its jerk limit takes to end that. Where
+    its acceleration is unknown it is taken to speed up as much as it can, unless it flies as fast as it was told to.
+    """
+    frame = situation.airframe
+    speed = math.hypot(situation.north_mps, situation.east_mps)
+    bite_s = frame.accel_mps2 / (2 * frame.jerk_mps3)
+    forward = situation.forward_mps2
+    if forward is None:
+        forward = frame.accel_mps2 if STANDING_MPS <= speed < situation.speed_setpoint_mps else 0.0
+    forward = min(max(forward, 0.0), frame.accel_mps2)
+    if forward <= 0.0:
+        return Surge(speed, speed * (situation.latency_s + bite_s))
+    late_s, easing_s = situation.latency_s, forward / frame.jerk_mps3
+    first = speed + forward * late_s
+    last = first + forward * easing_s / 2
+    run = (speed + first) / 2 * late_s + first * easing_s + forward * easing_s**2 / 3
+    if situation.forward_mps2 is None and last > situation.speed_setpoint_mps:
+        last = max(situation.speed_setpoint_mps, speed)
+        run = min(run, last * (late_s + easing_s))
+    return Surge(last, run + last * bite_s)
+
+
 def stop_point(situation: Situation, at: XY) -> XY:
     """Where the drone comes to rest, in frame metres, when it is told to stop now."""
     speed = math.hypot(situation.north_mps, situation.east_mps)
     if speed < 0.05:
         return at
-    frame = situation.airframe
-    run = speed * reaction_s(situation, frame.accel_mps2)
-    run += stopping_distance_m(speed, frame.accel_mps2, frame.position_gain)
+    frame, begin = situation.airframe, surge(situation)
+    run = begin.run_m + stopping_distance_m(begin.speed_mps, frame.accel_mps2, frame.position_gain)
     return at[0] + situation.east_mps / speed * run, at[1] + situation.north_mps / speed * run
 
 
@@ -82,15 +119,17 @@ def turn_point(situation: Situation, at: XY, target: XY) -> XY:
     stop = stop_point(situation, at)
     if speed < STANDING_MPS:
         return stop
-    change = 0.0
+    begin = surge(situation)
+    east, north = situation.east_mps / speed * begin.speed_mps, situation.north_mps / speed * begin.speed_mps
+    change = begin.speed_mps
     for origin in (at, stop):
         dx, dy = target[0] - origin[0], target[1] - origin[1]
         away = math.hypot(dx, dy)
         cruise = min(situation.speed_setpoint_mps, math.sqrt(2 * frame.accel_mps2 * away)) if away > 0 else 0.0
-        east, north = (dx / away * cruise, dy / away * cruise) if away > 0 else (0.0, 0.0)
-        change = max(change, math.hypot(east - situation.east_mps, north - situation.north_mps), speed)
+        to_east, to_north = (dx / away * cruise, dy / away * cruise) if away > 0 else (0.0, 0.0)
+        change = max(change, math.hypot(to_east - east, to_north - north))
     slack = frame.accel_mps2 / (2 * frame.position_gain**2)
-    run = speed * reaction_s(situation, frame.accel_mps2) + slack + speed * change / (2 * frame.accel_mps2)
+    run = begin.run_m + slack + begin.speed_mps * change / (2 * frame.accel_mps2)
     run = max(run, math.hypot(stop[0] - at[0], stop[1] - at[1]))
     return at[0] + situation.east_mps / speed * run, at[1] + situation.north_mps / speed * run
 
@@ -179,23 +218,30 @@ def swept(now: Situation, at: XY, asked: VelocityArgs) -> Leg:
     The ground is the convex hull of where it may be, whether latency delays the beginning, the end, or neither. The leg's
     target is where it comes to rest at the latest.
     """
-    frame = now.airframe
-    present, wanted = (now.east_mps, now.north_mps), (asked.east_mps, asked.north_mps)
-    ways = _course(present, wanted, asked.hold_s, now, (frame.accel_mps2, frame.position_gain))
-    climbs = _course((-now.down_mps, 0.0), (-asked.down_mps, 0.0), asked.hold_s, now, (frame.climb_accel_mps2, 1.0))
+    frame, begin = now.airframe, surge(now)
+    wanted = (asked.east_mps, asked.north_mps)
+    speed = math.hypot(now.north_mps, now.east_mps)
+    ahead = (now.east_mps / speed, now.north_mps / speed) if speed > 0 else (0.0, 0.0)
+    present = (ahead[0] * begin.speed_mps, ahead[1] * begin.speed_mps)
+    lasting_s = asked.hold_s + now.latency_s
+    control = (frame.accel_mps2, frame.position_gain)
+    ways = _course(present, wanted, lasting_s, frame, control)
+    late = (ahead[0] * begin.run_m, ahead[1] * begin.run_m)
+    ways += [(x + late[0], y + late[1]) for x, y in ways]
+    climb = -now.down_mps
+    climbs = _course((climb, 0.0), (-asked.down_mps, 0.0), lasting_s, frame, (frame.climb_accel_mps2, 1.0))
+    late_m = climb * reaction_s(now, frame.climb_accel_mps2)
+    climbs += [(up + late_m, 0.0) for up, _ in climbs]
     heights = [now.altitude_m, stop_altitude_m(now), *(now.altitude_m + climb for climb, _ in climbs)]
     corners = tuple((at[0] + x, at[1] + y) for x, y in ways)
     stop = stop_point(now, at)
     return Leg(at, stop, stop, corners[-1], min(heights), max(heights), corners, drifts=True)
 
 
-def _course(present: XY, wanted: XY, hold_s: float, now: Situation, control: tuple[float, float]) -> list[XY]:
+def _course(present: XY, wanted: XY, lasting_s: float, frame: Airframe, control: tuple[float, float]) -> list[XY]:
     """Displacements whose hull holds the motion from one velocity to another and to rest; the last is the rest."""
     accel, gain = control
-    delay_s = reaction_s(now, accel)
-    lasting_s = hold_s + now.latency_s
     change_s = math.dist(present, wanted) / accel
-    late = (present[0] * delay_s, present[1] * delay_s)
     found = []
     for share in (0.25, 0.5, 0.75, 1.0):
         turning_s = min(change_s * share, lasting_s)
@@ -209,7 +255,7 @@ def _course(present: XY, wanted: XY, hold_s: float, now: Situation, control: tup
             found.append((x, y))
             x, y = x + vx * (lasting_s - turning_s), y + vy * (lasting_s - turning_s)
         if speed > 0:
-            run = accel / (2 * now.airframe.jerk_mps3) + stopping_distance_m(speed, accel, gain) / speed
+            run = accel / (2 * frame.jerk_mps3) + stopping_distance_m(speed, accel, gain) / speed
             x, y = x + vx * run, y + vy * run
         found.append((x, y))
-    return [*found, *((x + late[0], y + late[1]) for x, y in found)]
+    return found

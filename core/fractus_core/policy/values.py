@@ -209,7 +209,10 @@ class Situation:
         position_error_m: bound of the horizontal position error.
         altitude_error_m: bound of the vertical position error.
         latency_s: time from a decision to its effect on the motion.
-        speed_setpoint_mps: horizontal speed that the autopilot flies legs with.
+        speed_setpoint_mps: horizontal speed that the autopilot flies legs with, or that of the velocity it was told to
+            hold, when that is higher: the speed that the present motion tends to.
+        forward_mps2: how much the drone speeds up along its course (negative: slows down), from the last velocities; None
+            while nobody knows.
         vertical: whether the drone is taking off or landing, when lower altitude limits do not hold.
         attitude: None while it is unknown; the camera may look anywhere then, unless a gimbal keeps it level.
         lens: None on a node whose camera is not described: it may see everything around it.
@@ -230,6 +233,7 @@ class Situation:
     altitude_error_m: float = 1.0
     latency_s: float = 0.3
     speed_setpoint_mps: float = 5.0
+    forward_mps2: float | None = None
     vertical: bool = False
     airframe: Airframe = field(default_factory=Airframe)
     attitude: Attitude | None = None
@@ -252,7 +256,7 @@ class Situation:
 
 _FIGURES = (
     "time_s", "lat", "lon", "altitude_m", "north_mps", "east_mps", "down_mps", "position_error_m", "altitude_error_m",
-    "latency_s", "speed_setpoint_mps", "relief_m",
+    "latency_s", "speed_setpoint_mps", "forward_mps2", "relief_m",
 )  # fmt: skip
 _MOTION = tuple(f.name for f in fields(Airframe))
 _TURNS = tuple(f.name for f in fields(Attitude))

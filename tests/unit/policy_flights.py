@@ -1,0 +1,441 @@
+"""An oracle for the policy engine: thousands of drones at once, flown in small steps through random policies.
+
+It shares nothing with the engine but the calls and verdicts: it projects on a flat Earth, casts rays to tell inside from
+outside, and integrates ArduPilot's jerk-limited position controller under wind, latency and position errors inside the
+bounds that the engine is told. Everything is numpy over drones; only the questions to the engine are asked one by one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from fractus_core.policy.compiled import CompiledGrant
+from fractus_core.policy.engine import judge
+from fractus_core.policy.values import Airframe, Call, GotoArgs, Situation, VelocityArgs, Verdict
+from numpy.typing import NDArray
+from policy_world import HOME, METHODS, NOW, compiled, policy, ring
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+STEP_S = 0.05
+ZONES, CORNERS = 7, 8
+ACCEL, CLIMB_ACCEL, JERK, GAIN = 2.5, 1.0, 5.0, 1.0
+UP_MPS, DOWN_MPS = 2.5, 1.5
+RATIO = 4.0
+"""ArduPilot's CONTROL_TIME_CONSTANT_RATIO: it plans to brake with three quarters of its acceleration."""
+POSITION_ERROR_M, HEIGHT_ERROR_M, TRACKING_M, LATENCY_S = 1.5, 1.0, 1.0, 0.3
+HOURS = 12
+"""The hour of the day at which all of it happens."""
+NORTH_M, EAST_M = 110_998.6, math.cos(math.radians(HOME.lat)) * 111_457.6
+"""Metres per degree at home (WGS 84), good to centimetres over this scene."""
+EXCLUSION, INCLUSION, LIMIT = 1, 2, 3
+SERVICES = [{"service": "mobility", "methods": [*METHODS, "SetVelocity"]}]
+_CIRCLE = np.array([(math.cos(a), math.sin(a)) for a in np.arange(16) * math.pi / 8])
+
+
+@dataclass
+class Scene:
+    """Policies as the oracle reads them: what each zone is, where, and between which heights.
+
+    Attributes:
+        rings: corners in metres, shape (ZONES, CORNERS, 2); short rings repeat their last corner.
+        kinds: 0 for an empty or inactive slot, shape (ZONES,).
+        bands: lower and upper metres above home, shape (ZONES, 2); of a limit the heights that are allowed.
+        heights: limits that hold everywhere.
+    """
+
+    grant: CompiledGrant
+    rings: Floats
+    kinds: NDArray[np.int64]
+    bands: Floats
+    heights: tuple[float, float]
+    top_mps: float
+
+
+def scene(rng: np.random.Generator) -> Scene:
+    """A random set of policies."""
+    rings = np.full((ZONES, CORNERS, 2), 1e6)
+    kinds = np.zeros(ZONES, dtype=np.int64)
+    bands = np.tile(np.array([-np.inf, np.inf]), (ZONES, 1))
+    policies: list[dict[str, Any]] = []
+    slot = 0
+    for _ in range(int(rng.integers(1, 5))):
+        zone, active = _zone(rng, slot, rings, bands, rng.uniform(4, 28), rng.uniform(-70, 70, 2))
+        action = rng.choice(["ignore", "adjust", "adjust", "hover", "land", "returnToLaunch", "revoke"])
+        policies.append(policy(f"out-{slot}", "GeofenceControl", "exclusion", [zone], action=str(action)))
+        kinds[slot] = EXCLUSION if active else 0
+        slot += 1
+    if rng.random() < 0.3:
+        zones = []
+        for _ in range(int(rng.integers(1, 3))):
+            zone, active = _zone(rng, slot, rings, bands, rng.uniform(60, 110), rng.uniform(-20, 20, 2))
+            zones.append(zone)
+            # A slot that is not active allows nothing: a band that no height is in.
+            kinds[slot] = INCLUSION
+            if not active:
+                bands[slot] = (np.inf, -np.inf)
+            slot += 1
+        action = str(rng.choice(["ignore", "adjust"]))
+        policies.append(policy("in", "GeofenceControl", "inclusion", zones, action=action))
+    if rng.random() < 0.2:
+        zone, active = _zone(rng, slot, rings, bands, rng.uniform(8, 25), rng.uniform(-60, 60, 2), banded=False)
+        low, high = sorted(rng.uniform(3, 50, 2))
+        policies.append(policy("zoned", "LimitControl", "altitude", [zone], lowerLimit=low, upperLimit=high))
+        kinds[slot], bands[slot] = (LIMIT if active else 0), (low, high)
+    heights, top = (-np.inf, 120.0), 15.0
+    if rng.random() < 0.5:
+        heights = (float(rng.uniform(2, 10)), float(rng.uniform(12, 60)))
+        action = str(rng.choice(["enforce", "enforce", "refuse"]))
+        limit = {"lowerLimit": heights[0], "upperLimit": heights[1], "action": action}
+        policies.append(policy("heights", "LimitControl", "altitude", **limit))
+    if rng.random() < 0.3:
+        top = float(rng.uniform(2, 10))
+        policies.append(policy("speeds", "LimitControl", "speed", upperLimit=top))
+    grant = compiled(*policies, operationArea=[], services=SERVICES)
+    return Scene(grant, rings, kinds, bands, heights, top)
+
+
+def _zone(
+    rng: np.random.Generator,
+    slot: int,
+    rings: Floats,
+    bands: Floats,
+    size: float,
+    middle: Floats,
+    *,
+    banded: bool = True,
+) -> tuple[dict[str, Any], bool]:
+    """A star-shaped zone, convex or not, in a slot of the scene; and whether it is active."""
+    count = int(rng.integers(3, CORNERS + 1))
+    turn = rng.uniform(0, 2 * math.pi) + 2 * math.pi * np.arange(count) / count
+    radii = size * rng.uniform(0.45, 1.0, count)
+    corners = middle + np.column_stack((np.cos(turn), np.sin(turn))) * radii[:, None]
+    rings[slot, :count], rings[slot, count:] = corners, corners[-1]
+    zone: dict[str, Any] = {"name": f"z{slot}", "area": ring([tuple(c) for c in corners.tolist()])}
+    if banded and rng.random() < 0.35:
+        low, high = sorted(rng.uniform(0, 70, 2))
+        amsl = rng.random() < 0.4
+        shift = HOME.amsl_m if amsl else 0.0
+        zone["altitude"] = {"lower": low + shift, "upper": high + shift + 1.0, "reference": "amsl" if amsl else "home"}
+        bands[slot] = (low, high + 1.0)
+    active = True
+    if rng.random() < 0.2:
+        begin, end = (int(h) for h in rng.integers(0, 24, 2))
+        zone["schedule"] = [{"start": f"{begin:02}:00", "end": f"{end:02}:00"}]
+        active = begin <= HOURS < end if begin < end else begin <= HOURS or end > HOURS
+    return zone, active
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Edges of rings, ready for rays: lower and upper end north, east at north 0, and east per north."""
+
+    y0: Floats
+    y1: Floats
+    x0: Floats
+    slope: Floats
+
+    @classmethod
+    def of(cls, rings: Floats) -> Walls:
+        """The edges of rings, shape (n, z, c, 2)."""
+        x, y = rings[..., 0], rings[..., 1]
+        rise = np.roll(y, -1, axis=2) - y
+        slope = (np.roll(x, -1, axis=2) - x) / np.where(rise == 0, 1.0, rise)
+        return cls(y, np.roll(y, -1, axis=2), x - slope * y, slope)
+
+    def around(self, points: Floats) -> Flags:
+        """Which rings points, shape (n, 2), lie in, by rays to the east: shape (n, z)."""
+        x, y = points[:, None, None, 0], points[:, None, None, 1]
+        hits = ((self.y0 > y) != (self.y1 > y)) & (x < self.x0 + self.slope * y)
+        odd: Flags = np.logical_xor.reduce(hits, axis=2)
+        return odd
+
+
+@dataclass
+class Fleet:
+    """Drones in flight, one a row: where the controller has each, and how the world treats it."""
+
+    rng: np.random.Generator
+    scenes: list[Scene]
+    place: Floats = field(init=False)
+    """East, north, up as the controller has it."""
+    speed: Floats = field(init=False)
+    accel: Floats = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Put each somewhere, with some velocity, wind and errors."""
+        rng, count = self.rng, len(self.scenes)
+        self.place = np.column_stack((rng.uniform(-80, 80, (count, 2)), rng.uniform(3, 45, count)))
+        angle, fast = rng.uniform(0, 2 * math.pi, count), rng.uniform(0, 8, count) * (rng.random(count) < 0.7)
+        climb = rng.uniform(-1.5, 2.0, count) * (rng.random(count) < 0.4)
+        self.speed = np.column_stack((fast * np.cos(angle), fast * np.sin(angle), climb))
+        self.accel = np.zeros((count, 3))
+        self.walls = Walls.of(np.stack([s.rings for s in self.scenes]))
+        self.kinds = np.stack([s.kinds for s in self.scenes])
+        self.bands = np.stack([s.bands for s in self.scenes])
+        self.heights = np.array([s.heights for s in self.scenes])
+        self.error = np.column_stack(
+            (_disc(rng, count, POSITION_ERROR_M), rng.uniform(-HEIGHT_ERROR_M, HEIGHT_ERROR_M, count))
+        )
+        self.gust = np.column_stack((_disc(rng, count, TRACKING_M), rng.uniform(-TRACKING_M, TRACKING_M, count)))
+        self.beat = rng.uniform(0.05, 0.4, count)
+        self.phase = rng.uniform(0, 2 * math.pi, count)
+        self.time_s = 0.0
+        # Commands: fly to a point with a speed, or hold a velocity until a time; all from a time on.
+        self.goal = self.place.copy()
+        self.cruise = np.full(count, 5.0)
+        self.setpoint = np.full(count, 5.0)
+        self.wanted = np.zeros((count, 3))
+        self.held = np.zeros(count, dtype=bool)
+        self.until = np.zeros(count)
+
+    def sway(self) -> Floats:
+        """How far wind has each off its course."""
+        return self.gust * np.sin(self.beat * self.time_s + self.phase)[:, None]
+
+    @property
+    def seen(self) -> Floats:
+        """Where each believes it is."""
+        return self.place + self.sway()
+
+    @property
+    def true(self) -> Floats:
+        """Where each is."""
+        return self.seen + self.error
+
+    def stop(self, who: NDArray[np.int64]) -> None:
+        """Send them to where their controllers can stop."""
+        for axes, accel in ((slice(0, 2), ACCEL), (slice(2, 3), CLIMB_ACCEL)):
+            moving = self.speed[who, axes]
+            fast = np.linalg.norm(moving, axis=1)
+            run = np.where(fast < accel / GAIN, fast / GAIN, accel / (2 * GAIN**2) + fast**2 / (2 * accel))
+            ahead = moving / np.maximum(fast, 1e-9)[:, None] * run[:, None]
+            self.goal[who, axes] = self.place[who, axes] + ahead
+        self.held[who] = False
+        self.cruise[who] = 20.0
+        self.wanted[who] = 0.0
+
+    def step(self) -> None:
+        """Move on by a little."""
+        late = self.held & (self.time_s >= self.until)
+        if late.any():
+            self.stop(np.flatnonzero(late))
+        self._axes(slice(0, 2), ACCEL, self.cruise, self.cruise)
+        self._axes(slice(2, 3), CLIMB_ACCEL, np.full(len(self.place), UP_MPS), np.full(len(self.place), DOWN_MPS))
+        self.place = self.place + self.speed * STEP_S
+        self.time_s += STEP_S
+
+    def _axes(self, axes: slice, accel: float, most: Floats, least: Floats) -> None:
+        """ArduPilot's shape_pos_vel_accel (AP_Math/control.cpp) for some axes together."""
+        off = self.goal[:, axes] - self.place[:, axes]
+        away = np.linalg.norm(off, axis=1)
+        most = np.where(off[:, -1] < 0, least, most) if off.shape[1] == 1 else most
+        wanted = (
+            off
+            / np.maximum(away, 1e-9)[:, None]
+            * np.minimum(_root(away, JERK / (RATIO * accel), (1 - 1 / RATIO) * accel), most)[:, None]
+        )
+        wanted = np.where(self.held[:, None], self.wanted[:, axes], wanted)
+        change = wanted - self.speed[:, axes]
+        size = np.linalg.norm(change, axis=1)
+        push = np.minimum(_root(size, JERK / accel, JERK), accel)
+        # A jerk-limited controller aims to be done a step ahead; without it, it rings by a step.
+        target = change / np.maximum(size, 1e-9)[:, None] * np.minimum(push, size / STEP_S)[:, None]
+        step = target - self.accel[:, axes]
+        jerk = np.linalg.norm(step, axis=1)
+        self.accel[:, axes] += step * np.minimum(1.0, JERK * STEP_S / np.maximum(jerk, 1e-9))[:, None]
+        self.speed[:, axes] += self.accel[:, axes] * STEP_S
+
+    def situation(self, i: int, *, retraces: bool, told: bool) -> Situation:
+        """What the engine is told of one drone; of its acceleration only some services know."""
+        x, y, z = self.seen[i]
+        drift = self.gust[i] * self.beat[i] * math.cos(self.beat[i] * self.time_s + self.phase[i])
+        east, north, up = (float(v) for v in self.speed[i] + drift)
+        ground, tends = math.hypot(east, north), float(np.linalg.norm(self.wanted[i, :2]))
+        forward = float(self.accel[i, 0] * east + self.accel[i, 1] * north) / max(ground, 0.05) if told else None
+        return Situation(
+            time_s=NOW, lat=float(HOME.lat + y / NORTH_M), lon=float(HOME.lon + x / EAST_M), altitude_m=float(z), north_mps=north, east_mps=east,
+            down_mps=-up, home=HOME, armed=True, in_air=True, position_error_m=POSITION_ERROR_M,
+            altitude_error_m=HEIGHT_ERROR_M, latency_s=LATENCY_S, speed_setpoint_mps=max(float(self.setpoint[i]), tends), forward_mps2=forward,
+            airframe=Airframe(retraces=retraces),
+        )  # fmt: skip
+
+    def obey(self, i: int, verdict: Verdict) -> None:
+        """Carry out what the engine made of a request."""
+        args = verdict.args
+        if verdict.brake_first:
+            self.stop(np.array([i]))
+        elif isinstance(args, GotoArgs):
+            self.held[i] = False
+            self.goal[i] = ((args.lon - HOME.lon) * EAST_M, (args.lat - HOME.lat) * NORTH_M, args.alt)
+            self.setpoint[i] = self.cruise[i] = args.speed_mps or self.setpoint[i]
+            self.wanted[i] = 0.0
+        elif isinstance(args, VelocityArgs):
+            self.held[i] = True
+            self.wanted[i] = (args.east_mps, args.north_mps, -args.down_mps)
+            self.until[i] = self.time_s + args.hold_s + self.rng.uniform(0, LATENCY_S)
+
+    def trespassing(self) -> Flags:
+        """Which zones each breaks: exclusion zones and limits one by one, inclusion zones all together in slot 0 of a second
+        block; shape (n, ZONES + 1)."""
+        true = self.true
+        return trespasses(true[:, :2], true[:, 2], self.walls, self.kinds, self.bands)
+
+
+def trespasses(points: Floats, heights: Floats, walls: Walls, kinds: NDArray[np.int64], bands: Floats) -> Flags:
+    """Which zones are broken by being at some points; the last column: being outside all inclusion zones."""
+    here = walls.around(points)
+    up = heights[:, None]
+    within = (bands[..., 0] <= up) & (up <= bands[..., 1])
+    slack = HEIGHT_ERROR_M + TRACKING_M + JUST_M
+    allowed = (bands[..., 0] - slack <= up) & (up <= bands[..., 1] + slack)
+    broken = (here & within & (kinds == EXCLUSION)) | (here & ~allowed & (kinds == LIMIT))
+    kept = kinds == INCLUSION
+    outside = kept.any(axis=1) & ~(here & within & kept).any(axis=1)
+    return np.column_stack((broken, outside))
+
+
+JUST_M = 0.3
+"""How much a limit of altitude may be overshot beyond the declared errors: the controller's own overshoot."""
+
+
+def _root(error: Floats, gain: float, limit: float) -> Floats:
+    """ArduPilot's square-root controller."""
+    linear = limit / gain**2
+    root = np.sqrt(np.maximum(2 * limit * (error - linear / 2), 0.0))
+    return np.where(error > linear, root, error * gain)
+
+
+def _disc(rng: np.random.Generator, count: int, radius: float) -> Floats:
+    """Points of a disc, half of them on its rim."""
+    angle, far = rng.uniform(0, 2 * math.pi, count), np.sqrt(np.minimum(rng.uniform(0, 2, count), 1.0)) * radius
+    return np.column_stack((far * np.cos(angle), far * np.sin(angle)))
+
+
+@dataclass
+class Tally:
+    """What came of the requests, and every one that went wrong."""
+
+    asked: int = 0
+    permitted: int = 0
+    corrected: int = 0
+    braked: int = 0
+    taken: int = 0
+    wrong: list[str] = field(default_factory=list)
+
+
+def flights(seed: int, count: int, shared: int = 8, requests: int = 3) -> Tally:
+    """Fly a fleet through random scenes, each drone with several requests, and look for trespasses.
+
+    Args:
+        seed: of everything.
+        count: drones.
+        shared: drones to a scene: compiling policies takes longer than judging.
+        requests: to each drone; the later ones interrupt the flight of the earlier.
+    """
+    rng = np.random.default_rng(seed)
+    scenes = [s for s in (scene(rng) for _ in range(math.ceil(count / shared))) for _ in range(shared)][:count]
+    fleet, tally = Fleet(rng, scenes), Tally()
+    excused = _excused(fleet)
+    told: list[str] = [""] * count
+    for turn in range(requests):
+        _ask_all(fleet, tally, told, rng)
+        span_s = 30.0 if turn == requests - 1 else rng.uniform(0.4, 7.0)
+        for _ in range(int(span_s / STEP_S)):
+            fleet.step()
+            if turn == requests - 1 and np.abs(fleet.speed).max() < 0.02:
+                break
+            found = fleet.trespassing() & ~excused
+            for i in np.flatnonzero(found.any(axis=1)):
+                tally.wrong.append(f"seed {seed}, drone {i}, turn {turn}, {fleet.time_s:.2f} s: {told[i]}")
+                excused[i] = True
+    return tally
+
+
+def _ask_all(fleet: Fleet, tally: Tally, told: list[str], rng: np.random.Generator) -> None:
+    """One request of each drone; after a latency they are obeyed."""
+    verdicts: list[tuple[int, Verdict]] = []
+    for i, place in enumerate(fleet.scenes):
+        call, now = _request(rng), fleet.situation(i, retraces=bool(rng.random() < 0.5), told=bool(rng.random() < 0.5))
+        verdict = judge(call, now, place.grant)
+        tally.asked += 1
+        tally.permitted += verdict.permits
+        tally.corrected += verdict.action == "correct"
+        tally.braked += verdict.permits and verdict.brake_first
+        tally.taken += verdict.action == "takeover"
+        if verdict.permits:
+            told[i] = f"{call} in {now} -> {verdict}"
+            tally.wrong += [f"{what}: {told[i]}" for what in _odd(verdict, now, place)]
+            verdicts.append((i, verdict))
+    waits = rng.uniform(0, LATENCY_S, len(verdicts))
+    order = np.argsort(waits)
+    begun = fleet.time_s
+    for n in order:
+        while fleet.time_s - begun + STEP_S <= waits[n]:
+            fleet.step()
+        fleet.obey(*verdicts[n])
+
+
+def _request(rng: np.random.Generator) -> Call:
+    if rng.random() < 0.65:
+        x, y = rng.uniform(-85, 85, 2)
+        alt = None if rng.random() < 0.3 else float(rng.uniform(1, 60))
+        speed = float(rng.uniform(1, 12)) if rng.random() < 0.4 else None
+        return Call("Goto", GotoArgs(float(HOME.lat + y / NORTH_M), float(HOME.lon + x / EAST_M), alt, speed_mps=speed))
+    north, east = rng.uniform(-9, 9, 2)
+    down = float(rng.uniform(-2.5, 2.0)) if rng.random() < 0.5 else 0.0
+    return Call("SetVelocity", VelocityArgs(float(north), float(east), down, hold_s=float(rng.uniform(0.1, 2.0))))
+
+
+def _odd(verdict: Verdict, now: Situation, place: Scene) -> Iterator[str]:
+    """What is wrong with the arguments that come back, flown or not."""
+    args = verdict.args
+    if isinstance(args, VelocityArgs) and math.hypot(args.north_mps, args.east_mps) > place.top_mps + 1e-6:
+        yield "too fast"
+    if not isinstance(args, GotoArgs):
+        return
+    if (args.speed_mps or now.speed_setpoint_mps) > place.top_mps + 1e-6:
+        yield "too fast"
+    low, high = place.heights
+    if args.alt is None or not low - 1e-6 <= args.alt <= high + 1e-6:
+        yield "at the wrong height"
+    here = np.array([(args.lon - HOME.lon) * EAST_M, (args.lat - HOME.lat) * NORTH_M])
+    around = here + _CIRCLE * (POSITION_ERROR_M + TRACKING_M - 0.05)
+    count = len(around)
+    broken = trespasses(
+        around, np.full(count, args.alt), Walls.of(np.repeat(place.rings[None], count, 0)),
+        np.repeat(place.kinds[None], count, 0), np.repeat(place.bands[None], count, 0),
+    )  # fmt: skip
+    if broken.any():
+        yield "target inside the margin of a fence"
+
+
+def _excused(fleet: Fleet) -> Flags:
+    """Fences that a drone breaks, or comes too close to, whatever it is told at the beginning; shape (n, ZONES + 1).
+
+    What it does before a request can have any effect is not the request's doing, nor are the ways back that the engine
+    allows from there.
+    """
+    trial = Fleet(np.random.default_rng(0), fleet.scenes)
+    for name in ("place", "speed", "accel", "error", "gust", "beat", "phase"):
+        setattr(trial, name, getattr(fleet, name).copy())
+    trial.held[:], trial.wanted, trial.until[:] = True, trial.speed.copy(), LATENCY_S
+    margin = _CIRCLE * (POSITION_ERROR_M + TRACKING_M + 0.1)
+    tall = HEIGHT_ERROR_M + TRACKING_M + 0.1
+    bands = fleet.bands.copy()
+    wide, tight = bands + np.array([-tall, tall]), bands + np.array([tall, -tall])
+    bands = np.where(
+        (fleet.kinds == EXCLUSION)[..., None], wide, np.where((fleet.kinds == INCLUSION)[..., None], tight, bands)
+    )
+    found = np.zeros((len(fleet.scenes), ZONES + 1), dtype=bool)
+    for n in range(int(6.0 / STEP_S)):
+        if n % 4 == 0:
+            for dx in (*margin, np.zeros(2)):
+                found |= trespasses(trial.seen[:, :2] + dx, trial.seen[:, 2], trial.walls, trial.kinds, bands)
+        trial.step()
+    return found

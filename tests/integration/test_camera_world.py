@@ -1,0 +1,246 @@
+"""The camera world as a process and a server: behind the real simulated vehicle, and against clients of all kinds."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from fractus_sim.world import server as server_module
+from fractus_sim.world.optics import Intrinsics, Mount, Pose
+from fractus_sim.world.server import CameraServer
+from fractus_sim.world.studio import Studio
+from fractus_sim.world.whereabouts import Fixed
+from fractus_sim.world.world import WorldAround
+from geotagged import save
+from vehicle_process import HOME, Client, free_port, running_vehicle
+
+
+def get(port: int, path: str, timeout_s: float = 60.0) -> tuple[int, dict[str, str], bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=timeout_s)
+    try:
+        connection.request("GET", path)
+        answer = connection.getresponse()
+        return answer.status, dict(answer.getheaders()), answer.read()
+    finally:
+        connection.close()
+
+
+def eventually(look: Callable[[], int | None], timeout_s: float = 60.0) -> int:
+    end = time.monotonic() + timeout_s
+    while time.monotonic() < end:
+        found = look()
+        if found is not None:
+            return found
+        time.sleep(0.1)
+    raise TimeoutError(f"nothing within {timeout_s:.0f} s")
+
+
+@contextlib.contextmanager
+def running_world(*arguments: str) -> Iterator[int]:
+    """The camera world as a process; its port."""
+    command = [sys.executable, "-m", "fractus_sim.world", "--listen", "127.0.0.1:0", *arguments]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    try:
+        lines: list[str] = []
+        while "camera world at" not in (line := process.stderr.readline()):
+            lines.append(line)
+            assert line, "".join(lines)
+        yield int(line.rstrip().rstrip("/").rsplit(":", 1)[1])
+    finally:
+        process.terminate()
+        process.wait(15)
+    assert process.returncode == 0, process.stderr.read()
+
+
+@pytest.fixture
+def served() -> Iterator[CameraServer]:
+    """A server in this process, whose camera is on a mast."""
+    frame_pose = Pose(50.8637, 4.6785, 40.0, yaw_deg=20.0)
+    studio = Studio(
+        WorldAround(7, (50.8637, 4.6785)), Fixed(frame_pose), Intrinsics(320, 180), Mount(), now=lambda: 1000.0
+    )
+    server = CameraServer(("127.0.0.1", 0), studio)
+    thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join(10)
+
+
+def picture_of(body: bytes) -> np.ndarray:
+    picture = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    return picture
+
+
+def test_camera_follows_the_vehicle_and_survives_its_restart() -> None:
+    """503 before, pictures while it flies, 503 when it is gone, pictures again."""
+    links = [f"tcp:127.0.0.1:{free_port()}" for _ in range(2)]
+    origin = f"{HOME[0]},{HOME[1]}"
+    small = "/snapshot.jpg?width=320&height=180"
+    with running_world("--vehicle", links[1], "--origin", origin, "--mount-pitch", "-60") as port:
+        status, _, body = get(port, small)
+        assert status == 503
+        assert b"position" in body
+        with running_vehicle("--ready-after", "2", "--speedup", "4", links=tuple(links)):
+            eventually(lambda: get(port, small)[0] == 200 or None)
+            pilot = Client(links[0])
+            pilot.take_off(20.0)
+            status, headers, body = get(port, small)
+            assert status == 200
+            assert headers["Content-Type"] == "image/jpeg"
+            assert picture_of(body).shape == (180, 320, 3)
+            truth = json.loads(get(port, f"/truth.json?snapshot={headers['X-Fractus-Snapshot']}")[2])
+            assert truth["pose"]["heightM"] == pytest.approx(20.0, abs=3.0)
+            assert truth["pose"]["lat"] == pytest.approx(HOME[0], abs=1e-4)
+            assert isinstance(truth["objects"], list)
+            pilot.close()
+        assert eventually(lambda: get(port, small)[0] == 503 or None)
+        with running_vehicle("--ready-after", "2", links=tuple(links)):
+            eventually(lambda: get(port, small)[0] == 200 or None)
+
+
+def test_snapshot_and_truth_agree(served: CameraServer) -> None:
+    status, headers, first = get(served.port, "/snapshot.jpg?time=77.5")
+    assert status == 200
+    assert headers["X-Fractus-Time"] == "77.500"
+    assert get(served.port, "/snapshot.jpg?time=77.5")[2] == first, "same pose and time, same bytes"
+    assert get(served.port, "/snapshot.jpg?time=77.5&band=ir")[2] != first
+    truth = json.loads(get(served.port, f"/truth.json?snapshot={headers['X-Fractus-Snapshot']}")[2])
+    assert truth["time"] == 77.5
+    assert truth["band"] == "rgb"
+    assert json.loads(get(served.port, "/truth.json")[2])["band"] == "ir", "without a number: the last one"
+
+
+def test_orthophoto_and_page(served: CameraServer) -> None:
+    status, headers, body = get(served.port, "/orthophoto.png?metres=100&pixels=200")
+    assert status == 200
+    assert headers["Content-Type"] == "image/png"
+    assert picture_of(body).shape == (200, 200, 3)
+    lines = get(served.port, "/orthophoto.pgw?metres=100&pixels=200")[2].split()
+    assert len(lines) == 6
+    assert float(lines[4]) + 99.5 * float(lines[0]) == pytest.approx(4.6785, abs=1e-9)
+    assert float(lines[5]) + 99.5 * float(lines[3]) == pytest.approx(50.8637, abs=1e-9)
+    status, headers, body = get(served.port, "/")
+    assert status == 200
+    assert b"snapshot.jpg" in body
+    assert headers["Content-Type"].startswith("text/html")
+
+
+@pytest.mark.parametrize(
+    ("path", "status", "words"),
+    [
+        ("/nothing", 404, "there is no /nothing"),
+        ("/snapshot.jpg?width=9999", 400, "width: 9999"),
+        ("/snapshot.jpg?width=8192&height=8192", 400, "more than 16,000,000 pixels"),
+        ("/snapshot.jpg?width=-5", 400, "whole number"),
+        ("/snapshot.jpg?height=nan", 400, "whole number"),
+        ("/snapshot.jpg?band=uv", 400, "neither rgb nor ir"),
+        ("/snapshot.jpg?time=inf", 400, "time"),
+        ("/snapshot.jpg?with=5", 400, "unknown parameter 'with'"),
+        ("/truth.json?snapshot=999999", 404, "snapshot 999999"),
+        ("/truth.json", 404, "no picture has been taken"),
+        ("/orthophoto.png?metres=1e9", 400, "metres"),
+        ("/orthophoto.png?pixels=100000", 400, "pixels"),
+        ("/orthophoto.png?lat=89", 400, "lat"),
+        ("/snapshot.jpg?" + "&".join(f"a{n}=1" for n in range(40)), 400, "query"),
+    ],
+)
+def test_bad_requests_get_a_sentence(served: CameraServer, path: str, status: int, words: str) -> None:
+    if "999999" in path:
+        get(served.port, "/snapshot.jpg")
+    answer = get(served.port, path)
+    assert answer[0] == status
+    assert words in answer[2].decode()
+
+
+def test_idle_slow_and_vanishing_clients_stall_nobody(served: CameraServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many clients as fit that say nothing; they are thrown out, and a picture is served afterwards."""
+    monkeypatch.setattr(server_module, "CLIENT_LIFE_S", 0.5)
+    idle = [
+        socket.create_connection(("127.0.0.1", served.port), timeout=5) for _ in range(server_module.MAX_CLIENTS + 8)
+    ]
+    for number, client in enumerate(idle):
+        if number % 3 == 0:
+            client.sendall(b"GET /snapshot.jpg HTTP/1.1\r\nHost: x\r\n")
+        elif number % 3 == 1:
+            client.close()
+    assert eventually(lambda: _status(served.port), 20.0) == 200
+    for client in idle:
+        client.close()
+
+
+def _status(port: int) -> int | None:
+    try:
+        return get(port, "/snapshot.jpg", 10.0)[0]
+    except (OSError, http.client.HTTPException):
+        return None
+
+
+def test_many_clients_at_once_get_pictures_or_are_told_to_wait(served: CameraServer) -> None:
+    answers: list[int | None] = []
+    threads = [threading.Thread(target=lambda: answers.append(_status(served.port))) for _ in range(24)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert len(answers) == 24
+    assert set(answers) <= {200, 503}
+    assert answers.count(200) >= 8
+
+
+def test_other_methods_are_refused(served: CameraServer) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=10)
+    connection.request("POST", "/snapshot.jpg", body=b"x" * 100)
+    assert connection.getresponse().status == 501
+    connection.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--vehicle", "udp:1"), "tcp:HOST:PORT"),
+        (("--pose", "50"), "LAT,LON,HEIGHT"),
+        (("--pose", "95,4,10"), "not on the globe"),
+        (("--fov", "200"), "field of view"),
+        (("--resolution", "big"), "WIDTHxHEIGHT"),
+        (("--listen", "8090"), "HOST:PORT"),
+        (("--orthophoto", "/nowhere.png"), "/nowhere.png"),
+        (("--photos", "/nowhere"), "/nowhere"),
+    ],
+)
+def test_bad_options_are_named(arguments: tuple[str, ...], words: str) -> None:
+    from click.testing import CliRunner
+    from fractus_sim.world.__main__ import camera_world
+
+    result = CliRunner().invoke(camera_world, list(arguments))
+    assert result.exit_code != 0
+    assert words in result.output
+
+
+def test_photos_instead_of_a_world(tmp_path: Path) -> None:
+    save(tmp_path / "near.jpg", 50.0, 4.0, 60.0, (200, 20, 20))
+    save(tmp_path / "far.jpg", 50.01, 4.0, 60.0, (20, 20, 200))
+    save(tmp_path / "ir" / "a.jpg", 50.01, 4.0, 60.0, (90, 90, 90))
+    with running_world("--photos", str(tmp_path), "--pose", "50.0001,4,20", "--ground", "40") as port:
+        assert picture_of(get(port, "/snapshot.jpg?width=64&height=48")[2])[20, 20, 2] > 180
+        truth = json.loads(get(port, "/truth.json")[2])
+        assert truth["photo"]["name"] == "near.jpg"
+        assert truth["photo"]["awayM"] == pytest.approx(11.1, abs=0.2)
+        get(port, "/snapshot.jpg?width=64&height=48&band=ir")
+        assert json.loads(get(port, "/truth.json")[2])["photo"]["name"] == "a.jpg"

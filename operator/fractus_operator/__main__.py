@@ -5,7 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import secrets
+import socket
 import sys
+import time
 from collections.abc import Awaitable, Callable, Coroutine
 from datetime import UTC, datetime
 from typing import Any
@@ -17,6 +20,7 @@ from fractus_operator.authority import BrokenAuthority, open_authority
 from fractus_operator.deployments import Deployments
 from fractus_operator.inventory import LiveInventory
 from fractus_operator.kinds import Key, Kind
+from fractus_operator.lease import Lease, LostLease
 from fractus_operator.location import Locations
 from fractus_operator.orphans import Orphans
 from fractus_operator.readiness import Readiness
@@ -40,7 +44,12 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         stop: Set it to end the operator; signals do so as well.
     """
     store = Store.connect()
+    identity = settings.identity or f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
+    lease = Lease(store, settings.namespace, identity, settings.lease_s, time.monotonic)
+    store.may_write_s = lambda: lease.left_s
+    keeping = asyncio.create_task(lease.run())
     try:
+        await _acting(lease, keeping)
         authority = await open_authority(store, settings.namespace)
         live = LiveInventory(store)
         deployments = Deployments(store, live, authority, _now, settings.planning)
@@ -52,6 +61,7 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         handlers.configure(kopf_settings)
         background: list[Coroutine[Any, Any, None]] = [r.run() for r in live.reflectors()]
         background += [worklist.run() for worklist in lists]
+        background.append(_outlasting(keeping))
         main = kopf.operator(
             registry=registry,
             settings=kopf_settings,
@@ -61,7 +71,24 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         )
         await _together(main, background)
     finally:
+        # Last of all: until here something of ours may still be written.
+        keeping.cancel()
+        await asyncio.gather(keeping, return_exceptions=True)
         await store.close()
+
+
+async def _acting(lease: Lease, keeping: asyncio.Task[None]) -> None:
+    """Wait until this operator may act, or it turns out that it never will."""
+    held = asyncio.create_task(lease.held())
+    done, _ = await asyncio.wait((held, keeping), return_when=asyncio.FIRST_COMPLETED)
+    held.cancel()
+    if keeping in done:
+        keeping.result()
+
+
+async def _outlasting(keeping: asyncio.Task[None]) -> None:
+    """Follow a task that goes on when this is cancelled."""
+    await asyncio.shield(keeping)
 
 
 def worklists(store: Store, live: LiveInventory, signing: NodeSigning) -> list[Worklist]:
@@ -135,7 +162,7 @@ def main() -> int:
     logging.getLogger("kopf").setLevel(max(settings.log_level, logging.WARNING))
     try:
         asyncio.run(run(settings))
-    except (Unconfigured, BrokenAuthority, StoreError) as error:
+    except (Unconfigured, BrokenAuthority, StoreError, LostLease) as error:
         logger.critical("%s", error)
         return 1
     return 0

@@ -21,11 +21,15 @@ class Settings:
         namespace: where the system lives.
         agent_account: name of the agents' service account in that namespace.
         health: URL that the liveness endpoint listens on.
+        identity: under which this operator acts, such as the name of its pod; empty: one that no other process has.
+        lease_s: for how long no other operator acts after this one was last heard of.
     """
 
     namespace: str = "fractus-system"
     agent_account: str = "fractus-agent"
     health: str = "http://0.0.0.0:8080/healthz"
+    identity: str = ""
+    lease_s: float = 15.0
     log_level: int = logging.INFO
     planning: PlanningSettings = field(default_factory=PlanningSettings)
 
@@ -36,7 +40,7 @@ class Settings:
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str]) -> Settings:
-        """Read FRACTUS_SYSTEM_NAMESPACE, FRACTUS_AGENT_ACCOUNT, FRACTUS_HEALTH, FRACTUS_LOG_LEVEL and the FRACTUS_PLANNING_*.
+        """Read FRACTUS_SYSTEM_NAMESPACE, FRACTUS_AGENT_ACCOUNT, FRACTUS_HEALTH, FRACTUS_IDENTITY, FRACTUS_LEASE, FRACTUS_LOG_LEVEL and the FRACTUS_PLANNING_*.
 
         Raises:
             BadSetting: naming the variable.
@@ -56,10 +60,19 @@ class Settings:
         return cls(
             namespace=environment.get("FRACTUS_SYSTEM_NAMESPACE", default.namespace),
             agent_account=environment.get("FRACTUS_AGENT_ACCOUNT", default.agent_account),
+            identity=environment.get("FRACTUS_IDENTITY", default.identity),
+            lease_s=_duration(environment, "FRACTUS_LEASE", default.lease_s),
             health=environment.get("FRACTUS_HEALTH", default.health),
             log_level=logging.getLevelNamesMapping()[level],
             planning=planning,
         )
+
+
+def _duration(environment: Mapping[str, str], name: str, default: float) -> float:
+    value = _number(environment, name, default)
+    if value < 1:
+        raise BadSetting(f"{name}: must be at least 1 second, but is {value:g}")
+    return value
 
 
 def _number(environment: Mapping[str, str], name: str, default: float) -> float:

@@ -8,7 +8,7 @@ ask for bookmarks and time out, which lightkube's own watch does not offer.
 from __future__ import annotations
 
 import json
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from datetime import datetime
 from typing import Any, Self
 
@@ -74,6 +74,8 @@ class Store:
 
     def __init__(self, client: httpx2.AsyncClient) -> None:
         self._client = client
+        self.may_write_s: Callable[[], float] = lambda: _REQUEST_TIMEOUT_S
+        """For how many seconds writes may still take effect; none: another operator acts."""
 
     @classmethod
     def connect(cls) -> Self:
@@ -188,14 +190,15 @@ class Store:
         except httpx2.HTTPError as error:
             raise StoreError(0, "Unreachable", f"watch of {kind.plural}: {type(error).__name__}: {error}") from error
 
-    async def create(self, kind: Kind, body: Body) -> Body:
-        """Create an object.
+    async def create(self, kind: Kind, body: Body, *, guarded: bool = True) -> Body:
+        """Create an object; `guarded` as for every write, unless it is the Lease itself.
 
         Raises:
             Taken: one of that name exists.
         """
         namespace, _ = _place(body)
-        return await self._send("POST", kind.path(namespace), params={"fieldManager": FIELD_MANAGER}, body=body)
+        params = {"fieldManager": FIELD_MANAGER}
+        return await self._send("POST", kind.path(namespace), params=params, body=body, guarded=guarded)
 
     async def apply(self, kind: Kind, body: Body, *, subresource: str = "") -> Body:
         """Make an object's fields as given, by server-side apply; fields of others stay.
@@ -228,14 +231,14 @@ class Store:
             content_type="application/merge-patch+json",
         )
 
-    async def replace(self, kind: Kind, body: Body, *, subresource: str) -> Body:
-        """Write a subresource that takes no apply, such as a signing request's approval.
+    async def replace(self, kind: Kind, body: Body, *, subresource: str = "", guarded: bool = True) -> Body:
+        """Write what takes no apply, such as a signing request's approval; `guarded` as for create.
 
         Raises:
             Taken: the object changed since it was read.
         """
         namespace, name = _place(body)
-        return await self._send("PUT", kind.path(namespace, name, subresource), body=body)
+        return await self._send("PUT", kind.path(namespace, name, subresource), body=body, guarded=guarded)
 
     async def delete(self, kind: Kind, key: Key, uid: str | None = None) -> None:
         """Delete an object and, in the background, what it owns; one that is gone already is no error."""
@@ -300,7 +303,13 @@ class Store:
         body: Body | None = None,
         content_type: str = "application/json",
         accept: str = "application/json",
+        guarded: bool = True,
     ) -> Body:
+        timeout_s = _REQUEST_TIMEOUT_S
+        if method != "GET" and guarded:
+            timeout_s = min(timeout_s, self.may_write_s())
+            if timeout_s <= 0:
+                raise StoreError(0, "NotActing", f"{method} {path}: the lease is not held, another operator may act")
         headers = {"Accept": accept, **({"Content-Type": content_type} if body is not None else {})}
         try:
             response = await self._client.request(
@@ -309,6 +318,7 @@ class Store:
                 params=params,
                 content=None if body is None else json.dumps(body),
                 headers=headers,
+                timeout=timeout_s,
             )
         except httpx2.HTTPError as error:
             raise StoreError(0, "Unreachable", f"{method} {path}: {type(error).__name__}: {error}") from error

@@ -221,8 +221,10 @@ def _condition(type_: str, status: str, reason: str) -> Body:
 class OperatorProcess:
     """The operator, as `python -m fractus_operator`."""
 
-    def __init__(self, kubeconfig: Path, log: Path) -> None:
+    def __init__(self, kubeconfig: Path, log: Path, identity: str = "operator", **settings: str) -> None:
         self._kubeconfig = kubeconfig
+        # As a pod does, it keeps its identity when it is started again.
+        self._settings = {"FRACTUS_IDENTITY": identity, **settings}
         self._log = log
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -231,6 +233,7 @@ class OperatorProcess:
             **os.environ,
             "KUBECONFIG": str(self._kubeconfig),
             "FRACTUS_HEALTH": f"http://127.0.0.1:{free_port()}/healthz",
+            **self._settings,
         }
         with self._log.open("ab") as log:
             self._process = subprocess.Popen(
@@ -247,6 +250,10 @@ class OperatorProcess:
     @property
     def running(self) -> bool:
         return self._process is not None and self._process.poll() is None
+
+    def signal(self, how: int) -> None:
+        assert self._process is not None
+        self._process.send_signal(how)
 
     def log(self) -> str:
         return self._log.read_text()

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import signal
+from pathlib import Path
 from typing import Any
 
 import pytest
-from control_plane import wait_for
+from control_plane import ControlPlane, wait_for
 from operator_world import FRACTUS, OperatorProcess, World, at, component, ours, traffic
 from test_operator import deployed, end_mission, events, running
 
@@ -173,3 +175,36 @@ def test_a_release_that_spells_grants_in_another_way_leaves_those_in_use(
     world.api.merge(path, {"spec": {"replicas": 3}})
     wait_for(lambda: (world.api.get(path) or {})["spec"]["replicas"] == 1, "the end of a reconcile")
     assert {g["metadata"]["name"]: g["metadata"]["resourceVersion"] for g in world.grants(namespace)} == before
+
+
+# -- two operators --
+
+
+def test_of_two_operators_one_acts_and_the_other_takes_over(
+    control_plane: ControlPlane, world: World, namespace: str, tmp_path: Path
+) -> None:
+    brief = {"FRACTUS_LEASE": "3"}
+    first, second = (
+        OperatorProcess(control_plane.kubeconfig, tmp_path / f"{name}.log", name, **brief) for name in ("one", "two")
+    )
+    first.start()
+    try:
+        wait_for(lambda: "one acts now" in first.log(), first.log)
+        second.start()
+        wait_for(lambda: "waiting for it to end" in second.log(), second.log)
+        world.put(traffic(namespace))
+        world.phase(namespace, "Deploying")
+        # Frozen, as on a machine that was paused, and then thawed beside the one that acts meanwhile.
+        first.signal(signal.SIGSTOP)
+        world.add_drone("drone-2")
+        world.put(traffic(namespace, "second"))
+        world.phase(namespace, "Deploying", "second")
+        assert "second is planned" in second.log()
+        first.signal(signal.SIGCONT)
+        wait_for(lambda: not first.running, "the first one to end")
+        assert "two has acted since one last did" in first.log()
+        assert "second is planned" not in first.log()
+    finally:
+        for operator in (first, second):
+            if operator.running:
+                operator.stop(signal.SIGKILL)

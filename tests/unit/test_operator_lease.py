@@ -1,0 +1,167 @@
+"""The Lease by which one of several operators acts, on a clock and an API server of the test's own."""
+
+from __future__ import annotations
+
+import asyncio
+import copy
+from typing import Any, cast
+
+import pytest
+from fractus_operator.kinds import Body, Kind, key_of
+from fractus_operator.lease import Lease, LostLease
+from fractus_operator.store import NotFound, Store, StoreError, Taken
+
+DURATION_S = 10.0
+
+
+class Shelf:
+    """As much of an API server as a Lease needs: one object with a version."""
+
+    def __init__(self) -> None:
+        self.body: Body | None = None
+        self.reachable = True
+        self.writes = 0
+
+    async def get(self, kind: Kind, name: str, namespace: str = "") -> Body:
+        self._reach()
+        if self.body is None:
+            raise NotFound(404, "NotFound", name)
+        return copy.deepcopy(self.body)
+
+    async def create(self, kind: Kind, body: Body, *, guarded: bool) -> Body:
+        self._reach()
+        if self.body is not None:
+            raise Taken(409, "AlreadyExists", "")
+        return self._put(body)
+
+    async def replace(self, kind: Kind, body: Body, *, guarded: bool) -> Body:
+        self._reach()
+        if self.body is None or body["metadata"].get("resourceVersion") != self.body["metadata"]["resourceVersion"]:
+            raise Taken(409, "Conflict", "")
+        return self._put(body)
+
+    def _reach(self) -> None:
+        if not self.reachable:
+            raise StoreError(0, "Unreachable", "nobody answers")
+
+    def _put(self, body: Body) -> Body:
+        assert key_of(body) == ("system", "fractus-operator")
+        self.writes += 1
+        self.body = copy.deepcopy(body)
+        self.body["metadata"]["resourceVersion"] = str(self.writes)
+        return self.body
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def lease(shelf: Shelf, clock: Clock, identity: str) -> Lease:
+    return Lease(cast(Store, shelf), "system", identity, DURATION_S, clock)
+
+
+async def step(*leases: Lease) -> None:
+    """Each asks once, in order."""
+    for one in leases:
+        task = asyncio.create_task(one.run())
+        for _ in range(6):
+            await asyncio.sleep(0)
+        if task.done():
+            task.result()
+        # Ended as a killed process is: nothing is given back.
+        one_give_back, one._give_back = one._give_back, _nothing  # type: ignore[method-assign]
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        one._give_back = one_give_back  # type: ignore[method-assign]
+
+
+async def _nothing() -> None:
+    return
+
+
+async def test_the_first_acts_and_the_second_waits_for_the_whole_duration() -> None:
+    shelf, clock = Shelf(), Clock()
+    first, second = lease(shelf, clock, "first"), lease(shelf, clock, "second")
+    await step(first, second)
+    assert first.left_s > 0
+    assert second.left_s == 0
+    acted_until = clock.now + first.left_s
+    clock.now += DURATION_S
+    await step(second)
+    assert second.left_s == 0
+    clock.now += 0.1
+    await step(second)
+    assert second.left_s > 0
+    # The first one had stopped long before.
+    assert acted_until < clock.now - 0.2 * DURATION_S
+    assert first.left_s == 0
+
+
+async def test_who_renews_goes_on_and_keeps_others_out() -> None:
+    shelf, clock = Shelf(), Clock()
+    first, second = lease(shelf, clock, "first"), lease(shelf, clock, "second")
+    for _ in range(20):
+        await step(first, second)
+        assert first.left_s > 0.5 * DURATION_S
+        assert second.left_s == 0
+        clock.now += 0.2 * DURATION_S
+
+
+async def test_a_frozen_holder_knows_that_it_must_begin_anew() -> None:
+    shelf, clock = Shelf(), Clock()
+    first, second = lease(shelf, clock, "first"), lease(shelf, clock, "second")
+    await step(first, second)
+    clock.now += DURATION_S + 1
+    await step(second)
+    assert first.left_s == 0
+    with pytest.raises(LostLease, match="second has acted"):
+        await step(first)
+
+
+async def test_an_api_server_out_of_reach_takes_the_lease_until_it_is_back() -> None:
+    shelf, clock = Shelf(), Clock()
+    only = lease(shelf, clock, "only")
+    await step(only)
+    shelf.reachable = False
+    clock.now += DURATION_S
+    await step(only)
+    assert only.left_s == 0
+    shelf.reachable = True
+    await step(only)
+    assert only.left_s > 0
+
+
+async def test_started_again_under_its_name_it_goes_on_at_once() -> None:
+    shelf, clock = Shelf(), Clock()
+    await step(lease(shelf, clock, "pod"))
+    again = lease(shelf, clock, "pod")
+    await step(again)
+    assert again.left_s > 0
+
+
+async def test_a_lease_that_is_given_back_is_free_at_once() -> None:
+    shelf, clock = Shelf(), Clock()
+    first, second = lease(shelf, clock, "first"), lease(shelf, clock, "second")
+    task = asyncio.create_task(first.run())
+    await asyncio.wait_for(first.held(), 5.0)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    assert first.left_s == 0
+    await step(second)
+    assert second.left_s > 0
+
+
+async def test_of_two_that_ask_at_once_one_gets_it() -> None:
+    shelf, clock = Shelf(), Clock()
+    racers = [lease(shelf, clock, f"r{i}") for i in range(5)]
+    tasks: list[asyncio.Task[Any]] = [asyncio.create_task(racer.run()) for racer in racers]
+    for _ in range(20):
+        await asyncio.sleep(0)
+    assert sum(racer.left_s > 0 for racer in racers) == 1
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from fractus_services.chain import verify
+from fractus_services.chain import lines_of, logs, verify
 
 from fractus_sim.experiment.stage import Findings
 
@@ -13,8 +13,8 @@ JUDGED = frozenset({"call", "monitor", "takeover"})
 
 
 def read_audit(path: Path, name: str, findings: Findings) -> None:
-    """Verify an audit log, and keep its judgements."""
-    lines = path.read_bytes().splitlines(keepends=True)
+    """Verify an audit log with its segments, and keep its judgements."""
+    lines = [line for _, _, line in lines_of(logs([path])[path])]
     finding = verify(lines)
     findings.audit_problems[name] = f"line {finding.line} {finding.problem}" if finding.problem else ""
     for line in lines:

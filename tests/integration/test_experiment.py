@@ -1,0 +1,171 @@
+"""Experiments played: what they find, what they leave, and that two runs of one seed are the same to the byte."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+from fractus_sim.experiment import parse, run
+from fractus_sim.experiment.cli import experiment as command
+from fractus_sim.experiment.processes import Processes
+from mcap.reader import make_reader
+from pymavlink import mavutil
+
+EXAMPLES = Path(__file__).parents[2] / "examples" / "experiments"
+HOME = {"lat": 50.8637, "lon": 4.6785, "alt": 25}
+TASK = [{"do": "takeoff", "alt": 8}, {"do": "goto", "north": 15, "east": 0, "alt": 8}, {"do": "returnToLaunch"}]
+GUST = {"fault": "windGust", "speed": 7, "at": 6, "duration": 4}
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def content(**changes: Any) -> dict[str, Any]:
+    vehicle = {"name": "d", "home": HOME, "readyAfter": 2, "task": TASK}
+    return {"name": "short", "vehicles": [vehicle], "timeout": 120, "settle": 1, **changes}
+
+
+def play(*arguments: str) -> Result:
+    return CliRunner().invoke(command, ["run", *arguments])
+
+
+def test_two_runs_of_one_seed_leave_the_same_bytes(tmp_path: Path) -> None:
+    found = parse(content(faults=[GUST], checks=[{"check": "task"}, {"check": "landed", "nearHome": 3}]))
+    for name in ("one", "two", "other"):
+        chosen = found if name != "other" else parse({**found.to_dict(), "seed": 2})
+        assert run(chosen, tmp_path / name).holds
+    logs = [{p.name: p.read_bytes() for p in (tmp_path / name / "logs").iterdir()} for name in ("one", "two", "other")]
+    assert set(logs[0]) == {"d.tlog", "d-observer.tlog", "short.mcap"}
+    assert logs[0] == logs[1]
+    assert logs[0]["d.tlog"] != logs[2]["d.tlog"]
+
+
+def test_what_is_left_can_be_read_by_others(tmp_path: Path) -> None:
+    outcome = run(parse(content(faults=[GUST], checks=[{"check": "landed"}])), tmp_path)
+    log = mavutil.mavlink_connection(str(tmp_path / "logs" / "d.tlog"))
+    seen: set[tuple[str, int]] = set()
+    while (message := log.recv_match()) is not None:
+        seen.add((message.get_type(), message.get_srcSystem()))
+    log.close()
+    assert ("GLOBAL_POSITION_INT", 1) in seen, "what the vehicle says"
+    assert ("SET_POSITION_TARGET_GLOBAL_INT", 255) in seen, "what it is told"
+    with (tmp_path / "logs" / "short.mcap").open("rb") as file:
+        messages = [
+            (channel.topic, json.loads(message.data)) for _, channel, message in make_reader(file).iter_messages()
+        ]
+    topics = {topic for topic, _ in messages}
+    assert topics == {"/d/location", "/d/state", "/d/attitude", "/d/text", "/events"}
+    assert any("gust 7 m/s" in body["text"] for topic, body in messages if topic == "/events")
+    tracks = json.loads((tmp_path / "tracks.geojson").read_text())
+    assert {feature["properties"]["what"] for feature in tracks["features"]} == {"path", "fault"}
+    assert (tmp_path / "map.png").read_bytes().startswith(PNG)
+    assert (tmp_path / "profile.png").read_bytes().startswith(PNG)
+    page = (tmp_path / "summary.md").read_text()
+    assert "All 1 checks hold" in page
+    assert "gust 7 m/s from 270°" in page
+    (fault,) = outcome.occurrences
+    assert fault.end_s is not None
+    assert fault.end_s - fault.begin_s == pytest.approx(4.0, abs=0.1)
+
+
+def test_failsafes_are_found_and_failed_checks_too(tmp_path: Path) -> None:
+    done = play(str(EXAMPLES / "gps-loss.yaml"), "--out", str(tmp_path / "holds"), "--quiet")
+    assert done.exit_code == 0, done.output
+    deaf = {"name": "d", "home": HOME, "readyAfter": 2, "task": TASK[:2], "parameters": {"FS_GCS_ENABLE": 1}}
+    checks = [{"check": "mode", "mode": "RTL", "after": "linkLoss"}, {"check": "task"}, {"check": "altitude", "max": 1}]
+    faults = [{"fault": "linkLoss", "at": 4}]
+    file = tmp_path / "fails.yaml"
+    file.write_text(json.dumps(content(vehicles=[deaf], faults=faults, checks=checks)))
+    done = play(str(file), "--out", str(tmp_path / "fails"), "--quiet")
+    assert done.exit_code == 2
+    report = json.loads((tmp_path / "fails" / "report.json").read_text())
+    assert [check["holds"] for check in report["checks"]] == [True, False, False]
+    assert not report["problem"]
+
+
+def test_bad_input_is_one_sentence_and_exit_code_1(tmp_path: Path) -> None:
+    file = tmp_path / "bad.yaml"
+    file.write_text(json.dumps(content(faults=[{"fault": "gpsLoss"}])))
+    done = play(str(file), "--out", str(tmp_path / "out"))
+    assert done.exit_code == 1
+    assert "faults[0].gpsLoss.at: field required" in done.output
+    unknown = {"name": "d", "home": HOME, "parameters": {"NO_SUCH": 1}}
+    file.write_text(json.dumps(content(vehicles=[unknown])))
+    done = play(str(file), "--out", str(tmp_path / "out"))
+    assert done.exit_code == 1
+    assert "d: the autopilot has no parameter NO_SUCH" in done.output
+
+
+PROGRAM = """
+import os
+from pymavlink import mavutil
+link = mavutil.mavlink_connection(os.environ["FRACTUS_VEHICLE"], source_system=255)
+link.wait_heartbeat(timeout=20)
+link.set_mode("GUIDED")
+for command, *params in ((400, 1), (22, 0, 0, 0, 0, 0, 0, 6)):
+    while True:
+        link.mav.command_long_send(1, 1, command, 0, *params, *[0] * (7 - len(params)))
+        answer = link.recv_match(type="COMMAND_ACK", condition=f"COMMAND_ACK.command=={command}", blocking=True, timeout=2)
+        if answer is not None and answer.result == 0:
+            break
+link.mav.command_long_send(1, 1, 511, 0, 33, 100000, 0, 0, 0, 0, 0)
+while link.recv_match(type="GLOBAL_POSITION_INT", blocking=True, timeout=20).relative_alt < 5000:
+    pass
+link.set_mode("LAND")
+link.motors_disarmed_wait()
+"""
+
+
+def test_a_program_flies_a_vehicle_faster_than_real_time(tmp_path: Path) -> None:
+    (tmp_path / "fly.py").write_text(PROGRAM)
+    program = {"name": "fly", "command": ["python", "fly.py"], "vehicle": "d"}
+    vehicle = {"name": "d", "home": HOME, "readyAfter": 2}
+    checks = [{"check": "program", "program": "fly"}, {"check": "landed"}, {"check": "altitude", "max": 8}]
+    found = parse(content(vehicles=[vehicle], programs=[program], speedup=5, checks=checks))
+    outcome = run(found, tmp_path / "out", base=tmp_path)
+    assert outcome.holds, outcome.verdicts
+    log = mavutil.mavlink_connection(str(tmp_path / "out" / "logs" / "d-fly.tlog"))
+    told = log.recv_match(type="COMMAND_LONG", condition="COMMAND_LONG.command==22")
+    log.close()
+    assert told is not None
+    assert told.get_srcSystem() == 255
+
+
+def test_an_interrupted_run_leaves_no_process(tmp_path: Path) -> None:
+    (tmp_path / "wait.py").write_text("import time\nopen('began', 'w').close()\ntime.sleep(600)\n")
+    program = {"name": "wait", "command": ["python", "wait.py"], "vehicle": "d"}
+    file = tmp_path / "long.yaml"
+    file.write_text(json.dumps(content(programs=[program], vehicles=[{"name": "d", "home": HOME, "readyAfter": 1}])))
+    code = (
+        f"from fractus_sim.experiment.cli import experiment as e; e(['run', {str(file)!r}, '--out', {str(tmp_path)!r}])"
+    )
+    runner = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        deadline = time.monotonic() + 60
+        while not (tmp_path / "began").exists():
+            assert runner.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        runner.send_signal(signal.SIGINT)
+        assert runner.wait(20) != 0
+    finally:
+        runner.kill()
+        runner.wait(10)
+    left = subprocess.run(["pgrep", "-f", str(tmp_path)], capture_output=True, check=False, text=True)
+    assert not left.stdout
+
+
+def test_processes_that_do_not_go_are_killed(tmp_path: Path) -> None:
+    stubborn = (
+        "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(60)"
+    )
+    processes = Processes(tmp_path)
+    processes.start("stubborn", [sys.executable, "-c", stubborn], {})
+    processes.wait("stubborn", lambda: "up" in processes.log("stubborn").read_text(), 20)
+    processes.stop_all()
+    assert processes.exit_code("stubborn") == -signal.SIGKILL

@@ -1,0 +1,171 @@
+"""Each check holds when it should, and fails when what it is about breaks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from fractus_sim.experiment import parse
+from fractus_sim.experiment.injection import Occurrence
+from fractus_sim.experiment.judging import Evidence, judge
+from fractus_sim.experiment.logbook import Flight, Text
+from fractus_sim.report.track import Place, Sample
+from fractus_sim.vehicle import earth
+
+HOME = earth.Place.from_degrees(50.0, 4.0, 0.0)
+
+
+def sample(time_s: float, north: float, east: float, alt: float, **changes: Any) -> Sample:
+    at = HOME.offset(north, east)
+    made = Sample(time_s, Place(at.lat_e7 / 1e7, at.lon_e7 / 1e7, alt), 5.0, "GUIDED", alt > 0.3, 0.8)
+    return replace(made, **changes)
+
+
+def flight(name: str = "d", east: float = 0.0, **changes: Any) -> Flight:
+    """Up to 20 m, 100 m north, back, and down, a sample each second."""
+    legs = [
+        *[sample(t, 0, east, 0) for t in range(3)],
+        *[sample(3 + t, 0, east, 2.0 * t + 1) for t in range(10)],
+        *[sample(13 + t, 5.0 * t, east, 20) for t in range(21)],
+        *[sample(34 + t, 100 - 5.0 * t, east, 20) for t in range(21)],
+        *[sample(55 + t, 0, east, 20 - 2.0 * t) for t in range(10)],
+        *[sample(65 + t, 0.5, east, 0) for t in range(3)],
+    ]
+    made = Flight(name, legs, [Text(30.0, 4, "GPS Glitch")], [(0.0, "GUIDED"), (50.0, "RTL")], task="done")
+    for field, value in changes.items():
+        setattr(made, field, value)
+    return made
+
+
+CIRCLE = {"circle": {"center": {"lat": 50.0 + 50 / 111_319.5, "lon": 4.0 + 40 / 71_696.0}, "radius": 20}}
+FAULT = Occurrence("gpsLoss", "GPS lost", "d", 45.0)
+
+
+def verdict(
+    check: dict[str, Any], *flights: Flight, zone: dict[str, Any] | None = None, **more: Any
+) -> tuple[bool, str]:
+    """The first verdict on a check of an experiment with these flights."""
+    experiment = parse(
+        {
+            "name": "x",
+            "vehicles": [{"name": f.name, "home": {"lat": 50, "lon": 4}, "task": [{"do": "land"}]} for f in flights],
+            "zones": [{"name": "z", "area": CIRCLE, **(zone or {})}],
+            "faults": [{"fault": "gpsLoss", "at": 1}],
+            "checks": [check],
+        }
+    )
+    evidence = Evidence({f.name: f for f in flights}, (FAULT,), {zone.name: zone for zone in experiment.zones}, **more)
+    found = judge(experiment.checks[0], evidence)
+    return all(one.holds for one in found), "; ".join(one.found for one in found)
+
+
+def in_the_air() -> Flight:
+    return flight(samples=flight().samples[:40])
+
+
+@pytest.mark.parametrize(
+    ("holding", "failing"),
+    [
+        ({"check": "landed", "within": 66}, {"check": "landed", "within": 64}),
+        ({"check": "landed", "nearHome": 1}, {"check": "landed", "nearHome": 0.2}),
+        ({"check": "reached", "north": 100, "east": 0, "alt": 20}, {"check": "reached", "north": 100, "east": 9}),
+        ({"check": "reached", "north": 100, "east": 0}, {"check": "reached", "north": 100, "east": 0, "within": 30}),
+        ({"check": "mode", "mode": "RTL", "within": 51}, {"check": "mode", "mode": "LAND"}),
+        (
+            {"check": "mode", "mode": "RTL", "after": "gpsLoss", "within": 6},
+            {"check": "mode", "mode": "RTL", "after": "gpsLoss", "within": 4},
+        ),
+        ({"check": "statustext", "matches": "^GPS"}, {"check": "statustext", "matches": "EKF"}),
+        (
+            {"check": "statustext", "matches": "EKF", "absent": True},
+            {"check": "statustext", "matches": "GPS", "absent": True},
+        ),
+        ({"check": "altitude", "max": 20, "min": 20}, {"check": "altitude", "max": 19.9}),
+        ({"check": "speed", "max": 5}, {"check": "speed", "max": 4.9}),
+        ({"check": "outsideZone", "zone": "z", "margin": 19}, {"check": "outsideZone", "zone": "z", "margin": 21}),
+        ({"check": "battery", "min": 80}, {"check": "battery", "min": 81}),
+    ],
+)
+def test_a_check_holds_and_fails(holding: dict[str, Any], failing: dict[str, Any]) -> None:
+    holds, found = verdict(holding, flight())
+    assert holds, found
+    holds, found = verdict(failing, flight())
+    assert not holds, found
+
+
+def test_a_vehicle_that_is_still_in_the_air_or_armed_has_not_landed() -> None:
+    assert not verdict({"check": "landed"}, in_the_air())[0]
+    assert not verdict({"check": "landed"}, flight(armed_at_end=True))[0]
+    assert not verdict({"check": "landed"}, flight(samples=[sample(0, 0, 0, 0)]))[0]
+
+
+def test_one_failing_vehicle_fails_the_check_unless_it_is_left_out() -> None:
+    assert not verdict({"check": "landed"}, flight(), flight("e", samples=flight().samples[:40]))[0]
+    assert verdict({"check": "landed", "vehicles": ["d"]}, flight(), flight("e", samples=flight().samples[:40]))[0]
+
+
+def test_a_dip_below_the_lower_altitude_fails() -> None:
+    dipped = flight()
+    dipped.samples[30] = sample(30, 85, 0, 12)
+    holds, found = verdict({"check": "altitude", "min": 15}, dipped)
+    assert not holds
+    assert "12.0 m" in found
+
+
+def test_zones_have_an_inside_and_a_band() -> None:
+    through = flight(east=40.0)
+    assert not verdict({"check": "outsideZone", "zone": "z"}, through)[0]
+    above = {"altitude": {"upper": 15}}
+    assert verdict({"check": "outsideZone", "zone": "z"}, through, zone=above)[0], "it flies above the zone"
+    assert not verdict({"check": "outsideZone", "zone": "z", "margin": 6}, through, zone=above)[0]
+    wide = {"area": {"circle": {"center": {"lat": 50.0, "lon": 4.0}, "radius": 120}}}
+    assert verdict({"check": "insideZone", "zone": "z"}, flight(), zone=wide)[0]
+    narrow = {"area": {"circle": {"center": {"lat": 50.0, "lon": 4.0}, "radius": 90}}}
+    holds, found = verdict({"check": "insideZone", "zone": "z"}, flight(), zone=narrow)
+    assert not holds
+    assert "m outside" in found
+
+
+def test_separation_is_measured_in_the_air_and_at_the_same_time() -> None:
+    assert verdict({"check": "separation", "min": 7.9}, flight(), flight("e", east=8.0))[0]
+    holds, found = verdict({"check": "separation", "min": 8.1}, flight(), flight("e", east=8.0))
+    assert not holds
+    assert "d and e" in found
+    later = [replace(s, time_s=s.time_s + 500) for s in flight().samples]
+    assert verdict({"check": "separation", "min": 50}, flight(), flight("e", samples=later))[0]
+
+
+def test_a_task_that_was_broken_off_is_not_done() -> None:
+    assert verdict({"check": "task"}, flight())[0]
+    holds, found = verdict({"check": "task"}, flight(task="the autopilot changed to RTL"))
+    assert not holds
+    assert found == "the autopilot changed to RTL"
+
+
+CALL = {"kind": "call", "caller": "spiffe://x/component/Navigator/instance/n", "method": "Goto", "action": "deny"}
+
+
+def service(check: dict[str, Any], **more: Any) -> bool:
+    mode = {"mode": "cluster", "cluster": {"file": "c", "apply": ["a"]}}
+    experiment = parse({"name": "x", "vehicles": [{"name": "d"}], "checks": [check], **mode})
+    return judge(experiment.checks[0], Evidence({}, **more))[0].holds
+
+
+def test_calls_are_found_in_audit_logs() -> None:
+    entry = {**CALL, "code": "InsideExclusionZone"}
+    wanted = {"check": "call", "component": "Navigator", "method": "Goto", "action": "deny"}
+    assert service({**wanted, "code": "InsideExclusionZone"}, calls=[entry])
+    assert not service({**wanted, "code": "AltitudeAboveLimit"}, calls=[entry])
+    assert not service({**wanted, "component": "Viewer"}, calls=[entry])
+    assert not service({**wanted, "absent": True}, calls=[entry])
+    assert service({**wanted, "absent": True})
+
+
+def test_broken_chains_phases_and_programs_are_judged() -> None:
+    assert service({"check": "audit"}, audit_problems={"d/mobility.jsonl": ""})
+    assert not service({"check": "audit"}, audit_problems={"d/mobility.jsonl": "line 3 was changed"})
+    assert not service({"check": "audit"}), "no log proves nothing"
+    phase = {"check": "phase", "application": "a", "phase": "Completed"}
+    assert service(phase, phases={"a": ["Running", "Completed"]})
+    assert not service(phase, phases={"a": ["Running", "Failed"]})

@@ -15,6 +15,8 @@ from fractus.errors import Unavailable, translate
 from fractus.values import Decision, ImageInfo, Result
 
 RETRIEVE_TIMEOUT_S = 60.0
+CAPTURE_TIMEOUT_S = 60.0
+"""Looking for faces in megapixels takes its time."""
 
 
 class Camera:
@@ -39,13 +41,18 @@ class Camera:
         """Close the connection."""
         await self._channel.close()
 
-    async def capture(self, width: int = 0, height: int = 0) -> ImageInfo:
+    async def capture(self, width: int = 0, height: int = 0, *, timeout_s: float = CAPTURE_TIMEOUT_S) -> ImageInfo:
         """Take a picture; 0 leaves width and height to the camera.
+
+        Where privacy policies ask for filters, the picture is kept filtered: `corrected` says so, and why. It is blurred as
+        a whole where faces are to be hidden but may be too small to be found; come closer, or ask for more pixels.
 
         Raises:
             PolicyDenied: no pictures from here, or not of this.
+            Unavailable: the camera gives no picture.
         """
-        reply = await self._channel.unary("CaptureImage", camera_pb2.CaptureImageRequest(width=width, height=height))
+        request = camera_pb2.CaptureImageRequest(width=width, height=height)
+        reply = await self._channel.unary("CaptureImage", request, timeout_s=timeout_s)
         return ImageInfo.from_proto(reply.image, reply.decision)
 
     async def retrieve(self, name: str, *, timeout_s: float = RETRIEVE_TIMEOUT_S) -> bytes:

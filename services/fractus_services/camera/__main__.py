@@ -104,7 +104,7 @@ def camera() -> None:
 @click.option(
     "--face-px",
     type=click.FloatRange(min=12, max=1000),
-    default=40,
+    default=48,
     show_default=True,
     help="Width in pixels from which on faces are found reliably; where they may be smaller, a policy's fallback applies.",
 )

@@ -114,8 +114,7 @@ def moving(before: Pixels, picture: Pixels, after: Pixels, *, fixed: bool) -> Ma
     cv2 = opencv()
     scale = min(MOTION_PX / picture.shape[1], 1.0)
     small = [
-        cv2.cvtColor(cv2.resize(one, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2GRAY)
-        for one in (before, picture, after)
+        cv2.resize(one, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) for one in (before, picture, after)
     ]
     differs = [_difference(other, small[1], fixed) for other in (small[0], small[2])]
     if differs[0] is None or differs[1] is None:
@@ -129,17 +128,17 @@ def moving(before: Pixels, picture: Pixels, after: Pixels, *, fixed: bool) -> Ma
     return np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0)
 
 
-def _difference(other: npt.NDArray[np.uint8], gray: npt.NDArray[np.uint8], fixed: bool) -> Mask | None:
+def _difference(other: Pixels, picture: Pixels, fixed: bool) -> Mask | None:
     """Where a picture differs from another that is laid over it; what only one of them shows does not."""
     cv2 = opencv()
-    shown = np.full(gray.shape, 255, np.uint8)
+    size = (picture.shape[1], picture.shape[0])
+    shown = np.full((size[1], size[0]), 255, np.uint8)
     if not fixed:
-        matrix = _overlay(other, gray)
+        matrix = _overlay(cv2.cvtColor(other, cv2.COLOR_BGR2GRAY), cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
         if matrix is None:
             return None
-        size = (gray.shape[1], gray.shape[0])
         other, shown = cv2.warpPerspective(other, matrix, size), cv2.warpPerspective(shown, matrix, size)
-    difference = cv2.absdiff(cv2.GaussianBlur(other, (5, 5), 0), cv2.GaussianBlur(gray, (5, 5), 0))
+    difference = cv2.absdiff(cv2.GaussianBlur(other, (5, 5), 0), cv2.GaussianBlur(picture, (5, 5), 0)).max(axis=2)
     return np.asarray((difference > MOTION_LEVELS) & (cv2.erode(shown, np.ones((7, 7), np.uint8)) == 255))
 
 

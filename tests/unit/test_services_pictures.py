@@ -1,0 +1,331 @@
+"""What filters take away, which faces are found, what pictures tell about themselves, and where they come from."""
+
+from __future__ import annotations
+
+import io
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import skimage.data
+from fractus_core.policy.values import Attitude, Filter, Home, Lens
+from fractus_services.camera.darkroom import NotHidden, recipe
+from fractus_services.camera.drivers import BadConnection, CameraFailed, Wanted, driver_for
+from fractus_services.camera.faces import BadModel, CascadeDetector, ModelDetector, smallest_face_px
+from fractus_services.camera.filters import (
+    black,
+    blur_average,
+    blur_median,
+    hide_faces,
+    moving,
+    remove_background,
+)
+from fractus_services.camera.imaging import NotAPicture, Pixels, decoded, encoded, fitted, source_size
+from fractus_services.camera.metadata import tagged
+from fractus_services.camera.shots import Pose, Shot, facts
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+from policy_world import HOME, NOW, at
+
+FACE = (177, 66, 97, 97)
+
+
+@pytest.fixture(scope="module")
+def photo() -> Pixels:
+    return np.asarray(cv2.cvtColor(skimage.data.astronaut(), cv2.COLOR_RGB2BGR), np.uint8)
+
+
+@pytest.fixture(scope="module")
+def detector() -> CascadeDetector:
+    return CascadeDetector()
+
+
+def covers(boxes: list[Any], face: tuple[int, int, int, int]) -> bool:
+    x, y = face[0] + face[2] / 2, face[1] + face[3] / 2
+    return any(left <= x <= left + w and top <= y <= top + h and w < 2.5 * face[2] for left, top, w, h in boxes)
+
+
+# Filters
+
+
+@pytest.mark.parametrize("blur", [blur_average, blur_median])
+def test_a_blur_leaves_sixteen_values_across_and_no_face(blur: Any, photo: Pixels, detector: CascadeDetector) -> None:
+    blurred = blur(photo)
+    assert blurred.shape == photo.shape
+    assert abs(float(blurred.mean()) - float(photo.mean())) < 12
+    assert not covers(detector.find(blurred, 48, upright=True), FACE)
+    # Structure finer than a cell is gone: what is left follows from 16x16 values.
+    few = cv2.resize(blurred[16::32, 16::32], (512, 512), interpolation=cv2.INTER_LINEAR)
+    assert float(np.abs(few.astype(float) - blurred).mean()) < 6
+
+
+def test_black_is_black(photo: Pixels) -> None:
+    assert black(photo).max() == 0
+
+
+@pytest.mark.parametrize("method", ["pixelate", "gaussian"])
+@pytest.mark.parametrize("width_px", [50, 97])
+def test_a_hidden_face_is_found_no_more(method: Any, width_px: int, photo: Pixels, detector: CascadeDetector) -> None:
+    scale = width_px / 97
+    picture = cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    face = tuple(int(v * scale) for v in FACE)
+    boxes = detector.find(picture, 48, upright=True)
+    assert covers(boxes, face)  # type: ignore[arg-type]
+    hidden = hide_faces(picture, boxes, method)
+    x, y, w, h = face
+    colours = np.unique(hidden[y : y + h, x : x + w].reshape(-1, 3), axis=0)
+    assert method == "gaussian" or len(colours) < 120
+    before, after = (cv2.cvtColor(p[y : y + h, x : x + w], cv2.COLOR_BGR2GRAY) for p in (picture, hidden))
+    eyes = cv2.CascadeClassifier(str(Path(cv2.data.haarcascades) / "haarcascade_frontalface_alt2.xml"))
+    assert len(eyes.detectMultiScale(cv2.copyMakeBorder(after, 20, 20, 20, 20, cv2.BORDER_REPLICATE), 1.1, 2)) == 0
+    fine = [cv2.Laplacian(cv2.GaussianBlur(p, (0, 0), 1), cv2.CV_64F) for p in (before, after)]
+    assert abs(np.corrcoef(fine[0].ravel(), fine[1].ravel())[0, 1]) < 0.3
+
+
+def test_faces_at_the_edge_do_not_break_the_filter(photo: Pixels) -> None:
+    hidden = hide_faces(photo, [(-50, -50, 80, 80), (500, 500, 90, 90), (600, 600, 10, 10), (5, 5, 1, 1)], "pixelate")
+    assert hidden.shape == photo.shape
+
+
+@pytest.mark.parametrize(("turn", "light"), [(0, 1.0), (40, 1.0), (120, 0.4), (180, 1.3), (265, 1.0)])
+def test_faces_are_found_in_every_direction(turn: int, light: float, photo: Pixels, detector: CascadeDetector) -> None:
+    middle = (FACE[0] + 48.5, FACE[1] + 48.5)
+    matrix = cv2.getRotationMatrix2D(middle, turn, 60 / 97)
+    matrix[:, 2] += (90 - middle[0], 90 - middle[1])
+    scene = cv2.convertScaleAbs(cv2.warpAffine(photo, matrix, (180, 180), borderMode=cv2.BORDER_REFLECT), alpha=light)
+    assert covers(detector.find(scene, 56, upright=False), (60, 60, 60, 60))
+
+
+def test_what_moves_is_kept_and_the_rest_is_black(photo: Pixels) -> None:
+    def frame(shift: int, car: int) -> Pixels:
+        picture = np.roll(photo, shift, axis=1).copy()
+        picture[350:380, car : car + 40] = (0, 0, 255)
+        return picture
+
+    before, now, after = (frame(s, c) for s, c in ((0, 100), (3, 200), (6, 300)))
+    mask = moving(before, now, after, fixed=False)
+    assert mask is not None
+    kept = remove_background(now, mask)
+    assert (kept[352:378, 202:238] == (0, 0, 255)).all()
+    assert (kept.max(axis=2) > 0).mean() < 0.08, "the landscape, and where the car was, are gone"
+    assert kept[66:163, 177:274].max() == 0
+    standing = moving(frame(0, 100), frame(0, 200), frame(0, 300), fixed=True)
+    assert standing is not None
+    assert standing[360, 220]
+    assert not standing[360, 120]
+
+
+def test_where_nobody_knows_what_moves_nothing_is_shown(photo: Pixels) -> None:
+    other = np.asarray(cv2.rotate(photo[:, ::-1], cv2.ROTATE_90_CLOCKWISE))
+    noise = np.random.default_rng(3).integers(0, 256, photo.shape).astype(np.uint8)
+    plain = np.full_like(photo, 90)
+    for before, after in ((noise, other), (plain, plain)):
+        mask = moving(before, photo, after, fixed=False)
+        assert mask is None
+        assert remove_background(photo, mask).max() == 0
+
+
+# Trust
+
+
+def test_the_smallest_face_follows_from_lens_distance_and_pixels() -> None:
+    lens = Lens(90.0, 60.0)
+    assert smallest_face_px(lens, 10.0, 2000) == pytest.approx(13.0)
+    assert smallest_face_px(lens, float("inf"), 2000) == 0
+    assert smallest_face_px(None, 10.0, 2000) == 0
+
+
+def test_where_faces_are_not_found_reliably_the_fallback_applies(detector: CascadeDetector) -> None:
+    def faces(fallback: Any) -> Filter:
+        return Filter("blurFaces", fallback=fallback)
+
+    assert recipe((faces("refuse"),), 48, detector).filters == (faces("refuse"),)
+    assert recipe((faces("blurAverage"),), 47, detector).filters == (Filter("blurAverage"),)
+    assert recipe((faces("black"), Filter("removeBackground")), 0, detector).filters == (Filter("black"),)
+    assert recipe((Filter("blurMedian"),), 0, detector).note == ""
+    with pytest.raises(NotHidden, match="6 pixels"):
+        recipe((faces("refuse"),), 6, detector)
+
+
+def test_a_model_that_is_none_is_refused_with_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(BadModel, match="there is no such file"):
+        ModelDetector(tmp_path / "none.onnx")
+    corrupt = tmp_path / "corrupt.onnx"
+    corrupt.write_bytes(b"\x08\x01 this is no network" * 50)
+    with pytest.raises(BadModel, match="cannot use it as a face detector"):
+        ModelDetector(corrupt)
+
+
+# Pictures as arrays
+
+
+@given(st.integers(16, 400), st.integers(16, 400), st.sampled_from([(640, 480), (1280, 720), (100, 100), (480, 640)]))
+@settings(max_examples=100, deadline=None, derandomize=True)
+def test_cropping_keeps_proportions_and_shows_no_more(width: int, height: int, native: tuple[int, int]) -> None:
+    source = source_size(width, height, native)
+    assert source[0] >= width
+    assert source[1] >= height
+    assert abs(source[0] / source[1] - native[0] / native[1]) < 0.1 * native[0] / native[1]
+    assert fitted(np.zeros((source[1], source[0], 3), np.uint8), width, height).shape == (height, width, 3)
+
+
+def test_the_middle_is_kept() -> None:
+    picture = np.zeros((100, 300, 3), np.uint8)
+    picture[:, 100:200] = 255
+    assert fitted(picture, 50, 50).min() > 250
+
+
+@pytest.mark.parametrize("data", [b"", b"no picture", b"\xff\xd8\xff\xe0broken"])
+def test_what_is_no_picture_is_said_so(data: bytes) -> None:
+    with pytest.raises(NotAPicture):
+        decoded(data)
+
+
+def test_pictures_tell_where_they_were_taken(photo: Pixels) -> None:
+    lens = Lens(60.0, 45.0, pitch_deg=-30.0, yaw_deg=10.0, stabilised=True)
+    pose = Pose.of(at(30, 40, alt=12.5, lens=lens, attitude=Attitude(5, 5, 80.0)))
+    data = tagged(encoded(photo), facts(pose, NOW + 0.25, "Pi Camera ü", 512))
+    with Image.open(io.BytesIO(data)) as picture:
+        assert np.asarray(picture).shape == photo.shape
+        exif = picture.getexif()
+        gps, more = exif.get_ifd(0x8825), exif.get_ifd(0x8769)
+        lat = sum(float(v) / 60**i for i, v in enumerate(gps[2]))
+        lon = sum(float(v) / 60**i for i, v in enumerate(gps[4]))
+        assert (lat, lon) == pytest.approx((pose.lat, pose.lon), abs=1e-9)
+        assert (gps[1], gps[3]) == ("N", "E")
+        assert float(gps[6]) == pytest.approx(HOME.amsl_m + 12.5)
+        assert float(gps[17]) == pytest.approx(90.0)
+        assert exif[0x0110] == "Pi Camera ?"
+        assert more[0x9003] == "2026:06:01 12:00:00"
+        assert more[0x9291] == "250"
+        xmp = str(picture.getxmp())
+    for name, value in (
+        ("Pitch", "-30.0000"),
+        ("Yaw", "90.0000"),
+        ("Roll", "0.0000"),
+        ("AboveGroundAltitude", "12.5000"),
+    ):
+        assert name in xmp
+        assert value in xmp
+    with pytest.raises(ValueError, match="JPEG"):
+        tagged(b"PNG", facts(pose, NOW, "", 512))
+
+
+def test_a_picture_from_nowhere_and_below_the_sea_can_be_tagged(photo: Pixels) -> None:
+    for now in (at(lens=None, home=None), at(home=Home(-33.9, -70.0, -50.0), alt=1.0)):
+        data = tagged(encoded(photo), facts(Pose.of(now), NOW, "", 512))
+        with Image.open(io.BytesIO(data)) as picture:
+            gps = picture.getexif().get_ifd(0x8825)
+        assert (6 in gps) == (now.home is not None)
+        if now.home is not None:
+            assert gps[5] == b"\x01"
+            assert float(gps[6]) == 49.0
+
+
+def test_records_of_pictures_survive_json() -> None:
+    import json
+
+    pose = Pose.of(at(attitude=Attitude(1, 2, 3)))
+    shot = Shot("n", NOW, 10, 20, 30, pose, Pose.of(at(home=None)), 12.0, (Filter("blurFaces", "gaussian"),))
+    assert Shot.parse(json.loads(json.dumps(shot.to_json()))) == shot
+    for broken in ({}, {"before": 1}, {**shot.to_json(), "colour": "red"}):
+        with pytest.raises(ValueError, match="no shot"):
+            Shot.parse(broken)
+
+
+# Drivers
+
+
+def wanted(**more: Any) -> Wanted:
+    return Wanted(64, 48, (64, 48), "RGB", at(**more))
+
+
+@pytest.mark.parametrize(
+    "connection", ["", "ftp://x/", "v4l2:", "picamera2:x", "directory:", "test:x", "http://", "http://h:x/"]
+)
+def test_what_names_no_camera_is_refused(connection: str) -> None:
+    with pytest.raises(BadConnection):
+        driver_for(connection)
+
+
+def test_cameras_that_are_not_there_say_so(tmp_path: Path) -> None:
+    no_camera = tmp_path / "video0"
+    no_camera.write_bytes(b"no device")
+    for connection, sentence in (
+        ("v4l2:/dev/no-such-video", "connect the camera"),
+        (f"v4l2:{no_camera}", "cannot be opened as a camera"),
+        ("picamera2:0", "picamera2 is not installed"),
+        (f"directory:{tmp_path}/none", "cannot be read"),
+        (f"directory:{tmp_path}", "GPS position"),
+    ):
+        driver = driver_for(connection)
+        with pytest.raises(CameraFailed, match=sentence):
+            driver.capture(wanted())
+        driver.close()
+
+
+def test_a_raspberry_camera_is_configured_started_and_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[Any] = []
+
+    class Picamera2:
+        def __init__(self, number: int) -> None:
+            if number != 1:
+                raise IndexError("list index out of range")
+            self.broken = False
+
+        def create_still_configuration(self, main: dict[str, Any]) -> dict[str, Any]:
+            return main
+
+        def configure(self, main: dict[str, Any]) -> None:
+            assert main == {"size": (64, 48), "format": "RGB888"}
+
+        def start(self) -> None:
+            begun.append(self)
+
+        def capture_array(self, name: str) -> Pixels:
+            assert name == "main"
+            if self.broken:
+                raise RuntimeError("camera timed out")
+            return np.full((48, 64, 4), 7, np.uint8)
+
+        def close(self) -> None:
+            self.broken = True
+
+    monkeypatch.setitem(sys.modules, "picamera2", types.SimpleNamespace(Picamera2=Picamera2))
+    driver = driver_for("picamera2:1")
+    assert driver.capture(wanted()).shape == (48, 64, 3)
+    begun[0].broken = True
+    with pytest.raises(CameraFailed, match="started again next time"):
+        driver.capture(wanted())
+    assert driver.capture(wanted()).max() == 7
+    assert len(begun) == 2
+    with pytest.raises(CameraFailed, match="there is no camera 0"):
+        driver_for("picamera2:0").capture(wanted())
+
+
+def test_a_directory_gives_the_picture_that_was_taken_nearest_in_space(tmp_path: Path) -> None:
+    for name, level, place in (
+        ("a", 10, at(0, 0, alt=10)),
+        ("b", 100, at(50, 0, alt=10)),
+        ("c", 200, at(50, 0, alt=80)),
+    ):
+        picture = np.full((48, 64, 3), level, np.uint8)
+        (tmp_path / f"{name}.jpg").write_bytes(tagged(encoded(picture), facts(Pose.of(place), NOW, "", 64)))
+    (tmp_path / "untagged.png").write_bytes(bytes(cv2.imencode(".png", np.zeros((4, 4, 3), np.uint8))[1]))
+    (tmp_path / "broken.jpg").write_bytes(b"no picture")
+    driver = driver_for(f"directory:{tmp_path}")
+
+    def level(**place: float) -> int:
+        return round(float(driver.capture(wanted(**place)).mean()))
+
+    assert (level(x=5, y=3, alt=20), level(x=40, y=0, alt=20), level(x=40, y=0, alt=70)) == (10, 100, 200)
+    late = np.full((48, 64, 3), 250, np.uint8)
+    (tmp_path / "d.jpg").write_bytes(tagged(encoded(late), facts(Pose.of(at(5, 3, alt=20)), NOW, "", 64)))
+    assert level(x=5, y=3, alt=20) == 250
+    with pytest.raises(CameraFailed, match="position is unknown"):
+        driver.capture(Wanted(64, 48, (64, 48), "RGB", at().__class__(time_s=NOW)))

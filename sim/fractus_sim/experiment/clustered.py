@@ -33,11 +33,12 @@ BEHIND_TAP_PORT = 5770
 OWN_TARGETS = ("operator", "agent", "services")
 RELEASES = ("fractus-crds", "fractus")
 ENDED = frozenset({"Completed", "Failed", "Invalid"})
+MAX_NAME = 30
 AUDIT_LOGS = ("mobility.jsonl", "camera.jsonl")
 
 
 class ClusterStage(Stage):
-    """A cluster of the experiment's own; taken down at the end unless it ran before."""
+    """A cluster of the experiment's own, of its name; taken down at the end unless it ran before."""
 
     def __init__(self, experiment: Experiment, folder: Path, base: Path, tell: Callable[[str], None]) -> None:
         super().__init__(experiment, folder, base, tell)
@@ -189,7 +190,7 @@ def _spec(experiment: Experiment, path: Path) -> ClusterSpec:
         if name not in flying:
             raise ExperimentError(f"{path} has no drone {name} with a vehicle; it has {', '.join(sorted(flying))}")
     nodes = [_prepared(node, setups[node.name], experiment) if node.name in setups else node for node in spec.nodes]
-    return spec.model_copy(update={"nodes": tuple(nodes)})
+    return spec.model_copy(update={"name": experiment.name[:MAX_NAME], "nodes": tuple(nodes)})
 
 
 def _prepared(node: NodeSpec, setup: VehicleSetup, experiment: Experiment) -> NodeSpec:

@@ -186,8 +186,8 @@ def _mission(station: Station, step: FlyMission) -> Flight:
 
 def _items(station: Station, step: FlyMission) -> list[dict[str, float]]:
     """The mission as MISSION_ITEM_INT fields; the first is home, as ArduPilot keeps it."""
-    first = {"command": int(Command.NAV_WAYPOINT), "frame": 0}
-    items = [first, {"command": int(Command.NAV_TAKEOFF), "frame": 6, "z": step.takeoff}]
+    first: dict[str, float] = {"command": int(Command.NAV_WAYPOINT), "frame": 0}
+    items: list[dict[str, float]] = [first, {"command": int(Command.NAV_TAKEOFF), "frame": 6, "z": step.takeoff}]
     for waypoint in step.waypoints:
         at = _point(station, waypoint)
         place = {"x": at.lat_e7, "y": at.lon_e7, "z": waypoint.alt}

@@ -193,7 +193,7 @@ def _distances_m(zone: NamedZone, samples: Sequence[Sample]) -> np.ndarray:
     heights = np.array([s.place.alt_m for s in samples])
     lower = -math.inf if band.lower is None else band.lower
     upper = math.inf if band.upper is None else band.upper
-    return np.maximum(flat, np.maximum(lower - heights, heights - upper))
+    return np.asarray(np.maximum(flat, np.maximum(lower - heights, heights - upper)))
 
 
 def _battery(check: kinds.Battery, flight: Flight, _evidence: Evidence) -> tuple[bool, str]:

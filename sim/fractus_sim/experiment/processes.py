@@ -122,10 +122,11 @@ class Processes:
     def stop_all(self, *stages: Callable[[str], bool]) -> None:
         """End everything: first all processes that the first stage's predicate names, and so on, then the rest."""
         names = list(reversed(self._running))
-        for stage in (*stages, lambda _name: True):
+        for stage in stages:
             chosen = [name for name in names if stage(name)]
             self.stop(*chosen)
             names = [name for name in names if name not in chosen]
+        self.stop(*names)
 
 
 def _signal(process: subprocess.Popen[bytes], number: signal.Signals) -> None:

@@ -131,9 +131,10 @@ def _requests(record: Record) -> Iterable[Request]:
         flown_m = None
         if not judged.refused and _climbs(judged):
             flown_m = judged.flown.alt_m if judged.flown is not None else place.alt_m
-        kind = "refused" if judged.refused else "corrected"
-        label = "refused" if judged.refused else "asked, and corrected"
-        yield Request(kind, str(index), judged.time_s, place.alt_m, label, flown_m)
+        if judged.refused:
+            yield Request("refused", str(index), judged.time_s, place.alt_m, "refused")
+        else:
+            yield Request("corrected", str(index), judged.time_s, place.alt_m, "asked, and corrected", flown_m)
 
 
 def _climbs(judged: Judgement) -> bool:

@@ -198,7 +198,7 @@ def _text(vehicle: Vehicle, message: Any, now: float) -> None:
     del vehicle.texts[:-20]
     if text.startswith("SmartRTL deactivated"):
         vehicle.path_lost = True
-    if ("ailsafe" in text and "leared" not in text) or "Fence" in text:
+    if ("ailsafe" in text or "fence" in text.lower()) and "leared" not in text:
         vehicle.failsafe_text, vehicle.failsafe_text_at = text, now
 
 

@@ -1,0 +1,416 @@
+"""A mobility service and a vehicle in one loop whose time jumps: minutes of flight in a fraction of a second, always the same."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import selectors
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from fractus_core.api.plans import GrantSpec
+from fractus_core.geo import LocalFrame
+from fractus_core.policy.compiled import compile_grant
+from fractus_core.policy.values import Airframe, Home, TakeoffArgs
+from fractus_services.grants import Held
+from fractus_services.mobility.autopilot import Autopilot
+from fractus_services.mobility.chauffeur import Chauffeur
+from fractus_services.mobility.control import Control
+from fractus_services.mobility.courses import Courses
+from fractus_services.mobility.dialect import message
+from fractus_services.mobility.failsafes import Checked
+from fractus_services.mobility.guard import Guard
+from fractus_services.mobility.homing import Homing
+from fractus_services.mobility.journal import Journal
+from fractus_services.mobility.leases import News, State
+from fractus_services.mobility.service import MobilityService, Progress
+from fractus_services.mobility.streams import Streams
+from fractus_services.mobility.supervisor import Supervisor
+from fractus_services.mobility.tours import Tours
+from fractus_services.mobility.vehicle import BRAKE, GUIDED, LAND, RTL, SMART_RTL
+from fractus_services.mobility.watch import Watch
+from fractus_services.replies import Refused
+
+FRAME = LocalFrame(39.36, 22.95)
+STEP_S = 0.05
+ACCEL, CLIMB = 2.5, 2.0
+ALL = (
+    "Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "SetVelocity", "Goto", "Hover", "GetPosition",
+    "ReturnToLaunch",
+)  # fmt: skip
+
+
+class _Hurried(selectors.DefaultSelector):
+    """Never waits: what others wait for is there at once."""
+
+    def __init__(self, hurry: Callable[[float], None]) -> None:
+        super().__init__()
+        self._hurry = hurry
+
+    def select(self, timeout: float | None = None) -> list[Any]:
+        found = super().select(0.001 if timeout is None else 0)
+        if not found and timeout:
+            self._hurry(timeout)
+        return found
+
+
+class Loop(asyncio.SelectorEventLoop):
+    """An event loop that jumps to the moment of the next event."""
+
+    def __init__(self) -> None:
+        self._now = 1000.0
+        super().__init__(_Hurried(self._hurry))
+
+    def _hurry(self, seconds: float) -> None:
+        self._now += seconds
+
+    def time(self) -> float:
+        return self._now
+
+    def run_in_executor(self, _executor: Any, work: Callable[..., Any], *args: Any) -> asyncio.Future[Any]:  # type: ignore[override]
+        """What goes to a thread is done at once: no thread sees this loop's time."""
+        done = self.create_future()
+        try:
+            done.set_result(work(*args))
+        except OSError as error:
+            done.set_exception(error)
+        return done
+
+
+def fly(flight: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """Run a flight to its end; ten minutes of its time are the most."""
+
+    async def bounded() -> None:
+        async with asyncio.timeout(600):
+            await flight()
+
+    with asyncio.Runner(loop_factory=Loop) as runner:
+        runner.run(bounded())
+
+
+class Plane(Autopilot):
+    """An autopilot of few words: it acknowledges, and moves as ArduCopter does, roughly."""
+
+    def __init__(self) -> None:
+        super().__init__("tcp:nowhere:1")
+        self._target = (1, 1)
+        self.xy, self.velocity = [0.0, 0.0], [0.0, 0.0]
+        self.height, self.climb = 0.0, 0.0
+        self.speed_mps = 8.0
+        self.goal: tuple[float, float] | None = None
+        self.wanted: tuple[float, float, float] | None = None
+        self.wanted_until = 0.0
+        self.goal_height = 0.0
+        self.heading = 0.0
+        self.commands: list[int] = []
+        self.trace: list[tuple[float, float, float]] = []
+        self.refuses: set[int] = set()
+        self.deaf = False
+        self.parameters = {"FS_GCS_ENABLE": 3.0, "BATT_FS_LOW_ACT": 3.0}
+        vehicle = self.vehicle
+        vehicle.mode, vehicle.ready, vehicle.located, vehicle.position_error_m = GUIDED, True, True, 0.5
+        vehicle.home = Home(39.36, 22.95, 10.0)
+
+    async def run(self) -> None:
+        while True:
+            self._step()
+            await asyncio.sleep(STEP_S)
+
+    async def read_parameter(self, name: str, attempts: int = 4) -> float | None:
+        del attempts
+        return self.parameters.get(name)
+
+    async def write_parameter(self, name: str, value: float) -> float | None:
+        self.parameters[name] = value
+        return value
+
+    def send(self, outgoing: Any) -> None:
+        if self.deaf:
+            return
+        kind = outgoing.get_type()
+        if kind in {"COMMAND_LONG", "COMMAND_INT"}:
+            self.commands.append(outgoing.command)
+            refused = outgoing.command in self.refuses
+            if not refused:
+                self._obey(outgoing)
+            self._take(message("COMMAND_ACK", command=outgoing.command, result=4 if refused else 0))
+        elif kind == "SET_POSITION_TARGET_LOCAL_NED" and self.vehicle.mode == GUIDED and self.height > 0.2:
+            self.commands.append(84)
+            self.wanted, self.wanted_until = (outgoing.vy, outgoing.vx, -outgoing.vz), self.now + 3.0
+            self.goal = None
+
+    def _obey(self, outgoing: Any) -> None:
+        number = outgoing.command
+        if number == 176:
+            self.set_to(int(outgoing.param2))
+        elif number == 400:
+            self.vehicle.armed = outgoing.param1 == 1
+        elif number == 22:
+            self.goal, self.goal_height, self.wanted = (self.xy[0], self.xy[1]), outgoing.param7, None
+        elif number == 178:
+            self.speed_mps = outgoing.param2
+        elif number == 192:
+            self.goal = FRAME.xy(outgoing.x / 1e7, outgoing.y / 1e7)
+            self.goal_height, self.wanted = outgoing.z, None
+        elif number == 115:
+            self.heading = outgoing.param1
+
+    def set_to(self, mode: int) -> None:
+        """Change the mode, as a pilot or a failsafe does."""
+        self.vehicle.mode = mode
+        self.goal, self.wanted = ((self.xy[0], self.xy[1]), None) if mode in {GUIDED, BRAKE} else (None, None)
+        self.goal_height = self.height
+
+    def _step(self) -> None:
+        if self.vehicle.armed:
+            self._move()
+        if not self.deaf:
+            self._tell()
+
+    def _move(self) -> None:
+        east, north, up = self._command()
+        change = math.hypot(east - self.velocity[0], north - self.velocity[1])
+        share = min(ACCEL * STEP_S / change, 1.0) if change > 0 else 0.0
+        self.velocity[0] += (east - self.velocity[0]) * share
+        self.velocity[1] += (north - self.velocity[1]) * share
+        self.climb = up
+        self.xy[0] += self.velocity[0] * STEP_S
+        self.xy[1] += self.velocity[1] * STEP_S
+        self.height = max(self.height + self.climb * STEP_S, 0.0)
+        if self.height > 0.3:
+            self.trace.append((self.xy[0], self.xy[1], self.height))
+        if self.vehicle.mode in {LAND, RTL, SMART_RTL} and self.height <= 0.0:
+            self.vehicle.armed = False
+            self.velocity, self.climb = [0.0, 0.0], 0.0
+
+    def _command(self) -> tuple[float, float, float]:  # noqa: PLR0911 - one line a mode
+        mode = self.vehicle.mode
+        if mode == LAND:
+            return 0.0, 0.0, -CLIMB
+        if mode in {RTL, SMART_RTL}:
+            away = math.hypot(*self.xy)
+            if away > 0.7:
+                high = 15.0 if mode == RTL else self.height
+                if self.height < high - 0.3:
+                    return 0.0, 0.0, CLIMB
+                return (*self._toward((0.0, 0.0)), 0.0)
+            return 0.0, 0.0, -CLIMB
+        if self.wanted is not None:
+            if self.now < self.wanted_until:
+                return self.wanted
+            self.set_to(mode)
+        if self.goal is None:
+            return 0.0, 0.0, 0.0
+        rise = self.goal_height - self.height
+        return (*self._toward(self.goal), max(-CLIMB, min(CLIMB, rise)))
+
+    def _toward(self, goal: tuple[float, float]) -> tuple[float, float]:
+        x, y = goal[0] - self.xy[0], goal[1] - self.xy[1]
+        away = math.hypot(x, y)
+        if away < 0.05:
+            return 0.0, 0.0
+        speed = min(self.speed_mps, away, math.sqrt(ACCEL * away))
+        return x / away * speed, y / away * speed
+
+    def _tell(self) -> None:
+        vehicle = self.vehicle
+        vehicle.lat, vehicle.lon = FRAME.latlon(self.xy[0], self.xy[1])
+        vehicle.altitude_m, vehicle.yaw_deg = self.height, self.heading
+        vehicle.east_mps, vehicle.north_mps = self.velocity
+        vehicle.down_mps = -self.climb
+        vehicle.position_at = vehicle.heartbeat_at = vehicle.landed_at = self.now
+        vehicle.landed_state = 2 if self.height > 0.2 else 1
+        self._updated.set()
+        self._updated = asyncio.Event()
+
+
+class Grants:
+    """Grants in force, without files."""
+
+    def __init__(self) -> None:
+        self.held: dict[str, Held] = {}
+        self._listeners: list[Any] = []
+
+    def of(self, identity: str) -> Held | None:
+        return self.held.get(identity)
+
+    def listen(self, listener: Any) -> None:
+        self._listeners.append(listener)
+
+    def put(self, spec: GrantSpec, key: str = "m1") -> Held:
+        fresh = Held(key, spec.instance, spec, compile_grant(spec))
+        before = self.held.get(fresh.identity)
+        self.held[fresh.identity] = fresh
+        for listener in self._listeners:
+            listener(before, fresh)
+        return fresh
+
+    def remove(self, held: Held) -> None:
+        del self.held[held.identity]
+        for listener in self._listeners:
+            listener(held, None)
+
+
+class Fence:
+    """Stands for the vehicle's own fence."""
+
+    raised = False
+    problem: Exception | None = None
+
+    async def raise_around(self, spec: GrantSpec, *, retraces: bool) -> None:
+        del spec, retraces
+        if self.problem is not None:
+            raise self.problem
+        self.raised = True
+
+    async def lower(self) -> None:
+        self.raised = False
+
+
+class World:
+    """Everything on a drone; use it inside `fly`."""
+
+    def __init__(
+        self,
+        directory: Path,
+        *,
+        retraces: bool = False,
+        grace_s: float = 5.0,
+        boarding_s: float = 0.0,
+        after: World | None = None,
+    ) -> None:
+        self.plane = after.plane if after is not None else Plane()
+        self.grants = Grants()
+        self.entries: list[tuple[str, dict[str, Any]]] = []
+        self.audit = SimpleNamespace(append=lambda kind, content, **_: self.entries.append((kind, content)), failure="")
+        self.journal = after.journal if after is not None else Journal(directory)
+        self.journal._write = lambda _data: None  # type: ignore[method-assign]
+        self.fence = Fence()
+        self.control = Control(
+            self.plane, self.journal, self.grants, self.audit, backstop=self.fence, grace_s=grace_s,  # type: ignore[arg-type]
+        )  # fmt: skip
+        control = self.control
+        control.checked = Checked("", (), Airframe(retraces=retraces), 8.0, retraces)
+        control.decided, control.was_armed, control.helm.expected = True, self.plane.vehicle.armed, GUIDED
+        self.guard = Guard(control, self.audit, lambda: 1_790_000_000.0 + self.plane.now)  # type: ignore[arg-type]
+        homing = Homing(control, self.guard)
+        control.helm.approach = homing.approach
+        courses = Courses(control, self.guard)
+        chauffeur = Chauffeur(control, self.guard, courses)
+        self.tours = Tours(control, self.grants, chauffeur, courses, boarding_s)  # type: ignore[arg-type]
+        self.service = MobilityService(control, self.guard, homing)
+        self.streams = Streams(control, chauffeur.bring)
+        self.supervisor = Supervisor(control)
+        self.watch = Watch(control, self.guard, self.audit, self.supervisor)  # type: ignore[arg-type]
+        self._tasks = [asyncio.ensure_future(part) for part in (self.plane.run(), self.watch.run(), self.tours.run())]
+        self.news: list[News] = []
+
+    async def __aenter__(self) -> World:
+        await asyncio.sleep(0.2)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        tasks = [*self._tasks, *self.control.tasks._tasks]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def drive(self, held: Held) -> asyncio.Task[None]:
+        """A driver's stream in the background, once it has the drone."""
+        granted = asyncio.Event()
+
+        async def follow() -> None:
+            async for news in self.streams.follow(held):
+                self.news.append(news)
+                if news.state is State.GRANTED:
+                    granted.set()
+
+        stream = asyncio.ensure_future(follow())
+        waiting = asyncio.ensure_future(granted.wait())
+        await asyncio.wait([stream, waiting], return_when=asyncio.FIRST_COMPLETED)
+        waiting.cancel()
+        if stream.done():
+            await stream
+        return stream
+
+    async def up(self, held: Held, altitude_m: float = 10.0) -> asyncio.Task[None]:
+        """A driver that has armed and taken off."""
+        stream = await self.drive(held)
+        await self.service.arm(held)
+        await end(self.service.take_off(held, TakeoffArgs(altitude_m)))
+        return stream
+
+    async def until(self, condition: Callable[[], object], timeout_s: float = 120.0) -> None:
+        async with asyncio.timeout(timeout_s):
+            while not condition():
+                await self.plane.update(0.1)
+
+    def kinds(self, kind: str) -> list[dict[str, Any]]:
+        return [content for found, content in self.entries if found == kind]
+
+
+async def end(motion: Any) -> Progress:
+    """The last step of a motion that completes."""
+    steps: list[Progress] = [step async for step in motion]
+    assert steps[-1].step.complete
+    return steps[-1]
+
+
+async def refusal(call: Any) -> Refused:
+    """Why a call or a motion is refused."""
+    try:
+        if hasattr(call, "__aiter__"):
+            await end(call)
+        else:
+            await call
+    except Refused as refused:
+        return refused
+    raise AssertionError("it was not refused")
+
+
+def at(x: float, y: float) -> tuple[float, float]:
+    return FRAME.latlon(x, y)
+
+
+def area(x0: float, y0: float, x1: float, y1: float) -> dict[str, Any]:
+    corners = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+    return {"polygon": {"exterior": [dict(zip(("lat", "lon"), at(x, y), strict=True)) for x, y in corners]}}
+
+
+def zone(name: str, action: str, *box: float) -> dict[str, Any]:
+    spec = {"type": "GeofenceControl", "kind": "exclusion", "action": action, "selector": {"zones": [f"{name}-zone"]}}
+    return {"name": name, "spec": spec, "zones": [{"name": f"{name}-zone", "area": area(*box)}]}
+
+
+def spec(*policies: dict[str, Any], **changes: Any) -> GrantSpec:
+    """A driver's grant: operation area 200 m around home."""
+    body = {
+        "node": "drone-1",
+        "application": {"namespace": "default", "name": "app", "uid": "u1"},
+        "component": "Navigator",
+        "instance": "app-navigator",
+        "class": "driver",
+        "control": "full",
+        "controlPoints": [{"navigation": "pathBased", "path": [_place(0, 70)]}],
+        "services": [{"service": "mobility", "methods": list(ALL)}],
+        "operationArea": [area(-200, -200, 200, 200)],
+        "home": {"lat": 39.36, "lon": 22.95, "alt": 10.0, "altitudeReference": "amsl"},
+        "limits": {"maxAltitude": 60, "maxSpeed": 12},
+        "policies": list(policies),
+    }
+    return GrantSpec.model_validate(body | changes)
+
+
+def partial(*policies: dict[str, Any], **changes: Any) -> GrantSpec:
+    return spec(*policies, control="partial", **changes)
+
+
+def touring(*policies: dict[str, Any], tour: tuple[tuple[float, float], ...], **changes: Any) -> GrantSpec:
+    changes = {"class": "passenger", "control": None, "controlPoints": [], "instance": "app-viewer"} | changes
+    return spec(*policies, tour=[_place(x, y) for x, y in tour], **changes)
+
+
+def _place(x: float, y: float, alt: float = 12.0) -> dict[str, float]:
+    return dict(zip(("lat", "lon", "alt"), (*at(x, y), alt), strict=True))

@@ -1,0 +1,586 @@
+"""How the mobility service flies: around zones, home, for passengers, at setpoints, and what it does not fly any more."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import shapely
+from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, VelocityArgs, Verdict
+from fractus_services.mobility.autopilot import AutopilotError
+from fractus_services.mobility.leases import State
+from fractus_services.mobility.vehicle import GUIDED, LAND, RTL, SMART_RTL
+from fractus_services.replies import Refused
+from mobility_world import World, at, end, fly, partial, refusal, spec, touring, zone
+
+WALL = (-40.0, 25.0, 40.0, 40.0)
+
+
+def clear_m(world: World, *box: float) -> float:
+    return float(min(shapely.box(*box).distance(shapely.Point(x, y)) for x, y, _ in world.plane.trace))
+
+
+def goto(x: float, y: float, alt: float = 10.0, **more: float) -> GotoArgs:
+    return GotoArgs(*at(x, y), alt, **more)
+
+
+# The system's ways
+
+
+def test_the_chauffeur_flies_around_a_wall_there_and_home(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, retraces=True) as world:
+            held = world.grants.put(partial(zone("wall", "ignore", *WALL), corridor=[]))
+            stream = await world.drive(held)
+            assert math.dist(world.plane.xy, (0, 70)) < 1.5
+            assert [n.reason for n in world.news if n.state is State.WAITING][
+                -1
+            ] == "the system flies to the control point"
+            assert await world.control.give_back(held)
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert math.dist(world.plane.xy, (0, 0)) < 1.5
+            assert clear_m(world, *WALL) > 1.0
+            assert max(abs(x) for x, _, _ in world.plane.trace) > 41
+            await stream
+
+    fly(flight)
+
+
+def test_a_zone_that_appears_on_the_way_is_flown_around(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, retraces=True) as world:
+            held = world.grants.put(partial())
+            driving = asyncio.ensure_future(world.drive(held))
+            await world.until(lambda: world.plane.xy[1] > 8)
+            world.grants.put(partial(zone("wall", "ignore", *WALL)))
+            await driving
+            assert math.dist(world.plane.xy, (0, 70)) < 1.5
+            assert clear_m(world, *WALL) > 0.5
+            assert world.kinds("control")[-1]["action"] == "granted"
+
+    fly(flight)
+
+
+def test_a_zone_that_demands_the_drone_ends_the_transit(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(partial())
+            driving = asyncio.ensure_future(world.drive(held))
+            await world.until(lambda: world.plane.xy[1] > 8)
+            world.grants.put(partial(zone("wall", "revoke", *WALL)))
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert world.journal.missions["m1"].outcome.startswith("revoked:")
+            assert clear_m(world, *WALL) > 0.5
+            with pytest.raises(Refused, match="about to enter zone wall-zone"):
+                await driving
+
+    fly(flight)
+
+
+def test_no_way_to_the_control_point_is_told(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(partial(zone("around", "ignore", -20, 50, 20, 90)))
+            why = await refusal(world.drive(held))
+            assert why.verdict.code == "NoLegalWay"
+            assert "around" in str(why)
+            assert world.control.hands == "system"
+
+    fly(flight)
+
+
+@pytest.mark.parametrize(("retraces", "mode"), [(True, SMART_RTL), (False, RTL)])
+def test_without_any_legal_way_home_the_drone_comes_home_all_the_same(
+    tmp_path: Path, retraces: bool, mode: int
+) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, retraces=retraces) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            await end(world.service.goto(held, goto(0, 70), 0))
+            world.grants.put(spec(zone("home", "ignore", -15, -15, 15, 15)))
+            why = await refusal(world.service.return_to_launch(held)) if not retraces else None
+            assert why is None or why.verdict.code == "NoLegalWay"
+            await world.control.give_back(held)
+            await world.until(lambda: world.plane.vehicle.mode == mode)
+            assert "NoLegalWay" in {e["code"] for e in world.kinds("control")}
+            await world.until(lambda: not world.plane.vehicle.armed)
+
+    fly(flight)
+
+
+def test_a_path_that_the_vehicle_forgot_is_not_relied_on(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, retraces=True) as world:
+            assert world.guard.situation().airframe.retraces
+            world.plane.vehicle.path_lost = True
+            assert not world.guard.situation().airframe.retraces
+
+    fly(flight)
+
+
+def test_a_removed_grant_keeps_its_fences_on_the_way_home(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, retraces=True) as world:
+            held = world.grants.put(spec(zone("wall", "ignore", *WALL)))
+            await world.up(held)
+            for x, y in ((60, 30), (60, 70), (0, 70)):
+                await end(world.service.goto(held, goto(x, y), 0))
+            world.grants.remove(held)
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert clear_m(world, *WALL) > 1.0
+            assert world.journal.missions["m1"].outcome == "revoked: the grant was removed"
+
+    fly(flight)
+
+
+def test_a_lost_driver_is_brought_home_around_the_wall(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, retraces=True) as world:
+            held = world.grants.put(spec(zone("wall", "ignore", *WALL)))
+            stream = await world.up(held)
+            for x, y in ((60, 30), (60, 70)):
+                await end(world.service.goto(held, goto(x, y), 0))
+            flying = asyncio.ensure_future(end(world.service.goto(held, goto(-60, 70), 0)))
+            await world.until(lambda: world.plane.xy[0] < 20)
+            stream.cancel()
+            await world.until(lambda: abs(world.plane.velocity[0]) < 0.2)
+            assert world.plane.vehicle.mode == GUIDED
+            assert world.plane.xy[0] > -30
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert clear_m(world, *WALL) > 1.0
+            assert math.dist(world.plane.xy, (0, 0)) < 1.5
+            assert world.journal.missions["m1"].outcome == "failed: driver lost"
+            with pytest.raises(Exception, match="driver"):
+                await flying
+
+    fly(flight)
+
+
+def test_a_new_wall_on_the_way_home_is_flown_around(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, retraces=True) as world:
+            held = world.grants.put(spec(zone("wall", "ignore", *WALL)))
+            await world.up(held)
+            for x, y in ((60, 30), (60, 70), (0, 70)):
+                await end(world.service.goto(held, goto(x, y), 0))
+            await world.control.give_back(held)
+            await world.until(lambda: math.hypot(*world.plane.velocity) > 3)
+            east = world.plane.velocity[0] > 0
+            second = (41.0, 20.0, 90.0, 60.0) if east else (-90.0, 20.0, -41.0, 60.0)
+            world.grants.put(spec(zone("wall", "ignore", *WALL), zone("second", "ignore", *second)))
+            begun = len(world.plane.trace)
+            await world.until(lambda: not world.plane.vehicle.armed)
+            del world.plane.trace[: begun - 1]
+            assert clear_m(world, *WALL) > 0.5
+            assert clear_m(world, *second) > 0.5
+
+    fly(flight)
+
+
+# Tours
+
+
+def test_a_tour_visits_its_points_and_comes_home(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, retraces=True, boarding_s=30) as world:
+            held = world.grants.put(touring(zone("wall", "ignore", *WALL), tour=((0, 70), (60, 70))))
+            await asyncio.sleep(5)
+            assert not world.plane.vehicle.armed
+            world.tours.heard(held)
+            await world.until(
+                lambda: world.journal.missions["m1"].outcome == "complete" if world.journal.missions else 0
+            )
+            assert world.journal.missions["m1"].waypoints == 2
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert clear_m(world, *WALL) > 1.0
+            for place in ((0, 70), (60, 70)):
+                assert min(math.dist(place, (x, y)) for x, y, _ in world.plane.trace) < 1.2
+            assert not world.kinds("takeover")
+
+    fly(flight)
+
+
+def test_passengers_that_never_call_are_flown_after_boarding(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, boarding_s=30) as world:
+            world.grants.put(touring(tour=((0, 30),)))
+            begun = world.plane.now
+            await world.until(lambda: world.plane.vehicle.armed)
+            assert 29 < world.plane.now - begun < 33
+
+    fly(flight)
+
+
+def test_a_pilot_ends_a_tour_and_a_mission_that_ended_is_not_flown_again(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.grants.put(touring(tour=((0, 100),)))
+            await world.until(lambda: world.plane.xy[1] > 20)
+            world.control.hands = "pilot"
+            world.control.lose("a human pilot took it")
+            world.control.tasks.drop(world.control.system)
+            world.plane.set_to(LAND)
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert world.control.touring is None
+            world.journal.missions["m1"].outcome = "failed: pilot"
+            world.control.hands = "system"
+            world.plane.vehicle.mode = GUIDED
+            await asyncio.sleep(20)
+            assert not world.plane.vehicle.armed
+
+    fly(flight)
+
+
+def test_a_point_out_of_reach_ends_the_tour_and_says_why(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.grants.put(touring(tour=((0, 30), (0, 500))))
+            await world.until(lambda: any(m.outcome for m in world.journal.missions.values()))
+            assert world.journal.missions["m1"].outcome.startswith("failed: the system cannot fly to")
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert math.dist(world.plane.xy, (0, 0)) < 1.5
+
+    fly(flight)
+
+
+def test_a_tour_goes_on_with_the_service_that_follows(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.grants.put(touring(tour=((0, 40), (0, 80))))
+            await world.until(lambda: world.plane.xy[1] > 50)
+        flown = len(world.plane.trace)
+        second = World(tmp_path, boarding_s=1000, after=world)
+        second.grants.put(touring(tour=((0, 40), (0, 80))))
+        async with second:
+            await second.until(lambda: second.journal.missions["m1"].outcome == "complete")
+            assert min(y for _, y, _ in second.plane.trace[flown:]) > 45, "the first point is not visited again"
+            await second.until(lambda: not second.plane.vehicle.armed)
+
+    fly(flight)
+
+
+def test_a_tour_waits_while_a_driver_has_the_drone(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            world.grants.put(touring(tour=((0, 30),)), "m2")
+            await asyncio.sleep(10)
+            assert world.control.controller == held.identity
+            await world.control.give_back(held)
+            await world.until(lambda: world.journal.missions.get("m2") and world.journal.missions["m2"].outcome)
+
+    fly(flight)
+
+
+# Setpoints
+
+
+def test_a_setpoint_runs_out(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            _, flown = await world.service.set_velocity(held, VelocityArgs(4.0, 0.0, hold_s=1.0))
+            assert flown.north_mps == 4.0
+            await asyncio.sleep(0.9)
+            assert world.plane.velocity[1] > 1.5
+            await world.until(lambda: abs(world.plane.velocity[1]) < 0.1, 10)
+            assert world.control.motion is None
+            assert world.control.controller == held.identity
+            assert world.plane.xy[1] < 15
+
+    fly(flight)
+
+
+def test_setpoints_that_follow_each_other_fly_on(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            for _ in range(50):
+                await world.service.set_velocity(held, VelocityArgs(3.0, 1.0, -0.5, hold_s=0.5))
+                await asyncio.sleep(0.1)
+            assert world.plane.velocity == pytest.approx([1.0, 3.0], abs=0.1)
+            assert world.plane.height > 11
+            assert world.plane.commands.count(84) > 40
+
+    fly(flight)
+
+
+def test_a_setpoint_toward_a_zone_is_not_flown_into_it(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec(zone("no-fly", "ignore", -50, 30, 50, 60)))
+            await world.up(held)
+            refused = 0
+            for _ in range(120):
+                try:
+                    await world.service.set_velocity(held, VelocityArgs(8.0, 0.0, hold_s=1.0))
+                except Exception as error:
+                    refused += 1
+                    assert "no-fly" in str(error)
+                await asyncio.sleep(0.2)
+            assert refused > 50
+            assert clear_m(world, -50, 30, 50, 60) > 0.5
+            assert world.control.controller == held.identity
+
+    fly(flight)
+
+
+def test_a_goto_ends_setpoints_and_setpoints_end_a_goto(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            flying = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 100), 0)))
+            await world.until(lambda: world.plane.velocity[1] > 3)
+            await world.service.set_velocity(held, VelocityArgs(0.0, 3.0, hold_s=2.0))
+            assert (await flying).verdict.code == "Replaced"
+            await end(world.service.goto(held, goto(30, 30), 0))
+            await asyncio.sleep(5)
+            assert math.dist(world.plane.xy, (30, 30)) < 1.5, "the watchdog of the setpoint is gone"
+
+    fly(flight)
+
+
+def test_a_lost_driver_ends_its_setpoint(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            stream = await world.up(held)
+            await world.service.set_velocity(held, VelocityArgs(5.0, 0.0, hold_s=2.0))
+            await asyncio.sleep(0.5)
+            sent = len(world.plane.commands)
+            stream.cancel()
+            await asyncio.sleep(0.5)
+            assert set(world.plane.commands[sent:]) <= {84, 176}
+            await world.until(lambda: abs(world.plane.velocity[1]) < 0.2, 5)
+            assert world.control.controller == "system"
+
+    fly(flight)
+
+
+# Turns, and what is not sent any more
+
+
+def test_a_sharp_turn_is_flown_from_standstill(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec(zone("no-fly", "ignore", -200, 63, 200, 100)))
+            await world.up(held)
+            flying = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 56), 0)))
+            await world.until(lambda: world.plane.velocity[1] > 5 and world.plane.xy[1] > 35)
+            first = world.service.check(Call("Goto", goto(-60, 50)), held)
+            assert first.brake_first, first
+            there = await end(world.service.goto(held, goto(-60, 50), 0))
+            assert there.verdict.permits
+            assert not there.verdict.brake_first
+            assert (await flying).verdict.code == "Replaced"
+            assert clear_m(world, -200, 63, 200, 100) > 1.0
+
+    fly(flight)
+
+
+def test_a_drone_that_does_not_stop_begins_no_leg(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec(zone("no-fly", "ignore", -200, 190, 200, 199)))
+            await world.up(held)
+            flying = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 180), 0)))
+            await world.until(lambda: world.plane.velocity[1] > 5)
+            world.guard.judge = lambda *_args, **_more: replace(Verdict("allow", goto(-60, 50)), brake_first=True)  # type: ignore[method-assign]
+            world.plane._command = lambda: (0.0, 1.0, 0.0)  # type: ignore[method-assign]
+            why = await refusal(world.service.goto(held, goto(-60, 50), 0))
+            assert why.verdict.code == "NotStopping"
+            assert world.plane.commands.count(192) == 1
+            await flying
+
+    fly(flight)
+
+
+@pytest.mark.parametrize("event", ["takeover", "returned", "revoked", "lost"])
+def test_a_command_that_waits_is_not_sent_once_it_is_stale(tmp_path: Path, event: str) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            stream = await world.up(held)
+            world.plane.deaf = True  # the autopilot neither acts nor answers: commands are tried again
+            asking = asyncio.ensure_future(refusal(world.service.set_speed(held, SetSpeedArgs(3.0))))
+            await asyncio.sleep(0.3)
+            if event == "takeover":
+                world.control.take_over(world.service.check(Call("Goto", goto(0, 5000)), held))
+            elif event == "returned":
+                await world.control.give_back(held)
+            elif event == "revoked":
+                world.grants.remove(held)
+            else:
+                stream.cancel()
+                await asyncio.sleep(0)
+            world.plane.deaf = False
+            why = await asking
+            assert why.verdict.code in {"NotInControl", "ControlLost"}
+            assert 178 not in world.plane.commands, "the retry was dropped"
+            await world.until(lambda: not world.plane.vehicle.armed)
+
+    fly(flight)
+
+
+def test_a_goto_that_waits_for_its_speed_is_judged_again(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            world.plane.deaf = True
+            asking = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 70, speed_mps=5.0), 0)))
+            await asyncio.sleep(0.3)
+            world.grants.put(spec(zone("wall", "ignore", *WALL)))
+            world.plane.deaf = False
+            why = await asking
+            assert why.verdict.code == "LegThroughExclusionZone"
+            assert 192 not in world.plane.commands
+
+    fly(flight)
+
+
+def test_armed_elsewhere_the_vehicle_does_not_rely_on_its_path(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, retraces=True) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            await end(world.service.goto(held, goto(0, 60), 0))
+            await end(world.service.land(held))
+            assert world.control.retraces
+            await world.service.arm(held)
+            assert not world.control.retraces
+            assert world.plane.parameters["FS_GCS_ENABLE"] == 1.0
+
+    fly(flight)
+
+
+# Heading
+
+
+def test_a_leg_with_a_heading_waits_for_the_nose(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            await end(world.service.goto(held, goto(0, 30, yaw_deg=90.0), 0))
+            assert world.plane.heading == 90.0
+            world.plane.refuses.add(115)
+            with pytest.raises(AutopilotError, match="failed command 115"):
+                await end(world.service.goto(held, goto(0, 40, yaw_deg=180.0), 0))
+
+    fly(flight)
+
+
+# Arming
+
+
+def test_nothing_arms_without_its_fence(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.drive(held)
+            world.fence.problem = AutopilotError("the autopilot refused the fence: no space")
+            why = await refusal(world.service.arm(held))
+            assert why.verdict.code == "FenceNotRaised"
+            assert "no space" in str(why)
+            assert 400 not in world.plane.commands
+            world.fence.problem = None
+            await world.service.arm(held)
+
+    fly(flight)
+
+
+def test_nothing_arms_far_from_the_home_of_its_grant(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.plane.xy = [60.0, 0.0]
+            held = world.grants.put(spec())
+            await asyncio.sleep(0.2)
+            await world.drive(held)
+            why = await refusal(world.service.arm(held))
+            assert why.verdict.code == "NotAtHome"
+            assert "60 m away" in str(why)
+            assert 400 not in world.plane.commands
+
+    fly(flight)
+
+
+@pytest.mark.parametrize("part", ["journal", "audit"])
+def test_nothing_arms_that_leaves_no_trace(tmp_path: Path, part: str) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.drive(held)
+
+            def full(_data: bytes) -> None:
+                raise OSError(28, "No space left on device")
+
+            if part == "journal":
+                world.journal._write = full  # type: ignore[method-assign]
+            else:
+                world.audit.failure = "cannot write the audit log: No space left on device"
+            why = await refusal(world.service.arm(held))
+            assert why.verdict.code in {"JournalUnavailable", "AuditUnavailable"}
+            assert "No space left" in str(why)
+            assert 400 not in world.plane.commands
+
+    fly(flight)
+
+
+def test_a_journal_that_fails_in_flight_ends_no_flight(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+
+            def full(_data: bytes) -> None:
+                raise OSError(28, "No space left on device")
+
+            world.journal._write = full  # type: ignore[method-assign]
+            await end(world.service.goto(held, goto(0, 30), 0))
+            await world.control.give_back(held)
+            await world.until(lambda: not world.plane.vehicle.armed)
+
+    fly(flight)
+
+
+# Nobody's drone
+
+
+def test_an_orphan_is_adopted(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            world.control.lease, world.control.hands = None, "system"  # a fault of ours
+            await world.until(lambda: world.kinds("takeover"))
+            assert world.kinds("takeover")[0]["code"] == "Orphaned"
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert math.dist(world.plane.xy, (0, 0)) < 1.5
+
+    fly(flight)
+
+
+def test_a_planner_that_fails_brings_the_drone_home_straight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise ZeroDivisionError
+
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec(zone("far", "ignore", 150, 150, 160, 160)))
+            await world.up(held)
+            await end(world.service.goto(held, goto(0, 30), 0))
+            monkeypatch.setattr("fractus_services.mobility.homing.straight_home_blocked", broken)
+            await world.control.give_back(held)
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert math.dist(world.plane.xy, (0, 0)) < 1.5
+
+    fly(flight)

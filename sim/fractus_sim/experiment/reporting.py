@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import string
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,9 +15,11 @@ from fractus_sim.experiment.checks import AltitudeBand, SpeedLimit
 from fractus_sim.report.drawing import save
 from fractus_sim.report.flightmap import draw_map
 from fractus_sim.report.geojson import feature, lonlat, path, point
+from fractus_sim.report.mission import marks_of, requests_of
 from fractus_sim.report.page import clock, table
 from fractus_sim.report.profile import Limit, Profile, Span, draw_profile
 from fractus_sim.report.scene import DrawnZone, Mark, Scene
+from fractus_sim.report.summary import judged
 from fractus_sim.report.track import Sample, Track
 
 if TYPE_CHECKING:
@@ -49,19 +53,19 @@ def scene_of(outcome: Outcome) -> Scene:
     frame = LocalFrame(first.lat, first.lon)
     zones = tuple(DrawnZone(z.name, z.kind, polygon(frame, z.area)) for z in outcome.experiment.zones)
     marks: list[Mark] = []
-    for number, occurrence in enumerate(_numbered(outcome), 1):
+    for letter, occurrence in _lettered(outcome):
         for track in tracks:
             at = _sample_at(track, occurrence.begin_s)
             if at is not None and (track.name in _victims(outcome, occurrence) or not occurrence.vehicle):
-                label = f"{number} {occurrence.title}"
-                marks.append(Mark("fault", str(number), frame.xy(at.place.lat, at.place.lon), label=label))
+                label = f"{letter} {occurrence.title}"
+                marks.append(Mark("fault", letter, frame.xy(at.place.lat, at.place.lon), label=label))
     return Scene(
         title=f"{outcome.experiment.name}: {_whom(tracks)}",
         frame=frame,
         tracks=tracks,
         zones=zones,
         depots=(("home", (0.0, 0.0)),) if len(tracks) == 1 else (),
-        marks=tuple(marks),
+        marks=(*marks, *marks_of(outcome.judgements, frame)),
     )
 
 
@@ -70,8 +74,8 @@ def profile_of(outcome: Outcome) -> Profile:
     tracks = _tracks(outcome)
     end_s = max(track.samples[-1].time_s for track in tracks)
     spans = [
-        Span(o.begin_s, o.end_s if o.end_s is not None else end_s, f"{number} {o.title}", fault=True)
-        for number, o in enumerate(_numbered(outcome), 1)
+        Span(o.begin_s, o.end_s if o.end_s is not None else end_s, f"{letter} {o.title}", fault=True)
+        for letter, o in _lettered(outcome)
     ]
     sagging = any(o.kind == "batteryDrop" for o in outcome.occurrences)
     limits: list[Limit] = []
@@ -89,6 +93,7 @@ def profile_of(outcome: Outcome) -> Profile:
         panels=("altitude", "speed", "voltage" if sagging else "battery"),
         limits=tuple(limits),
         spans=tuple(spans),
+        requests=tuple(requests_of(outcome.judgements)),
         axis="seconds since the vehicles were ready",
     )
 
@@ -104,6 +109,7 @@ def summary(outcome: Outcome) -> str:
         _checks(outcome),
         pictures,
         _flights(outcome),
+        judged(outcome.judgements, lambda time_s: f"{time_s:.1f} s") if outcome.findings.calls else "",
         _events(outcome),
         _texts(outcome),
         _files(outcome),
@@ -177,16 +183,17 @@ def _whom(tracks: Sequence[Track]) -> str:
     return f"{len(tracks)} vehicles, {sum(track.distance_m for track in tracks):.0f} m flown"
 
 
-def _numbered(outcome: Outcome) -> list[Occurrence]:
-    """Faults as pictures number them: one that hits several vehicles at once counts once."""
+def _lettered(outcome: Outcome) -> list[tuple[str, Occurrence]]:
+    """Faults as pictures letter them: one that hits several vehicles at once counts once."""
     seen: dict[tuple[str, float], Occurrence] = {}
     for occurrence in sorted(outcome.occurrences, key=lambda o: o.begin_s):
         seen.setdefault((occurrence.title, round(occurrence.begin_s)), occurrence)
-    return list(seen.values())
+    letters = (f"{letter}{turn or ''}" for turn in itertools.count() for letter in string.ascii_uppercase)
+    return list(zip(letters, seen.values(), strict=False))
 
 
-def _victims(outcome: Outcome, numbered: Occurrence) -> set[str]:
-    key = (numbered.title, round(numbered.begin_s))
+def _victims(outcome: Outcome, lettered: Occurrence) -> set[str]:
+    key = (lettered.title, round(lettered.begin_s))
     return {o.vehicle for o in outcome.occurrences if (o.title, round(o.begin_s)) == key}
 
 
@@ -251,7 +258,7 @@ def _flights(outcome: Outcome) -> str:
 
 
 def _events(outcome: Outcome) -> str:
-    numbers = {(o.title, round(o.begin_s)): str(n) for n, o in enumerate(_numbered(outcome), 1)}
+    letters = {(o.title, round(o.begin_s)): letter for letter, o in _lettered(outcome)}
     modes = [
         (at, flight.name, f"mode {mode}")
         for flight in outcome.flights.values()
@@ -259,11 +266,11 @@ def _events(outcome: Outcome) -> str:
         if len(outcome.flights) <= 3
     ]
     merged = sorted([*outcome.events, *modes], key=lambda event: event[0])
-    rows = [(numbers.get((text, round(at)), ""), f"{at:.1f} s", who or "-", text) for at, who, text in merged]
+    rows = [(letters.get((text, round(at)), ""), f"{at:.1f} s", who or "-", text) for at, who, text in merged]
     if not rows:
         return ""
     left = f"\n\n{len(rows) - _PAGE_EVENTS} more are in report.json." if len(rows) > _PAGE_EVENTS else ""
-    return "## What happened\n\n" + table(("No", "At", "Vehicle", "What"), rows[:_PAGE_EVENTS]) + left
+    return "## What happened\n\n" + table(("", "At", "Vehicle", "What"), rows[:_PAGE_EVENTS]) + left
 
 
 def _texts(outcome: Outcome) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from fractus_sim.experiment.errors import ExperimentError
@@ -15,6 +15,7 @@ from fractus_sim.experiment.logbook import Flight, McapLog, Recorder
 from fractus_sim.experiment.model import Experiment, VehicleSetup
 from fractus_sim.experiment.stage import Findings, Moment, Stage
 from fractus_sim.experiment.vehicles import VehicleStage
+from fractus_sim.report.record import Judgement, judgements_of
 
 READY_S = 90.0
 LONG_AGO_S = 1e6
@@ -48,6 +49,7 @@ class Outcome:
         duration_s: how long it took, in the vehicles' time.
         wall_s: how long it took here.
         events: (seconds, vehicle or empty, text) of tasks and faults.
+        judgements: what policies corrected or refused.
     """
 
     experiment: Experiment
@@ -57,6 +59,7 @@ class Outcome:
     verdicts: tuple[Verdict, ...]
     findings: Findings
     events: tuple[tuple[float, str, str], ...]
+    judgements: tuple[Judgement, ...]
     duration_s: float
     wall_s: float
     problem: str = ""
@@ -278,7 +281,13 @@ def _outcome(play: _Play, out: Path, problem: str, wall_s: float) -> Outcome:
         tuple(verdicts),
         findings,
         tuple(play.events),
+        tuple(_since_start(judged, play) for judged in judgements_of(findings.calls)),
         play.now_s,
         wall_s,
         problem,
     )
+
+
+def _since_start(judged: Judgement, play: _Play) -> Judgement:
+    """A judgement with its time on the experiment's clock."""
+    return replace(judged, time_s=(judged.time_s - play.start.unix_us / 1e6) * (play.experiment.pace or 1.0))

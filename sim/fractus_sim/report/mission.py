@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 import shapely
 import shapely.geometry
 from fractus_core.api import EdgeNode, Policy
-from fractus_core.geo import polygon
+from fractus_core.geo import LocalFrame, polygon
 
 from fractus_sim.report.profile import Limit, Profile, Request, Span
 from fractus_sim.report.record import Judgement, Record
@@ -36,7 +36,7 @@ def scene_of(record: Record) -> Scene:
         area=_area_shape(record),
         nodes=nodes,
         depots=depots,
-        marks=tuple(_marks(record)),
+        marks=tuple(marks_of(record.judgements, frame)),
     )
 
 
@@ -50,7 +50,7 @@ def profile_of(record: Record) -> Profile:
         panels=("altitude",),
         limits=tuple(_limits(record)),
         spans=tuple(_home_leg(record)),
-        requests=tuple(_requests(record)),
+        requests=tuple(requests_of(record.judgements)),
         axis="seconds since takeoff",
     )
 
@@ -84,9 +84,9 @@ def _kind(policy: Policy) -> str:
     return "limit" if policy.spec.type == "LimitControl" else policy.spec.kind
 
 
-def _marks(record: Record) -> Iterable[Mark]:
-    frame = record.frame
-    for index, judged in enumerate(record.judgements, 1):
+def marks_of(judgements: Sequence[Judgement], frame: LocalFrame) -> Iterable[Mark]:
+    """What policies changed, on the map."""
+    for index, judged in enumerate(judgements, 1):
         place = judged.asked or judged.at
         if place is None:
             continue
@@ -123,8 +123,9 @@ def _home_leg(record: Record) -> Iterable[Span]:
     return spans
 
 
-def _requests(record: Record) -> Iterable[Request]:
-    for index, judged in enumerate(record.judgements, 1):
+def requests_of(judgements: Sequence[Judgement]) -> Iterable[Request]:
+    """What policies changed, in the profile."""
+    for index, judged in enumerate(judgements, 1):
         place = judged.asked or judged.at
         if place is None:
             continue

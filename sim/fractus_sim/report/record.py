@@ -111,7 +111,6 @@ class Record:
         plans = found["DeploymentPlan"]
         chosen = plans[0].spec.drone.node if plans and plans[0].spec.drone else None
         entries = sorted(audit, key=lambda e: str(e.get("time", "")))
-        judged = [j for e in entries if (j := _judgement(e)) is not None]
         return cls(
             application=found["Application"][0],
             plan=plans[0] if plans else None,
@@ -123,7 +122,7 @@ class Record:
             pods=tuple(sorted((_pod(body) for body in content.get("pods", ())), key=lambda p: (p.component, p.name))),
             events=tuple(content.get("events", ())),
             samples=_flight(_sample(e) for e in entries if _has_state(e)),
-            judgements=_merged(judged),
+            judgements=judgements_of(entries),
             calls=sum(e.get("kind") == "call" for e in entries),
             results=content.get("results", 0),
             audit=content.get("audit", {}),
@@ -208,6 +207,12 @@ def _flight(samples: Iterable[Sample]) -> tuple[Sample, ...]:
     if not flying:
         return ()
     return tuple(s for s in ordered if flying[0] - 3.0 <= s.time_s <= flying[-1] + 3.0)
+
+
+def judgements_of(entries: Iterable[Mapping[str, Any]]) -> tuple[Judgement, ...]:
+    """What policies changed, from entries of audit logs, in order; the same asked again soon counts as one."""
+    ordered = sorted(entries, key=lambda e: str(e.get("time", "")))
+    return _merged([j for e in ordered if (j := _judgement(e)) is not None])
 
 
 def _judgement(entry: Mapping[str, Any]) -> Judgement | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
@@ -23,7 +23,7 @@ def summary(record: Record) -> str:
     parts = [
         f"# Flight of {record.application.name}\n\n{_headline(record)}",
         _figures(record),
-        _judged(record.judgements),
+        judged(record.judgements, _utc),
         _placements(record),
         _pods(record),
         _audit(record),
@@ -114,13 +114,14 @@ def _durations(record: Record) -> list[tuple[str, float]]:
     return sorted(known, key=lambda mark: mark[1])
 
 
-def _judged(judgements: Sequence[Judgement]) -> str:
+def judged(judgements: Sequence[Judgement], stamp: Callable[[float], str]) -> str:
+    """The section on what policies did; `stamp` writes a time."""
     if not judgements:
         return "## What policies did\n\nEvery call was allowed as asked."
     rows = [
         (
             str(number),
-            datetime.fromtimestamp(j.time_s, UTC).strftime("%H:%M:%S"),
+            stamp(j.time_s),
             j.component,
             f"{j.method} {j.detail}".strip() + (f" (x{j.count})" if j.count > 1 else ""),
             {"correct": "corrected", "deny": "refused", "takeover": "taken over"}[j.action],
@@ -129,7 +130,7 @@ def _judged(judgements: Sequence[Judgement]) -> str:
         )
         for number, j in enumerate(judgements, 1)
     ]
-    head = ("No", "UTC", "Component", "Asked", "Outcome", "Policies", "Reason")
+    head = ("No", "At", "Component", "Asked", "Outcome", "Policies", "Reason")
     return "## What policies did\n\n" + table(head, rows) + "\n\nNumbers are those of the pictures."
 
 
@@ -169,6 +170,10 @@ def _audit(record: Record) -> str:
 
 def _span(start: float | None, end: float | None) -> float | None:
     return end - start if start is not None and end is not None else None
+
+
+def _utc(time_s: float) -> str:
+    return datetime.fromtimestamp(time_s, UTC).strftime("%H:%M:%S UTC")
 
 
 def _stamp(time_s: float) -> str:

@@ -59,7 +59,10 @@ def altitude_limit(lower: float, upper: float) -> dict[str, Any]:
     return {"name": "altitudes", "spec": spec}
 
 
-ALL = ["Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "Goto", "Hover", "GetPosition", "ReturnToLaunch"]
+ALL = [
+    "Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "SetVelocity", "Goto", "Hover", "GetPosition",
+    "ReturnToLaunch",
+]  # fmt: skip
 
 
 def grant(*policies: dict[str, Any], **changes: Any) -> dict[str, Any]:
@@ -223,10 +226,10 @@ class Rig:
             "--ready-after", "2", *more,
         )  # fmt: skip
 
-    def start_service(self, *more: str) -> None:
+    def start_service(self, *more: str, link: str = "") -> None:
         self._start(
             "service", "-m", "fractus_services.mobility", "serve", "--grants", str(self.grants), "--tls", str(self.tls),
-            "--state", str(self.directory / "state"), "--audit", str(self.audit), "--node", NODE, "--autopilot", self.link,
+            "--state", str(self.directory / "state"), "--audit", str(self.audit), "--node", NODE, "--autopilot", link or self.link,
             "--listen", self.address, "--description", str(self.directory / "none.yaml"), "--driver-grace", "3", *more,
         )  # fmt: skip
 
@@ -351,7 +354,7 @@ class Driver:
     async def take(self, timeout_s: float = 30.0) -> pb.ControlEvent:
         self._stream = self.stub.GetControl(pb.GetControlRequest(), wait_for_ready=True)
         async with asyncio.timeout(timeout_s):
-            return await self.next(pb.ControlEvent.STATE_GRANTED)
+            return await self.next(pb.ControlEvent.STATE_GRANTED, timeout_s)
 
     async def next(self, state: int, timeout_s: float = 30.0) -> pb.ControlEvent:
         async with asyncio.timeout(timeout_s):

@@ -281,7 +281,7 @@ class Control:
     def _thrust_and_lean(self, wanted: tuple[float, float, float], est: Estimate, full: float) -> float:
         """Turn a wanted acceleration into a lean (kept in `self.lean`) and a collective thrust in newtons."""
         an, ae, ad = wanted
-        yaw = est.yaw
+        yaw = self.yaw_setpoint
         vertical = clamp(GRAVITY - ad, 0.2 * GRAVITY, 3.0 * GRAVITY)
         if self.horizontal is Axis.ATTITUDE:
             roll, pitch = self.attitude
@@ -303,22 +303,21 @@ class Control:
     def _mix(self, thrust: float, est: Estimate, full: float) -> tuple[float, float, float, float]:
         gains, frame = self.gains, self.airframe
         roll, pitch = self.lean
-        # Attitude error as a rotation vector in body axes, from the quaternion of the target.
-        cr, sr = math.cos(roll / 2.0), math.sin(roll / 2.0)
-        cp, sp = math.cos(pitch / 2.0), math.sin(pitch / 2.0)
-        cy, sy = math.cos(self.yaw_setpoint / 2.0), math.sin(self.yaw_setpoint / 2.0)
-        tw, tx = cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy
-        ty, tz = cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy
+        # The wanted direction of the body's down axis, in the world and then in the body: thrust first, heading apart, so
+        # that a turn of the nose does not bend the way flown.
+        cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
+        cy, sy = math.cos(self.yaw_setpoint), math.sin(self.yaw_setpoint)
+        dn, de, dd = cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp
         w, x, y, z = est.quaternion
-        ew = w * tw + x * tx + y * ty + z * tz
-        ex = w * tx - x * tw - y * tz + z * ty
-        ey = w * ty + x * tz - y * tw - z * tx
-        ez = w * tz - x * ty + y * tx - z * tw
-        sign = 2.0 if ew >= 0.0 else -2.0
+        ax = (1.0 - 2.0 * (y * y + z * z)) * dn + 2.0 * (x * y + w * z) * de + 2.0 * (x * z - w * y) * dd
+        ay = 2.0 * (x * y - w * z) * dn + (1.0 - 2.0 * (x * x + z * z)) * de + 2.0 * (y * z + w * x) * dd
+        az = 2.0 * (x * z + w * y) * dn + 2.0 * (y * z - w * x) * de + (1.0 - 2.0 * (x * x + y * y)) * dd
+        level = math.hypot(ax, ay)
+        turn = math.atan2(level, az) / level if level > 1e-9 else 1.0
         top = gains.max_rate_rps
-        rate_p = clamp(gains.attitude * sign * ex, -top, top)
-        rate_q = clamp(gains.attitude * sign * ey, -top, top)
-        rate_r = clamp(gains.yaw * sign * ez, -1.5, 1.5) + (self.yaw_rate or 0.0)
+        rate_p = clamp(-gains.attitude * turn * ay, -top, top)
+        rate_q = clamp(gains.attitude * turn * ax, -top, top)
+        rate_r = clamp(gains.yaw * wrap_pi(self.yaw_setpoint - est.yaw), -1.5, 1.5) + (self.yaw_rate or 0.0)
         tau_x = frame.inertia_xy * gains.rate * (rate_p - est.p) / frame.arm_m
         tau_y = frame.inertia_xy * gains.rate * (rate_q - est.q) / frame.arm_m
         tau_z = frame.inertia_z * gains.yaw_accel * (rate_r - est.r) / frame.yaw_lever_m

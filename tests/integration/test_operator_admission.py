@@ -366,12 +366,56 @@ def test_nobody_else_gets_a_certificate_of_a_node(
 # -- the operator's own permissions --
 
 
+def operator_token(world: World) -> str:
+    path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-operator/token"
+    request = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest", "spec": {"expirationSeconds": 600}}
+    return str(world.api.call("POST", path, request)["status"]["token"])
+
+
+def test_the_operator_writes_nothing_that_it_has_not_made(
+    control_plane: ControlPlane, world: World, chart: None, namespace: str
+) -> None:
+    theirs = f"/api/v1/namespaces/{namespace}/secrets/theirs"
+    body = {"apiVersion": "v1", "kind": "Secret", "metadata": {"name": "theirs", "namespace": namespace}}
+    world.api.apply(theirs, body)
+    ours_too = {"metadata": {"labels": {"app.kubernetes.io/managed-by": "fractus"}}}
+    client = control_plane.with_token(operator_token(world))
+    made = "writes only the secrets that it has made itself"
+    try:
+        wait_for(lambda: _probe_refused(client), "the admission policy to be in force")
+        # A patch would answer with the whole Secret: what is refused is not told either.
+        denied(lambda: client.merge(theirs, {}), made)
+        denied(lambda: client.merge(theirs, ours_too), made)
+        denied(lambda: client.apply(theirs, body | {"data": {}}), made)
+        denied(lambda: client.delete(theirs), made)
+        denied(lambda: client.apply(theirs.replace("theirs", "fresh"), body | {"metadata": {"name": "fresh"}}), made)
+        node, labels = "/api/v1/nodes/edge-1", "writes only the location labels of nodes"
+        denied(lambda: client.merge(node, {"spec": {"unschedulable": True}}), labels)
+        denied(lambda: client.merge(node, {"metadata": {"labels": {"fractus.dev/class": "cloud"}}}), labels)
+        denied(lambda: client.merge(node, {"metadata": {"labels": {"kubernetes.io/os": "x"}}}), labels)
+        client.merge(node, {"metadata": {"labels": {"fractus.dev/geohash": "sx1"}}})
+        world.put(traffic(namespace))
+        path = world.path(traffic(namespace))
+        denied(
+            lambda: client.merge(path, {"spec": {"components": [component("A", "cloud")]}}), "does not write the spec"
+        )
+        client.merge(path, {"metadata": {"finalizers": []}})
+    finally:
+        client.close()
+
+
+def _probe_refused(client: Api) -> bool:
+    try:
+        client.merge("/api/v1/nodes/cloud-1", {"metadata": {"labels": {"probe": uuid.uuid4().hex}}})
+    except Refused as error:
+        return error.code == 403 and "location labels" in str(error)
+    return False
+
+
 def test_the_operator_does_its_work_with_the_chart_s_permissions(
     control_plane: ControlPlane, world: World, chart: None, namespace: str, tmp_path: Path
 ) -> None:
-    path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-operator/token"
-    request = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest", "spec": {"expirationSeconds": 600}}
-    token = world.api.call("POST", path, request)["status"]["token"]
+    token = operator_token(world)
     config = yaml.safe_load(control_plane.kubeconfig.read_text())
     config["users"][0]["user"] = {"token": token}
     kubeconfig = tmp_path / "operator.kubeconfig"

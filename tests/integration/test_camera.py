@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import http.server
 import io
+import json
 import threading
+import urllib.request
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -14,9 +16,23 @@ import cv2
 import grpc
 import numpy as np
 import pytest
+import yaml
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
 from fractus_services.audit import verify
-from mobility_rig import DRIVER, FRAME, HOME, NODE, PASSENGER, Driver, Rig, area, denied, grant, passenger_grant
+from mobility_rig import (
+    DRIVER,
+    FRAME,
+    HOME,
+    NODE,
+    PASSENGER,
+    Driver,
+    Rig,
+    area,
+    denied,
+    free_port,
+    grant,
+    passenger_grant,
+)
 from PIL import Image
 
 ALL = ["CaptureImage", "RetrieveImage", "ListImages", "DeleteImage"]
@@ -68,7 +84,7 @@ def stub(rig: Rig, address: str, identity: str = PASSENGER) -> camera_pb2_grpc.C
 
 
 async def capture(camera: Any, **size: int) -> camera_pb2.CaptureImageResponse:
-    return await camera.CaptureImage(camera_pb2.CaptureImageRequest(**size), wait_for_ready=True, timeout=20)
+    return await camera.CaptureImage(camera_pb2.CaptureImageRequest(**size), wait_for_ready=True, timeout=60)
 
 
 async def retrieve(camera: Any, name: str, action: Any = types_pb2.Decision.ACTION_ALLOW) -> bytes:
@@ -204,6 +220,55 @@ async def test_an_ip_camera_that_breaks_and_comes_back(rig: Rig) -> None:
     assert (code, why.code) == (grpc.StatusCode.UNAVAILABLE, "CameraFailed")
     listed = await camera.ListImages(camera_pb2.ListImagesRequest(), timeout=5)
     assert len(listed.images) == 2
+
+
+BILLBOARD = (39.36009591, 22.95004318)
+"""A lying picture of a face in the simulated landscape."""
+
+
+async def test_a_face_in_the_simulated_world_is_hidden_and_the_rest_stays(rig: Rig) -> None:
+    port = free_port()
+    rig._start(
+        "world", "-m", "fractus_sim.world", "--listen", f"127.0.0.1:{port}", "--pose", f"{BILLBOARD[0]},{BILLBOARD[1]},4",
+        "--origin", "39.36,22.95", "--resolution", "640x360",
+    )  # fmt: skip
+    node = {
+        "apiVersion": "fractus.dev/v1alpha1", "kind": "EdgeNode", "metadata": {"name": NODE},
+        "spec": {
+            "location": {"lat": BILLBOARD[0], "lon": BILLBOARD[1], "alt": 0, "altitudeReference": "amsl"},
+            "services": {"camera": {
+                "connection": f"http://127.0.0.1:{port}/snapshot.jpg", "resolution": "640x360", "methods": ALL,
+                "horizontalFieldOfView": 62.2, "mount": {"pitch": -90, "height": 4},
+            }},
+        },
+    }  # fmt: skip
+    faces = {"name": "faces", "spec": {"type": "PrivacyControl", "kind": "camera", "action": "blurFaces"}}
+    rig.write_grant(grant(services=CAMERA, operationArea=[]))
+    rig.write_grant(passenger_grant(faces, services=CAMERA, operationArea=[], **{"class": None}))
+    address = rig.start_camera("--face-px", "12", description=yaml.safe_dump(node))
+
+    async def picture(identity: str) -> np.ndarray:
+        camera = stub(rig, address, identity)
+        for _ in range(100):
+            try:
+                taken = await capture(camera)
+                break
+            except grpc.aio.AioRpcError as error:
+                assert error.code() == grpc.StatusCode.UNAVAILABLE, error
+                await asyncio.sleep(0.2)
+        data = await retrieve(camera, taken.image.name, taken.decision.action)
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE).astype(float)
+
+    plain, hidden = await picture(DRIVER), await picture(PASSENGER)
+    url = f"http://127.0.0.1:{port}/truth.json"
+    truth = json.loads(await asyncio.to_thread(lambda: urllib.request.urlopen(url, timeout=10).read()))
+    (left, top, right, bottom) = (int(v) for v in next(f for f in truth["faces"] if f["visible"] > 0.7)["box"])
+    face = np.s_[max(top, 0) : bottom, max(left, 0) : right]
+    fine = [np.abs(np.diff(p[face], axis=1)) for p in (plain, hidden)]
+    assert (fine[1] > 4).mean() < 0.35 * (fine[0] > 4).mean()
+    border = np.s_[:, :60]
+    assert np.abs(plain[border] - hidden[border]).mean() < 12, "nothing else is touched"
+    assert np.abs(plain[face] - hidden[face]).mean() > 5
 
 
 @pytest.mark.parametrize(

@@ -202,8 +202,22 @@ def _inclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Ite
         if not fence.rule.in_force(now.time_s):
             continue
         shape, border = fence.at(air.lower_m, air.upper_m, now, grant.flat_terrain)
-        if not _stays_inside(shape, border, leg, air.margin_m):
+        if not _stays_inside(shape, border, leg, air.margin_m) or (
+            fence.banded and _leaves_by_height(fence, shape, leg, now, grant)
+        ):
             yield _inclusion_breach(fence, shape, border, leg, air.margin_m)
+
+
+def _leaves_by_height(fence: Inclusion, shape: BaseGeometry, leg: Leg, now: Situation, grant: CompiledGrant) -> bool:
+    """Whether a drone that is inside at its present altitude would not be at all altitudes of a leg.
+
+    Such a leg does not lead back in, though it may look so from above.
+    """
+    if shape.covers(leg.ground):
+        return False
+    rest_m = stop_altitude_m(now)
+    present, _ = fence.at(min(now.altitude_m, rest_m), max(now.altitude_m, rest_m), now, grant.flat_terrain)
+    return bool(present.covers(leg.unavoidable))
 
 
 def _inclusion_breach(fence: Inclusion, shape: BaseGeometry, border: BaseGeometry, leg: Leg, margin_m: float) -> Breach:

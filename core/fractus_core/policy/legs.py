@@ -30,6 +30,7 @@ from fractus_core.policy.motion import (
     stop_altitude_m,
     stop_point,
     turn_point,
+    turning_stops,
 )
 from fractus_core.policy.returning import straight_home_blocked
 from fractus_core.policy.routes import route
@@ -172,7 +173,8 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Clamped])
 
 def _leg(at: XY, target: XY, now: Situation, altitude_m: float) -> Leg:
     heights = (now.altitude_m, stop_altitude_m(now), altitude_m)
-    return Leg(at, stop_point(now, at), turn_point(now, at, target), target, min(heights), max(heights))
+    turn, stops = turn_point(now, at, target), turning_stops(now, at, target)
+    return Leg(at, stop_point(now, at), turn, target, min(heights), max(heights), stops)
 
 
 def way_home_blocked(target: XY, altitude_m: float, now: Situation, grant: CompiledGrant) -> Verdict | None:

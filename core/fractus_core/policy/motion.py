@@ -14,6 +14,9 @@ from fractus_core.policy.values import STANDING_MPS, Airframe, Situation, Veloci
 
 XY = tuple[float, float]
 
+_TURNING = (0.25, 0.5, 0.75)
+"""Shares of a turn at which a stop is looked at."""
+
 OVERSHOOT = 0.35
 """Share of the stopping distance that a drone which turns in flight may overshoot its target by."""
 
@@ -134,6 +137,35 @@ def turn_point(situation: Situation, at: XY, target: XY) -> XY:
     return at[0] + situation.east_mps / speed * run, at[1] + situation.north_mps / speed * run
 
 
+def turning_stops(situation: Situation, at: XY, target: XY) -> tuple[XY, ...]:
+    """Where a drone comes to rest that is told to stop while it turns toward a target.
+
+    It stops along its velocity of that moment, which may lead out of the triangle that the turn itself stays in.
+    """
+    speed = math.hypot(situation.north_mps, situation.east_mps)
+    if speed < STANDING_MPS:
+        return ()
+    frame, begin, stop = situation.airframe, surge(situation), stop_point(situation, at)
+    ahead = (situation.east_mps / speed, situation.north_mps / speed)
+    away = math.dist(stop, target)
+    cruise = min(situation.speed_setpoint_mps, math.sqrt(2 * frame.accel_mps2 * away))
+    toward = ((target[0] - stop[0]) / away * cruise, (target[1] - stop[1]) / away * cruise) if away > 0 else (0.0, 0.0)
+    present = (ahead[0] * begin.speed_mps, ahead[1] * begin.speed_mps)
+    change_s = math.dist(present, toward) / frame.accel_mps2
+    found = []
+    for share in _TURNING:
+        vx, vy = (p + (t - p) * share for p, t in zip(present, toward, strict=True))
+        fast = math.hypot(vx, vy)
+        if fast > 0:
+            half = change_s * share / 2
+            on = reaction_s(situation, frame.accel_mps2)
+            on += stopping_distance_m(fast, frame.accel_mps2, frame.position_gain) / fast
+            x = at[0] + ahead[0] * begin.run_m + (present[0] + vx) * half + vx * on
+            y = at[1] + ahead[1] * begin.run_m + (present[1] + vy) * half + vy * on
+            found.append((x, y))
+    return tuple(found)
+
+
 def stop_altitude_m(situation: Situation) -> float:
     """Altitude above home at which the drone comes to rest when it is told to stop now."""
     climb = -situation.down_mps
@@ -174,9 +206,9 @@ class Leg:
     @cached_property
     def ground(self) -> BaseGeometry:
         """The ground below the leg: a triangle, a line or a point."""
-        if self.corners:
-            return shapely.MultiPoint((self.start, self.stop, self.target, *self.corners)).convex_hull
         start, turn, target = self.start, self.turn, self._beyond
+        if self.corners:
+            return shapely.MultiPoint((start, turn, self.target, target, *self.corners)).convex_hull
         if start == turn:
             return shapely.Point(start) if start == target else shapely.LineString((start, target))
         if turn == target:
@@ -189,6 +221,8 @@ class Leg:
     @property
     def _beyond(self) -> XY:
         """How far the drone may overshoot: one that turns on its way arrives askew and swings past the target."""
+        if self.drifts:
+            return self.target
         (tx, ty), (x, y) = self.turn, self.target
         along = math.hypot(x - tx, y - ty)
         over = OVERSHOOT * math.hypot(self.stop[0] - self.start[0], self.stop[1] - self.start[1])

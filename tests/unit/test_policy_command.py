@@ -1,0 +1,145 @@
+"""`fractus policy check`: the engine's answer from manifests, and one sentence for what it cannot read."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+import shutil
+from typing import Any
+
+import pytest
+import yaml
+from click.testing import CliRunner, Result
+from fractus_operator.commands.policy import policy
+
+FIELD = pathlib.Path(__file__).parents[2] / "examples" / "field"
+DRONE = str(FIELD / "place.yaml")
+HERE = "39.370270,22.930291,10"
+INSIDE = {"lat": 39.370540, "lon": 22.932629}
+FREE = {"lat": 39.3704, "lon": 22.9302, "alt": 10}
+
+
+def run(*options: str, policies: str = str(FIELD), drone: str = DRONE) -> Result:
+    return CliRunner().invoke(policy, ["check", "--policies", policies, "--drone", drone, *options])
+
+
+def ask(method: str, args: dict[str, Any] | None = None, *options: str, at: str = HERE, **paths: str) -> dict[str, Any]:
+    result = run("--method", method, "--args", json.dumps(args or {}), "--at", at, "-o", "json", *options, **paths)
+    assert result.exit_code == 0, result.output
+    answer: dict[str, Any] = json.loads(result.output)
+    return answer
+
+
+def test_what_is_allowed() -> None:
+    answer = ask("Goto", FREE)
+    assert {k: answer[k] for k in ("action", "takeover", "reason", "policies")} == {
+        "action": "allow", "takeover": None, "reason": "", "policies": [],
+    }  # fmt: skip
+    assert answer["args"] == {**FREE, "reference": "home"}
+
+
+def test_what_is_corrected_denied_and_taken_over() -> None:
+    high = ask("Goto", {**FREE, "alt": 20})
+    assert (high["action"], high["args"]["alt"], high["policies"]) == ("correct", 15.0, ["low-flight"])
+    assert "15.0 m" in high["reason"]
+    forbidden = ask("Goto", INSIDE, at="39.370701,22.932303,10")
+    assert (forbidden["action"], forbidden["takeover"], forbidden["args"]) == ("takeover", "revoke", None)
+    assert forbidden["policies"] == ["keep-away"]
+    assert ask("Disarm")["action"] == "deny"
+    assert ask("Disarm", at="39.370270,22.930291,0")["action"] == "allow"
+
+
+def test_the_camera() -> None:
+    seen = ask("CaptureImage", at="39.370450,22.9318,10")
+    assert (seen["action"], seen["code"]) == ("deny", "PrivacyZone")
+    assert ask("CaptureImage", at="39.3700,22.9300,10")["action"] == "allow"
+
+
+def test_motion_counts() -> None:
+    still = ask("Goto", {"lat": 39.3708, "lon": 22.9322, "alt": 10}, at="39.37015,22.9323,10")
+    assert still["action"] == "allow"
+    fast = ask("Goto", {"lat": 39.3708, "lon": 22.9322, "alt": 10}, "--velocity", "0,7,0", at="39.37015,22.9323,10")
+    assert fast["brakeFirst"] or fast["action"] != "allow"
+
+
+def test_a_component_has_the_grant_that_the_operator_would_write() -> None:
+    application = ("--application", str(FIELD / "application.yaml"), "--component")
+    assert ask("Goto", {"lat": 39.370674, "lon": 22.930233}, *application, "Navigator")["action"] == "allow"
+    outside = ask("Goto", {"lat": 39.3750, "lon": 22.930233}, *application, "Navigator")
+    assert (outside["action"], outside["policies"]) == ("deny", ["operation-area"])
+    assert ask("Land", {}, *application, "Navigator")["code"] == "MethodNotGranted"
+    assert ask("Goto", FREE, *application, "AerialViewer")["code"] == "MethodNotGranted"
+
+
+def test_times_homes_and_ways_home(tmp_path: pathlib.Path) -> None:
+    shutil.copytree(FIELD, tmp_path / "field")
+    file = tmp_path / "field" / "policies.yaml"
+    bodies = list(yaml.safe_load_all(file.read_text()))
+    for body in bodies:
+        if body["metadata"]["name"] == "keep-away":
+            body["spec"]["validUntil"] = "2026-06-01T12:00:00Z"
+        if body["metadata"]["name"] == "low-flight":
+            body["spec"] |= {"altitudeReference": "amsl", "upperLimit": 115, "lowerLimit": 105}
+    file.write_text(yaml.safe_dump_all(bodies))
+    paths = {"policies": str(tmp_path / "field"), "drone": str(tmp_path / "field" / "place.yaml")}
+    home, near = ("--home", "39.37,22.93,100"), "39.370701,22.932303,10"
+    before = ask("Goto", INSIDE, "--time", "2026-06-01T11:59:59Z", *home, at=near, **paths)
+    after = ask("Goto", INSIDE, "--time", "2026-06-01T14:00:00+02:00", *home, at=near, **paths)
+    assert (before["action"], after["action"]) == ("takeover", "allow")
+    assert ask("Goto", {**FREE, "alt": 20}, *home, **paths)["args"]["alt"] == 15.0
+    behind = {"lat": 39.37055, "lon": 22.93315}
+    spot, early = "39.37000,22.93315,10", ("--time", "2026-06-01T11:00:00Z", *home)
+    assert ask("Goto", behind, *early, at=spot, **paths)["code"] == "WayHomeBlocked"
+    assert ask("Goto", behind, *early, "--way-home", "retraced", at=spot, **paths)["action"] == "allow"
+
+
+def test_arguments_with_and_without_their_units() -> None:
+    for args in ({"north": 1, "east": 0, "hold": 1}, {"north_mps": 1, "east_mps": 0, "hold_s": 1}):
+        assert ask("SetVelocity", args)["args"]["north_mps"] == 1.0
+    assert ask("Takeoff", {"altitude": 12}, at="39.37,22.93,0")["args"] == {"altitude_m": 12.0}
+    assert ask("SetSpeed", {"speed": 99})["args"] == {"speed_mps": 5.0}
+
+
+def test_text() -> None:
+    text = run("--method", "Goto", "--args", json.dumps({**FREE, "alt": 20}), "--at", HERE).output
+    assert text.splitlines()[0] == "action:   correct"
+    assert "alt=15" in text
+    assert "policies: low-flight" in text
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (("--method", "Fly", "--at", HERE), "there is no method Fly"),
+        (("--method", "Goto", "--at", HERE), "Goto needs lat and lon"),
+        (("--method", "Goto", "--args", "{", "--at", HERE), "no JSON"),
+        (("--method", "Goto", "--args", "[1]", "--at", HERE), "JSON object"),
+        (("--method", "Goto", "--args", '{"lat": "x", "lon": 1}', "--at", HERE), "lat must be a number"),
+        (("--method", "Goto", "--args", '{"lat": 1, "lon": 1, "up": 1}', "--at", HERE), "Goto has no up"),
+        (("--method", "Land", "--args", '{"lat": 1}', "--at", HERE), "takes no arguments"),
+        (("--method", "Land", "--at", "1,2"), "3 numbers"),
+        (("--method", "Land", "--at", "nan,2,3"), "3 numbers"),
+        (("--method", "Land", "--at", "91,2,3"), "lat must be"),
+        (("--method", "Land", "--at", HERE, "--time", "2026-01-01T00:00:00"), "no time with its zone"),
+        (("--method", "Land", "--at", HERE, "--component", "Navigator"), "together"),
+        (("--method", "Land", "--at", HERE, "--application", DRONE, "--component", "X"), "one Application"),
+        (
+            ("--method", "Land", "--at", HERE, "--application", str(FIELD / "application.yaml"), "--component", "X"),
+            "no component X",
+        ),
+    ],
+)
+def test_bad_input(options: tuple[str, ...], sentence: str) -> None:
+    result = run(*options)
+    assert result.exit_code in {1, 2}
+    assert sentence in result.output
+    assert "Traceback" not in result.output
+
+
+def test_a_manifest_without_a_drone() -> None:
+    result = run("--method", "Land", "--at", HERE, drone=str(FIELD / "application.yaml"))
+    assert (result.exit_code, "one Drone" in result.output) == (1, True)
+
+
+def test_an_argument_out_of_range_is_an_answer() -> None:
+    assert ask("Goto", {"lat": 95, "lon": 0})["code"] == "InvalidArgument"

@@ -217,7 +217,10 @@ class Deployments:
         known = memory.compiled
         if known is not None and known[0] == basis and known[1] is decided:
             return known[2]
-        grants = compile_grants(application, decided, inventory, self._settings, [grant.spec for grant in present])
+        before = {grant.spec.instance: grant.spec.model_copy(update={"issued_at": None}) for grant in present}
+        made = compile_grants(application, decided, inventory, self._settings, [grant.spec for grant in present])
+        # Areas have many points: what equals the present grant is that one, and not kept twice.
+        grants = tuple(same if (same := before.get(spec.instance)) == spec else spec for spec in made)
         memory.compiled = (basis, decided, grants)
         return grants
 

@@ -29,7 +29,7 @@ from fractus_operator.hosts import Asked, BookedHosts, Bookings, ByName, correct
 from fractus_operator.kinds import Body, Key, Kind
 from fractus_operator.labels import APPLICATION_LABEL, MANAGED_SELECTOR, NAMESPACE_LABEL, label_value
 from fractus_operator.pods import PodView, read_host, read_pod
-from fractus_operator.reading import Broken, Submitted, keeping_broken, read_submitted, reader
+from fractus_operator.reading import Broken, Makes, Submitted, keeping_broken, read_submitted, reader
 from fractus_operator.reflector import Reflector
 from fractus_operator.rides import Flown, host_key
 from fractus_operator.store import Store
@@ -68,8 +68,9 @@ class LiveInventory:
         managed = {"labelSelector": MANAGED_SELECTOR}
         self.hosts = Reflector(store, kinds.NODE, read_host, self._host_changed)
         self.pods = Reflector(store, kinds.POD, read_pod, self._pod_changed)
-        self.drones = Reflector(store, kinds.DRONE, reader(Drone), self._drone_changed)
-        self.edge_nodes = Reflector(store, kinds.EDGE_NODE, reader(EdgeNode), self._edge_node_changed)
+        makes = Makes()
+        self.drones = Reflector(store, kinds.DRONE, makes.sharing(reader(Drone)), self._drone_changed)
+        self.edge_nodes = Reflector(store, kinds.EDGE_NODE, makes.sharing(reader(EdgeNode)), self._edge_node_changed)
         self.depots = Reflector(store, kinds.DEPOT, reader(Depot), self._depot_changed)
         self.zones = Reflector(store, kinds.ZONE, keeping_broken(Zone), self._spec_changed(kinds.ZONE))
         self.policies = Reflector(store, kinds.POLICY, keeping_broken(Policy), self._spec_changed(kinds.POLICY))

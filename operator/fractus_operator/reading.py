@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from fractus_core.api import Application, Condition, InvalidObject, Metadata, Resource
+from fractus_core.api import Application, Condition, Drone, EdgeNode, InvalidObject, Metadata, Resource
 from pydantic import ValidationError
 
 from fractus_operator.kinds import Body
@@ -15,6 +15,11 @@ from fractus_operator.kinds import Body
 logger = logging.getLogger(__name__)
 
 R = TypeVar("R", bound=Resource)
+N = TypeVar("N", Drone, EdgeNode)
+P = TypeVar("P", bound=Hashable)
+
+_MAKES = 10_000
+"""Parts that are remembered to be shared."""
 
 SETTLED = frozenset({"Completed", "Failed"})
 """Phases of an application whose mission is over."""
@@ -115,6 +120,33 @@ def reader(model: type[R]) -> Callable[[Body], R | None]:
             return None
 
     return parse
+
+
+class Makes:
+    """What nodes of one make have in common: thousands of them share one description of their services."""
+
+    def __init__(self) -> None:
+        self._known: dict[Hashable, Any] = {}
+
+    def sharing(self, parse: Callable[[Body], N | None]) -> Callable[[Body], N | None]:
+        """A parser whose results share equal parts."""
+
+        def shared(body: Body) -> N | None:
+            node = parse(body)
+            if node is None:
+                return None
+            spec = node.spec
+            parts = {"services": self._one(spec.services), "interfaces": tuple(map(self._one, spec.interfaces))}
+            parts["interfaces"] = self._one(parts["interfaces"])
+            return node.model_copy(update={"spec": spec.model_copy(update=parts)})
+
+        return shared
+
+    def _one(self, part: P) -> P:
+        if len(self._known) >= _MAKES:
+            self._known.clear()
+        found: P = self._known.setdefault(part, part)
+        return found
 
 
 def keeping_broken(model: type[R]) -> Callable[[Body], R | Broken]:

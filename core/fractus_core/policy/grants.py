@@ -23,6 +23,9 @@ from fractus_core.geo import LocalFrame, area_of, ground, middle, polygon
 from fractus_core.planning.area import OperationArea, operation_area
 from fractus_core.planning.inventory import Inventory, Settings
 
+ROUNDING_M = 0.01
+"""How far the outline of a granted area may be from the planned one: a third of the points do."""
+
 FIXED_NODE_REACH_M = 1000.0
 """Zones further than this from a fixed node do not concern it."""
 
@@ -109,14 +112,15 @@ def _drone_grant(
     home = drone.spec.home
     base = ground(home) if home is not None else depot.spec.location if depot is not None else area.start
     stand = Area(circle=Circle(center=base, radius=depot.spec.radius if depot is not None else 30.0))
-    way = shapely.union(area.shape, polygon(area.frame, stand)).convex_hull
+    shape = area.shape.simplify(ROUNDING_M)
+    way = shapely.union(shape, polygon(area.frame, stand)).convex_hull
     return GrantSpec(
         node=drone.name,
         application=_owner(application),
         component=component.name,
         instance=placed.instance,
-        operation_area=area_of(area.frame, area.shape),
-        corridor=area_of(area.frame, way),
+        operation_area=area_of(area.frame, shape),
+        corridor=area_of(area.frame, way.simplify(ROUNDING_M)),
         depot=depot.spec.location if depot is not None else None,
         home=home,
         limits=GrantedLimits(max_altitude=mobility.max_altitude, max_speed=mobility.max_speed) if mobility else None,

@@ -181,7 +181,7 @@ async def test_a_caller_that_hangs_up_does_not_free_the_shutter(world: World) ->
     await asyncio.gather(task, return_exceptions=True)
     assert world.service._exposing.busy
     held_up.set()
-    await world.capture(held())
+    await asyncio.gather(world.capture(held()), *world.service._tasks)
     assert len((await world.service.list(held()))[1]) == 2
 
 
@@ -262,6 +262,23 @@ async def test_without_a_lens_nobody_knows_how_small_faces_are(world: World, mon
     verdict, _ = await world.service.capture(held(private("blurFaces")), CaptureArgs())
     assert "nobody knows how small" in verdict.reason
     assert verdict.policies == ("p",), "80 m away, but who knows what the camera sees"
+
+
+async def test_a_picture_that_was_enlarged_has_no_larger_faces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World(tmp_path, (1600, 1600))
+    world.drone.y, world.drone.alt = 0.0, 2.0
+    small = np.zeros((100, 100, 3), np.uint8)
+    monkeypatch.setattr(world.scene, "capture", lambda _wanted: small)
+    verdict, shot = await world.service.capture(held(private("blurFaces")), CaptureArgs())
+    assert (shot.width, shot.height) == (1600, 1600)
+    assert "faces may be as small as 3 pixels" in verdict.reason
+    world.shutter.close()
+
+
+@pytest.mark.parametrize(("width", "height"), [(15, 64), (64, 9000), (8192, 8192), (8000, 16)])
+async def test_sizes_beyond_measure_are_refused(world: World, width: int, height: int) -> None:
+    assert await refusal(world.service.capture(held(), CaptureArgs(width, height))) == "InvalidArgument"
+    assert not world.scene.taken
 
 
 # Cameras that break

@@ -13,7 +13,7 @@ Pixels = npt.NDArray[np.uint8]
 """Height, width, and blue, green, red: 8 bits each."""
 
 QUALITY = 90
-MOST_PIXELS = 100_000_000
+MOST_PIXELS = 50_000_000
 MOST_BYTES = 64_000_000
 
 

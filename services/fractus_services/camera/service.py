@@ -32,7 +32,9 @@ from fractus_services.replies import Refused, refused
 
 log = logging.getLogger(__name__)
 
-MAX_PX = 8192
+MIN_PX, MAX_PX = 16, 8192
+MOST_PIXELS = 12_600_000
+"""Of a camera that has fewer itself: so many may be asked for."""
 MAX_WAITING = 8
 """So many pictures may be under way or wait for the shutter, of one component and of all."""
 MAX_OF_ONE = 4
@@ -77,8 +79,9 @@ class Body:
 
 @dataclass(frozen=True, slots=True)
 class _Exposed:
-    """What came out of an exposure, judged."""
+    """What came out of an exposure, judged; `whole_width` is that of the whole view, in pixels that the camera gave."""
 
+    name: str
     held: Held
     verdict: Verdict
     before: Situation
@@ -139,13 +142,28 @@ class CameraService:
             present: the caller's grant at a later moment; raises when there is none any more.
         """
         width, height = args.width or self._body.resolution[0], args.height or self._body.resolution[1]
-        if width > MAX_PX or height > MAX_PX or width < 16 or height < 16:
-            reason = f"{width}x{height} pixels is not between 16x16 and {MAX_PX}x{MAX_PX}; ask for another size"
-            raise refused(Verdict("deny", None, "InvalidArgument", reason))
+        self._check_size(width, height)
         # A caller that hangs up does not free the shutter before the picture is done.
         return await self._finished(
             self._taken(owner_of(held), replace(args, width=width, height=height), present or (lambda: held))
         )
+
+    def _check_size(self, width: int, height: int) -> None:
+        """Refuse sizes for which the camera's picture, before it is cropped, would take too much memory."""
+        native = self._body.resolution
+        if not (MIN_PX <= width <= MAX_PX and MIN_PX <= height <= MAX_PX):
+            reason = (
+                f"{width}x{height} pixels is not between {MIN_PX}x{MIN_PX} and {MAX_PX}x{MAX_PX}; ask for another size"
+            )
+            raise refused(Verdict("deny", None, "InvalidArgument", reason))
+        whole = source_size(width, height, native)
+        most = max(native[0] * native[1], MOST_PIXELS)
+        if whole[0] * whole[1] > most * 1.01:
+            reason = (
+                f"{width}x{height} pixels would be cut from {whole[0]}x{whole[1]}, more than {most / 1e6:.1f} megapixels;"
+                f" ask for less, or for the proportions of {native[0]}x{native[1]}"
+            )
+            raise refused(Verdict("deny", None, "InvalidArgument", reason))
 
     async def _finished(self, work: Coroutine[Any, Any, _T]) -> _T:
         task = asyncio.get_running_loop().create_task(work)
@@ -191,7 +209,11 @@ class CameraService:
                 self._allow(call, held, after, always=False),
                 self._checked(call, held, judge_privacy(now, held.compiled, after), after),
             ]
-            return _Exposed(held, _together(verdicts), now, after, pictures, width)
+            # Enlarging a picture does not make its faces easier to find.
+            shown = min(width, *(picture.shape[1] for picture in pictures))
+            moment = datetime.fromtimestamp(after.time_s, UTC).strftime("%Y%m%d%H%M%S%f")[:17]
+            name = f"{moment}-{next(self._numbers) % 10000:04d}.jpg"
+            return _Exposed(name, held, _together(verdicts), now, after, pictures, shown)
 
     async def _kept(self, call: Call, exposed: _Exposed) -> tuple[Verdict, Shot]:
         args, held, verdict = call.args, exposed.held, exposed.verdict
@@ -202,6 +224,7 @@ class CameraService:
         before, after = Pose.of(exposed.before), Pose.of(exposed.after)
         moment_s = float(exposed.after.time_s)
         upright = is_upright(exposed.before.lens, exposed.before)
+        whole_width = source_size(args.width, args.height, self._body.resolution)[0]
 
         def work() -> bytes:
             pictures = [fitted(one, args.width, args.height) for one in exposed.pictures]
@@ -210,12 +233,11 @@ class CameraService:
             data = encoded(picture)
             if verdict.filters:
                 return data
-            return tagged(data, facts(after, moment_s, self._body.model, exposed.whole_width))
+            return tagged(data, facts(after, moment_s, self._body.model, whole_width))
 
         data = await asyncio.to_thread(work)
-        name = datetime.fromtimestamp(moment_s, UTC).strftime("%Y%m%d%H%M%S%f")[:17]
         shot = Shot(
-            f"{name}-{next(self._numbers) % 10000:04d}.jpg", moment_s, args.width, args.height, len(data), before, after,
+            exposed.name, moment_s, args.width, args.height, len(data), before, after,
             face_px, chosen.filters,
         )  # fmt: skip
         await asyncio.to_thread(self._album.add, owner_of(held), shot, data)

@@ -24,9 +24,10 @@ STALE_S = 1.0
 RETRY_S = 1.0
 UNTOLD_ERROR_M = 10.0
 """Position error of a mobility service that tells none."""
-TILT_ERROR_DEG = 4.0
-YAW_ERROR_DEG = 15.0
-"""Bounds of an autopilot's attitude errors in calm flight: both tilts together, and the compass."""
+TILT_ERROR_DEG = 10.0
+YAW_ERROR_DEG = 20.0
+"""Bounds of an autopilot's attitude errors, both tilts together and the compass, with the tenth of a second that a
+measurement is old when it is told."""
 TURN_DEG_S = 60.0
 """How fast an airframe turns at most while nobody looks."""
 

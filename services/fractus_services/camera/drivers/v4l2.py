@@ -10,7 +10,7 @@ import numpy as np
 from fractus_services.camera.drivers import CameraFailed, Wanted
 from fractus_services.camera.imaging import Pixels, opencv
 
-_STALE_FRAMES = 2
+_STALE_FRAMES = 4
 """Pictures that the driver's buffers hold from before."""
 
 

@@ -41,7 +41,7 @@ def judge_access(call: Call, now: Situation, grant: CompiledGrant) -> Verdict | 
 def _outside_operation_area(method: str, now: Situation, grant: CompiledGrant) -> Verdict | None:
     if now.lat is None or now.lon is None:
         return deny("PositionUnknown", f"{method} needs a known position; wait for a fix")
-    here = shapely.Point(grant.frame.xy(now.lat, now.lon))
+    here = shapely.points(grant.frame.xy(now.lat, now.lon))
     if grant.operation is None or grant.operation.covers(here):
         return None
     away_m = grant.operation.distance(here)
@@ -76,7 +76,7 @@ def _matching(
             found |= {p.rule.name: p.rule for p in patches.patches if p.in_force(now.time_s)}
         return ordered(found)
     if patches.patches:
-        here = shapely.Point(grant.frame.xy(now.lat, now.lon))
+        here = shapely.points(grant.frame.xy(now.lat, now.lon))
         slack_m = 0.0 if certain else now.altitude_error_m
         air = Air(here, distance_m, now.altitude_m - slack_m, now.altitude_m + slack_m)
         for patch in patches.near(air, now, grant.flat_terrain):

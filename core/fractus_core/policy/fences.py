@@ -94,10 +94,10 @@ def _operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: fl
     operation, border = grant.operation, grant.operation_border
     if operation is None or border is None or grant.passage is None or grant.passage_border is None:
         return
-    target = shapely.Point(leg.target)
+    target = shapely.points(leg.target)
     homeward = False
     if now.home is not None:
-        homeward = target.distance(shapely.Point(grant.frame.xy(now.home.lat, now.home.lon))) <= HOME_RADIUS_M
+        homeward = math.dist(leg.target, grant.frame.xy(now.home.lat, now.home.lon)) <= HOME_RADIUS_M
     vertical = leg.start == leg.target
     within = operation.covers(target) and not border.dwithin(target, margin_m)
     homeward = homeward or (leg.drifts and _approaches(leg, now, grant, operation))
@@ -120,7 +120,7 @@ def _operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: fl
 
 def _approaches(leg: Leg, now: Situation, grant: CompiledGrant, operation: BaseGeometry) -> bool:
     """Whether a drone outside the operation area comes nearer to it, or to its home."""
-    stop, end = shapely.Point(leg.stop), shapely.Point(leg.target)
+    stop, end = shapely.points(leg.stop), shapely.points(leg.target)
     if operation.covers(stop):
         return False
     if operation.distance(end) < operation.distance(stop):
@@ -168,7 +168,7 @@ def _comes_level(patch: Patch, leg: Leg, now: Situation, grant: CompiledGrant) -
 
 def _exclusion_breach(patch: Patch, leg: Leg, margin_m: float, enters: bool) -> Breach:
     shape, name = patch.shape, patch.rule.name
-    target = shapely.Point(leg.target)
+    target = shapely.points(leg.target)
     if shape.intersects(target):
         depth_m = shape.boundary.distance(target)
         code, reason = "InsideExclusionZone", f"the target is {depth_m:.1f} m inside zone {patch.zone}"
@@ -222,7 +222,7 @@ def _leaves_by_height(fence: Inclusion, shape: BaseGeometry, leg: Leg, now: Situ
 
 def _inclusion_breach(fence: Inclusion, shape: BaseGeometry, border: BaseGeometry, leg: Leg, margin_m: float) -> Breach:
     name = fence.rule.name
-    target = shapely.Point(leg.target)
+    target = shapely.points(leg.target)
     zones = ", ".join(dict.fromkeys(p.zone for p in fence.patches)) or "its zones"
     if shape.is_empty:
         code, reason = "OutsideInclusionZone", f"none of {zones} allows this altitude"
@@ -270,14 +270,14 @@ def _leads_out(shape: BaseGeometry, leg: Leg, margin_m: float, clearance_m: floa
     border = shape.boundary
     outer = shape.buffer(margin_m)
     line = leg.line
-    target = shapely.Point(leg.target)
+    target = shapely.points(leg.target)
     if outer.intersects(target):
         return False
     return _monotone(line.intersection(outer), leg.stop, lambda point: -_signed(shape, border, point))
 
 
 def _returns(leg: Leg, inner: BaseGeometry, clearance: Callable[[BaseGeometry], float]) -> bool:
-    target = shapely.Point(leg.target)
+    target = shapely.points(leg.target)
     if not inner.intersects(target):
         return False
     return _monotone(leg.line.difference(inner), leg.stop, clearance)
@@ -289,7 +289,7 @@ def _monotone(part: BaseGeometry, begin: XY, clearance: Callable[[BaseGeometry],
         return True
     if not isinstance(part, shapely.LineString | shapely.Point):
         return False
-    if shapely.Point(begin).distance(part) > 1e-6:
+    if shapely.points(begin).distance(part) > 1e-6:
         return False
     last = float("-inf")
     for i in range(_SAMPLES + 1):
@@ -310,7 +310,7 @@ def _signed(shape: BaseGeometry, border: BaseGeometry, point: BaseGeometry) -> f
 def last_legal(leg: Leg, found: list[Breach]) -> XY | None:
     """The furthest point of a leg that no breached fence objects to, or None when there is none worth flying to."""
     line = leg.line
-    start = shapely.Point(leg.stop)
+    start = shapely.points(leg.stop)
     if not isinstance(line, shapely.LineString):
         return None
     reach = line.length

@@ -37,6 +37,8 @@ from fractus_core.policy.routes import route
 from fractus_core.policy.values import POSITION_UNKNOWN, Call, GotoArgs, Situation, Verdict, deny
 
 MAX_RANGE_M = 100_000.0
+NEAR_DEG = 30.0
+"""Nobody asks further whether a target so near, in degrees, lies on the frame's side of the globe."""
 
 
 def judge_goto(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
@@ -121,7 +123,10 @@ class _Aim:
 
 def _beyond(args: GotoArgs, grant: CompiledGrant) -> bool:
     """Whether the target lies on the far side of the globe, where the frame folds over."""
-    x, y = grant.frame.xy(args.lat, args.lon)
+    frame = grant.frame
+    if abs(args.lat - frame.lat) < NEAR_DEG and abs(args.lon - frame.lon) < NEAR_DEG:
+        return False
+    x, y = frame.xy(args.lat, args.lon)
     lat, lon = grant.frame.latlon(x, y)
     return abs(lat - args.lat) > 1e-6 or abs((lon - args.lon + 180.0) % 360.0 - 180.0) > 1e-5
 
@@ -162,7 +167,7 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Clamped])
         )
     asked = request.args.speed_mps if aim.speed_mps is None else aim.speed_mps
     speed = clamp("Speed", "m/s", now.speed_setpoint_mps if asked is None else asked, speed_bounds(grant, now, air))
-    problem = height_on_entry(shapely.Point(request.at), now, bounds, height_margin_m(now))
+    problem = height_on_entry(shapely.points(request.at), now, bounds, height_margin_m(now))
     if problem is not None:
         return problem
     if isinstance(speed, Verdict):

@@ -47,13 +47,13 @@ def monitor(now: Situation, grant: CompiledGrant) -> Verdict | None:
     start = grant.frame.xy(now.lat, now.lon)
     stop = stop_point(now, start)
     rest_m = stop_altitude_m(now)
-    way = shapely.Point(start) if start == stop else shapely.LineString((start, stop))
+    way = shapely.points(start) if start == stop else shapely.linestrings((start, stop))
     lower = min(now.altitude_m, rest_m) - now.altitude_error_m
     upper = max(now.altitude_m, rest_m) + now.altitude_error_m
     ahead = _Ahead(
         Air(way, now.position_error_m + STRAY * now.airframe.tracking_m, lower, upper),
-        shapely.Point(start),
-        shapely.Point(stop),
+        shapely.points(start),
+        shapely.points(stop),
     )
     found = _fences(now, grant, ahead)
     if found:
@@ -153,7 +153,7 @@ def _heights(now: Situation, grant: CompiledGrant, start: XY, stop: XY, rest_m: 
     """
     if grant.max_altitude_m is None and not grant.altitude_limits:
         return None
-    bounds = altitude_bounds(grant, now, Air(shapely.Point(start), 0.0, now.altitude_m, now.altitude_m))
+    bounds = altitude_bounds(grant, now, Air(shapely.points(start), 0.0, now.altitude_m, now.altitude_m))
     if isinstance(bounds, Verdict):
         sinking = now.down_mps > -SINKS_MPS
         return None if sinking else Verdict("deny", None, bounds.code, bounds.reason, bounds.policies, "hover")
@@ -197,7 +197,7 @@ def _speeds(now: Situation, grant: CompiledGrant, start: XY) -> Verdict | None:
     if grant.max_speed_mps is None and not grant.speed_limits:
         return None
     speed = math.hypot(now.north_mps, now.east_mps)
-    bounds = speed_bounds(grant, now, Air(shapely.Point(start), 0.0, now.altitude_m, now.altitude_m))
+    bounds = speed_bounds(grant, now, Air(shapely.points(start), 0.0, now.altitude_m, now.altitude_m))
     over = strictest(bounds, above=True)
     if over is None or over.upper is None or speed <= over.upper * 1.1 + 1.0:
         return None

@@ -208,15 +208,15 @@ class Leg:
         """The ground below the leg: a triangle, a line or a point."""
         start, turn, target = self.start, self.turn, self._beyond
         if self.corners:
-            return shapely.MultiPoint((start, turn, self.target, target, *self.corners)).convex_hull
+            return shapely.convex_hull(shapely.multipoints((start, turn, self.target, target, *self.corners)))
         if start == turn:
-            return shapely.Point(start) if start == target else shapely.LineString((start, target))
+            return shapely.points(start) if start == target else shapely.linestrings((start, target))
         if turn == target:
-            return shapely.LineString((start, turn))
+            return shapely.linestrings((start, turn))
         doubled = (turn[0] - start[0]) * (target[1] - start[1]) - (turn[1] - start[1]) * (target[0] - start[0])
         if abs(doubled) < 1e-6:
-            return shapely.MultiPoint((start, turn, target)).convex_hull
-        return shapely.Polygon((start, turn, target))
+            return shapely.convex_hull(shapely.multipoints((start, turn, target)))
+        return shapely.polygons((start, turn, target))
 
     @property
     def _beyond(self) -> XY:
@@ -233,12 +233,12 @@ class Leg:
     @cached_property
     def unavoidable(self) -> BaseGeometry:
         """The part that the drone flies whatever it is told."""
-        return shapely.Point(self.start) if self.start == self.stop else shapely.LineString((self.start, self.stop))
+        return shapely.points(self.start) if self.start == self.stop else shapely.linestrings((self.start, self.stop))
 
     @cached_property
     def line(self) -> BaseGeometry:
         """From where the drone comes to rest straight to the target."""
-        return shapely.Point(self.stop) if self.stop == self.target else shapely.LineString((self.stop, self.target))
+        return shapely.points(self.stop) if self.stop == self.target else shapely.linestrings((self.stop, self.target))
 
 
 def standing(at: XY, lower_m: float, upper_m: float) -> Leg:

@@ -32,7 +32,7 @@ def straight_home_blocked(
         return None
     home = grant.frame.xy(now.home.lat, now.home.lon)
     height_m = max(altitude_m, now.airframe.return_altitude_m)
-    lane = shapely.LineString((target, home)) if target != home else shapely.Point(home)
+    lane = shapely.linestrings((target, home)) if target != home else shapely.points(home)
     anything = grant.exclusions.near(Air(lane, margin, -slack, height_m + slack), now, grant.flat_terrain)
     if not grant.inclusions and next(anything, None) is None:
         return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
+from operator import attrgetter
 from typing import Literal
 
 from fractus_core.api.geometry import Reference
@@ -243,24 +244,24 @@ class Situation:
     @property
     def sound(self) -> bool:
         """Whether every figure is a number."""
-        figures = [getattr(self, name) for name in _FIGURES]
-        figures += [getattr(self.airframe, name) for name in _MOTION]
+        figures = (*_FIGURES(self), *_MOTION(self.airframe))
         if self.home is not None:
-            figures += [self.home.lat, self.home.lon, self.home.amsl_m]
+            figures += (self.home.lat, self.home.lon, self.home.amsl_m)
         if self.attitude is not None:
-            figures += [getattr(self.attitude, name) for name in _TURNS]
+            figures += _TURNS(self.attitude)
         if self.lens is not None:
-            figures += [getattr(self.lens, name) for name in _VIEW]
-        return all(figure is None or math.isfinite(figure) for figure in figures)
+            figures += _VIEW(self.lens)
+        # A sum of figures is finite only if all of them are.
+        return math.isfinite(sum(figure for figure in figures if figure is not None))
 
 
-_FIGURES = (
+_FIGURES = attrgetter(
     "time_s", "lat", "lon", "altitude_m", "north_mps", "east_mps", "down_mps", "position_error_m", "altitude_error_m",
     "latency_s", "speed_setpoint_mps", "forward_mps2", "relief_m",
 )  # fmt: skip
-_MOTION = tuple(f.name for f in fields(Airframe))
-_TURNS = tuple(f.name for f in fields(Attitude))
-_VIEW = tuple(f.name for f in fields(Lens))
+_MOTION = attrgetter(*(f.name for f in fields(Airframe)))
+_TURNS = attrgetter(*(f.name for f in fields(Attitude)))
+_VIEW = attrgetter(*(f.name for f in fields(Lens)))
 
 
 FilterAction = Literal["black", "removeBackground", "blurMedian", "blurAverage", "blurFaces"]

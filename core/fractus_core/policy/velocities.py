@@ -50,7 +50,7 @@ def judge_speed(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
         return deny("InvalidArgument", "SetSpeed needs its arguments")
     if at is None:
         return POSITION_UNKNOWN
-    bounds = speed_bounds(grant, now, Air(shapely.Point(at), margin_m(now), now.altitude_m, now.altitude_m))
+    bounds = speed_bounds(grant, now, Air(shapely.points(at), margin_m(now), now.altitude_m, now.altitude_m))
     clamped = clamp("Speed", "m/s", args.speed_mps, bounds)
     if isinstance(clamped, Verdict):
         return clamped
@@ -78,7 +78,7 @@ class _Setpoint:
     def air(self) -> Air:
         """Where limits may hold for it."""
         leg = self.leg
-        return Air(leg.ground, margin_m(self.now), leg.lower_m, leg.upper_m)
+        return Air(leg.ground, _margin_m(self.now), leg.lower_m, leg.upper_m)
 
 
 def judge_velocity(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
@@ -128,7 +128,7 @@ def _within_heights(setpoint: _Setpoint) -> Verdict | None:
     if isinstance(bounds, Verdict):
         return bounds
     problem = conflict("Altitude", "m", bounds) or height_on_entry(
-        shapely.Point(setpoint.at), now, bounds, height_margin_m(now)
+        shapely.points(setpoint.at), now, bounds, height_margin_m(now)
     )
     if problem is not None:
         return problem
@@ -227,4 +227,13 @@ def _scaled(args: VelocityArgs, share: float) -> VelocityArgs:
 
 def _breached(setpoint: _Setpoint, args: VelocityArgs) -> list[Breach]:
     now = setpoint.now
-    return breaches(swept(now, setpoint.at, args), now, setpoint.grant, margin_m(now), height_margin_m(now))
+    slack = height_margin_m(now) + now.airframe.tracking_m
+    return breaches(swept(now, setpoint.at, args), now, setpoint.grant, _margin_m(now), slack)
+
+
+def _margin_m(now: Situation) -> float:
+    """What a velocity keeps from fences.
+
+    It leads on from wherever wind has the drone at this moment, not to a place: what the drone strays counts twice.
+    """
+    return margin_m(now) + now.airframe.tracking_m

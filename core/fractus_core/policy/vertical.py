@@ -18,7 +18,7 @@ def judge_takeoff(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     if at is None or not isinstance(args, TakeoffArgs):
         return POSITION_UNKNOWN if at is None else deny("InvalidArgument", "Takeoff needs its arguments")
     lower, upper = sorted((now.altitude_m, args.altitude_m))
-    bounds = altitude_bounds(grant, now, Air(shapely.Point(at), margin_m(now), lower, upper))
+    bounds = altitude_bounds(grant, now, Air(shapely.points(at), margin_m(now), lower, upper))
     clamped = bounds if isinstance(bounds, Verdict) else clamp("Altitude", "m above home", args.altitude_m, bounds)
     if isinstance(clamped, Verdict):
         return clamped

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import pytest
 from click.testing import CliRunner, Result
 from fractus_sim.experiment import parse, run
 from fractus_sim.experiment.cli import experiment as command
-from fractus_sim.experiment.processes import Processes
+from fractus_sim.experiment.processes import Ports, Processes, listening
 from mcap.reader import make_reader
 from pymavlink import mavutil
 
@@ -169,3 +170,19 @@ def test_processes_that_do_not_go_are_killed(tmp_path: Path) -> None:
     processes.wait("stubborn", lambda: "up" in processes.log("stubborn").read_text(), 20)
     processes.stop_all()
     assert processes.exit_code("stubborn") == -signal.SIGKILL
+
+
+def test_an_autopilot_that_runs_already_is_flown_and_harmed_over_tcp(tmp_path: Path) -> None:
+    processes, port = Processes(tmp_path), Ports().take()
+    link, home = f"tcp:127.0.0.1:{port}", "50.8637,4.6785,25"
+    arguments = ["--listen", link, "--home", home, "--speedup", "5", "--ready-after", "2", "--param", "FS_GCS_ENABLE=1"]
+    processes.start("sitl", [sys.executable, "-m", "fractus_sim.vehicle", *arguments], dict(os.environ))
+    try:
+        processes.wait("sitl", lambda: listening(port), 30)
+        vehicle = {"name": "d", "connection": link, "task": TASK[:2]}
+        checks = [{"check": "mode", "mode": "LAND", "after": "gpsLoss"}, {"check": "statustext", "matches": "EKF"}]
+        faults = [{"fault": "gpsLoss", "at": 5}]
+        outcome = run(parse(content(vehicles=[vehicle], faults=faults, checks=checks, speedup=5)), tmp_path / "out")
+    finally:
+        processes.stop_all()
+    assert outcome.holds, (outcome.problem, outcome.verdicts)

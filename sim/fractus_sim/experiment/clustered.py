@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,7 @@ class ClusterStage(Stage):
         Raises:
             ExperimentError: something did not come up.
         """
-        try:
+        with _explained():
             images = build_images(ROOT, targets=(*OWN_TARGETS, *self._part.images), report=self.tell)
             self._cluster.up(images=images)
             programs = ensure_binaries(("kubectl", "helm"), report=self.tell)
@@ -74,8 +75,6 @@ class ClusterStage(Stage):
                 self._kube.install(release, ROOT / "charts" / release)
             self._kube.apply(self._surroundings)
             wait_ready(self._kube, DRONE_READY_S, lambda _line: None)
-        except (ClusterError, DemoError) as error:
-            raise ExperimentError(str(error)) from None
         self._began_s = time.monotonic()
 
     def tick(self) -> Moment:
@@ -89,10 +88,8 @@ class ClusterStage(Stage):
         Raises:
             ExperimentError: the API server refused one.
         """
-        try:
+        with _explained():
             self._running_kube().apply(self._applications)
-        except DemoError as error:
-            raise ExperimentError(str(error)) from None
         self._watcher.start()
 
     @property
@@ -102,19 +99,23 @@ class ClusterStage(Stage):
 
     def cut_link(self, vehicle: str) -> None:
         """Cut the node's uplink; services and vehicle go on."""
-        self._cluster.node(vehicle).cut_link()
+        with _explained():
+            self._cluster.node(vehicle).cut_link()
 
     def heal_link(self, vehicle: str) -> None:
         """Give the node its uplink back."""
-        self._cluster.node(vehicle).heal_link()
+        with _explained():
+            self._cluster.node(vehicle).heal_link()
 
     def power_off(self, node: str) -> None:
         """Pull the node's power; its vehicle flies on."""
-        self._cluster.set_power(node, on=False)
+        with _explained():
+            self._cluster.set_power(node, on=False)
 
     def power_on(self, node: str) -> None:
         """Give it back."""
-        self._cluster.set_power(node, on=True)
+        with _explained():
+            self._cluster.set_power(node, on=True)
 
     def collect(self) -> None:
         """Read the audit logs from the drones' disks."""
@@ -132,10 +133,11 @@ class ClusterStage(Stage):
             observer.close()
         for tap in self._taps:
             tap.close()
-        if not self._was_running:
-            self._cluster.down()
-        elif self._kube is not None:
-            self._kube.delete(self._applications, DRONE_READY_S)
+        with _explained():
+            if not self._was_running:
+                self._cluster.down()
+            elif self._kube is not None:
+                self._kube.delete(self._applications, DRONE_READY_S)
 
     def _attach(self, setup: VehicleSetup) -> None:
         """Put a tap between the vehicle and whoever flies it, and attach to the vehicle."""
@@ -174,16 +176,27 @@ class ClusterStage(Stage):
         return self._kube
 
 
+@contextmanager
+def _explained() -> Iterator[None]:
+    """What goes wrong on the cluster goes wrong with the experiment.
+
+    Raises:
+        ExperimentError: a part of the cluster failed.
+    """
+    try:
+        yield
+    except (ClusterError, DemoError) as error:
+        raise ExperimentError(str(error)) from None
+
+
 def _spec(experiment: Experiment, path: Path) -> ClusterSpec:
     """The cluster with seed, wind and parameters for its vehicles, which listen behind our tap.
 
     Raises:
         ExperimentError: it cannot be read, or a vehicle of the experiment is none of its.
     """
-    try:
+    with _explained():
         spec = load_spec(path)
-    except ClusterError as error:
-        raise ExperimentError(str(error)) from None
     flying = {node.name for node in spec.nodes if node.vehicle() is not None}
     setups = {setup.name: setup for setup in experiment.setups()}
     for name in setups:
@@ -226,9 +239,7 @@ def _port(spec: ClusterSpec, name: str) -> int:
 
 def _manifests(part: ClusterPart, base: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """The Applications, and everything else that is applied before."""
-    try:
+    with _explained():
         every: list[Mapping[str, Any]] = [body for path in part.apply for body in documents(base / path)]
-    except DemoError as error:
-        raise ExperimentError(str(error)) from None
     applications = [dict(body) for body in every if body.get("kind") == "Application"]
     return applications, [dict(body) for body in every if body.get("kind") != "Application"]

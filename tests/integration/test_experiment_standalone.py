@@ -1,0 +1,84 @@
+"""Drones with their services on one machine: programs run as components, power goes and comes, nothing is left."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fractus_core.api.model import InvalidObject
+from fractus_sim.experiment import ExperimentError
+from fractus_sim.experiment.standalone import DroneSetup, Standalone
+from mobility_rig import HOME, grant
+from pymavlink import mavutil
+
+PROGRAM = """
+import asyncio, os, pathlib, fractus
+async def main():
+    (task,) = fractus.control_points()
+    async with fractus.mobility() as drone, drone.control():
+        async for state in drone.telemetry(interval_s=0.2):
+            if state.ready or state.in_air:
+                break
+        if not state.in_air:
+            await drone.arm()
+            await drone.takeoff(10)
+        print("up at", os.environ["FRACTUS_NODE"], len(task.path), flush=True)
+        if pathlib.Path("hold").exists():
+            await asyncio.sleep(600)
+print("began", flush=True)
+try:
+    asyncio.run(main())
+except fractus.ControlLost as lost:  # the autopilot's failsafe may have been quicker than the restart
+    print("lost:", lost)
+"""
+
+
+def said(ground: Standalone, words: str, count: int) -> None:
+    """Wait until the program has said something so many times."""
+    log, deadline = ground.processes.log("pilot"), time.monotonic() + 60
+    while log.read_text().count(words) < count:
+        assert time.monotonic() < deadline, log.read_text()
+        time.sleep(0.1)
+
+
+def test_a_program_flies_and_its_computer_loses_power(tmp_path: Path) -> None:
+    (tmp_path / "pilot.py").write_text(PROGRAM)
+    (tmp_path / "hold").touch()
+    with Standalone(tmp_path / "ground") as ground:
+        drone = ground.add_drone(DroneSetup("drone-1", HOME, speedup=5))
+        identity = ground.grant(grant())
+        ground.run("pilot", [sys.executable, "pilot.py"], identity, folder=tmp_path)
+        said(ground, "up at drone-1 2", 1)
+        ground.power_off("drone-1")
+        assert not ground.processes.running("pilot")
+        assert not ground.processes.running("drone-1-mobility")
+        assert ground.processes.running("drone-1-vehicle")
+        ground.check()
+        (tmp_path / "hold").unlink()
+        ground.power_on("drone-1")
+        said(ground, "began", 2)
+        assert ground.wait_program("pilot", 30) == 0
+        ground.check()
+        tlog = str(drone.tlog)
+    assert not subprocess.run(["pgrep", "-f", str(tmp_path)], capture_output=True, check=False).stdout
+    log = mavutil.mavlink_connection(tlog)
+    takeoff = log.recv_match(type="COMMAND_LONG", condition="COMMAND_LONG.command==22")
+    log.close()
+    assert takeoff is not None, "the tap of the link shows what the service told the autopilot"
+
+
+def test_what_is_wrong_is_said_at_once(tmp_path: Path) -> None:
+    with Standalone(tmp_path) as ground:
+        with pytest.raises(ExperimentError, match="there is no drone drone-1; there are none"):
+            ground.grant(grant())
+        with pytest.raises(ExperimentError, match="has no Grant"):
+            ground.environment("spiffe://fractus.dev/ns/a/app/b/component/C/instance/d")
+        bad: dict[str, Any] = {"services": {"mobility": {"maxSpeed": -1}}}
+        with pytest.raises(InvalidObject, match="maxSpeed"):
+            ground.add_drone(DroneSetup("drone-1", HOME, description=bad))
+        with pytest.raises(ExperimentError, match="drone-2-vehicle ended with"):
+            ground.add_drone(DroneSetup("drone-2", HOME, vehicle_arguments=("--no-such-option",)))

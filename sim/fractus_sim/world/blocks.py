@@ -7,7 +7,7 @@ import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -93,7 +93,7 @@ class Parking:
     heading_deg: float
 
 
-@dataclass(slots=True)
+@dataclass
 class Block:
     """One mesh of the road network.
 
@@ -113,13 +113,23 @@ class Block:
     trees: Points = field(default_factory=lambda: np.empty((0, 4)))
     parked: list[Parking] = field(default_factory=list)
 
+    @cached_property
+    def patch_boxes(self) -> Points:
+        """West, south, east and north edge of each patch, shape (n, 4)."""
+        return _boxes([patch.outline for patch in self.patches])
+
+    @cached_property
+    def roof_boxes(self) -> Points:
+        """The same of each roof."""
+        return _boxes([roof.corners for roof in self.roofs])
+
 
 class Blocks:
     """The blocks of a seed; each is laid out when it is first asked for."""
 
     def __init__(self, roads: Roads) -> None:
         self.roads = roads
-        self.block = lru_cache(maxsize=1024)(self._block)
+        self.block = lru_cache(maxsize=256)(self._block)
 
     def kind(self, i: int, j: int) -> Kind:
         """What a block is used for."""
@@ -409,6 +419,11 @@ def _scatter(site: _Site, area: shapely.Geometry, count: int, radius_m: tuple[fl
         radius, looks = radius_m[0] + (radius_m[1] - radius_m[0]) * roll.random() ** 2, roll.random()
         if shapely.contains_xy(area, x, y):
             site.trees.append((x, y, radius, looks))
+
+
+def _boxes(outlines: list[Points]) -> Points:
+    boxes = [(*outline.min(axis=0), *outline.max(axis=0)) for outline in outlines]
+    return np.array(boxes).reshape(-1, 4)
 
 
 def _corners(shape: shapely.Polygon) -> Points:

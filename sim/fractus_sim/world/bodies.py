@@ -204,9 +204,25 @@ _VEHICLES: dict[Kind, Callable[[Colour, bool], tuple[Part, ...]]] = {
 }
 
 
-def placed(thing: Thing, points: Points) -> Points:
-    """Points of a body in the world's frame."""
-    angle = math.radians(thing.heading_deg)
-    ahead, right = np.array([math.sin(angle), math.cos(angle)]), np.array([math.cos(angle), -math.sin(angle)])
-    flat = np.outer(points[:, 0], ahead) + np.outer(points[:, 1], right) + [thing.x, thing.y]
-    return np.column_stack((flat, points[:, 2]))
+def silhouette(thing: Thing) -> tuple[Part, ...]:
+    """The one part that is left of a thing which is only a few pixels long: its sides and roof in its main colour."""
+    if thing.kind == "person":
+        return _far_person(CLOTHES[thing.looks % 997 % len(CLOTHES)])
+    colour = (206, 208, 206) if thing.kind == "truck" else PAINTS[thing.looks // 128 % len(PAINTS)]
+    return _far_vehicle(thing.size_m, colour)
+
+
+@lru_cache(maxsize=128)
+def _far_vehicle(size_m: tuple[float, float, float], paint: Colour) -> tuple[Part, ...]:
+    length, width, height = size_m
+    base, roof = _outline(length, width, round_m=0.4), _outline(0.6 * length, 0.8 * width, round_m=0.2)
+    low = 0.6 * height
+    return (
+        Part(_prism(base, 0.2, base, low), _shaded(paint, 0.62), 140),
+        Part(_prism(base, low, roof, height), _shaded(paint, 0.95), 160),
+    )
+
+
+@lru_cache(maxsize=64)
+def _far_person(shirt: Colour) -> tuple[Part, ...]:
+    return (Part(_prism(_outline(0.24, 0.36, round_m=0.1), 0.0, _outline(0.27, 0.5, round_m=0.11), 1.75), shirt, 236),)

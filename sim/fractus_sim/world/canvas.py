@@ -21,6 +21,7 @@ _SHIFT = 4
 _LATTICE = 256
 _FINEST_OCTAVE_M = 0.0625
 _OCTAVES = 13
+_ENLARGED = 8
 _CROWN_PX = 160
 _CROWNS = 7
 
@@ -35,14 +36,19 @@ class Noise:
     def octave(self, octave: int, canvas: Canvas) -> NDArray[np.float32]:
         """One octave over a square tile, standard deviation below 1."""
         cell = _FINEST_OCTAVE_M * 2**octave
-        scale, size = canvas.pixel_m / cell, canvas.size
+        # What is much coarser than a pixel is worked out for every eighth one, with a rim, and enlarged.
+        step = _ENLARGED if cell >= 2 * _ENLARGED * canvas.pixel_m else 1
+        rim, size = (1, canvas.size // step + 2) if step > 1 else (0, canvas.size)
+        scale = step * canvas.pixel_m / cell
         x, y = (canvas.left_m / cell) % _LATTICE, (-canvas.top_m / cell) % _LATTICE
-        matrix = np.array([[scale, 0.0, x + scale / 2], [0.0, scale, y + scale / 2]])
+        matrix = np.array([[scale, 0.0, x + (0.5 - rim) * scale], [0.0, scale, y + (0.5 - rim) * scale]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        return np.asarray(
-            cv2.warpAffine(self._lattices[octave], matrix, (size, size), flags=flags, borderMode=cv2.BORDER_WRAP),
-            np.float32,
-        )
+        lattice = self._lattices[octave]
+        drawn = cv2.warpAffine(lattice, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_WRAP)
+        if step > 1:
+            drawn = cv2.resize(drawn, (size * step, size * step), interpolation=cv2.INTER_LINEAR)
+            drawn = drawn[step:-step, step:-step]
+        return np.asarray(drawn, np.float32)
 
     def between(self, finest_m: float, coarsest_m: float, canvas: Canvas) -> NDArray[np.float32]:
         """The sum over a tile of the octaves from one size of cell to another, those below a pixel left out."""
@@ -82,6 +88,13 @@ class Canvas:
         west, south, east, north = self.box
         (x0, y0), (x1, y1) = points.min(axis=0)[:2], points.max(axis=0)[:2]
         return bool(x0 < east + margin_m and x1 > west - margin_m and y0 < north + margin_m and y1 > south - margin_m)
+
+    def within(self, boxes: Points, margin_m: float = 0.0) -> NDArray[np.int64]:
+        """Which of some boxes (west, south, east, north), shape (n, 4), touch the tile."""
+        west, south, east, north = self.box
+        touch = (boxes[:, 0] < east + margin_m) & (boxes[:, 2] > west - margin_m)
+        touch &= (boxes[:, 1] < north + margin_m) & (boxes[:, 3] > south - margin_m)
+        return np.flatnonzero(touch)
 
     def pixels(self, points: Points) -> NDArray[np.int32]:
         """Points in metres as fixed-point pixel coordinates of OpenCV."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 from fractus_core.geo import LocalFrame
 from numpy.typing import NDArray
@@ -33,7 +34,8 @@ _AFAR: dict[Kind, Colour] = {
 }
 _SHADOW_DEPTH = 0.56
 _EARTHY, _LEAFY = np.array([0.86, 1.0, 0.98], np.float32), np.array([0.8, 1.0, 1.0], np.float32)
-_WARM = np.array([0.97, 1.0, 1.03], np.float32)
+_LIGHT = np.clip(np.outer(np.arange(256), [0.97, 1.0, 1.03]), 0, 255).astype(np.uint8).reshape(256, 1, 3)
+"""The colour of an afternoon."""
 _DASH_M, _DASH_EVERY_M, _JUNCTION_M = 3.0, 9.0, 11.0
 
 
@@ -66,8 +68,7 @@ class Landscape:
             self._roads(canvas, near)
             self._grain(canvas)
             _stand_up(canvas, blocks)
-        self._light(canvas)
-        return canvas.colour
+        return np.asarray(cv2.LUT(canvas.colour, _LIGHT), np.uint8)
 
     def _from_afar(self, canvas: Canvas, near: list[tuple[int, int]]) -> None:
         """Only what shows from kilometres away: what each block is used for, with straight borders."""
@@ -122,20 +123,14 @@ class Landscape:
         """Uneven ground: clods, tufts and stains, as rough as each material is."""
         fine = self._noise.between(0.0, 0.6, canvas) * 6.5 + self._noise.between(1.0, 4.5, canvas) * 5.5
         shift = fine * (canvas.rough.astype(np.float32) / 128.0)
-        shift += self._noise.between(8.0, 70.0, canvas) * 3.6
-        canvas.colour = np.clip(canvas.colour + shift[..., None] * _EARTHY, 0, 255).astype(np.uint8)
-
-    def _light(self, canvas: Canvas) -> None:
-        """The colour of an afternoon; and large, faint differences."""
-        broad = self._noise.between(120.0, 300.0, canvas)
-        gain = (1.0 + 0.018 * broad)[..., None] * _WARM
-        canvas.colour = np.clip(canvas.colour * gain, 0, 255).astype(np.uint8)
+        shift += self._noise.between(8.0, 70.0, canvas) * 3.6 + self._noise.between(120.0, 300.0, canvas) * 2.0
+        shifts = cv2.merge([shift * part for part in _EARTHY])
+        canvas.colour = np.asarray(cv2.add(canvas.colour, shifts, dtype=cv2.CV_8U), np.uint8)
 
 
 def _patches(canvas: Canvas, block: Block) -> None:
-    for patch in block.patches:
-        if not canvas.sees(patch.outline):
-            continue
+    for index in canvas.within(block.patch_boxes):
+        patch = block.patches[index]
         canvas.fill(patch.outline, patch.colour, patch.rough)
         if patch.rows_deg is not None and canvas.pixel_m < 1.2:
             _rows(canvas, patch, patch.rows_deg)
@@ -200,7 +195,7 @@ def _marks(canvas: Canvas, edge: Points, width_m: float, main: bool) -> None:
 
 def _stand_up(canvas: Canvas, blocks: list[Block]) -> None:
     """What is higher than the ground, after its shadow."""
-    roofs = [roof for block in blocks for roof in block.roofs if canvas.sees(roof.corners, 10.0)]
+    roofs = [block.roofs[index] for block in blocks for index in canvas.within(block.roof_boxes, 10.0)]
     trees = _trees(canvas, blocks) if canvas.pixel_m <= _TREES_DOWN_TO_M else np.empty((0, 4))
     for roof in roofs:
         canvas.shadow(roof.corners, roof.height_m)

@@ -153,6 +153,7 @@ class View:
         height_m: Of the camera above the ground.
         place: Metres east and north of the world's origin, of the point below the camera.
         turn: What a metre east and north at the camera are in the world's frame.
+        unturn: The inverse of that.
     """
 
     intrinsics: Intrinsics
@@ -160,16 +161,19 @@ class View:
     height_m: float
     place: Matrix
     turn: Matrix
+    unturn: Matrix
 
     @classmethod
     def of(cls, pose: Pose, mount: Mount, intrinsics: Intrinsics, frame: LocalFrame) -> View:
         """The view of a camera on an airframe, in the frame of a world."""
+        turn = plane_turn(frame, pose.lat, pose.lon)
         return cls(
             intrinsics,
             camera_rotation(pose, mount),
             max(pose.height_m, MIN_HEIGHT_M),
             np.array(frame.xy(pose.lat, pose.lon)),
-            plane_turn(frame, pose.lat, pose.lon),
+            turn,
+            np.linalg.inv(turn),
         )
 
     def rays(self, pixels: Matrix) -> Matrix:
@@ -199,7 +203,7 @@ class View:
 
         The pixels of points nearer than `NEAR_M` mean nothing.
         """
-        plane = (points[:, :2] - self.place) @ np.linalg.inv(self.turn).T
+        plane = (points[:, :2] - self.place) @ self.unturn.T
         camera = np.column_stack((plane, points[:, 2] - self.height_m)) @ self.rotation
         depth = camera[:, 2]
         lens = self.intrinsics

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from fractus_sim.world.optics import Matrix, View
-from fractus_sim.world.thermal import thermal
 from fractus_sim.world.tiles import TILE_PX, Picture, TileStore, pixel_m
 
 Band = Literal["rgb", "ir"]
@@ -20,7 +19,7 @@ CELL_PX = 16
 """Detail and haze are worked out once for a cell of so many pixels."""
 VISIBILITY_M = 9000.0
 FARTHEST_M = 25_000.0
-MAX_MOSAIC_PX = 24_000_000
+_SPARE_PX = 5_000_000
 _NOTHING = -1
 _LEVEL_BIAS = 0.35
 
@@ -44,12 +43,13 @@ def render_ground(view: View, store: TileStore, band: Band) -> Picture:
     lens = view.intrinsics
     cells = _Cells.of(view, store)
     picture = np.empty((lens.height, lens.width, 3), np.uint8)
-    picture[:] = np.array(SKIES[band].horizon, np.uint8)
+    beyond = np.flatnonzero((cells.levels == _NOTHING).any(axis=1))
+    if len(beyond):
+        first, last = int(beyond[0]) * CELL_PX, (int(beyond[-1]) + 1) * CELL_PX
+        cv2.rectangle(picture, (0, first), (lens.width, last), SKIES[band].horizon, -1)
     for level in np.unique(cells.levels):
         if level != _NOTHING:
             _draw_level(picture, view, store, int(level), cells)
-    if band == "ir":
-        thermal(picture)
     _add_air(picture, cells, SKIES[band])
     return picture
 
@@ -74,8 +74,8 @@ class _Cells:
         down, flat = -rays[..., 2], np.hypot(rays[..., 0], rays[..., 1])
         away = view.height_m * np.sqrt(flat**2 + down**2) / np.maximum(down, 1e-9)
         away = np.where(down > 1e-9, np.minimum(away, 1e7), 1e7)
-        # The area of a pixel on the ground is the homography's Jacobian: h^2 / f^2 / down^3.
-        size_m = view.height_m / lens.focal_px / np.maximum(down, 1e-9) ** 1.5
+        # A pixel is h / f / down wide and h / f / down^2 long; the mean leans to its length, so that nothing flickers.
+        size_m = view.height_m / lens.focal_px / np.maximum(down, 1e-9) ** 1.75
         level = np.log2(np.maximum(size_m, 1e-9) / store.ground.finest_m) + _LEVEL_BIAS
         level = np.clip(np.floor(level), 0, store.ground.levels - 1).astype(np.int64)
         level = np.where(away < FARTHEST_M, level, _NOTHING)
@@ -104,37 +104,41 @@ def _draw_level(picture: Picture, view: View, store: TileStore, level: int, cell
     mapping = to_source @ view.ground_matrix() @ shift
     target = picture[top:bottom, left:right]
     part = marked[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    drawn = cv2.warpPerspective(
-        source,
-        mapping,
-        (right - left, bottom - top),
-        dst=target if target.flags.c_contiguous and part.all() else None,
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    drawn = _warped(source, mapping, (right - left, bottom - top))
     if part.all():
-        if drawn is not target:
-            target[:] = drawn
+        target[:] = drawn
         return
     mask = np.repeat(np.repeat(part, CELL_PX, axis=0), CELL_PX, axis=1)[: bottom - top, : right - left]
-    cv2.copyTo(np.asarray(drawn, np.uint8), mask.astype(np.uint8), target)
+    cv2.copyTo(drawn, mask.astype(np.uint8), target)
+
+
+def _warped(source: Picture, mapping: Matrix, size: tuple[int, int]) -> Picture:
+    flags, border = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, cv2.BORDER_REPLICATE
+    if float(np.abs(mapping[2, :2]).max()) * max(size) < 1e-9 * abs(float(mapping[2, 2])):
+        # Looking straight down: no perspective, and half the work.
+        drawn = cv2.warpAffine(source, mapping[:2] / mapping[2, 2], size, flags=flags, borderMode=border)
+    else:
+        drawn = cv2.warpPerspective(source, mapping, size, flags=flags, borderMode=border)
+    return np.asarray(drawn, np.uint8)
 
 
 def _window(
     view: View, store: TileStore, level: int, marked: NDArray[np.bool_]
 ) -> tuple[tuple[int, int, int, int], int]:
     """The level's pixels that the marked cells show; a coarser level where that would be too many."""
-    rows, columns = np.nonzero(marked)
-    offsets = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])
-    corners = (np.stack((columns, rows), axis=-1)[:, None, :] + offsets[None]).reshape(-1, 2) * float(CELL_PX)
-    corners = np.minimum(corners, [view.intrinsics.width, view.intrinsics.height])
+    # The extremes of what a plane shows are at the ends of rows.
+    rows = np.flatnonzero(marked.any(axis=1))
+    first, last = marked[rows].argmax(axis=1), marked.shape[1] - marked[rows][:, ::-1].argmax(axis=1)
+    corners = np.array([(c, r + d) for r, f, e in zip(rows, first, last, strict=True) for c in (f, e) for d in (0, 1)])
+    corners = np.minimum(corners * float(CELL_PX), [view.intrinsics.width, view.intrinsics.height])
+    most = _SPARE_PX + 3 * view.intrinsics.width * view.intrinsics.height
     ground = _on_ground(view, corners)
     while True:
         metres = pixel_m(store.ground, level)
         west, north = math.floor(ground[:, 0].min() / metres) - 1, math.floor(-ground[:, 1].max() / metres) - 1
         east, south = math.ceil(ground[:, 0].max() / metres) + 2, math.ceil(-ground[:, 1].min() / metres) + 2
         area = (east - west + TILE_PX) * (south - north + TILE_PX)
-        if area <= MAX_MOSAIC_PX or level >= store.ground.levels - 1:
+        if area <= most or level >= store.ground.levels - 1:
             return (west, north, east, south), level
         level += 1
 
@@ -159,30 +163,18 @@ def _add_air(picture: Picture, cells: _Cells, sky: Sky) -> None:
     top, bottom = first * CELL_PX, min(last * CELL_PX, height)
     if bottom <= top:
         return
-    weight = _enlarged(cells.haze[first : last + 1], (width, bottom - top))
+    weight = _enlarged(cells.haze[first : last + 1])[: bottom - top, :width]
     up = np.clip(cells.elevation[first : last + 1] / math.radians(40.0), 0.0, 1.0) ** 0.6
-    shade = _enlarged(up, (width, bottom - top))
-    colours = np.stack(
-        [np.linspace(near, far, 256) for near, far in zip(sky.horizon, sky.zenith, strict=True)], axis=-1
-    )
-    table = np.round(colours).astype(np.uint8).reshape(256, 1, 3)
-    index = (shade * 255.0).astype(np.uint8)
-    air = cv2.LUT(cv2.merge([index, index, index]), table)
-    part = picture[top:bottom]
-    picture[top:bottom] = cv2.blendLinear(part, air, 1.0 - weight, weight)
+    near, far = np.array(sky.horizon), np.array(sky.zenith)
+    colours = np.round(near + (far - near) * up[..., None]).astype(np.uint8)
+    air = _enlarged(colours)[: bottom - top, :width]
+    cv2.blendLinear(picture[top:bottom], air, 1.0 - weight, weight, dst=picture[top:bottom])
 
 
-def _enlarged(values: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+def _enlarged(corners: NDArray[Any]) -> NDArray[Any]:
     """Values at the corners of cells, interpolated at every pixel."""
-    whole = np.empty((size[1], size[0]), np.float32)
-    scale = 1.0 / CELL_PX
-    matrix = np.array([[scale, 0.0, 0.5 * scale], [0.0, scale, 0.5 * scale]])
-    cv2.warpAffine(
-        np.ascontiguousarray(values, np.float32),
-        matrix,
-        size,
-        dst=whole,
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
-    return whole
+    size = (corners.shape[1] * CELL_PX, corners.shape[0] * CELL_PX)
+    whole = cv2.resize(np.ascontiguousarray(corners), size, interpolation=cv2.INTER_LINEAR)
+    # Resizing puts a corner into the middle of a cell.
+    half = CELL_PX // 2
+    return np.asarray(whole)[half:-half, half:-half]

@@ -63,7 +63,7 @@ class Roads:
     def __init__(self, seed: int) -> None:
         self.seed = seed
         self.vertex = lru_cache(maxsize=65536)(self._vertex)
-        self.edge = lru_cache(maxsize=16384)(self._edge)
+        self.edge = lru_cache(maxsize=4096)(self._edge)
         self.town = lru_cache(maxsize=65536)(self._town)
 
     def _vertex(self, i: int, j: int) -> tuple[float, float]:

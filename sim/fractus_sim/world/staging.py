@@ -12,7 +12,7 @@ from fractus_core.geo import LocalFrame
 from numpy.typing import NDArray
 
 from fractus_sim.world.billboards import Billboard, Gallery, portrait
-from fractus_sim.world.bodies import Part, parts_of, placed
+from fractus_sim.world.bodies import Colour, Part, parts_of, silhouette
 from fractus_sim.world.canvas import SUN_SHADOW
 from fractus_sim.world.optics import NEAR_M, Matrix, View
 from fractus_sim.world.population import Population, Thing, nearest
@@ -21,12 +21,16 @@ from fractus_sim.world.truth import Box, Seen, SeenFace
 
 Picture = NDArray[np.uint8]
 Labels = NDArray[np.int32]
+Fixed = NDArray[np.int32]
 
 _SHIFT = 4
 _MOST_THINGS = 500
 _SMALL_PX = 14.0
+_SILHOUETTE_PX = 7.0
+_SHADELESS_PX = 5.0
 _TINY_PX = 1.2
-_REACH = 0.9
+_LEAST_BOARD_PX = 4.0
+_REACH = 0.7
 """Things are drawn as far away as so many focal lengths in pixels are metres."""
 _SHADOW = 0.5
 _BOARD_BACK = (96, 100, 104)
@@ -36,10 +40,17 @@ _FAR_PX = 30_000.0
 
 @dataclass(frozen=True, slots=True)
 class _Shape:
-    """A convex piece of something, in pixels."""
+    """A convex piece of something.
 
-    hull: Matrix
-    part: Part
+    Attributes:
+        hull: Its corners in fixed-point pixels, shape (n, 1, 2).
+        colour: Blue, green, red.
+        warmth: Grey value for a thermal camera.
+    """
+
+    hull: Fixed
+    colour: Colour
+    warmth: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,14 +61,14 @@ class _Actor:
         what: The thing or billboard.
         away_m: From the camera; what is nearer covers what is farther.
         shapes: Its parts as they are drawn; a billboard's one.
-        shadow: Its shadow in pixels; None when a corner of it is out of sight.
+        shadow: Its shadow in fixed-point pixels; None when it has none or a corner of it is out of sight.
         points: All its corners in pixels.
     """
 
     what: Thing | Billboard
     away_m: float
     shapes: tuple[_Shape, ...]
-    shadow: Matrix | None
+    shadow: Fixed | None
     points: Matrix
 
 
@@ -75,10 +86,10 @@ class Stage:
             return []
         box = box + np.array([[-14.0, -14.0], [14.0, 14.0]])
         things = nearest(self._population.within(box, time_s), view.place, _MOST_THINGS)
-        actors = [_thing_actor(view, thing) for thing in things if thing.id not in hidden]
-        actors += [_board_actor(view, board) for board in self._gallery.within(box) if board.id not in hidden]
-        seen = [actor for actor in actors if actor is not None]
-        return sorted(seen, key=lambda actor: (-actor.away_m, actor.what.id))
+        actors = _thing_actors(view, [thing for thing in things if thing.id not in hidden])
+        boards = [_board_actor(view, board) for board in self._gallery.within(box) if board.id not in hidden]
+        actors += [actor for actor in boards if actor is not None]
+        return sorted(actors, key=lambda actor: (-actor.away_m, actor.what.id))
 
     def draw(self, picture: Picture, view: View, actors: list[_Actor], band: Band) -> None:
         """Draw what is in sight."""
@@ -91,8 +102,7 @@ class Stage:
                 _draw_board(picture, view, actor, actor.what, band)
             else:
                 for shape in actor.shapes:
-                    grey = shape.part.warmth
-                    _fill(picture, shape.hull, shape.part.colour if band == "rgb" else (grey, grey, grey))
+                    _fill(picture, shape, band)
 
     def truth(
         self, view: View, actors: list[_Actor], frame: LocalFrame
@@ -102,7 +112,7 @@ class Stage:
         labels = np.zeros((lens.height, lens.width), np.int32)
         for number, actor in enumerate(actors, start=1):
             for shape in actor.shapes:
-                cv2.fillConvexPoly(labels, _fixed(shape.hull), (number,), cv2.LINE_8, _SHIFT)
+                cv2.fillConvexPoly(labels, shape.hull, (number,), cv2.LINE_8, _SHIFT)
         objects, faces = [], []
         for number, actor in enumerate(actors, start=1):
             if isinstance(actor.what, Billboard):
@@ -117,21 +127,66 @@ class Stage:
         return tuple(objects), tuple(faces)
 
 
-def _thing_actor(view: View, thing: Thing) -> _Actor | None:
-    length = thing.size_m[0]
-    away = math.dist((thing.x, thing.y, 0.0), (*view.place, view.height_m))
-    size_px = length * view.intrinsics.focal_px / max(away, 0.1)
-    if size_px < _TINY_PX:
-        return None
-    parts = [part for part in parts_of(thing) if size_px >= _SMALL_PX or not part.detail]
-    corners = np.vstack([part.points for part in parts])
-    world = placed(thing, corners)
+def _thing_actors(view: View, things: list[Thing]) -> list[_Actor]:
+    """The things that are in sight; their corners are projected all at once."""
+    if not things:
+        return []
+    place = np.array([(thing.x, thing.y) for thing in things]) - view.place
+    away = np.hypot(np.hypot(place[:, 0], place[:, 1]), view.height_m)
+    sizes = np.array([max(thing.size_m) for thing in things]) * view.intrinsics.focal_px / np.maximum(away, 0.1)
+    parts = [_parts(thing, float(size)) for thing, size in zip(things, sizes, strict=True)]
+    counts = np.array([sum(len(part.points) for part in found) for found in parts])
+    corners = np.vstack([part.points for found in parts for part in found])
+    world = _placed(things, corners, counts)
     pixels, depth = view.project(world)
-    if bool((depth < NEAR_M).any()) or _outside(view, pixels):
-        return None
-    cuts = np.cumsum([len(part.points) for part in parts])[:-1]
-    shapes = tuple(_Shape(_hull(piece), part) for piece, part in zip(np.split(pixels, cuts), parts, strict=True))
-    return _Actor(thing, away, shapes, _shadow(view, world), pixels)
+    fallen = world.copy()
+    fallen[:, :2] += world[:, 2:] * np.array(SUN_SHADOW)
+    fallen[:, 2] = 0.0
+    shade, shade_depth = view.project(fallen)
+    starts = np.concatenate(([0], np.cumsum(counts)[:-1]))
+    near = np.minimum.reduceat(depth, starts) < NEAR_M
+    low, high = np.minimum.reduceat(pixels, starts), np.maximum.reduceat(pixels, starts)
+    lens = view.intrinsics
+    outside = (high <= 0).any(axis=1) | (low[:, 0] >= lens.width) | (low[:, 1] >= lens.height)
+    shadeless = (np.minimum.reduceat(shade_depth, starts) < NEAR_M) | (sizes < _SHADELESS_PX)
+    fixed, fixed_shade = _fixed(pixels), _fixed(shade)
+    actors = []
+    for k in np.flatnonzero(~near & ~outside & (sizes >= _TINY_PX)):
+        span = np.s_[starts[k] : starts[k] + counts[k]]
+        shadow = None if shadeless[k] else cv2.convexHull(fixed_shade[span])
+        shapes = _shapes(fixed[span], parts[k])
+        actors.append(_Actor(things[k], float(away[k]), shapes, _as_fixed(shadow), pixels[span]))
+    return actors
+
+
+def _parts(thing: Thing, size_px: float) -> tuple[Part, ...]:
+    """The parts that show at a size; of what is only a few pixels long, its silhouette."""
+    if size_px < _SILHOUETTE_PX:
+        return silhouette(thing)
+    parts = parts_of(thing)
+    return parts if size_px >= _SMALL_PX else tuple(part for part in parts if not part.detail)
+
+
+def _placed(things: list[Thing], corners: Matrix, counts: NDArray[np.int64]) -> Matrix:
+    """Corners of bodies in the world's frame, shape (n, 3)."""
+    angles = np.radians([thing.heading_deg for thing in things])
+    sines, cosines = np.repeat(np.sin(angles), counts), np.repeat(np.cos(angles), counts)
+    x = np.repeat([thing.x for thing in things], counts) + corners[:, 0] * sines + corners[:, 1] * cosines
+    y = np.repeat([thing.y for thing in things], counts) + corners[:, 0] * cosines - corners[:, 1] * sines
+    return np.column_stack((x, y, corners[:, 2]))
+
+
+def _shapes(fixed: Fixed, parts: tuple[Part, ...]) -> tuple[_Shape, ...]:
+    shapes, start = [], 0
+    for part in parts:
+        hull = np.asarray(cv2.convexHull(fixed[start : start + len(part.points)]), np.int32)
+        shapes.append(_Shape(hull, part.colour, part.warmth))
+        start += len(part.points)
+    return tuple(shapes)
+
+
+def _as_fixed(hull: object) -> Fixed | None:
+    return None if hull is None else np.asarray(hull, np.int32)
 
 
 def _board_actor(view: View, board: Billboard) -> _Actor | None:
@@ -140,7 +195,9 @@ def _board_actor(view: View, board: Billboard) -> _Actor | None:
     if bool((depth < NEAR_M).any()) or _outside(view, pixels):
         return None
     away = float(np.linalg.norm(corners.mean(axis=0) - [*view.place, view.height_m]))
-    shape = _Shape(_hull(pixels), Part(corners, _BOARD_BACK, _FRAME_WARMTH))
+    if float(np.ptp(pixels, axis=0).max()) < _LEAST_BOARD_PX:
+        return None
+    shape = _Shape(_hull(pixels), _BOARD_BACK, _FRAME_WARMTH)
     return _Actor(board, away, (shape,), _shadow(view, corners) if board.standing else None, pixels)
 
 
@@ -150,7 +207,7 @@ def _outside(view: View, pixels: Matrix) -> bool:
     return bool(high[0] <= 0 or high[1] <= 0 or low[0] >= lens.width or low[1] >= lens.height)
 
 
-def _shadow(view: View, world: Matrix) -> Matrix | None:
+def _shadow(view: View, world: Matrix) -> Fixed | None:
     fallen = world.copy()
     fallen[:, :2] += world[:, 2:] * np.array(SUN_SHADOW)
     fallen[:, 2] = 0.0
@@ -158,17 +215,19 @@ def _shadow(view: View, world: Matrix) -> Matrix | None:
     return None if bool((depth < NEAR_M).any()) else _hull(pixels)
 
 
-def _hull(pixels: Matrix) -> Matrix:
-    return np.asarray(cv2.convexHull(pixels.astype(np.float32)), np.float64).reshape(-1, 2)
+def _hull(pixels: Matrix) -> Fixed:
+    return np.asarray(cv2.convexHull(_fixed(pixels)), np.int32)
 
 
-def _fixed(points: Matrix) -> NDArray[np.int32]:
+def _fixed(points: Matrix) -> Fixed:
     """Pixel coordinates as OpenCV's fixed-point numbers, whose origin is the middle of the first pixel."""
     return np.round((np.clip(points, -_FAR_PX, _FAR_PX) - 0.5) * (1 << _SHIFT)).astype(np.int32)
 
 
-def _fill(picture: Picture, hull: Matrix, colour: tuple[int, int, int]) -> None:
-    cv2.fillConvexPoly(picture, _fixed(hull), colour, cv2.LINE_AA, _SHIFT)
+def _fill(picture: Picture, shape: _Shape, band: Band) -> None:
+    grey = shape.warmth
+    colour = shape.colour if band == "rgb" else (grey, grey, grey)
+    cv2.fillConvexPoly(picture, shape.hull, colour, cv2.LINE_AA, _SHIFT)
 
 
 def _clip(low: Matrix, high: Matrix, shape: tuple[int, ...]) -> tuple[int, int, int, int] | None:
@@ -178,14 +237,16 @@ def _clip(low: Matrix, high: Matrix, shape: tuple[int, ...]) -> tuple[int, int, 
     return None if x0 >= x1 or y0 >= y1 else (x0, y0, x1, y1)
 
 
-def _darken(picture: Picture, hull: Matrix) -> None:
-    found = _clip(hull.min(axis=0), hull.max(axis=0), picture.shape)
+def _darken(picture: Picture, hull: Fixed) -> None:
+    corners = hull[:, 0, :] / (1 << _SHIFT) + 0.5
+    found = _clip(corners.min(axis=0), corners.max(axis=0), picture.shape)
     if found is None:
         return
     x0, y0, x1, y1 = found
     light = np.full((y1 - y0, x1 - x0, 3), 255, np.uint8)
     dark = int(255 * (1 - _SHADOW))
-    cv2.fillConvexPoly(light, _fixed(hull - [x0, y0]), (dark + 10, dark, dark - 4), cv2.LINE_AA, _SHIFT)
+    shifted = hull - np.array([x0, y0], np.int32) * (1 << _SHIFT)
+    cv2.fillConvexPoly(light, shifted.astype(np.int32), (dark + 10, dark, dark - 4), cv2.LINE_AA, _SHIFT)
     part = picture[y0:y1, x0:x1]
     part[:] = cv2.multiply(part, light, scale=1 / 255)
 
@@ -195,8 +256,7 @@ def _draw_board(picture: Picture, view: View, actor: _Actor, board: Billboard, b
     if board.standing:
         _draw_posts(picture, view, board, band)
     if not board.faces(viewer):
-        grey = _FRAME_WARMTH
-        _fill(picture, actor.shapes[0].hull, _BOARD_BACK if band == "rgb" else (grey, grey, grey))
+        _fill(picture, actor.shapes[0], band)
         return
     found = _clip(actor.points.min(axis=0), actor.points.max(axis=0), picture.shape)
     if found is None:
@@ -217,7 +277,7 @@ def _draw_board(picture: Picture, view: View, actor: _Actor, board: Billboard, b
         source, matrix, (x1 - x0, y1 - y0), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
     cover = np.zeros((y1 - y0, x1 - x0), np.uint8)
-    cv2.fillConvexPoly(cover, _fixed(actor.shapes[0].hull - [x0, y0]), (255,), cv2.LINE_AA, _SHIFT)
+    cv2.fillConvexPoly(cover, _hull(actor.points - [x0, y0]), (255,), cv2.LINE_AA, _SHIFT)
     weight = cover.astype(np.float32) / 255.0
     part = picture[y0:y1, x0:x1]
     part[:] = cv2.blendLinear(np.asarray(drawn, np.uint8), np.ascontiguousarray(part), weight, 1.0 - weight)
@@ -244,10 +304,10 @@ def _box(points: Matrix, view: View) -> Box | None:
     return None if left >= right or top >= bottom else (left, top, right, bottom)
 
 
-def _shares(view: View, hulls: Iterable[Matrix], labels: Labels, number: int) -> tuple[float, float]:
+def _shares(view: View, hulls: Iterable[Fixed], labels: Labels, number: int) -> tuple[float, float]:
     """Which share of some hulls is in the picture, and which is also labelled with a number."""
-    pieces = [_fixed(hull) for hull in hulls]
-    points = np.vstack(pieces) / (1 << _SHIFT)
+    pieces = list(hulls)
+    points = np.vstack(pieces)[:, 0, :] / (1 << _SHIFT)
     low, high = np.floor(points.min(axis=0)) - 1, np.ceil(points.max(axis=0)) + 2
     limit = 4.0 * max(view.intrinsics.width, view.intrinsics.height)
     low, high = np.maximum(low, -limit).astype(int), np.minimum(high, limit).astype(int)
@@ -267,7 +327,7 @@ def _shares(view: View, hulls: Iterable[Matrix], labels: Labels, number: int) ->
 def _true_heading(view: View, heading_deg: float) -> float:
     """A direction of the world's frame as one from true north at the camera."""
     angle = math.radians(heading_deg)
-    east, north = np.linalg.inv(view.turn) @ np.array([math.sin(angle), math.cos(angle)])
+    east, north = view.unturn @ np.array([math.sin(angle), math.cos(angle)])
     return math.degrees(math.atan2(east, north))
 
 

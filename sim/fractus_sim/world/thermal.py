@@ -1,15 +1,29 @@
-"""How a picture looks to a thermal camera: white is hot. A look, not radiometry."""
+"""How a ground looks to a thermal camera: white is hot. A look, not radiometry."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+
+from fractus_sim.world.tiles import Picture, TileStore
 
 # Grey value from blue, green, red: plants (green) are cool, asphalt and roofs (grey, red) are warmer, water is cold.
 _WEIGHTS = np.array([[-0.10, -0.28, 0.62, 62.0]] * 3)
 
 
-def thermal(picture: NDArray[np.uint8]) -> None:
-    """Turn a picture of the ground in daylight colours into one of its warmth, in place."""
-    cv2.transform(picture, _WEIGHTS, dst=picture)
+class ThermalGround:
+    """The warmth of another ground; see `tiles.Ground`.
+
+    Args:
+        daylight: Tiles of the other ground.
+    """
+
+    def __init__(self, daylight: TileStore) -> None:
+        self._daylight = daylight
+        self.frame = daylight.ground.frame
+        self.finest_m = daylight.ground.finest_m
+        self.levels = daylight.ground.levels
+
+    def tile(self, level: int, column: int, row: int) -> Picture:
+        """The warmth of one tile."""
+        return np.asarray(cv2.transform(self._daylight.tile(level, column, row), _WEIGHTS), np.uint8)

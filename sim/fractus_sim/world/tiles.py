@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 Picture = NDArray[np.uint8]
 
 TILE_PX = 512
+_MOSAIC_BYTES = 90_000_000
 
 
 class Ground(Protocol):
@@ -45,7 +46,7 @@ class TileStore:
         limit_bytes: What the tiles may take together.
     """
 
-    def __init__(self, ground: Ground, limit_bytes: int = 160_000_000) -> None:
+    def __init__(self, ground: Ground, limit_bytes: int = 100_000_000) -> None:
         self.ground = ground
         self.made = 0
         self._limit = max(limit_bytes // (TILE_PX * TILE_PX * 3), 16)
@@ -69,13 +70,18 @@ class TileStore:
         for row in range(top, bottom):
             for column in range(left, right):
                 y, x = (row - top) * TILE_PX, (column - left) * TILE_PX
-                picture[y : y + TILE_PX, x : x + TILE_PX] = self._tile(level, column, row)
-        self._mosaics[level] = (wanted, picture)
-        while len(self._mosaics) > 8:
-            del self._mosaics[next(iter(self._mosaics))]
+                picture[y : y + TILE_PX, x : x + TILE_PX] = self.tile(level, column, row)
+        self._keep(level, wanted, picture)
         return picture, left * TILE_PX, top * TILE_PX
 
-    def _tile(self, level: int, column: int, row: int) -> Picture:
+    def _keep(self, level: int, window: tuple[int, int, int, int], picture: Picture) -> None:
+        self._mosaics.pop(level, None)
+        self._mosaics[level] = (window, picture)
+        while len(self._mosaics) > 1 and sum(kept.nbytes for _, kept in self._mosaics.values()) > _MOSAIC_BYTES:
+            del self._mosaics[next(iter(self._mosaics))]
+
+    def tile(self, level: int, column: int, row: int) -> Picture:
+        """One tile."""
         key = (level, column, row)
         with self._lock:
             tile = self._tiles.get(key)

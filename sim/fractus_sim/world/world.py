@@ -14,6 +14,7 @@ from fractus_sim.world.population import Nobody, Townsfolk
 from fractus_sim.world.render import Band, render_ground
 from fractus_sim.world.staging import Stage
 from fractus_sim.world.survey import Sheet, draw_sheet
+from fractus_sim.world.thermal import ThermalGround
 from fractus_sim.world.tiles import Ground, Picture, TileStore
 from fractus_sim.world.truth import Truth
 
@@ -32,6 +33,7 @@ class World:
         self.ground = ground
         self._stage = stage
         self._store = TileStore(ground)
+        self._warmth = TileStore(ThermalGround(self._store), 50_000_000)
         self._lock = threading.Lock()
         cv2.setNumThreads(1)
 
@@ -80,7 +82,7 @@ class World:
         """
         with self._lock:
             view = self.view(pose, intrinsics, mount)
-            picture = render_ground(view, self._store, band)
+            picture = render_ground(view, self._warmth if band == "ir" else self._store, band)
             self._stage.draw(picture, view, self._stage.actors(view, time_s, hidden), band)
             return picture
 

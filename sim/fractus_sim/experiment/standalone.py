@@ -198,6 +198,9 @@ class RunningDrone:
         if self.setup.camera is not None:
             camera = services.setdefault("camera", {})
             camera.setdefault("methods", list(_CAMERA_METHODS))
+            # The camera world's own, unless it is told otherwise.
+            camera.setdefault("horizontalFieldOfView", 62.2)
+            camera.setdefault("mount", {"pitch": -90, "stabilised": True})
             camera.update(self.setup.camera.features)
             if self.world_url is not None:
                 camera["connection"] = f"{self.world_url}/snapshot.jpg"

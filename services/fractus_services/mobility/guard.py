@@ -61,7 +61,15 @@ class Guard:
         vehicle = self._control.autopilot.vehicle
         return distance_m(LocalFrame(lat, lon), vehicle.lat, vehicle.lon)
 
-    def judge(self, call: Call, held: Held, grant: CompiledGrant | None = None, *, kind: str = "call") -> Verdict:
+    def judge(
+        self,
+        call: Call,
+        held: Held,
+        grant: CompiledGrant | None = None,
+        *,
+        kind: str = "call",
+        known: Verdict | None = None,
+    ) -> Verdict:
         """The verdict on a call, written to the audit log.
 
         An internal error refuses the call and, for a caller that flies, holds the drone where it is.
@@ -71,6 +79,7 @@ class Guard:
             held: the caller's grant.
             grant: what it is judged under instead, when the system flies.
             kind: of the audit entry; `check` when the call is not carried out.
+            known: the verdict that was written down a moment ago; the same again is not.
         """
         now = self.situation()
         try:
@@ -85,7 +94,7 @@ class Guard:
                 (),
                 "hover",
             )
-        if call.method not in QUIET or not verdict.permits:
+        if verdict != known and (call.method not in QUIET or not verdict.permits):
             self.record(call, held.identity, verdict, now, kind=kind)
         return verdict
 

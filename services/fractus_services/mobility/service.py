@@ -77,11 +77,11 @@ class MobilityService:
         self._guard.record(call, held.identity, verdict, self._guard.situation(), kind=kind)
         return verdict
 
-    def _allow_motion(self, call: Call, held: Held) -> Verdict:
+    def _allow_motion(self, call: Call, held: Held, known: Verdict | None = None) -> Verdict:
         """Judge a call that moves the drone, of a driver that has it; a takeover happens here."""
         if held.spec.class_ != "driver":
             raise refused(self._not_a_driver(call, held))
-        verdict = self._guard.judge(call, held)
+        verdict = self._guard.judge(call, held, known=known)
         if verdict.code == "MethodNotGranted":
             raise refused(verdict)
         self._control.require(held)
@@ -177,7 +177,7 @@ class MobilityService:
             if not verdict.brake_first and self._autopilot.now - begun <= JUDGE_AGAIN_S:
                 return verdict
             permit()
-            verdict = self._allow_motion(call, self._control.require(held).held)
+            verdict = self._allow_motion(call, self._control.require(held).held, verdict)
         raise aborted("NotStopping", "the drone does not come to rest, and could not begin its leg otherwise")
 
     async def set_velocity(self, held: Held, args: VelocityArgs) -> tuple[Verdict, VelocityArgs]:

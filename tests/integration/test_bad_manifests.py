@@ -108,6 +108,11 @@ BAD: list[tuple[str, Body, str]] = [
     ("limit that lands", policy("LimitControl", "speed", upperLimit=1, action="land"), "LimitControl takes action enforce or refuse"),
     ("geofence nowhere", policy("GeofenceControl", "exclusion"), "GeofenceControl takes kind inclusion or exclusion, and selector.zones"),
     ("privacy without filter", policy("PrivacyControl", "camera"), "PrivacyControl takes kind camera, and action refuse"),
+    (
+        "fallback without faces",
+        policy("PrivacyControl", "camera", action="blurAverage", fallback="black"),
+        "faces and fallback go with PrivacyControl and action blurFaces",
+    ),
     ("policy that ends before it begins", policy("LimitControl", "speed", upperLimit=1, validFrom="2026-02-01T00:00:00Z", validUntil="2026-01-01T00:00:00Z"), "validUntil must be after validFrom"),
     ("nothing to be in", selecting({"key": "class", "operator": "In"}), "values must be given for In, NotIn, Gt and Lt, and left out for Exists"),
     ("greater than two", selecting({"key": "mtom", "operator": "Gt", "values": ["1", "2"]}), "Gt and Lt take exactly one value"),

@@ -121,6 +121,14 @@ def test_area_of_continental_size_is_refused():
             "spec.selector.zones: GeofenceControl needs at least one zone",
         ),
         ({"type": "PrivacyControl", "kind": "camera"}, "spec.action: PrivacyControl needs an image filter"),
+        (
+            {"type": "PrivacyControl", "kind": "camera", "action": "black", "fallback": "refuse"},
+            "spec.fallback: goes with PrivacyControl and action blurFaces",
+        ),
+        (
+            {"type": "LimitControl", "kind": "speed", "upperLimit": 3, "faces": "gaussian"},
+            "spec.faces: goes with PrivacyControl and action blurFaces",
+        ),
     ],
 )
 def test_sentences_of_bad_policies(spec, sentence):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,7 +16,7 @@ import pytest
 from fractus_core.policy.values import Attitude, CaptureArgs, Lens, Situation
 from fractus_services.audit import AuditLog
 from fractus_services.camera import service as camera
-from fractus_services.camera.album import Album
+from fractus_services.camera.album import Album, AlbumFull
 from fractus_services.camera.drivers import CameraFailed, Wanted
 from fractus_services.camera.faces import Box
 from fractus_services.camera.imaging import Pixels, decoded
@@ -339,4 +340,33 @@ async def test_the_album_forgets_what_a_crash_left_and_makes_room(tmp_path: Path
     assert not folder.exists()
     small.add(living[0], replace(shot, name="20260101000000000-0009.jpg"), b"x" * 2000)
     assert "--keep-total-mb" in small.room(living[0])
+    world.shutter.close()
+
+
+async def test_a_full_disk_is_said_and_leaves_nothing_behind(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_file: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as broken:
+        broken.setattr("fractus_services.camera.album.os.fsync", full)
+        with pytest.raises(OSError, match="No space left") as caught:
+            await world.capture(held())
+    refused = camera.known(caught.value)
+    assert refused is not None
+    assert (refused.status.name, refused.verdict.code) == ("RESOURCE_EXHAUSTED", "StorageFailed")
+    assert "make room on the node" in refused.verdict.reason
+    assert [path for path in world.directory.rglob("*") if path.is_file()] == []
+    await world.capture(held())
+
+
+async def test_a_full_album_says_what_to_do(tmp_path: Path) -> None:
+    world = World(tmp_path)
+    world.album._keep = 1
+    await world.capture(held())
+    with pytest.raises(AlbumFull, match="DeleteImage") as caught:
+        await world.capture(held())
+    refused = camera.known(caught.value)
+    assert refused is not None
+    assert refused.status.name == "RESOURCE_EXHAUSTED"
+    await world.capture(held(instance="other"))
     world.shutter.close()

@@ -28,7 +28,7 @@ _YELLOW = "#F0E442"
 
 def draw_ground(field: Field, area: Sequence[Any], runs: Sequence[Evidence]) -> Figure:
     """The map, in metres east and north of home."""
-    figure, axes = canvas(10.0, 7.0)
+    figure, axes = canvas(10.0, 6.2)
     region = max(area, key=lambda shape: shape.area, default=None)
     for shape in area:
         words = "operation area at CTRL2 (REGION2)" if shape is region else "operation area at CTRL1"
@@ -44,9 +44,9 @@ def draw_ground(field: Field, area: Sequence[Any], runs: Sequence[Evidence]) -> 
     _stars(axes, field, runs)
     _names(axes, field)
     axes.set_aspect("equal")
-    axes.margins(0.03)
-    low_x, high_x = axes.get_xlim()
+    low_x, low_y, high_x, high_y = axes.dataLim.extents
     axes.set_xlim(low_x - _MARGIN_M, high_x + _MARGIN_M)
+    axes.set_ylim(low_y - _MARGIN_M, high_y + _MARGIN_M)
     axes.set_xlabel("metres east of HOME", fontsize=9)
     axes.set_ylabel("metres north of HOME", fontsize=9)
     axes.grid(color="#EEEEEE", linewidth=0.6, zorder=0)
@@ -96,9 +96,9 @@ def _names(axes: Any, field: Field) -> None:
 
 def _offset(name: str) -> tuple[float, float]:
     return {
-        "HOME": (0.0, -15.0),
+        "HOME": (-25.0, 0.0),
         "CTRL1": (-27.0, 0.0),
-        "WP1": (-20.0, 6.0),
+        "WP1": (-22.0, 6.0),
         "WP3": (22.0, 4.0),
         "WP4": (0.0, -14.0),
         "CTRL2": (0.0, -14.0),

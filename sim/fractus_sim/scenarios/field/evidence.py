@@ -29,7 +29,7 @@ class Call:
         time_s: on the autopilot's clock.
         who: the component, or `system`.
         method: of the service; for what the system did, the takeover or the kind of control.
-        action: allow, correct or deny; empty for what the system did.
+        action: allow, correct, deny, or takeover (denied, and the drone taken); empty for what the system did.
         asked: where to, for Goto.
         flown: where to in the end.
         at: where the drone was.
@@ -45,6 +45,11 @@ class Call:
     asked: Place | None
     flown: Place | None
     at: Place | None
+
+    @property
+    def refused(self) -> bool:
+        """Whether nothing of it was carried out."""
+        return self.action in ("deny", "takeover")
 
 
 @dataclass(frozen=True)
@@ -66,8 +71,8 @@ class Evidence:
         """The CaptureImage calls that were carried out, or refused for what they would have shown."""
         asked = [c for c in self.calls if c.method == "CaptureImage" and c.at is not None]
         if taken:
-            return [c for c in asked if c.action != "deny"]
-        return [c for c in asked if c.action == "deny" and c.code != "OutsideOperationArea"]
+            return [c for c in asked if not c.refused]
+        return [c for c in asked if c.refused and c.code != "OutsideOperationArea"]
 
     def takeover(self) -> Call | None:
         """When the system took the drone for good."""

@@ -128,17 +128,17 @@ class Judge:
         calls = self._gotos(name)
         self._check(
             f"{name} is discarded with an error",
-            bool(calls) and all(c.action == "deny" for c in calls),
+            bool(calls) and all(c.refused for c in calls),
             calls[0].reason if calls else "never asked for",
         )
-        after = [c for c in self._gotos(then) if calls and c.time_s > calls[0].time_s and c.action != "deny"]
+        after = [c for c in self._gotos(then) if calls and c.time_s > calls[0].time_s and not c.refused]
         self._check(f"and the mission goes on to {then}", bool(after), f"{len(after)} calls")
 
     def _stopped_for(self, name: str) -> None:
         calls, taken = self._gotos(name), self._run.takeover()
         self._check(
             f"{name} revokes access",
-            bool(calls) and all(c.action == "deny" for c in calls) and taken is not None,
+            bool(calls) and all(c.refused for c in calls) and taken is not None,
             calls[0].reason if calls else "never asked for",
         )
         since = taken.time_s if taken is not None else math.inf

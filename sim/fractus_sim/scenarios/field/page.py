@@ -57,7 +57,7 @@ def _figures(run: Evidence) -> dict[str, Any]:
         "pictures_taken": len(run.pictures(taken=True)),
         "pictures_refused": len(run.pictures(taken=False)),
         "corrected": sum(c.action == "correct" and _altered(c) for c in _mine(run)),
-        "denied": sum(c.action == "deny" for c in _mine(run)),
+        "denied": sum(c.refused for c in _mine(run)),
         "takeover": None if takeover is None else takeover.reason,
         "texts": list(run.texts),
     }
@@ -92,9 +92,9 @@ def _violations(field: Field, runs: Sequence[Evidence]) -> str:
     rows = []
     for run in runs:
         for call in _mine(run):
-            if call.asked is None or not (call.action == "deny" or _altered(call)):
+            if call.asked is None or not (call.refused or _altered(call)):
                 continue
-            flown = "refused" if call.action == "deny" or call.flown is None else f"{call.flown.alt_m:.1f} m"
+            flown = "refused" if call.refused or call.flown is None else f"{call.flown.alt_m:.1f} m"
             rows.append((run.title, _name(field, call), f"{call.asked.alt_m:.0f} m", flown, call.reason))
     return table(("Run", "Goto", "Asked", "Flown", "Why"), rows) if rows else "Nothing."
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from fractus_sim.experiment import parse
+from fractus_sim.experiment.detections import Score, Seen, read_detections, score
 from fractus_sim.experiment.injection import Occurrence
 from fractus_sim.experiment.judging import Evidence, judge
 from fractus_sim.experiment.logbook import Flight, Text
@@ -169,3 +170,20 @@ def test_broken_chains_phases_and_programs_are_judged() -> None:
     phase = {"check": "phase", "application": "a", "phase": "Completed"}
     assert service(phase, phases={"a": ["Running", "Completed"]})
     assert not service(phase, phases={"a": ["Running", "Failed"]})
+
+
+def car(name: str, north: float, kind: str = "car") -> Seen:
+    at = HOME.offset(north, 0.0)
+    return Seen(kind, at.lat_e7 / 1e7, at.lon_e7 / 1e7, name)
+
+
+def test_detections_are_scored_against_what_was_in_view() -> None:
+    truths = [car("a", 0), car("a", 6), car("b", 30), car("c", 60, "person")]
+    given = [car("", 1), car("", 7), car("", 50), car("", 60, "person")]
+    assert score(given, truths, "car", 3.0) == Score(detections=3, right=2, objects=2, found=1)
+    assert score(given, truths, "person", 3.0) == Score(1, 1, 1, 1)
+    assert score([], truths, "car", 3.0).precision == 1.0
+    assert score([], truths, "car", 3.0).recall == 0.0
+    assert read_detections(['{"class": "car", "lat": 1, "lon": 2}', "no JSON", '{"class": "car"}']) == [
+        Seen("car", 1.0, 2.0)
+    ]

@@ -156,8 +156,23 @@ class ApplicationPhase(Model):
     phase: Literal["Running", "Completed", "Failed", "Invalid"]
 
 
+class Detections(Model):
+    """A program's detections agree with what the camera world had in view (mode standalone, a vehicle with a camera).
+
+    The program appends a JSON object a line, with `class`, `lat` and `lon`, to the file that the variable
+    FRACTUS_EXPERIMENT_DETECTIONS names.
+    """
+
+    check: Literal["detections"]
+    kind: str = Field(description="Class of object, as the world's truth.json names it: car, person, ...")
+    radius: float = Field(default=3.0, gt=0, description="Metres within which a detection counts as the object.")
+    precision: float = Field(default=0, ge=0, le=1, description="Share of detections that are objects, at least.")
+    recall: float = Field(default=0, ge=0, le=1, description="Share of the objects seen that were detected, at least.")
+
+
 Check = Annotated[
     Landed | NeverFlew | Reached | ModeReached | StatusText | AltitudeBand | SpeedLimit | OutsideZone | InsideZone
-    | Battery | TaskDone | Separation | ProgramEnded | CallJudged | AuditSound | ApplicationPhase,
+    | Battery | TaskDone | Separation | ProgramEnded | CallJudged | AuditSound | ApplicationPhase
+    | Detections,
     Field(discriminator="check"),
 ]  # fmt: skip

@@ -14,6 +14,7 @@ import shapely
 from fractus_core.geo import LocalFrame, polygon
 
 from fractus_sim.experiment import checks as kinds
+from fractus_sim.experiment.detections import Seen, score
 from fractus_sim.experiment.injection import Occurrence
 from fractus_sim.experiment.logbook import Flight
 from fractus_sim.experiment.model import NamedZone
@@ -33,6 +34,8 @@ class Evidence:
         calls: entries of the audit logs of kind call, monitor and takeover.
         audit_problems: what is wrong with audit logs, by log; empty text for one that verifies.
         phases: the phases each Application was seen in.
+        detections: what programs detected.
+        truths: what camera worlds had in view at each snapshot.
     """
 
     flights: Mapping[str, Flight]
@@ -42,6 +45,8 @@ class Evidence:
     calls: Sequence[Mapping[str, Any]] = ()
     audit_problems: Mapping[str, str] = field(default_factory=dict)
     phases: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    detections: Sequence[Seen] = ()
+    truths: Sequence[Seen] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,6 +270,17 @@ def _phase(check: kinds.ApplicationPhase, evidence: Evidence) -> tuple[bool, str
     return check.phase in seen, f"it was {', '.join(seen)}" if seen else "it was never seen"
 
 
+def _detections(check: kinds.Detections, evidence: Evidence) -> tuple[bool, str]:
+    found = score(evidence.detections, evidence.truths, check.kind, check.radius)
+    said = (
+        f"precision {found.precision:.2f} ({found.right} of {found.detections}),"
+        f" recall {found.recall:.2f} ({found.found} of {found.objects})"
+    )
+    if not found.objects and not found.detections:
+        return False, f"no {check.kind} was in view, and none was detected"
+    return found.precision >= check.precision and found.recall >= check.recall, said
+
+
 _FOR_VEHICLES: Mapping[type, Callable[[Any, Flight, Evidence], tuple[bool, str]]] = {
     kinds.Landed: _landed,
     kinds.NeverFlew: _never_flew,
@@ -284,4 +300,5 @@ _FOR_ALL: Mapping[type, Callable[[Any, Evidence], tuple[bool, str]]] = {
     kinds.CallJudged: _call,
     kinds.AuditSound: _audit,
     kinds.ApplicationPhase: _phase,
+    kinds.Detections: _detections,
 }

@@ -17,6 +17,7 @@ from fractus_sim.experiment.checks import (
     ApplicationPhase,
     CallJudged,
     Check,
+    Detections,
     InsideZone,
     OutsideZone,
     ProgramEnded,
@@ -315,6 +316,8 @@ def _check_checks(experiment: Experiment) -> None:
             raise InvalidObject(f"{where}.check", "phase is for mode cluster")
         if isinstance(check, TaskDone) and not any(entry.task for entry in experiment.vehicles):
             raise InvalidObject(f"{where}.check", "task: no vehicle has one")
+        if isinstance(check, Detections) and not any(entry.camera for entry in experiment.vehicles):
+            raise InvalidObject(f"{where}.check", "detections needs a vehicle with a camera (mode standalone)")
         after = getattr(check, "after", None)
         if after is not None:
             _known(f"{where}.after", [after], kinds, "fault")

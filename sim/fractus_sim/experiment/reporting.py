@@ -294,8 +294,7 @@ def _files(outcome: Outcome) -> str:
     listed = [f"[{name}]({name}): {what}" for name, what in names.items()]
     if logs:
         listed.append(f"logs/*.tlog ({len(list(logs))} files): MAVLink of each link, for MAVProxy and Mission Planner")
-    notes = [f"- {note}" for note in outcome.findings.notes]
-    return "\n".join(["## Files", "", *(f"- {line}" for line in listed), *notes])
+    return "\n".join(["## Files", "", *(f"- {line}" for line in listed)])
 
 
 def _rounded(value: float | None) -> float | None:

@@ -271,6 +271,8 @@ def _outcome(play: _Play, out: Path, problem: str, wall_s: float) -> Outcome:
         findings.calls,
         findings.audit_problems,
         findings.phases,
+        findings.detections,
+        findings.truths,
     )
     verdicts: Sequence[Verdict] = [verdict for check in experiment.checks for verdict in judge(check, evidence)]
     return Outcome(

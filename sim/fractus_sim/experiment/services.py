@@ -16,6 +16,7 @@ from fractus_operator.commands.manifests import BadManifest, Manifests, read_man
 from fractus_operator.commands.plan import plan_all
 
 from fractus_sim.experiment.audits import read_audit
+from fractus_sim.experiment.detections import FILE, VARIABLE, TruthWatch, read_detections
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.model import Experiment, Program, VehicleSetup
 from fractus_sim.experiment.stage import Moment, Stage
@@ -40,6 +41,9 @@ class ServiceStage(Stage):
         self._manifests = _read(experiment, base)
         self._ground = Standalone(folder)
         self._identities: dict[str, str] = {}
+        self._watches: list[TruthWatch] = []
+        self._detections = folder / FILE
+        self._detections.unlink(missing_ok=True)
         self._began_s = time.monotonic()
 
     def set_up(self) -> None:
@@ -57,6 +61,8 @@ class ServiceStage(Stage):
             link = TcpLink.connect(host, int(port), CONNECT_S)
             self.observers[setup.name] = Station(link, setup.system_id, watch, own_id=OBSERVER_ID, beats=False)
             self.endpoints[setup.name] = drone.guest_link
+            if drone.world_url is not None:
+                self._watches.append(TruthWatch(drone.world_url, self.folder / "logs" / f"{setup.name}-truth.jsonl"))
         for spec in grants:
             if spec.node in self._ground.drones:
                 self._identities[spec.component] = self._ground.grant(_manifest(spec))
@@ -113,6 +119,11 @@ class ServiceStage(Stage):
         for program in self.experiment.programs:
             self.findings.programs[program.name] = self._ground.processes.exit_code(program.name)
         self._ground.stop_services()
+        if self._detections.exists():
+            self.findings.detections = read_detections(self._detections.read_text().splitlines())
+        for watch in self._watches:
+            watch.close()
+            self.findings.truths += watch.seen
         for drone in self._ground.drones.values():
             for path in (drone.audit, drone.audit.with_name("camera.jsonl")):
                 if path.exists():
@@ -120,6 +131,8 @@ class ServiceStage(Stage):
 
     def close(self) -> None:
         """End every process."""
+        for watch in self._watches:
+            watch.close()
         for observer in self.observers.values():
             observer.close()
         self._ground.close()
@@ -149,7 +162,7 @@ class ServiceStage(Stage):
         others = {name: address for name, address in addresses.items() if name != program.component}
         own = {"PORT": str(program.port)} if program.port is not None else {}
         identity = self._identities.get(program.component or "")
-        environment = {**own, **program.environment}
+        environment = {VARIABLE: str(self._detections.absolute()), **own, **program.environment}
         if identity is not None:
             self._ground.run(
                 program.name, command_of(program), identity, environment=environment, services=others, folder=self.base

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from fractus_sim.experiment.detections import Seen
 from fractus_sim.experiment.model import Experiment
 from fractus_sim.experiment.station import Station
 
@@ -29,14 +30,16 @@ class Findings:
         calls: entries of the audit logs that are judgements.
         audit_problems: by log; empty text for one that verifies.
         phases: of each Application, in the order seen.
-        notes: sentences for the report.
+        detections: what programs detected.
+        truths: what camera worlds had in view.
     """
 
     programs: dict[str, int | None] = field(default_factory=dict)
     calls: list[Mapping[str, Any]] = field(default_factory=list)
     audit_problems: dict[str, str] = field(default_factory=dict)
     phases: dict[str, list[str]] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
+    detections: list[Seen] = field(default_factory=list)
+    truths: list[Seen] = field(default_factory=list)
 
 
 class Stage(ABC):

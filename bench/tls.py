@@ -204,7 +204,7 @@ async def run(options: argparse.Namespace) -> list[dict[str, Any]]:
         pki = StandalonePki.create(Path(directory) / "pki")
         sides = (Side("tls", Path(directory), pki, url), Side("plain", Path(directory), pki, url))
         try:
-            found = await measured(sides, 10 if options.quick else options.runs)
+            found = await measured(sides, 30 if options.quick else options.runs)
         finally:
             for side in sides:
                 await side.close()
@@ -230,7 +230,7 @@ def main() -> int:
         serve_plainly(sys.argv[2:])
         return 0
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="ten fetches of each size")
+    parser.add_argument("--quick", action="store_true", help="thirty fetches of each size")
     parser.add_argument("--runs", type=int, default=60, help="fetches of each size")
     parser.add_argument("--json", type=Path, help="write the claims to a file")
     options = parser.parse_args()

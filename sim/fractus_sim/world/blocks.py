@@ -342,15 +342,20 @@ def _houses(site: _Site) -> None:
             if isinstance(part, shapely.Polygon):
                 block.patches.append(Patch(_corners(part), colour, 36))
             rows = rows.difference(street.buffer(0.4) if half > 4 else street)
+    hedges: list[shapely.Geometry] = []
     for row in shapely.get_parts(rows):
         if isinstance(row, shapely.Polygon) and row.area > 600.0:
-            _row(site, row)
+            hedges += _row(site, row)
+    standing = shapely.union_all(site.built).buffer(1.2)
+    for line in shapely.get_parts(shapely.difference(np.array(hedges, object), standing)):
+        _hedge(site, line, (0.5, 0.9), (0.8, 1.2))
     solid = [*site.built, *(shapely.Polygon(patch.outline) for patch in block.patches[1:])]
     _scatter(site, inside.buffer(-1.0).difference(shapely.union_all(solid).buffer(1.6)), 330, (0.6, 3.4))
 
 
-def _row(site: _Site, ground: shapely.Polygon) -> None:
-    """Houses around a piece of ground."""
+def _row(site: _Site, ground: shapely.Polygon) -> list[shapely.Geometry]:
+    """Put houses around a piece of ground; returns where hedges could be."""
+    hedges: list[shapely.Geometry] = []
     ring, roll = ground.exterior, site.roll
     at = roll.uniform(4.0, 12.0)
     while at < ring.length - 10.0:
@@ -360,8 +365,9 @@ def _row(site: _Site, ground: shapely.Polygon) -> None:
             front = _frontage(ring, at)
             (x, y), (nx, ny) = front.origin, front.away
             hedge = shapely.LineString([(x + nx * 3, y + ny * 3), (x + nx * 26, y + ny * 26)])
-            _hedge(site, hedge.intersection(ground), (0.5, 0.9), (0.8, 1.2))
+            hedges.append(hedge.intersection(ground))
         at += lot
+    return hedges
 
 
 def _frontage(line: shapely.LinearRing, at_m: float) -> _Frontage:
@@ -400,11 +406,12 @@ def _garden(site: _Site, front: _Frontage, wide: float, behind: float) -> None:
     if inside.contains(terrace):
         block.patches.append(Patch(_corners(terrace), _tinted((150, 160, 172), roll, 10), 40))
     pool = front.box(-2.0, behind + 5.5, 5.5, behind + 9.2)
-    if roll.random() < 0.16 and inside.contains(pool):
+    bed = front.box(wide / 2 - 2.0, behind + 8.0, wide / 2 + 3.0, behind + 14.0)
+    draw = roll.random()
+    if draw < 0.16 and inside.contains(pool):
         block.patches.append(Patch(_corners(pool.buffer(0.9, join_style="mitre")), (186, 192, 196), 20))
         block.patches.append(Patch(_corners(pool), (196, 168, 92), 10))
-    bed = front.box(wide / 2 - 2.0, behind + 8.0, wide / 2 + 3.0, behind + 14.0)
-    if roll.random() < 0.4 and inside.contains(bed):
+    elif draw < 0.5 and inside.contains(bed):
         block.patches.append(Patch(_corners(bed), (72, 98, 116), 140))
 
 

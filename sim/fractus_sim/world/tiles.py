@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 Picture = NDArray[np.uint8]
 
 TILE_PX = 512
-_MOSAIC_BYTES = 90_000_000
+_MOSAIC_BYTES = 60_000_000
 
 
 class Ground(Protocol):
@@ -46,7 +46,7 @@ class TileStore:
         limit_bytes: What the tiles may take together.
     """
 
-    def __init__(self, ground: Ground, limit_bytes: int = 100_000_000) -> None:
+    def __init__(self, ground: Ground, limit_bytes: int = 70_000_000) -> None:
         self.ground = ground
         self.made = 0
         self._limit = max(limit_bytes // (TILE_PX * TILE_PX * 3), 16)

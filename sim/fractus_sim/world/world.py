@@ -33,7 +33,7 @@ class World:
         self.ground = ground
         self._stage = stage
         self._store = TileStore(ground)
-        self._warmth = TileStore(ThermalGround(self._store), 50_000_000)
+        self._warmth = TileStore(ThermalGround(self._store), 30_000_000)
         self._lock = threading.Lock()
         cv2.setNumThreads(1)
 

@@ -5,6 +5,7 @@ from fractus.control import Control
 from fractus.drone import Mobility, Motion, mobility
 from fractus.environment import Endpoint, control_points, egress, endpoint
 from fractus.errors import (
+    Busy,
     ControlLost,
     Corrected,
     FractusError,
@@ -40,6 +41,7 @@ __all__ = [
     "Action",
     "AltitudeReference",
     "Attitude",
+    "Busy",
     "Camera",
     "CanI",
     "Check",

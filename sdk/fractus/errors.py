@@ -6,6 +6,7 @@ from typing import Any
 
 import grpc
 from fractus_proto.v1 import types_pb2
+from google.rpc import error_details_pb2  # type: ignore[import-untyped]
 from grpc_status import rpc_status  # type: ignore[import-untyped]
 
 from fractus.values import Action, Decision, Result
@@ -75,24 +76,46 @@ class Unavailable(FractusError):
     """The service cannot be reached, or did not answer in time."""
 
 
+class Busy(FractusError):
+    """The service takes no more of this component now: too many calls, or no room for another picture.
+
+    Attributes:
+        again_s: in how many seconds to try again; None where waiting alone does not help.
+    """
+
+    def __init__(self, message: str, again_s: float | None = None) -> None:
+        self.again_s = again_s
+        super().__init__(message)
+
+
 class NotConfigured(FractusError):
     """The environment lacks what Fractus gives the pods of a component."""
 
 
 def decision_of(error: Any) -> Decision | None:
     """The policy checker's decision in the status details of a failed call, if it carries one."""
-    metadata = error.trailing_metadata()
-    if metadata is None:
+    message = types_pb2.Decision()
+    return Decision.from_proto(message) if _detail(error, message) else None
+
+
+def _again_s(error: Any) -> float | None:
+    """In how many seconds a failed call may be tried again, if it says so."""
+    message = error_details_pb2.RetryInfo()
+    if not _detail(error, message):
         return None
+    return float(message.retry_delay.seconds + message.retry_delay.nanos / 1e9)
+
+
+def _detail(error: Any, message: Any) -> bool:
+    """Fill in the detail of the message's kind that a failed call carries; False if it carries none."""
+    if error.trailing_metadata() is None:
+        return False
     try:
         status = rpc_status.from_call(error)
     except ValueError:  # the details contradict the status: not ours
-        return None
-    for detail in status.details if status is not None else ():
-        message = types_pb2.Decision()
-        if detail.Is(message.DESCRIPTOR) and detail.Unpack(message):
-            return Decision.from_proto(message)
-    return None
+        return False
+    found = status.details if status is not None else ()
+    return any(detail.Is(message.DESCRIPTOR) and detail.Unpack(message) for detail in found)
 
 
 def translate(error: Any, what: str, address: str) -> FractusError:
@@ -113,6 +136,8 @@ def translate(error: Any, what: str, address: str) -> FractusError:
         return InvalidRequest(f"{what}: {text}")
     if code in {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED}:
         return Unavailable(f"{what}: no answer from {address} ({text or code.name})")
+    if code is grpc.StatusCode.RESOURCE_EXHAUSTED:
+        return Busy(f"{what}: {text or code.name}", _again_s(error))
     return FractusError(f"{what}: {text or code.name}")
 
 

@@ -1,0 +1,45 @@
+"""Failed calls as typed errors."""
+
+from __future__ import annotations
+
+import grpc
+import pytest
+from fractus import Busy, InvalidRequest, PolicyDenied
+from fractus.errors import translate
+from fractus_core.policy.values import Verdict
+from fractus_services.replies import Refused, abort
+
+
+async def failed(refusal: Refused) -> grpc.aio.AioRpcError:
+    """The error that a client gets of a refusal."""
+    seen: list[grpc.aio.AioRpcError] = []
+
+    class Context:
+        async def abort(self, code: grpc.StatusCode, text: str, metadata: tuple[tuple[str, bytes], ...]) -> None:
+            trailing = grpc.aio.Metadata(*metadata)
+            seen.append(grpc.aio.AioRpcError(code, grpc.aio.Metadata(), trailing, details=text))
+
+    with pytest.raises(AssertionError):
+        await abort(Context(), refusal)
+    return seen[0]
+
+
+@pytest.mark.parametrize("again_s", [0.25, 0.0])
+async def test_who_asks_too_much_learns_when_to_ask_again(again_s: float) -> None:
+    verdict = Verdict("deny", None, "TooManyCalls", "more than 50 calls a second; slow down")
+    error = await failed(Refused(grpc.StatusCode.RESOURCE_EXHAUSTED, verdict, again_s))
+    found = translate(error, "GetSpeed", "there")
+    assert isinstance(found, Busy)
+    assert str(found) == "GetSpeed: more than 50 calls a second; slow down"
+    assert found.again_s == (again_s or None)
+
+
+async def test_a_refusal_carries_who_decided() -> None:
+    verdict = Verdict("deny", None, "InsideExclusionZone", "the target is inside", ("no-fly",))
+    found = translate(await failed(Refused(grpc.StatusCode.PERMISSION_DENIED, verdict)), "Goto", "there")
+    assert isinstance(found, PolicyDenied)
+    assert (found.decision.code, found.decision.policies) == ("InsideExclusionZone", ("no-fly",))
+    missing = Verdict("deny", None, "DeadlineMissing", "the call has no deadline; set a timeout, as the SDK does")
+    found = translate(await failed(Refused(grpc.StatusCode.INVALID_ARGUMENT, missing)), "GetSpeed", "there")
+    assert isinstance(found, InvalidRequest)
+    assert "set a timeout" in str(found)

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from vehicle_process import free_port, running_vehicle
 
-SLOW = ("WPNAV_SPEED=350", "WPNAV_ACCEL=150", "WPNAV_SPEED_UP=200", "RTL_ALT=1300", "LAND_SPEED=70")
+SLOW = ("WPNAV_SPEED=450", "WPNAV_ACCEL=150", "WPNAV_SPEED_UP=200", "RTL_ALT=1300", "LAND_SPEED=70")
 SPEEDUP = "4"
 
 
@@ -22,7 +22,7 @@ SPEEDUP = "4"
 def test_a_violating_program_is_corrected_refused_and_brought_home(tmp_path: Path):
     link = f"tcp:127.0.0.1:{free_port()}"
     parameters = [part for setting in SLOW for part in ("--param", setting)]
-    options = ("--sysid", "7", "--heading", "250", "--ready-after", "8", "--speedup", SPEEDUP, "--seed", "9")
+    options = ("--sysid", "7", "--heading", "250", "--ready-after", "5", "--speedup", SPEEDUP, "--seed", "9")
     elsewhere = ("--home", "-35.3632621,149.1652374,584", "--wind", "3,10,1")
     out = tmp_path / "field"
     with running_vehicle(*options, *elsewhere, *parameters, links=(link,)):

@@ -28,7 +28,7 @@ _YELLOW = "#F0E442"
 
 def draw_ground(field: Field, area: Sequence[Any], runs: Sequence[Evidence]) -> Figure:
     """The map, in metres east and north of home."""
-    figure, axes = canvas(10.0, 6.2)
+    figure, axes = canvas(10.0, 6.9)
     region = max(area, key=lambda shape: shape.area, default=None)
     for shape in area:
         words = "operation area at CTRL2 (REGION2)" if shape is region else "operation area at CTRL1"
@@ -96,7 +96,7 @@ def _names(axes: Any, field: Field) -> None:
 
 def _offset(name: str) -> tuple[float, float]:
     return {
-        "HOME": (-25.0, 0.0),
+        "HOME": (0.0, -14.0),
         "CTRL1": (-27.0, 0.0),
         "WP1": (-22.0, 6.0),
         "WP3": (22.0, 4.0),
@@ -153,15 +153,10 @@ def _requests(axes: Any, run: Evidence) -> None:
             arrowprops={"arrowstyle": "-|>", "color": ORANGE, "linewidth": 1.8, "shrinkA": 4, "shrinkB": 0},
         )  # fmt: skip
         axes.plot(
-            at, asked, marker="^" if asked > flown else "v", markersize=9, color=ORANGE, markeredgecolor=INK,
-            linestyle="none", label="asked for, and corrected", zorder=7,
+            at, asked, marker="o", markersize=8, color=ORANGE, markeredgecolor=INK, linestyle="none",
+            label="asked for, and corrected", zorder=7,
         )  # fmt: skip
         axes.annotate(
-            f"{asked:.0f} m",
-            (at, asked),
-            xytext=(9, 0),
-            textcoords="offset points",
-            fontsize=8.5,
-            color=INK,
-            va="center",
-        )
+            f"{asked:.0f} m", (at, asked), xytext=(0, 11 if asked > flown else -11), textcoords="offset points",
+            fontsize=8.5, color=INK, va="center", ha="center",
+        )  # fmt: skip

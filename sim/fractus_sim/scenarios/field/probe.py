@@ -11,7 +11,7 @@ from fractus_sim.experiment.station import OBSERVER_ID, STATION_COMPONENT, TcpLi
 from fractus_sim.vehicle.mav import AUTOPILOT_ARDUPILOTMEGA, Command, ModeFlag
 from fractus_sim.vehicle.wire import Message, Parser, Value, encode, layout_named
 
-CONNECT_S = 10.0
+CONNECT_S = 5.0
 HEARTBEAT_S = 15.0
 READY_S = 120.0
 ASK_S = 1.0

@@ -6,9 +6,10 @@ import asyncio
 import math
 from typing import Any
 
+import pytest
 from fractus_core.policy.values import Airframe
 from fractus_services.mobility.autopilot import SYSTEM_ID
-from fractus_services.mobility.failsafes import Checked, configure
+from fractus_services.mobility.failsafes import Checked, choose_return, configure
 
 SOUND = {
     "FS_GCS_ENABLE": 1.0, "FS_GCS_TIMEOUT": 5.0, "BATT_FS_LOW_ACT": 2.0, "BATT_FS_CRT_ACT": 1.0, "FS_EKF_ACTION": 1.0,
@@ -58,3 +59,52 @@ def test_an_airframe_that_is_not_a_number_forbids_arming() -> None:
     assert "WPNAV_ACCEL is not a number" in checked.problem
     assert "PSC_POSXY_P is not a number" in checked.problem
     assert checked.airframe == Airframe()
+
+
+RETRACING = {"SYSID_MYGCS": 244.0, "SRTL_POINTS": 300.0}
+
+
+def test_a_vehicle_that_remembers_its_path_goes_back_on_it() -> None:
+    vehicle = Parameters(RETRACING)
+    checked = configured(vehicle)
+    assert not checked.problem
+    assert checked.airframe.retraces
+    assert (vehicle.values["FS_GCS_ENABLE"], vehicle.values["BATT_FS_LOW_ACT"]) == (3.0, 3.0)
+
+
+def test_smart_return_or_landing_may_stay() -> None:
+    vehicle = Parameters(RETRACING | {"FS_GCS_ENABLE": 4.0, "BATT_FS_LOW_ACT": 4.0})
+    assert configured(vehicle).airframe.retraces
+    assert (vehicle.values["FS_GCS_ENABLE"], vehicle.values["BATT_FS_LOW_ACT"]) == (4.0, 4.0)
+
+
+@pytest.mark.parametrize("how", [{"SRTL_POINTS": 0.0}, {"SRTL_POINTS": 50.0}])
+def test_a_short_memory_is_none(how: dict[str, float]) -> None:
+    vehicle = Parameters(RETRACING | how | {"FS_GCS_ENABLE": 3.0})
+    checked = configured(vehicle)
+    assert not checked.problem
+    assert not checked.airframe.retraces
+    assert vehicle.values["FS_GCS_ENABLE"] == 1.0
+
+
+@pytest.mark.parametrize("fixed", ["FS_GCS_ENABLE", "BATT_FS_LOW_ACT"])
+def test_a_failsafe_that_stays_straight_retraces_nothing(fixed: str) -> None:
+    vehicle = Parameters(RETRACING, (fixed,))
+    checked = configured(vehicle)
+    assert not checked.problem
+    assert not checked.airframe.retraces
+    assert vehicle.values["FS_GCS_ENABLE"] == 1.0
+
+
+def test_armed_elsewhere_it_goes_straight_and_from_home_again_on_its_path() -> None:
+    async def chosen() -> None:
+        vehicle: Any = Parameters(RETRACING)
+        checked = await configure(vehicle)
+        away = await choose_return(vehicle, checked, retrace=False)
+        assert not away.airframe.retraces
+        assert vehicle.values["FS_GCS_ENABLE"] == 1.0
+        again = await choose_return(vehicle, away, retrace=True)
+        assert again.airframe.retraces
+        assert vehicle.values["FS_GCS_ENABLE"] == 3.0
+
+    asyncio.run(chosen())

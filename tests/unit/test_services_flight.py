@@ -6,10 +6,12 @@ import asyncio
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import shapely
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, VelocityArgs, Verdict
+from fractus_services.grants import Held
 from fractus_services.mobility.autopilot import AutopilotError
 from fractus_services.mobility.leases import State
 from fractus_services.mobility.vehicle import GUIDED, LAND, RTL, SMART_RTL
@@ -23,7 +25,7 @@ def clear_m(world: World, *box: float) -> float:
     return float(min(shapely.box(*box).distance(shapely.Point(x, y)) for x, y, _ in world.plane.trace))
 
 
-def goto(x: float, y: float, alt: float = 10.0, **more: float) -> GotoArgs:
+def goto(x: float, y: float, alt: float = 10.0, **more: Any) -> GotoArgs:
     return GotoArgs(*at(x, y), alt, **more)
 
 
@@ -477,6 +479,24 @@ def test_a_leg_with_a_heading_waits_for_the_nose(tmp_path: Path) -> None:
                 await end(world.service.goto(held, goto(0, 40, yaw_deg=180.0), 0))
 
     fly(flight)
+
+
+def test_altitudes_are_flown_in_the_datum_they_are_given_in(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            there = await end(world.service.goto(held, goto(0, 30, 28.0, reference="amsl"), 0))
+            assert there.verdict.args == replace(goto(0, 30, 18.0), speed_mps=there.verdict.args.speed_mps)  # type: ignore[union-attr]
+            assert world.plane.height == pytest.approx(18.0, abs=0.9)
+            why = await refusal(_begun(world, held, goto(0, 40, 20.0, reference="terrain")))
+            assert why.verdict.code == "TerrainUnknown"
+
+    fly(flight)
+
+
+async def _begun(world: World, held: Held, args: GotoArgs) -> None:
+    await end(world.service.goto(held, args, 0))
 
 
 # Arming

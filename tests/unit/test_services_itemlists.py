@@ -1,0 +1,101 @@
+"""The mission protocol from our side: lists written and read over a link that loses messages."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+from fractus_services.mobility import itemlists
+from fractus_services.mobility.autopilot import Autopilot, AutopilotError
+from fractus_services.mobility.dialect import message
+from fractus_services.mobility.itemlists import FENCE, Item, NoLists, download, upload
+
+ITEMS = tuple(Item(5001, 3.0, 393600000 + i, 229500000 - i) for i in range(3))
+
+
+class Keeper(Autopilot):
+    """An autopilot that keeps one list; it hears and says every message but those whose number is in `lost`."""
+
+    def __init__(self, *lost: int, result: int = 0) -> None:
+        super().__init__("tcp:nowhere:1")
+        self._target = (1, 1)
+        self.vehicle.heartbeat_at = asyncio.get_running_loop().time()
+        self.items: list[Any] = []
+        self.wanted = 0
+        self.result = result
+        self._lost = set(lost)
+        self._count = 0
+
+    def _passes(self) -> bool:
+        self._count += 1
+        return self._count not in self._lost
+
+    def send(self, outgoing: Any) -> None:
+        if self._passes():
+            answer = self._answer(outgoing)
+            if answer is not None and self._passes():
+                self._take(message("MISSION_ACK", mission_type=0))  # of another list: not ours
+                self._take(answer)
+
+    def _answer(self, outgoing: Any) -> Any:
+        kind = outgoing.get_type()
+        if self.result:
+            return message("MISSION_ACK", type=self.result, mission_type=FENCE)
+        if kind == "MISSION_COUNT":
+            self.items, self.wanted = [], outgoing.count
+        elif kind == "MISSION_ITEM_INT" and outgoing.seq == len(self.items):
+            self.items.append(outgoing)
+        elif kind == "MISSION_REQUEST_LIST":
+            return message("MISSION_COUNT", count=len(self.items), mission_type=FENCE)
+        elif kind == "MISSION_REQUEST_INT":
+            return self.items[outgoing.seq]
+        elif kind == "MISSION_ACK":
+            return None
+        if len(self.items) < self.wanted:
+            return message("MISSION_REQUEST", seq=len(self.items), mission_type=FENCE)
+        return message("MISSION_ACK", mission_type=FENCE)
+
+
+@pytest.fixture(autouse=True)
+def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(itemlists, "ANSWER_S", 0.01)
+
+
+@pytest.mark.parametrize("lost", [(), (1,), (2,), (3, 4), (6,), (8, 9, 10), (11,)])
+async def test_what_is_written_is_read(lost: tuple[int, ...]) -> None:
+    keeper = Keeper(*lost)
+    await upload(keeper, ITEMS)
+    assert await download(keeper) == ITEMS
+    await upload(keeper, ())
+    assert await download(keeper) == ()
+
+
+@pytest.mark.parametrize(("result", "why"), [(4, "no space"), (14, "denied"), (77, "result 77")])
+async def test_a_refusal_is_told(result: int, why: str) -> None:
+    with pytest.raises(AutopilotError, match=why):
+        await upload(Keeper(result=result), ITEMS)
+
+
+async def test_a_vehicle_without_such_lists_is_told_apart() -> None:
+    with pytest.raises(NoLists):
+        await upload(Keeper(result=3), ITEMS)
+    with pytest.raises(NoLists):
+        await download(Keeper(result=3))
+
+
+async def test_silence_ends_it() -> None:
+    silent = range(1, 100)
+    with pytest.raises(AutopilotError, match="stopped answering") as written:
+        await upload(Keeper(*silent), ITEMS)
+    with pytest.raises(AutopilotError, match="stopped answering") as read:
+        await download(Keeper(*silent))
+    assert written.value.link
+    assert read.value.link
+
+
+async def test_without_a_vehicle_nothing_is_sent() -> None:
+    keeper = Keeper()
+    keeper._target = None
+    with pytest.raises(AutopilotError, match="not connected"):
+        await download(keeper)

@@ -1,7 +1,6 @@
 """Clients that nobody here wrote fly the vehicle: MAVProxy, DroneKit, MAVSDK, and plans of QGroundControl.
 
-MAVProxy, DroneKit and MAVSDK run in the interpreter named by FRACTUS_CLIENTS_PYTHON (else in this one) and are skipped
-where it does not have them: `pip install MAVProxy==1.8.75 dronekit==2.9.2 mavsdk==4.1.0 future`.
+They are development dependencies, so CI has them; FRACTUS_CLIENTS_PYTHON names another interpreter to run them in.
 """
 
 from __future__ import annotations

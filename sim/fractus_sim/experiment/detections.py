@@ -108,6 +108,7 @@ class TruthWatch:
                 if truth is not None and truth.get("snapshot") != self._last:
                     self._last = truth.get("snapshot")
                     file.write(json.dumps(truth) + "\n")
+                    file.flush()
                     self.seen += seen_in(truth)
 
     def _ask(self) -> Mapping[str, Any] | None:

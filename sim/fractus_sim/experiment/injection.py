@@ -94,8 +94,13 @@ class Injector:
 
     @property
     def pending(self) -> bool:
-        """Whether a fault that can still happen has not ended."""
-        return any(not r.over and (r.index is not None or self._begin_s(r) is not None) for r in self._running)
+        """Whether a fault has begun and not ended."""
+        return any(not running.over and running.index is not None for running in self._running)
+
+    @property
+    def missed(self) -> list[tuple[str, str]]:
+        """Vehicle and title of the faults that have not begun."""
+        return [(running.vehicle, running.fault.title) for running in self._running if running.index is None]
 
     def _victims(self, fault: Fault) -> Sequence[str]:
         if isinstance(fault, NodePowerOff) and fault.node is not None:

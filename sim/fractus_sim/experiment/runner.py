@@ -211,6 +211,8 @@ def _play(play: _Play) -> str:
     except ExperimentError as error:
         problem = str(error)
         play.tell("", problem)
+    for vehicle, title in play.injector.missed:
+        play.tell(vehicle, f"{title}: it was over before")
     stage.collect()
     return problem
 

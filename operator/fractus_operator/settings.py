@@ -5,8 +5,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from fractus_core.planning.inventory import Settings as PlanningSettings
+
+from fractus_operator.plugins import UnknownPlugin, load_plugin
 
 
 class BadSetting(ValueError):
@@ -56,6 +59,8 @@ class Settings:
             cruise_speed_mps=_number(environment, "FRACTUS_PLANNING_CRUISE_SPEED", default.planning.cruise_speed_mps),
             climb_speed_mps=_number(environment, "FRACTUS_PLANNING_CLIMB_SPEED", default.planning.climb_speed_mps),
             battery_reserve=_number(environment, "FRACTUS_PLANNING_BATTERY_RESERVE", default.planning.battery_reserve),
+            score_drone=_plugin(environment, "FRACTUS_PLANNING_RANKING"),
+            cover=_plugin(environment, "FRACTUS_PLANNING_COVERING"),
         )
         return cls(
             namespace=environment.get("FRACTUS_SYSTEM_NAMESPACE", default.namespace),
@@ -66,6 +71,13 @@ class Settings:
             log_level=logging.getLevelNamesMapping()[level],
             planning=planning,
         )
+
+
+def _plugin(environment: Mapping[str, str], name: str) -> Any:
+    try:
+        return load_plugin(environment.get(name))
+    except UnknownPlugin as error:
+        raise BadSetting(f"{name}: {error}") from None
 
 
 def _duration(environment: Mapping[str, str], name: str, default: float) -> float:

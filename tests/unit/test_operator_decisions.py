@@ -265,7 +265,13 @@ def test_settings_come_from_the_environment() -> None:
 
 @pytest.mark.parametrize(
     "environment",
-    [{"FRACTUS_LOG_LEVEL": "LOUD"}, {"FRACTUS_PLANNING_CRUISE_SPEED": "fast"}, {"FRACTUS_PLANNING_CRUISE_SPEED": "-1"}],
+    [
+        {"FRACTUS_LOG_LEVEL": "LOUD"},
+        {"FRACTUS_PLANNING_CRUISE_SPEED": "fast"},
+        {"FRACTUS_PLANNING_CRUISE_SPEED": "-1"},
+        {"FRACTUS_PLANNING_RANKING": "best"},
+        {"FRACTUS_LEASE": "0.5"},
+    ],
 )
 def test_a_bad_setting_is_named(environment: dict[str, str]) -> None:
     with pytest.raises(BadSetting, match=next(iter(environment))):

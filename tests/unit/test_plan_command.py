@@ -1,5 +1,6 @@
 """`fractus plan`: what it prints, how it exits, and the sentence for what it cannot read."""
 
+import importlib.metadata
 import json
 import pathlib
 
@@ -257,7 +258,7 @@ def test_plug_ins_are_entry_points(run, monkeypatch):
             return lambda facts: facts.drone.name == "d2"
 
     monkeypatch.setattr(
-        command.importlib.metadata, "entry_points", lambda group: [Entry()] if group == "fractus.planning" else []
+        importlib.metadata, "entry_points", lambda group: [Entry()] if group == "fractus.planning" else []
     )
     result = run([*SCENE, TRAFFIC], "--ranking", "last")
     assert "drone d2 flies" in result.output

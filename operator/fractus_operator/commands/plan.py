@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import json
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
@@ -23,8 +22,9 @@ from fractus_core.validation import check_application
 from fractus_operator.commands.manifests import BadManifest, Manifests, read_manifests
 from fractus_operator.commands.plan_map import plan_map
 from fractus_operator.commands.plan_table import infeasible_table, plan_table
+from fractus_operator.plugins import GROUP as PLUGINS
+from fractus_operator.plugins import UnknownPlugin, load_plugin
 
-PLUGINS = "fractus.planning"
 _DEFAULTS = Settings()
 _INFEASIBLE = 2
 
@@ -187,21 +187,10 @@ def _settings(tuned: Mapping[str, Any]) -> Settings:
 
 
 def _plugin(name: str | None, option: str) -> Any:
-    """The plug-in of that name; None when none is asked for.
-
-    Raises:
-        click.ClickException: there is none, or it is no function.
-    """
-    if name is None:
-        return None
-    known = {entry.name: entry for entry in importlib.metadata.entry_points(group=PLUGINS)}
-    if name not in known:
-        names = ", ".join(sorted(known)) or "none is installed"
-        raise click.ClickException(f"{option}: there is no plug-in {name} ({names})")
-    found = known[name].load()
-    if not callable(found):
-        raise click.ClickException(f"{option}: {known[name].value} is not a function")
-    return found
+    try:
+        return load_plugin(name)
+    except UnknownPlugin as error:
+        raise click.ClickException(f"{option}: {error}") from None
 
 
 # -- output --

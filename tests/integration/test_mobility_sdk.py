@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import math
 from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
+from fractus import sync
 from fractus.drone import Mobility
 from fractus.environment import Endpoint
 from fractus.errors import ControlLost, InvalidRequest, MissionComplete, PolicyDenied
 from fractus_core.api.plans import node_server_name
-from mobility_rig import DRIVER, FRAME, NODE, Rig, altitude_limit, fence, grant
+from mobility_rig import DRIVER, FRAME, NODE, PASSENGER, Rig, altitude_limit, fence, grant, passenger_grant
 
 
 @pytest.fixture
@@ -23,10 +26,10 @@ async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
         await rig.close()
 
 
-def endpoint(rig: Rig) -> Endpoint:
-    folder = rig.directory / "driver-tls"
+def endpoint(rig: Rig, identity: str = DRIVER) -> Endpoint:
+    folder = rig.directory / f"tls-{identity.rpartition('/')[2]}"
     folder.mkdir(exist_ok=True)
-    key, certificate = rig.authority.issue(DRIVER)
+    key, certificate = rig.authority.issue(identity)
     for name, data in (("tls.key", key), ("tls.crt", certificate), ("ca.crt", rig.authority.pem)):
         (folder / name).write_bytes(data)
     return Endpoint(rig.address, node_server_name(NODE), folder)
@@ -82,3 +85,49 @@ async def test_control_returned_through_the_sdk(rig: Rig) -> None:
         with pytest.raises(MissionComplete):
             async with drone.control():
                 raise AssertionError("control after the mission")
+
+
+async def test_asking_first_and_riding_along(rig: Rig) -> None:
+    rig.write_grant(grant(altitude_limit(5, 15), fence("no-fly", "exclusion", "revoke", -60, -10, -40, 10)))
+    rig.start_service()
+    rig.start_vehicle()
+    await rig.until(lambda t: t.HasField("position"), 30)
+    async with Mobility(endpoint(rig)) as drone:
+        high = await drone.can_i.takeoff(40)
+        assert high
+        assert high.altitude_m == pytest.approx(15.0)
+        assert high.decision.policies == ("altitudes",)
+        into = await drone.can_i.goto(*FRAME.latlon(-50, 0), 10)
+        assert not into
+        assert into.takeover == "revoke"
+        fast = await drone.can_i.set_speed(30)
+        assert fast.speed_mps == pytest.approx(12.0)
+        slow = await drone.can_i.set_velocity(1.0, 0.0, yaw_deg=90)
+        assert slow.velocity is None or slow.velocity.north <= 1.0
+        assert (await drone.can_i.hover()).allowed
+        with pytest.raises(ControlLost):
+            await drone.set_velocity(1.0, 0.0)
+        async for sample in drone.telemetry(0.1):
+            assert sample.attitude is not None
+            assert abs(sample.attitude.roll_deg) < 5
+            break
+
+    def plainly() -> None:
+        with sync.Mobility(endpoint(rig)) as drone:
+            assert drone.can_i.takeoff(40).altitude_m == pytest.approx(15.0)
+            samples = drone.telemetry(0.1)
+            assert next(samples).attitude is not None
+            samples.close()
+
+    await asyncio.to_thread(plainly)
+
+    tour = [dict(zip(("lat", "lon", "alt"), (*FRAME.latlon(0, 30), 10.0), strict=True))]
+    rig.write_grant(passenger_grant(tour=tour, services=[{"service": "mobility", "methods": ["GetControl"]}]))
+    await rig.until(lambda t: t.ready and len(rig.entries("grant")) == 2, 20, "the passenger's grant")
+    async with Mobility(endpoint(rig, PASSENGER)) as viewer:
+        assert not await viewer.can_i.goto(*FRAME.latlon(0, 10), 10)
+        async with contextlib.aclosing(viewer.ride()) as rides:
+            async for ride in rides:
+                assert (ride.visited, ride.complete) == (0, False)
+                if ride.flying:
+                    break

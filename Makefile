@@ -27,7 +27,7 @@ demo: packages uv ## Fly the traffic-monitoring example and leave its report in 
 	$(UV) run --frozen --extra sim python -m fractus_sim.demo --cluster $(CLUSTER) --out $(OUT)/demo
 
 # AUTOPILOT=tcp:HOST:PORT flies an ArduCopter that runs already (SITL or a vehicle), at SPEEDUP=1, instead of simulated ones.
-SPEEDUP ?= $(if $(AUTOPILOT),1,4)
+SPEEDUP ?= $(if $(AUTOPILOT),1,3)
 .PHONY: scenario-field
 scenario-field: env ## Fly the field experiment and leave its report in out/field (AUTOPILOT=tcp:HOST:PORT)
 	$(RUN) python -m fractus_sim.scenarios.field --out $(OUT)/field --speedup $(SPEEDUP) \

@@ -1,7 +1,7 @@
 """The field experiment's violating flight, with an autopilot that was started apart, stands elsewhere, and flies slowly.
 
 Waypoints, readiness, modes and acknowledgements must not depend on how the scenario's own vehicles are set up. The other
-runs are left to `make scenario-field`: this one, four times faster than real time, takes about a minute already.
+runs are left to `make scenario-field`: this one, three times faster than real time, takes more than a minute already.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import pytest
 from vehicle_process import free_port, running_vehicle
 
 SLOW = ("WPNAV_SPEED=450", "WPNAV_ACCEL=150", "WPNAV_SPEED_UP=200", "RTL_ALT=1300", "LAND_SPEED=70")
-SPEEDUP = "4"
+SPEEDUP = "3"
 
 
 @pytest.mark.timeout(240)

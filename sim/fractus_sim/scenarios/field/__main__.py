@@ -30,7 +30,7 @@ FAILED_EXPECTATIONS = 2
 @click.option(
     "--speedup",
     type=click.FloatRange(0.2, 8.0),
-    default=4.0,
+    default=3.0,
     show_default=True,
     help="Times real time; for an autopilot that runs already: how fast that one runs.",
 )

@@ -55,15 +55,18 @@ class GrantDirectory:
         """Names of the grants on disk."""
         return {path.stem for path in self._path.glob("*.json")}
 
+    def holds(self, grant: Grant) -> bool:
+        """Whether this very grant is stored."""
+        try:
+            return self._file(grant.name).read_bytes() == stored_form(grant)
+        except FileNotFoundError:
+            return False
+
     def put(self, grant: Grant) -> bool:
         """Store a grant; False when the same was stored already."""
-        path, content = self._file(grant.name), stored_form(grant)
-        try:
-            if path.read_bytes() == content:
-                return False
-        except FileNotFoundError:
-            pass
-        write_file(path, content)
+        if self.holds(grant):
+            return False
+        write_file(self._file(grant.name), stored_form(grant))
         return True
 
     def drop(self, name: str) -> bool:
@@ -234,8 +237,10 @@ class GrantKeeper:
         try:
             self._check(grant)
         except Undecided as doubt:
-            self._doubt(body, str(doubt))
-            return
+            # One that was stored once was verified then, whatever became of its authority since.
+            if not self._stored(grant):
+                self._doubt(body, str(doubt))
+                return
         except Unsigned as problem:
             LOG.error("grant %s is not stored: %s", name, problem)  # noqa: TRY400
             self._remove(name)
@@ -255,6 +260,12 @@ class GrantKeeper:
                 "observedGeneration": grant.status.observed_generation or 0,
             }
         self._write(grant)
+
+    def _stored(self, grant: Grant) -> bool:
+        try:
+            return self._directory.holds(grant)
+        except OSError:
+            return False
 
     def _doubt(self, body: Object, why: str) -> None:
         """Keep what is stored for a while: the authority may be changing."""

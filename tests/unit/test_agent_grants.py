@@ -246,6 +246,20 @@ def test_an_authority_that_stays_unknown_ends_the_grant(
     assert on_disk(tmp_path) == set(), "what the API server has no more does not come back"
 
 
+async def test_a_stored_grant_outlives_its_authority_and_the_agent(
+    doubting: GrantKeeper, doubter: Doubter, store: FakeStore, tmp_path: Path
+) -> None:
+    doubting.take(Listed((manifest(),)))
+    doubter.error = Undecided("it is of an authority that is not in ca.crt")
+    again = GrantKeeper(store, GrantDirectory(tmp_path), "drone-1", doubter.check, monotonic=lambda: doubter.now_s)
+    again.take(Listed((manifest(),)))
+    doubter.now_s = HOLD_S * 2
+    again._give_up_undecided()
+    await again.report_once()
+    assert on_disk(tmp_path) == {"g1.json"}
+    assert store.statuses[-1][1]["phase"] == "Active"
+
+
 async def test_an_api_server_that_is_gone_for_a_month_takes_no_grant_away(
     doubting: GrantKeeper, doubter: Doubter, store: FakeStore, tmp_path: Path
 ) -> None:

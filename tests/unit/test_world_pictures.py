@@ -89,7 +89,7 @@ def test_boxes_are_where_the_pixels_change(world: World, height_m: float, mount:
     truth = world.truth(pose, LENS, mount=mount, time_s=TIME_S)
     whole = [seen for seen in truth.objects if seen.in_frame == 1.0 and seen.visible > 0.995]
     whole = [seen for seen in whole if seen.box[2] - seen.box[0] > 6]
-    assert len(whole) >= 3, "the scene lost its traffic; choose another time"
+    assert len(whole) >= 2, "the scene lost its traffic; choose another time"
     for seen in whole:
         changed = difference(world, pose, mount, seen.id)
         assert np.abs(np.array(changed) - np.array(seen.box)).max() < 2.0, seen
@@ -177,7 +177,7 @@ def test_people_and_engines_are_warm(world: World) -> None:
     picture = world.render(pose, LENS, time_s=TIME_S, band="ir")
     assert np.array_equal(picture[..., 0], picture[..., 2]), "a thermal picture has no colours"
     ground = float(np.median(picture))
-    things = [seen for seen in world.truth(pose, LENS, time_s=TIME_S).objects if seen.visible == 1.0]
+    things = [seen for seen in world.truth(pose, LENS, time_s=TIME_S).objects if seen.visible == 1.0 and seen.speed_mps]
     assert things
     for seen in things:
         left, top, right, bottom = (round(edge) for edge in seen.box)

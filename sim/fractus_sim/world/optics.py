@@ -173,7 +173,7 @@ class View:
             max(pose.height_m, MIN_HEIGHT_M),
             np.array(frame.xy(pose.lat, pose.lon)),
             turn,
-            np.linalg.inv(turn),
+            np.asarray(np.linalg.inv(turn), np.float64),
         )
 
     def rays(self, pixels: Matrix) -> Matrix:

@@ -321,7 +321,7 @@ def _shares(view: View, hulls: Iterable[Fixed], labels: Labels, number: int) -> 
         return 0.0, 0.0
     inside = whole[y0 - low[1] : y1 - low[1], x0 - low[0] : x1 - low[0]] > 0
     visible = inside & (labels[y0:y1, x0:x1] == number)
-    return np.count_nonzero(inside) / total, np.count_nonzero(visible) / total
+    return float(np.count_nonzero(inside) / total), float(np.count_nonzero(visible) / total)
 
 
 def _true_heading(view: View, heading_deg: float) -> float:

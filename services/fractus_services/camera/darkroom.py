@@ -74,7 +74,7 @@ def developed(
     """A picture with its filters applied.
 
     Args:
-        pictures: one; or three of the same size, when there are more to tell what moves by.
+        pictures: one; or three of the same view, when there are more to tell what moves by. The middle one counts.
         chosen: what to do.
         detector: finds faces.
         face_px: width of the smallest face.

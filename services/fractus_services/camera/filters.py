@@ -9,7 +9,7 @@ import numpy.typing as npt
 from fractus_core.policy.values import FaceMethod
 
 from fractus_services.camera.faces import Box
-from fractus_services.camera.imaging import Pixels, opencv
+from fractus_services.camera.imaging import Pixels, opencv, reduced
 
 Mask = npt.NDArray[np.bool_]
 
@@ -103,18 +103,19 @@ def moving(before: Pixels, picture: Pixels, after: Pixels, *, fixed: bool) -> Ma
     over a homography). What differs from both of them moves.
 
     Args:
-        before: taken a moment before, same size.
+        before: taken a moment before, of the same view.
         picture: the one that is asked about.
-        after: taken a moment after, same size.
+        after: taken a moment after, of the same view.
         fixed: the camera does not move.
 
     Returns:
         True where something moves; None when the pictures could not be laid over each other.
     """
     cv2 = opencv()
-    scale = min(MOTION_PX / picture.shape[1], 1.0)
+    still = reduced(picture, MOTION_PX)
     small = [
-        cv2.resize(one, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) for one in (before, picture, after)
+        one if one.shape == still.shape else cv2.resize(one, still.shape[1::-1], interpolation=cv2.INTER_AREA)
+        for one in (before, still, after)
     ]
     differs = [_difference(other, small[1], fixed) for other in (small[0], small[2])]
     if differs[0] is None or differs[1] is None:

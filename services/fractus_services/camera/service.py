@@ -22,6 +22,7 @@ from fractus_services.camera.album import Album, AlbumFull, NoSuchImage
 from fractus_services.camera.darkroom import NotHidden, Recipe, developed, is_upright, recipe
 from fractus_services.camera.drivers import CameraFailed, Wanted
 from fractus_services.camera.faces import BadModel, Detector, smallest_face_px
+from fractus_services.camera.filters import MOTION_PX
 from fractus_services.camera.imaging import NotAPicture, Pixels, decoded, encoded, fitted, source_size
 from fractus_services.camera.metadata import tagged
 from fractus_services.camera.shots import Pose, Shot, facts
@@ -33,7 +34,7 @@ from fractus_services.replies import Refused, refused
 log = logging.getLogger(__name__)
 
 MIN_PX, MAX_PX = 16, 8192
-MOST_PIXELS = 12_600_000
+MOST_PIXELS = 8_300_000
 """Of a camera that has fewer itself: so many may be asked for."""
 MAX_WAITING = 8
 """So many pictures may be under way or wait for the shutter, of one component and of all."""
@@ -210,7 +211,7 @@ class CameraService:
                 self._checked(call, held, judge_privacy(now, held.compiled, after), after),
             ]
             # Enlarging a picture does not make its faces easier to find.
-            shown = min(width, *(picture.shape[1] for picture in pictures))
+            shown = min(width, pictures[len(pictures) // 2].shape[1])
             moment = datetime.fromtimestamp(after.time_s, UTC).strftime("%Y%m%d%H%M%S%f")[:17]
             name = f"{moment}-{next(self._numbers) % 10000:04d}.jpg"
             return _Exposed(name, held, _together(verdicts), now, after, pictures, shown)
@@ -227,7 +228,10 @@ class CameraService:
         whole_width = source_size(args.width, args.height, self._body.resolution)[0]
 
         def work() -> bytes:
-            pictures = [fitted(one, args.width, args.height) for one in exposed.pictures]
+            small = min(MOTION_PX / args.width, 1.0)
+            sizes = [(max(round(args.width * small), 1), max(round(args.height * small), 1))] * len(exposed.pictures)
+            sizes[len(sizes) // 2] = (args.width, args.height)
+            pictures = [fitted(one, *size) for one, size in zip(exposed.pictures, sizes, strict=True)]
             exposed.pictures.clear()
             picture = developed(pictures, chosen, self._detector, face_px, upright=upright, fixed=self._body.fixed)
             data = encoded(picture)

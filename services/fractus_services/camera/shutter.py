@@ -9,7 +9,8 @@ import time
 from collections.abc import Callable
 
 from fractus_services.camera.drivers import TIMEOUT_S, CameraFailed, Driver, Wanted
-from fractus_services.camera.imaging import Pixels
+from fractus_services.camera.filters import MOTION_PX
+from fractus_services.camera.imaging import Pixels, reduced
 
 _Answer = asyncio.Future[list[Pixels]]
 
@@ -30,7 +31,7 @@ class Shutter:
         self._busy_since_s: float | None = None
 
     async def expose(self, wanted: Wanted, count: int = 1, apart_s: float = 0.0) -> list[Pixels]:
-        """Pictures one after the other.
+        """Pictures one after the other; the one in the middle in full, the others reduced to `MOTION_PX`.
 
         Args:
             wanted: what is asked of the camera.
@@ -76,7 +77,8 @@ class Shutter:
             for i in range(count):
                 if i:
                     time.sleep(apart_s)
-                pictures.append(self._driver.capture(wanted))
+                picture = self._driver.capture(wanted)
+                pictures.append(picture if i == count // 2 else reduced(picture, MOTION_PX))
         except Exception as error:  # whatever it is, it is the caller's to hear of
             failure = error
         self._busy_since_s = None

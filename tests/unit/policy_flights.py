@@ -193,6 +193,8 @@ class Fleet:
         self.wanted = np.zeros((count, 3))
         self.held = np.zeros(count, dtype=bool)
         self.until = np.zeros(count)
+        # Who is told nothing stops.
+        self.stop(np.arange(count))
 
     def sway(self) -> Floats:
         """How far wind has each off its course."""
@@ -352,6 +354,9 @@ def flights(seed: int, count: int, shared: int = 8, requests: int = 3) -> Tally:
                 break
             found = fleet.trespassing() & ~excused
             for i in np.flatnonzero(found.any(axis=1)):
+                # Where wind takes a drone that nothing was permitted to is nobody's doing.
+                if not told[i]:
+                    continue
                 tally.wrong.append(f"seed {seed}, drone {i}, turn {turn}, {fleet.time_s:.2f} s: {told[i]}")
                 excused[i] = True
     return tally

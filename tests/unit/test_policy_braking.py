@@ -93,3 +93,28 @@ def test_a_faster_leg_needs_a_wider_turn() -> None:
     assert (slow.action, slow.brake_first) == ("allow", False)
     fast = ask(grant, goto(0, 60, speed_mps=15.0), at(0, -2, east_mps=1.5, speed_setpoint_mps=1.0))
     assert fast.brake_first or not fast.permits
+
+
+def test_a_drone_that_speeds_up_needs_more_room() -> None:
+    steady = stop_point(at(east_mps=4, speed_setpoint_mps=4), (0.0, 0.0))[0]
+    known = stop_point(at(east_mps=4, speed_setpoint_mps=9, forward_mps2=0.0), (0.0, 0.0))[0]
+    unknown = stop_point(at(east_mps=4, speed_setpoint_mps=9), (0.0, 0.0))[0]
+    measured = stop_point(at(east_mps=4, speed_setpoint_mps=9, forward_mps2=2.5), (0.0, 0.0))[0]
+    slowing = stop_point(at(east_mps=4, speed_setpoint_mps=9, forward_mps2=-2.5), (0.0, 0.0))[0]
+    assert steady == known
+    assert slowing < known - 2
+    assert unknown == measured > steady + 3
+    # By hand, in steps: latency, easing off with the jerk limit, then ArduPilot's stopping distance.
+    x, v, a, t = 0.0, 4.0, 2.5, 0.0
+    while t < 0.3 or a > 0:
+        a = a if t < 0.3 else max(a - 5.0 * 1e-4, 0.0)
+        x, v, t = x + v * 1e-4, v + a * 1e-4, t + 1e-4
+    x += v * 0.25 + 1.25 + v * v / 5
+    assert unknown == pytest.approx(x, abs=0.05)
+
+
+def test_room_for_a_stop_while_it_turns() -> None:
+    grant = compiled(exclusion(box(14, 7.5, 40, 30)))
+    now = at(0, 0, east_mps=6, speed_setpoint_mps=6)
+    leg = ask(grant, goto(-6, 60), now)
+    assert leg.brake_first or not leg.permits, "a stop in the middle of the turn would end in the zone's margin"

@@ -96,3 +96,70 @@ def test_an_unknown_position_is_no_position() -> None:
         verdict = monitor(state, compiled())
         assert verdict is not None
         assert (verdict.action, verdict.takeover) == ("takeover", "hover")
+
+
+def test_a_takeover_of_a_fast_drone_begins_with_a_stop() -> None:
+    grant = compiled(exclusion(WALL, "returnToLaunch"))
+    fast, slow = monitor(at(0, 40, north_mps=8), grant), monitor(at(0, 70), grant)
+    assert fast is not None
+    assert slow is not None
+    assert (fast.brake_first, slow.brake_first) == (True, False)
+
+
+def test_a_drone_that_creeps_over_a_border_is_stopped() -> None:
+    creeping = monitor(at(0, 49.9, north_mps=0.3), compiled(exclusion(WALL)))
+    assert creeping is not None
+    assert (creeping.action, creeping.takeover) == ("deny", "hover")
+    out = monitor(at(0, 49.9, north_mps=0.3), compiled(inclusion(box(-50, -50, 50, 50)), operationArea=[]))
+    assert out is not None
+
+
+def test_lower_limits_hold_in_flight_but_not_for_a_landing() -> None:
+    grant = compiled(altitude(lowerLimit=8, upperLimit=30))
+    low = monitor(at(alt=4), grant)
+    assert low is not None
+    assert isinstance(low.args, GotoArgs)
+    assert (low.action, low.code, low.args.alt) == ("correct", "AltitudeBelowLimit", 8)
+    assert monitor(at(alt=4, vertical=True), grant) is None
+    assert monitor(at(alt=7), grant) is None, "within what the autopilot strays"
+
+
+def test_no_correction_leads_into_a_zone() -> None:
+    under = exclusion(box(-50, -50, 50, 50), upper=20, name="under")
+    stuck = monitor(at(alt=30), compiled(under, altitude(upperLimit=15)))
+    assert stuck is not None
+    assert (stuck.action, stuck.takeover, stuck.args) == ("deny", "hover", None)
+
+
+def test_a_zone_that_appears_around_a_flying_drone() -> None:
+    for action, want in (("ignore", None), ("hover", "hover"), ("land", "land"), ("revoke", "revoke")):
+        verdict = monitor(at(0, 70, north_mps=-4), compiled(exclusion(WALL, action)))
+        assert (verdict.takeover if verdict else None) == want, "it leaves by itself, where the policy lets it"
+    deeper = monitor(at(0, 60, north_mps=6), compiled(exclusion(WALL, "adjust")))
+    assert deeper is not None
+    assert (deeper.action, deeper.takeover) == ("deny", "hover")
+
+
+@pytest.mark.parametrize("speed_mps", [2.0, 5.0, 8.0, 12.0])
+def test_what_is_permitted_never_alarms(speed_mps: float) -> None:
+    """A drone that flies a permitted leg to the edge of a zone's margin, as ArduPilot brakes for it."""
+    import numpy as np
+    from policy_flights import STEP_S, Fleet, scene
+    from policy_world import ask, goto
+
+    grant = compiled(exclusion(WALL, "revoke"), operationArea=[])
+    assert ask(grant, goto(0, 47.4, speed_mps=speed_mps)).permits
+    rng = np.random.default_rng(1)
+    fleet = Fleet(rng, [scene(rng)])
+    fleet.place[:], fleet.speed[:], fleet.gust[:], fleet.error[:] = [0, 0, 10], 0.0, 0.0, 0.0
+    fleet.goal[:], fleet.cruise[:], fleet.setpoint[:], fleet.held[:] = [0, 47.4, 10], speed_mps, speed_mps, False
+    for _ in range(int(60 / STEP_S)):
+        fleet.step()
+        x, y, z = fleet.place[0]
+        east, north, up = fleet.speed[0]
+        now = at(
+            x, y, z, east_mps=east, north_mps=north, down_mps=-up, speed_setpoint_mps=speed_mps,
+            forward_mps2=fleet.accel[0, 1],
+        )  # fmt: skip
+        assert monitor(now, grant) is None, (y, north)
+    assert fleet.place[0, 1] == pytest.approx(47.4, abs=0.1)

@@ -9,10 +9,13 @@ from __future__ import annotations
 import math
 import random
 
+import pytest
+from fractus_core.policy import legs, velocities
 from fractus_core.policy.limits import LEAST_LEG_M
 from fractus_core.policy.values import Call, GotoArgs, TakeoffArgs
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from policy_flights import flights
 from policy_world import HOME, Corners, altitude, ask, at, compiled, exclusion, goto, inclusion, ring, target
 
 EARTH_M = 6_371_000.0
@@ -89,7 +92,7 @@ def polygons(draw: st.DrawFn) -> Corners:
 
 
 spots = st.tuples(st.floats(-150, 150), st.floats(-150, 150))
-velocities = st.tuples(st.floats(-8, 8), st.floats(-8, 8)).filter(lambda v: math.hypot(*v) < 10)
+speeds = st.tuples(st.floats(-8, 8), st.floats(-8, 8)).filter(lambda v: math.hypot(*v) < 10)
 
 
 @_cases
@@ -97,7 +100,7 @@ velocities = st.tuples(st.floats(-8, 8), st.floats(-8, 8)).filter(lambda v: math
     zones=st.lists(polygons(), min_size=1, max_size=4),
     start=spots,
     to=spots,
-    velocity=velocities,
+    velocity=speeds,
     action=st.sampled_from(["ignore", "adjust"]),
     seed=st.integers(0, 10**6),
 )
@@ -203,3 +206,19 @@ def test_no_request_is_too_odd_to_answer(lat: float, lon: float, alt: float, vn:
     else:
         assert verdict.reason
         assert verdict.code
+
+
+def test_no_permitted_request_ends_in_a_breach() -> None:
+    """Velocities, legs in flight, bands, schedules, limits, wind: the million of `bench/oracle.py` in small."""
+    tally = flights(seed=7, count=500)
+    assert tally.wrong == []
+    assert tally.permitted > tally.asked / 3
+    assert tally.corrected > 100
+    assert tally.taken > 20
+    assert tally.braked > 0
+
+
+def test_the_oracle_would_notice(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (legs, velocities):
+        monkeypatch.setattr(module, "margin_m", lambda _now: 0.5)
+    assert flights(seed=3, count=200).wrong

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 from fractus_services.mobility.vehicle import Vehicle
 
@@ -23,3 +25,15 @@ def test_in_doubt_it_flies(landed_state: int, landed_at: float, altitude_m: floa
 
 def test_an_armed_vehicle_whose_place_is_unknown_flies() -> None:
     assert Vehicle(armed=True, heartbeat_at=10.0).in_air
+
+
+@pytest.mark.parametrize(("vx", "forward_mps2"), [((100, 12), 2.4), ((600, -10), -2.0), ((300, 0), 0.0)])
+def test_it_tells_how_it_speeds_up(vx: tuple[int, int], forward_mps2: float) -> None:
+    vehicle = Vehicle(located=True)
+    assert vehicle.forward_mps2 is None
+    for i in range(12):
+        told = SimpleNamespace(lat=1, lon=1, relative_alt=0, alt=0, vx=vx[0] + i * vx[1], vy=0, vz=0, hdg=0)
+        told.get_type = lambda: "GLOBAL_POSITION_INT"
+        vehicle.take(told, i * 0.05)
+    assert vehicle.forward_mps2 == pytest.approx(forward_mps2, abs=0.01)
+    assert len(vehicle.courses) < 10, "old ones are forgotten"

@@ -41,9 +41,8 @@ def monitor(now: Situation, grant: CompiledGrant) -> Verdict | None:
         raise ValueError("the time is not a number")
     if now.lat is None or now.lon is None or not now.sound:
         return Verdict("takeover", None, "PositionUnknown", "the drone's position is unknown", (), "hover")
-    if now.forward_mps2 is None:
-        # A drone that flies as it was permitted to mostly cruises or brakes; what it was permitted has room for the rest.
-        now = replace(now, forward_mps2=0.0)
+    # A drone that speeds up does so on a way that was judged with room for it, and brakes at its end in time.
+    now = replace(now, forward_mps2=min(now.forward_mps2 or 0.0, 0.0))
     start = grant.frame.xy(now.lat, now.lon)
     stop = stop_point(now, start)
     rest_m = stop_altitude_m(now)

@@ -87,9 +87,12 @@ def surge(situation: Situation) -> Surge:
     forward = situation.forward_mps2
     if forward is None:
         forward = frame.accel_mps2 if STANDING_MPS <= speed < situation.speed_setpoint_mps else 0.0
-    forward = min(max(forward, 0.0), frame.accel_mps2)
+    forward = min(max(forward, -frame.accel_mps2), frame.accel_mps2)
     if forward <= 0.0:
-        return Surge(speed, speed * (situation.latency_s + bite_s))
+        # Who brakes already brakes on, and has less to add.
+        left = max(speed + forward * situation.latency_s, 0.0)
+        bite_s *= 1.0 + forward / frame.accel_mps2
+        return Surge(left, (speed + left) / 2 * situation.latency_s + left * bite_s)
     late_s, easing_s = situation.latency_s, forward / frame.jerk_mps3
     first = speed + forward * late_s
     last = first + forward * easing_s / 2

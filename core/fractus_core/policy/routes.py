@@ -225,17 +225,19 @@ class _Search:
         self._known: set[int] = set()
         self._clear: dict[tuple[int, int], bool] = {}
         self._returns: dict[int, bool] = {}
+        # Ends that are too close to a fence themselves: legs to and from them are judged by the engine's own rules.
+        self._odd: set[int] = set()
 
     def run(self) -> tuple[XY, ...] | None:
         """The way, or None."""
         if self._ends[0] == self._ends[1]:
             return (self._ends[1],) if self._space.permits(*self._ends) else None
-        here, begin = shapely.Point(self._ends[1]), shapely.Point(self._ends[0])
-        if not self._space.returns(self._ends[1]) or (
-            self._space.blockers(here) and not self._space.permits(self._ends[1], self._ends[1])
-        ):
+        begin = shapely.points(self._ends[0])
+        around, about = self._space.blockers(begin), self._space.blockers(shapely.points(self._ends[1]))
+        self._odd = {node for node, found in ((_START, around), (_TARGET, about)) if found}
+        if not self._space.returns(self._ends[1]) or (about and not self._space.permits(self._ends[1], self._ends[1])):
             return None
-        for obstacle in self._space.blockers(begin):
+        for obstacle in around:
             # Out of it the nearest way first: no corner need lie there.
             self._add(self._space.way_out(obstacle, begin))
             self._learn([obstacle], self._ends[0])
@@ -264,9 +266,8 @@ class _Search:
         return tuple(points[1:])
 
     def _clears(self, a: XY, b: XY) -> bool:
-        free = not self._space.blockers(shapely.LineString((a, b))) or (
-            (a == self._ends[0] or b == self._ends[1]) and self._space.permits(a, b)
-        )
+        odd = (_START in self._odd and a == self._ends[0]) or (_TARGET in self._odd and b == self._ends[1])
+        free = not self._space.blockers(shapely.linestrings((a, b))) or (odd and self._space.permits(a, b))
         return free and self._space.returns(b)
 
     def _way(self) -> tuple[XY, ...]:
@@ -303,8 +304,8 @@ class _Search:
     def _test(self, begin: int, end: int) -> bool:
         """Whether a leg is legal; what blocks it joins the obstacles."""
         a, b = (self._ends[n] if n <= _TARGET else self._place(n) for n in (begin, end))
-        blockers = self._space.blockers(shapely.LineString((a, b)))
-        if blockers and (min(begin, end) > _TARGET or not self._space.permits(a, b)):
+        blockers = self._space.blockers(shapely.linestrings((a, b)))
+        if blockers and (self._odd.isdisjoint((begin, end)) or not self._space.permits(a, b)):
             self._learn(blockers, a)
             return False
         if end > _TARGET and end not in self._returns:
@@ -320,7 +321,7 @@ class _Search:
         new = [o for o in obstacles if (o if isinstance(o, int) else id(o)) not in self._known]
         if not new:
             return
-        here = shapely.Point(begin)
+        here = shapely.points(begin)
         zones = [o for o in new if isinstance(o, Patch)]
         nearest = min(zones, key=lambda o: (o.shape.distance(here), o.rule.name, o.zone), default=None)
         new = [o for o in new if o is nearest or isinstance(o, int)]

@@ -68,11 +68,18 @@ class _Setpoint:
     grant: CompiledGrant
     at: XY
     notes: list[Clamped] = field(default_factory=list)
+    _legs: dict[VelocityArgs, Leg] = field(default_factory=dict)
 
     @property
     def leg(self) -> Leg:
         """What it sweeps as it stands."""
-        return swept(self.now, self.at, self.args)
+        return self.sweep(self.args)
+
+    def sweep(self, args: VelocityArgs) -> Leg:
+        """What a velocity sweeps."""
+        if args not in self._legs:
+            self._legs[args] = swept(self.now, self.at, args)
+        return self._legs[args]
 
     @property
     def air(self) -> Air:
@@ -177,7 +184,7 @@ def _lead_back(setpoint: _Setpoint, bound: Bound, *, above: bool) -> Verdict | N
 
 
 def _beyond(setpoint: _Setpoint, args: VelocityArgs, edge: float, *, above: bool) -> bool:
-    leg = swept(setpoint.now, setpoint.at, args)
+    leg = setpoint.sweep(args)
     return leg.upper_m > edge + SLACK if above else leg.lower_m < edge - SLACK
 
 
@@ -228,7 +235,7 @@ def _scaled(args: VelocityArgs, share: float) -> VelocityArgs:
 def _breached(setpoint: _Setpoint, args: VelocityArgs) -> list[Breach]:
     now = setpoint.now
     slack = height_margin_m(now) + now.airframe.tracking_m
-    return breaches(swept(now, setpoint.at, args), now, setpoint.grant, _margin_m(now), slack)
+    return breaches(setpoint.sweep(args), now, setpoint.grant, _margin_m(now), slack)
 
 
 def _margin_m(now: Situation) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,6 +29,12 @@ SURELY_M, UNTOLD_M = 1.5, 0.5
 _IN_AIR = frozenset({2, 3, 4})
 _FIX_3D = 3
 _LEAST_ERROR_M, _UNTOLD_ERROR_M, _WORST_ERROR_M = 0.5, 1.5, 10.0
+
+COURSE_S = 0.3
+"""Velocities this far back tell how the drone speeds up."""
+
+SLOW_MPS = 0.1
+"""Below this nobody can tell where a drone heads."""
 
 
 @dataclass(slots=True)
@@ -67,6 +74,7 @@ class Vehicle:
     fix_type: int = 0
     located: bool = False
     position_error_m: float = _UNTOLD_ERROR_M
+    courses: deque[tuple[float, float, float]] = field(default_factory=deque)
     texts: list[str] = field(default_factory=list)
     path_lost: bool = False
     failsafe_text: str = ""
@@ -104,6 +112,17 @@ class Vehicle:
         return math.hypot(self.north_mps, self.east_mps)
 
     @property
+    def forward_mps2(self) -> float | None:
+        """How much it speeds up along its course, over the last velocities; None while these are too few."""
+        if len(self.courses) < 2:
+            return None
+        (begun, north, east), (now, *_) = self.courses[0], self.courses[-1]
+        if now - begun < COURSE_S / 3:
+            return None
+        along = (self.north_mps - north) * self.north_mps + (self.east_mps - east) * self.east_mps
+        return along / max(self.speed_mps, SLOW_MPS) / (now - begun)
+
+    @property
     def flight_state(self) -> str:
         """inactive, takingOff, flying or landing."""
         if not self.in_air:
@@ -133,6 +152,7 @@ class Vehicle:
             in_air=self.in_air,
             position_error_m=self.position_error_m,
             speed_setpoint_mps=speed_mps,
+            forward_mps2=self.forward_mps2,
             vertical=vertical,
             airframe=airframe,
         )
@@ -154,6 +174,9 @@ def _position(vehicle: Vehicle, message: Any, now: float) -> None:
     vehicle.lat, vehicle.lon = message.lat / 1e7, message.lon / 1e7
     vehicle.altitude_m, vehicle.amsl_m = message.relative_alt / 1e3, message.alt / 1e3
     vehicle.north_mps, vehicle.east_mps, vehicle.down_mps = message.vx / 100, message.vy / 100, message.vz / 100
+    vehicle.courses.append((now, vehicle.north_mps, vehicle.east_mps))
+    while vehicle.courses[0][0] < now - COURSE_S:
+        vehicle.courses.popleft()
     if message.hdg != 0xFFFF:
         vehicle.yaw_deg = message.hdg / 100
     vehicle.position_at = now

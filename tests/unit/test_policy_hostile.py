@@ -1,0 +1,204 @@
+"""The engine under attack: odd places, odd zones, odd numbers, odd clocks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from fractus_core.api.plans import GrantSpec
+from fractus_core.geo import LocalFrame
+from fractus_core.policy.compiled import compile_grant
+from fractus_core.policy.engine import judge
+from fractus_core.policy.monitoring import monitor
+from fractus_core.policy.routes import route
+from fractus_core.policy.values import Airframe, Call, GotoArgs, Home, Moment, Situation, VelocityArgs
+from policy_world import (
+    METHODS,
+    NOW,
+    altitude,
+    ask,
+    at,
+    box,
+    compiled,
+    exclusion,
+    goto,
+    inclusion,
+    policy,
+    spec,
+    zone,
+)
+
+SERVICES = [{"service": "mobility", "methods": [*METHODS, "SetVelocity"]}]
+RETRACING = Airframe(retraces=True)
+
+
+@pytest.mark.parametrize(
+    ("lat", "lon"), [(-17.0, 179.9999), (-17.0, -180.0), (89.9995, 40.0), (-89.9995, -120.0), (0, 0)]
+)
+def test_anywhere_on_the_globe(lat: float, lon: float) -> None:
+    frame = LocalFrame(lat, lon)
+
+    def area(x0: float, y0: float, x1: float, y1: float) -> dict[str, Any]:
+        corners = [frame.latlon(x, y) for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
+        return {"polygon": {"exterior": [{"lat": a, "lon": b} for a, b in corners]}}
+
+    body = spec(exclusion(area(30, -20, 60, 20)), services=SERVICES, operationArea=[], home={"lat": lat, "lon": lon})
+    grant = compile_grant(body)
+    now = Situation(
+        time_s=NOW, lat=lat, lon=lon, altitude_m=10, home=Home(lat, lon, 0), in_air=True, airframe=RETRACING
+    )
+    for x, y, code in ((45, 0, "InsideExclusionZone"), (100, 0, "LegThroughExclusionZone"), (0, 100, "")):
+        assert judge(Call("Goto", GotoArgs(*frame.latlon(x, y), 10)), now, grant).code == code
+    assert judge(Call("SetVelocity", VelocityArgs(0, 9, hold_s=2)), replace(now, east_mps=9), grant).action == "deny"
+    way = route((0, 0), (100, 0), now, grant, 10)
+    assert way is not None
+    assert len(way) == 3
+    assert monitor(replace(now, east_mps=9), grant) is None
+    assert monitor(replace(now, east_mps=14), grant) is not None
+
+
+@pytest.mark.parametrize("place", [(90.0, 0.0), (-90.0, 180.0), (39.36, -157.05), (0.0, 202.95)])
+def test_targets_at_the_ends_of_the_earth(place: tuple[float, float]) -> None:
+    for area in ([], [box(-200, -200, 200, 200)]):
+        assert ask(compiled(operationArea=area), Call("Goto", GotoArgs(*place, 10))).code == "InvalidArgument"
+
+
+def test_a_zone_as_big_as_a_country() -> None:
+    huge = {"circle": {"center": {"lat": 39.0, "lon": 22.0}, "radius": 200_000}}
+    assert ask(compiled(exclusion(huge)), goto(50, 0)).action == "deny"
+    assert ask(compiled(inclusion(huge)), goto(50, 0)).action == "allow"
+    beside = {"circle": {"center": {"lat": 41.3, "lon": 22.95}, "radius": 200_000}}
+    assert ask(compiled(exclusion(beside)), goto(50, 0)).action == "allow"
+    assert ask(compiled(inclusion(beside)), goto(50, 0)).action == "deny"
+
+
+def _court() -> dict[str, Any]:
+    area = box(-60, -60, 60, 60)
+    area["polygon"]["holes"] = [box(-40, -40, 40, 40)["polygon"]["exterior"]]
+    return area
+
+
+def test_a_zone_with_a_hole() -> None:
+    grant = compiled(exclusion(_court()), operationArea=[])
+    assert ask(grant, goto(30, 0)).action == "allow"
+    assert ask(grant, goto(38, 0)).code == "TooCloseToExclusionZone"
+    assert ask(grant, goto(50, 0)).code == "InsideExclusionZone"
+    assert ask(grant, goto(100, 0)).code == "LegThroughExclusionZone"
+    assert route((0, 0), (100, 0), at(airframe=RETRACING), grant, 10) is None
+    kept = compiled(inclusion(_court()), operationArea=[])
+    assert ask(kept, goto(50, 20), at(50, 0)).code == "WayHomeBlocked", "home lies in the hole"
+    assert ask(kept, goto(30, 0), at(50, 0)).action == "deny"
+
+
+def test_zones_that_touch_leave_no_gap() -> None:
+    two = (exclusion(box(-100, 20, 0, 40), name="a"), exclusion(box(0, 20, 100, 40), name="b"))
+    for way in ((0, 60), (0.001, 60), (-0.001, 60)):
+        assert ask(compiled(*two), goto(*way)).action == "deny"
+    union = policy(
+        "in", "GeofenceControl", "inclusion", [zone("a", box(-50, -50, 0, 50)), zone("b", box(0, -50, 50, 50))]
+    )
+    assert ask(compiled(union), goto(30, 0), at(-30, 0)).action == "allow", "their common border is none"
+
+
+def test_a_leg_to_where_the_drone_is() -> None:
+    grant = compiled(exclusion(box(10, -20, 30, 20)), services=SERVICES)
+    assert ask(grant, goto(0, 0)).action == "allow"
+    assert ask(grant, goto(0, 0, 30)).action == "allow"
+    assert ask(grant, goto(8.5, 0), at(8.5, 0)).action == "deny", "too close to stay"
+    assert ask(grant, Call("SetVelocity", VelocityArgs(0, 0, 0))).action == "allow"
+    assert ask(grant, goto(20, 0), at(20, 0)).action == "deny"
+
+
+def test_home_inside_a_zone() -> None:
+    grant = compiled(exclusion(box(-20, -20, 20, 20), "land"), operationArea=[])
+    assert ask(grant, Call("Arm"), at(alt=0, in_air=False)).code == "InsideExclusionZone"
+    assert ask(grant, Call("Takeoff"), at(alt=0)).action == "deny"
+    assert ask(grant, goto(100, 0), at(60, 0)).code == "WayHomeBlocked"
+    assert ask(grant, goto(100, 0), at(60, 0, airframe=RETRACING)).code == "WayHomeBlocked"
+    assert ask(grant, goto(40, 0), at(15, 0)).action == "allow", "out of it, whatever lies at home"
+    assert ask(grant, Call("ReturnToLaunch"), at(60, 0)).action == "allow"
+
+
+NANS = [math.nan, math.inf, -math.inf]
+
+
+@pytest.mark.parametrize("odd", NANS)
+def test_figures_that_are_none(odd: float) -> None:
+    grant = compiled(exclusion(box(-20, 20, 20, 60)), altitude(upperLimit=30), services=SERVICES)
+    calls = [
+        Call("SetVelocity", VelocityArgs(odd, 0)), Call("SetVelocity", VelocityArgs(0, 0, odd)),
+        Call("SetVelocity", VelocityArgs(0, 1, hold_s=odd)), Call("Goto", GotoArgs(odd, 22.95)),
+        Call("Goto", GotoArgs(39.36, 22.95, speed_mps=odd)),
+    ]  # fmt: skip
+    assert {ask(grant, call).code for call in calls} == {"InvalidArgument"}
+    fine = Call("SetVelocity", VelocityArgs(1, 0))
+    for field in ("altitude_m", "down_mps", "forward_mps2", "latency_s", "position_error_m", "altitude_error_m"):
+        assert ask(grant, fine, replace(at(), **{field: odd})).code == "PositionUnknown", field
+        assert ask(grant, goto(0, 10), replace(at(), **{field: odd})).code == "PositionUnknown", field
+
+
+def test_a_clock_set_back_in_flight() -> None:
+    shut = {"validFrom": "2026-06-01T11:00:00Z", "validUntil": "2026-06-01T13:00:00Z"}
+    fence = exclusion(box(-20, 20, 20, 60), "land")
+    fence["spec"] |= shut
+    grant = compiled(fence, services=SERVICES)
+    back = replace(at(0, 10, north_mps=5), time_s=Moment(NOW, NOW - 7200.0))
+    assert monitor(back, grant) is not None, "it may be any time in between"
+    assert not ask(grant, Call("SetVelocity", VelocityArgs(5, 0)), back).permits
+    assert not ask(grant, goto(0, 40), replace(back, time_s=Moment(NOW + 7200, NOW))).permits
+
+
+def test_a_grant_without_anything_grants_nothing() -> None:
+    empty = compile_grant(GrantSpec.model_validate(spec(services=[]).to_dict()))
+    for method in (*METHODS, "CaptureImage", "SetVelocity", "Explode"):
+        assert judge(Call(method), at(), empty).action == "deny"
+
+
+def test_a_granted_method_without_a_rule_is_refused() -> None:
+    grant = replace(compiled(), methods=frozenset({"Barrel"}))
+    assert ask(grant, Call("Barrel")).code == "MethodUnknown"
+
+
+def test_thousands_of_policies_at_one_place() -> None:
+    many = [exclusion(box(50, -20, 80, 20), "ignore" if i else "land", f"p{i:04}", priority=i % 7) for i in range(500)]
+    verdict = ask(compiled(*many), goto(60, 0))
+    assert (verdict.action, verdict.takeover, verdict.policies[0]) == ("takeover", "land", "p0000")
+    assert len(verdict.policies) == 500
+    sixth = [f"p{i:04}" for i in range(1, 500) if i % 7 == 6]
+    assert list(verdict.policies[1 : len(sixth) + 1]) == sixth, "then by priority, then by name"
+
+
+def test_datums_of_bands() -> None:
+    amsl = compiled(exclusion(box(50, -20, 80, 20), lower=90, upper=115, reference="amsl"), services=SERVICES)
+    low, high = at(40, 0, alt=10), at(40, 0, alt=30)
+    push = Call("SetVelocity", VelocityArgs(0, 9, hold_s=2))
+    assert ask(amsl, push, low).action == "deny", "home lies at 100 m"
+    assert ask(amsl, push, high).action == "allow"
+    sunk = replace(high, home=Home(39.36, 22.95, 80.0))
+    assert ask(amsl, push, sunk).action == "deny", "home lies lower, and so does the drone"
+    terrain = exclusion(box(50, -20, 80, 20), lower=0, upper=15, reference="terrain")
+    assert ask(compiled(terrain, services=SERVICES), push, high).action == "deny", "nobody knows the terrain"
+    assert ask(compiled(terrain, services=SERVICES, flat_terrain=True), push, high).action == "allow"
+
+
+def test_out_of_a_zone_but_not_up_into_it() -> None:
+    above = compiled(exclusion(box(-30, -30, 30, 30), lower=14), operationArea=[])
+    under = at(25, 0, alt=12.5, airframe=RETRACING)
+    assert ask(above, goto(60, 0, 11), under).action == "allow", "out from under it"
+    assert ask(above, goto(60, 0, 30), under).action == "deny", "it would climb into it on its way out"
+    inside = at(25, 0, alt=20)
+    assert ask(above, goto(60, 0, 30), replace(inside, airframe=RETRACING)).action == "allow"
+
+
+def test_not_out_of_an_inclusion_zone_by_sinking() -> None:
+    two = policy(
+        "in", "GeofenceControl", "inclusion",
+        [zone("ground", box(-50, -50, 10, 50)), zone("high", box(0, -50, 60, 50), lower=16)],
+    )  # fmt: skip
+    grant = compiled(two, operationArea=[])
+    assert ask(grant, goto(-30, 0, 5), at(-20, 0, alt=25)).action == "allow"
+    sinking = ask(grant, goto(-30, 0, 5), at(30, 0, alt=25))
+    assert sinking.action == "deny", "it may sink below the high zone before it is over the ground zone"
+    assert ask(grant, goto(-30, 0, 5), at(30, 0, alt=8)).action == "allow", "already below: the way back in"

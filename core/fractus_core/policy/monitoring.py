@@ -39,11 +39,12 @@ def monitor(now: Situation, grant: CompiledGrant) -> Verdict | None:
         return None
     if not now.sound and not math.isfinite(now.time_s):
         raise ValueError("the time is not a number")
-    if now.lat is None or now.lon is None or not now.sound:
+    lat, lon = now.lat, now.lon
+    if lat is None or lon is None or not now.sound:
         return Verdict("takeover", None, "PositionUnknown", "the drone's position is unknown", (), "hover")
     # A drone that speeds up does so on a way that was judged with room for it, and brakes at its end in time.
     now = replace(now, forward_mps2=min(now.forward_mps2 or 0.0, 0.0))
-    start = grant.frame.xy(now.lat, now.lon)
+    start = grant.frame.xy(lat, lon)
     stop = stop_point(now, start)
     rest_m = stop_altitude_m(now)
     way = shapely.points(start) if start == stop else shapely.linestrings((start, stop))

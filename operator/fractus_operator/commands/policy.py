@@ -16,6 +16,7 @@ from fractus_core.api import Application, Drone
 from fractus_core.api.methods import METHODS_OF, Method
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.plans import GrantApplication, GrantedLimits, GrantSpec
+from fractus_core.planning import Settings
 from fractus_core.policy.compiled import compile_grant
 from fractus_core.policy.engine import judge
 from fractus_core.policy.footprint import lens_of
@@ -36,7 +37,7 @@ from fractus_core.policy.values import (
 )
 
 from fractus_operator.commands.manifests import BadManifest, Manifests, read_manifests
-from fractus_operator.commands.plan import Settings, plan_all
+from fractus_operator.commands.plan import plan_all
 
 IN_AIR_M = 0.5
 METHODS: tuple[str, ...] = get_args(Method)
@@ -56,7 +57,7 @@ _NEEDED: dict[str, frozenset[str]] = {
 }
 
 
-class Figures(click.ParamType):
+class Figures(click.ParamType["tuple[float, ...]"]):
     """Numbers with commas between them."""
 
     name = "figures"
@@ -83,7 +84,7 @@ class Figures(click.ParamType):
         return found
 
 
-class Time(click.ParamType):
+class Time(click.ParamType["float"]):
     """A moment as RFC 3339 spells it, as Unix time."""
 
     name = "RFC3339"

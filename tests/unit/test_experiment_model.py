@@ -58,7 +58,12 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "unknown field": ({"drones": 3}, "drones"),
     "no home": ({"vehicles": [{"name": "d"}]}, "vehicles[0].home"),
     "twice": ({"vehicles": [{"name": "d", "home": HOME}] * 2}, "the name d is given twice"),
-    "no such fault": ({"faults": [{"fault": "gust", "at": 1}]}, "windGust"),
+    "no such fault": (
+        {"faults": [{"fault": "gpsLos", "at": 1}]},
+        "faults[0].fault: there is no gpsLos; did you mean gpsLoss?",
+    ),
+    "no such check": ({"checks": [{"check": "x"}]}, "checks[0].check: there is no x; there are landed, neverFlew"),
+    "no fault named": ({"faults": [{"at": 1}]}, "faults[0].fault: is missing"),
     "fault without time": ({"faults": [{"fault": "gpsLoss"}]}, "at"),
     "fault for nobody": ({"faults": [{**GUST, "vehicles": ["e"]}]}, "faults[0].vehicles: there is no vehicle e"),
     "link of another mode": ({"faults": [{"fault": "linkLoss", "at": 1, "link": "uplink"}]}, "use groundStation"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -226,7 +227,23 @@ def parse(content: object) -> Experiment:
     try:
         return Experiment.model_validate(content)
     except ValidationError as error:
-        raise InvalidObject.from_pydantic(error) from None
+        raise _unknown_tag(error) or InvalidObject.from_pydantic(error) from None
+
+
+def _unknown_tag(error: ValidationError) -> InvalidObject | None:
+    """The sentence for a fault, check or step that does not exist; None when that is not what is wrong."""
+    finding = error.errors(include_url=False)[0]
+    context = finding.get("ctx", {})
+    field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in finding["loc"]).lstrip(".")
+    name = str(context.get("discriminator", "")).strip("'")
+    if finding["type"] == "union_tag_not_found":
+        return InvalidObject(f"{field}.{name}", "is missing; `fractus experiment schema` lists what there is")
+    if finding["type"] != "union_tag_invalid":
+        return None
+    known = [tag.strip(" '") for tag in str(context["expected_tags"]).split(",")]
+    near = difflib.get_close_matches(str(context["tag"]), known, n=1)
+    hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
+    return InvalidObject(f"{field}.{name}", f"there is no {context['tag']}; {hint}")
 
 
 def _spread(entry: VehicleEntry, at: int) -> Home | None:

@@ -163,7 +163,7 @@ def _spans(axes: Any, profile: Profile, *, top: bool) -> None:
     for span, row in _rows(profile):
         begin, end = span.begin_s - profile.start_s, span.end_s - profile.start_s
         if span.fault:
-            axes.axvspan(begin, end, color=PURPLE, alpha=0.16, linewidth=0, zorder=0.6)
+            axes.axvspan(begin, end, color=PURPLE, alpha=0.11, linewidth=0, zorder=0.6)
             axes.axvline(begin, color=PURPLE, linewidth=1.2, zorder=2)
             place = {"xytext": (0, 3 + _ROW_POINTS * row), "va": "bottom", "ha": "left"}
         else:

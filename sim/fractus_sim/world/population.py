@@ -117,7 +117,7 @@ class Townsfolk:
             along = (slot + 0.65 * unit(*key, slot)) * gap + rate * time_s
             if not span[0] <= along <= span[1]:
                 continue
-            x, y, dx, dy = self._roads.at(road, along)
+            x, y, dx, dy = self._roads.along(road, along)
             length = math.hypot(dx, dy)
             ux, uy = way * dx / length, way * dy / length
             offset = _LANE_M[road.main]
@@ -148,7 +148,7 @@ class Townsfolk:
                 turn = (unit(*key, 1) + time_s * pace / (2 * SPACING_M)) % 1.0
                 way = 1 if turn < 0.5 else -1
                 share = 0.04 + 0.92 * (2 * turn if way > 0 else 2 - 2 * turn)
-                x, y, dx, dy = self._roads.at(road, step + share)
+                x, y, dx, dy = self._roads.along(road, step + share)
                 length = math.hypot(dx, dy)
                 side = (self._roads.width_m(road, step) / 2 + 1.2) * (1 if unit(*key, 2) < 0.5 else -1)
                 heading = math.degrees(math.atan2(way * dx, way * dy))

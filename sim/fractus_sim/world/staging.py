@@ -29,7 +29,7 @@ _SMALL_PX = 14.0
 _SILHOUETTE_PX = 7.0
 _SHADELESS_PX = 5.0
 _TINY_PX = 1.2
-_LEAST_BOARD_PX = 4.0
+_LEAST_BOARD_PX = 6.0
 _REACH = 0.55
 """Things are drawn as far away as so many focal lengths in pixels are metres."""
 _SHADOW = 0.5

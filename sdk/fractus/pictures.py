@@ -15,7 +15,7 @@ from fractus.errors import Unavailable, translate
 from fractus.values import Decision, ImageInfo, Result
 
 RETRIEVE_TIMEOUT_S = 60.0
-CAPTURE_TIMEOUT_S = 60.0
+CAPTURE_TIMEOUT_S = 120.0
 """Looking for faces in megapixels takes its time."""
 
 

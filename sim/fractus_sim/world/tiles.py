@@ -30,7 +30,7 @@ class Ground(Protocol):
     levels: int
 
     def tile(self, level: int, column: int, row: int) -> Picture:
-        """The tile (blue, green, red; row 0 is north) whose north-western corner is at `corner`."""
+        """One tile: blue, green, red; north is up; tile (0, 0) lies south-east of the origin, rows count southward."""
 
 
 def pixel_m(ground: Ground, level: int) -> float:

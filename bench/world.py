@@ -153,7 +153,9 @@ def visit(world: World) -> float:
 
 def memory() -> Claim:
     """The same in a process of its own."""
-    done = subprocess.run([sys.executable, __file__, "--visit"], capture_output=True, text=True, check=True, timeout=600)
+    done = subprocess.run(
+        [sys.executable, __file__, "--visit"], capture_output=True, text=True, check=True, timeout=600
+    )
     resident = float(done.stdout)
     return Claim("resident memory after 24 places of 17 km of world", resident, None, "MB", "< 500", resident < 500.0)
 

@@ -28,8 +28,8 @@ finds the next leg legal."""
 CORNER_M = 0.1
 """Waypoints lie this much further out than their legs must, so that rounding costs no leg."""
 
-PATIENCE = 4000
-"""So many legs are tested before a search gives up, a quarter of a second or so."""
+PATIENCE = 1500
+"""So many legs are tested before a search gives up, a fifth of a second or so: the monitor waits meanwhile."""
 
 LONGER = 1.02
 """A way may be so much longer than the shortest one, for the sake of a quicker search."""
@@ -84,7 +84,7 @@ def route(
     found = roomy.run()
     if found is not None and _length_m(start, found) <= _DETOUR * math.dist(start, target):
         return roomy.rounded(found)
-    shorter = narrow.run()
+    shorter = narrow.run() if not roomy.exhausted else None
     if shorter is not None and (found is None or _length_m(start, shorter) < _length_m(start, found) / _DETOUR):
         return narrow.rounded(shorter)
     return roomy.rounded(found) if found is not None else None
@@ -242,7 +242,7 @@ class _Search:
             self._add(self._space.way_out(obstacle, begin))
             self._learn([obstacle], self._ends[0])
         self._expand(_START)
-        while self._heap and len(self._clear) < PATIENCE:
+        while self._heap and not self.exhausted:
             _, end, begin, cost = heapq.heappop(self._heap)
             if cost >= self._cost[end] - 1e-9 or not self._open(begin, end):
                 continue
@@ -251,6 +251,11 @@ class _Search:
                 return self._way()
             self._expand(end)
         return None
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether it gave up."""
+        return len(self._clear) >= PATIENCE
 
     def rounded(self, way: tuple[XY, ...]) -> tuple[XY, ...]:
         """The way with neighbouring waypoints made one where the legs meet a little further on: each costs a stop."""

@@ -57,7 +57,7 @@ _NEEDED: dict[str, frozenset[str]] = {
 }
 
 
-class Figures(click.ParamType["tuple[float, ...]"]):
+class Figures(click.ParamType):  # type: ignore[type-arg]
     """Numbers with commas between them."""
 
     name = "figures"
@@ -84,7 +84,7 @@ class Figures(click.ParamType["tuple[float, ...]"]):
         return found
 
 
-class Time(click.ParamType["float"]):
+class Time(click.ParamType):  # type: ignore[type-arg]
     """A moment as RFC 3339 spells it, as Unix time."""
 
     name = "RFC3339"

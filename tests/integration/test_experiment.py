@@ -161,7 +161,8 @@ def test_an_interrupted_run_leaves_no_process(tmp_path: Path) -> None:
     assert not left.stdout
 
 
-def test_processes_that_do_not_go_are_killed(tmp_path: Path) -> None:
+def test_processes_that_do_not_go_are_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fractus_sim.experiment.processes.GRACE_S", 1.0)
     stubborn = (
         "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(60)"
     )
@@ -175,7 +176,7 @@ def test_processes_that_do_not_go_are_killed(tmp_path: Path) -> None:
 def test_an_autopilot_that_runs_already_is_flown_and_harmed_over_tcp(tmp_path: Path) -> None:
     processes, port = Processes(tmp_path), Ports().take()
     link, home = f"tcp:127.0.0.1:{port}", "50.8637,4.6785,25"
-    arguments = ["--listen", link, "--home", home, "--speedup", "5", "--ready-after", "2", "--param", "FS_GCS_ENABLE=1"]
+    arguments = ["--listen", link, "--home", home, "--speedup", "5", "--ready-after", "2"]
     processes.start("sitl", [sys.executable, "-m", "fractus_sim.vehicle", *arguments], dict(os.environ))
     try:
         processes.wait("sitl", lambda: listening(port), 30)

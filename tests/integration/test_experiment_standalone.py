@@ -25,14 +25,14 @@ async def main():
                 break
         if not state.in_air:
             await drone.arm()
-            await drone.takeoff(10)
+            await drone.takeoff(5)
         print("up at", os.environ["FRACTUS_NODE"], len(task.path), flush=True)
         if pathlib.Path("hold").exists():
             await asyncio.sleep(600)
 print("began", flush=True)
 try:
     asyncio.run(main())
-except fractus.ControlLost as lost:  # the autopilot's failsafe may have been quicker than the restart
+except fractus.FractusError as lost:  # the autopilot may have gone home before the restart, or while the program waited
     print("lost:", lost)
 """
 
@@ -49,7 +49,7 @@ def test_a_program_flies_and_its_computer_loses_power(tmp_path: Path) -> None:
     (tmp_path / "pilot.py").write_text(PROGRAM)
     (tmp_path / "hold").touch()
     with Standalone(tmp_path / "ground") as ground:
-        drone = ground.add_drone(DroneSetup("drone-1", HOME, speedup=5))
+        drone = ground.add_drone(DroneSetup("drone-1", HOME, speedup=2))
         identity = ground.grant(grant())
         ground.run("pilot", [sys.executable, "pilot.py"], identity, folder=tmp_path)
         said(ground, "up at drone-1 2", 1)

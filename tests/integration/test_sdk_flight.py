@@ -95,10 +95,10 @@ class Stage:
         signed = sign(self.grant.to_dict(), *signer, datetime.now(UTC))
         (folder / "grants" / "navigator.json").write_text(json.dumps(signed))
 
-    def start_vehicle(self) -> None:
+    def start_vehicle(self, speedup: float) -> None:
         depot = documents("depot.yaml")[0]["spec"]["location"]
         self._start(
-            "vehicle", "-m", "fractus_sim.vehicle", "--listen", self.autopilot, "--speedup", str(SPEEDUP),
+            "vehicle", "-m", "fractus_sim.vehicle", "--listen", self.autopilot, "--speedup", str(speedup),
             "--ready-after", "2", "--home", f"{depot['lat']},{depot['lon']},25",
         )  # fmt: skip
 
@@ -164,10 +164,10 @@ class Stage:
                 process.wait(10)
 
 
-def on_stage(folder: Path, waypoints: int) -> Iterator[Stage]:
+def on_stage(folder: Path, waypoints: int, speedup: float = SPEEDUP) -> Iterator[Stage]:
     stage = Stage(folder, waypoints)
     try:
-        stage.start_vehicle()
+        stage.start_vehicle(speedup)
         stage.start_service()
         yield stage
     finally:
@@ -184,6 +184,12 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
 def short(tmp_path: Path) -> Iterator[Stage]:
     """The way to the first two waypoints only."""
     yield from on_stage(tmp_path, 2)
+
+
+@pytest.fixture
+def slow(tmp_path: Path) -> Iterator[Stage]:
+    """The same without haste: five of the vehicle's seconds without a service send it home."""
+    yield from on_stage(tmp_path, 2, 1.0)
 
 
 def calls(stage: Stage) -> list[tuple[str, str, str]]:
@@ -238,13 +244,13 @@ def test_a_navigator_that_is_killed_goes_on_where_it_was_and_rests_after_its_mis
     assert short.processes["navigator"].poll() is None
 
 
-def test_a_service_that_is_killed_is_found_again_by_the_navigator(short: Stage) -> None:
-    short.start_navigator()
-    short.wait("first waypoint", lambda: "waypoint 1/2 reached" in short.log("navigator"))
-    short.kill("service")
-    short.start_service()
-    short.wait("return", lambda: "control returned" in short.log("navigator"))
-    log = short.log("navigator")
+def test_a_service_that_is_killed_is_found_again_by_the_navigator(slow: Stage) -> None:
+    slow.start_navigator()
+    slow.wait("first waypoint", lambda: "waypoint 1/2 reached" in slow.log("navigator"))
+    slow.kill("service")
+    slow.start_service()
+    slow.wait("return", lambda: "control returned" in slow.log("navigator"))
+    log = slow.log("navigator")
     assert "the mobility service is away" in log
     assert log.count("in control") == 1, "the same process, under the same control"
     assert "waypoint 2/2 reached" in log

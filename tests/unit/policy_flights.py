@@ -183,6 +183,8 @@ class Fleet:
             (_disc(rng, count, POSITION_ERROR_M), rng.uniform(-HEIGHT_ERROR_M, HEIGHT_ERROR_M, count))
         )
         self.gust = np.column_stack((_disc(rng, count, TRACKING_M), rng.uniform(-TRACKING_M, TRACKING_M, count)))
+        self.settled = np.zeros((count, 3))
+        """The sway that each had when its present course began: from there on it strays."""
         self.beat = rng.uniform(0.05, 0.4, count)
         self.phase = rng.uniform(0, 2 * math.pi, count)
         self.time_s = 0.0
@@ -197,7 +199,10 @@ class Fleet:
         self.stop(np.arange(count))
 
     def sway(self) -> Floats:
-        """How far wind has each off its course."""
+        """How far wind has each off its course: no further than the bound from a course that began where it was seen."""
+        return (self._wind() - self.settled) / 2
+
+    def _wind(self) -> Floats:
         return self.gust * np.sin(self.beat * self.time_s + self.phase)[:, None]
 
     @property
@@ -270,6 +275,8 @@ class Fleet:
     def obey(self, i: int, verdict: Verdict) -> None:
         """Carry out what the engine made of a request."""
         args = verdict.args
+        self.place[i] = self.seen[i]
+        self.settled[i] = self._wind()[i]
         if verdict.brake_first:
             self.stop(np.array([i]))
         elif isinstance(args, GotoArgs):
@@ -427,7 +434,7 @@ def _excused(fleet: Fleet) -> Flags:
     allows from there.
     """
     trial = Fleet(np.random.default_rng(0), fleet.scenes)
-    for name in ("place", "speed", "accel", "error", "gust", "beat", "phase"):
+    for name in ("place", "speed", "accel", "error", "gust", "beat", "phase", "settled"):
         setattr(trial, name, getattr(fleet, name).copy())
     trial.held[:], trial.wanted, trial.until[:] = True, trial.speed.copy(), LATENCY_S
     margin = _CIRCLE * (POSITION_ERROR_M + TRACKING_M + 0.1)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import shapely
 from shapely.geometry.base import BaseGeometry
 
 from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Inclusion, Patch, band_meets
-from fractus_core.policy.motion import XY, Leg, stop_altitude_m
+from fractus_core.policy.motion import XY, Leg, stop_altitude_m, stop_point
 from fractus_core.policy.values import Situation, Takeover, Verdict, deny
 
 FenceAction = Literal["ignore", "adjust", "hover", "returnToLaunch", "land", "revoke"]
@@ -154,6 +154,20 @@ def _exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Ite
         yield _exclusion_breach(patch, leg, margin_m, enters)
 
 
+def _surely_too_close(shape: BaseGeometry, leg: Leg, now: Situation, margin_m: float) -> bool:
+    """Whether a drone comes too close to a zone even if it brakes by now as hard as it can.
+
+    Where nobody knows whether it does, its way to rest is taken for long, which must not open ways past the zone.
+    """
+    return now.forward_mps2 is not None or bool(shape.dwithin(_least_way(leg, now), margin_m))
+
+
+def _least_way(leg: Leg, now: Situation) -> BaseGeometry:
+    """The shortest way to rest that is possible."""
+    stop = stop_point(replace(now, forward_mps2=-now.airframe.accel_mps2), leg.start)
+    return shapely.points(leg.start) if stop == leg.start else shapely.linestrings((leg.start, stop))
+
+
 def _is_level_with(patch: Patch, now: Situation, grant: CompiledGrant) -> bool:
     """Whether the drone is, or comes to rest, between the altitudes of a zone."""
     rest_m = stop_altitude_m(now)
@@ -202,10 +216,22 @@ def _inclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Ite
         if not fence.rule.in_force(now.time_s):
             continue
         shape, border = fence.at(air.lower_m, air.upper_m, now, grant.flat_terrain)
-        if not _stays_inside(shape, border, leg, air.margin_m) or (
-            fence.banded and _leaves_by_height(fence, shape, leg, now, grant)
+        if (
+            not _stays_inside(shape, border, leg, air.margin_m)
+            or (_turns_from_inside(shape, border, leg, now, air.margin_m))
+            or (fence.banded and _leaves_by_height(fence, shape, leg, now, grant))
         ):
             yield _inclusion_breach(fence, shape, border, leg, air.margin_m)
+
+
+def _turns_from_inside(shape: BaseGeometry, border: BaseGeometry, leg: Leg, now: Situation, margin_m: float) -> bool:
+    """Whether a leg that may lead back in begins, for all that is known, well inside: see `_surely_too_close`."""
+    if now.forward_mps2 is not None or leg.start == leg.stop:
+        return False
+    if shape.covers(leg.ground) and not border.dwithin(leg.ground, margin_m):
+        return False
+    least = _least_way(leg, now)
+    return bool(shape.covers(least) and not border.dwithin(least, margin_m))
 
 
 def _leaves_by_height(fence: Inclusion, shape: BaseGeometry, leg: Leg, now: Situation, grant: CompiledGrant) -> bool:

@@ -262,9 +262,12 @@ def swept(now: Situation, at: XY, asked: VelocityArgs) -> Leg:
     present = (ahead[0] * begin.speed_mps, ahead[1] * begin.speed_mps)
     lasting_s = asked.hold_s + now.latency_s
     control = (frame.accel_mps2, frame.position_gain)
-    ways = _course(present, wanted, lasting_s, frame, control)
+    # At the earliest it obeys at once, and slower than it may be by the latest: so it comes furthest the new way.
+    braked = speed - frame.accel_mps2 * now.latency_s if now.forward_mps2 is None else begin.speed_mps
+    least = max(min(speed, braked), 0.0)
+    ways = _course((ahead[0] * least, ahead[1] * least), wanted, lasting_s, frame, control)
     late = (ahead[0] * begin.run_m, ahead[1] * begin.run_m)
-    ways += [(x + late[0], y + late[1]) for x, y in ways]
+    ways += [(x + late[0], y + late[1]) for x, y in _course(present, wanted, lasting_s, frame, control)]
     climb = -now.down_mps
     climbs = _course((climb, 0.0), (-asked.down_mps, 0.0), lasting_s, frame, (frame.climb_accel_mps2, 1.0))
     late_m = climb * reaction_s(now, frame.climb_accel_mps2)

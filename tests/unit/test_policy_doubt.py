@@ -89,7 +89,8 @@ def test_a_zone_to_stay_in_must_be_active_at_both_readings() -> None:
 
 
 @pytest.mark.parametrize(
-    ("x", "height_m", "seen"), [(0, 20, True), (0, 35, True), (23, 20, True), (45, 20, True), (53, 20, False), (80, 70, True)]
+    ("x", "height_m", "seen"),
+    [(0, 20, True), (0, 35, True), (23, 20, True), (45, 20, True), (53, 20, False), (80, 70, True)],
 )
 def test_privacy_is_judged_by_what_a_picture_shows(x: float, height_m: float, seen: bool) -> None:
     private = policy("p", "PrivacyControl", "camera", [zone("z", box(-20, -20, 20, 20), upper=30)], action="refuse")

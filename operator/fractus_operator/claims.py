@@ -47,8 +47,9 @@ class OwnedPlan:
 def claims(plans: Mapping[Key, OwnedPlan], grants: Iterable[Grant]) -> dict[str, Claim]:
     """Claims by node name.
 
-    Who has the oldest grant on a node has it, whatever plans say; without any grant, plans do. An application that
-    comes along with another one claims nothing.
+    Who has a grant on a node and a plan of its own for it has it, before others who have only a grant; among equals the
+    oldest grant counts. Without any grant, plans do. An application that comes along with another one claims nothing, and
+    what it leaves behind when its plan is gone takes no drone from who flies it.
 
     Args:
         plans: Plans of applications whose mission is not over.
@@ -56,17 +57,20 @@ def claims(plans: Mapping[Key, OwnedPlan], grants: Iterable[Grant]) -> dict[str,
     """
     found: dict[str, Claim] = {}
     guests: set[tuple[str, str]] = set()
+    flyers: set[tuple[str, str]] = set()
     for key, plan in sorted(plans.items(), key=lambda item: item[0]):
         drone = plan.spec.drone
         if drone is not None and drone.shared_with is not None:
             guests.add((plan.uid, drone.node))
         elif drone is not None:
+            flyers.add((plan.uid, drone.node))
             found.setdefault(drone.node, Claim(key, plan.uid))
-    oldest: dict[str, tuple[datetime, Key, str]] = {}
+    first: dict[str, tuple[bool, datetime, Key, str]] = {}
     for grant in grants:
         owner, node = grant.spec.application, grant.spec.node
         if (owner.uid, node) in guests:
             continue
-        rank = (grant.metadata.creation_timestamp or _LATEST, (owner.namespace, owner.name), owner.uid)
-        oldest[node] = min(rank, oldest.get(node, rank))
-    return found | {node: Claim(key, uid) for node, (_, key, uid) in oldest.items()}
+        created = grant.metadata.creation_timestamp or _LATEST
+        rank = ((owner.uid, node) not in flyers, created, (owner.namespace, owner.name), owner.uid)
+        first[node] = min(rank, first.get(node, rank))
+    return found | {node: Claim(key, uid) for node, (_, _, key, uid) in first.items()}

@@ -47,7 +47,8 @@ _REFUSALS = frozenset({400, 403, 422})
 """HTTP statuses by which the API server says that it does not want an object: the user should know."""
 
 _WAVES = (
-    (kinds.GRANT, kinds.DEPLOYMENT_PLAN),
+    (kinds.DEPLOYMENT_PLAN,),
+    (kinds.GRANT,),
     (kinds.SECRET, kinds.SERVICE, kinds.ENDPOINT_SLICE),
     (kinds.DEPLOYMENT,),
 )

@@ -16,6 +16,8 @@ NAME = "fractus-operator"
 _RENEWALS = 5
 _HELD_SHARE = 0.7
 _RETRY_S = 1.0
+_ANSWER_SHARE = _HELD_SHARE / 2
+"""How much of the duration an answer may take: one that stalls leaves time to ask again before the Lease is lost."""
 
 
 class LostLease(Exception):
@@ -71,10 +73,14 @@ class Lease:
             while True:
                 asked = self._time()
                 try:
-                    if await self._ask():
+                    async with asyncio.timeout(_ANSWER_SHARE * self._duration_s):
+                        taken = await self._ask()
+                    if taken:
                         self._hold(asked)
                 except StoreError as error:
                     logger.info("the lease: %s", error)
+                except TimeoutError:
+                    logger.info("the lease: no answer in %.1f s", _ANSWER_SHARE * self._duration_s)
                 pause_s = self._duration_s / _RENEWALS if self.left_s else min(_RETRY_S, self._duration_s / _RENEWALS)
                 await asyncio.sleep(pause_s)
         finally:

@@ -7,6 +7,7 @@ ask for bookmarks and time out, which lightkube's own watch does not offer.
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import AsyncIterator, Callable, Mapping
 from datetime import datetime
@@ -312,14 +313,18 @@ class Store:
                 raise StoreError(0, "NotActing", f"{method} {path}: the lease is not held, another operator may act")
         headers = {"Accept": accept, **({"Content-Type": content_type} if body is not None else {})}
         try:
-            response = await self._client.request(
-                method,
-                path,
-                params=params,
-                content=None if body is None else json.dumps(body),
-                headers=headers,
-                timeout=timeout_s,
-            )
+            # As a whole: the client's own time-outs are for each part of a request, and begin anew with every byte.
+            async with asyncio.timeout(timeout_s):
+                response = await self._client.request(
+                    method,
+                    path,
+                    params=params,
+                    content=None if body is None else json.dumps(body),
+                    headers=headers,
+                    timeout=timeout_s,
+                )
+        except TimeoutError as error:
+            raise StoreError(0, "Unreachable", f"{method} {path}: no answer in {timeout_s:.1f} s") from error
         except httpx2.HTTPError as error:
             raise StoreError(0, "Unreachable", f"{method} {path}: {type(error).__name__}: {error}") from error
         if response.status_code >= 400:

@@ -6,8 +6,9 @@ import asyncio
 import copy
 from typing import Any, cast
 
+import httpx2
 import pytest
-from fractus_operator.kinds import Body, Kind, key_of
+from fractus_operator.kinds import LEASE, Body, Kind, key_of
 from fractus_operator.lease import Lease, LostLease
 from fractus_operator.store import NotFound, Store, StoreError, Taken
 
@@ -20,10 +21,14 @@ class Shelf:
     def __init__(self) -> None:
         self.body: Body | None = None
         self.reachable = True
+        self.stalls = 0
         self.writes = 0
 
     async def get(self, kind: Kind, name: str, namespace: str = "") -> Body:
         self._reach()
+        if self.stalls:
+            self.stalls -= 1
+            await asyncio.Event().wait()
         if self.body is None:
             raise NotFound(404, "NotFound", name)
         return copy.deepcopy(self.body)
@@ -165,3 +170,31 @@ async def test_of_two_that_ask_at_once_one_gets_it() -> None:
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def test_an_answer_that_stalls_is_given_up_in_time_to_ask_again() -> None:
+    shelf = Shelf()
+    shelf.stalls = 2
+    short = Lease(cast(Store, shelf), "system", "short", 0.1, asyncio.get_running_loop().time)
+    task = asyncio.create_task(short.run())
+    await asyncio.wait_for(short.held(), 10.0)
+    assert shelf.stalls == 0
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_a_write_to_an_api_server_that_stalls_ends_before_another_may_act() -> None:
+    async def stalled(_: httpx2.Request) -> httpx2.Response:
+        await asyncio.Event().wait()
+        raise AssertionError
+
+    client = httpx2.AsyncClient(base_url="https://nowhere.test", transport=httpx2.MockTransport(stalled))
+    store = Store(client)
+    store.may_write_s = lambda: 0.02
+    async with asyncio.timeout(10.0):
+        with pytest.raises(StoreError, match=r"no answer in 0\.0 s"):
+            await store.create(LEASE, LEASE.header("any", "system"))
+    store.may_write_s = lambda: 0.0
+    with pytest.raises(StoreError, match="another operator may act"):
+        await store.create(LEASE, LEASE.header("any", "system"))
+    await store.close()

@@ -87,8 +87,28 @@ def test_a_guest_claims_nothing_however_old_its_grant_is() -> None:
     plans = {("default", "guest"): OwnedPlan("g", RIDE), ("default", "traffic"): OwnedPlan("t", OWN)}
     old, new = grant("guest", "g", "2026-01-01T00:00:00Z"), grant("traffic", "t", "2026-01-02T00:00:00Z")
     assert claims(plans, [old, new])["d"].uid == "t"
-    # One that has a drone of its own by now, or no plan any more, is no guest.
+    # Without any plan nobody knows who was the guest.
     assert claims({}, [old, new])["d"].uid == "g"
+
+
+@pytest.mark.parametrize("left_by", [None, "elsewhere"])
+def test_what_a_guest_leaves_behind_takes_no_drone_from_who_flies_it(left_by: str | None) -> None:
+    plans = {("default", "traffic"): OwnedPlan("t", OWN)}
+    if left_by is not None:
+        # It has a drone of its own by now, and its grant on the old one is yet to go.
+        plans["default", "guest"] = OwnedPlan("g", OWN.model_copy(update={"drone": DroneChoice(node="e")}))
+    left, flown_by = grant("guest", "g", "2026-01-01T00:00:00Z"), grant("traffic", "t", "2026-01-02T00:00:00Z")
+    for grants in ([left, flown_by], [flown_by, left]):
+        assert claims(plans, grants)["d"].uid == "t"
+    # Nobody flies by a plan alone where somebody may still be flying by a grant.
+    assert claims(plans, [left])["d"].uid == "g"
+
+
+def test_of_two_that_fly_one_drone_the_older_grant_counts() -> None:
+    plans = {("default", "a"): OwnedPlan("a", OWN), ("default", "traffic"): OwnedPlan("t", OWN)}
+    old, new = grant("traffic", "t", "2026-01-01T00:00:00Z"), grant("a", "a", "2026-01-02T00:00:00Z")
+    assert claims(plans, [old, new])["d"].uid == "t"
+    assert claims(plans, [])["d"].uid == "a"
 
 
 # -- bookings --

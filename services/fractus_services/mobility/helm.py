@@ -15,7 +15,8 @@ from fractus_services.mobility.vehicle import GUIDED, HOMEWARD, LAND, RTL
 log = logging.getLogger(__name__)
 
 AGAIN_S = 0.5
-RTL_TRIES = 4
+RTL_TRIES = 6
+"""A drone that does not turn home after so many refusals lands where it is."""
 SETTLE_S = 10.0
 BRAKE_S, BRAKE_AGAIN_S = 8.0, 0.1
 STANDING_MPS = 0.2
@@ -32,14 +33,15 @@ class Helm:
         expected: the mode that the autopilot is in by our doing, or that we know of.
         changing: how many changes are under way.
         arming: whether the motors are being started by us.
-        approach: flies to where the autopilot's own return is legal, and says in which mode it does the rest.
+        approach: flies to where the autopilot's own return is legal, and says in which mode it does the rest; told how
+            often the autopilot refused.
     """
 
     def __init__(self, autopilot: Autopilot, moving: Callable[[], bool]) -> None:
         self.expected: int | None = None
         self.changing = 0
         self.arming = False
-        self.approach: Callable[[Callable[[], bool]], Awaitable[int]] = _straight
+        self.approach: Callable[[Callable[[], bool], int], Awaitable[int]] = _straight
         self._autopilot = autopilot
         self._moving = moving
 
@@ -128,7 +130,7 @@ class Helm:
             await self._brake(wanted)
             mode = LAND
             if action != "land" and tries < RTL_TRIES:
-                mode = await self.approach(wanted) if tries == 0 else RTL
+                mode = await self.approach(wanted, tries)
             await self.change_mode(mode, lambda: _check(wanted))
         while vehicle.armed and vehicle.mode in HOMEWARD:
             await self._autopilot.update(1.0)
@@ -154,7 +156,7 @@ class Helm:
             await self.settle()
 
 
-async def _straight(_wanted: Callable[[], bool]) -> int:
+async def _straight(_wanted: Callable[[], bool], _tries: int) -> int:
     return RTL
 
 

@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import aclosing
 from dataclasses import replace
 
+import grpc
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.motion import height_margin_m, margin_m
 from fractus_core.policy.returning import straight_home_blocked
@@ -26,6 +27,10 @@ log = logging.getLogger(__name__)
 
 HOME_M = 3.0
 
+TRIES = 3
+"""So often the system tries to fly around what is in the way, when the autopilot refuses; the way that the drone came is
+tried after that, and at last the straight one."""
+
 
 class Homing:
     """Brings the drone to where the autopilot's own return is legal."""
@@ -34,11 +39,12 @@ class Homing:
         self._control = control
         self._guard = guard
 
-    async def approach(self, wanted: Callable[[], bool]) -> int:
+    async def approach(self, wanted: Callable[[], bool], tries: int) -> int:
         """Fly, for the system, until the autopilot can do the rest.
 
         Args:
             wanted: whether the system still has the drone.
+            tries: how often that has failed.
 
         Returns:
             The mode in which the autopilot does the rest. Where no legal way home is known it is the path that the drone
@@ -52,7 +58,7 @@ class Homing:
         if held is None or not vehicle.in_air or vehicle.mode in HOMEWARD:
             return RTL
         try:
-            why = await self._bring(held, wanted)
+            why = await self._bring(held, wanted) if tries < TRIES else self._give_up(held, tries)
         except AutopilotError:
             raise
         except Exception:
@@ -60,10 +66,15 @@ class Homing:
             why = "the planner failed"
         if not why:
             return RTL
-        how = "goes back the way it came" if control.retraces else "flies straight"
+        back = control.retraces and tries <= TRIES
+        how = "goes back the way it came" if back else "flies straight"
         control.note("returnToLaunch", "system", f"no legal way home is known ({why}); the drone {how}", "NoLegalWay")
         log.error("no legal way home is known (%s); the drone %s", why, how)
-        return SMART_RTL if control.retraces else RTL
+        return SMART_RTL if back else RTL
+
+    def _give_up(self, held: Held, tries: int) -> str:
+        """Why the way home is not flown by us any more; nothing where the straight one is legal."""
+        return "" if self._clear(held.compiled) else f"the autopilot refused {tries} times"
 
     async def _bring(self, held: Held, wanted: Callable[[], bool]) -> str:
         """Fly to where the straight way home is legal; why that is impossible, or nothing."""
@@ -83,7 +94,11 @@ class Homing:
             control.relieve(regime)
 
     async def _round(self, trip: Trip) -> str:
-        """Fly around what is in the way; why that failed, or nothing."""
+        """Fly around what is in the way; why there is no way, or nothing.
+
+        Raises:
+            AutopilotError: the drone did not fly what it was told.
+        """
         why = ""
         for _ in range(REPLANS + 1):
             motion = self._control.begin(trip.kind)
@@ -92,8 +107,10 @@ class Homing:
                     pass
             except Refused as refusal:
                 why = str(refusal)
-                if not stopped_by_monitor(refusal):
+                if refusal.verdict.code == "NoLegalWay":
                     return why
+                if not stopped_by_monitor(refusal):
+                    raise AutopilotError(why, link=refusal.status is grpc.StatusCode.UNAVAILABLE) from refusal
             else:
                 return ""
             finally:
@@ -101,7 +118,9 @@ class Homing:
         return why
 
     async def around(self, trip: Trip, motion: Motion) -> AsyncIterator[Step]:
-        """Fly the legs after which the straight way home is legal; none when it is already.
+        """Fly the legs after which the straight way home is legal; none when it is already. The drone is in GUIDED.
+
+        It comes to rest before each judgement, so that what is judged is the place where the way begins.
 
         Raises:
             Refused: there is no such way, or the motion was stopped.
@@ -109,14 +128,11 @@ class Homing:
         """
         autopilot, permit = self._control.autopilot, trip.permit(motion)
         for _ in range(MAX_LEGS):
+            if self._guard.situation().lat is not None and not at_rest(autopilot):
+                await come_to_rest(autopilot, motion, permit)
             leg = self._leg(trip)
             if leg is None:
                 return
-            if not at_rest(autopilot):
-                await come_to_rest(autopilot, motion, permit)
-                leg = self._leg(trip)
-                if leg is None:
-                    return
             async with aclosing(fly_to(autopilot, motion, leg, REACHED_M, permit)) as steps:  # type: ignore[type-var]
                 async for step in steps:
                     yield Step(step.distance_m, complete=False)

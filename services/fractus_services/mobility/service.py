@@ -217,6 +217,7 @@ class MobilityService:
             permit = driver_permit(control, held, motion)
             regime = control.under(control.require(held).held)
             try:
+                await control.helm.change_mode(GUIDED, permit)
                 trip = Trip(regime, motion.kind, lambda _motion: permit)
                 async with aclosing(self._homing.around(trip, motion)) as legs:  # type: ignore[type-var]
                     async for step in legs:

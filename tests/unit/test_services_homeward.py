@@ -1,0 +1,97 @@
+"""Ways home: begun at rest, tried again when the autopilot refuses, and what stays behind after them."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from pathlib import Path
+
+import pytest
+import shapely
+from fractus_core.policy.values import GotoArgs
+from fractus_services.mobility.vehicle import LAND, RTL, SMART_RTL
+from mobility_world import World, at, end, fly, spec, zone
+
+WALL = (-40.0, 25.0, 40.0, 40.0)
+REPOSITION = 192
+
+
+def clear_m(world: World, *box: float) -> float:
+    return float(min(shapely.box(*box).distance(shapely.Point(x, y)) for x, y, _ in world.plane.trace))
+
+
+async def beyond_the_wall(world: World) -> None:
+    """A driver whose way home is behind a wall gives the drone back."""
+    held = world.grants.put(spec(zone("wall", "ignore", *WALL)))
+    await world.up(held)
+    for x, y in ((60, 30), (60, 70), (0, 70)):
+        await end(world.service.goto(held, GotoArgs(*at(x, y), 10.0), 0))
+    await world.control.give_back(held)
+
+
+def test_a_driver_turns_home_from_standstill(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            flying = asyncio.ensure_future(end(world.service.goto(held, GotoArgs(*at(0, 90), 10.0), 0)))
+            await world.until(lambda: world.plane.velocity[1] > 6)
+            turned: list[float] = []
+            obey = world.plane.set_to
+
+            def noted(mode: int) -> None:
+                if mode == RTL:
+                    turned.append(math.hypot(*world.plane.velocity))
+                obey(mode)
+
+            world.plane.set_to = noted  # type: ignore[method-assign]
+            await end(world.service.return_to_launch(held))
+            assert turned
+            assert max(turned) < 0.5
+            with pytest.raises(Exception, match="replaced"):
+                await flying
+
+    fly(flight)
+
+
+def test_one_refused_command_leads_through_no_zone(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, retraces=True) as world:
+            plane = world.plane
+            await beyond_the_wall(world)
+            plane.commands.clear()
+            plane.refuses.add(REPOSITION)
+            await world.until(lambda: REPOSITION in plane.commands)
+            plane.refuses.clear()
+            await world.until(lambda: not plane.vehicle.armed)
+            assert clear_m(world, *WALL) > 1.0
+            assert "NoLegalWay" not in {e["code"] for e in world.kinds("control")}
+
+    fly(flight)
+
+
+@pytest.mark.parametrize(("remembers", "mode"), [(True, SMART_RTL), (False, RTL)])
+def test_an_autopilot_that_refuses_again_and_again_brings_the_drone_home_itself(
+    tmp_path: Path, remembers: bool, mode: int
+) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, retraces=True) as world:
+            plane = world.plane
+            plane.vehicle.path_lost = not remembers
+            if remembers:
+                await beyond_the_wall(world)
+            else:
+                held = world.grants.put(spec())
+                await world.up(held)
+                await end(world.service.goto(held, GotoArgs(*at(0, 70), 10.0), 0))
+                world.grants.put(spec(zone("wall", "ignore", *WALL)))
+                await world.control.give_back(held)
+            plane.commands.clear()
+            plane.refuses.add(REPOSITION)
+            await world.until(lambda: plane.vehicle.mode in {RTL, SMART_RTL, LAND})
+            assert plane.vehicle.mode == mode
+            assert plane.commands.count(REPOSITION) == 3
+            notes = [e["reason"] for e in world.kinds("control") if e["code"] == "NoLegalWay"]
+            assert "the autopilot refused 3 times" in notes[-1]
+
+    fly(flight)

@@ -265,8 +265,8 @@ class Fence:
             raise self.problem
         self.raised = True
 
-    async def lower(self) -> None:
-        self.raised = False
+    async def lower(self, idle: Callable[[], bool]) -> None:
+        self.raised = self.raised and not idle()
 
 
 class World:

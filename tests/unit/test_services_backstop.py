@@ -122,7 +122,7 @@ async def test_a_fence_is_raised_and_put_back(vehicle: Vehicle, tmp_path: Path) 
     again = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
     assert again.raised, "a service that was restarted knows"
     await again.raise_around(spec(area(-10, -10, 10, 10)), retraces=False)
-    await again.lower()
+    await again.lower(lambda: True)
     assert vehicle.values == before
     assert vehicle.items == (Item(5003, 30.0, 1, 2),)
     assert not again.raised
@@ -196,5 +196,5 @@ async def test_nothing_is_changed_before_the_owners_fence_is_stored(vehicle: Veh
 
 async def test_a_damaged_memory_of_the_owners_fence_is_no_memory(vehicle: Vehicle, tmp_path: Path) -> None:
     await asyncio.to_thread((tmp_path / "fence.json").write_text, json.dumps({"items": 3}))
-    await Backstop(vehicle, tmp_path).lower()  # type: ignore[arg-type]
+    await Backstop(vehicle, tmp_path).lower(lambda: True)  # type: ignore[arg-type]
     assert not vehicle.written

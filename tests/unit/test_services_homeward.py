@@ -95,3 +95,54 @@ def test_an_autopilot_that_refuses_again_and_again_brings_the_drone_home_itself(
             assert "the autopilot refused 3 times" in notes[-1]
 
     fly(flight)
+
+
+@pytest.mark.parametrize("how", ["returned", "grace", "removed", "refused", "unused"])
+def test_no_fence_outlives_its_mission(tmp_path: Path, how: str) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            if how in {"refused", "unused"}:
+                await world.drive(held)
+                world.plane.refuses |= {400} if how == "refused" else set()
+                arming = asyncio.ensure_future(world.service.arm(held))
+                await world.until(lambda: world.fence.raised)
+                await asyncio.wait([arming])
+                if how == "unused":
+                    assert world.fence.raised, "while the motors run"
+                    await world.service.disarm(held)
+                else:
+                    assert "command 400" in str(arming.exception())
+            else:
+                stream = await world.up(held)
+                await end(world.service.land(held))
+                await asyncio.sleep(15)
+                assert world.fence.raised, "the driver may take off again"
+                if how == "returned":
+                    await world.control.give_back(held)
+                elif how == "grace":
+                    stream.cancel()
+                else:
+                    world.grants.remove(held)
+            await world.until(lambda: not world.fence.raised)
+            assert not world.plane.vehicle.armed
+
+    fly(flight)
+
+
+def test_a_fence_is_not_lowered_under_who_arms(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.drive(held)
+            raising = world.fence.raise_around
+
+            async def slowly(*what: object, **how: object) -> None:
+                await raising(*what, **how)  # type: ignore[arg-type]
+                await asyncio.sleep(12)
+
+            world.fence.raise_around = slowly  # type: ignore[method-assign]
+            await world.service.arm(held)
+            assert world.fence.raised
+
+    fly(flight)

@@ -39,7 +39,7 @@ async def arm(control: Control, held: Held, permit: Permit) -> None:
 
 
 async def _arm(control: Control, held: Held, permit: Permit) -> None:
-    autopilot, helm = control.autopilot, control.helm
+    helm = control.helm
     _check(control)
     mission = control.journal.mission(held)
     home = mission.home = _home_of(control, held, mission)
@@ -48,8 +48,18 @@ async def _arm(control: Control, held: Held, permit: Permit) -> None:
     if control.journal.failure:
         raise precondition("JournalUnavailable", control.journal.failure)
     permit()
-    await _prepare_ways_home(control, held, home)
-    permit()
+    helm.preparing += 1
+    try:
+        await _prepare_ways_home(control, held, home)
+        permit()
+        await _start(control, home, permit)
+    finally:
+        helm.preparing -= 1
+
+
+async def _start(control: Control, home: tuple[float, float, float], permit: Permit) -> None:
+    """Start the motors; stop them again when anything fails before the drone flies."""
+    autopilot, helm = control.autopilot, control.helm
     helm.arming = True
     try:
         await helm.change_mode(GUIDED, permit)

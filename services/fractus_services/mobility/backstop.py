@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -96,14 +96,17 @@ class Backstop:
             except NoLists as error:
                 self._lacks(str(error))
 
-    async def lower(self) -> None:
+    async def lower(self, idle: Callable[[], bool]) -> None:
         """Put back what the owner had, if anything was changed.
+
+        Args:
+            idle: whether no mission needs the fence; asked when no other change of it is under way.
 
         Raises:
             AutopilotError: it cannot be; it is tried again next time.
         """
         async with self._lock:
-            owned = await asyncio.to_thread(self._load)
+            owned = await asyncio.to_thread(self._load) if idle() else None
             if owned is None:
                 return
             first = {} if owned.enabled else {ENABLE: 0.0}

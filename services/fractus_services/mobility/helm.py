@@ -33,6 +33,7 @@ class Helm:
         expected: the mode that the autopilot is in by our doing, or that we know of.
         changing: how many changes are under way.
         arming: whether the motors are being started by us.
+        preparing: how many attempts to arm are under way, from the fence that is raised first to running motors.
         approach: flies to where the autopilot's own return is legal, and says in which mode it does the rest; told how
             often the autopilot refused.
     """
@@ -41,6 +42,7 @@ class Helm:
         self.expected: int | None = None
         self.changing = 0
         self.arming = False
+        self.preparing = 0
         self.approach: Callable[[Callable[[], bool], int], Awaitable[int]] = _straight
         self._autopilot = autopilot
         self._moving = moving

@@ -46,18 +46,11 @@ class Observer:
                 self._control.wake()
                 if autopilot.vehicle.home is None:
                     await self._control.tasks.attempt(autopilot.ask_home())
-                if not autopilot.vehicle.armed and self._control.journal.flying is None:
-                    await self._lower()
             except AutopilotError as error:
                 log.warning("cannot prepare the autopilot yet: %s", error)
                 await asyncio.sleep(RETRY_S)
             else:
                 return
-
-    async def _lower(self) -> None:
-        """Put back the fence that the vehicle's owner had; what fails is tried again at the next occasion."""
-        if self._control.backstop.raised:
-            await self._control.tasks.attempt(self._control.backstop.lower())
 
     def _resume(self) -> None:
         """Decide who has a vehicle that was there before us, or comes back from a broken link."""
@@ -143,7 +136,6 @@ class Observer:
             self._control.hands = "system"
             if mission is None or mission.outcome:
                 self._control.journal.active = None
-                self._control.tasks.spawn(self._lower())
         self._control.note("landed", self._control.controller, "the motors are stopped")
         self._control.journal.save_soon()
         self._control.tasks.spawn(self._control.tasks.attempt(self._control.autopilot.set_rates(flying=False)))

@@ -1,7 +1,8 @@
-"""The last look: an armed drone that nobody is responsible for is brought home, whatever led there."""
+"""The last look: an armed drone that nobody is responsible for is brought home, and no fence outlives its mission."""
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import math
 
@@ -14,6 +15,7 @@ log = logging.getLogger(__name__)
 
 TICKED_S = 1.0
 ORPHAN_S = 3.0
+LOWER_AGAIN_S = 10.0
 
 
 class Supervisor:
@@ -26,9 +28,11 @@ class Supervisor:
         self._control = control
         self._ticked_at = -math.inf
         self._orphan_since: float | None = None
+        self._lowering: asyncio.Task[None] | None = None
+        self._lower_at = -math.inf
 
     def tick(self) -> None:
-        """Find out whether somebody is responsible; act when nobody is."""
+        """Find out whether somebody is responsible; act when nobody is. Put back the fence that no mission needs."""
         control = self._control
         now = control.autopilot.now
         mute = not self.alive()
@@ -42,6 +46,10 @@ class Supervisor:
         self._ticked_at = now
         if mute and self.alive():
             control.autopilot.beat()
+        if now >= self._lower_at and self._idle() and control.backstop.raised:
+            self._lower_at = now + LOWER_AGAIN_S
+            if self._lowering is None or self._lowering.done():
+                self._lowering = control.tasks.spawn(self._lower())
 
     def alive(self) -> bool:
         """Whether the autopilot may rely on this companion."""
@@ -53,6 +61,17 @@ class Supervisor:
             and now - self._ticked_at <= TICKED_S
             and (self._orphan_since is None or now - self._orphan_since < ORPHAN_S)
         )
+
+    def _idle(self) -> bool:
+        """Whether the drone stands, and no mission that began goes on."""
+        control, mission = self._control, self._control.journal.flying
+        if not (control.decided and control.autopilot.connected) or control.autopilot.vehicle.armed:
+            return False
+        over = mission is None or bool(mission.outcome) or not mission.flown
+        return over and not control.helm.preparing
+
+    async def _lower(self) -> None:
+        await self._control.tasks.attempt(self._control.backstop.lower(self._idle))
 
     def _orphaned(self) -> bool:
         """Whether the motors run for nobody: no pilot, no driver, no chauffeur, no tour, no grace, no way home."""

@@ -108,3 +108,11 @@ def test_armed_elsewhere_it_goes_straight_and_from_home_again_on_its_path() -> N
         assert vehicle.values["FS_GCS_ENABLE"] == 3.0
 
     asyncio.run(chosen())
+
+
+def test_a_velocity_ends_soon_without_another() -> None:
+    vehicle = Parameters({"SYSID_MYGCS": SYSTEM_ID, "GUID_TIMEOUT": 3.0})
+    assert not configured(vehicle).problem
+    assert vehicle.values["GUID_TIMEOUT"] == 1.0
+    assert "GUID_TIMEOUT is 3" in configured(Parameters({"GUID_TIMEOUT": 3.0}, ("GUID_TIMEOUT",))).problem
+    assert "GUID_TIMEOUT" in configured(Parameters({"SYSID_MYGCS": SYSTEM_ID})).missing

@@ -351,7 +351,7 @@ class Autopilot:
         self.fly(0.0, 0.0, 0.0)
 
     def fly(self, north_mps: float, east_mps: float, down_mps: float, yaw_deg: float | None = None) -> None:
-        """Fly with a velocity over ground, which the autopilot gives up after three seconds by itself."""
+        """Fly with a velocity over ground, which the autopilot gives up by itself after GUID_TIMEOUT."""
         target = self._target
         if target is not None:
             self.send(

@@ -38,6 +38,7 @@ _OLD_NAME, _NEW_NAME = "SYSID_MYGCS", "MAV_GCS_SYSID"
 SETTINGS = (
     Setting((_OLD_NAME, _NEW_NAME), SYSTEM_ID, frozenset(), True, _LISTENS),
     Setting(("FS_GCS_TIMEOUT",), 5, frozenset(), False, "after five seconds of silence"),
+    Setting(("GUID_TIMEOUT",), 1, frozenset(), False, "gives a velocity up after a second without another"),
     Setting(("BATT_FS_CRT_ACT",), 1, frozenset({1.0}), False, "lands on a critical battery"),
     Setting(("FS_EKF_ACTION",), 1, frozenset({1.0, 3.0}), False, "lands when it no longer knows where it is"),
 )

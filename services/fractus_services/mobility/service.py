@@ -184,7 +184,7 @@ class MobilityService:
         """Fly with a velocity until the next one, or until its hold is over."""
         verdict = self._allow_motion(Call("SetVelocity", args), held)
         self._flying("SetVelocity")
-        motion = self._steering.motion()
+        motion = self._control.begin("SetVelocity")
         permit = driver_permit(self._control, held, motion)
         try:
             final = await self._settled(Call("SetVelocity", args), held, verdict, motion, permit)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 
 from fractus_core.policy.values import VelocityArgs
 
@@ -10,6 +11,8 @@ from fractus_services.mobility.autopilot import Permit
 from fractus_services.mobility.control import Control
 from fractus_services.mobility.leases import Motion
 from fractus_services.replies import Refused
+
+log = logging.getLogger(__name__)
 
 AGAIN_S = 0.2
 """A setpoint is sent again so often while it holds: one that is lost on the way must not leave the one before in force."""
@@ -20,42 +23,35 @@ class Steering:
 
     def __init__(self, control: Control) -> None:
         self._control = control
-        self._motion: Motion | None = None
-        self._setpoint = VelocityArgs(0.0, 0.0)
-        self._until = 0.0
         self._watchdog: asyncio.Task[None] | None = None
 
-    def motion(self) -> Motion:
-        """The motion that setpoints belong to: the one under way, or a new one that replaces what the drone did."""
-        if self._motion is None or self._control.motion is not self._motion:
-            self._motion = self._control.begin("SetVelocity")
-        return self._motion
-
     def steer(self, setpoint: VelocityArgs, motion: Motion, permit: Permit) -> None:
-        """Put a setpoint in force.
+        """Put a setpoint in force, as a motion of its own.
 
         Raises:
             Refused: the caller may not move the drone any more.
         """
         permit()
-        self._setpoint, self._until = setpoint, self._control.autopilot.now + setpoint.hold_s
-        self._send()
-        if self._watchdog is None or self._watchdog.done():
-            self._watchdog = self._control.tasks.spawn(self._watch(motion, permit))
+        self._send(setpoint)
+        self._control.tasks.drop(self._watchdog)
+        self._watchdog = self._control.tasks.spawn(self._watch(setpoint, motion, permit))
 
-    def _send(self) -> None:
-        point = self._setpoint
+    def _send(self, point: VelocityArgs) -> None:
         self._control.autopilot.fly(point.north_mps, point.east_mps, point.down_mps, point.yaw_deg)
 
-    async def _watch(self, motion: Motion, permit: Permit) -> None:
+    async def _watch(self, setpoint: VelocityArgs, motion: Motion, permit: Permit) -> None:
+        """Keep the setpoint in force to its end, and end it unless somebody else has said what the drone does."""
         control = self._control
-        while (left_s := self._until - control.autopilot.now) > 0:
+        until = control.autopilot.now + setpoint.hold_s
+        while control.motion is motion and (left_s := until - control.autopilot.now) > 0:
             await asyncio.sleep(min(left_s, AGAIN_S))
             try:
                 permit()
-            except Refused:
-                return  # whoever flies by now has said what the drone does
-            if control.autopilot.now < self._until:
-                self._send()
-        control.finish(motion)
-        await control.tasks.attempt(control.hold(control.still))
+            except Refused as refusal:
+                log.info("a velocity ends: %s", refusal)
+                break
+            if control.motion is motion and control.autopilot.now < until:
+                self._send(setpoint)
+        if control.motion is motion:
+            control.finish(motion)
+            await control.tasks.attempt(control.hold(control.still))

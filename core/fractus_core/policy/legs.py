@@ -33,7 +33,7 @@ from fractus_core.policy.motion import (
     turning_stops,
 )
 from fractus_core.policy.returning import straight_home_blocked
-from fractus_core.policy.routes import route
+from fractus_core.policy.routes import leads
 from fractus_core.policy.values import POSITION_UNKNOWN, Call, GotoArgs, Situation, Verdict, deny
 
 MAX_RANGE_M = 100_000.0
@@ -197,9 +197,9 @@ def way_home_blocked(target: XY, altitude_m: float, now: Situation, grant: Compi
     if not now.airframe.retraces:
         return problem
     home = grant.frame.xy(now.home.lat, now.home.lon)
-    if route(target, home, now, grant, altitude_m) is not None:
+    if leads(target, home, now, grant, altitude_m):
         return None
-    return replace(problem, reason=f"{problem.reason}, and no legal way leads around it")
+    return replace(problem, reason=f"{problem.reason}, and no legal way is found around it")
 
 
 def _outcome(args: GotoArgs, flown: _Aim, notes: list[Clamped], grant: CompiledGrant) -> Verdict:

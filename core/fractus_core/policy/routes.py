@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 import itertools
 import math
+from collections.abc import Generator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,11 +29,14 @@ finds the next leg legal."""
 CORNER_M = 0.1
 """Waypoints lie this much further out than their legs must, so that rounding costs no leg."""
 
-PATIENCE = 1500
-"""So many legs are tested before a search gives up, a fifth of a second or so: the monitor waits meanwhile."""
+PATIENCE = 3000
+"""So many legs are tested before a search gives up, half a second's work or so."""
 
-LONGER = 1.02
-"""A way may be so much longer than the shortest one, for the sake of a quicker search."""
+LONGER = 1.2
+"""A way may be so much longer than the shortest one, for the sake of a quicker search; a percent or two is usual."""
+
+GLANCE, ANY_WAY = 250, 5.0
+"""The same where it only matters whether there is a way, and somebody waits: some 25 ms."""
 
 _SIMPLER_M = 0.2
 _PLAIN = 24
@@ -41,6 +45,9 @@ _DETOUR = 1.2
 _ROUNDED_M = 1.5
 _ROUNDING = 1e-6
 _START, _TARGET = 0, 1
+
+
+Steps = Generator[None, None, tuple[XY, ...] | None]
 
 
 def route(
@@ -60,8 +67,8 @@ def route(
     application's own Gotos must end inside the operation area.
 
     Source: shortest paths among polygons turn at convex corners of obstacles only (Lozano-Perez and Wesley 1979). The search
-    is A* (weighted: at most 2 % too long) over tangents between such corners; an obstacle joins when it first blocks a promising leg, so the time depends
-    on the obstacles along the way, not on how many there are.
+    is A* (weighted: at most a fifth too long) over tangents between such corners; an obstacle joins when it first blocks a
+    promising leg, so the time depends on the obstacles along the way, not on how many there are.
 
     Args:
         start: where the way begins, in metres of `grant.frame`; need not be where the drone is now.
@@ -76,18 +83,42 @@ def route(
         target, the start is left out. None when there is no legal way, when home or a limit's datum is unknown, or when
         the search gives up.
     """
+    return _finished(searching(start, target, now, grant, altitude_m, from_m=from_m))
+
+
+def searching(
+    start: XY, target: XY, now: Situation, grant: CompiledGrant, altitude_m: float, *, from_m: float | None = None
+) -> Steps:
+    """`route` in steps of a fraction of a millisecond, for who has other things to do meanwhile; returns the way."""
     figures = (*start, *target, altitude_m, altitude_m if from_m is None else from_m)
     if now.home is None or not now.sound or not all(math.isfinite(figure) for figure in figures):
         return None
     low, high = sorted(figures[-2:])
     roomy, narrow = (_Search(start, target, _Space.around(now, grant, low, high, room_m)) for room_m in ROOM_M)
-    found = roomy.run()
+    found = yield from roomy.steps()
     if found is not None and _length_m(start, found) <= _DETOUR * math.dist(start, target):
-        return roomy.rounded(found)
-    shorter = narrow.run() if not roomy.exhausted else None
+        return (yield from roomy.rounded(found))
+    shorter = (yield from narrow.steps()) if not roomy.exhausted else None
     if shorter is not None and (found is None or _length_m(start, shorter) < _length_m(start, found) / _DETOUR):
-        return narrow.rounded(shorter)
-    return roomy.rounded(found) if found is not None else None
+        return (yield from narrow.rounded(shorter))
+    return (yield from roomy.rounded(found)) if found is not None else None
+
+
+def leads(start: XY, target: XY, now: Situation, grant: CompiledGrant, altitude_m: float) -> bool:
+    """Whether a short search, of `GLANCE` legs, finds any legal way from one place to another; see `route`."""
+    if now.home is None or not now.sound:
+        return False
+    space = _Space.around(now, grant, altitude_m, altitude_m, ROOM_M[1])
+    return _finished(_Search(start, target, space, longer=ANY_WAY, patience=GLANCE).steps()) is not None
+
+
+def _finished(search: Steps) -> tuple[XY, ...] | None:
+    while True:
+        try:
+            next(search)
+        except StopIteration as end:
+            found: tuple[XY, ...] | None = end.value
+            return found
 
 
 def _length_m(start: XY, way: tuple[XY, ...]) -> float:
@@ -213,8 +244,12 @@ def _meeting(before: XY, first: XY, second: XY, after: XY) -> XY | None:
 class _Search:
     """A* from start to target over tangents between corners; obstacles are found on the way."""
 
-    def __init__(self, start: XY, target: XY, space: _Space) -> None:
+    def __init__(
+        self, start: XY, target: XY, space: _Space, *, longer: float = LONGER, patience: int = PATIENCE
+    ) -> None:
         self._space = space
+        self._longer = longer
+        self._patience = patience
         self._ends = (start, target)
         # The ends count as corners without neighbours: anything is tangent to them.
         self._nodes: Floats = np.asarray([start * 3, target * 3])
@@ -228,8 +263,8 @@ class _Search:
         # Ends that are too close to a fence themselves: legs to and from them are judged by the engine's own rules.
         self._odd: set[int] = set()
 
-    def run(self) -> tuple[XY, ...] | None:
-        """The way, or None."""
+    def steps(self) -> Steps:
+        """Look for the way, leg by leg; returns it, or None."""
         if self._ends[0] == self._ends[1]:
             return (self._ends[1],) if self._space.permits(*self._ends) else None
         begin = shapely.points(self._ends[0])
@@ -243,6 +278,7 @@ class _Search:
             self._learn([obstacle], self._ends[0])
         self._expand(_START)
         while self._heap and not self.exhausted:
+            yield
             _, end, begin, cost = heapq.heappop(self._heap)
             if cost >= self._cost[end] - 1e-9 or not self._open(begin, end):
                 continue
@@ -255,13 +291,14 @@ class _Search:
     @property
     def exhausted(self) -> bool:
         """Whether it gave up."""
-        return len(self._clear) >= PATIENCE
+        return len(self._clear) >= self._patience
 
-    def rounded(self, way: tuple[XY, ...]) -> tuple[XY, ...]:
+    def rounded(self, way: tuple[XY, ...]) -> Steps:
         """The way with neighbouring waypoints made one where the legs meet a little further on: each costs a stop."""
         points = [self._ends[0], *way]
         i = 1
         while i + 2 < len(points):
+            yield
             before, first, second, after = points[i - 1 : i + 3]
             corner = _meeting(before, first, second, after)
             if corner is not None and self._clears(before, corner) and self._clears(corner, after):
@@ -298,7 +335,7 @@ class _Search:
         good &= _tangent(along, froms[:, None]) & _tangent(along, tos[None])
         left = np.hypot(*(tos[:, :2] - self._nodes[_TARGET, :2]).T)
         for i, j in np.argwhere(good).tolist():
-            heapq.heappush(self._heap, (float(cost[i, j] + LONGER * left[j]), first + j, begins[i], float(cost[i, j])))
+            heapq.heappush(self._heap, (float(cost[i, j] + self._longer * left[j]), first + j, begins[i], float(cost[i, j])))
 
     def _open(self, begin: int, end: int) -> bool:
         key = (min(begin, end), max(begin, end))

@@ -335,7 +335,9 @@ class _Search:
         good &= _tangent(along, froms[:, None]) & _tangent(along, tos[None])
         left = np.hypot(*(tos[:, :2] - self._nodes[_TARGET, :2]).T)
         for i, j in np.argwhere(good).tolist():
-            heapq.heappush(self._heap, (float(cost[i, j] + self._longer * left[j]), first + j, begins[i], float(cost[i, j])))
+            heapq.heappush(
+                self._heap, (float(cost[i, j] + self._longer * left[j]), first + j, begins[i], float(cost[i, j]))
+            )
 
     def _open(self, begin: int, end: int) -> bool:
         key = (min(begin, end), max(begin, end))

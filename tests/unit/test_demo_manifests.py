@@ -18,6 +18,8 @@ from fractus_core.policy.engine import judge
 from fractus_core.policy.grants import compile_grants
 from fractus_core.policy.values import Call, GotoArgs, Home, SetSpeedArgs, Situation
 from fractus_core.validation import check_application, check_policy, check_zone
+from fractus_sim.cluster import hardware
+from fractus_sim.cluster.hardware import hardware_commands
 from fractus_sim.cluster.spec import load_spec
 
 ROOT = Path(__file__).parents[2]
@@ -88,9 +90,27 @@ def test_the_objects_agree_with_each_other(inventory: Inventory, application: Ap
 def test_the_cluster_s_nodes_are_those_of_the_manifests() -> None:
     spec = load_spec(ROOT / "examples" / "clusters" / "demo.yaml")
     described = {n.name: BY_KIND[n.manifest["kind"]].from_body(n.manifest) for n in spec.nodes if n.manifest}
-    assert {k: v.to_dict()["spec"] for k, v in described.items()} == {
+    drone = described["drone-1"].to_dict()["spec"]
+    camera = drone["services"]["camera"]
+    assert camera["connection"] == "http://127.0.0.1:8090/snapshot.jpg"
+    camera["connection"] = "test:"  # clusters of others have no simulated camera
+    assert {k: v.to_dict()["spec"] for k, v in described.items()} | {"drone-1": drone} == {
         k: v.to_dict()["spec"] for k, v in {**named("drone.yaml"), **named("edge-nodes.yaml")}.items()
     }
+
+
+def test_the_drone_s_camera_sees_the_simulated_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hardware.shutil, "which", lambda name: f"/bin/{name}")
+    spec = load_spec(ROOT / "examples" / "clusters" / "demo.yaml")
+    commands = {node.name: hardware_commands(node, spec.world_origin) for node in spec.nodes}
+    vehicle, camera = commands["drone-1"]["vehicle"], commands["drone-1"]["camera"]
+    options = dict(itertools.pairwise(camera))
+    assert options["--listen"] == "127.0.0.1:8090"
+    assert options["--vehicle"] in vehicle
+    told = named("drone.yaml")["drone-1"].spec.services.camera
+    assert float(options["--fov"]) == told.horizontal_field_of_view
+    assert (options["--resolution"], float(options["--mount-pitch"])) == (told.resolution, told.mount.pitch)
+    assert not any(commands[name] for name in commands if name != "drone-1")
 
 
 def test_the_plan_uses_what_is_near_and_says_why_edge_3_is_not(inventory: Inventory, application: Application) -> None:

@@ -25,7 +25,11 @@ from fractus_sim.cluster.processes import kill, read_record
 from fractus_sim.cluster.spec import load_spec, parse_spec
 from fractus_sim.cluster.state import state_of
 
-pytestmark = [pytest.mark.root, pytest.mark.skipif(os.geteuid() != 0, reason="needs root")]
+pytestmark = [
+    pytest.mark.root,
+    pytest.mark.skipif(os.geteuid() != 0, reason="needs root"),
+    pytest.mark.xdist_group("cluster"),
+]
 
 ROOT = Path(__file__).parents[2]
 NAME = f"ct{os.getpid()}"

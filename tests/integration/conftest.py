@@ -13,6 +13,18 @@ from control_plane import ControlPlane, programs
 from operator_world import OperatorProcess, World, fresh_namespace
 
 
+LONG = ("test_scenario_field", "test_sdk_flight", "test_mobility_sdk", "test_mobility_lost")
+"""Modules whose flights take longest: what begins first lets nobody wait for it at the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give every worker single tests; those that need an API server share one, and a worker."""
+    for item in items:
+        if "control_plane" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.xdist_group("control-plane"))
+    items.sort(key=lambda item: item.path.stem not in LONG)
+
+
 @pytest.fixture(scope="session")
 def control_plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ControlPlane]:
     """A real API server with the CRDs installed; about 6 s, once a session."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import json
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -16,7 +17,7 @@ import pytest
 from fractus_core.policy.values import Attitude, CaptureArgs, Lens, Situation
 from fractus_services.audit import AuditLog
 from fractus_services.camera import service as camera
-from fractus_services.camera.album import Album, AlbumFull
+from fractus_services.camera.album import Album, AlbumFull, NoSuchImage
 from fractus_services.camera.drivers import CameraFailed, Wanted
 from fractus_services.camera.faces import Box
 from fractus_services.camera.imaging import Pixels, decoded
@@ -35,13 +36,23 @@ def private(action: str = "refuse", name: str = "p", **fields: Any) -> dict[str,
 
 
 class Drone:
-    """Whereabouts that a test moves."""
+    """Whereabouts that a test moves; they remember what they told."""
 
     def __init__(self) -> None:
-        self.x, self.y, self.alt = 0.0, 80.0, 10.0
+        self.x, self.y, self.alt, self.yaw = 0.0, 80.0, 10.0, 0.0
+        self.lens: Lens | None = SEEING
+        self.told: list[tuple[float, Situation]] = []
 
     def situation(self, time_s: float) -> Situation:
-        return at(self.x, self.y, alt=self.alt, time_s=time_s, lens=SEEING, attitude=Attitude(0, 0, 0, 0, 0))
+        now = at(
+            self.x, self.y, alt=self.alt, time_s=time_s, lens=self.lens, attitude=Attitude(0, 0, self.yaw, 0, 0)
+        )  # fmt: skip
+        self.told.append((time.monotonic(), now))
+        return now
+
+    def way(self, begun_s: float, time_s: float) -> tuple[Situation, ...]:
+        self.situation(time_s)
+        return tuple(one for told_at, one in self.told if told_at >= begun_s)
 
     async def run(self) -> None:
         """Nothing to follow."""
@@ -88,7 +99,7 @@ def held(*policies: dict[str, Any], uid: str = "u1", instance: str = "app-naviga
     fields: dict[str, Any] = {
         "application": {"namespace": "default", "name": "app", "uid": uid},
         "instance": instance,
-        "services": [{"service": "camera", "methods": ["CaptureImage", "RetrieveImage", "ListImages"]}],
+        "services": [{"service": "camera", "methods": ["CaptureImage", "RetrieveImage", "ListImages", "DeleteImage"]}],
     }
     chosen = policies or (private(),)
     return Held(uid, "g", spec(*chosen, **fields), compiled(*chosen, **fields))
@@ -150,6 +161,32 @@ async def test_a_drone_that_crosses_private_ground_during_the_exposure_keeps_no_
     assert await refusal(world.service.capture(held(), CaptureArgs())) == "PrivacyZone"
 
 
+async def test_a_camera_that_looks_aside_and_back_during_the_exposure_keeps_no_picture(world: World) -> None:
+    """Narrow and oblique, 10 m up: the zone 60 m to the south is behind it at both ends of the exposure."""
+    world.drone.lens = Lens(20.0, 20.0, pitch_deg=-15.0, stabilised=True, error_deg=0.0)
+
+    def looked(**changes: float) -> None:
+        before = {name: getattr(world.drone, name) for name in changes}
+        for now in (changes, before):
+            for name, value in now.items():
+                setattr(world.drone, name, value)
+            world.drone.situation(NOW)
+
+    world.scene.during = lambda: looked(yaw=45.0)
+    shot = await world.capture(held())
+    assert {round(pose.attitude.yaw_deg) for pose in shot.poses if pose.attitude} == {0, 45}
+    world.scene.during = lambda: looked(yaw=180.0)
+    assert await refusal(world.service.capture(held(), CaptureArgs())) == "PrivacyZone"
+    world.scene.during = lambda: looked(y=0.0)
+    assert await refusal(world.service.capture(held(), CaptureArgs())) == "PrivacyZone"
+    blind = policy("a", "AccessControl", "denial", [zone("z", box(-20, -20, 20, 20))], methods=["CaptureImage"])
+    assert await refusal(world.service.capture(held(blind), CaptureArgs())) == "MethodDenied"
+    elsewhere = policy("q", "PrivacyControl", "camera", [zone("z", box(500, 500, 510, 510))], action="refuse")
+    world.scene.during = lambda: looked(yaw=180.0)
+    shot = await world.capture(held(elsewhere))
+    assert await refusal(world.service.retrieve(held(), shot.name)) == "PrivacyZone"
+
+
 async def test_those_who_wait_are_judged_and_placed_when_it_is_their_turn(world: World) -> None:
     held_up = threading.Event()
     world.scene.during = lambda: held_up.wait(10) and None
@@ -163,7 +200,8 @@ async def test_those_who_wait_are_judged_and_placed_when_it_is_their_turn(world:
     shots = await asyncio.gather(*waiting)
     assert (await other).name == sorted(s.name for s in [*shots, await other])[1], "callers take turns"
     for shot in shots:
-        assert FRAME.xy(shot.after.lat or 0, shot.after.lon or 0)[1] == pytest.approx(60.0, abs=0.01)
+        last = shot.poses[-1]
+        assert FRAME.xy(last.lat or 0, last.lon or 0)[1] == pytest.approx(60.0, abs=0.01)
 
 
 async def refusal_of_queue(work: Any) -> bool:
@@ -257,9 +295,44 @@ async def test_faces_are_hidden_where_they_are_large_enough_to_be_found(tmp_path
     world.shutter.close()
 
 
-async def test_without_a_lens_nobody_knows_how_small_faces_are(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = world.drone.situation
-    monkeypatch.setattr(world.drone, "situation", lambda time_s: replace(plain(time_s), lens=None))
+async def test_faces_that_were_hidden_too_softly_are_not_looked_for_again(tmp_path: Path) -> None:
+    world = World(tmp_path, (1600, 1600))
+    world.drone.y, world.drone.alt = 0.0, 2.0
+    world.finder.boxes = [(700, 700, 100, 100)]
+    soft = held(private("blurFaces", faces="gaussian"))
+    shot = await world.capture(soft)
+    assert shot.filters[0].faces == "gaussian"
+    assert grain(await world.pixels(soft, shot)) > 30
+    world.finder.boxes = []
+    for fallback, most in (("blurAverage", 12), ("black", 0)):
+        hard = held(private("blurFaces", faces="pixelate", fallback=fallback))
+        assert grain(await world.pixels(hard, shot)) <= most
+    strict = held(private("blurFaces", faces="pixelate", fallback="refuse"))
+    assert await refusal(world.service.retrieve(strict, shot.name)) == "FacesNotFound"
+    world.shutter.close()
+
+
+@pytest.mark.parametrize(("size", "shown"), [((120, 160), (120, 68)), ((400, 90), (160, 90)), ((160, 90), (160, 90))])
+async def test_no_more_is_kept_than_the_view_that_was_judged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], shown: tuple[int, int]
+) -> None:
+    """Whatever proportions the camera gives: the footprint was that of 16:9."""
+    world = World(tmp_path, (160, 90))
+    picture = np.zeros((size[1], size[0], 3), np.uint8)
+    left, top = (size[0] - shown[0]) // 2, (size[1] - shown[1]) // 2
+    picture[top : top + shown[1], left : left + shown[0]] = 200
+    monkeypatch.setattr(world.scene, "capture", lambda _wanted: picture)
+    for asked in ({"width": 64, "height": 64}, {"width": 64, "height": 36}, {"width": 90, "height": 160}):
+        kept = world.stored(held(), await world.capture(held(), **asked))
+        assert kept.min() > 150, asked
+    world.drone.lens = None
+    elsewhere = held(private("black"), uid="u9")
+    assert (await world.capture(elsewhere, width=64, height=64)).filters, "without a lens it sees everything"
+    world.shutter.close()
+
+
+async def test_without_a_lens_nobody_knows_how_small_faces_are(world: World) -> None:
+    world.drone.lens = None
     verdict, _ = await world.service.capture(held(private("blurFaces")), CaptureArgs())
     assert "nobody knows how small" in verdict.reason
     assert verdict.policies == ("p",), "80 m away, but who knows what the camera sees"
@@ -340,6 +413,29 @@ async def test_the_album_forgets_what_a_crash_left_and_makes_room(tmp_path: Path
     assert not folder.exists()
     small.add(living[0], replace(shot, name="20260101000000000-0009.jpg"), b"x" * 2000)
     assert "--keep-total-mb" in small.room(living[0])
+    world.shutter.close()
+
+
+async def test_a_picture_whose_record_is_damaged_is_removed_and_never_handed_out(tmp_path: Path) -> None:
+    world = World(tmp_path)
+    owner, shots = camera.owner_of(held()), [await world.capture(held()) for _ in range(5)]
+    records = [world.album.path(owner, shot.name).with_suffix(".json") for shot in shots]
+    body = json.loads(records[0].read_text())
+    poses = body.pop("poses")
+    records[0].write_text(json.dumps({**body, "before": poses[0], "after": poses[-1]}))  # as an older release wrote it
+    records[1].write_text("{")
+    records[2].write_text(json.dumps({**body, "poses": []}))
+    records[3].write_text(json.dumps({**body, "poses": [{**poses[0], "lat": float("nan")}]}))
+    for shot in shots[:4]:
+        with pytest.raises(NoSuchImage, match=r"damaged.*DeleteImage"):
+            await world.service.retrieve(held(), shot.name)
+    assert world.album.list(owner) == (shots[4],)
+    await world.service.delete(held(), shots[0].name)
+    assert not records[0].with_suffix(".jpg").exists()
+    with pytest.raises(NoSuchImage, match="there is no picture"):
+        await world.service.delete(held(), shots[0].name)
+    assert Album(world.directory, 50, 10**9).list(owner) == (shots[4],)
+    assert [path.name for path in world.directory.glob("*/*.jpg")] == [shots[4].name]
     world.shutter.close()
 
 

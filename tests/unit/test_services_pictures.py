@@ -6,6 +6,7 @@ import io
 import sys
 import types
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -231,7 +232,7 @@ def test_records_of_pictures_survive_json() -> None:
     import json
 
     pose = Pose.of(at(attitude=Attitude(1, 2, 3)))
-    shot = Shot("n", NOW, 10, 20, 30, pose, Pose.of(at(home=None)), 12.0, (Filter("blurFaces", "gaussian"),))
+    shot = Shot("n", NOW, 10, 20, 30, (pose, Pose.of(at(home=None))), 12.0, (Filter("blurFaces", "gaussian"),))
     assert Shot.parse(json.loads(json.dumps(shot.to_json()))) == shot
     for broken in ({}, {"before": 1}, {**shot.to_json(), "colour": "red"}):
         with pytest.raises(ValueError, match="no shot"):
@@ -306,6 +307,24 @@ def test_a_raspberry_camera_is_configured_started_and_started_again(monkeypatch:
     assert len(begun) == 2
     with pytest.raises(CameraFailed, match="there is no camera 0"):
         driver_for("picamera2:0").capture(wanted())
+
+
+def test_a_video_device_that_ignores_the_size_it_was_set_to_gives_no_picture_of_a_known_view(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """640x480 of a sensor that was set to 64x48 may show more than its description says."""
+    device = SimpleNamespace(
+        isOpened=lambda: True, set=lambda *_: False, grab=lambda: True, release=lambda: None,
+        read=lambda: (True, np.zeros((480, 640, 3), np.uint8)),
+    )  # fmt: skip
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: device)
+    (tmp_path / "video0").touch()
+    driver = driver_for(f"v4l2:{tmp_path}/video0")
+    with pytest.raises(CameraFailed, match=r"640x480 pixels though it was set to 64x48.*services\.camera\.resolution"):
+        driver.capture(wanted(lens=Lens(60.0, 45.0)))
+    assert driver.capture(wanted(lens=None)).shape == (480, 640, 3), "a camera that is not described sees everything"
+    device.read = lambda: (True, np.zeros((48, 64, 3), np.uint8))
+    assert driver.capture(wanted(lens=Lens(60.0, 45.0))).shape == (48, 64, 3)
 
 
 def test_a_directory_gives_the_picture_that_was_taken_nearest_in_space(tmp_path: Path) -> None:

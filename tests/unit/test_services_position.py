@@ -54,10 +54,21 @@ def test_telemetry_carries_no_stale_position() -> None:
     fresh = told(vehicle, 10.5)
     assert fresh.HasField("position")
     assert fresh.position_error_m == pytest.approx(0.6 + 3.0 * 0.5)
+    assert fresh.position_age_s == pytest.approx(0.5)
     stale = told(vehicle, 11.1)
     assert not stale.HasField("position")
     assert not stale.HasField("velocity")
     assert not told(Vehicle(), math.inf).HasField("position")
+
+
+def test_telemetry_tells_how_old_the_attitude_is() -> None:
+    vehicle = Vehicle()
+    vehicle.take(message("ATTITUDE", roll=0.1, pitch=0.0, yaw=1.0), 10.0)
+    fresh = told(vehicle, 10.4)
+    assert fresh.attitude_age_s == pytest.approx(0.4)
+    stale = told(vehicle, 11.1)
+    assert not stale.HasField("attitude")
+    assert not stale.HasField("attitude_age_s")
 
 
 def test_missions_are_for_the_node_alone() -> None:

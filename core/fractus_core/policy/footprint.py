@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,14 +72,24 @@ class Footprint:
         points = [(x + e * d, y + n * d) for d in (near, far) for e, n in self._below]
         return bool(shape.dwithin(_hull(points), self.margin_m))
 
-    def joined(self, other: Footprint) -> Footprint:
-        """What is shown by a picture that is taken while the camera moves from here to there."""
-        return Footprint(
-            shapely.union(self.sight, other.sight).convex_hull,
-            max(self.margin_m, other.margin_m),
-            max(self.upper_m, other.upper_m),
-            max(self.farthest_m, other.farthest_m),
-        )
+
+def joined(views: Sequence[Footprint]) -> Footprint:
+    """What is shown by a picture that is taken while the camera moves through these, one after the other."""
+    if len(views) == 1:
+        return views[0]
+    return Footprint(
+        shapely.union_all([view.sight for view in views]).convex_hull,
+        max(view.margin_m for view in views),
+        max(view.upper_m for view in views),
+        max(view.farthest_m for view in views),
+    )
+
+
+def seen_from(poses: Sequence[Situation], frame: LocalFrame) -> Footprint | None:
+    """What a picture may show that is taken while the camera moves through these; None where one of them is unknown."""
+    views = [footprint(now, frame) for now in poses]
+    known = [view for view in views if view is not None]
+    return joined(known) if known and len(known) == len(views) else None
 
 
 def footprint(now: Situation, frame: LocalFrame) -> Footprint | None:
@@ -87,7 +98,7 @@ def footprint(now: Situation, frame: LocalFrame) -> Footprint | None:
     The ground is taken for level, between home's height and `relief_m` below it. Whatever is unknown - attitude, lens,
     ground - makes the camera see everything around it.
     """
-    if now.lat is None or now.lon is None:
+    if now.lat is None or now.lon is None or not now.sound:
         return None
     at = frame.xy(now.lat, now.lon)
     attitude = _attitude(now)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import shapely
 
 from fractus_core.policy.compiled import Air, CompiledGrant, Patch, Patches, Rule, height_m
-from fractus_core.policy.footprint import Footprint, footprint
+from fractus_core.policy.footprint import seen_from
 from fractus_core.policy.values import FaceMethod, Fallback, Filter, FilterAction, Situation, Verdict, deny
 
 _IN_ORDER: tuple[FilterAction, ...] = ("blurFaces", "removeBackground", "blurMedian", "blurAverage", "black")
@@ -18,15 +18,14 @@ _WHOLE: frozenset[FilterAction] = frozenset({"blurMedian", "blurAverage", "black
 """Filters of the whole picture, which leave no face to find."""
 
 
-def judge_privacy(now: Situation, grant: CompiledGrant, until: Situation | None = None) -> Verdict:
+def judge_privacy(now: Situation, grant: CompiledGrant) -> Verdict:
     """What privacy policies ask of a picture taken or handed out here: nothing, filters, or refusal.
 
     Args:
-        now: where the camera is and how it is turned.
+        now: where the camera is and how it is turned, and on which way it got there during the exposure.
         grant: whose policies hold.
-        until: where it is at the end of the exposure; the picture may show what is seen on the way as well.
     """
-    rules = seen(grant.privacy, now, grant, until) if grant.privacy else []
+    rules = seen(grant.privacy, now, grant) if grant.privacy else []
     refusing = [rule for rule in rules if rule.spec.action == "refuse"]
     if refusing:
         return deny("PrivacyZone", f"policy {refusing[0].name} forbids pictures here", names(refusing))
@@ -66,21 +65,31 @@ def _strictest(alike: list[Filter]) -> Filter:
 
 
 def remaining(asked: Iterable[Filter], applied: Iterable[Filter]) -> tuple[Filter, ...]:
-    """What must still be done to a picture that was filtered before."""
-    done = {one.action for one in applied}
-    if "black" in done:
+    """What must still be done to a picture that was filtered before.
+
+    Faces that were hidden in a milder way than is asked for must still be hidden.
+    """
+    done = tuple(applied)
+    if any(one.action == "black" for one in done):
         return ()
-    hidden = "blurFaces" in done or bool(done & _WHOLE)
-    return tuple(one for one in compose(asked) if one.action not in done and not (one.action == "blurFaces" and hidden))
+    return tuple(one for one in compose(asked) if not _satisfied(one, done))
 
 
-def seen(patches: Patches, now: Situation, grant: CompiledGrant, until: Situation | None = None) -> list[Rule]:
+def _satisfied(asked: Filter, done: Sequence[Filter]) -> bool:
+    if asked.action != "blurFaces":
+        return any(one.action == asked.action for one in done)
+    if any(one.action in _WHOLE for one in done):
+        return True
+    return any(one.action == "blurFaces" and (one.faces == "pixelate" or asked.faces == "gaussian") for one in done)
+
+
+def seen(patches: Patches, now: Situation, grant: CompiledGrant) -> list[Rule]:
     """Policies of an index that hold where the camera is, or of which a picture may show a zone.
 
     While the position is unknown every policy in force may hold.
     """
     found = {rule.name: rule for rule in patches.everywhere if rule.in_force(now.time_s)}
-    view = _view(now, until, grant)
+    view = seen_from([*now.way, now], grant.frame)
     if now.lat is None or now.lon is None or view is None:
         return ordered(found | {p.rule.name: p.rule for p in patches.patches if p.in_force(now.time_s)})
     if not patches.patches:
@@ -94,14 +103,6 @@ def seen(patches: Patches, now: Situation, grant: CompiledGrant, until: Situatio
         if patch.rule.name not in found and view.shows(patch.shape, *_heights(patch, now, grant.flat_terrain)):
             found[patch.rule.name] = patch.rule
     return ordered(found)
-
-
-def _view(now: Situation, until: Situation | None, grant: CompiledGrant) -> Footprint | None:
-    view = footprint(now, grant.frame)
-    if until is None or view is None:
-        return view
-    later = footprint(until, grant.frame)
-    return None if later is None else view.joined(later)
 
 
 def _heights(patch: Patch, now: Situation, flat_terrain: bool) -> tuple[float, float]:

@@ -234,7 +234,7 @@ class SubscribeTelemetryRequest(_message.Message):
     def __init__(self, interval_s: _Optional[float] = ...) -> None: ...
 
 class Telemetry(_message.Message):
-    __slots__ = ("time", "position", "altitude_amsl_m", "velocity", "yaw_deg", "battery_remaining", "battery_voltage_v", "battery_current_a", "armed", "in_air", "mode", "ready", "home", "flight_state", "controller", "autopilot_connected", "missions", "position_error_m", "attitude")
+    __slots__ = ("time", "position", "altitude_amsl_m", "velocity", "yaw_deg", "battery_remaining", "battery_voltage_v", "battery_current_a", "armed", "in_air", "mode", "ready", "home", "flight_state", "controller", "autopilot_connected", "missions", "position_error_m", "attitude", "position_age_s", "attitude_age_s")
     class MissionsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -261,6 +261,8 @@ class Telemetry(_message.Message):
     MISSIONS_FIELD_NUMBER: _ClassVar[int]
     POSITION_ERROR_M_FIELD_NUMBER: _ClassVar[int]
     ATTITUDE_FIELD_NUMBER: _ClassVar[int]
+    POSITION_AGE_S_FIELD_NUMBER: _ClassVar[int]
+    ATTITUDE_AGE_S_FIELD_NUMBER: _ClassVar[int]
     time: _timestamp_pb2.Timestamp
     position: _types_pb2.Position
     altitude_amsl_m: float
@@ -280,4 +282,6 @@ class Telemetry(_message.Message):
     missions: _containers.ScalarMap[str, str]
     position_error_m: float
     attitude: _types_pb2.Attitude
-    def __init__(self, time: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., position: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., altitude_amsl_m: _Optional[float] = ..., velocity: _Optional[_Union[_types_pb2.Velocity, _Mapping]] = ..., yaw_deg: _Optional[float] = ..., battery_remaining: _Optional[float] = ..., battery_voltage_v: _Optional[float] = ..., battery_current_a: _Optional[float] = ..., armed: bool = ..., in_air: bool = ..., mode: _Optional[str] = ..., ready: bool = ..., home: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., flight_state: _Optional[str] = ..., controller: _Optional[str] = ..., autopilot_connected: bool = ..., missions: _Optional[_Mapping[str, str]] = ..., position_error_m: _Optional[float] = ..., attitude: _Optional[_Union[_types_pb2.Attitude, _Mapping]] = ...) -> None: ...
+    position_age_s: float
+    attitude_age_s: float
+    def __init__(self, time: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., position: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., altitude_amsl_m: _Optional[float] = ..., velocity: _Optional[_Union[_types_pb2.Velocity, _Mapping]] = ..., yaw_deg: _Optional[float] = ..., battery_remaining: _Optional[float] = ..., battery_voltage_v: _Optional[float] = ..., battery_current_a: _Optional[float] = ..., armed: bool = ..., in_air: bool = ..., mode: _Optional[str] = ..., ready: bool = ..., home: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., flight_state: _Optional[str] = ..., controller: _Optional[str] = ..., autopilot_connected: bool = ..., missions: _Optional[_Mapping[str, str]] = ..., position_error_m: _Optional[float] = ..., attitude: _Optional[_Union[_types_pb2.Attitude, _Mapping]] = ..., position_age_s: _Optional[float] = ..., attitude_age_s: _Optional[float] = ...) -> None: ...

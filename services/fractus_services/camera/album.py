@@ -17,7 +17,7 @@ from fractus_services.camera.shots import Shot
 
 log = logging.getLogger(__name__)
 
-_NAME = re.compile(r"^[0-9]{17}-[0-9]{4}\.jpg$")
+_NAME = re.compile(r"[0-9]{17}-[0-9]{4}\.jpg")
 
 
 class AlbumFull(Exception):
@@ -67,7 +67,9 @@ class Album:
             except FileNotFoundError:
                 continue
             except ValueError as error:
-                log.warning("%s cannot be read, so its picture is not handed out: %s", path, error)
+                log.warning(
+                    "%s cannot be read, so its picture is not handed out (%s); DeleteImage removes it", path, error
+                )
         return tuple(shots)
 
     def room(self, owner: str) -> str:
@@ -110,34 +112,41 @@ class Album:
         """What is known of a picture.
 
         Raises:
-            NoSuchImage: there is none of that name.
+            NoSuchImage: there is none of that name, or its record cannot be read, so that nobody knows what it shows.
         """
-        missing = NoSuchImage(f"there is no picture {name[:64]!r} of this component; ListImages tells which there are")
-        if not _NAME.match(name):
-            raise missing
+        record = self._record(owner, name)
         try:
-            return Shot.parse(json.loads((self._folder(owner) / name).with_suffix(".json").read_bytes()))
+            return Shot.parse(json.loads(record.read_bytes()))
         except FileNotFoundError:
-            raise missing from None
+            raise _missing(name) from None
         except ValueError as error:
             log.warning("picture %s cannot be handed out: %s", name, error)
-            raise missing from None
+            raise NoSuchImage(
+                f"the record of picture {name!r} is damaged, so it is not handed out; DeleteImage removes it"
+            ) from None
+
+    def _record(self, owner: str, name: str) -> Path:
+        if not _NAME.fullmatch(name):
+            raise _missing(name)
+        return (self._folder(owner) / name).with_suffix(".json")
 
     def path(self, owner: str, name: str) -> Path:
         """The file of a picture that `find` knows."""
         return self._folder(owner) / name
 
     def delete(self, owner: str, name: str) -> None:
-        """Remove a picture.
+        """Remove a picture, also one with a damaged record.
 
         Raises:
             NoSuchImage: there is none of that name.
         """
-        self.find(owner, name)
-        path = self._folder(owner) / name
-        # Without its record a picture is never handed out.
-        path.with_suffix(".json").unlink(missing_ok=True)
-        path.unlink(missing_ok=True)
+        record = self._record(owner, name)
+        try:
+            # Without its record a picture is never handed out.
+            record.unlink()
+        except FileNotFoundError:
+            raise _missing(name) from None
+        record.with_suffix(".jpg").unlink(missing_ok=True)
 
     def _total(self) -> int:
         total = 0
@@ -158,11 +167,26 @@ class Album:
         return False
 
     def _tidy(self) -> None:
-        """Remove what a crash left: files that were being written, and pictures without a record."""
+        """Remove what nobody can ever get: files that were being written, and pictures without a record that is understood.
+
+        These are what a crash, a damaged disk or another release left.
+        """
+        for record in self._directory.glob("*/*.json"):
+            try:
+                Shot.parse(json.loads(record.read_bytes()))
+            except ValueError as error:
+                log.warning("removing %s and its picture: nobody can tell any more what it shows (%s)", record, error)
+                record.unlink(missing_ok=True)
+            except OSError as error:
+                log.warning("%s cannot be read: %s", record, error)
         for path in self._directory.glob("*/*"):
             orphan = path.suffix == ".jpg" and not path.with_suffix(".json").exists()
             if orphan or path.suffix == ".new":
                 path.unlink(missing_ok=True)
+
+
+def _missing(name: str) -> NoSuchImage:
+    return NoSuchImage(f"there is no picture {name[:64]!r} of this component; ListImages tells which there are")
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fractus_core.policy.privacy import compose
-from fractus_core.policy.values import Filter, Lens, Situation
+from fractus_core.policy.values import Filter
 
 from fractus_services.camera import filters as do
 from fractus_services.camera.faces import Detector
 from fractus_services.camera.imaging import Pixels
+from fractus_services.camera.shots import Pose, directions
 
 _UPRIGHT_PITCH_DEG = -45.0
 _UPRIGHT_ROLL_DEG = 15.0
@@ -55,11 +56,15 @@ def recipe(asked: tuple[Filter, ...], face_px: float, detector: Detector) -> Rec
     return Recipe(compose([*rest, Filter(faces.fallback)]), f"{note}, so {faces.fallback} instead")
 
 
-def is_upright(lens: Lens | None, now: Situation) -> bool:
-    """Whether people stand upright in pictures, as those see them who look ahead."""
-    if lens is None or lens.pitch_deg < _UPRIGHT_PITCH_DEG:
-        return False
-    return lens.stabilised or (now.attitude is not None and abs(now.attitude.roll_deg) < _UPRIGHT_ROLL_DEG)
+def is_upright(poses: Sequence[Pose]) -> bool:
+    """Whether people stand upright in pictures taken from these, as those see them who look ahead."""
+    for pose in poses:
+        roll_deg, pitch_deg, _ = directions(pose)
+        if roll_deg is None or pitch_deg is None:
+            return False
+        if pitch_deg < _UPRIGHT_PITCH_DEG or abs(roll_deg) > _UPRIGHT_ROLL_DEG:
+            return False
+    return True
 
 
 def developed(

@@ -81,7 +81,7 @@ def _info(shot: Shot) -> camera_pb2.ImageInfo:
         name=shot.name, width=shot.width, height=shot.height, size_bytes=shot.size_bytes, media_type="image/jpeg"
     )
     info.time.FromNanoseconds(int(shot.time_s * 1e9))
-    taken = shot.after
+    taken = shot.poses[-1]
     if taken.lat is not None and taken.lon is not None and not shot.filters:
         info.position.latitude_deg, info.position.longitude_deg = taken.lat, taken.lon
         info.position.altitude_m = taken.altitude_m

@@ -75,17 +75,22 @@ def source_size(width: int, height: int, native: tuple[int, int]) -> tuple[int, 
     return max(round(native[0] * scale), width), max(round(native[1] * scale), height)
 
 
-def fitted(picture: Pixels, width: int, height: int) -> Pixels:
-    """The middle of a picture in other proportions and of another size; never more than it shows."""
-    cv2 = opencv()
+def cropped(picture: Pixels, width: int, height: int) -> Pixels:
+    """The middle of a picture in the proportions of a width and height."""
     rows, columns = picture.shape[:2]
     scale = max(width / columns, height / rows)
     kept_columns, kept_rows = min(round(width / scale), columns), min(round(height / scale), rows)
     left, top = (columns - kept_columns) // 2, (rows - kept_rows) // 2
-    middle = picture[top : top + kept_rows, left : left + kept_columns]
+    return picture[top : top + kept_rows, left : left + kept_columns]
+
+
+def fitted(picture: Pixels, width: int, height: int) -> Pixels:
+    """The middle of a picture in other proportions and of another size; never more than it shows."""
+    cv2 = opencv()
+    middle = cropped(picture, width, height)
     if middle.shape[:2] == (height, width):
         return np.ascontiguousarray(middle)
-    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    how = cv2.INTER_AREA if middle.shape[1] > width else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(middle, (width, height), interpolation=how), np.uint8)
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
+import math
+import time
 from collections.abc import Callable, Coroutine
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -13,7 +15,7 @@ from typing import Any, Literal, Protocol, TypeVar
 
 import grpc
 from fractus_core.policy.engine import judge
-from fractus_core.policy.footprint import footprint
+from fractus_core.policy.footprint import seen_from
 from fractus_core.policy.privacy import compose, judge_privacy, remaining
 from fractus_core.policy.values import Call, CaptureArgs, Filter, Situation, Verdict
 
@@ -23,7 +25,7 @@ from fractus_services.camera.darkroom import NotHidden, Recipe, developed, is_up
 from fractus_services.camera.drivers import CameraFailed, Wanted
 from fractus_services.camera.faces import BadModel, Detector, smallest_face_px
 from fractus_services.camera.filters import MOTION_PX
-from fractus_services.camera.imaging import NotAPicture, Pixels, decoded, encoded, fitted, source_size
+from fractus_services.camera.imaging import NotAPicture, Pixels, cropped, decoded, encoded, fitted, source_size
 from fractus_services.camera.metadata import tagged
 from fractus_services.camera.shots import Pose, Shot, facts
 from fractus_services.camera.shutter import Shutter
@@ -57,6 +59,9 @@ class Whereabouts(Protocol):
     def situation(self, time_s: float) -> Situation:
         """The present state."""
 
+    def way(self, begun_s: float, time_s: float) -> tuple[Situation, ...]:
+        """All states since a moment of monotonic time, the one then first and the present one last."""
+
     async def run(self) -> None:
         """Keep it present."""
 
@@ -80,12 +85,20 @@ class Body:
 
 @dataclass(frozen=True, slots=True)
 class _Exposed:
-    """What came out of an exposure, judged; `whole_width` is that of the whole view, in pixels that the camera gave."""
+    """What came out of an exposure, judged.
+
+    Attributes:
+        name: of the picture.
+        held: by which grant it was judged.
+        verdict: what became of it.
+        after: where the camera was at the end, and on which way it got there.
+        pictures: what the camera gave.
+        whole_width: of the whole view, in pixels that the camera gave.
+    """
 
     name: str
     held: Held
     verdict: Verdict
-    before: Situation
     after: Situation
     pictures: list[Pixels]
     whole_width: int
@@ -195,6 +208,7 @@ class CameraService:
         if not isinstance(args, CaptureArgs):
             raise TypeError("CaptureImage without its arguments")
         async with self._exposing.turn(owner):
+            begun_s = time.monotonic()
             held, now = present(), self._whereabouts.situation(self._clock())
             verdict = self._allow(call, held, now)
             problem = await asyncio.to_thread(self._album.room, owner)
@@ -204,27 +218,29 @@ class CameraService:
             wanted = Wanted(width, height, self._body.resolution, self._body.sensor, now, held.spec.node)
             three = any(one.action == "removeBackground" for one in verdict.filters)
             pictures = await self._shutter.expose(wanted, 3 if three else 1, APART_S)
-            after, held = self._whereabouts.situation(self._clock()), present()
-            verdicts = [
-                verdict,
-                self._allow(call, held, after, always=False),
-                self._checked(call, held, judge_privacy(now, held.compiled, after), after),
-            ]
+            if now.lens is not None:
+                # It is judged by a view in these proportions, whatever the camera gave.
+                pictures = [cropped(one, *self._body.resolution) for one in pictures]
+            way, held = self._whereabouts.way(begun_s, self._clock()), present()
+            after = replace(way[-1], way=way)
+            # A zone that was active when the picture was begun counts as well as one that is now.
+            moments = [after, replace(after, time_s=now.time_s)]
+            verdicts = [verdict, *(self._allow(call, held, moment, always=False) for moment in moments)]
             # Enlarging a picture does not make its faces easier to find.
             shown = min(width, pictures[len(pictures) // 2].shape[1])
             moment = datetime.fromtimestamp(after.time_s, UTC).strftime("%Y%m%d%H%M%S%f")[:17]
             name = f"{moment}-{next(self._numbers) % 10000:04d}.jpg"
-            return _Exposed(name, held, _together(verdicts), now, after, pictures, shown)
+            return _Exposed(name, held, _together(verdicts), after, pictures, shown)
 
     async def _kept(self, call: Call, exposed: _Exposed) -> tuple[Verdict, Shot]:
         args, held, verdict = call.args, exposed.held, exposed.verdict
         if not isinstance(args, CaptureArgs):
             raise TypeError("CaptureImage without its arguments")
         face_px = self._face_px(exposed)
-        chosen = self._recipe(call, held, verdict, face_px, exposed.before)
-        before, after = Pose.of(exposed.before), Pose.of(exposed.after)
+        chosen = self._recipe(call, held, verdict, face_px, exposed.after)
+        poses = tuple(Pose.of(one) for one in exposed.after.way)
         moment_s = float(exposed.after.time_s)
-        upright = is_upright(exposed.before.lens, exposed.before)
+        upright = is_upright(poses)
         whole_width = source_size(args.width, args.height, self._body.resolution)[0]
 
         def work() -> bytes:
@@ -237,21 +253,18 @@ class CameraService:
             data = encoded(picture)
             if verdict.filters:
                 return data
-            return tagged(data, facts(after, moment_s, self._body.model, whole_width))
+            return tagged(data, facts(poses[-1], moment_s, self._body.model, whole_width))
 
         data = await asyncio.to_thread(work)
-        shot = Shot(
-            exposed.name, moment_s, args.width, args.height, len(data), before, after,
-            face_px, chosen.filters,
-        )  # fmt: skip
+        shot = Shot(exposed.name, moment_s, args.width, args.height, len(data), poses, face_px, chosen.filters)
         await asyncio.to_thread(self._album.add, owner_of(held), shot, data)
         return _noted(verdict, chosen), shot
 
     def _face_px(self, exposed: _Exposed) -> float:
         """Width of the smallest face that the picture may show; 0 when nobody knows."""
-        views = [footprint(now, exposed.held.compiled.frame) for now in (exposed.before, exposed.after)]
-        farthest_m = max((view.farthest_m if view is not None else float("inf")) for view in views)
-        return smallest_face_px(exposed.before.lens, farthest_m, exposed.whole_width)
+        view = seen_from(exposed.after.way, exposed.held.compiled.frame)
+        farthest_m = view.farthest_m if view is not None else math.inf
+        return smallest_face_px(exposed.after.lens, farthest_m, exposed.whole_width)
 
     def _recipe(self, call: Call, held: Held, verdict: Verdict, face_px: float, now: Situation) -> Recipe:
         try:
@@ -267,21 +280,27 @@ class CameraService:
         verdict = self._allow(call, held, now)
         owner = owner_of(held)
         shot = await asyncio.to_thread(self._album.find, owner, name)
-        before, after = shot.before.at(now), shot.after.at(now)
-        then = self._checked(call, held, judge_privacy(before, held.compiled, after), after)
-        verdict = _together([verdict, then])
+        way = tuple(pose.at(now) for pose in shot.poses)
+        taken = replace(way[-1], way=way)
+        verdict = _together([verdict, self._checked(call, held, judge_privacy(taken, held.compiled), taken)])
         todo = remaining(verdict.filters, shot.filters)
         path = self._album.path(owner, name)
         if not todo:
             return verdict, shot, path
-        chosen = self._recipe(call, held, replace(verdict, filters=todo), shot.face_px, after)
-        data = await self._finished(self._redeveloped(owner, path, chosen, shot, is_upright(after.lens, after)))
-        return _noted(verdict, chosen), replace(shot, size_bytes=len(data), filters=(*shot.filters, *todo)), data
+        # Nobody knows which faces are still found in a picture that was filtered before.
+        face_px = 0.0 if shot.filters else shot.face_px
+        chosen = self._recipe(call, held, replace(verdict, filters=todo), face_px, taken)
+        data = await self._finished(self._redeveloped(owner, path, chosen, replace(shot, face_px=face_px)))
+        return (
+            _noted(verdict, chosen),
+            replace(shot, size_bytes=len(data), filters=(*shot.filters, *chosen.filters)),
+            data,
+        )
 
-    async def _redeveloped(self, owner: str, path: Path, chosen: Recipe, shot: Shot, upright: bool) -> bytes:
+    async def _redeveloped(self, owner: str, path: Path, chosen: Recipe, shot: Shot) -> bytes:
         def work() -> bytes:
             picture = decoded(path.read_bytes())
-            return encoded(developed([picture], chosen, self._detector, shot.face_px, upright=upright))
+            return encoded(developed([picture], chosen, self._detector, shot.face_px, upright=is_upright(shot.poses)))
 
         async with self._developing.turn(owner):
             return await asyncio.to_thread(work)

@@ -57,8 +57,7 @@ class Shot:
         width: pixels.
         height: pixels.
         size_bytes: of the file.
-        before: pose when it began to be taken.
-        after: pose when it was taken.
+        poses: where the camera was while it was taken, from its begin to its end.
         face_px: the smallest face that it may show is so wide; 0 when nobody knows.
         filters: what was done to it.
     """
@@ -68,8 +67,7 @@ class Shot:
     width: int
     height: int
     size_bytes: int
-    before: Pose
-    after: Pose
+    poses: tuple[Pose, ...]
     face_px: float = 0.0
     filters: tuple[Filter, ...] = ()
 
@@ -85,10 +83,14 @@ class Shot:
             ValueError: it holds none.
         """
         try:
-            poses = {key: Pose.parse(body[key]) for key in ("before", "after")}
-            return cls(**{**body, **poses, "filters": tuple(Filter(**one) for one in body["filters"])})
+            poses = tuple(Pose.parse(pose) for pose in body["poses"])
+            shot = cls(**{**body, "poses": poses, "filters": tuple(Filter(**one) for one in body["filters"])})
+            sound = all(pose.at(Situation(0.0)).sound for pose in poses) and math.isfinite(shot.face_px + shot.time_s)
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"no shot: {error}") from None
+        if not poses or not sound:
+            raise ValueError("no shot: it does not tell where it was taken")
+        return shot
 
 
 def facts(pose: Pose, time_s: float, camera: str, width: int) -> Facts:
@@ -100,7 +102,7 @@ def facts(pose: Pose, time_s: float, camera: str, width: int) -> Facts:
         camera: make and model.
         width: pixels of the whole view.
     """
-    roll_deg, pitch_deg, yaw_deg = _directions(pose)
+    roll_deg, pitch_deg, yaw_deg = directions(pose)
     half = math.radians(pose.lens.horizontal_deg) / 2 if pose.lens is not None else None
     return Facts(
         time_s=float(time_s),
@@ -117,7 +119,7 @@ def facts(pose: Pose, time_s: float, camera: str, width: int) -> Facts:
     )
 
 
-def _directions(pose: Pose) -> tuple[float | None, float | None, float | None]:
+def directions(pose: Pose) -> tuple[float | None, float | None, float | None]:
     """Roll, pitch and yaw of the camera in degrees, as far as they are known."""
     lens, attitude = pose.lens, pose.attitude
     if lens is None or attitude is None:

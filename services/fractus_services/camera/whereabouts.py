@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -24,12 +25,17 @@ STALE_S = 1.0
 RETRY_S = 1.0
 UNTOLD_ERROR_M = 10.0
 """Position error of a mobility service that tells none."""
-TILT_ERROR_DEG = 10.0
-YAW_ERROR_DEG = 20.0
-"""Bounds of an autopilot's attitude errors, both tilts together and the compass, with the tenth of a second that a
-measurement is old when it is told."""
+UNTOLD_AGE_S = 0.5
+"""Age of measurements when a mobility service tells none."""
+ALTITUDE_ERROR_M = 1.0
+TILT_ERROR_DEG = 5.0
+YAW_ERROR_DEG = 15.0
+"""Bounds of an autopilot's attitude errors, both tilts together and the compass."""
 TURN_DEG_S = 60.0
-"""How fast an airframe turns at most while nobody looks."""
+SPEED_UP_MPS2 = 5.0
+"""How fast an airframe turns, and how much it speeds up, at most while nobody looks."""
+REMEMBERED_S = 30.0
+"""Longer than any exposure."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +72,75 @@ class Fixed:
             relief_m=self.relief_m,
         )
 
+    def way(self, _begun_s: float, time_s: float) -> tuple[Situation, ...]:
+        """All that it was since a moment: the same."""
+        return (self.situation(time_s),)
+
     async def run(self) -> None:
         """Nothing to follow."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """A message of the mobility service, and when what it tells was measured; times are monotonic seconds."""
+
+    message: mobility_pb2.Telemetry
+    heard_at: float
+    position_at: float
+    attitude_at: float
+
+    @classmethod
+    def of(cls, message: mobility_pb2.Telemetry, heard_at: float) -> _Told:
+        ages_s = [
+            getattr(message, name) if message.HasField(name) else UNTOLD_AGE_S
+            for name in ("position_age_s", "attitude_age_s")
+        ]
+        return cls(message, heard_at, heard_at - ages_s[0], heard_at - ages_s[1])
+
+
+@dataclass(frozen=True, slots=True)
+class _Unseen:
+    """What may have happened around a pose without being told.
+
+    Attributes:
+        moved_s: seconds for which the airframe may have moved on.
+        turned_s: seconds for which it may have turned on.
+        tilt_deg: how much further from the pose its roll and pitch are known to have been.
+        yaw_deg: how much further from the pose its yaw is known to have been.
+    """
+
+    moved_s: float = 0.0
+    turned_s: float = 0.0
+    tilt_deg: float = 0.0
+    yaw_deg: float = 0.0
+
+    @classmethod
+    def until(cls, told: _Told, now_s: float) -> _Unseen:
+        """After the last pose that was told."""
+        return cls(max(now_s - told.position_at, 0.0), max(now_s - told.attitude_at, 0.0))
+
+    @classmethod
+    def between(cls, told: _Told, other: _Told) -> _Unseen:
+        """On the half of the way to a pose told next or before that lies nearer to this one."""
+        moved_s, turned_s = abs(other.position_at - told.position_at), abs(other.attitude_at - told.attitude_at)
+        here, there = told.message.attitude, other.message.attitude
+        tilts = (here.roll_deg - there.roll_deg, here.pitch_deg - there.pitch_deg)
+        yaw_deg = abs(math.remainder(here.yaw_deg - there.yaw_deg, 360.0))
+        return cls(
+            moved_s / 2 if moved_s <= STALE_S else math.inf,
+            turned_s / 2 if turned_s <= STALE_S else math.inf,
+            sum(abs(math.remainder(tilt, 360.0)) for tilt in tilts) / 2,
+            yaw_deg / 2,
+        )
+
+    def joined(self, other: _Unseen) -> _Unseen:
+        """Whichever is more."""
+        return _Unseen(
+            max(self.moved_s, other.moved_s),
+            max(self.turned_s, other.turned_s),
+            max(self.tilt_deg, other.tilt_deg),
+            max(self.yaw_deg, other.yaw_deg),
+        )
 
 
 class Airborne:
@@ -98,14 +171,42 @@ class Airborne:
         self._now = now
         self._lens = lens
         self._relief_m = relief_m
-        self._latest: mobility_pb2.Telemetry | None = None
-        self._heard_at = 0.0
+        self._told: deque[_Told] = deque()
 
     def situation(self, time_s: float) -> Situation:
         """The state as the engine judges it; unknown when the mobility service is silent."""
-        message, age_s = self._latest, self._now() - self._heard_at
-        if message is None or age_s > STALE_S or not message.HasField("position"):
-            return Situation(time_s=time_s, lens=self._lens, relief_m=self._relief_m)
+        if not self._told:
+            return self._unknown(time_s)
+        return self._state(self._told[-1], _Unseen.until(self._told[-1], self._now()), time_s)
+
+    def way(self, begun_s: float, time_s: float) -> tuple[Situation, ...]:
+        """All states since a moment, the one before it first and the present one last.
+
+        The errors of each hold for half of the way to its neighbours as well: it was there at most that long before or
+        after, and turned at most half of what the two poses differ by, and what `TURN_DEG_S` allows, away from it.
+
+        Args:
+            begun_s: monotonic seconds.
+            time_s: Unix time that all states get.
+        """
+        told = list(self._told)
+        first = next((i for i in reversed(range(len(told))) if told[i].heard_at <= begun_s), None)
+        states = [self._unknown(time_s)] if first is None else []
+        told = told[first or 0 :]
+        for i, one in enumerate(told):
+            unseen = _Unseen() if i < len(told) - 1 else _Unseen.until(one, self._now())
+            for neighbour in (*told[max(i - 1, 0) : i], *told[i + 1 : i + 2]):
+                unseen = unseen.joined(_Unseen.between(one, neighbour))
+            states.append(self._state(one, unseen, time_s))
+        return tuple(states)
+
+    def _unknown(self, time_s: float) -> Situation:
+        return Situation(time_s=time_s, lens=self._lens, relief_m=self._relief_m)
+
+    def _state(self, told: _Told, unseen: _Unseen, time_s: float) -> Situation:
+        message = told.message
+        if not message.autopilot_connected or not message.HasField("position") or unseen.moved_s > STALE_S:
+            return self._unknown(time_s)
         speed_mps = math.hypot(message.velocity.north_mps, message.velocity.east_mps)
         home = None
         if message.HasField("home"):
@@ -121,11 +222,18 @@ class Airborne:
             home=home,
             armed=message.armed,
             in_air=message.in_air,
-            position_error_m=(message.position_error_m or UNTOLD_ERROR_M) + speed_mps * max(age_s, 0.0),
-            attitude=_attitude(message, age_s),
+            position_error_m=(message.position_error_m or UNTOLD_ERROR_M) + _flown_m(speed_mps, unseen.moved_s),
+            altitude_error_m=ALTITUDE_ERROR_M + _flown_m(abs(message.velocity.down_mps), unseen.moved_s),
+            attitude=_attitude(message, unseen),
             lens=self._lens,
             relief_m=self._relief_m,
         )
+
+    def _hear(self, message: mobility_pb2.Telemetry) -> None:
+        now_s = self._now()
+        self._told.append(_Told.of(message, now_s))
+        while self._told[0].heard_at < now_s - REMEMBERED_S:
+            self._told.popleft()
 
     async def run(self) -> None:
         """Follow the telemetry until cancelled."""
@@ -137,8 +245,7 @@ class Airborne:
                     async for message in stub.SubscribeTelemetry(
                         mobility_pb2.SubscribeTelemetryRequest(interval_s=INTERVAL_S)
                     ):
-                        self._latest = message if message.autopilot_connected else None
-                        self._heard_at = self._now()
+                        self._hear(message)
             except grpc.aio.AioRpcError as error:
                 log.warning("no telemetry from %s: %s", self._address, error.details())
             except OSError as error:
@@ -146,14 +253,19 @@ class Airborne:
             await asyncio.sleep(RETRY_S)
 
 
-def _attitude(message: mobility_pb2.Telemetry, age_s: float) -> Attitude | None:
-    if not message.HasField("attitude"):
+def _flown_m(speed_mps: float, time_s: float) -> float:
+    """How far a drone gets that flies so fast when nobody looks."""
+    return (speed_mps + SPEED_UP_MPS2 * time_s / 2) * time_s
+
+
+def _attitude(message: mobility_pb2.Telemetry, unseen: _Unseen) -> Attitude | None:
+    if not message.HasField("attitude") or unseen.turned_s > STALE_S:
         return None
-    turned_deg = TURN_DEG_S * max(age_s, 0.0)
+    turned_deg = TURN_DEG_S * unseen.turned_s
     return Attitude(
         message.attitude.roll_deg,
         message.attitude.pitch_deg,
         message.attitude.yaw_deg,
-        TILT_ERROR_DEG + turned_deg,
-        YAW_ERROR_DEG + turned_deg,
+        TILT_ERROR_DEG + turned_deg + unseen.tilt_deg,
+        YAW_ERROR_DEG + turned_deg + unseen.yaw_deg,
     )

@@ -62,8 +62,11 @@ def telemetry_of(control: Control, time_s: float, missions: bool) -> Any:
     if located(control):
         message.position.CopyFrom(position_of(vehicle))
         message.velocity.CopyFrom(velocity_of(vehicle))
-        message.position_error_m = vehicle.position_error_m + vehicle.speed_mps * max(position_age_s(control), 0.0)
-    if control.autopilot.now - vehicle.attitude_at <= STALE_S:
+        message.position_age_s = max(position_age_s(control), 0.0)
+        message.position_error_m = vehicle.position_error_m + vehicle.speed_mps * message.position_age_s
+    attitude_age_s = control.autopilot.now - vehicle.attitude_at
+    if attitude_age_s <= STALE_S:
+        message.attitude_age_s = max(attitude_age_s, 0.0)
         message.attitude.roll_deg, message.attitude.pitch_deg = vehicle.roll_deg, vehicle.pitch_deg
         message.attitude.yaw_deg = vehicle.heading_deg
     if vehicle.home is not None:

@@ -43,6 +43,25 @@ class Wanted:
     label: str = ""
 
 
+def as_described(picture: Pixels, wanted: Wanted) -> Pixels:
+    """The picture of a camera that was set to its native size, unless it is not of that size.
+
+    Another size is another part of the sensor, and nobody knows which.
+
+    Raises:
+        CameraFailed: it is not, and the picture would be judged by what its description says that it shows.
+    """
+    rows, columns = picture.shape[:2]
+    if wanted.now.lens is not None and (columns, rows) != wanted.native:
+        width, height = wanted.native
+        raise CameraFailed(
+            f"the camera gives {columns}x{rows} pixels though it was set to {width}x{height}, so nobody knows what they"
+            " show; set services.camera.resolution of the node to a size that the camera has, and"
+            " horizontalFieldOfView to what it shows at that size"
+        )
+    return picture
+
+
 class Driver(Protocol):
     """A camera. Its methods block, and are called from one thread, never two at a time."""
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fractus_services.camera.drivers import CameraFailed, Wanted
+from fractus_services.camera.drivers import CameraFailed, Wanted, as_described
 from fractus_services.camera.imaging import Pixels
 
 
@@ -33,7 +33,7 @@ class RaspberryCamera:
             raise CameraFailed(
                 f"camera {self._number} gives no picture ({error}); it is started again next time"
             ) from error
-        return np.ascontiguousarray(picture[:, :, :3], np.uint8)
+        return as_described(np.ascontiguousarray(picture[:, :, :3], np.uint8), wanted)
 
     def close(self) -> None:
         """See `Driver`."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fractus_services.camera.drivers import CameraFailed, Wanted
+from fractus_services.camera.drivers import CameraFailed, Wanted, as_described
 from fractus_services.camera.imaging import Pixels, opencv
 
 _STALE_FRAMES = 4
@@ -43,7 +43,7 @@ class VideoDevice:
         if not done or picture is None:
             self.close()
             raise CameraFailed(f"{self._path} gives no picture; it is opened again next time")
-        return np.asarray(picture, np.uint8)
+        return as_described(np.asarray(picture, np.uint8), wanted)
 
     def close(self) -> None:
         """See `Driver`."""

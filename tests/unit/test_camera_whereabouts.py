@@ -1,0 +1,152 @@
+"""Where a drone's camera was during an exposure, as its telemetry tells: no motion between two messages is left out."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fractus_core.policy.footprint import footprint, seen_from
+from fractus_core.policy.values import Lens, Situation
+from fractus_proto.v1 import mobility_pb2
+from fractus_services.auth import TlsFiles
+from fractus_services.camera import whereabouts
+from fractus_services.camera.whereabouts import Airborne
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from policy_world import FRAME, HOME
+
+LENS = Lens(40.0, 30.0, pitch_deg=-60.0, error_deg=0.0)
+
+
+class Drone:
+    """Telemetry as a test tells it, on a clock that the test sets."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+        self.airborne = Airborne("", "drone-1", TlsFiles(Path()), lambda: self.now_s, lens=LENS)
+
+    def tell(
+        self,
+        at_s: float,
+        *,
+        x: float = 0.0,
+        alt: float = 20.0,
+        turned: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        speed: tuple[float, float] = (0.0, 0.0),
+        ages: tuple[float, float] | None = (0.0, 0.0),
+        connected: bool = True,
+    ) -> None:
+        self.now_s = at_s
+        lat, lon = FRAME.latlon(x, 0.0)
+        message = mobility_pb2.Telemetry(autopilot_connected=connected, position_error_m=1.0)
+        message.position.latitude_deg, message.position.longitude_deg, message.position.altitude_m = lat, lon, alt
+        message.velocity.east_mps, message.velocity.down_mps = speed
+        message.attitude.roll_deg, message.attitude.pitch_deg, message.attitude.yaw_deg = turned
+        message.home.latitude_deg, message.home.longitude_deg, message.home.altitude_m = HOME.lat, HOME.lon, 100.0
+        if ages is not None:
+            message.position_age_s, message.attitude_age_s = ages
+        self.airborne._hear(message)
+
+    def way(self, begun_s: float) -> tuple[Situation, ...]:
+        return self.airborne.way(begun_s, 1.0)
+
+
+@pytest.fixture
+def drone() -> Drone:
+    return Drone()
+
+
+def attitude(now: Situation) -> Any:
+    assert now.attitude is not None
+    return now.attitude
+
+
+def test_every_pose_since_the_begin_counts_with_the_one_before_it(drone: Drone) -> None:
+    for i in range(10):
+        drone.tell(100.0 + i / 10, turned=(0.0, 0.0, 10.0 * i))
+    way = drone.way(100.45)
+    assert [attitude(now).yaw_deg for now in way] == [40, 50, 60, 70, 80, 90]
+    # Half of what neighbours differ by, and what an airframe turns unseen in half a tenth of a second.
+    assert attitude(way[1]).yaw_error_deg == pytest.approx(whereabouts.YAW_ERROR_DEG + 5.0 + 0.05 * 60.0)
+    assert attitude(way[1]).tilt_error_deg == pytest.approx(whereabouts.TILT_ERROR_DEG + 0.05 * 60.0)
+    assert drone.airborne.situation(1.0).attitude is not None
+
+
+def test_errors_grow_with_the_age_of_what_they_belong_to(drone: Drone) -> None:
+    drone.tell(100.0, speed=(8.0, -3.0), ages=(0.2, 0.3))
+    drone.now_s = 100.4
+    now = drone.airborne.situation(1.0)
+    assert now.position_error_m == pytest.approx(1.0 + 8.0 * 0.6 + 2.5 * 0.36)
+    assert now.altitude_error_m == pytest.approx(1.0 + 3.0 * 0.6 + 2.5 * 0.36)
+    assert attitude(now).tilt_error_deg == pytest.approx(whereabouts.TILT_ERROR_DEG + 60.0 * 0.7)
+    drone.now_s = 100.75
+    now = drone.airborne.situation(1.0)
+    assert now.lat is not None
+    assert now.attitude is None, "measured more than a second ago"
+    drone.now_s = 100.85
+    assert drone.airborne.situation(1.0).lat is None
+
+
+def test_an_age_that_is_not_told_is_not_none(drone: Drone) -> None:
+    drone.tell(100.0, ages=None)
+    assert attitude(drone.airborne.situation(1.0)).yaw_error_deg > whereabouts.YAW_ERROR_DEG + 20.0
+
+
+def test_where_a_part_of_the_exposure_was_not_told_it_is_unknown(drone: Drone) -> None:
+    assert drone.airborne.situation(1.0).lat is None
+    assert [now.lat for now in drone.way(100.0)] == [None]
+    drone.tell(100.0)
+    assert drone.way(99.9)[0].lat is None, "nothing was told when it began"
+    assert drone.way(100.0)[0].lat is not None
+    drone.tell(101.1)
+    assert drone.way(100.0)[0].lat is None, "silent for more than a second"
+    drone.tell(101.2, connected=False)
+    drone.tell(101.3)
+    assert [now.lat is None for now in drone.way(101.1)] == [False, True, False]
+    for i in range(400):
+        drone.tell(102.0 + i / 10)
+    assert len(drone.airborne._told) <= 302
+    assert drone.way(101.3)[0].lat is None, "longer ago than anybody remembers"
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(
+    gaps=st.lists(st.floats(0.02, 0.5), min_size=2, max_size=5),
+    rates=st.tuples(st.floats(-25, 25), st.floats(-25, 25), st.floats(-150, 150)),
+    speed=st.tuples(st.floats(-12, 12), st.floats(-4, 4)),
+    ages=st.tuples(st.floats(0, 0.2), st.floats(0, 0.2)),
+    share=st.floats(0, 1),
+)
+def test_whatever_is_seen_between_two_messages_is_in_the_footprint(
+    gaps: list[float], rates: tuple[float, ...], speed: tuple[float, float], ages: tuple[float, float], share: float
+) -> None:
+    """A drone that flies and turns steadily, told of at uneven times, each measurement with an age of its own."""
+    drone = Drone()
+
+    def turned(at_s: float) -> tuple[float, float, float]:
+        since_s = at_s - 100.0
+        return rates[0] * since_s, rates[1] * since_s, (rates[2] * since_s) % 360.0
+
+    at_s = 100.0
+    for gap_s in [0.0, *gaps]:
+        at_s += gap_s
+        measured_s = at_s - ages[0] - 100.0
+        drone.tell(
+            at_s, x=speed[0] * measured_s, alt=40.0 - speed[1] * measured_s, turned=turned(at_s - ages[1]), speed=speed,
+            ages=ages,
+        )  # fmt: skip
+    shown = seen_from(drone.way(100.0), FRAME)
+    assert shown is not None
+    moment_s = 100.0 + share * (at_s - 100.0)
+    drone = Drone()
+    drone.tell(
+        moment_s, x=speed[0] * (moment_s - 100.0), alt=40.0 - speed[1] * (moment_s - 100.0), turned=turned(moment_s)
+    )  # fmt: skip
+    exact = drone.airborne.situation(1.0)
+    actual = footprint(exact, FRAME)
+    assert actual is not None
+    assert shown.farthest_m >= actual.farthest_m - shown.margin_m
+    if math.isfinite(actual.farthest_m):
+        assert shown.sight.buffer(shown.margin_m + 0.1).covers(actual.sight)

@@ -173,6 +173,68 @@ def test_processes_that_do_not_go_are_killed(tmp_path: Path, monkeypatch: pytest
     assert processes.exit_code("stubborn") == -signal.SIGKILL
 
 
+def test_what_a_program_left_behind_ends_with_it(tmp_path: Path) -> None:
+    processes = Processes(tmp_path)
+    left = f"sleep 600; : {tmp_path}"
+    processes.start("leader", ["/bin/sh", "-c", f"/bin/sh -c '{left}' & exit 3"], {"PATH": os.environ["PATH"]})
+    assert processes.wait_end("leader", 20) == 3
+    assert gone(tmp_path)
+    processes.stop_all()
+
+
+RUNNER = """
+import sys, time
+from pathlib import Path
+from fractus_sim.experiment import processes as room
+from fractus_sim.interruption import break_off_on_signals
+room.GRACE_S = 600.0
+break_off_on_signals()
+processes = room.Processes(Path(sys.argv[1]))
+try:
+    stubborn = f"trap '' TERM; sleep 600 & echo up; while :; do sleep 1; done; : {sys.argv[1]}"
+    processes.start("stubborn", ["/bin/sh", "-c", stubborn], {"PATH": "/usr/bin:/bin"})
+    processes.wait("stubborn", lambda: "up" in processes.log("stubborn").read_text(), 20)
+    print("up", flush=True)
+    time.sleep(600)
+finally:
+    print("stopping", flush=True)
+    processes.stop_all()
+"""
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [(signal.SIGKILL, None), (signal.SIGINT, signal.SIGINT), (signal.SIGHUP, signal.SIGTERM)],
+    ids=["killed", "Ctrl-C twice", "terminal closed"],
+)
+def test_no_process_outlives_a_runner_that_is_in_a_hurry(
+    tmp_path: Path, first: signal.Signals, second: signal.Signals | None
+) -> None:
+    command = [sys.executable, "-c", RUNNER, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as runner:
+        try:
+            assert runner.stdout is not None
+            assert runner.stdout.readline() == b"up\n"
+            runner.send_signal(first)
+            if second is not None:
+                assert runner.stdout.readline() == b"stopping\n"
+                runner.send_signal(second)
+            assert runner.wait(60) != 0
+        finally:
+            runner.kill()
+    assert gone(tmp_path)
+
+
+def gone(mark: Path) -> bool:
+    """Whether no process has the mark in its command line, within some time."""
+    deadline = time.monotonic() + 20
+    while subprocess.run(["pgrep", "-f", str(mark)], capture_output=True, check=False).stdout:
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.05)
+    return True
+
+
 def test_an_autopilot_that_runs_already_is_flown_and_harmed_over_tcp(tmp_path: Path) -> None:
     processes, port = Processes(tmp_path), Ports().take()
     link, home = f"tcp:127.0.0.1:{port}", "50.8637,4.6785,25"

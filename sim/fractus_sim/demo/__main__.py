@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from types import FrameType
-from typing import NoReturn
 
 import click
 from rich.console import Console
@@ -16,6 +13,7 @@ from rich.markdown import Markdown
 from fractus_sim.demo.kube import DemoError
 from fractus_sim.demo.place import Current, Embedded
 from fractus_sim.demo.runner import ClusterError, Demo, Teller, report_again
+from fractus_sim.interruption import break_off_on_signals
 
 
 def _assignments(_context: click.Context, _option: click.Parameter, texts: tuple[str, ...]) -> Mapping[str, str]:
@@ -52,7 +50,7 @@ def demo(
 ) -> None:
     """Deploy the traffic monitoring example, watch it fly, and report what happened."""
     console = Console()
-    signal.signal(signal.SIGTERM, _interrupt)
+    break_off_on_signals()
     try:
         if report_only:
             report_again(out)
@@ -70,10 +68,6 @@ def demo(
     console.print(Markdown((out / "summary.md").read_text()))
     click.echo(f"report: {out}/summary.md, map.png, altitude.png, flight.geojson, plan.yaml, audit.jsonl")
     sys.exit(0 if fine else 1)
-
-
-def _interrupt(_number: int, _frame: FrameType | None) -> NoReturn:
-    raise KeyboardInterrupt
 
 
 if __name__ == "__main__":

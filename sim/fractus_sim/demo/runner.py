@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from fractus_sim.demo.collect import collect
 from fractus_sim.demo.kube import SYSTEM, DemoError, Kube, Object
 from fractus_sim.demo.place import EXAMPLE, ROOT, Place, documents
 from fractus_sim.demo.watch import GROUNDED, Mission, follow, wait_ready
+from fractus_sim.interruption import uninterrupted
 from fractus_sim.report import Record, write_report
 from fractus_sim.report.summary import figures
 
@@ -35,9 +36,9 @@ class Teller:
 
     def __call__(self, line: str) -> None:
         """Say something for good."""
-        self._console.print(
-            f"[dim]{time.monotonic() - self._start:7.1f} s[/dim]  {_escaped(line)}", highlight=False, soft_wrap=True
-        )
+        stamp = f"[dim]{time.monotonic() - self._start:7.1f} s[/dim]"
+        with suppress(OSError):  # the terminal is gone; what is to be cleaned up still is
+            self._console.print(f"{stamp}  {_escaped(line)}", highlight=False, soft_wrap=True)
 
     def show(self, line: str) -> None:
         """Say what is so at the moment."""
@@ -49,8 +50,13 @@ class Teller:
         started = time.monotonic()
         self(f"{what} ...")
         self.show(what)
-        with self._status:
+        with suppress(OSError):
+            self._status.start()
+        try:
             yield
+        finally:
+            with suppress(OSError):
+                self._status.stop()
         self(f"{what}: {time.monotonic() - started:.1f} s")
 
 
@@ -141,7 +147,8 @@ class Demo:
                 self._remove(kube, installed)
             except DemoError as error:
                 self.tell(f"not removed: {error}")
-        self.place.down()
+        with uninterrupted():
+            self.place.down()
 
     def _remove_application(self, kube: Kube) -> None:
         """Delete the application and wait until no drone is in the air."""

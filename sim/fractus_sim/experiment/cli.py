@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import signal
 import sys
 from pathlib import Path
-from types import FrameType
-from typing import NoReturn
 
 import click
 from fractus_core.api.model import InvalidObject
@@ -18,6 +15,7 @@ from rich.table import Table
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.model import Experiment, load, parse
 from fractus_sim.experiment.runner import Outcome, Progress, run
+from fractus_sim.interruption import break_off_on_signals
 
 _FAILED = 2
 _BAD_INPUT = 1
@@ -37,7 +35,7 @@ def experiment() -> None:
 def run_(file: Path, out: Path | None, seed: int | None, speedup: float | None, quiet: bool) -> None:
     """Play the experiment in FILE; exit code 0 if all checks hold, 2 if one failed, 1 for bad input."""
     console = Console(highlight=False)
-    signal.signal(signal.SIGTERM, _interrupt)
+    break_off_on_signals()
     try:
         found = _changed(load(file), seed=seed, speedup=speedup)
     except InvalidObject as error:
@@ -50,6 +48,9 @@ def run_(file: Path, out: Path | None, seed: int | None, speedup: float | None, 
             outcome = run(found, folder, base=file.parent.absolute(), progress=progress)
     except (ExperimentError, InvalidObject) as error:
         raise click.ClickException(str(error)) from None
+    except OSError as error:
+        where = f" {error.filename}" if error.filename else ""
+        raise click.ClickException(f"cannot write below {folder}:{where} {error.strerror}") from None
     _tell_outcome(console, outcome)
     sys.exit(0 if outcome.holds else _FAILED)
 
@@ -100,7 +101,3 @@ def _tell_outcome(console: Console, outcome: Outcome) -> None:
     if outcome.problem:
         console.print(f"[red]not played to its end:[/red] {escape(outcome.problem)}", soft_wrap=True)
     console.print(f"report: {outcome.folder}/summary.md", soft_wrap=True)
-
-
-def _interrupt(_number: int, _frame: FrameType | None) -> NoReturn:
-    raise KeyboardInterrupt

@@ -25,6 +25,7 @@ from fractus_sim.experiment.processes import Ports
 from fractus_sim.experiment.stage import Moment, Stage
 from fractus_sim.experiment.station import OBSERVER_ID, Station, TcpLink
 from fractus_sim.experiment.tlog import TlogWriter
+from fractus_sim.interruption import uninterrupted
 
 TICK_S = 0.05
 POLL_S = 1.0
@@ -51,7 +52,6 @@ class ClusterStage(Stage):
         self._was_running = self._cluster.running
         self._applications, self._surroundings = _manifests(self._part, base)
         self._kube: Kube | None = None
-        self._taps: list[LinkTap] = []
         self._ports = Ports()
         self._watcher = threading.Thread(target=self._watch, name="phases", daemon=True)
         self._stop = threading.Event()
@@ -64,6 +64,7 @@ class ClusterStage(Stage):
         Raises:
             ExperimentError: something did not come up.
         """
+        self.at_end(self._take_down)
         with _explained():
             images = build_images(ROOT, targets=(*OWN_TARGETS, *self._part.images), report=self.tell)
             self._cluster.up(images=images)
@@ -126,14 +127,10 @@ class ClusterStage(Stage):
                 if (folder / name).exists():
                     read_audit(folder / name, f"{setup.name}/{name}", self.findings)
 
-    def close(self) -> None:
+    def _take_down(self) -> None:
         """Take the cluster down, or only what was applied, if it ran before."""
         self._stop.set()
-        for observer in self.observers.values():
-            observer.close()
-        for tap in self._taps:
-            tap.close()
-        with _explained():
+        with _explained(), uninterrupted():
             if not self._was_running:
                 self._cluster.down()
             elif self._kube is not None:
@@ -149,13 +146,13 @@ class ClusterStage(Stage):
         def connect() -> Any:
             return connect_in(namespace, BEHIND_TAP_PORT, CONNECT_S)
 
-        self._taps.append(LinkTap(listen_in(namespace, port), connect, logs / f"{setup.name}.tlog"))
+        self.keep(LinkTap(listen_in(namespace, port), connect, logs / f"{setup.name}.tlog"))
         guest = self._ports.listen()
-        self._taps.append(LinkTap(guest, connect, logs / f"{setup.name}-guest.tlog"))
+        self.keep(LinkTap(guest, connect, logs / f"{setup.name}-guest.tlog"))
         self.endpoints[setup.name] = f"tcp:127.0.0.1:{guest.getsockname()[1]}"
-        watch = TlogWriter(logs / f"{setup.name}-observer.tlog")
+        watch = self.keep(TlogWriter(logs / f"{setup.name}-observer.tlog"))
         link = TcpLink(connect(), f"to the vehicle of {setup.name}")
-        self.observers[setup.name] = Station(link, setup.system_id, watch, own_id=OBSERVER_ID, beats=False)
+        self.observers[setup.name] = self.keep(Station(link, setup.system_id, watch, own_id=OBSERVER_ID, beats=False))
 
     def _watch(self) -> None:
         """Follow the Applications' phases; what the API server does not answer is asked again."""

@@ -12,8 +12,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.experiment.lifeline import Lifeline
+from fractus_sim.interruption import uninterrupted
 
 POLL_S = 0.05
+STOP_POLL_S = 0.01
 GRACE_S = 5.0
 _LAST_WORDS = 600
 
@@ -22,12 +25,14 @@ class Processes:
     """The processes of one experiment, by name.
 
     Each runs in a session of its own, so that Ctrl-C reaches only us, and we end them in good order: the last that was
-    started goes first, with SIGTERM, and with SIGKILL to its whole group if it does not go.
+    started goes first, with SIGTERM, and with SIGKILL if it does not go. What a process has started and left behind in
+    its group is killed when it ends, as in a container. If we are killed ourselves, all of them are.
     """
 
     def __init__(self, logs: Path) -> None:
         self._logs = logs
         self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._lifeline = Lifeline()
 
     def start(
         self, name: str, argv: Sequence[str], environment: Mapping[str, str], folder: Path | None = None
@@ -40,7 +45,7 @@ class Processes:
         if self.running(name):
             raise ExperimentError(f"{name} runs already")
         self._logs.mkdir(parents=True, exist_ok=True)
-        with self.log(name).open("ab") as output:
+        with self.log(name).open("ab") as output, uninterrupted():
             try:
                 process = subprocess.Popen(
                     list(argv),
@@ -53,8 +58,9 @@ class Processes:
                 )
             except OSError as error:
                 raise ExperimentError(f"{name}: cannot start {argv[0]}: {error.strerror}") from None
-        self._running.pop(name, None)
-        self._running[name] = process
+            self._running.pop(name, None)
+            self._running[name] = process
+            self._lifeline.hold(process.pid)
         return process
 
     def log(self, name: str) -> Path:
@@ -63,7 +69,7 @@ class Processes:
 
     def running(self, name: str) -> bool:
         """Whether a process of that name runs."""
-        return name in self._running and self._running[name].poll() is None
+        return name in self._running and self._code(self._running[name]) is None
 
     def exit_code(self, name: str) -> int | None:
         """How a process ended; None while it runs.
@@ -73,11 +79,11 @@ class Processes:
         """
         if name not in self._running:
             raise ExperimentError(f"no process {name}; there are {', '.join(sorted(self._running)) or 'none'}")
-        return self._running[name].poll()
+        return self._code(self._running[name])
 
     def dead(self) -> dict[str, int]:
         """Processes that have ended, with their exit codes."""
-        return {name: code for name, process in self._running.items() if (code := process.poll()) is not None}
+        return {name: code for name, process in self._running.items() if (code := self._code(process)) is not None}
 
     def wait(self, name: str, condition: Callable[[], bool], timeout_s: float) -> None:
         """Wait until a condition holds while a process must run.
@@ -107,35 +113,59 @@ class Processes:
         return " | ".join(line.strip() for line in text.splitlines()[-4:] if line.strip()) or "it said nothing"
 
     def stop(self, *names: str, kill: bool = False) -> None:
-        """End processes; those that run no more are passed over."""
+        """End processes; those that run no more are passed over. Interrupted, it kills them and is done at once."""
         chosen = [self._running[name] for name in names if self.running(name)]
-        for process in chosen:
-            _signal(process, signal.SIGKILL if kill else signal.SIGTERM)
-        deadline = time.monotonic() + GRACE_S
-        for process in chosen:
-            try:
-                process.wait(max(deadline - time.monotonic(), 0.01))
-            except subprocess.TimeoutExpired:
-                _signal(process, signal.SIGKILL)
-                process.wait(GRACE_S)
+        try:
+            if not kill:
+                for process in chosen:
+                    process.terminate()
+                self._wait_ended(chosen)
+        finally:
+            for process in chosen:
+                if process.returncode is None:
+                    _kill_group(process.pid)
+            self._wait_ended(chosen)
 
     def stop_all(self, *stages: Callable[[str], bool]) -> None:
-        """End everything: first all processes that the first stage's predicate names, and so on, then the rest."""
+        """End everything: first all processes that the first stage's predicate names, and so on, then the rest.
+
+        Interrupted, it kills what is left and is done at once.
+        """
         names = list(reversed(self._running))
-        for stage in stages:
-            chosen = [name for name in names if stage(name)]
-            self.stop(*chosen)
-            names = [name for name in names if name not in chosen]
-        self.stop(*names)
+        try:
+            for stage in stages:
+                chosen = [name for name in names if stage(name)]
+                self.stop(*chosen)
+                names = [name for name in names if name not in chosen]
+            self.stop(*names)
+        finally:
+            self.stop(*self._running, kill=True)
+            self._lifeline.close()
+
+    def _wait_ended(self, processes: Sequence[subprocess.Popen[bytes]]) -> None:
+        deadline = time.monotonic() + GRACE_S
+        while any(self._code(process) is None for process in processes) and time.monotonic() < deadline:
+            time.sleep(STOP_POLL_S)
+
+    def _code(self, process: subprocess.Popen[bytes]) -> int | None:
+        """How a process ended, with the end of its group; None while it runs."""
+        if process.returncode is None and _has_ended(process.pid):
+            # Not waited for yet, so the number is still its own, as its group's.
+            _kill_group(process.pid)
+            self._lifeline.let_go(process.pid)
+        return process.poll()
 
 
-def _signal(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
-    """Signal a process that has not been waited for, with its group when it must die."""
+def _has_ended(pid: int) -> bool:
+    try:
+        return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+    except ChildProcessError:
+        return False
+
+
+def _kill_group(group: int) -> None:
     with contextlib.suppress(ProcessLookupError, PermissionError):
-        if number is signal.SIGKILL:
-            os.killpg(process.pid, number)
-        else:
-            process.send_signal(number)
+        os.killpg(group, signal.SIGKILL)
 
 
 class Ports:

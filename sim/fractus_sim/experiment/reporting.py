@@ -35,15 +35,19 @@ _QUIET_SEVERITY = 6
 def write_outcome(outcome: Outcome) -> None:
     """Write summary.md, report.json, tracks.geojson, map.png and profile.png into the experiment's folder."""
     folder = outcome.folder
-    tracks = _tracks(outcome)
-    (folder / "summary.md").write_text(summary(outcome))
-    (folder / "report.json").write_text(json.dumps(figures(outcome), indent=2) + "\n")
-    (folder / "tracks.geojson").write_text(json.dumps(features(outcome)) + "\n")
-    for name in ("map.png", "profile.png"):
-        (folder / name).unlink(missing_ok=True)
-    if tracks:
+    if _tracks(outcome):
         save(draw_map(scene_of(outcome)), folder / "map.png")
         save(draw_profile(profile_of(outcome)), folder / "profile.png")
+    (folder / "tracks.geojson").write_text(json.dumps(features(outcome)) + "\n")
+    (folder / "report.json").write_text(json.dumps(figures(outcome), indent=2) + "\n")
+    # Last, so that where there is a page the report is complete.
+    (folder / "summary.md").write_text(summary(outcome))
+
+
+def remove_report(folder: Path) -> None:
+    """Remove what an earlier run wrote there, so that a run that is broken off does not show another's report."""
+    for name in ("summary.md", "report.json", "tracks.geojson", "map.png", "profile.png"):
+        (folder / name).unlink(missing_ok=True)
 
 
 def scene_of(outcome: Outcome) -> Scene:

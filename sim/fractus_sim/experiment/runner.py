@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -155,22 +156,22 @@ def run(experiment: Experiment, out: Path, *, base: Path | None = None, progress
 
     Raises:
         ExperimentError: it could not be set up; the message says what to do.
+        OSError: a file could not be written.
     """
-    from fractus_sim.experiment.reporting import write_outcome  # noqa: PLC0415 - matplotlib is slow to import
+    from fractus_sim.experiment.reporting import remove_report, write_outcome  # noqa: PLC0415 - matplotlib is slow
 
     progress = progress or Progress()
     out.mkdir(parents=True, exist_ok=True)
     (out / "logs").mkdir(exist_ok=True)
+    remove_report(out)
     began_s = time.monotonic()
-    stage = _stage(experiment, out, base or Path.cwd(), progress)
-    log = McapLog(out / "logs" / f"{experiment.name}.mcap")
-    try:
+    with (
+        closing(_stage(experiment, out, base or Path.cwd(), progress)) as stage,
+        closing(McapLog(out / "logs" / f"{experiment.name}.mcap")) as log,
+    ):
         flights = {setup.name: Flight(setup.name) for setup in experiment.setups()}
         play = _Play(experiment, stage, flights, {n: Recorder(f, log) for n, f in flights.items()}, log, progress)
         problem = _play(play)
-    finally:
-        log.close()
-        stage.close()
     outcome = _outcome(play, out, problem, time.monotonic() - began_s)
     write_outcome(outcome)
     return outcome

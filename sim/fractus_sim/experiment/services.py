@@ -39,7 +39,7 @@ class ServiceStage(Stage):
         for log in (folder / "logs").glob("*.log"):
             log.unlink()
         self._manifests = _read(experiment, base)
-        self._ground = Standalone(folder)
+        self._ground = self.keep(Standalone(folder))
         self._identities: dict[str, str] = {}
         self._watches: list[TruthWatch] = []
         self._detections = folder / FILE
@@ -57,12 +57,15 @@ class ServiceStage(Stage):
         for setup in self.experiment.setups():
             drone = self._ground.add_drone(self._setup(setup, described.get(setup.name)))
             host, port = drone.station_link.split(":")[1:]
-            watch = TlogWriter(self.folder / "logs" / f"{setup.name}-observer.tlog")
+            watch = self.keep(TlogWriter(self.folder / "logs" / f"{setup.name}-observer.tlog"))
             link = TcpLink.connect(host, int(port), CONNECT_S)
-            self.observers[setup.name] = Station(link, setup.system_id, watch, own_id=OBSERVER_ID, beats=False)
+            self.observers[setup.name] = self.keep(
+                Station(link, setup.system_id, watch, own_id=OBSERVER_ID, beats=False)
+            )
             self.endpoints[setup.name] = drone.guest_link
             if drone.world_url is not None:
-                self._watches.append(TruthWatch(drone.world_url, self.folder / "logs" / f"{setup.name}-truth.jsonl"))
+                truths = self.folder / "logs" / f"{setup.name}-truth.jsonl"
+                self._watches.append(self.keep(TruthWatch(drone.world_url, truths)))
         for spec in grants:
             if spec.node in self._ground.drones:
                 self._identities[spec.component] = self._ground.grant(_manifest(spec))
@@ -128,14 +131,6 @@ class ServiceStage(Stage):
             for path in (drone.audit, drone.audit.with_name("camera.jsonl")):
                 if path.exists():
                     read_audit(path, f"{drone.name}/{path.name}", self.findings)
-
-    def close(self) -> None:
-        """End every process."""
-        for watch in self._watches:
-            watch.close()
-        for observer in self.observers.values():
-            observer.close()
-        self._ground.close()
 
     def _setup(self, setup: VehicleSetup, described: Drone | None) -> DroneSetup:
         if described is None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 from fractus_sim.experiment.detections import Seen
 from fractus_sim.experiment.model import Experiment
@@ -42,6 +43,16 @@ class Findings:
     truths: list[Seen] = field(default_factory=list)
 
 
+class Closable(Protocol):
+    """Something to be closed."""
+
+    def close(self) -> None:
+        """End it."""
+
+
+_Kept = TypeVar("_Kept", bound=Closable)
+
+
 class Stage(ABC):
     """The vehicles of an experiment and what stands around them.
 
@@ -57,6 +68,20 @@ class Stage(ABC):
         self.pilots: dict[str, Station] = {}
         self.endpoints: dict[str, str] = {}
         self.findings = Findings()
+        self._kept = ExitStack()
+
+    def keep(self, resource: _Kept) -> _Kept:
+        """Have something closed with the stage; say so as soon as it is made."""
+        self._kept.callback(resource.close)
+        return resource
+
+    def at_end(self, action: Callable[[], object]) -> None:
+        """Have something done when the stage is closed."""
+        self._kept.callback(action)
+
+    def close(self) -> None:
+        """End everything that was started, the last first; what fails or is interrupted keeps nothing else from its end."""
+        self._kept.close()
 
     @abstractmethod
     def set_up(self) -> None:
@@ -107,7 +132,3 @@ class Stage(ABC):
     @abstractmethod
     def collect(self) -> None:
         """Gather what is left for `findings`, before everything is taken down."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """End everything that was started."""

@@ -22,6 +22,7 @@ import os
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -465,13 +466,12 @@ class Standalone:
 
     def close(self) -> None:
         """End every process: programs first, then services, then vehicles."""
-        try:
+        with ExitStack() as links:
+            for drone in self.drones.values():
+                links.callback(drone.close)
             self.processes.stop_all(
                 lambda name: name in self._programs, lambda name: not name.endswith(("-vehicle", "-world"))
             )
-        finally:
-            for drone in self.drones.values():
-                drone.close()
 
     def _drone(self, node: str) -> RunningDrone:
         if node not in self.drones:

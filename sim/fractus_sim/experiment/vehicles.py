@@ -34,7 +34,7 @@ class VehicleStage(Stage):
         self._logs = folder / "logs"
         self._processes = Processes(self._logs)
         self._ports = Ports()
-        self._hub = Hub()
+        self._hub = self.keep(Hub())
         self._simulation = Simulation([])
         self._program_links: dict[str, str] = {}
         self._taps: dict[str, list[LinkTap]] = {}
@@ -54,6 +54,7 @@ class VehicleStage(Stage):
                 self._attach(setup)
             else:
                 self._make(setup)
+        self.at_end(self._processes.stop_all)
         self._last_wall_s = time.monotonic()
 
     def tick(self) -> Moment:
@@ -116,15 +117,6 @@ class VehicleStage(Stage):
         for program in self.experiment.programs:
             self.findings.programs[program.name] = self._processes.exit_code(program.name)
 
-    def close(self) -> None:
-        """End programs, close links and logs."""
-        self._processes.stop_all()
-        for tap in (tap for taps in self._taps.values() for tap in taps):
-            tap.close()
-        for station in (*self.pilots.values(), *self.observers.values()):
-            station.close()
-        self._hub.close()
-
     def _make(self, setup: VehicleSetup) -> None:
         try:
             craft = Craft(self._config(setup))
@@ -150,10 +142,13 @@ class VehicleStage(Stage):
                 self._program_links[program.name] = connection
 
     def _stations(self, setup: VehicleSetup, pilot: Link, observer: Link) -> None:
-        log = TlogWriter(self._logs / f"{setup.name}.tlog")
-        self.pilots[setup.name] = Station(pilot, setup.system_id, log, beats=not self._has_program(setup.name))
-        watch = TlogWriter(self._logs / f"{setup.name}-observer.tlog")
-        self.observers[setup.name] = Station(observer, setup.system_id, watch, own_id=OBSERVER_ID, beats=False)
+        log = self.keep(TlogWriter(self._logs / f"{setup.name}.tlog"))
+        beats = not self._has_program(setup.name)
+        self.pilots[setup.name] = self.keep(Station(pilot, setup.system_id, log, beats=beats))
+        watch = self.keep(TlogWriter(self._logs / f"{setup.name}-observer.tlog"))
+        self.observers[setup.name] = self.keep(
+            Station(observer, setup.system_id, watch, own_id=OBSERVER_ID, beats=False)
+        )
 
     def _has_program(self, vehicle: str) -> bool:
         return any(program.vehicle == vehicle for program in self.experiment.programs)
@@ -171,7 +166,7 @@ class VehicleStage(Stage):
         tap = LinkTap.between(
             port, ("127.0.0.1", int(link.rpartition(":")[2])), self._logs / f"{vehicle}-{program}.tlog"
         )
-        self._taps.setdefault(vehicle, []).append(tap)
+        self._taps.setdefault(vehicle, []).append(self.keep(tap))
         return f"tcp:127.0.0.1:{port}"
 
     def _config(self, setup: VehicleSetup) -> VehicleConfig:

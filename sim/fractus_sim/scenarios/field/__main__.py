@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.interruption import break_off_on_signals
 from fractus_sim.report.drawing import save
 from fractus_sim.scenarios.field.drawing import draw_altitudes, draw_ground
 from fractus_sim.scenarios.field.evidence import Evidence
@@ -40,6 +41,7 @@ def field(*, out: Path, autopilot: str | None, speedup: float, names: tuple[str,
 
     Exit code: 0 if everything came out as expected, 2 if something did not, 1 if it could not be flown.
     """
+    break_off_on_signals()
     try:
         checks = experiment(out, Autopilot(autopilot, speedup), names)
     except ExperimentError as error:

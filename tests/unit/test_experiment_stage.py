@@ -1,0 +1,117 @@
+"""An experiment's stage and runner end what they have started, whatever goes wrong."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import signal
+from pathlib import Path
+
+import pytest
+from fractus_sim.experiment import lifeline, runner
+from fractus_sim.experiment.model import Experiment, parse
+from fractus_sim.experiment.stage import Moment, Stage
+from fractus_sim.interruption import uninterrupted
+
+
+class Thing:
+    """Something that a stage has started."""
+
+    def __init__(self, error: BaseException | None = None) -> None:
+        self.closed = False
+        self._error = error
+
+    def close(self) -> None:
+        self.closed = True
+        if self._error is not None:
+            raise self._error
+
+
+class Empty(Stage):
+    """A stage on which nothing stands."""
+
+    def set_up(self) -> None:
+        """Nothing to set up."""
+
+    def tick(self) -> Moment:
+        raise AssertionError("never reached")
+
+    begin = collect = set_up
+
+    def cut_link(self, vehicle: str) -> None:
+        """No links."""
+
+    heal_link = power_off = power_on = cut_link
+
+
+def full() -> OSError:
+    return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.fixture
+def experiment() -> Experiment:
+    vehicle = {"name": "d", "home": {"lat": 50.0, "lon": 4.0}}
+    return parse({"name": "test", "mode": "vehicles", "timeout": 10, "vehicles": [vehicle]})
+
+
+@pytest.fixture
+def stage(experiment: Experiment, tmp_path: Path) -> Empty:
+    return Empty(experiment, tmp_path, tmp_path, print)
+
+
+@pytest.mark.parametrize("error", [full(), KeyboardInterrupt()], ids=["disk full", "Ctrl-C"])
+def test_what_cannot_be_closed_keeps_nothing_else_open(stage: Empty, error: BaseException) -> None:
+    first, last, order = stage.keep(Thing()), Thing(error), list[str]()
+    stage.at_end(lambda: order.append("done"))
+    stage.keep(last)
+    with pytest.raises(type(error)):
+        stage.close()
+    assert (first.closed, last.closed, order) == (True, True, ["done"])
+
+
+def test_a_full_disk_at_the_start_closes_the_stage_and_leaves_no_report_of_another_run(
+    experiment: Experiment, stage: Empty, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    thing = stage.keep(Thing())
+
+    def no_log(_path: Path) -> None:
+        raise full()
+
+    monkeypatch.setattr(runner, "_stage", lambda *_: stage)
+    monkeypatch.setattr(runner, "McapLog", no_log)
+    (tmp_path / "summary.md").write_text("All checks hold.")
+    with pytest.raises(OSError, match="No space left"):
+        runner.run(experiment, tmp_path)
+    assert thing.closed
+    assert not (tmp_path / "summary.md").exists()
+
+
+def test_a_full_disk_at_the_end_closes_the_stage(
+    experiment: Experiment, stage: Empty, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    thing = stage.keep(Thing())
+    monkeypatch.setattr(runner, "_stage", lambda *_: stage)
+    monkeypatch.setattr(runner, "_play", lambda _: "")
+    monkeypatch.setattr(runner, "McapLog", lambda _: Thing(full()))
+    with pytest.raises(OSError, match="No space left"):
+        runner.run(experiment, tmp_path)
+    assert thing.closed
+
+
+def test_signals_wait_until_the_block_is_over() -> None:
+    steps = []
+    with pytest.raises(KeyboardInterrupt):
+        with uninterrupted():
+            signal.raise_signal(signal.SIGINT)
+            steps.append("inside")
+        steps.append("after")
+    assert steps == ["inside"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_the_guard_kills_what_it_was_not_told_to_leave_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    killed: list[int] = []
+    monkeypatch.setattr(lifeline.os, "killpg", lambda group, _signal: killed.append(group))
+    lifeline.guard(io.StringIO("41\n42\n43\n-42\n"))
+    assert killed == [41, 43]

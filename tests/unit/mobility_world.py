@@ -36,6 +36,7 @@ from fractus_services.replies import Refused
 FRAME = LocalFrame(39.36, 22.95)
 STEP_S = 0.05
 ACCEL, CLIMB = 2.5, 2.0
+DEFAULT_MPS = 8.0
 ALL = (
     "Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "SetVelocity", "Goto", "Hover", "GetPosition",
     "ReturnToLaunch",
@@ -98,7 +99,8 @@ class Plane(Autopilot):
         self._target = (1, 1)
         self.xy, self.velocity = [0.0, 0.0], [0.0, 0.0]
         self.height, self.climb = 0.0, 0.0
-        self.speed_mps = 8.0
+        self.speed_mps = DEFAULT_MPS
+        self.positions = False
         self.goal: tuple[float, float] | None = None
         self.wanted: tuple[float, float, float] | None = None
         self.wanted_until = 0.0
@@ -138,6 +140,7 @@ class Plane(Autopilot):
             self._take(message("COMMAND_ACK", command=outgoing.command, result=4 if refused else 0))
         elif kind == "SET_POSITION_TARGET_LOCAL_NED" and self.vehicle.mode == GUIDED and self.height > 0.2:
             self.commands.append(84)
+            self.positions = False
             self.wanted, self.wanted_until = (outgoing.vy, outgoing.vx, -outgoing.vz), self.now + 3.0
             self.goal = None
 
@@ -152,6 +155,8 @@ class Plane(Autopilot):
         elif number == 178:
             self.speed_mps = outgoing.param2
         elif number == 192:
+            if not self.positions:
+                self.positions, self.speed_mps = True, DEFAULT_MPS  # its position controller begins anew
             self.goal = FRAME.xy(outgoing.x / 1e7, outgoing.y / 1e7)
             self.goal_height, self.wanted = outgoing.z, None
         elif number == 115:
@@ -159,6 +164,7 @@ class Plane(Autopilot):
 
     def set_to(self, mode: int) -> None:
         """Change the mode, as a pilot or a failsafe does."""
+        self.positions = False
         self.vehicle.mode = mode
         self.goal, self.wanted = ((self.xy[0], self.xy[1]), None) if mode in {GUIDED, BRAKE} else (None, None)
         self.goal_height = self.height

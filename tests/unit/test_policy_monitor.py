@@ -6,9 +6,10 @@ import math
 from dataclasses import replace
 
 import pytest
+from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs
-from policy_world import NOW, altitude, at, box, compiled, exclusion, inclusion, speed
+from policy_world import NOW, altitude, at, box, compiled, exclusion, goto, inclusion, speed
 
 WALL = box(-50, 50, 50, 90)
 
@@ -70,12 +71,49 @@ def test_bands_and_validity() -> None:
 def test_leaving_the_operation_area_or_an_inclusion_zone() -> None:
     leaving = monitor(at(0, 190, north_mps=6), compiled())
     assert leaving is not None
-    assert (leaving.action, leaving.code) == ("deny", "OutsideOperationArea")
+    assert (leaving.action, leaving.code) == ("deny", "OperationAreaBorderAhead")
     assert monitor(at(0, 190, north_mps=-6), compiled()) is None
     kept = compiled(inclusion(box(-50, -50, 50, 50), "returnToLaunch"))
     verdict = monitor(at(0, 45, north_mps=6), kept)
     assert verdict is not None
-    assert verdict.takeover == "returnToLaunch"
+    assert (verdict.code, verdict.takeover) == ("InclusionBorderAhead", "returnToLaunch")
+
+
+def test_what_the_system_flies_is_stopped_only_where_it_makes_things_worse() -> None:
+    kept, out = compiled(inclusion(box(-50, -50, 50, 50), "land")), compiled(exclusion(WALL, "revoke"))
+    for state, grant, code in (
+        (at(0, 45, north_mps=6), kept, "InclusionBorderAhead"),
+        (at(0, 60, north_mps=6), kept, "OutsideInclusionZone"),
+        (at(0, 40, north_mps=6), out, "ExclusionZoneAhead"),
+        (at(0, 55, north_mps=6), out, "InsideExclusionZone"),
+        (replace(at(), lat=None), out, "PositionUnknown"),
+    ):
+        verdict = monitor(state, grant, leaving=True)
+        assert verdict is not None
+        assert (verdict.action, verdict.code) == ("takeover", code)
+    for state, grant in ((at(0, 60), kept), (at(0, 60, north_mps=-6), kept), (at(0, 55, north_mps=-6), out)):
+        assert monitor(state, grant, leaving=True) is None, "it leads back"
+        assert monitor(state, grant) is not None
+
+
+def test_a_zone_that_is_left_hides_no_zone_ahead() -> None:
+    around, ahead = exclusion(box(-50, -50, 50, 10), "revoke", "around"), exclusion(WALL, "ignore", "ahead")
+    verdict = monitor(at(0, 8, north_mps=12), compiled(around, ahead), leaving=True)
+    assert verdict is None
+    verdict = monitor(at(0, 9.5, north_mps=16), compiled(around, ahead), leaving=True)
+    assert verdict is not None
+    assert verdict.policies == ("ahead",)
+
+
+@pytest.mark.parametrize("forward_mps2", [None, 0.0, -2.5])
+def test_a_drone_on_its_way_into_a_zone_rests_before_it_begins_anything(forward_mps2: float | None) -> None:
+    grant, back = compiled(exclusion(WALL)), goto(0, 0)
+    heading = replace(at(0, 29, north_mps=7.5), forward_mps2=forward_mps2)
+    verdict = judge(back, heading, grant)
+    assert (verdict.permits, verdict.brake_first) == (True, True)
+    assert judge(back, at(0, 29), grant).brake_first is False
+    assert judge(back, at(0, 29, north_mps=-7.5), grant).brake_first is False
+    assert judge(back, at(0, 10, north_mps=7.5), grant).brake_first is False
 
 
 def test_altitude_and_speed_are_corrected() -> None:

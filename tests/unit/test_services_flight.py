@@ -432,7 +432,7 @@ def test_a_command_that_waits_is_not_sent_once_it_is_stale(tmp_path: Path, event
     fly(flight)
 
 
-def test_a_goto_that_waits_for_its_speed_is_judged_again(tmp_path: Path) -> None:
+def test_a_goto_that_is_sent_again_is_judged_again(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             held = world.grants.put(spec())

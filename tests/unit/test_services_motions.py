@@ -3,17 +3,44 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_core.policy.values import GotoArgs, VelocityArgs
+import shapely
+from fractus_core.policy.engine import judge
+from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, VelocityArgs
 from fractus_services.mobility.autopilot import AutopilotError
-from mobility_world import World, at, fly, refusal, spec
+from fractus_services.mobility.vehicle import GUIDED
+from mobility_world import World, at, end, fly, partial, refusal, spec, zone
+
+WALL = (-40.0, 25.0, 40.0, 40.0)
 
 
 def goto(x: float, y: float, alt: float = 10.0, **more: Any) -> GotoArgs:
     return GotoArgs(*at(x, y), alt, **more)
+
+
+def clear_m(world: World, *box: float) -> float:
+    return float(min(shapely.box(*box).distance(shapely.Point(x, y)) for x, y, _ in world.plane.trace))
+
+
+def limit(which: str, upper: float) -> dict[str, Any]:
+    """A limit of speed or altitude that corrects."""
+    return {
+        "name": "limited",
+        "spec": {"type": "LimitControl", "kind": which, "upperLimit": upper, "action": "enforce"},
+        "zones": [],
+    }
+
+
+async def fastest(world: World, motion: Any) -> float:
+    """How fast the drone gets in a motion."""
+    top = 0.0
+    async for _ in motion:
+        top = max(top, math.hypot(*world.plane.velocity))
+    return top
 
 
 # Setpoints
@@ -94,5 +121,188 @@ def test_a_setpoint_that_waited_is_watched_as_well(tmp_path: Path, monkeypatch: 
             assert world.plane.wanted == (3.0, 0.0, 0.0)
             await asyncio.sleep(0.7)
             assert world.plane.wanted == (0.0, 0.0, 0.0), "it ran out"
+
+    fly(flight)
+
+
+# Speeds
+
+
+def test_a_leg_is_flown_with_its_speed_whatever_was_flown_before(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            go = world.service.goto
+            assert await fastest(world, go(held, goto(0, 40, speed_mps=3.0), 0)) == pytest.approx(3.0, abs=0.2)
+            assert await fastest(world, go(held, goto(0, -30), 0)) == pytest.approx(8.0, abs=0.5)
+            await world.service.set_speed(held, SetSpeedArgs(4.0))
+            await world.service.set_velocity(held, VelocityArgs(2.0, 0.0, hold_s=0.5))
+            assert await fastest(world, go(held, goto(0, 40), 0)) == pytest.approx(4.0, abs=0.2)
+            assert await fastest(world, go(held, goto(0, 0, speed_mps=6.0), 0)) == pytest.approx(6.0, abs=0.2)
+            assert await fastest(world, go(held, goto(0, 40), 0)) == pytest.approx(4.0, abs=0.2)
+
+    fly(flight)
+
+
+def test_the_system_keeps_to_speed_limits(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(partial(limit("speed", 3.0)))
+            bringing = asyncio.ensure_future(world.drive(held))
+            top = 0.0
+            while not bringing.done():
+                await world.plane.update(0.1)
+                top = max(top, math.hypot(*world.plane.velocity))
+            assert math.dist(world.plane.xy, (0, 70)) < 1.5
+            assert top == pytest.approx(3.0, abs=0.2)
+
+    fly(flight)
+
+
+def test_a_speed_that_is_corrected_holds_when_the_leg_is_sent_again(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            flying = asyncio.ensure_future(end(world.service.goto(held, goto(0, 150), 0)))
+            await world.until(lambda: world.plane.velocity[1] > 6)
+            world.grants.put(spec(limit("speed", 3.0)))
+            await world.until(lambda: world.plane.speed_mps == 3.0)
+            world.plane.goal = (world.plane.xy[0], world.plane.xy[1])  # it forgets where it was told to fly
+            world.plane.positions = False
+            stayed = world.plane.xy[1] + 10
+            await world.until(lambda: world.plane.xy[1] > stayed)
+            assert world.plane.velocity[1] == pytest.approx(3.0, abs=0.2)
+            await flying
+
+    fly(flight)
+
+
+# Commands that are lost
+
+
+def test_a_goto_whose_command_was_lost_is_judged_where_the_drone_is_by_then(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            plane = world.plane
+            held = world.grants.put(spec(zone("no-fly", "ignore", -200, 63, 200, 100)))
+            await world.up(held)
+            first = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 56), 0)))
+            await world.until(lambda: plane.velocity[1] > 5 and plane.xy[1] > 22)
+            send, lost = plane.send, []
+
+            def lossy(outgoing: Any) -> None:
+                if outgoing.get_type() == "COMMAND_INT" and len(lost) < 3:
+                    lost.append(math.hypot(*plane.velocity))
+                else:
+                    send(outgoing)
+
+            plane.send = lossy  # type: ignore[method-assign]
+            begun = len(plane.commands)
+            there = await end(world.service.goto(held, goto(-60, 50), 0))
+            assert there.verdict.permits
+            assert min(lost[:2]) > 5, "it flew on, unheard"
+            assert plane.commands[begun] == 84, "by then it had to stop first"
+            assert (await first).verdict.code == "Replaced"
+            assert clear_m(world, -200, 63, 200, 100) > 1.0
+
+    fly(flight)
+
+
+# Motions that begin while the drone comes to rest
+
+
+@pytest.mark.parametrize("target", [(0.0, 20.0), (40.0, 30.0)])
+def test_what_is_permitted_while_the_drone_brakes_before_a_new_zone_is_flown(
+    tmp_path: Path, target: tuple[float, float]
+) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            flying = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 90), 0)))
+            await world.until(lambda: world.plane.velocity[1] > 7.5 and world.plane.xy[1] > 30)
+            held = world.grants.put(spec(zone("new", "ignore", -30, 50, 30, 70)))
+            assert (await flying).verdict.code == "ExclusionZoneAhead"
+            back = goto(*target)
+            await world.until(lambda: judge(Call("Goto", back), world.guard.situation(), held.compiled).permits, 5)
+            assert world.plane.velocity[1] > 5, "it still flies toward the zone"
+            await end(world.service.goto(held, back, 0))
+            assert clear_m(world, -30, 50, 30, 70) > 0.0
+            codes = [note["code"] for note in world.kinds("control") if note["action"] == "brake"]
+            assert codes == ["ExclusionZoneAhead"], "the monitor stopped one motion, not two"
+
+    fly(flight)
+
+
+def test_a_correction_is_not_undone_by_the_motion_that_it_ends(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            flying = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 60, 45.0), 0)))
+            await world.until(lambda: world.plane.height > 25)
+            world.grants.put(spec(limit("altitude", 15.0)))
+            assert (await flying).verdict.code == "AltitudeAboveLimit"
+            begun = len(world.plane.commands)
+            await world.until(lambda: world.plane.height < 16.0, 8)
+            assert 84 not in world.plane.commands[begun:], "nothing stops it on its way down"
+            await world.until(lambda: world.control.motion is None, 10)
+            assert world.control.controller == held.identity
+
+    fly(flight)
+
+
+# The system's own flying
+
+
+async def homeward(world: World) -> bool:
+    """A drone on its way home around a wall; whether it flies east."""
+    held = world.grants.put(spec(zone("wall", "ignore", *WALL)))
+    await world.up(held)
+    for x, y in ((60, 30), (60, 70), (0, 70)):
+        await end(world.service.goto(held, goto(x, y), 0))
+    await world.control.give_back(held)
+    await world.until(lambda: abs(world.plane.velocity[0]) > 3)
+    return world.plane.velocity[0] > 0
+
+
+def test_the_way_home_stays_inside_an_inclusion_zone_that_shrinks(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, retraces=True) as world:
+            side = 1 if await homeward(world) else -1
+            edge = world.plane.xy[0] + side * 16.0
+            west, east = (-200.0, edge) if side > 0 else (edge, 200.0)
+            kept = zone("shrunk", "revoke", west, -200.0, east, 200.0)
+            kept["spec"]["kind"] = "inclusion"
+            world.grants.put(spec(zone("wall", "ignore", *WALL), kept))
+            begun = len(world.plane.trace)
+            await world.until(lambda: not world.plane.vehicle.armed)
+            codes = [note["code"] for note in world.kinds("control") if note["action"] == "brake"]
+            assert codes[:1] == ["InclusionBorderAhead"]
+            del world.plane.trace[: begun - 1]
+            assert max(side * x for x, _, _ in world.plane.trace) < side * edge
+            assert math.dist(world.plane.xy, (0, 0)) < 1.5
+
+    fly(flight)
+
+
+def test_a_drone_that_loses_its_position_on_the_way_home_flies_on_no_further(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, retraces=True) as world:
+            await homeward(world)
+            tell, begun = world.plane._tell, world.plane.now
+
+            def blind() -> None:
+                tell()
+                world.plane.vehicle.position_at = begun
+
+            world.plane._tell = blind  # type: ignore[method-assign]
+            await world.until(lambda: world.kinds("control")[-1]["action"] != "returned", 3)
+            codes = [note["code"] for note in world.kinds("control") if note["action"] == "brake"]
+            assert codes == ["PositionUnknown"]
+            await world.until(lambda: world.plane.vehicle.mode != GUIDED, 20)
+            await world.until(lambda: not world.plane.vehicle.armed)
 
     fly(flight)

@@ -235,18 +235,24 @@ def test_reposition_switches_mode_only_when_asked():
     assert vehicle.altitude_m == pytest.approx(15.0, abs=0.4)
 
 
-def test_change_speed_holds_until_the_mode_changes():
+def test_change_speed_holds_until_the_controller_changes():
     vehicle, pilot = airborne(10.0)
     assert pilot.command(Command.DO_CHANGE_SPEED, 1, 2.0) is Result.ACCEPTED
     assert pilot.command(Command.DO_CHANGE_SPEED, 1, -1.0) is Result.FAILED
     pilot.go_to(40.0, 0.0, 10.0)
-    pilot.fly_on(10.0)
+    pilot.fly_on(4.0)
+    assert vehicle.body.vn > 5.0, "the first position starts the position controller, with the parameter's speed"
+    assert pilot.command(Command.DO_CHANGE_SPEED, 1, 2.0) is Result.ACCEPTED
+    pilot.fly_on(5.0)
     assert vehicle.body.vn == pytest.approx(2.0, abs=0.2)
-    pilot.mode(Mode.LOITER)
-    pilot.mode(Mode.GUIDED)
     pilot.go_to(-60.0, 0.0, 10.0)
-    pilot.fly_on(6.0)
-    assert vehicle.body.vn < -5.0
+    pilot.fly_on(10.0)
+    assert vehicle.body.vn == pytest.approx(-2.0, abs=0.2), "the next position keeps it"
+    _local(pilot, 1, 0xDC7, vx=0.0, vy=0.0, vz=0.0)
+    pilot.fly_on(3.0)
+    pilot.go_to(-60.0, 0.0, 10.0)
+    pilot.fly_on(4.0)
+    assert vehicle.body.vn < -5.0, "a velocity in between ends it"
 
 
 @pytest.mark.parametrize(("mode", "slack_m"), [(Mode.BRAKE, 0.0), (Mode.LOITER, 4.0), (Mode.GUIDED, 4.0)])

@@ -12,6 +12,7 @@ from dataclasses import replace
 from fractus_core.policy.access import judge_access
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.legs import judge_goto
+from fractus_core.policy.monitoring import must_rest
 from fractus_core.policy.motion import moving
 from fractus_core.policy.privacy import judge_privacy
 from fractus_core.policy.values import (
@@ -58,10 +59,19 @@ def judge(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     rule = _RULES.get(call.method)
     if rule is not None:
         verdict = rule(call, now, grant)
-        return replace(verdict, brake_first=True) if verdict.action == "takeover" and moving(now) else verdict
+        return replace(verdict, brake_first=True) if _must_brake(call, verdict, now, grant) else verdict
     if call.method in _ACCESS_ONLY:
         return Verdict("allow", call.args)
     return deny("MethodUnknown", f"the policy engine has no rule for {call.method}")
+
+
+def _must_brake(call: Call, verdict: Verdict, now: Situation, grant: CompiledGrant) -> bool:
+    """Whether a moving drone must stop before anything else: it is taken over, or on its way into a fence."""
+    if verdict.brake_first or not moving(now):
+        return verdict.brake_first
+    if verdict.permits:
+        return call.method in _COURSES and must_rest(now, grant)
+    return verdict.action == "takeover"
 
 
 def _unsound(now: Situation) -> Situation:
@@ -119,6 +129,9 @@ def _figures(call: Call) -> tuple[_Figure, ...]:
         case _:
             return ()
 
+
+_COURSES = frozenset({"Goto", "SetVelocity"})
+"""Methods that give a flying drone another course."""
 
 _ARGS: dict[str, type] = {
     "Takeoff": TakeoffArgs,

@@ -11,7 +11,7 @@ from shapely.geometry.base import BaseGeometry
 from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Patch
 from fractus_core.policy.fences import TAKEOVERS, breaches
 from fractus_core.policy.limits import Bound, altitude_bounds, speed_bounds, strictest
-from fractus_core.policy.motion import XY, moving, standing, stop_altitude_m, stop_point
+from fractus_core.policy.motion import XY, margin_m, moving, standing, stop_altitude_m, stop_point
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Situation, Verdict
 
 STRAY = 0.3
@@ -25,11 +25,17 @@ DEEPER_M = 0.6
 _RANK = {None: 0, "hover": 1, "returnToLaunch": 2, "land": 3, "revoke": 4}
 
 
-def monitor(now: Situation, grant: CompiledGrant) -> Verdict | None:
+def monitor(now: Situation, grant: CompiledGrant, *, leaving: bool = False) -> Verdict | None:
     """What the system must do about a flying drone at this moment.
 
     Judged is the way from the present position to where the drone comes to rest if it is told to stop now, with the
     position error around it: a smaller margin than that of accepted legs, so that a leg flown as accepted never alarms.
+
+    Args:
+        now: the state of the drone.
+        grant: whose fences.
+        leaving: whether the system flies the drone already, so that only what gets worse counts: where it is on the wrong
+            side of a fence, the system's way leads back.
 
     Returns:
         None when all is well; a takeover; a denial with `hover`, when the motion is to be stopped and the application
@@ -47,19 +53,33 @@ def monitor(now: Situation, grant: CompiledGrant) -> Verdict | None:
     start = grant.frame.xy(lat, lon)
     stop = stop_point(now, start)
     rest_m = stop_altitude_m(now)
-    way = shapely.points(start) if start == stop else shapely.linestrings((start, stop))
-    lower = min(now.altitude_m, rest_m) - now.altitude_error_m
-    upper = max(now.altitude_m, rest_m) + now.altitude_error_m
-    ahead = _Ahead(
-        Air(way, now.position_error_m + STRAY * now.airframe.tracking_m, lower, upper),
-        shapely.points(start),
-        shapely.points(stop),
-    )
-    found = _fences(now, grant, ahead)
+    ahead = _look_ahead(now, start, stop, now.position_error_m + STRAY * now.airframe.tracking_m)
+    found = _fences(now, grant, ahead, leaving=leaving)
     if found:
         worst = min(found, key=lambda f: (-_RANK[f[1].takeover if f[1].action == "takeover" else None], -f[0]))[1]
         return replace(worst, brake_first=worst.action == "takeover" and moving(now))
     return _heights(now, grant, start, stop, rest_m) or _speeds(now, grant, start)
+
+
+def must_rest(now: Situation, grant: CompiledGrant) -> bool:
+    """Whether a moving drone must come to rest before it begins anything else, legal though that is.
+
+    Its way to rest comes so near to a fence that the monitor may stop it on the new course, too: with the margin of legs,
+    and without the braking that has begun already, which a new command may interrupt.
+    """
+    at = grant.locate(now)
+    if at is None or not now.in_air or not moving(now):
+        return False
+    now = replace(now, forward_mps2=0.0)
+    return bool(_fences(now, grant, _look_ahead(now, at, stop_point(now, at), margin_m(now)), leaving=True))
+
+
+def _look_ahead(now: Situation, start: XY, stop: XY, margin: float) -> _Ahead:
+    way = shapely.points(start) if start == stop else shapely.linestrings((start, stop))
+    rest_m = stop_altitude_m(now)
+    lower = min(now.altitude_m, rest_m) - now.altitude_error_m
+    upper = max(now.altitude_m, rest_m) + now.altitude_error_m
+    return _Ahead(Air(way, margin, lower, upper), shapely.points(start), shapely.points(stop))
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,44 +93,58 @@ class _Ahead:
 
 @dataclass(frozen=True, slots=True)
 class _Fence:
-    """What a fence is called, and what its policy does."""
+    """What a fence is called, what its policy does, and how its breach is called once it is there and before."""
 
     policy: str
     action: str | None
-    code: str
     name: str
+    broken: str
+    ahead: str
 
 
-def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead) -> list[tuple[int, Verdict]]:
+@dataclass(frozen=True, slots=True)
+class _Finding:
+    """What a drone does to a fence: it is on the wrong side, or its motion makes things worse, or both."""
+
+    fence: _Fence
+    broken: bool
+    worse: bool
+    what: str
+
+
+def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead, *, leaving: bool) -> list[tuple[int, Verdict]]:
     """What fences ask for, each with its policy's priority."""
-    found: list[tuple[int, Verdict | None]] = [
+    found: list[tuple[int, _Finding | None]] = [
         (patch.rule.spec.priority, _kept_out(patch, ahead))
         for patch in grant.exclusions.near(ahead.air, now, grant.flat_terrain)
     ]
     if grant.passage is not None and grant.passage_border is not None:
-        area = _Fence(OPERATION_AREA, "ignore", "OutsideOperationArea", "the operation area")
+        area = _Fence(
+            OPERATION_AREA, "ignore", "the operation area", "OutsideOperationArea", "OperationAreaBorderAhead"
+        )
         found.append((0, _kept_in(grant.passage, grant.passage_border, ahead, area)))
     for inclusion in grant.inclusions:
         if inclusion.rule.in_force(now.time_s):
             shape, border = inclusion.at(ahead.air.lower_m, ahead.air.upper_m, now, grant.flat_terrain)
             zones = ", ".join(dict.fromkeys(p.zone for p in inclusion.patches)) or "its zones"
             rule = inclusion.rule
-            fence = _Fence(rule.name, rule.spec.action, "OutsideInclusionZone", f"{zones} of policy {rule.name}")
+            name = f"{zones} of policy {rule.name}"
+            fence = _Fence(rule.name, rule.spec.action, name, "OutsideInclusionZone", "InclusionBorderAhead")
             found.append((rule.spec.priority, _kept_in(shape, border, ahead, fence)))
-    return [(priority, verdict) for priority, verdict in found if verdict is not None]
+    reactions = [(priority, _reaction(f, leaving=leaving)) for priority, f in found if f is not None]
+    return [(priority, verdict) for priority, verdict in reactions if verdict is not None]
 
 
-def _kept_out(patch: Patch, ahead: _Ahead) -> Verdict | None:
+def _kept_out(patch: Patch, ahead: _Ahead) -> _Finding:
     inside = bool(patch.shape.intersects(ahead.here))
     worse = _depth(patch.shape, ahead.rest) > _depth(patch.shape, ahead.here) + DEEPER_M
     entering = not inside and bool(patch.shape.intersects(ahead.air.ground))
-    code = "InsideExclusionZone" if inside else "ExclusionZoneAhead"
-    where = "is inside" if inside else "is about to enter"
-    fence = _Fence(patch.rule.name, patch.rule.spec.action, code, f"zone {patch.zone} of policy {patch.rule.name}")
-    return _reaction(fence, inside, worse or entering, where)
+    name = f"zone {patch.zone} of policy {patch.rule.name}"
+    fence = _Fence(patch.rule.name, patch.rule.spec.action, name, "InsideExclusionZone", "ExclusionZoneAhead")
+    return _Finding(fence, inside, worse or entering, "is inside" if inside else "is about to enter")
 
 
-def _kept_in(shape: BaseGeometry, border: BaseGeometry, ahead: _Ahead, fence: _Fence) -> Verdict | None:
+def _kept_in(shape: BaseGeometry, border: BaseGeometry, ahead: _Ahead, fence: _Fence) -> _Finding | None:
     way = ahead.air.ground
     if shape.covers(way) and not border.dwithin(way, ahead.air.margin_m):
         return None
@@ -118,22 +152,24 @@ def _kept_in(shape: BaseGeometry, border: BaseGeometry, ahead: _Ahead, fence: _F
     worse = False
     if not shape.is_empty:
         worse = _signed_depth(shape, border, ahead.rest) < _signed_depth(shape, border, ahead.here) - DEEPER_M
-    leaving = worse or (not outside and not shape.covers(way))
-    return _reaction(fence, outside, leaving, "is outside" if outside else "is about to leave")
+    worse = worse or (not outside and not shape.covers(way))
+    return _Finding(fence, outside, worse, "is outside" if outside else "is about to leave")
 
 
-def _reaction(fence: _Fence, broken: bool, worse: bool, what: str) -> Verdict | None:
+def _reaction(found: _Finding, *, leaving: bool) -> Verdict | None:
     """What follows from a fence that is broken or about to be.
 
     A policy that takes the drone over does so for both; one that ignores requests only stops the motion that makes
     things worse.
     """
+    fence = found.fence
     takeover = TAKEOVERS.get(fence.action or "ignore")
-    reason = f"the drone {what} {fence.name}"
-    if takeover is not None and (broken or worse):
-        return Verdict("takeover", None, fence.code, reason, (fence.policy,), takeover)
-    if worse:
-        return Verdict("deny", None, fence.code, f"{reason}; the motion is stopped", (fence.policy,), "hover")
+    code = fence.broken if found.broken else fence.ahead
+    reason = f"the drone {found.what} {fence.name}"
+    if takeover is not None and (found.worse or (found.broken and not leaving)):
+        return Verdict("takeover", None, code, reason, (fence.policy,), takeover)
+    if found.worse:
+        return Verdict("deny", None, code, f"{reason}; the motion is stopped", (fence.policy,), "hover")
     return None
 
 

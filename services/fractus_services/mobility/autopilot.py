@@ -336,14 +336,19 @@ class Autopilot:
     async def go_to(
         self, lat: float, lon: float, altitude_m: float, yaw_deg: float | None, permit: Permit = always
     ) -> None:
-        """Begin to fly straight to a point; altitude above home."""
+        """Begin to fly straight to a point; altitude above home.
+
+        The autopilot falls back to its own speed when it was not flying to a place before: see `set_speed`.
+        """
         yaw = math.nan if yaw_deg is None else yaw_deg
         await self.command(_REPOSITION, -1, 0, 0, yaw, place=(lat, lon, altitude_m), permit=permit)
-        if yaw_deg is not None:
-            await self.command(_YAW, yaw_deg % 360.0, 0, 0, 0, permit=permit)
+
+    async def turn(self, yaw_deg: float, permit: Permit = always) -> None:
+        """Point the nose, on the leg under way."""
+        await self.command(_YAW, yaw_deg % 360.0, 0, 0, 0, permit=permit)
 
     async def set_speed(self, speed_mps: float, permit: Permit = always) -> None:
-        """Fly legs with this horizontal speed over ground."""
+        """Fly the leg under way with this horizontal speed over ground; one to a place may begin with the default again."""
         await self.command(_SPEED, 1, speed_mps, -1, permit=permit)
 
     def stop(self) -> None:

@@ -31,6 +31,8 @@ log = logging.getLogger(__name__)
 Hands = Literal["driver", "system", "pilot"]
 
 WAYPOINT_M = 5.0
+DEFAULT_SPEED_MPS = 5.0
+"""Legs are taken to be flown so fast while the vehicle's parameters are not known."""
 
 
 class Control:
@@ -253,6 +255,17 @@ class Control:
 
     # Motions
 
+    @property
+    def cruise_mps(self) -> float:
+        """The speed of legs that name none."""
+        return self.speed_mps or (self.checked.speed_mps if self.checked is not None else DEFAULT_SPEED_MPS)
+
+    def cruise(self, speed_mps: float) -> None:
+        """Fly legs with this speed from now on, the one under way included."""
+        self.speed_mps = speed_mps
+        if self.motion is not None and self.motion.speed_mps is not None:
+            self.motion.speed_mps = speed_mps
+
     def begin(self, kind: str) -> Motion:
         """Start a motion; the one under way is replaced."""
         self.stop_motion(aborted("Replaced", f"{kind} replaced it"))
@@ -309,7 +322,11 @@ class Control:
     def brake(self, verdict: Verdict) -> None:
         """Stop the present motion; the driver keeps the drone."""
         self.note("brake", self.controller, verdict.reason, verdict.code, policies=verdict.policies)
-        self.stop_motion(aborted(verdict.code, verdict.reason, verdict.policies))
+        # A position that is not known now may be known in a moment.
+        passing = verdict.code == "PositionUnknown"
+        self.stop_motion(
+            unavailable(verdict.reason) if passing else aborted(verdict.code, verdict.reason, verdict.policies)
+        )
         self.autopilot.stop()
         self.tasks.spawn(self.helm.settle())
 

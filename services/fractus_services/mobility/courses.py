@@ -28,8 +28,11 @@ REPLANS = 5
 MAX_LEGS = 60
 
 STOPPED = frozenset(
-    {"ExclusionZoneAhead", "InsideExclusionZone", "OutsideInclusionZone", "OutsideOperationArea", "AltitudeAboveLimit"}
-)
+    {
+        "ExclusionZoneAhead", "InsideExclusionZone", "InclusionBorderAhead", "OutsideInclusionZone",
+        "OperationAreaBorderAhead", "OutsideOperationArea", "AltitudeAboveLimit",
+    }
+)  # fmt: skip
 """Codes with which the monitor stops a leg that has become illegal."""
 
 
@@ -110,7 +113,7 @@ class Courses:
             if not at_rest(autopilot):
                 await come_to_rest(autopilot, motion, permit)
             leg, last = self._next(trip, target)
-            leg = await self._allowed(trip, leg, permit)
+            leg = self._allowed(trip, leg)
             if last:
                 leg = replace(leg, yaw_deg=target.yaw_deg)
             async for step in fly_to(autopilot, motion, leg, REACHED_M, permit):
@@ -152,16 +155,9 @@ class Courses:
         why = verdict.reason or "no way around the zones is found"
         return precondition("NoLegalWay", f"the system cannot fly to {target.lat:.6f}, {target.lon:.6f}: {why}")
 
-    async def _allowed(self, trip: Trip, leg: GotoArgs, permit: Permit) -> GotoArgs:
-        """A leg as the policies allow it; its speed is set when they change it."""
-        args = self._judged(trip, leg)
-        if args.speed_mps is None:
-            return args
-        await self._control.autopilot.set_speed(args.speed_mps, permit)
-        return self._judged(trip, leg)
-
-    def _judged(self, trip: Trip, leg: GotoArgs) -> GotoArgs:
+    def _allowed(self, trip: Trip, leg: GotoArgs) -> GotoArgs:
+        """A leg as the policies allow it."""
         verdict = self._guard.judge(Call("Goto", leg), trip.regime.held, trip.regime.grant)
         if not verdict.permits or not isinstance(verdict.args, GotoArgs):
             raise precondition("NoLegalWay", f"the system cannot fly there: {verdict.reason}")
-        return verdict.args
+        return replace(verdict.args, speed_mps=verdict.args.speed_mps or self._control.cruise_mps)

@@ -40,7 +40,7 @@ class Guard:
         airframe = checked.airframe if checked is not None else Airframe()
         if airframe.retraces and not self._control.retraces:
             airframe = replace(airframe, retraces=False)
-        speed = self._control.speed_mps or (checked.speed_mps if checked is not None else 5.0)
+        speed = self._control.cruise_mps
         motion = self._control.motion
         vertical = motion is not None and motion.kind in {"Takeoff", "Land", "ReturnToLaunch"}
         now = autopilot.vehicle.situation(self._clock(), airframe, speed, vertical)

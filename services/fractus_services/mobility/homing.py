@@ -157,7 +157,7 @@ class Homing:
         leg, last, _ = found
         if last and self._guard.distance_m(leg.lat, leg.lon) <= HOME_M:
             return None
-        return leg
+        return replace(leg, speed_mps=self._control.cruise_mps)
 
 
 def _straight(now: Situation, grant: CompiledGrant) -> bool:

@@ -80,10 +80,18 @@ class Regime:
 
 
 class Motion:
-    """A motion call that is being carried out, until it is complete or somebody stops it."""
+    """A motion call that is being carried out, until it is complete or somebody stops it.
+
+    Attributes:
+        kind: what it is called.
+        braking: whether the drone comes to rest first, so that nothing stops the motion before it begins.
+        speed_mps: with what its present leg is flown; None while it flies none.
+    """
 
     def __init__(self, kind: str) -> None:
         self.kind = kind
+        self.braking = False
+        self.speed_mps: float | None = None
         self._stopped: Refused | None = None
 
     @property

@@ -55,12 +55,36 @@ async def climb(autopilot: Autopilot, motion: Motion, altitude_m: float, permit:
 
 
 async def fly_to(
-    autopilot: Autopilot, motion: Motion, args: GotoArgs, reached_m: float, permit: Permit
+    autopilot: Autopilot,
+    motion: Motion,
+    args: GotoArgs,
+    reached_m: float,
+    permit: Permit,
+    *,
+    judged: Permit | None = None,
 ) -> AsyncIterator[Step]:
-    """Fly straight to a point; altitude above home."""
+    """Fly straight to a point; altitude above home.
+
+    Args:
+        autopilot: flies.
+        motion: what it belongs to.
+        args: the leg; with a speed, since the autopilot may not remember the last one.
+        reached_m: how near is there.
+        permit: asked before each command.
+        judged: asked instead each time before the leg is begun, for the drone moves while commands are lost.
+    """
     altitude = args.alt if args.alt is not None else autopilot.vehicle.altitude_m
     frame = LocalFrame(args.lat, args.lon)
-    await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg, permit)
+    motion.speed_mps = args.speed_mps
+
+    async def begin() -> None:
+        await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg, judged or permit)
+        if motion.speed_mps is not None:
+            await autopilot.set_speed(motion.speed_mps, permit)
+        if args.yaw_deg is not None:
+            await autopilot.turn(args.yaw_deg, permit)
+
+    await begin()
     sent, resends, best = autopilot.now, 0, math.inf
     there: float | None = None
     while True:
@@ -81,7 +105,7 @@ async def fly_to(
             if resends == RESENDS:
                 raise aborted("NotFollowing", f"the drone stays {math.hypot(away, rise):.1f} m away from the target")
             resends, sent = resends + 1, autopilot.now
-            await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg, permit)
+            await begin()
         await _tick(autopilot, motion)
 
 
@@ -101,18 +125,20 @@ async def come_to_rest(autopilot: Autopilot, motion: Motion, permit: Permit) -> 
         Refused: the motion was stopped, or the drone does not come to rest.
     """
     deadline, sent = autopilot.now + REST_S, -math.inf
-    while not at_rest(autopilot):
-        if autopilot.now > deadline:
-            raise aborted(
-                "NotStopping", f"the drone does not stop; it still flies {autopilot.vehicle.speed_mps:.1f} m/s"
-            )
-        if autopilot.now - sent >= REST_AGAIN_S:
-            permit()
-            autopilot.stop()
-            sent = autopilot.now
-        motion.check()
-        if not await autopilot.update(REPORT_S) and not autopilot.connected:
-            raise unavailable("the autopilot is no longer heard; it flies home by its own failsafe")
+    motion.braking = True
+    try:
+        while not at_rest(autopilot):
+            if autopilot.now > deadline:
+                speed = autopilot.vehicle.speed_mps
+                raise aborted("NotStopping", f"the drone does not stop; it still flies {speed:.1f} m/s")
+            if autopilot.now - sent >= REST_AGAIN_S:
+                permit()
+                autopilot.stop()
+                sent = autopilot.now
+            motion.check()
+            await _news(autopilot)
+    finally:
+        motion.braking = False
     motion.check()
 
 
@@ -138,6 +164,10 @@ async def _tick(autopilot: Autopilot, motion: Motion) -> None:
     deadline = autopilot.now + REPORT_S
     while autopilot.now < deadline:
         motion.check()
-        if not await autopilot.update(REPORT_S) and not autopilot.connected:
-            raise unavailable("the autopilot is no longer heard; it flies home by its own failsafe")
+        await _news(autopilot)
     motion.check()
+
+
+async def _news(autopilot: Autopilot) -> None:
+    if not await autopilot.update(REPORT_S) and not autopilot.connected:
+        raise unavailable("the autopilot is no longer heard; it flies home by its own failsafe")

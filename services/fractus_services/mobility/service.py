@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import aclosing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, VelocityArgs, Verdict
 
@@ -37,6 +37,14 @@ class Progress:
 
     verdict: Verdict
     step: Step
+
+
+class _Outdated(Exception):
+    """A leg is not the one that was judged any more."""
+
+    def __init__(self, verdict: Verdict) -> None:
+        super().__init__(verdict.reason)
+        self.verdict = verdict
 
 
 MOVING = frozenset(
@@ -119,7 +127,7 @@ class MobilityService:
         """Change the speed of legs."""
         verdict = self._allow_motion(Call("SetSpeed", args), held)
         speed = verdict.args.speed_mps if isinstance(verdict.args, SetSpeedArgs) else args.speed_mps
-        self._control.speed_mps = speed
+        self._control.cruise(speed)
         await self._autopilot.set_speed(speed, driver_permit(self._control, held))
         return verdict, speed
 
@@ -148,14 +156,44 @@ class MobilityService:
 
         async def steps(motion: Motion) -> AsyncIterator[Progress]:
             permit = driver_permit(self._control, held, motion)
-            final = await self._settled(Call("Goto", args), held, verdict, motion, permit)
-            goal = final.args if isinstance(final.args, GotoArgs) else args
-            async for step in fly_to(self._autopilot, motion, goal, radius, permit):
-                if step.complete:
-                    self._control.reached(held, args.lat, args.lon)
-                yield Progress(final, step)
+            call, final = Call("Goto", args), verdict
+            for _ in range(JUDGEMENTS):
+                final = await self._settled(call, held, final, motion, permit)
+                leg, judged = self._leg(final, args), self._judged(call, held, final, permit)
+                try:
+                    async with aclosing(fly_to(self._autopilot, motion, leg, radius, permit, judged=judged)) as flying:  # type: ignore[type-var]
+                        async for step in flying:
+                            if step.complete:
+                                self._control.reached(held, args.lat, args.lon)
+                            yield Progress(final, step)
+                except _Outdated as outdated:
+                    final = outdated.verdict
+                else:
+                    return
+            raise aborted("NotFollowing", f"the autopilot was told {JUDGEMENTS} times where to fly, and does not")
 
         return self._run("Goto", steps)
+
+    def _leg(self, verdict: Verdict, args: GotoArgs) -> GotoArgs:
+        """What is flown of a goto, with its speed."""
+        goal = verdict.args if isinstance(verdict.args, GotoArgs) else args
+        return replace(goal, speed_mps=goal.speed_mps or self._control.cruise_mps)
+
+    def _judged(self, call: Call, held: Held, verdict: Verdict, permit: Permit) -> Permit:
+        """Permits a leg only as it is judged where the drone is when the command is sent, maybe again."""
+        judged_at = self._autopilot.now
+
+        def check() -> None:
+            nonlocal judged_at
+            permit()
+            if self._autopilot.now - judged_at <= JUDGE_AGAIN_S:
+                return
+            judged_at = self._autopilot.now
+            again = self._allow_motion(call, self._control.require(held).held, verdict)
+            if again.brake_first or again.args != verdict.args:
+                raise _Outdated(again)
+
+        return check
 
     async def _settled(self, call: Call, held: Held, verdict: Verdict, motion: Motion, permit: Permit) -> Verdict:
         """The verdict to carry out, given where the drone is once it may be: in GUIDED, and standing if need be.
@@ -163,18 +201,12 @@ class MobilityService:
         Raises:
             Refused: the call is not legal from there, or the drone does not come to rest.
         """
-        flown_mps: float | None = None
         for _ in range(JUDGEMENTS):
             begun = self._autopilot.now
             await self._control.helm.change_mode(GUIDED, permit)
             if verdict.brake_first:
                 await come_to_rest(self._autopilot, motion, permit)
-            elif isinstance(verdict.args, GotoArgs):
-                speed = verdict.args.speed_mps or self._control.speed_mps
-                if speed is not None and speed != flown_mps:
-                    await self._autopilot.set_speed(speed, permit)
-                    flown_mps = speed
-            if not verdict.brake_first and self._autopilot.now - begun <= JUDGE_AGAIN_S:
+            elif self._autopilot.now - begun <= JUDGE_AGAIN_S:
                 return verdict
             permit()
             verdict = self._allow_motion(call, self._control.require(held).held, verdict)

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from dataclasses import replace
 
+from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Verdict
 
 from fractus_services.audit import AuditLog
-from fractus_services.mobility.autopilot import AutopilotError
+from fractus_services.mobility.autopilot import AutopilotError, Permit
 from fractus_services.mobility.control import Control
 from fractus_services.mobility.guard import Guard
+from fractus_services.mobility.leases import Motion
+from fractus_services.mobility.motions import REACHED_M, fly_to
 from fractus_services.mobility.supervisor import Supervisor
 from fractus_services.mobility.telemetry import recorded
 from fractus_services.mobility.vehicle import GUIDED
@@ -66,7 +70,7 @@ class Watch:
         if grant is None or control.hands == "pilot" or coming or control.autopilot.vehicle.mode != GUIDED:
             self._alarm = ""
             return
-        verdict = monitor(self._guard.situation(), grant)
+        verdict, ours = self._judge(grant)
         if verdict is None:
             self._alarm = ""
             return
@@ -74,7 +78,6 @@ class Watch:
         if fresh:
             self._alarm, self._alarm_at = verdict.code, control.autopilot.now
             log.warning("%s: %s", verdict.code, verdict.reason)
-        ours = control.homeward or (control.hands != "driver" and verdict.takeover == "hover")
         if verdict.action == "takeover" and not ours:
             control.take_over(verdict)
         elif verdict.action in {"takeover", "deny"}:
@@ -82,44 +85,77 @@ class Watch:
         elif fresh:
             self._correct(verdict)
 
+    def _judge(self, grant: CompiledGrant) -> tuple[Verdict | None, bool]:
+        """What is wrong, and whether the system flies the drone already, so that there is nobody to take it from."""
+        control, now = self._control, self._guard.situation()
+        if control.homeward:
+            return monitor(now, grant, leaving=True), True
+        verdict = monitor(now, grant)
+        if verdict is None or verdict.takeover != "hover" or control.hands == "driver":
+            return verdict, False
+        return monitor(now, grant, leaving=True), True
+
     def _stop(self, verdict: Verdict, fresh: bool) -> None:
         """End the motion that makes things worse; the system then looks for another way.
 
-        Where it flies itself and is in a zone already, its way leads out.
+        A motion that comes to rest before it begins does what is wanted.
         """
-        if verdict.action == "takeover" and verdict.code != "ExclusionZoneAhead":
-            return
-        if fresh:
-            self._control.brake(verdict)
+        control = self._control
+        motion = control.motion
+        waits = motion is not None and motion.braking and verdict.code != "PositionUnknown"
+        if not waits and (fresh or motion is not None):
+            control.brake(verdict)
         else:
-            self._control.autopilot.stop()
+            control.autopilot.stop()
 
     def _correct(self, verdict: Verdict) -> None:
         self._audit.append(
             "monitor", {"action": verdict.action, "code": verdict.code, "reason": verdict.reason, "policies": list(verdict.policies)}
         )  # fmt: skip
-        task = asyncio.get_running_loop().create_task(self._carry_out(verdict))
+        task = asyncio.get_running_loop().create_task(self._carry_out(verdict, self._control.motion))
         self._corrections.add(task)
         task.add_done_callback(self._corrections.discard)
 
-    async def _carry_out(self, verdict: Verdict) -> None:
-        control = self._control
-        motion, lease, hands = control.motion, control.lease, control.hands
-
-        def permit() -> None:
-            if control.lease is not lease or control.hands != hands or control.motion not in {motion, None}:
-                raise aborted("Replaced", "something else flies by now")
-
+    async def _carry_out(self, verdict: Verdict, seen: Motion | None) -> None:
+        if self._control.motion is not seen:
+            return  # the monitor looks at what flies now first
         try:
             if isinstance(verdict.args, SetSpeedArgs):
-                control.speed_mps = verdict.args.speed_mps
-                await control.autopilot.set_speed(verdict.args.speed_mps, permit)
-            elif isinstance(verdict.args, GotoArgs) and verdict.args.alt is not None:
-                if control.motion is not None:
-                    control.motion.stop(aborted(verdict.code, verdict.reason, verdict.policies))
-                await control.autopilot.go_to(verdict.args.lat, verdict.args.lon, verdict.args.alt, None, permit)
+                await self._slow_down(verdict.args.speed_mps)
+            elif isinstance(verdict.args, GotoArgs):
+                await self._lead_back(verdict, verdict.args)
         except (AutopilotError, Refused) as error:
             log.warning("cannot correct the motion: %s", error)
+
+    def _permit(self, motion: Motion | None) -> Permit:
+        """What corrects a motion is sent only while nobody else flies."""
+        control = self._control
+        lease, hands = control.lease, control.hands
+
+        def check() -> None:
+            if control.lease is not lease or control.hands != hands or control.motion is not motion:
+                raise aborted("Replaced", "something else flies by now")
+
+        return check
+
+    async def _slow_down(self, speed_mps: float) -> None:
+        control = self._control
+        control.cruise(speed_mps)
+        await control.autopilot.set_speed(speed_mps, self._permit(control.motion))
+
+    async def _lead_back(self, verdict: Verdict, place: GotoArgs) -> None:
+        """Fly to where the limits hold, as a motion that follows the one that left them."""
+        control = self._control
+        control.stop_motion(aborted(verdict.code, verdict.reason, verdict.policies))
+        motion = control.begin("Correction")
+        leg = replace(place, speed_mps=control.cruise_mps)
+        try:
+            async for _ in fly_to(control.autopilot, motion, leg, REACHED_M, self._permit(motion)):
+                pass
+        except Exception:
+            control.failed(motion)
+            raise
+        control.finish(motion)
 
     async def record(self) -> None:
         """The flight recorder, until cancelled."""

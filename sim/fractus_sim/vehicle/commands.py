@@ -153,8 +153,6 @@ def _reposition(v: Vehicle, o: Order, _c: Channel) -> Result:
     flight = v.flight
     if not isinstance(flight, GuidedFlight):
         return Result.FAILED
-    if o.params[0] > 0.0:
-        v.change_speed(1, o.params[0])
     flight.go_to(v, north, east, down)
     if math.isfinite(o.params[3]) and o.params[3] != 0.0:
         v.turn_to(o.params[3] % 360.0, 0.0, 0, relative=False)

@@ -190,20 +190,13 @@ def _target(v: Vehicle, m: Message, position: Vector, velocity: Vector, accel: V
     if use_position and outside_fence(v, *position):
         return
     if use_velocity:
-        flight.fly(v, _limited(v, velocity), position if use_position else None)
+        flight.fly(v, velocity, position if use_position else None)
     elif use_position:
         flight.go_to(v, *position)
     else:
         e = v.control.vel
-        flight.fly(v, _limited(v, (e[0] + accel[0], e[1] + accel[1], e[2] + accel[2])))
+        flight.fly(v, (e[0] + accel[0], e[1] + accel[1], e[2] + accel[2]))
     _turn(v, yaw, yaw_rate)
-
-
-def _limited(v: Vehicle, velocity: Vector) -> Vector:
-    limits = v.control.limits
-    size = math.hypot(velocity[0], velocity[1])
-    scale = limits.speed_mps / size if size > limits.speed_mps else 1.0
-    return (velocity[0] * scale, velocity[1] * scale, clamp(velocity[2], -limits.climb_mps, limits.sink_mps))
 
 
 def _turn(v: Vehicle, yaw: float | None, yaw_rate: float | None) -> None:

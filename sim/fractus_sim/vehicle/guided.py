@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 from fractus_sim.vehicle.control import Axis
 from fractus_sim.vehicle.flight import Flight
+from fractus_sim.vehicle.settings import leg_speeds_mps
+from fractus_sim.vehicle.shaping import clamp
 
 if TYPE_CHECKING:
     from fractus_sim.vehicle.vehicle import Vehicle
@@ -32,6 +34,7 @@ class GuidedFlight(Flight):
     def __init__(self) -> None:
         self.task = Task.IDLE
         self.updated_s = 0.0
+        self._controller = Task.VELOCITY
         self.paused = False
         self._resume: tuple[float, float, float] | None = None
 
@@ -41,13 +44,25 @@ class GuidedFlight(Flight):
         v.control.hold_here()
         v.yaw.follow_course()
 
+    def use(self, v: Vehicle, controller: Task) -> None:
+        """Begin with positions or velocities: ArduCopter starts that controller, with the parameters' speeds.
+
+        A speed that was set before is forgotten; stopping keeps the controller, and with it the speed.
+        """
+        if controller is not self._controller:
+            self._controller = controller
+            limits = v.control.limits
+            limits.speed_mps, limits.climb_mps, limits.sink_mps = leg_speeds_mps(v.params)
+
     def take_off(self, v: Vehicle, down: float) -> None:
         """Climb straight up to `down` (local, metres)."""
+        self._controller = Task.TAKEOFF
         self.task = Task.TAKEOFF
         v.begin_takeoff(down)
 
     def go_to(self, v: Vehicle, north: float, east: float, down: float) -> None:
         """Fly to a local position."""
+        self.use(v, Task.POSITION)
         self.task = Task.POSITION
         self.updated_s = v.time_s
         v.control.go_to(north, east, down)
@@ -59,8 +74,10 @@ class GuidedFlight(Flight):
         position: tuple[float, float, float] | None = None,
     ) -> None:
         """Fly with a velocity, or with a position that moves with it, until GUID_TIMEOUT."""
+        self.use(v, Task.VELOCITY)
         self.task = Task.VELOCITY
         self.updated_s = v.time_s
+        velocity = _limited(v, velocity)
         control = v.control
         if position is None:
             control.fly(*velocity)
@@ -71,7 +88,7 @@ class GuidedFlight(Flight):
 
     def lean(self, v: Vehicle, roll: float, pitch: float, yaw: float | None, climb_mps: float) -> None:
         """Hold an attitude with a climb rate, until GUID_TIMEOUT."""
-        self.task = Task.ATTITUDE
+        self._controller = self.task = Task.ATTITUDE
         self.updated_s = v.time_s
         v.control.horizontal = Axis.ATTITUDE
         v.control.attitude = (roll, pitch)
@@ -110,6 +127,13 @@ class GuidedFlight(Flight):
                 v.control.target = (north + vn * dt, east + ve * dt)
                 v.control.target_down += v.control.target_vd * dt
         v.yaw.step(v, dt)
+
+
+def _limited(v: Vehicle, velocity: tuple[float, float, float]) -> tuple[float, float, float]:
+    limits = v.control.limits
+    size = math.hypot(velocity[0], velocity[1])
+    scale = limits.speed_mps / size if size > limits.speed_mps else 1.0
+    return (velocity[0] * scale, velocity[1] * scale, clamp(velocity[2], -limits.climb_mps, limits.sink_mps))
 
 
 class Heading:

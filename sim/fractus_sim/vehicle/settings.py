@@ -17,12 +17,19 @@ JERK_SHARE = 0.6
 LIMIT_PREFIXES = frozenset({"WPNAV", "PSC", "ANGLE", "ATC", "MOT", "LOIT"})
 
 
+def leg_speeds_mps(params: Parameters) -> tuple[float, float, float]:
+    """How fast legs are flown: over ground, up, and down."""
+    return (
+        max(params["WPNAV_SPEED"] / 100.0, 0.2),
+        max(params["WPNAV_SPEED_UP"] / 100.0, 0.1),
+        max(params["WPNAV_SPEED_DN"] / 100.0, 0.1),
+    )
+
+
 def set_limits(params: Parameters, control: Control) -> None:
     """Speeds, accelerations, jerk, lean and gains of the controllers."""
     limits, gains = control.limits, control.gains
-    limits.speed_mps = max(params["WPNAV_SPEED"] / 100.0, 0.2)
-    limits.climb_mps = max(params["WPNAV_SPEED_UP"] / 100.0, 0.1)
-    limits.sink_mps = max(params["WPNAV_SPEED_DN"] / 100.0, 0.1)
+    limits.speed_mps, limits.climb_mps, limits.sink_mps = leg_speeds_mps(params)
     limits.accel_mps2 = max(params["WPNAV_ACCEL"] / 100.0, 0.5)
     limits.accel_z_mps2 = max(params["WPNAV_ACCEL_Z"] / 100.0, 0.5)
     limits.jerk_mps3 = max(JERK_SHARE * params["PSC_JERK_XY"], 1.0)

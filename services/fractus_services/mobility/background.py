@@ -4,12 +4,31 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Coroutine
-from typing import Any
+import time
+from collections.abc import Coroutine, Generator
+from typing import Any, TypeVar
 
 from fractus_services.mobility.autopilot import AutopilotError
 
 log = logging.getLogger(__name__)
+
+SLICE_S = 0.004
+"""Long computations let everything else in the loop have its turn so often: monitor, watchdog, heartbeats."""
+
+T = TypeVar("T")
+
+
+async def in_slices(work: Generator[None, None, T]) -> T:
+    """The outcome of a long computation, done in slices between everything else."""
+    while True:
+        until = time.perf_counter() + SLICE_S
+        while time.perf_counter() < until:
+            try:
+                next(work)
+            except StopIteration as end:
+                outcome: T = end.value
+                return outcome
+        await asyncio.sleep(0)
 
 
 class Background:

@@ -8,12 +8,12 @@ from contextlib import aclosing
 from dataclasses import dataclass, replace
 
 import grpc
-from fractus_core.policy.compiled import height_m
-from fractus_core.policy.motion import XY
-from fractus_core.policy.routes import route
+from fractus_core.policy.compiled import CompiledGrant, height_m
+from fractus_core.policy.routes import searching
 from fractus_core.policy.values import Call, GotoArgs, Situation
 
 from fractus_services.mobility.autopilot import Permit
+from fractus_services.mobility.background import in_slices
 from fractus_services.mobility.control import Control
 from fractus_services.mobility.guard import Guard
 from fractus_services.mobility.leases import Motion, Regime
@@ -56,25 +56,43 @@ def stopped_by_monitor(refusal: Refused) -> bool:
     return refusal.status is grpc.StatusCode.ABORTED and refusal.verdict.code in STOPPED
 
 
-def first_leg(goal: XY, heights_m: Iterable[float], now: Situation, trip: Trip) -> tuple[GotoArgs, bool, float] | None:
+async def first_leg(
+    goal: tuple[float, float], heights_m: Iterable[float], now: Situation, trip: Trip
+) -> tuple[GotoArgs, bool, float] | None:
     """The first leg of the shortest legal way to a place from where the drone stands.
 
+    It is looked for between everything else that the service does; fences that change meanwhile begin the search anew.
+
     Args:
-        goal: in metres of the grant's frame.
+        goal: latitude and longitude.
         heights_m: altitudes above home to fly at, in the order of preference.
         now: the state of the drone; its position is known.
         trip: whose fences.
 
     Returns:
         The leg, whether it is the last one, and the altitude of the way; None when there is no way.
+
+    Raises:
+        Refused: the fences change faster than a way is found.
     """
-    grant = trip.regime.grant
-    at = grant.frame.xy(now.lat or 0.0, now.lon or 0.0)
-    for height in dict.fromkeys(heights_m):
-        way = route(at, goal, now, grant, height, from_m=now.altitude_m)
+    heights = tuple(dict.fromkeys(heights_m))
+    for _ in range(REPLANS + 1):
+        grant = trip.regime.grant
+        found = await _first_leg(goal, heights, now, grant)
+        if trip.regime.grant is grant:
+            return found
+    raise aborted("FencesChanged", "the fences change faster than a way is found")
+
+
+async def _first_leg(
+    goal: tuple[float, float], heights_m: Iterable[float], now: Situation, grant: CompiledGrant
+) -> tuple[GotoArgs, bool, float] | None:
+    frame = grant.frame
+    begin, end = frame.xy(now.lat or 0.0, now.lon or 0.0), frame.xy(*goal)
+    for height in heights_m:
+        way = await in_slices(searching(begin, end, now, grant, height, from_m=now.altitude_m))
         if way is not None:
-            lat, lon = grant.frame.latlon(*way[0])
-            return GotoArgs(lat, lon, height), len(way) == 1, height
+            return GotoArgs(*frame.latlon(*way[0]), height), len(way) == 1, height
     return None
 
 
@@ -112,7 +130,7 @@ class Courses:
         for _ in range(MAX_LEGS):
             if not at_rest(autopilot):
                 await come_to_rest(autopilot, motion, permit)
-            leg, last = self._next(trip, target)
+            leg, last = await self._next(trip, target)
             leg = self._allowed(trip, leg)
             if last:
                 leg = replace(leg, yaw_deg=target.yaw_deg)
@@ -122,7 +140,7 @@ class Courses:
                 return
         raise aborted("NotFollowing", f"the drone did not arrive within {MAX_LEGS} legs")
 
-    def _next(self, trip: Trip, target: GotoArgs) -> tuple[GotoArgs, bool]:
+    async def _next(self, trip: Trip, target: GotoArgs) -> tuple[GotoArgs, bool]:
         now, grant = self._guard.situation(), trip.regime.grant
         if now.lat is None or now.lon is None:
             raise unavailable("the drone's position is not known")
@@ -134,8 +152,7 @@ class Courses:
                     "TerrainUnknown", "the altitude is given above terrain, and no terrain model is loaded"
                 )
             wanted = known
-        goal = grant.frame.xy(target.lat, target.lon)
-        found = first_leg(goal, (wanted, now.altitude_m), now, trip)
+        found = await first_leg((target.lat, target.lon), (wanted, now.altitude_m), now, trip)
         if found is None:
             raise self._unreachable(trip, target)
         leg, last, height = found

@@ -139,7 +139,9 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     async def SetVelocity(self, request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context) as caller:
-            verdict, flown = await self._service.set_velocity(self._held(caller), velocity_args(request))
+            args = velocity_args(request)
+            await self._service.turn(self._held(caller))
+            verdict, flown = await self._service.set_velocity(self._held(caller), args)
             reply = mobility_pb2.SetVelocityResponse(decision=decision(verdict))
             reply.velocity.north_mps, reply.velocity.east_mps = flown.north_mps, flown.east_mps
             reply.velocity.down_mps = flown.down_mps
@@ -148,7 +150,9 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     async def CheckCall(self, request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context) as caller:
-            return checked(self._service.check(call_of(request), self._held(caller)))
+            call = call_of(request)
+            await self._service.turn(self._held(caller))
+            return checked(self._service.check(call, self._held(caller)))
 
     async def GetPosition(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
@@ -173,6 +177,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         """See mobility.proto."""
         async with self._reception.call(context, lasting=True) as caller:
             args = goto_args(request)
+            await self._service.turn(self._held(caller))
             progress = self._service.goto(self._held(caller), args, _finite(request.acceptance_radius_m))
             await self._report(progress, context)
 

@@ -130,7 +130,7 @@ class Homing:
         for _ in range(MAX_LEGS):
             if self._guard.situation().lat is not None and not at_rest(autopilot):
                 await come_to_rest(autopilot, motion, permit)
-            leg = self._leg(trip)
+            leg = await self._leg(trip)
             if leg is None:
                 return
             async with aclosing(fly_to(autopilot, motion, leg, REACHED_M, permit)) as steps:  # type: ignore[type-var]
@@ -144,14 +144,14 @@ class Homing:
             return True  # nobody can say anything of the way; the autopilot knows more than we do
         return _straight(now, grant)
 
-    def _leg(self, trip: Trip) -> GotoArgs | None:
+    async def _leg(self, trip: Trip) -> GotoArgs | None:
         now, grant = self._guard.situation(), trip.regime.grant
         if now.lat is None or now.lon is None or now.home is None or _straight(now, grant):
             return None
         # The whole way is flown by us, so the autopilot's own straight one need not be legal from its waypoints.
         free = replace(now, airframe=replace(now.airframe, retraces=True))
-        home = grant.frame.xy(now.home.lat, now.home.lon)
-        found = first_leg(home, (now.altitude_m, now.airframe.return_altitude_m), free, trip)
+        home = (now.home.lat, now.home.lon)
+        found = await first_leg(home, (now.altitude_m, now.airframe.return_altitude_m), free, trip)
         if found is None:
             raise precondition("NoLegalWay", "zones are all around the drone or its home")
         leg, last, _ = found

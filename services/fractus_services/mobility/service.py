@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import aclosing
 from dataclasses import dataclass, replace
@@ -26,6 +27,10 @@ from fractus_services.replies import Refused, aborted, precondition, refused
 MAX_REACHED_M = 50.0
 JUDGE_AGAIN_S = 0.05
 """A goto whose command waited for longer is judged again, at the place where the drone is by then."""
+
+REST = {True: 1.0, False: 4.0}
+"""After a costly judgement the next one waits, for so many times the time that it took, when who has the drone asks, and when
+anybody else does: a flood of calls never keeps the monitor from its work."""
 
 JUDGEMENTS = 6
 """So often a call is judged before it is given up: a drone that does not come to rest cannot begin its leg."""
@@ -62,6 +67,7 @@ class MobilityService:
         self._homing = homing
         self._steering = Steering(control)
         self._autopilot: Autopilot = control.autopilot
+        self._rested_at = {True: 0.0, False: 0.0}
 
     def allow(self, call: Call, held: Held) -> Verdict:
         """Judge a call that moves nothing.
@@ -78,7 +84,26 @@ class MobilityService:
         """The verdict on a call that is not carried out."""
         if held.spec.class_ != "driver" and call.method in MOVING:
             return self._not_a_driver(call, held, kind="check")
-        return self._guard.judge(call, held, kind="check")
+        return self._judge(call, held, kind="check")
+
+    async def turn(self, held: Held) -> None:
+        """Wait until the loop has had time for the flight since a call of this caller, or its like, was judged last."""
+        left_s = self._rested_at[self._drives(held)] - self._autopilot.now
+        while left_s > 0:
+            await asyncio.sleep(left_s)  # others that waited may have been first
+            left_s = self._rested_at[self._drives(held)] - self._autopilot.now
+
+    def _drives(self, held: Held) -> bool:
+        lease = self._control.lease
+        return lease is not None and lease.key == held.key
+
+    def _judge(self, call: Call, held: Held, *, kind: str = "call", known: Verdict | None = None) -> Verdict:
+        drives, begun = self._drives(held), time.perf_counter()
+        try:
+            return self._guard.judge(call, held, kind=kind, known=known)
+        finally:
+            rest_s = (time.perf_counter() - begun) * REST[drives]
+            self._rested_at[drives] = self._autopilot.now + rest_s
 
     def _not_a_driver(self, call: Call, held: Held, *, kind: str = "call") -> Verdict:
         verdict = Verdict("deny", None, "NotADriver", f"passengers ride along; only a driver may {call.method}")
@@ -89,7 +114,7 @@ class MobilityService:
         """Judge a call that moves the drone, of a driver that has it; a takeover happens here."""
         if held.spec.class_ != "driver":
             raise refused(self._not_a_driver(call, held))
-        verdict = self._guard.judge(call, held, known=known)
+        verdict = self._judge(call, held, known=known)
         if verdict.code == "MethodNotGranted":
             raise refused(verdict)
         self._control.require(held)

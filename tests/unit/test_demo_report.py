@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -168,5 +169,22 @@ def test_a_drone_still_in_the_air_has_not_landed(record: Record) -> None:
 def test_a_record_is_read_from_the_files_of_the_demo(tmp_path: Path, record: Record) -> None:
     (tmp_path / "objects.json").write_text(json.dumps(demo_flight.content()))
     lines = "".join(json.dumps(entry) + "\n" for entry in demo_flight.audit())
-    (tmp_path / "audit.jsonl").write_text(lines + '{"time": "2027-')
+    earlier = json.dumps({**demo_flight.calls()[0], "time": demo_flight.stamp(demo_flight.APPLIED_S - 60)}) + "\n"
+    (tmp_path / "audit").mkdir()
+    (tmp_path / "audit" / "mobility.000000000001.jsonl").write_text(earlier)
+    (tmp_path / "audit" / "mobility.jsonl").write_text(lines + '{"time": "2027-')
     assert figures(Record.read(tmp_path)) == figures(record)
+    assert "camera saw" not in summary(record)
+
+
+def test_the_page_shows_pictures_with_time_and_height(tmp_path: Path, record: Record) -> None:
+    high = max(record.samples, key=lambda sample: sample.place.alt_m)
+    name = datetime.fromtimestamp(high.time_s, UTC).strftime("%Y%m%d%H%M%S%f")[:17] + "-0007.jpg"
+    (tmp_path / "objects.json").write_text(json.dumps(demo_flight.content()))
+    (tmp_path / "audit").mkdir()
+    (tmp_path / "audit" / "mobility.jsonl").write_text("".join(json.dumps(e) + "\n" for e in demo_flight.audit()))
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "pictures" / name).touch()
+    page = summary(Record.read(tmp_path))
+    assert f"![from the drone](pictures/{name})" in page
+    assert "UTC, 50 m above home |" in page

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,11 @@ import yaml
 from click.testing import CliRunner
 from fractus_sim.demo import watch
 from fractus_sim.demo.__main__ import demo
-from fractus_sim.demo.collect import of_mission
-from fractus_sim.demo.kube import DemoError
+from fractus_sim.demo.collect import fetch_logs, spread
+from fractus_sim.demo.kube import DemoError, Kube
 from fractus_sim.demo.place import ROOT, assign
 from fractus_sim.demo.watch import Mission
+from fractus_sim.report.record import of_mission
 
 
 def node(name: str, label: str | None = None) -> dict[str, Any]:
@@ -123,6 +125,54 @@ def test_only_entries_of_this_mission_are_kept() -> None:
     assert of_mission(after, 100.0)
     assert not of_mission(before, 100.0)
     assert not of_mission(b"{torn", 100.0)
+
+
+class Rotating:
+    """A node whose audit log begins a new file while it is read for the first time."""
+
+    def __init__(self) -> None:
+        self.files = {"mobility.000000000001.jsonl": "1", "mobility.jsonl": "23", "camera.jsonl": "c", "notes": ""}
+        self.read: list[str] = []
+
+    def run(self, *arguments: str) -> str:
+        assert arguments[-2:] == ("ls", "/var/lib/fractus/audit")
+        return "\n".join(self.files)
+
+    def fetch(self, pod: str, path: str, to: Path) -> None:
+        assert pod == "fractus-mobility-x"
+        name = path.removeprefix("/var/lib/fractus/audit/")
+        self.read.append(name)
+        if name == "mobility.jsonl" and self.read.count(name) == 1:
+            self.files |= {"mobility.000000000002.jsonl": "23", "mobility.jsonl": "4"}
+        to.write_text(self.files[name])
+
+
+def test_audit_logs_are_fetched_whole_even_when_a_new_file_begins(tmp_path: Path) -> None:
+    node = Rotating()
+    fetch_logs(node, "fractus-mobility-x", tmp_path / "audit")  # type: ignore[arg-type]
+    found = {path.name: path.read_text() for path in (tmp_path / "audit").iterdir()}
+    assert found == {name: text for name, text in node.files.items() if name != "notes"}
+    assert node.read.count("mobility.000000000001.jsonl") == 1, "what is closed does not change"
+
+
+def test_a_file_is_fetched_whole_or_not_at_all(tmp_path: Path) -> None:
+    kubectl = tmp_path / "kubectl"
+    kubectl.write_text("#!/bin/sh\nprintf '\\377\\330half'\nif [ \"$7\" = /bad ]; then echo broken >&2; exit 1; fi\n")
+    kubectl.chmod(0o755)
+    kube, to = Kube(kubectl, kubectl, tmp_path), tmp_path / "out.jpg"
+    with pytest.raises(DemoError, match="broken"):
+        kube.fetch("pod", "/bad", to)
+    assert [path.name for path in tmp_path.iterdir()] == ["kubectl"]
+    kube.fetch("pod", "/good", to)
+    assert to.read_bytes() == b"\xff\xd8half"
+
+
+def test_pictures_are_spread_over_the_flight() -> None:
+    start_s = datetime(2026, 11, 21, 11, 0, tzinfo=UTC).timestamp()
+    every = [f"{'a' * 32}/202611211100{second:02d}000-0001.jpg" for second in range(0, 60, 2)]
+    chosen = spread(every, start_s + 10, start_s + 50)
+    assert [path[-14:-12] for path in chosen] == ["20", "30", "40"]
+    assert spread(every, start_s + 100, start_s + 200) == []
 
 
 def test_a_wrong_assignment_is_refused() -> None:

@@ -66,7 +66,7 @@ def demo(
         click.echo("demo: interrupted", err=True)
         sys.exit(130)
     console.print(Markdown((out / "summary.md").read_text()))
-    click.echo(f"report: {out}/summary.md, map.png, altitude.png, flight.geojson, plan.yaml, audit.jsonl")
+    click.echo(f"report: {out}/summary.md, map.png, altitude.png, flight.geojson, plan.yaml, audit/, pictures/")
     sys.exit(0 if fine else 1)
 
 

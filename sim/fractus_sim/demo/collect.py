@@ -1,26 +1,31 @@
-"""Gathers what a mission left on the cluster: objects, events, and the audit log from the drone."""
+"""Gathers what a mission left on the cluster: objects, events, the drone's audit logs, pictures from the flight."""
 
 from __future__ import annotations
 
 import json
 import re
-from datetime import datetime
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from fractus_services.chain import Finding, verify
+from fractus_services.chain import lines_of, logs, verify
 
 from fractus_sim.demo.kube import NAMESPACE, SYSTEM, DemoError, Kube, Object
 from fractus_sim.demo.watch import Mission
-from fractus_sim.report.record import AUDIT, CAMERA_AUDIT, OBJECTS
+from fractus_sim.report.record import AUDIT, OBJECTS, PICTURES, Record, of_mission, taken_s
 
-LOGS = {AUDIT: "/var/lib/fractus/audit/mobility.jsonl", CAMERA_AUDIT: "/var/lib/fractus/audit/camera.jsonl"}
+_AUDIT = "/var/lib/fractus/audit"
+_ALBUMS = "/var/lib/fractus/camera"
+_AUDIT_FILE = re.compile(r"(mobility|camera)(\.\d{12})?\.jsonl")
+_PICTURE = re.compile(r"[0-9a-f]{32}/\d{17}-\d{4}\.jpg")
+_TRIES = 5
+_SHARES = (0.25, 0.5, 0.75)
 _KINDS = "applications,deploymentplans,depots,drones,edgenodes,policies,zones"
 _KEPT = re.compile(rb"\[pod/[^/]+/data-store\] .* kept ")
 
 
-def collect(kube: Kube, mission: Mission, folder: Path, logs: Path) -> None:
-    """Write objects.json, audit.jsonl and events.json into a folder.
+def collect(kube: Kube, mission: Mission, folder: Path, log: Path) -> None:
+    """Write objects.json, events.json and the audit logs into a folder; `log` is the components'.
 
     Raises:
         DemoError: the API server does not answer.
@@ -35,7 +40,7 @@ def collect(kube: Kube, mission: Mission, folder: Path, logs: Path) -> None:
         "pods": list(mission.pods.values()),
         "times": mission.times,
         "audit": audit,
-        "results": len(_KEPT.findall(logs.read_bytes())) if logs.exists() else 0,
+        "results": len(_KEPT.findall(log.read_bytes())) if log.exists() else 0,
     }
     (folder / OBJECTS).write_text(json.dumps(content, indent=1) + "\n")
     (folder / "events.json").write_text(json.dumps([_event(e) for e in events], indent=1) + "\n")
@@ -47,37 +52,79 @@ def _concerns(body: Object, application: str) -> bool:
 
 
 def _audit(kube: Kube, mission: Mission, folder: Path) -> dict[str, Any]:
-    """Fetch the drone's logs, check their chains, and keep what is of this mission."""
+    """Fetch the drone's logs, check their chains, and count what is of this mission."""
     found: dict[str, Any] = {"entries": 0, "kept": 0, "problem": ""}
     if not mission.drone:
         return {}
     try:
-        pod = _mobility_pod(kube, mission.drone)
-        for name, path in LOGS.items():
-            command = f"cat {path} 2>/dev/null || test ! -e {path}"
-            text = kube.run("exec", "-n", SYSTEM, pod, "--", "sh", "-c", command, timeout_s=120.0)
-            lines = text.encode().splitlines(keepends=True)
-            kept = [line for line in lines if line.endswith(b"\n") and of_mission(line, mission.times["applied"])]
-            (folder / name).write_bytes(b"".join(kept))
-            finding = verify(lines)
-            found["entries"] += finding.entries
-            found["kept"] += len(kept)
-            found["problem"] = found["problem"] or _problem(path, finding)
+        fetch_logs(kube, _mobility_pod(kube, mission.drone), folder / AUDIT)
     except DemoError as error:
-        found["problem"] = f"it could not be fetched: {error}"
+        return {**found, "problem": f"it could not be fetched: {error}"}
+
+    def counted(files: list[Path]) -> Iterator[bytes]:
+        for _, _, line in lines_of(files):
+            found["kept"] += line.endswith(b"\n") and of_mission(line, mission.times["applied"])
+            yield line
+
+    for name, files in logs([folder / AUDIT]).items():
+        finding = verify(counted(files))
+        found["entries"] += finding.entries
+        if finding.problem and not found["problem"]:
+            found["problem"] = f"line {finding.line} of {name.name} {finding.problem}"
     return found
 
 
-def of_mission(line: bytes, applied_s: float) -> bool:
-    """Whether an entry was written after the application was applied."""
-    try:
-        return datetime.fromisoformat(json.loads(line)["time"]).timestamp() >= applied_s
-    except (ValueError, KeyError, TypeError):
-        return False
+def fetch_logs(kube: Kube, pod: str, folder: Path) -> None:
+    """Copy the audit logs of a node's services, with all their segments.
+
+    Raises:
+        DemoError: they cannot be read.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for _ in range(_TRIES):
+        listed = _audit_files(kube, pod)
+        for name in listed:
+            segment = name.count(".") > 1
+            if not (segment and (folder / name).exists()):
+                kube.fetch(pod, f"{_AUDIT}/{name}", folder / name)
+        if _audit_files(kube, pod) == listed:
+            return
+    raise DemoError(f"the audit log of pod {pod} begins new files faster than they can be read")
 
 
-def _problem(path: str, finding: Finding) -> str:
-    return f"line {finding.line} of {path} {finding.problem}" if finding.problem else ""
+def _audit_files(kube: Kube, pod: str) -> list[str]:
+    names = kube.run("exec", "-n", SYSTEM, pod, "--", "ls", _AUDIT).split()
+    return sorted(name for name in names if _AUDIT_FILE.fullmatch(name))
+
+
+def fetch_pictures(kube: Kube, record: Record, folder: Path) -> None:
+    """Copy a few of the pictures that were taken in flight, as policies had them kept.
+
+    Raises:
+        DemoError: they cannot be read.
+    """
+    if record.drone is None or record.takeoff_s is None:
+        return
+    pod = _mobility_pod(kube, record.drone.name)
+    listed = kube.run("exec", "-n", SYSTEM, pod, "--", "sh", "-c", f"cd {_ALBUMS} && ls -1 */*.jpg || true").split()
+    begin_s, end_s = record.samples[0].time_s, record.samples[-1].time_s
+    (folder / PICTURES).mkdir(parents=True, exist_ok=True)
+    for path in spread([path for path in listed if _PICTURE.fullmatch(path)], begin_s, end_s):
+        kube.fetch(pod, f"{_ALBUMS}/{path}", folder / PICTURES / Path(path).name)
+
+
+def spread(paths: list[str], begin_s: float, end_s: float) -> list[str]:
+    """Those pictures that were taken nearest to a quarter, half and three quarters of a time; oldest first."""
+    taken = {path: taken_s(Path(path).name) for path in paths}
+    inside = [path for path in paths if begin_s <= taken[path] <= end_s]
+    if not inside:
+        return []
+
+    def nearest(at_s: float) -> str:
+        return min(inside, key=lambda path: abs(taken[path] - at_s))
+
+    chosen = {nearest(begin_s + share * (end_s - begin_s)) for share in _SHARES}
+    return sorted(chosen, key=lambda path: taken[path])
 
 
 def _mobility_pod(kube: Kube, node: str) -> str:

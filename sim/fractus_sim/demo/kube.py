@@ -39,6 +39,22 @@ class Kube:
         """
         return self._run(self.kubectl, arguments, stdin, timeout_s)
 
+    def fetch(self, pod: str, path: str, to: Path, timeout_s: float = 120.0) -> None:
+        """Copy a file of a pod of the system, as it is now; there is no half file.
+
+        Raises:
+            DemoError: it cannot be read, or not written here.
+        """
+        scratch = to.with_name(f".{to.name}")
+        try:
+            with scratch.open("wb") as out:
+                self._run(self.kubectl, ["exec", "-n", SYSTEM, pod, "--", "cat", path], None, timeout_s, out)
+            scratch.replace(to)
+        except OSError as error:
+            raise DemoError(f"cannot write {to}: {error.strerror}") from None
+        finally:
+            scratch.unlink(missing_ok=True)
+
     def objects(self, kinds: str, namespace: str = NAMESPACE) -> list[Object]:
         """Objects of the kinds (comma-separated) in a namespace, or of the whole cluster where they have none."""
         text = self.run("get", kinds, "-n", namespace, "-o", "json")
@@ -72,13 +88,21 @@ class Kube:
             [str(self.kubectl), *arguments], stdout=out, stderr=subprocess.DEVNULL, env=self._environment()
         )
 
-    def _run(self, program: Path, arguments: Sequence[str], stdin: str | None, timeout_s: float) -> str:
+    def _run(
+        self,
+        program: Path,
+        arguments: Sequence[str],
+        stdin: str | None,
+        timeout_s: float,
+        out: IO[bytes] | None = None,
+    ) -> str:
         words = f"{program.name} {' '.join(arguments[:4])}"
         try:
             done = subprocess.run(
                 [str(program), *arguments],
                 input=stdin,
-                capture_output=True,
+                stdout=subprocess.PIPE if out is None else out,
+                stderr=subprocess.PIPE,
                 text=True,
                 timeout=timeout_s,
                 env=self._environment(),
@@ -90,7 +114,7 @@ class Kube:
             raise DemoError(f"cannot run {program}: {error.strerror}; install it, or use --cluster embedded") from None
         if done.returncode:
             raise DemoError(f"{words}: {' '.join(done.stderr.split())}")
-        return done.stdout
+        return done.stdout or ""
 
     def _environment(self) -> dict[str, str]:
         return {**os.environ, "KUBECONFIG": str(self.kubeconfig)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -12,12 +13,13 @@ from pathlib import Path
 from rich.console import Console
 
 from fractus_sim.cluster import ClusterError
-from fractus_sim.demo.collect import collect
+from fractus_sim.demo.collect import collect, fetch_pictures
 from fractus_sim.demo.kube import SYSTEM, DemoError, Kube, Object
 from fractus_sim.demo.place import EXAMPLE, ROOT, Place, documents
 from fractus_sim.demo.watch import GROUNDED, Mission, follow, wait_ready
 from fractus_sim.interruption import uninterrupted
 from fractus_sim.report import Record, write_report
+from fractus_sim.report.record import AUDIT, OBJECTS, PICTURES
 from fractus_sim.report.summary import figures
 
 READY_TIMEOUT_S = 180.0
@@ -92,8 +94,10 @@ class Demo:
             ClusterError: the embedded cluster could not be brought up.
         """
         self.out.mkdir(parents=True, exist_ok=True)
-        for stale in ("objects.json", "audit.jsonl", "camera-audit.jsonl", "events.json", LOGS):
+        for stale in ("summary.md", OBJECTS, "events.json", LOGS):
             (self.out / stale).unlink(missing_ok=True)
+        for folder in (AUDIT, PICTURES):
+            shutil.rmtree(self.out / folder, ignore_errors=True)
         kube: Kube | None = None
         installed: list[str] = []
         try:
@@ -137,9 +141,16 @@ class Demo:
                 follow(kube, mission, logs, timeout_s=self.timeout_s, say=self.tell, show=self.tell.show)
             finally:
                 collect(kube, mission, self.out, logs)
+                self._fetch_pictures(kube)
                 record = Record.read(self.out)
                 write_report(record, self.out)
         return _as_promised(record, self.tell)
+
+    def _fetch_pictures(self, kube: Kube) -> None:
+        try:
+            fetch_pictures(kube, Record.read(self.out), self.out)
+        except DemoError as error:
+            self.tell(f"no pictures of the flight: {error}")
 
     def _clean_up(self, kube: Kube | None, installed: list[str]) -> None:
         if kube is not None and not self.place.disposable:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from datetime import datetime
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from fractus_core.policy.grants import node_attributes, selects
 
 from fractus_sim.report.track import Place, Sample, Track
 
-OBJECTS, AUDIT, CAMERA_AUDIT = "objects.json", "audit.jsonl", "camera-audit.jsonl"
+OBJECTS, AUDIT, PICTURES = "objects.json", "audit", "pictures"
 _DECIDED = {"correct", "deny", "takeover"}
 _KINDS: tuple[type[Resource], ...] = (Application, DeploymentPlan, Depot, Drone, EdgeNode, Policy, Zone)
 
@@ -66,7 +66,7 @@ class Pod:
 
 @dataclass(frozen=True)
 class Record:
-    """Everything that the report is made of."""
+    """Everything that the report is made of; pictures are by the names of their files."""
 
     application: Application
     plan: DeploymentPlan | None
@@ -83,6 +83,7 @@ class Record:
     results: int = 0
     audit: Mapping[str, Any] = field(default_factory=dict)
     times: Mapping[str, float] = field(default_factory=dict)
+    pictures: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, folder: Path) -> Record:
@@ -93,7 +94,10 @@ class Record:
             ValueError: a file is not what the demo writes.
         """
         content = json.loads((folder / OBJECTS).read_text())
-        return cls.of(content, [*_lines(folder / AUDIT), *_lines(folder / CAMERA_AUDIT)])
+        applied_s = content.get("times", {}).get("applied", 0.0)
+        entries = [entry for path in sorted((folder / AUDIT).glob("*.jsonl")) for entry in _entries(path, applied_s)]
+        pictures = tuple(sorted(path.name for path in (folder / PICTURES).glob("*.jpg")))
+        return replace(cls.of(content, entries), pictures=pictures)
 
     @classmethod
     def of(cls, content: Mapping[str, Any], audit: Iterable[Mapping[str, Any]]) -> Record:
@@ -170,14 +174,22 @@ class Record:
         return LocalFrame.at(at)
 
 
-def _lines(path: Path) -> list[dict[str, Any]]:
-    found = []
-    for line in path.read_text().splitlines() if path.exists() else ():
-        try:
-            found.append(json.loads(line))
-        except ValueError:  # a line that was being written when the log was fetched
-            continue
-    return found
+def of_mission(line: bytes, applied_s: float) -> bool:
+    """Whether a line of an audit log is an entry from after the application was applied."""
+    try:
+        return _time(json.loads(line)["time"]) >= applied_s
+    except (ValueError, KeyError, TypeError):  # being written when the log was fetched
+        return False
+
+
+def taken_s(picture: str) -> float:
+    """When a picture was taken, by the name that the camera service gave it."""
+    return datetime.strptime(picture[:17], "%Y%m%d%H%M%S%f").replace(tzinfo=UTC).timestamp()
+
+
+def _entries(path: Path, applied_s: float) -> list[dict[str, Any]]:
+    with path.open("rb") as file:
+        return [json.loads(line) for line in file if of_mission(line, applied_s)]
 
 
 def _time(text: str) -> float:

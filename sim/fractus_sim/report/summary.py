@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from fractus_sim.report.page import clock, table
-from fractus_sim.report.record import Judgement, Record
+from fractus_sim.report.record import PICTURES, Judgement, Record, taken_s
 
 _ROLES = {
     "drone": "on the drone",
@@ -24,11 +24,12 @@ def summary(record: Record) -> str:
         f"# Flight of {record.application.name}\n\n{_headline(record)}",
         _figures(record),
         judged(record.judgements, _utc),
+        _pictures(record),
         _placements(record),
         _pods(record),
         _audit(record),
-        "Pictures: [map.png](map.png), [altitude.png](altitude.png). For other tools: [flight.geojson](flight.geojson),"
-        " [report.json](report.json), [plan.yaml](plan.yaml), [audit.jsonl](audit.jsonl).",
+        "Drawings: [map.png](map.png), [altitude.png](altitude.png). For other tools: [flight.geojson](flight.geojson),"
+        " [report.json](report.json), [plan.yaml](plan.yaml), [audit](audit).",
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -131,7 +132,20 @@ def judged(judgements: Sequence[Judgement], stamp: Callable[[float], str]) -> st
         for number, j in enumerate(judgements, 1)
     ]
     head = ("No", "At", "Component", "Asked", "Outcome", "Policies", "Reason")
-    return "## What policies did\n\n" + table(head, rows) + "\n\nNumbers are those of the pictures."
+    return "## What policies did\n\n" + table(head, rows) + "\n\nNumbers are those of the drawings."
+
+
+def _pictures(record: Record) -> str:
+    if not record.pictures:
+        return ""
+    shots = [(name, taken_s(name)) for name in record.pictures]
+    head = [f"{_utc(at_s)}, {_height_m(record, at_s):.0f} m above home" for _, at_s in shots]
+    row = [f"![from the drone]({PICTURES}/{name})" for name, _ in shots]
+    return "## What the drone's camera saw\n\n" + table(head, [row])
+
+
+def _height_m(record: Record, at_s: float) -> float:
+    return min(record.samples, key=lambda sample: abs(sample.time_s - at_s)).place.alt_m if record.samples else 0.0
 
 
 def _placements(record: Record) -> str:
@@ -165,7 +179,10 @@ def _audit(record: Record) -> str:
         return "## Audit log\n\nNone was collected."
     entries, problem = record.audit.get("entries", 0), record.audit.get("problem")
     verdict = f"**broken: {problem}**" if problem else "the chain is sound"
-    return f"## Audit log\n\n{entries} entries on the drone, {record.audit.get('kept', 0)} of this mission; {verdict}."
+    return (
+        f"## Audit log\n\n{entries} entries on the drone, {record.audit.get('kept', 0)} of this mission; {verdict}."
+        " To check it again: `fractus audit verify audit` in this folder."
+    )
 
 
 def _span(start: float | None, end: float | None) -> float | None:

@@ -29,6 +29,10 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = CLIENT_TIMEOUT_S
 
     def do_GET(self) -> None:
+        if self._deserted():
+            # A connection that breaks off in the middle of a request looks like its end; nobody waits for the picture.
+            self.close_connection = True
+            return
         parts = urlsplit(self.path)
         try:
             answer = self.server.studio.answer(parts.path, dict(parse_qsl(parts.query, max_num_fields=16)))
@@ -38,6 +42,18 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.BAD_REQUEST, Answer("text/plain; charset=utf-8", f"query: {error}\n".encode()))
         else:
             self._send(HTTPStatus.OK, answer)
+
+    def _deserted(self) -> bool:
+        """Whether nobody is at the other end any more."""
+        self.connection.settimeout(0.0)
+        try:
+            return not self.connection.recv(1, socket.MSG_PEEK)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+        finally:
+            self.connection.settimeout(self.timeout)
 
     def _send(self, status: HTTPStatus, answer: Answer) -> None:
         try:

@@ -63,7 +63,7 @@ async def test_a_whole_mission_with_a_correction_and_refusals(rig: Rig) -> None:
     assert (code, why.code) == (grpc.StatusCode.PERMISSION_DENIED, "InsideExclusionZone")
     assert why.action == Decision.ACTION_DENY
     assert list(why.policies) == ["no-fly"]
-    code, why = await denied(flown(driver.going(-80, 0)))
+    code, why = await denied(flown(driver.going(-80, -20)))
     assert why.code == "LegThroughExclusionZone"
     code, why = await denied(flown(driver.going(0, 150)))
     assert (code, why.code) == (grpc.StatusCode.PERMISSION_DENIED, "OutsideOperationArea")

@@ -91,7 +91,7 @@ async def test_asking_first_and_riding_along(rig: Rig) -> None:
     rig.write_grant(grant(altitude_limit(5, 15), fence("no-fly", "exclusion", "revoke", -60, -10, -40, 10)))
     rig.start_service()
     rig.start_vehicle()
-    await rig.until(lambda t: t.HasField("position"), 30)
+    await rig.until(lambda t: t.HasField("position") and t.HasField("home"), 30)
     async with Mobility(endpoint(rig)) as drone:
         high = await drone.can_i.takeoff(40)
         assert high

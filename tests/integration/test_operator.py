@@ -454,4 +454,4 @@ def test_a_passenger_that_goes_is_removed(world: World, operator: OperatorProces
     deployed(world, namespace, pods=3)
     world.put(traffic(namespace, "traffic", navigator(), store))
     wait_for(lambda: "deployments/traffic-aerial-viewer" not in world.children(namespace), "the passenger to go")
-    assert [g["spec"]["component"] for g in world.grants(namespace)] == ["Navigator"]
+    wait_for(lambda: [g["spec"]["component"] for g in world.grants(namespace)] == ["Navigator"], "its grant to go")

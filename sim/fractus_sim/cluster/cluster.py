@@ -47,7 +47,7 @@ from fractus_sim.cluster.spec import ClusterSpec, load_spec
 from fractus_sim.cluster.state import Memory, StateDirectory, only_cluster, state_of
 
 _LOCK_TIMEOUT_S = 300.0
-_API_TIMEOUT_S = 60.0
+_API_TIMEOUT_S = 120.0
 _READY_TIMEOUT_S = 90.0
 _DNS_TIMEOUT_S = 30.0
 _POLL_S = 0.1

@@ -263,6 +263,7 @@ class Fence:
     """Stands for the vehicle's own fence."""
 
     raised = False
+    missing = ""
     problem: Exception | None = None
 
     async def raise_around(self, spec: GrantSpec, *, retraces: bool) -> None:

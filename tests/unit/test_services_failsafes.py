@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from fractus_core.policy.values import Airframe
 from fractus_services.mobility.autopilot import SYSTEM_ID
-from fractus_services.mobility.failsafes import Checked, choose_return, configure
+from fractus_services.mobility.failsafes import Checked, choose_return, configure, learn_return
 
 SOUND = {
     "FS_GCS_ENABLE": 1.0, "FS_GCS_TIMEOUT": 5.0, "BATT_FS_LOW_ACT": 2.0, "BATT_FS_CRT_ACT": 1.0, "FS_EKF_ACTION": 1.0,
@@ -116,3 +116,31 @@ def test_a_velocity_ends_soon_without_another() -> None:
     assert vehicle.values["GUID_TIMEOUT"] == 1.0
     assert "GUID_TIMEOUT is 3" in configured(Parameters({"GUID_TIMEOUT": 3.0}, ("GUID_TIMEOUT",))).problem
     assert "GUID_TIMEOUT" in configured(Parameters({"SYSID_MYGCS": SYSTEM_ID})).missing
+
+
+def test_the_vehicles_own_fence_caps_its_way_home() -> None:
+    fence = {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 7.0, "FENCE_ALT_MAX": 40.0, "FENCE_MARGIN": 3.0}
+
+    def returns_at(**changes: float) -> float:
+        return configured(Parameters({"RTL_ALT": 5000.0, **fence, **changes})).airframe.return_altitude_m
+
+    assert returns_at() == 37.0
+    assert returns_at(RTL_ALT=2000.0) == 20.0
+    assert returns_at(FENCE_TYPE=6.0) == 50.0, "no ceiling"
+    assert returns_at(FENCE_ENABLE=0.0) == 50.0
+    assert returns_at(FENCE_ENABLE=0.0, FENCE_AUTOENABLE=1.0) == 37.0
+
+
+def test_a_fence_raised_later_caps_it_as_well() -> None:
+    async def learnt() -> None:
+        vehicle: Any = Parameters(RETRACING | {"RTL_ALT": 5000.0})
+        checked = await configure(vehicle)
+        assert checked.airframe.return_altitude_m == 50.0
+        vehicle.values |= {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 5.0, "FENCE_ALT_MAX": 35.0}
+        lower = await learn_return(vehicle, checked)
+        assert lower.airframe.return_altitude_m == 33.0
+        assert lower.airframe.retraces
+        vehicle.values["FENCE_ALT_MAX"] = math.nan
+        assert "FENCE_ALT_MAX is not a number" in (await learn_return(vehicle, checked)).problem
+
+    asyncio.run(learnt())

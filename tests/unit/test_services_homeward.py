@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import shapely
 from fractus_core.policy.values import GotoArgs
+from fractus_services.mobility.observer import Observer
 from fractus_services.mobility.vehicle import LAND, RTL, SMART_RTL
 from mobility_world import World, at, end, fly, spec, zone
 
@@ -144,5 +145,36 @@ def test_a_fence_is_not_lowered_under_who_arms(tmp_path: Path) -> None:
             world.fence.raise_around = slowly  # type: ignore[method-assign]
             await world.service.arm(held)
             assert world.fence.raised
+
+    fly(flight)
+
+
+def test_the_way_home_is_judged_below_the_fence_of_the_mission(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.drive(held)
+            world.plane.parameters |= {"RTL_ALT": 9000.0, "FENCE_ENABLE": 1.0, "FENCE_TYPE": 5.0, "FENCE_ALT_MAX": 65.0}
+            await world.service.arm(held)
+            assert world.guard.situation().airframe.return_altitude_m == 63.0
+
+    fly(flight)
+
+
+def test_failsafes_are_set_again_when_a_message_was_lost(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            control, plane = world.control, world.plane
+            held = world.grants.put(spec())
+            plane.parameters |= {"SYSID_MYGCS": 244.0}
+            lost = plane.parameters.pop("FS_GCS_ENABLE")
+            Observer(control).found()
+            await world.until(lambda: control.checked is not None)
+            assert control.checked is not None
+            assert "FS_GCS_ENABLE" in control.checked.problem
+            plane.parameters["FS_GCS_ENABLE"] = lost
+            await world.until(lambda: control.checked is not None and not control.checked.problem, 10)
+            await world.drive(held)
+            await world.service.arm(held)
 
     fly(flight)

@@ -9,7 +9,7 @@ from fractus_core.geo import LocalFrame
 from fractus_services.grants import Held
 from fractus_services.mobility.autopilot import AutopilotError, Permit
 from fractus_services.mobility.control import Control
-from fractus_services.mobility.failsafes import choose_return
+from fractus_services.mobility.failsafes import choose_return, learn_return
 from fractus_services.mobility.journal import Mission
 from fractus_services.mobility.motions import distance_m
 from fractus_services.mobility.vehicle import GUIDED
@@ -82,7 +82,7 @@ async def _start(control: Control, home: tuple[float, float, float], permit: Per
 
 
 async def _prepare_ways_home(control: Control, held: Held, home: tuple[float, float, float]) -> None:
-    """Choose how the autopilot comes home by itself, and raise its own fence around the mission.
+    """Choose how the autopilot comes home by itself, raise its own fence around the mission, and learn how high it returns.
 
     A vehicle remembers its path from where it was armed last: armed elsewhere than at home, it must not go back on it.
     """
@@ -98,6 +98,9 @@ async def _prepare_ways_home(control: Control, held: Held, home: tuple[float, fl
         said = str(error) or f"it takes longer than {FENCE_S:.0f} s"
         why = f"the vehicle's own fence cannot be raised around the operation area: {said}"
         raise precondition("FenceNotRaised", why) from error
+    if control.checked is not None and not control.backstop.missing:
+        control.checked = await learn_return(autopilot, control.checked)
+        _check(control)
 
 
 def _check(control: Control) -> None:

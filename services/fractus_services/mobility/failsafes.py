@@ -60,6 +60,13 @@ RANGE = Setting(("MAV_GCS_SYSID_HI",), 0, frozenset(float(n) for n in range(1, S
 """Releases that know the new name can take a whole range of systems for the companion."""
 
 
+Names = tuple[tuple[str, float], ...]
+"""A parameter's name, and older or newer spellings of it, each with what its values are multiplied by."""
+
+_RETURN_ALTITUDE: Names = (("RTL_ALT", 0.01), ("RTL_ALT_M", 1.0))
+_USUAL_FENCES, _USUAL_MARGIN_M, _CEILING = 7.0, 2.0, 1
+
+
 @dataclass(frozen=True, slots=True)
 class Checked:
     """What the autopilot will do by itself, and what it will not.
@@ -98,7 +105,7 @@ async def configure(autopilot: Autopilot) -> Checked:
     retraces, wrong = await _choose(autopilot, retrace=remembers)
     problems += wrong
     airframe, speed, unsound = await _airframe(autopilot)
-    problems.extend(f"{name} is not a number" for name in unsound)
+    problems.extend(_not_numbers(unsound))
     airframe = replace(airframe, retraces=retraces)
     checked = Checked("; ".join(problems), tuple(missing), airframe, speed, remembers)
     if checked.problem:
@@ -119,6 +126,18 @@ async def choose_return(autopilot: Autopilot, checked: Checked, *, retrace: bool
         return checked
     retraces, problems = await _choose(autopilot, retrace=retrace)
     return replace(checked, problem="; ".join(problems), airframe=replace(checked.airframe, retraces=retraces))
+
+
+async def learn_return(autopilot: Autopilot, checked: Checked) -> Checked:
+    """Learn at which altitude the autopilot flies home by itself, under the fence that it has by now.
+
+    Raises:
+        AutopilotError: the link broke.
+    """
+    unsound: list[str] = []
+    height_m = await _return_altitude_m(autopilot, unsound)
+    problem = "; ".join(filter(None, [checked.problem, *_not_numbers(unsound)]))
+    return replace(checked, problem=problem, airframe=replace(checked.airframe, return_altitude_m=height_m))
 
 
 async def _choose(autopilot: Autopilot, *, retrace: bool) -> tuple[bool, list[str]]:
@@ -151,22 +170,15 @@ async def _airframe(autopilot: Autopilot) -> tuple[Airframe, float, list[str]]:
     """How the vehicle moves, the speed of its legs, and the parameters that are not numbers."""
     unsound: list[str] = []
 
-    async def read(names: tuple[tuple[str, float], ...], default: float) -> float:
-        for name, scale in names:
-            value = await autopilot.read_parameter(name, attempts=2)
-            if value is not None and math.isfinite(value):
-                return value * scale
-            if value is not None:
-                unsound.append(name)
-                return default
-        return default
+    async def read(names: Names, default: float) -> float:
+        return await _read(autopilot, names, default, unsound)
 
     standard = Airframe()
     accel = await read((("WPNAV_ACCEL", 0.01), ("WP_ACC", 1.0)), standard.accel_mps2)
     gain = await read((("PSC_POSXY_P", 1.0), ("PSC_NE_POS_P", 1.0)), standard.position_gain)
     climb = await read((("WPNAV_ACCEL_Z", 0.01), ("WP_ACC_Z", 1.0)), standard.climb_accel_mps2)
     jerk = await read((("PSC_JERK_XY", 1.0), ("PSC_JERK_NE", 1.0)), standard.jerk_mps3)
-    height = await read((("RTL_ALT", 0.01), ("RTL_ALT_M", 1.0)), standard.return_altitude_m)
+    height = await _return_altitude_m(autopilot, unsound)
     speed = await read((("WPNAV_SPEED", 0.01), ("WP_SPD", 1.0)), 5.0)
     airframe = Airframe(
         accel_mps2=max(accel, 0.1),
@@ -176,3 +188,31 @@ async def _airframe(autopilot: Autopilot) -> tuple[Airframe, float, list[str]]:
         return_altitude_m=height,
     )
     return airframe, speed, unsound
+
+
+async def _read(autopilot: Autopilot, names: Names, default: float, unsound: list[str]) -> float:
+    for name, scale in names:
+        value = await autopilot.read_parameter(name, attempts=2)
+        if value is not None and math.isfinite(value):
+            return value * scale
+        if value is not None:
+            unsound.append(name)
+            return default
+    return default
+
+
+async def _return_altitude_m(autopilot: Autopilot, unsound: list[str]) -> float:
+    """How high the autopilot climbs to fly home: never above its own fence's ceiling, less the fence's margin."""
+
+    async def read(name: str, default: float) -> float:
+        return await _read(autopilot, ((name, 1.0),), default, unsound)
+
+    height_m = await _read(autopilot, _RETURN_ALTITUDE, Airframe().return_altitude_m, unsound)
+    fenced = await read("FENCE_ENABLE", 0.0) or await read("FENCE_AUTOENABLE", 0.0)
+    if not fenced or not int(await read("FENCE_TYPE", _USUAL_FENCES)) & _CEILING:
+        return height_m
+    return min(height_m, await read("FENCE_ALT_MAX", math.inf) - await read("FENCE_MARGIN", _USUAL_MARGIN_M))
+
+
+def _not_numbers(names: list[str]) -> list[str]:
+    return [f"{name} is not a number" for name in names]

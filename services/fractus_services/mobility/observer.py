@@ -13,7 +13,7 @@ from fractus_services.mobility.vehicle import GUIDED, HOMEWARD, LAND, MODE_NAMES
 
 log = logging.getLogger(__name__)
 
-RETRY_S = 0.5
+RETRY_S, MOST_RETRY_S = 0.5, 30.0
 
 SAID_S = 3.0
 """A mode change this soon after the autopilot spoke of a failsafe is the failsafe's."""
@@ -28,6 +28,7 @@ class Observer:
 
     def __init__(self, control: Control) -> None:
         self._control = control
+        self._preparing: asyncio.Task[None] | None = None
 
     def found(self) -> None:
         """The autopilot is there, for the first time or again."""
@@ -35,22 +36,31 @@ class Observer:
         self._control.decided = False
         self._resume()
         self._control.decided = True
-        self._control.tasks.spawn(self._prepare())
+        self._control.tasks.drop(self._preparing)
+        self._preparing = self._control.tasks.spawn(self._prepare())
 
     async def _prepare(self) -> None:
-        autopilot = self._control.autopilot
-        while autopilot.connected:
-            try:
-                await autopilot.set_rates(flying=autopilot.vehicle.armed)
-                self._control.checked = await configure(autopilot)
-                self._control.wake()
-                if autopilot.vehicle.home is None:
-                    await self._control.tasks.attempt(autopilot.ask_home())
-            except AutopilotError as error:
-                log.warning("cannot prepare the autopilot yet: %s", error)
-                await asyncio.sleep(RETRY_S)
+        """Set the failsafes; again, while nothing flies, as long as they are not verified: a message may have been lost."""
+        autopilot, again_s = self._control.autopilot, RETRY_S
+        while autopilot.found:
+            if autopilot.connected and self._unverified():
+                try:
+                    await autopilot.set_rates(flying=autopilot.vehicle.armed)
+                    self._control.checked = await configure(autopilot)
+                    self._control.wake()
+                    if autopilot.vehicle.home is None:
+                        await self._control.tasks.attempt(autopilot.ask_home())
+                except AutopilotError as error:
+                    log.warning("cannot prepare the autopilot yet: %s", error)
+                else:
+                    again_s = min(2 * again_s, MOST_RETRY_S)
             else:
-                return
+                again_s = RETRY_S
+            await asyncio.sleep(again_s)
+
+    def _unverified(self) -> bool:
+        checked, idle = self._control.checked, not self._control.autopilot.vehicle.armed
+        return checked is None or (bool(checked.problem) and idle and not self._control.helm.preparing)
 
     def _resume(self) -> None:
         """Decide who has a vehicle that was there before us, or comes back from a broken link."""

@@ -11,7 +11,7 @@ import shapely
 from fractus_core.policy.values import GotoArgs
 from fractus_services.mobility.observer import Observer
 from fractus_services.mobility.vehicle import LAND, RTL, SMART_RTL
-from mobility_world import World, at, end, fly, spec, zone
+from mobility_world import World, at, end, fly, partial, refusal, spec, touring, zone
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
 REPOSITION = 192
@@ -176,5 +176,27 @@ def test_failsafes_are_set_again_when_a_message_was_lost(tmp_path: Path) -> None
             await world.until(lambda: control.checked is not None and not control.checked.problem, 10)
             await world.drive(held)
             await world.service.arm(held)
+
+    fly(flight)
+
+
+@pytest.mark.parametrize("who", ["tour", "driver"])
+def test_a_fault_of_ours_ends_the_mission_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, who: str) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise ZeroDivisionError
+
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            monkeypatch.setattr("fractus_services.mobility.courses.searching", broken)
+            held = world.grants.put(touring(tour=((0.0, 60.0),)) if who == "tour" else partial())
+            if who == "driver":
+                why = await refusal(world.drive(held))
+                assert "has a fault" in str(why)
+            await world.until(lambda: held.key in world.journal.missions and world.journal.missions["m1"].outcome)
+            assert world.journal.missions["m1"].outcome.startswith("failed: the mobility service has a fault")
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert world.plane.commands.count(400) == 1, "not armed again"
+            await asyncio.sleep(20)
+            assert world.plane.commands.count(400) == 1
 
     fly(flight)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import AsyncIterator
 
 from fractus_core.api.applications import ControlPoint
@@ -11,6 +12,7 @@ from fractus_core.policy.compiled import height_m
 from fractus_core.policy.values import Call, GotoArgs, TakeoffArgs
 
 from fractus_services.mobility.arming import arm
+from fractus_services.mobility.autopilot import AutopilotError
 from fractus_services.mobility.control import Control
 from fractus_services.mobility.courses import Courses, Trip
 from fractus_services.mobility.guard import Guard
@@ -19,9 +21,12 @@ from fractus_services.mobility.leases import Lease
 from fractus_services.mobility.motions import climb
 from fractus_services.mobility.permits import transit_permit
 from fractus_services.mobility.vehicle import GUIDED
-from fractus_services.replies import precondition
+from fractus_services.replies import Refused, precondition
 
 CRUISE_M = 10.0
+FAULT = "the mobility service has a fault, see its log"
+
+log = logging.getLogger(__name__)
 
 
 def start_of(point: ControlPoint) -> Position:
@@ -69,8 +74,24 @@ class Chauffeur:
             yield "the system flies to the control point"
             async for _ in self._courses.fly(trip, target_of(start)):
                 pass
+        except (Refused, AutopilotError):
+            raise
+        except Exception as error:
+            log.exception("the drone cannot be brought to %s", lease.held.identity)
+            raise self._give_up(lease, mission) from error
         finally:
             control.relieve(regime)
+
+    def _give_up(self, lease: Lease, mission: Mission) -> Refused:
+        """End a mission that a fault of ours would end again and again, and bring the drone home."""
+        control = self._control
+        if control.lease is lease and control.hands == "system" and not mission.outcome:
+            mission.outcome = f"failed: {FAULT}"
+            control.note("returnToLaunch", "system", FAULT, "InternalError", kind="takeover")
+            control.journal.save_soon()
+            control.lose(FAULT)
+            control.start("returnToLaunch")
+        return precondition("ControlLost", FAULT)
 
     async def lift(self, trip: Trip, place: Position) -> AsyncIterator[str]:
         """Arm and take off, unless the drone is in the air, to the altitude of a place.

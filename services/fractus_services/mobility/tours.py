@@ -9,7 +9,7 @@ import grpc
 
 from fractus_services.grants import GrantFiles, Held
 from fractus_services.mobility.autopilot import AutopilotError
-from fractus_services.mobility.chauffeur import Chauffeur, target_of
+from fractus_services.mobility.chauffeur import FAULT, Chauffeur, target_of
 from fractus_services.mobility.control import Control
 from fractus_services.mobility.courses import Courses, Trip
 from fractus_services.mobility.journal import Mission
@@ -102,6 +102,10 @@ class Tours:
                 control.begin_grace(mission, str(error))
                 return
             self._end(mission, f"failed: {error}")
+        except Exception:
+            log.exception("the tour of %s cannot be flown", held.identity)
+            if not mission.outcome and control.hands == "system" and control.touring == held.key:
+                self._end(mission, f"failed: {FAULT}")
         finally:
             if control.touring == held.key:
                 control.touring = None

@@ -3,9 +3,13 @@
 import dataclasses
 
 import pytest
+import shapely
 from fractus_core.api import InvalidObject, Policy, Zone
 from fractus_core.api.policies import NodeExpression
+from fractus_core.geo import polygon
 from fractus_core.planning import flight_of, plan
+from fractus_core.planning.area import operation_area
+from fractus_core.policy import grants
 from fractus_core.policy.grants import compile_grants, matches, node_attributes, refresh
 from test_planning import FRAME, PATH, VIEWER, application, at, drone, edge, inventory, manifest, navigator
 
@@ -43,6 +47,44 @@ def test_driver_and_passenger_get_their_own_grants():
     assert driver.operation_area == passenger.operation_area != ()
     assert (
         driver.identity == "spiffe://fractus.dev/ns/default/app/traffic/component/Navigator/instance/traffic-navigator"
+    )
+
+
+def furrows(turns, apart_m=20.0, length_m=60.0):
+    return [at((i + 1) // 2 % 2 * length_m, i // 2 * apart_m, 10) for i in range(turns)]
+
+
+def test_a_path_with_many_turns_is_granted_within_a_centimetre():
+    (grant,) = compiled(components=[navigator(furrows(60))])
+    (area,) = grant.operation_area
+    assert len(area.polygon.exterior) > 1000
+    assert _off_the_plan_m(grant, furrows(60)) < 0.011
+
+
+def test_an_outline_with_more_points_than_a_ring_takes_is_rounded_further(monkeypatch):
+    monkeypatch.setattr(grants, "RING_POINTS", 150)
+    (grant,) = compiled(components=[navigator(furrows(12))])
+    (area,) = grant.operation_area
+    assert len(area.polygon.exterior) <= 150
+    assert 0.011 < _off_the_plan_m(grant, furrows(12)) < grants.COARSEST_M
+
+
+def test_a_path_with_too_many_meshes_is_refused_with_a_sentence(monkeypatch):
+    monkeypatch.setattr(grants, "HOLES", 0)
+    meshes = [at(0, 0, 10), at(60, 0, 10), at(60, 60, 10), at(0, 60, 10), at(0, 0, 10)]
+    with pytest.raises(
+        InvalidObject, match=r"^spec\.components: .* 1 holes, more than .*; give fewer waypoints, or a region"
+    ):
+        compiled(components=[navigator(meshes)])
+
+
+def _off_the_plan_m(grant, path):
+    spec = application(navigator(path)).spec
+    planned = operation_area(spec, inventory([drone("d")]).depots, 7.0)
+    granted = shapely.union_all([polygon(planned.frame, area) for area in grant.operation_area])
+    return max(
+        float(shapely.distance(shapely.points(shapely.get_coordinates(a)), b.boundary).max())
+        for a, b in ((granted, planned.shape), (planned.shape, granted))
     )
 
 

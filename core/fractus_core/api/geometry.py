@@ -41,7 +41,13 @@ class Circle(Model):
     radius: float = Field(gt=0, le=200_000, description="Metres, above 0.")
 
 
-Ring = Annotated[tuple[Point, ...], Field(min_length=3, max_length=1000)]
+RING_POINTS = 10_000
+"""Points of a ring at most: the outline of a path with a thousand turns has several a turn."""
+
+HOLES = 1000
+"""Holes of a polygon at most: a path that crosses itself leaves one in each of its meshes."""
+
+Ring = Annotated[tuple[Point, ...], Field(min_length=3, max_length=RING_POINTS)]
 
 
 class Polygon(Model):
@@ -51,7 +57,7 @@ class Polygon(Model):
     """
 
     exterior: Ring = Field(description="The outer ring, three points or more, in order, not closed.")
-    holes: tuple[Ring, ...] = Field(default=(), max_length=100, description="Rings cut out of the exterior.")
+    holes: tuple[Ring, ...] = Field(default=(), max_length=HOLES, description="Rings cut out of the exterior.")
 
 
 class Area(Model):

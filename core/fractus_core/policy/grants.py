@@ -6,9 +6,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import shapely
+from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api import Application, Component, Drone, EdgeNode, InvalidObject, Policy
-from fractus_core.api.geometry import Area, Circle, Point, Position
+from fractus_core.api.geometry import HOLES, RING_POINTS, Area, Circle, Point, Position
 from fractus_core.api.plans import (
     DeploymentPlanSpec,
     GrantApplication,
@@ -25,6 +26,9 @@ from fractus_core.planning.inventory import Inventory, Settings
 
 ROUNDING_M = 0.01
 """How far the outline of a granted area may be from the planned one: a third of the points do."""
+
+COARSEST_M = 0.16
+"""How far it may be where an outline has more points than a ring takes."""
 
 FIXED_NODE_REACH_M = 1000.0
 """Zones further than this from a fixed node do not concern it."""
@@ -112,7 +116,7 @@ def _drone_grant(
     home = drone.spec.home
     base = ground(home) if home is not None else depot.spec.location if depot is not None else area.start
     stand = Area(circle=Circle(center=base, radius=depot.spec.radius if depot is not None else 30.0))
-    shape = area.shape.simplify(ROUNDING_M)
+    shape = _outlined(area.shape)
     way = shapely.union(shape, polygon(area.frame, stand)).convex_hull
     return GrantSpec(
         node=drone.name,
@@ -124,6 +128,28 @@ def _drone_grant(
         depot=depot.spec.location if depot is not None else None,
         home=home,
         limits=GrantedLimits(max_altitude=mobility.max_altitude, max_speed=mobility.max_speed) if mobility else None,
+    )
+
+
+def _outlined(shape: BaseGeometry) -> BaseGeometry:
+    """The shape with as many points and holes as an Area takes, its outline moved no further than that needs.
+
+    Raises:
+        InvalidObject: it has too many even so.
+    """
+    tolerance_m = ROUNDING_M
+    while tolerance_m <= COARSEST_M:
+        rounded = shape.simplify(tolerance_m)
+        rings = shapely.get_rings(shapely.get_parts(rounded))
+        points = int(shapely.get_num_coordinates(rings).max(initial=0)) - 1
+        holes = int(shapely.get_num_interior_rings(shapely.get_parts(rounded)).max(initial=0))
+        if points <= RING_POINTS and holes <= HOLES:
+            return rounded
+        tolerance_m *= 2
+    raise InvalidObject(
+        "spec.components",
+        f"the area that the drone flies in has {points} corners and {holes} holes, more than {RING_POINTS} and {HOLES};"
+        " give fewer waypoints, or a region instead of a path",
     )
 
 

@@ -47,7 +47,11 @@ def test_two_runs_of_one_seed_leave_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_what_is_left_can_be_read_by_others(tmp_path: Path) -> None:
-    outcome = run(parse(content(faults=[GUST], checks=[{"check": "landed"}])), tmp_path)
+    slow = {"name": "d", "home": HOME, "readyAfter": 2, "task": [TASK[0], {"do": "speed", "speed": 2.5}, *TASK[1:]]}
+    checks = [{"check": "landed"}, {"check": "reached", "north": 15, "east": 0}]
+    outcome = run(parse(content(vehicles=[slow], faults=[GUST], checks=checks)), tmp_path)
+    leg = [s.speed_mps for s in outcome.flights["d"].track.samples if s.mode == "GUIDED"]
+    assert max(leg) < 4.0, "the leg is flown at the speed that was set before it began"
     log = mavutil.mavlink_connection(str(tmp_path / "logs" / "d.tlog"))
     seen: set[tuple[str, int]] = set()
     while (message := log.recv_match()) is not None:
@@ -67,7 +71,8 @@ def test_what_is_left_can_be_read_by_others(tmp_path: Path) -> None:
     assert (tmp_path / "map.png").read_bytes().startswith(PNG)
     assert (tmp_path / "profile.png").read_bytes().startswith(PNG)
     page = (tmp_path / "summary.md").read_text()
-    assert "All 1 checks hold" in page
+    assert "All 2 checks hold" in page
+    assert "| holds | reached: north 15, east 0, tolerance 3 |" in page
     assert "gust 7 m/s from 270°" in page
     (fault,) = outcome.occurrences
     assert fault.end_s is not None

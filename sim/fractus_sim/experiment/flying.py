@@ -46,15 +46,17 @@ def fly(station: Station, steps: Sequence[Step], tell: Callable[[str], None]) ->
     Raises:
         TaskFailed: a step was refused, or the autopilot changed its mode by itself.
     """
+    speed_mps: float | None = None
     for step in steps:
         tell(step.title)
         match step:
             case Takeoff():
                 yield from _take_off(station, step.alt)
             case Goto():
-                yield from _go(station, step)
+                yield from _go(station, step, speed_mps)
             case Speed():
-                yield from _command(station, Command.DO_CHANGE_SPEED, 1, step.speed, -1)
+                speed_mps = step.speed
+                yield from _command(station, Command.DO_CHANGE_SPEED, 1, speed_mps, -1)
             case Hold():
                 yield from _hold(station, step.seconds)
             case SetMode():
@@ -117,7 +119,7 @@ def _take_off(station: Station, altitude_m: float) -> Flight:
         yield
 
 
-def _go(station: Station, step: Goto) -> Flight:
+def _go(station: Station, step: Goto, speed_mps: float | None) -> Flight:
     target = _point(station, step)
     lat, lon = target.lat_e7, target.lon_e7
     remind_s = station.now_s
@@ -127,6 +129,8 @@ def _go(station: Station, step: Goto) -> Flight:
             where = {"lat_int": lat, "lon_int": lon, "alt": step.alt}
             frame = {"coordinate_frame": RELATIVE_FRAME, "type_mask": POSITION_ONLY}
             station.tell("SET_POSITION_TARGET_GLOBAL_INT", {**where, **frame})
+            if speed_mps is not None:  # the first leg begins with the parameters' speed, whatever was set before
+                station.command(Command.DO_CHANGE_SPEED, 1, speed_mps, -1)
         yield
         _expect(station, Mode.GUIDED)
         here = earth.Place.from_degrees(station.state.lat, station.state.lon, 0.0)

@@ -59,6 +59,9 @@ class Verdict:
     found: str
 
 
+_TOLD_AS_ZERO = ("north", "east", "alt", "exitCode")
+
+
 def judge(check: kinds.Check, evidence: Evidence) -> tuple[Verdict, ...]:
     """Judge one check: a verdict for each vehicle concerned, or one."""
     if isinstance(check, kinds.VehicleCheck) and not isinstance(check, kinds.Separation):
@@ -76,12 +79,14 @@ def title(check: kinds.Check) -> str:
     said = check.to_dict()
     kind = said.pop("check")
     said.pop("vehicles", None)
-    words = ", ".join(
-        f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}"
-        for name, value in said.items()
-        if value not in (False, 0.0) or name == "exitCode"
-    )
+    words = ", ".join(_word(name, value) for name, value in said.items() if value or name in _TOLD_AS_ZERO)
     return f"{kind}: {words}" if words else kind
+
+
+def _word(name: str, value: object) -> str:
+    if value is True:
+        return name
+    return f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}"
 
 
 def _landed(check: kinds.Landed, flight: Flight, evidence: Evidence) -> tuple[bool, str]:

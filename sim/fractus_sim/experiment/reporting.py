@@ -211,6 +211,8 @@ def _headline(outcome: Outcome) -> str:
         word = f"**Not played to its end: {outcome.problem}.**"
     elif not outcome.verdicts:
         word = "**Played to its end.** It has no checks."
+    elif len(outcome.verdicts) == 1:
+        word = "**The check failed.**" if failed else "**The check holds.**"
     elif failed:
         word = f"**{len(failed)} of {len(outcome.verdicts)} checks failed.**"
     else:
@@ -249,7 +251,7 @@ def _vehicle(track: Track, outcome: Outcome) -> dict[str, Any]:
 def _flights(outcome: Outcome) -> str:
     rows = []
     for track in _by_name(outcome).values():
-        battery = f"{track.samples[-1].battery:.0%}" if track.samples else "-"
+        battery = f"{100 * track.samples[-1].battery:.0f} %" if track.samples else "-"
         rows.append(
             (
                 track.name, clock(track.takeoff_s), clock(track.landing_s), f"{track.distance_m:.0f} m",

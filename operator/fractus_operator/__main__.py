@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import os
 import secrets
@@ -61,7 +62,7 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         handlers.configure(kopf_settings)
         background: list[Coroutine[Any, Any, None]] = [r.run() for r in live.reflectors()]
         background += [worklist.run() for worklist in lists]
-        background.append(_outlasting(keeping))
+        background += [_outlasting(keeping), _settled(live)]
         main = kopf.operator(
             registry=registry,
             settings=kopf_settings,
@@ -84,6 +85,16 @@ async def _acting(lease: Lease, keeping: asyncio.Task[None]) -> None:
     held.cancel()
     if keeping in done:
         keeping.result()
+
+
+async def _settled(live: LiveInventory) -> None:
+    """Keep the garbage collector off what is known of thousands of nodes: looking through it takes 0.1 s each time.
+
+    What goes of it is freed nonetheless, as nothing refers to it any more.
+    """
+    await live.synced()
+    gc.freeze()
+    await asyncio.Event().wait()
 
 
 async def _outlasting(keeping: asyncio.Task[None]) -> None:

@@ -20,7 +20,7 @@ from fractus_operator.store import NotFound, Store
 
 logger = logging.getLogger(__name__)
 
-_PARALLEL = 8
+_PARALLEL = 4
 
 
 class NameTaken(Exception):
@@ -37,10 +37,15 @@ class Children:
         self._parallel = asyncio.Semaphore(_PARALLEL)
         self._normalised: dict[tuple[Kind, Key], tuple[object, ...] | None] = {}
 
-    async def look_around(self, namespace: str) -> Mapping[Kind, set[str]]:
-        """Names of all that is in a namespace of the kinds that are made there: one look instead of one an object."""
-        made_there = [kind for kind in kinds.CHILDREN if kind.namespaced]
-        found = await asyncio.gather(*(self._store.names(kind, namespace) for kind in made_there))
+    async def look_around(self, key: Key) -> Mapping[Kind, set[str]] | None:
+        """Names of all that is in the namespace of a new application, of the kinds that are made there.
+
+        One look instead of one an object; None for an application that has children already.
+        """
+        if self._live.children_of(key, kinds.DEPLOYMENT):
+            return None
+        made_there = [kind for kind in kinds.CHILDREN if kind.namespaced and kind is not kinds.DEPLOYMENT_PLAN]
+        found = await asyncio.gather(*(self._store.names(kind, key[0]) for kind in made_there))
         return dict(zip(made_there, found, strict=True))
 
     async def observed(self, kind: Kind, key: Key, taken: Mapping[Kind, set[str]] | None = None) -> Body | None:

@@ -46,13 +46,9 @@ RESYNC_S = 30.0
 _REFUSALS = frozenset({400, 403, 422})
 """HTTP statuses by which the API server says that it does not want an object: the user should know."""
 
-_WAVES = (
-    (kinds.DEPLOYMENT_PLAN,),
-    (kinds.GRANT,),
-    (kinds.SECRET, kinds.SERVICE, kinds.ENDPOINT_SLICE),
-    (kinds.DEPLOYMENT,),
-)
-"""What is applied together, one after the other: what an object in the way of another must not stop comes first."""
+_ORDER = (kinds.DEPLOYMENT, kinds.SECRET, kinds.SERVICE, kinds.ENDPOINT_SLICE, kinds.GRANT)
+"""What is applied once the plan is: at once, so that an object in the way of one stops no other, and begun in this order,
+because scheduling takes longest. A pod waits for its Secret, and can call nothing without its Grant."""
 
 _OPTIONAL = frozenset({"NodeCordoned", "NodesAppeared"})
 """Reasons for a new plan that can do without: what runs goes on where there is no other."""
@@ -359,13 +355,15 @@ class Deployments:
             wanted[kinds.DEPLOYMENT].append(builders.deployment(application, placed, drone))
         secrets = {builders.secret_name(placed.instance): placed for placed in decided.placements}
         await self._children.prune(application, wanted, keep_secrets=secrets.keys())
-        new = not self._live.children_of(application.key, kinds.DEPLOYMENT)
-        taken = await self._children.look_around(application.key[0]) if new else None
+        # The plan before any grant: it tells, also after a crash, who flies the drone and who comes along.
+        plan_first = {kinds.DEPLOYMENT_PLAN: wanted.pop(kinds.DEPLOYMENT_PLAN)}
+        _, taken = await asyncio.gather(
+            self._children.apply(application, plan_first), self._children.look_around(application.key)
+        )
         for placed in secrets.values():
             wanted[kinds.SECRET].append(await self._certificate(application, placed, taken))
         wanted[kinds.DEPLOYMENT] = [body for body in wanted[kinds.DEPLOYMENT] if not self._in_the_air(body, decided)]
-        for wave in _WAVES:
-            await self._children.apply(application, {kind: wanted[kind] for kind in wave}, taken)
+        await self._children.apply(application, {kind: wanted[kind] for kind in _ORDER}, taken)
 
     def _in_the_air(self, desired: Body, decided: DeploymentPlanSpec) -> bool:
         """Whether a Deployment is left alone: its drone flies, and its owner has asked for no change.

@@ -19,7 +19,7 @@ from fractus_operator.store import StoreError
 
 logger = logging.getLogger(__name__)
 
-_SHORTEST_S, _LONGEST_S = 0.02, 1.0
+_LONGEST_S = 1.0
 _REST = 2.0
 """After a reconcile the next one waits this many times as long as that took: where many are busy, each looks less often."""
 
@@ -88,7 +88,7 @@ async def follow(live: LiveInventory, deployments: Deployments, key: Key, stoppe
             took_s = loop.time() - began
             if await inputs.changed(again_s):
                 # Changes come in bursts, such as the pods of a plan: one reconcile for all.
-                await asyncio.sleep(min(max(_SHORTEST_S, _REST * took_s), _LONGEST_S))
+                await asyncio.sleep(min(_REST * took_s, _LONGEST_S))
 
 
 def configure(settings: kopf.OperatorSettings) -> None:

@@ -97,6 +97,7 @@ class LiveInventory:
         self._decided: dict[Key, OwnedPlan] = {}
         self._plans: dict[Key, OwnedPlan] = {}
         self._grants: dict[Key, Grant] = {}
+        self._areas = Makes(parts=64)
         self._last_claims: dict[str, Claim] = {}
         self._aloft: set[str] = set()
         self._bookings = Bookings()
@@ -352,7 +353,7 @@ class LiveInventory:
             self.wake((key[0] or labels.get(NAMESPACE_LABEL, ""), labels[APPLICATION_LABEL]))
 
     def _grant_changed(self, key: Key, new: Body | None) -> None:
-        grant = reader(Grant)(new) if new is not None else None
+        grant = self._areas.grant(new) if new is not None else None
         if grant is None:
             self._grants.pop(key, None)
             self.wake_all()
@@ -430,7 +431,7 @@ def _place(key: Key) -> Key:
 def _without_status(body: Body) -> Body:
     """A Deployment without what changes all the time while its pods come up."""
     kept = {name: value for name, value in body.items() if name != "status"}
-    kept["metadata"] = {n: v for n, v in body["metadata"].items() if n not in {"managedFields", "resourceVersion"}}
+    kept["metadata"] = {n: v for n, v in body["metadata"].items() if n != "resourceVersion"}
     annotations = dict(kept["metadata"].get("annotations") or {})
     annotations.pop("deployment.kubernetes.io/revision", None)
     kept["metadata"]["annotations"] = annotations
@@ -438,5 +439,4 @@ def _without_status(body: Body) -> Body:
 
 
 def _as_is(body: Body) -> Body:
-    body["metadata"].pop("managedFields", None)
     return body

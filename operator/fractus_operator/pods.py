@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import sys
+import types
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -132,8 +135,14 @@ def read_host(body: Body) -> Host:
     ready = any(c["type"] == "Ready" and c["status"] == "True" for c in status.get("conditions") or ())
     return Host(
         name=metadata["name"],
-        labels=dict(metadata.get("labels") or {}),
-        allocatable={name: amount_of(q) for name, q in (status.get("allocatable") or {}).items()},
+        labels={sys.intern(name): value for name, value in (metadata.get("labels") or {}).items()},
+        allocatable=_allocatable(tuple((status.get("allocatable") or {}).items())),
         ready=ready,
         schedulable=not spec.get("unschedulable", False),
     )
+
+
+@functools.lru_cache(maxsize=256)
+def _allocatable(quantities: tuple[tuple[str, str], ...]) -> Mapping[str, float]:
+    """What a node offers, in base units: one mapping for all nodes of a make."""
+    return types.MappingProxyType({name: amount_of(quantity) for name, quantity in quantities})

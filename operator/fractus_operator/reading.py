@@ -7,7 +7,7 @@ from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from fractus_core.api import Application, Condition, Drone, EdgeNode, InvalidObject, Metadata, Resource
+from fractus_core.api import Application, Condition, Drone, EdgeNode, Grant, InvalidObject, Metadata, Resource
 from pydantic import ValidationError
 
 from fractus_operator.kinds import Body
@@ -19,7 +19,6 @@ N = TypeVar("N", Drone, EdgeNode)
 P = TypeVar("P", bound=Hashable)
 
 _MAKES = 10_000
-"""Parts that are remembered to be shared."""
 
 SETTLED = frozenset({"Completed", "Failed"})
 """Phases of an application whose mission is over."""
@@ -93,16 +92,16 @@ def read(model: type[R], body: Body) -> R:
         InvalidObject: it cannot be parsed, for whatever reason.
     """
     try:
-        return model.from_body(body)
-    except InvalidObject:
-        raise
+        # As it is: what was decoded from JSON needs no conversion, and large parts are shared with it.
+        return model.model_validate(body)
+    except ValidationError as error:
+        raise InvalidObject.from_pydantic(error) from None
     except Exception as error:
         raise InvalidObject("", f"the object cannot be read: {type(error).__name__}: {error}") from error
 
 
 def read_submitted(body: Body) -> Submitted:
     """Parse an Application, keeping what cannot be parsed with the reason."""
-    body["metadata"].pop("managedFields", None)
     try:
         return Submitted(body, read(Application, body), None)
     except InvalidObject as error:
@@ -123,10 +122,15 @@ def reader(model: type[R]) -> Callable[[Body], R | None]:
 
 
 class Makes:
-    """What nodes of one make have in common: thousands of them share one description of their services."""
+    """What objects of one make have in common, such as the services of thousands of nodes, or the areas of grants.
 
-    def __init__(self) -> None:
+    Args:
+        parts: How many parts are remembered to be shared.
+    """
+
+    def __init__(self, parts: int = _MAKES) -> None:
         self._known: dict[Hashable, Any] = {}
+        self._parts = parts
 
     def sharing(self, parse: Callable[[Body], N | None]) -> Callable[[Body], N | None]:
         """A parser whose results share equal parts."""
@@ -142,8 +146,17 @@ class Makes:
 
         return shared
 
+    def grant(self, body: Body) -> Grant | None:
+        """Parse a Grant so that it shares equal areas, which have many points, with others."""
+        grant = reader(Grant)(body)
+        if grant is None:
+            return None
+        spec = grant.spec
+        parts = {"operation_area": self._one(spec.operation_area), "corridor": self._one(spec.corridor)}
+        return grant.model_copy(update={"spec": spec.model_copy(update=parts)})
+
     def _one(self, part: P) -> P:
-        if len(self._known) >= _MAKES:
+        if len(self._known) >= self._parts:
             self._known.clear()
         found: P = self._known.setdefault(part, part)
         return found
@@ -156,7 +169,6 @@ def keeping_broken(model: type[R]) -> Callable[[Body], R | Broken]:
         try:
             return read(model, body)
         except InvalidObject as error:
-            body["metadata"].pop("managedFields", None)
             return Broken(body, str(error))
 
     return parse

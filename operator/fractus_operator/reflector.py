@@ -141,7 +141,8 @@ class Reflector(Generic[T]):
 
     def _take(self, type_: str, body: Body) -> None:
         key = key_of(body)
-        if _version(body) < self._noted.get(key, 0):
+        version, noted = _version(body), self._noted.get(key, 0)
+        if version < noted or (noted and version == noted and type_ != "DELETED"):
             return
         self._noted.pop(key, None)
         if type_ == "DELETED":
@@ -173,7 +174,8 @@ class Reflector(Generic[T]):
             logger.exception("a change of %s %s was not followed", self.kind.name, "/".join(filter(None, key)))
 
     def _typed(self, item: Body) -> Body:
-        """Items of a list come without their kind; give it to them."""
+        """Items of a list come without their kind: give it to them. Who manages which field, half of an object, goes."""
+        item["metadata"].pop("managedFields", None)
         item.setdefault("apiVersion", self.kind.api_version)
         item.setdefault("kind", self.kind.name)
         return item

@@ -152,8 +152,7 @@ def test_new_nodes_make_a_plan_grow(world: World, operator: OperatorProcess, nam
     wait_for(lambda: "traffic-ground-viewer-edge-9" in instances(world, namespace, ""), "the new node")
     after = {n: b["metadata"]["uid"] for n, b in world.children(namespace).items()}
     assert before.items() <= after.items()
-    world.run_pods(namespace)
-    assert world.phase(namespace, "Running")["pods"] == "2/2"
+    assert deployed(world, namespace, pods=2)["pods"] == "2/2"
 
 
 # -- releases --

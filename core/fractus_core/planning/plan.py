@@ -24,6 +24,10 @@ from fractus_core.planning.inventory import Inventory, Settings
 __all__ = ["Infeasible", "instance_name", "plan", "plan_in_steps"]
 
 
+_ROUNDING_M = 0.01
+"""How far from the area its outline in a plan may be: it is written to the centimetre anyway."""
+
+
 def plan(
     application: Application,
     inventory: Inventory,
@@ -99,7 +103,7 @@ def _drafted(draft: Draft) -> Generator[str, None, DeploymentPlanSpec]:
     decided = DeploymentPlanSpec(
         application=application.name,
         application_generation=application.metadata.generation,
-        operation_area=geojson(area.frame, area.shape) if area is not None else None,
+        operation_area=geojson(area.frame, area.shape.simplify(_ROUNDING_M)) if area is not None else None,
         drone=choice,
         placements=tuple(draft.placements),
         rejected=rejected,

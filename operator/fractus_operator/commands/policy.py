@@ -9,10 +9,10 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 import click
-from fractus_core.api import Application, Drone
+from fractus_core.api import Application, Drone, Policy, Resource
 from fractus_core.api.methods import METHODS_OF, Method
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.plans import GrantApplication, GrantedLimits, GrantSpec
@@ -38,6 +38,8 @@ from fractus_core.policy.values import (
 
 from fractus_operator.commands.manifests import BadManifest, Manifests, read_manifests
 from fractus_operator.commands.plan import plan_all
+
+R = TypeVar("R", bound=Resource)
 
 IN_AIR_M = 0.5
 METHODS: tuple[str, ...] = get_args(Method)
@@ -78,10 +80,21 @@ class Figures(click.ParamType):  # type: ignore[type-arg]
             found = ()
         if len(found) != len(self._names) or not all(math.isfinite(figure) for figure in found):
             self.fail(f"{value!r} is not {','.join(self._names)}: {len(self._names)} numbers with commas", param, ctx)
-        for name, figure, most in zip(self._names, found, (90.0, 180.0, math.inf), strict=True):
-            if name in {"lat", "lon"} and abs(figure) > most:
-                self.fail(f"{name} must be -{most:g} to {most:g} degrees, not {figure:g}", param, ctx)
+        for name, figure in zip(self._names, found, strict=True):
+            lower, upper, unit = _BOUNDS[name]
+            if not lower <= figure <= upper:
+                self.fail(f"{name} must be {lower:g} to {upper:g} {unit}, not {figure:g}", param, ctx)
         return found
+
+
+_BOUNDS: dict[str, tuple[float, float, str]] = {
+    "lat": (-90.0, 90.0, "degrees"),
+    "lon": (-180.0, 180.0, "degrees"),
+    "alt": (-1000.0, 20_000.0, "m"),
+    "n": (-100.0, 100.0, "m/s"),
+    "e": (-100.0, 100.0, "m/s"),
+    "d": (-100.0, 100.0, "m/s"),
+}
 
 
 class Time(click.ParamType):  # type: ignore[type-arg]
@@ -174,7 +187,9 @@ def _question(paths: Sequence[pathlib.Path], drone_file: pathlib.Path, asked: Ma
         raise BadManifest("give --application and --component together, or neither")
     files = {path.resolve(): path for path in (*paths, drone_file, application) if path is not None}.values()
     manifests = read_manifests(_apart(list(files)))
-    drone = _drone(drone_file)
+    if not manifests.of(Policy):
+        click.echo("note: --policies has no Policy, so nothing but the drone's own limits is judged", err=True)
+    drone = _drone(manifests, drone_file)
     grant = _anything(manifests, drone) if application is None else _granted(manifests, drone, application, component)
     return Question(call, _situation(drone, asked), grant)
 
@@ -185,12 +200,22 @@ def _apart(paths: list[pathlib.Path]) -> list[pathlib.Path]:
     return [p for p in paths if not any(d in p.resolve().parents for d in directories)]
 
 
-def _drone(file: pathlib.Path) -> Drone:
-    drones = read_manifests([file]).of(Drone)
+def _from(manifests: Manifests, path: pathlib.Path, kind: type[R]) -> list[R]:
+    """The objects of a kind that were read from a file, or from below a directory."""
+    inside = path.resolve()
+    return [
+        found.resource
+        for found in manifests.found.values()
+        if isinstance(found.resource, kind) and pathlib.Path(found.origin).resolve().is_relative_to(inside)
+    ]
+
+
+def _drone(manifests: Manifests, file: pathlib.Path) -> Drone:
+    drones = _from(manifests, file, Drone)
     if len(drones) != 1:
-        names = ", ".join(sorted(drones)) or "none"
+        names = ", ".join(sorted(drone.name for drone in drones)) or "none"
         raise BadManifest(f"{file}: --drone takes a manifest of one Drone, not of {len(drones)} ({names})")
-    return next(iter(drones.values()))
+    return drones[0]
 
 
 def _granted(manifests: Manifests, drone: Drone, file: pathlib.Path, component: str) -> GrantSpec:
@@ -199,15 +224,14 @@ def _granted(manifests: Manifests, drone: Drone, file: pathlib.Path, component: 
     Raises:
         BadManifest: there is no such component, or no plan puts it on the drone.
     """
-    applications = read_manifests([file]).applications()
+    applications = _from(manifests, file, Application)
     if len(applications) != 1:
         raise BadManifest(f"{file}: --application takes a manifest of one Application, not of {len(applications)}")
     application = applications[0]
     # Nobody else is to be planned, and on no other drone.
-    dropped = {Application.KIND: application.name, Drone.KIND: drone.name}
-    for kind, namespace, name in list(manifests.found):
-        if kind in dropped and name != dropped[kind]:
-            del manifests.found[kind, namespace, name]
+    for key, found in list(manifests.found.items()):
+        if isinstance(found.resource, Application | Drone) and found.resource not in (application, drone):
+            del manifests.found[key]
     known = [c.name for c in application.spec.components]
     if component not in known:
         raise BadManifest(f"Application {application.name} has no component {component} (it has {', '.join(known)})")
@@ -289,9 +313,11 @@ def _call(method: str, text: str) -> Call:
     if method not in METHODS:
         raise BadManifest(f"--method: there is no method {method} (there are {', '.join(sorted(METHODS))})")
     try:
-        given = json.loads(text)
+        given = json.loads(text, parse_int=float)  # an integer of any length is a number out of range
     except json.JSONDecodeError as error:
         raise BadManifest(f"--args: this is no JSON: {error.msg} at character {error.pos + 1}") from None
+    except RecursionError:
+        raise BadManifest("--args: this JSON is nested too deeply; give an object of numbers") from None
     if not isinstance(given, dict):
         raise BadManifest('--args: give a JSON object, such as {"lat": 39.36, "lon": 22.95, "alt": 10}')
     takes = _TAKES.get(method)
@@ -307,11 +333,14 @@ def _call(method: str, text: str) -> Call:
         field = spelled.get(name)
         if field is None:
             raise BadManifest(f"--args: {method} has no {name} (it takes {', '.join(f.name for f in fields(takes))})")
-        found[field] = _value(name, field, value)
+        if field in found:
+            raise BadManifest(f"--args: {name} is there twice under two names; give it once")
+        if value is not None:
+            found[field] = _value(name, field, value)
     missing = sorted(_NEEDED.get(method, frozenset()) - set(found))
     if missing:
         raise BadManifest(f"--args: {method} needs {' and '.join(missing)}")
-    args: Args = takes(**{name: value for name, value in found.items() if value is not None})
+    args: Args = takes(**found)
     return Call(method, args)
 
 
@@ -322,16 +351,16 @@ def _plain(name: str) -> str:
 
 def _value(name: str, field: str, value: Any) -> Any:
     if field == "reference":
-        if value not in {"home", "amsl", "terrain"}:
+        if value not in ("home", "amsl", "terrain"):
             raise BadManifest(f"--args: {name} must be home, amsl or terrain, not {value!r}")
         return value
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int | float):
+    if not isinstance(value, float):
         raise BadManifest(f"--args: {name} must be a number, not {value!r}")
-    if field in {"width", "height"} and value != int(value):
+    if field not in {"width", "height"}:
+        return value
+    if not value.is_integer():
         raise BadManifest(f"--args: {name} must be a whole number of pixels, not {value!r}")
-    return int(value) if field in {"width", "height"} else float(value)
+    return int(value)
 
 
 # -- output --

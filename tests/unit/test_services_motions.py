@@ -175,6 +175,24 @@ def test_a_speed_that_is_corrected_holds_when_the_leg_is_sent_again(tmp_path: Pa
             await world.until(lambda: world.plane.xy[1] > stayed)
             assert world.plane.velocity[1] == pytest.approx(3.0, abs=0.2)
             await flying
+            held = world.grants.put(spec())
+            assert await fastest(world, world.service.goto(held, goto(0, 90), 0)) > 6, "where nothing limits it"
+
+    fly(flight)
+
+
+def test_the_next_driver_does_not_inherit_a_speed(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            await world.service.set_speed(held, SetSpeedArgs(2.0))
+            assert world.guard.situation().speed_setpoint_mps == 2.0
+            await world.control.give_back(held)
+            await world.until(lambda: not world.plane.vehicle.armed)
+            held = world.grants.put(spec(), "m2")
+            await world.up(held)
+            assert await fastest(world, world.service.goto(held, goto(0, 60), 0)) > 6
 
     fly(flight)
 

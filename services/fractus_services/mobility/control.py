@@ -166,6 +166,8 @@ class Control:
     def adopt(self, mission: Mission) -> None:
         """The drone flies for this mission."""
         self._removed = None
+        if self.journal.active != mission.key:
+            self.speed_mps = None
         self.journal.active = mission.key
         self.journal.save_soon()
 

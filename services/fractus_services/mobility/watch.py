@@ -139,9 +139,11 @@ class Watch:
         return check
 
     async def _slow_down(self, speed_mps: float) -> None:
-        control = self._control
-        control.cruise(speed_mps)
-        await control.autopilot.set_speed(speed_mps, self._permit(control.motion))
+        """Fly the present leg slower; the next one is judged anew."""
+        motion = self._control.motion
+        if motion is not None and motion.speed_mps is not None:
+            motion.speed_mps = speed_mps
+        await self._control.autopilot.set_speed(speed_mps, self._permit(motion))
 
     async def _lead_back(self, verdict: Verdict, place: GotoArgs) -> None:
         """Fly to where the limits hold, as a motion that follows the one that left them."""

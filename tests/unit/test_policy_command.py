@@ -120,6 +120,14 @@ def test_text() -> None:
         (("--method", "Land", "--at", "1,2"), "3 numbers"),
         (("--method", "Land", "--at", "nan,2,3"), "3 numbers"),
         (("--method", "Land", "--at", "91,2,3"), "lat must be"),
+        (("--method", "Land", "--at", "1,2,1e300"), "alt must be"),
+        (("--method", "Land", "--at", HERE, "--velocity", "1e300,0,0"), "n must be"),
+        (("--method", "Goto", "--args", '{"lat": null, "lon": 1}', "--at", HERE), "Goto needs lat"),
+        (("--method", "Goto", "--args", '{"lat": true, "lon": 1}', "--at", HERE), "lat must be a number"),
+        (("--method", "Goto", "--args", '{"lat": 1, "lon": 1, "alt": 1, "altitude": 2}', "--at", HERE), "twice"),
+        (("--method", "Goto", "--args", '{"lat": 1, "lon": 1, "reference": []}', "--at", HERE), "reference must be"),
+        (("--method", "Goto", "--args", "[" * 100_000, "--at", HERE), "nested too deeply"),
+        (("--method", "CaptureImage", "--args", '{"width": NaN}', "--at", HERE), "whole number"),
         (("--method", "Land", "--at", HERE, "--time", "2026-01-01T00:00:00"), "no time with its zone"),
         (("--method", "Land", "--at", HERE, "--component", "Navigator"), "together"),
         (("--method", "Land", "--at", HERE, "--application", DRONE, "--component", "X"), "one Application"),
@@ -143,3 +151,19 @@ def test_a_manifest_without_a_drone() -> None:
 
 def test_an_argument_out_of_range_is_an_answer() -> None:
     assert ask("Goto", {"lat": 95, "lon": 0})["code"] == "InvalidArgument"
+    assert ask("Goto", {"lat": 10**400, "lon": 0})["code"] == "InvalidArgument"
+
+
+def test_a_drone_in_a_file_with_policies_whose_zones_are_in_another(tmp_path: pathlib.Path) -> None:
+    bodies = list(yaml.safe_load_all((FIELD / "place.yaml").read_text()))
+    policies = list(yaml.safe_load_all((FIELD / "policies.yaml").read_text()))
+    zones, others = tmp_path / "zones.yaml", tmp_path / "others.yaml"
+    zones.write_text(yaml.safe_dump_all(b for b in bodies if b["kind"] == "Zone"))
+    others.write_text(yaml.safe_dump_all([*(b for b in bodies if b["kind"] != "Zone"), *policies]))
+    answer = ask("Goto", INSIDE, at="39.370701,22.932303,10", policies=str(zones), drone=str(others))
+    assert answer["policies"] == ["keep-away"]
+
+
+def test_no_policies_at_all_are_pointed_out() -> None:
+    result = run("--method", "Goto", "--args", json.dumps(FREE), "--at", HERE, policies=DRONE)
+    assert (result.exit_code, "has no Policy" in result.stderr) == (0, True)

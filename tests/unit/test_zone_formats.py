@@ -1,6 +1,7 @@
 """Zones from and to GeoJSON, KML, QGroundControl plans and ED-269; nothing is dropped in silence."""
 
 import json
+import math
 
 import pytest
 import yaml
@@ -111,13 +112,14 @@ def test_geojson_of_others():
 def test_kml_of_others():
     ring = " ".join(f"{lon},{lat},30" for lon, lat in SQUARE)
     text = f"""<?xml version="1.0" encoding="UTF-8"?><kml xmlns="http://www.opengis.net/kml/2.2"><Document><Folder>
-    <Placemark><name>School &amp; yard</name><description>no pictures</description><Polygon>
+    <Placemark><name>School &amp; yard</name><description>no pictures</description><TimeSpan/><styleUrl/><Polygon>
     <altitudeMode>relativeToGround</altitudeMode><outerBoundaryIs><LinearRing><coordinates>{ring}</coordinates></LinearRing></outerBoundaryIs></Polygon></Placemark>
     <Placemark><name>pin</name><Point><coordinates>4,50</coordinates></Point></Placemark></Folder></Document></kml>"""
     found = formats.read_kml(text)
     assert [(z.name, z.spec.description) for z in found.zones] == [("school-yard", "no pictures")]
     assert len(found.zones[0].spec.area.polygon.exterior) == 4
-    assert [n.split(":")[0] for n in found.notes] == ["School & yard", "pin"]
+    assert [n.split(":")[0] for n in found.notes] == ["School & yard", "School & yard", "pin"]
+    assert found.notes[0] == "School & yard: no place for TimeSpan; left out"
 
 
 def test_qgc_plan_of_others():
@@ -182,6 +184,52 @@ def test_ed269_schedules_are_never_shortened():
 
 
 @pytest.mark.parametrize(
+    ("volume", "upper", "note"),
+    [
+        (
+            {"uomDimensions": "FL"},
+            None,
+            "limits in FL are not taken over, M and FT are; the zone has no limits of altitude",
+        ),
+        ({"upperLimit": "120"}, None, "upperLimit '120' is no number and not taken over; the zone has no upper limit"),
+        ({"layer": 3}, 120, "no place for layer; left out"),
+    ],
+)
+def test_ed269_tells_what_of_a_volume_it_cannot_take(volume, upper, note):
+    spec, notes = ed269([], **volume)
+    assert (spec.altitude.upper if spec.altitude is not None else None) == upper
+    assert f"BEL0001: {note}" in notes
+
+
+@pytest.mark.parametrize(
+    ("day", "note"),
+    [
+        ({"day": ["MON", "HOL"]}, "HOL is no day of the week; the zone is active every day"),
+        ({"day": [{}]}, "{} is no day of the week; the zone is active every day"),
+        ({"day": ["ANY"], "startEvent": "BMCT"}, "no place for startEvent; left out"),
+    ],
+)
+def test_ed269_zones_whose_time_is_not_understood_are_always_active(day, note):
+    spec, notes = ed269([{"permanent": "NO", "schedule": [day]}])
+    assert spec.schedule == ()
+    assert f"BEL0001: {note}" in notes
+
+
+def test_ed269_tells_of_features_without_geometry():
+    found = formats.read_ed269('{"features": [{"identifier": "A", "message": "%s"}]}' % ("x" * 1100))
+    assert found.notes == ("A: its description is cut after 1024 characters", "A: it has no geometry; left out")
+
+
+def test_geojson_tells_of_heights_and_reference_systems():
+    high = [[lon, lat, 30] for lon, lat in SQUARE]
+    whole = feature({"type": "Polygon", "coordinates": [high]}, id="a") | {"crs": {"type": "name"}}
+    found = formats.read_geojson("\ufeff" + json.dumps(whole))
+    assert len(found.zones) == 1
+    assert [n.split(":")[0] for n in found.notes] == ["crs", "a"]
+    assert "heights of its points are not taken over" in found.notes[1]
+
+
+@pytest.mark.parametrize(
     ("read", "text", "sentence"),
     [
         (formats.read_geojson, "{", "line 1: this is no JSON"),
@@ -207,6 +255,58 @@ def test_ed269_schedules_are_never_shortened():
             formats.read_ed269,
             '{"features": [{"geometry": [{"horizontalProjection": {"type": "Blob"}}]}]}',
             "features[0].geometry[0].horizontalProjection.type: must be Polygon or Circle",
+        ),
+        pytest.param(
+            formats.read_geojson, '{"type":' * 100_000, "its lists or objects are nested too deeply", id="deep"
+        ),
+        pytest.param(formats.read_geojson, "1" * 5000, "a number in it has thousands of digits", id="digits"),
+        (
+            formats.read_geojson,
+            json.dumps(feature(None, properties=[1])),
+            "features[0].properties: must be an object, not [1]",
+        ),
+        (formats.read_geojson, json.dumps(feature("x")), "features[0].geometry: must be an object, not 'x'"),
+        (
+            formats.read_geojson,
+            json.dumps(feature({"type": "MultiPolygon", "coordinates": 5})),
+            "features[0].geometry.coordinates: must be a list of polygons",
+        ),
+        (
+            formats.read_geojson,
+            json.dumps(feature({"type": "Polygon", "coordinates": [[[True, 5], [4, 5], [5, 5]]]})),
+            "features[0].geometry.coordinates[0][0]: must be two numbers",
+        ),
+        (
+            formats.read_geojson,
+            json.dumps(feature({"type": "Polygon", "coordinates": [[[10**99, 5], [4, 5], [5, 5]]]})),
+            "features[0].geometry.coordinates[0][0]: a number of many digits, 5 is no place on Earth",
+        ),
+        *(
+            (
+                formats.read_geojson,
+                json.dumps(feature({"type": "Point", "coordinates": [4, 50]}, properties={"radius": radius})),
+                "features[0].properties.radius: must be 0 to 200000 metres, not",
+            )
+            for radius in (0, -1, True, "5", math.nan, math.inf, 10**400)
+        ),
+        (formats.read_qgc_plan, '{"fileType": "Plan", "geoFence": [1]}', "geoFence: must be an object, not [1]"),
+        (formats.read_qgc_plan, '{"fileType": "Plan", "mission": "x"}', "mission: must be an object"),
+        (
+            formats.read_qgc_plan,
+            '{"fileType": "Plan", "geoFence": {"version": 2, "circles": [{"circle": 5}]}}',
+            "geoFence.circles[0].circle: must be an object",
+        ),
+        (
+            formats.read_qgc_plan,
+            json.dumps(
+                {"fileType": "Plan", "geoFence": {"version": 2, "polygons": [{"polygon": SQUARE, "inclusion": "no"}]}}
+            ),
+            "geoFence.polygons[0].inclusion: must be true or false, not 'no'",
+        ),
+        (
+            formats.read_ed269,
+            '{"features": [{"geometry": [{"horizontalProjection": 5}]}]}',
+            "features[0].geometry[0].horizontalProjection: must be an object",
         ),
     ],
 )

@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeGuard
 
 from fractus_core.api import API_VERSION, InvalidObject, Zone
 from fractus_core.api.geometry import Area, Circle, Point, Polygon
@@ -15,6 +15,12 @@ from fractus_core.geo.areas import middle, polygon
 from fractus_core.geo.frames import LocalFrame
 
 LonLat = Sequence[float]
+
+DESCRIPTION_LENGTH = 1024
+"""Characters that the description of a zone takes."""
+
+MAX_RADIUS_M = 200_000.0
+"""Of a circle."""
 
 CORNERS = 64
 """Corners of the polygon that stands for a circle where a format has none."""
@@ -59,6 +65,18 @@ class Drafts:
             raise InvalidObject(f"{title}: {error.field}".rstrip(": "), error.problem) from None
         self._zones.append(zone)
 
+    def described(self, title: str, text: str) -> str:
+        """The description of a zone, as long as it may be; notes if that cuts it."""
+        if len(text) > DESCRIPTION_LENGTH:
+            self.note(title, f"its description is cut after {DESCRIPTION_LENGTH} characters")
+        return text[:DESCRIPTION_LENGTH]
+
+    def unmapped(self, title: str, found: Iterable[str], known: Iterable[str]) -> None:
+        """Note the fields for which a zone has no place."""
+        dropped = sorted(set(found) - set(known))
+        if dropped:
+            self.note(title, f"no place for {', '.join(dropped)}; left out")
+
     def note(self, title: str, problem: str) -> None:
         """Say what of a zone is not taken over."""
         self.notes.append(f"{title}: {problem}")
@@ -84,9 +102,13 @@ def parse_json(text: str) -> dict[str, Any]:
         InvalidObject: it is none.
     """
     try:
-        found = json.loads(text)
+        found = json.loads(text.removeprefix("\ufeff"))
     except json.JSONDecodeError as error:
         raise InvalidObject(f"line {error.lineno}", f"this is no JSON ({error.msg.lower()})") from None
+    except RecursionError:
+        raise InvalidObject("", "its lists or objects are nested too deeply") from None
+    except ValueError:
+        raise InvalidObject("", "a number in it has thousands of digits") from None
     if not isinstance(found, dict):
         raise InvalidObject("", "this is no JSON object")
     return found
@@ -105,6 +127,29 @@ def objects(found: Any, field: str) -> list[dict[str, Any]]:
     return found
 
 
+def fields(found: Any, field: str) -> dict[str, Any]:
+    """A JSON object; absent is empty.
+
+    Raises:
+        InvalidObject: it is something else.
+    """
+    if found is None:
+        return {}
+    if not isinstance(found, dict):
+        raise InvalidObject(field, f"must be an object, not {_shown(found)}")
+    return found
+
+
+def number(found: Any) -> TypeGuard[float]:
+    """Whether this is a number; true and false are none."""
+    return isinstance(found, (int, float)) and not isinstance(found, bool)
+
+
+def _shown(found: Any) -> str:
+    text = repr(found) if not isinstance(found, int) or abs(found) < 10**12 else "a number of many digits"
+    return text if len(text) <= 40 else text[:37] + "..."
+
+
 def place(found: Any, field: str, *, lat_first: bool = False) -> Point:
     """A pair of degrees as a point.
 
@@ -112,12 +157,12 @@ def place(found: Any, field: str, *, lat_first: bool = False) -> Point:
         InvalidObject: it is none, or out of range.
     """
     pair = found if isinstance(found, (list, tuple)) else ()
-    if len(pair) < 2 or not all(isinstance(v, (int, float)) for v in pair[:2]):
+    if len(pair) < 2 or not all(map(number, pair[:2])):
         raise InvalidObject(field, "must be two numbers, degrees")
     lat, lon = (pair[0], pair[1]) if lat_first else (pair[1], pair[0])
     if not (-90 <= lat <= 90 and -180 <= lon <= 180):
         order = "lat, lon" if lat_first else "lon, lat"
-        raise InvalidObject(field, f"{pair[0]}, {pair[1]} is no place on Earth; the order is {order}")
+        raise InvalidObject(field, f"{_shown(pair[0])}, {_shown(pair[1])} is no place on Earth; the order is {order}")
     return Point(lat=lat, lon=lon)
 
 
@@ -155,8 +200,8 @@ def round_area(centre: Point, radius_m: Any, field: str) -> dict[str, Any]:
     Raises:
         InvalidObject: the radius is no length.
     """
-    if not isinstance(radius_m, (int, float)) or radius_m <= 0:
-        raise InvalidObject(field, f"must be a length in metres, not {radius_m!r}")
+    if not number(radius_m) or not 0 < radius_m <= MAX_RADIUS_M:
+        raise InvalidObject(field, f"must be 0 to {MAX_RADIUS_M:.0f} metres, not {_shown(radius_m)}")
     return {"circle": {"center": centre.to_dict(), "radius": float(radius_m)}}
 
 

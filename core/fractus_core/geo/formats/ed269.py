@@ -15,6 +15,8 @@ from fractus_core.geo.formats.drafts import (
     Exported,
     Imported,
     area_rings,
+    fields,
+    number,
     objects,
     parse_json,
     place,
@@ -23,10 +25,18 @@ from fractus_core.geo.formats.drafts import (
     unsaid,
 )
 
-_FOOT_M = 0.3048
+_UNITS_M = {"M": 1.0, "FT": 0.3048}
 _DAYS = {"MON": "Mon", "TUE": "Tue", "WED": "Wed", "THU": "Thu", "FRI": "Fri", "SAT": "Sat", "SUN": "Sun"}
 _REFERENCES = {"AGL": "terrain", "WGS84": None, "AMSL": "amsl"}
 _USED = frozenset({"identifier", "name", "message", "restriction", "applicability", "geometry"})
+_OF_VOLUME = frozenset(
+    {
+        "uomDimensions", "lowerLimit", "lowerVerticalReference", "upperLimit", "upperVerticalReference",
+        "horizontalProjection",
+    }
+)  # fmt: skip
+_OF_PERIOD = frozenset({"permanent", "startDateTime", "endDateTime", "schedule"})
+_OF_DAY = frozenset({"day", "startTime", "endTime"})
 _TIME = re.compile(r"^(\d{2}):(\d{2})(?::(\d{2})(?:\.\d+)?)?Z?$")
 
 
@@ -48,24 +58,31 @@ def read_ed269(text: str) -> Imported:
 def _read_feature(drafts: Drafts, feature: dict[str, Any], field: str) -> None:
     title = str(feature.get("identifier") or feature.get("name") or field)
     told = [str(feature[key]) for key in ("name", "restriction", "message") if feature.get(key)]
-    spec: dict[str, Any] = {"description": ": ".join(told)[:1024]} if told else {}
-    dropped = sorted(key for key, value in feature.items() if key not in _USED and value not in (None, "", []))
-    if dropped:
-        drafts.note(title, f"no place for {', '.join(dropped)}; left out")
+    spec: dict[str, Any] = {"description": drafts.described(title, ": ".join(told))} if told else {}
+    drafts.unmapped(title, _given(feature), _USED)
     if feature.get("restriction"):
         drafts.note(title, f"a Zone forbids nothing by itself; add a policy for restriction {feature['restriction']}")
     schedule = _schedule(drafts, title, feature, field)
     if schedule:
         spec["schedule"] = schedule
-    for j, volume in enumerate(objects(feature.get("geometry"), f"{field}.geometry")):
+    volumes = objects(feature.get("geometry"), f"{field}.geometry")
+    if not volumes:
+        drafts.note(title, "it has no geometry; left out")
+    for j, volume in enumerate(volumes):
         where = f"{field}.geometry[{j}]"
+        drafts.unmapped(title, _given(volume), _OF_VOLUME)
         band = _band(drafts, title, volume)
         drafts.add(title, {**spec, "area": _area(volume, where), **({"altitude": band} if band else {})})
 
 
+def _given(found: dict[str, Any]) -> list[str]:
+    """The fields that say something."""
+    return [key for key, value in found.items() if value not in (None, "", [], {})]
+
+
 def _area(volume: dict[str, Any], field: str) -> dict[str, Any]:
-    projection = volume.get("horizontalProjection") or {}
     where = f"{field}.horizontalProjection"
+    projection = fields(volume.get("horizontalProjection"), where)
     match projection.get("type"):
         case "Polygon":
             return rings(projection.get("coordinates"), f"{where}.coordinates")
@@ -79,11 +96,20 @@ def _area(volume: dict[str, Any], field: str) -> dict[str, Any]:
 
 def _band(drafts: Drafts, title: str, volume: dict[str, Any]) -> dict[str, Any]:
     """The altitude band; what cannot be said makes the zone higher and deeper, never smaller."""
-    scale = _FOOT_M if volume.get("uomDimensions") == "FT" else 1.0
+    unit = str(volume.get("uomDimensions") or "M")
+    scale = _UNITS_M.get(unit)
+    if scale is None:
+        drafts.note(title, f"limits in {unit} are not taken over, M and FT are; the zone has no limits of altitude")
+        return {}
     limits: dict[str, tuple[float, str]] = {}
     for side in ("lower", "upper"):
         value, datum = volume.get(f"{side}Limit"), str(volume.get(f"{side}VerticalReference"))
-        if not isinstance(value, (int, float)) or (side == "lower" and value <= 0 and datum == "AGL"):
+        if value is None:
+            continue
+        if not number(value):
+            drafts.note(title, f"{side}Limit {value!r} is no number and not taken over; the zone has no {side} limit")
+            continue
+        if side == "lower" and value <= 0 and datum == "AGL":
             continue
         reference = _REFERENCES.get(datum)
         if reference is None:
@@ -100,6 +126,7 @@ def _band(drafts: Drafts, title: str, volume: dict[str, Any]) -> dict[str, Any]:
 def _schedule(drafts: Drafts, title: str, feature: dict[str, Any], field: str) -> list[dict[str, Any]]:
     times: list[dict[str, Any]] = []
     for i, period in enumerate(objects(feature.get("applicability"), f"{field}.applicability")):
+        drafts.unmapped(title, _given(period), _OF_PERIOD)
         if period.get("permanent") == "YES":
             return []
         valid = {
@@ -113,9 +140,14 @@ def _schedule(drafts: Drafts, title: str, feature: dict[str, Any], field: str) -
 
 
 def _daily(drafts: Drafts, title: str, day: dict[str, Any]) -> dict[str, Any]:
-    named = day.get("day") or []
-    days = [_DAYS[d] for d in (named if isinstance(named, list) else [named]) if d in _DAYS]
-    found: dict[str, Any] = {"days": days} if days and "ANY" not in named else {}
+    drafts.unmapped(title, _given(day), _OF_DAY)
+    given = day.get("day") or []
+    named = [str(d) for d in (given if isinstance(given, list) else [given])]
+    unknown = sorted(set(named) - set(_DAYS) - {"ANY"})
+    if unknown:
+        drafts.note(title, f"{', '.join(unknown)} is no day of the week; the zone is active every day")
+    days = [_DAYS[d] for d in named if d in _DAYS]
+    found: dict[str, Any] = {"days": days} if days and not unknown and "ANY" not in named else {}
     start, end = (_TIME.match(str(day.get(key, ""))) for key in ("startTime", "endTime"))
     if start is not None and end is not None:
         # Whole minutes that contain the time: a zone is rather active too long.

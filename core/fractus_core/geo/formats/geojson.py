@@ -12,6 +12,8 @@ from fractus_core.geo.formats.drafts import (
     Exported,
     Imported,
     area_rings,
+    fields,
+    number,
     objects,
     parse_json,
     place,
@@ -41,32 +43,52 @@ def read_geojson(text: str) -> Imported:
     else:
         raise InvalidObject("type", f"{kind!r} is no GeoJSON of zones; expected a FeatureCollection of polygons")
     drafts = Drafts()
+    if whole.get("crs"):
+        drafts.note("crs", "is not looked at; coordinates are taken as WGS 84, lon, lat")
     for i, feature in enumerate(features):
         _read_feature(drafts, feature, f"features[{i}]")
     return drafts.result()
 
 
 def _read_feature(drafts: Drafts, feature: dict[str, Any], field: str) -> None:
-    properties = feature.get("properties") or {}
+    properties = fields(feature.get("properties"), f"{field}.properties")
     title = str(properties.get("name") or properties.get("title") or feature.get("id") or f"zone {field[9:-1]}")
     spec = {k: properties[k] for k in ("altitude", "schedule", "description") if properties.get(k)}
+    if isinstance(spec.get("description"), str):
+        spec["description"] = drafts.described(title, spec["description"])
     dropped = sorted(set(properties) - _KNOWN - _STYLE)
     if dropped:
         drafts.note(title, f"no place for properties {', '.join(dropped)}; left out")
-    geometry = feature.get("geometry") or {}
+    geometry = fields(feature.get("geometry"), f"{field}.geometry")
     coordinates = geometry.get("coordinates")
+    if _heights(coordinates):
+        drafts.note(title, "heights of its points are not taken over; give properties.altitude")
     where = f"{field}.geometry.coordinates"
     match geometry.get("type"):
         case "Polygon":
             drafts.add(title, {**spec, "area": rings(coordinates, where)})
         case "MultiPolygon":
-            for j, part in enumerate(coordinates or ()):
+            if not isinstance(coordinates, list):
+                raise InvalidObject(where, "must be a list of polygons")
+            for j, part in enumerate(coordinates):
                 drafts.add(title, {**spec, "area": rings(part, f"{where}[{j}]")})
         case "Point" if "radius" in properties:
             area = round_area(place(coordinates, where), properties["radius"], f"{field}.properties.radius")
             drafts.add(title, {**spec, "area": area})
         case other:
             drafts.note(title, f"a geometry of type {other} is no zone; left out")
+
+
+def _heights(coordinates: Any) -> bool:
+    """Whether a position has a third number other than 0."""
+    pending = [coordinates]
+    while pending:
+        found = pending.pop()
+        if isinstance(found, list):
+            if len(found) > 2 and all(map(number, found[:3])) and found[2]:
+                return True
+            pending += [item for item in found if isinstance(item, list)]
+    return False
 
 
 def write_geojson(zones: Iterable[Zone]) -> Exported:

@@ -10,6 +10,8 @@ from xml.sax.saxutils import escape
 from fractus_core.api import InvalidObject, Zone
 from fractus_core.geo.formats.drafts import Drafts, Exported, Imported, area_rings, ring, unsaid
 
+_KNOWN = frozenset({"name", "description", "Polygon", "MultiGeometry"})
+_LOOK = frozenset({"Style", "StyleMap", "styleUrl", "visibility", "open", "Snippet", "LookAt", "Camera"})
 _OTHERS = ("Point", "LineString", "LinearRing", "Model", "Track")
 
 
@@ -22,7 +24,7 @@ def read_kml(text: str) -> Imported:
     if re.search(r"<!(DOCTYPE|ENTITY)", text):
         raise InvalidObject("", "a KML file must not declare entities")
     try:
-        root = ElementTree.fromstring(re.sub(r"^\s*<\?xml[^>]*\?>", "", text))  # noqa: S314  (no entities, see above)
+        root = ElementTree.fromstring(re.sub(r"^\ufeff?\s*<\?xml[^>]*\?>", "", text))  # noqa: S314  (no entities, see above)
     except ElementTree.ParseError as error:
         raise InvalidObject("", f"this is no XML ({error})") from None
     if _tag(root) != "kml":
@@ -35,13 +37,12 @@ def read_kml(text: str) -> Imported:
 
 def _read_placemark(drafts: Drafts, mark: ElementTree.Element, count: int) -> None:
     title = _text(mark, "name") or f"placemark {count + 1}"
-    description = _text(mark, "description")
+    described = drafts.described(title, _text(mark, "description"))
     polygons = [e for e in mark.iter() if _tag(e) == "Polygon"]
     others = sorted({_tag(e) for e in mark.iter()} & set(_OTHERS) - ({"LinearRing"} if polygons else set()))
     if others:
         drafts.note(title, f"{', '.join(others)} is no zone; left out")
-    if any(_tag(e) == "ExtendedData" for e in mark):
-        drafts.note(title, "no place for ExtendedData; left out")
+    drafts.unmapped(title, map(_tag, mark), _KNOWN | _LOOK | set(_OTHERS))
     for i, shape in enumerate(polygons):
         field = f"{title}: Polygon[{i}]"
         exterior = [_ring(e, f"{field}.outerBoundaryIs") for e in shape if _tag(e) == "outerBoundaryIs"]
@@ -52,7 +53,7 @@ def _read_placemark(drafts: Drafts, mark: ElementTree.Element, count: int) -> No
         if mode not in {"", "clampToGround"}:
             drafts.note(title, f"heights ({mode}) are not taken over; the zone reaches from the ground up")
         area = {"polygon": {"exterior": exterior[0]} | ({"holes": holes} if holes else {})}
-        drafts.add(title, {"area": area} | ({"description": description[:1024]} if description else {}))
+        drafts.add(title, {"area": area} | ({"description": described} if described else {}))
 
 
 def _ring(boundary: ElementTree.Element, field: str) -> list[dict[str, float]]:

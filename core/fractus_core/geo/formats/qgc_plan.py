@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
+from typing import Any
 
 from fractus_core.api import InvalidObject, Zone
 from fractus_core.geo.formats.drafts import (
     Drafts,
     Exported,
     Imported,
+    fields,
     objects,
     parse_json,
     place,
@@ -30,7 +32,7 @@ def read_qgc_plan(text: str) -> Imported:
     whole = parse_json(text)
     if whole.get("fileType") != "Plan":
         raise InvalidObject("fileType", f"must be Plan, not {whole.get('fileType')!r}")
-    fence = whole.get("geoFence") or {}
+    fence = fields(whole.get("geoFence"), "geoFence")
     if fence and fence.get("version") != _FENCE_VERSION:
         raise InvalidObject(
             "geoFence.version", f"must be {_FENCE_VERSION}, not {fence.get('version')!r}; save the plan anew"
@@ -39,21 +41,28 @@ def read_qgc_plan(text: str) -> Imported:
     for i, item in enumerate(objects(fence.get("polygons"), "geoFence.polygons")):
         field = f"geoFence.polygons[{i}]"
         exterior = ring(item.get("polygon"), f"{field}.polygon", lat_first=True)
-        _add(drafts, f"polygon {i + 1}", {"polygon": {"exterior": exterior}}, inclusion=bool(item.get("inclusion")))
+        _add(drafts, f"polygon {i + 1}", {"polygon": {"exterior": exterior}}, inclusion=_inclusion(item, field))
     for i, item in enumerate(objects(fence.get("circles"), "geoFence.circles")):
         field = f"geoFence.circles[{i}].circle"
-        circle = item.get("circle") or {}
+        circle = fields(item.get("circle"), field)
         area = round_area(
             place(circle.get("center"), f"{field}.center", lat_first=True), circle.get("radius"), f"{field}.radius"
         )
-        _add(drafts, f"circle {i + 1}", area, inclusion=bool(item.get("inclusion")))
-    if (whole.get("mission") or {}).get("items"):
+        _add(drafts, f"circle {i + 1}", area, inclusion=_inclusion(item, f"geoFence.circles[{i}]"))
+    if fields(whole.get("mission"), "mission").get("items"):
         drafts.note("mission", "its items are no zones; left out")
-    if (whole.get("rallyPoints") or {}).get("points"):
+    if fields(whole.get("rallyPoints"), "rallyPoints").get("points"):
         drafts.note("rallyPoints", "its points are no zones; left out")
     if fence.get("breachReturn"):
         drafts.note("geoFence.breachReturn", "is no zone; left out")
     return drafts.result()
+
+
+def _inclusion(item: dict[str, Any], field: str) -> bool:
+    found = item.get("inclusion", False)
+    if not isinstance(found, bool):
+        raise InvalidObject(f"{field}.inclusion", f"must be true or false, not {found!r}")
+    return found
 
 
 def _add(drafts: Drafts, title: str, area: dict[str, object], *, inclusion: bool) -> None:

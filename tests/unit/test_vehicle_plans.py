@@ -121,14 +121,68 @@ def test_a_stalled_upload_is_repeated_then_given_up_and_changes_nothing():
     [
         ({"command": 4000, "frame": 3}, MissionResult.UNSUPPORTED),
         ({"command": 16, "frame": 1, "x": 5, "y": 5}, MissionResult.UNSUPPORTED_FRAME),
-        ({"command": 16, "frame": 3, "x": 950_000_000, "y": 5}, MissionResult.INVALID),
-        ({"command": 16, "frame": 3, "x": 5, "y": 5, "z": float("nan")}, MissionResult.INVALID),
+        ({"command": 16, "frame": 3, "x": 950_000_000, "y": 5}, MissionResult.INVALID_PARAM5_X),
+        ({"command": 16, "frame": 3, "x": 5, "y": 1_850_000_000}, MissionResult.INVALID_PARAM6_Y),
+        ({"command": 16, "frame": 3, "x": 5, "y": 5, "z": math.nan}, MissionResult.INVALID_PARAM7),
+        ({"command": 16, "frame": 3, "x": 5, "y": 5, "param1": math.nan}, MissionResult.INVALID_PARAM1),
+        ({"command": 16, "frame": 3, "x": 5, "y": 5, "param4": math.inf}, MissionResult.INVALID_PARAM4),
+        ({"command": 19, "frame": 3, "x": 5, "y": 5, "param4": math.nan}, MissionResult.INVALID_PARAM4),
+        ({"command": 177, "param1": 2, "param2": 1}, MissionResult.ERROR),
     ],
 )
 def test_bad_items_end_the_upload(item: dict[str, float], result: MissionResult):
     vehicle, pilot = alone()
     assert upload(pilot, 0, [HOME, item]) == result
     assert vehicle.mission.items == []
+
+
+def test_a_heading_may_be_nan():
+    _, pilot = alone()
+    assert upload(pilot, 0, [HOME, _waypoint(5.0, 0.0, 10.0, param4=math.nan)]) == MissionResult.ACCEPTED
+
+
+def test_a_partial_upload_may_append_one_item():
+    vehicle, pilot = alone()
+    upload(pilot, 0, MISSION)
+    end = len(MISSION)
+    target = {"target_system": 1, "target_component": 1}
+    pilot.send("MISSION_WRITE_PARTIAL_LIST", target | {"start_index": end, "end_index": end})
+    assert pilot.expect("MISSION_REQUEST").integer("seq") == end
+    pilot.send("MISSION_ITEM_INT", target | {"seq": end} | _waypoint(1.0, 2.0, 3.0))
+    assert pilot.expect("MISSION_ACK").integer("type") == MissionResult.ACCEPTED
+    assert [item.z for item in vehicle.mission.items[end - 1 :]] == [0.0, 3.0]
+
+
+def test_a_list_that_is_being_uploaded_is_neither_read_nor_cleared():
+    vehicle, pilot = alone()
+    upload(pilot, 0, MISSION)
+    target = {"target_system": 1, "target_component": 1}
+    pilot.send("MISSION_COUNT", target | {"count": 3})
+    for name, more, result in (
+        ("MISSION_REQUEST_LIST", {}, MissionResult.DENIED),
+        ("MISSION_REQUEST_INT", {"seq": 1}, MissionResult.DENIED),
+        ("MISSION_CLEAR_ALL", {}, MissionResult.ERROR),
+    ):
+        pilot.send(name, target | more)
+        assert pilot.expect("MISSION_ACK").integer("type") == result
+    assert len(vehicle.mission.items) == len(MISSION)
+
+
+def test_jumps_lead_to_tags():
+    vehicle, pilot = alone()
+    tag = {"command": 600, "param1": 7.0}
+    jump = {"command": 601, "param1": 7.0, "param2": 1.0}
+    lost = {"command": 601, "param1": 8.0, "param2": -1.0}
+    points = [_waypoint(north, 0.0, 10.0) for north in (1.0, 2.0, 3.0)]
+    assert upload(pilot, 0, [HOME, points[0], tag, points[1], jump, lost, points[2]]) == MissionResult.ACCEPTED
+    mission, at, order = vehicle.mission, 0, []
+    while (following := mission.next_after(at)) is not None:
+        at = following
+        order.append(at)
+    assert order == [1, 2, 3, 2, 3]  # a jump to a tag that is missing ends the mission
+    assert pilot.command(Command.DO_JUMP_TAG, 7.0) is Result.ACCEPTED
+    assert mission.current == 2
+    assert pilot.command(Command.DO_JUMP_TAG, 9.0) is Result.FAILED
 
 
 def test_too_many_items_are_refused():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import signal
 import sys
 import time
@@ -13,11 +14,12 @@ import click
 from fractus_sim.vehicle.earth import Place
 from fractus_sim.vehicle.links import Hub, LinkError, LinkSpec
 from fractus_sim.vehicle.lockstep import Conductor, conduct
-from fractus_sim.vehicle.params import UnknownParameterError
+from fractus_sim.vehicle.params import ParameterValueError, UnknownParameterError
 from fractus_sim.vehicle.simulation import Simulation, formation
 from fractus_sim.vehicle.vehicle import CONTROL_STEP_S, REPEATABLE_EPOCH_US, VehicleConfig
 
 DEFAULT_LISTEN = "tcp:127.0.0.1:5760"
+MAX_SYSID = 250
 MAX_BATCH = 25
 MAX_LAG_S = 1.0
 MIN_SLEEP_S = 0.001
@@ -64,6 +66,12 @@ def _place(_context: click.Context, _option: click.Parameter, text: str) -> Plac
     return Place.from_degrees(lat, lon, alt)
 
 
+def _finite(_context: click.Context, _option: click.Parameter, value: float | None) -> float | None:
+    if value is not None and not math.isfinite(value):
+        raise click.BadParameter("expected a finite number")
+    return value
+
+
 def _wind(_context: click.Context, _option: click.Parameter, text: str | None) -> dict[str, float]:
     if text is None:
         return {}
@@ -71,7 +79,7 @@ def _wind(_context: click.Context, _option: click.Parameter, text: str | None) -
         numbers = [float(part) for part in text.split(",")]
     except ValueError as error:
         raise click.BadParameter("expected SPEED,DIR[,TURBULENCE]") from error
-    if not 1 <= len(numbers) <= 3:
+    if not 1 <= len(numbers) <= 3 or not all(math.isfinite(number) for number in numbers):
         raise click.BadParameter("expected SPEED,DIR[,TURBULENCE]")
     speed, direction, turbulence = [*numbers, 0.0, 0.0][:3]
     if not 0.0 <= speed < 60.0 or not 0.0 <= turbulence < 30.0:
@@ -82,13 +90,11 @@ def _wind(_context: click.Context, _option: click.Parameter, text: str | None) -
 def _parameters(_context: click.Context, _option: click.Parameter, texts: tuple[str, ...]) -> dict[str, float]:
     values: dict[str, float] = {}
     for text in texts:
-        name, equals, value = text.partition("=")
+        name, _, value = text.partition("=")
         try:
             values[name.strip()] = float(value)
         except ValueError as error:
             raise click.BadParameter(f"{text!r}: expected NAME=VALUE") from error
-        if not equals:
-            raise click.BadParameter(f"{text!r}: expected NAME=VALUE")
     return values
 
 
@@ -109,15 +115,31 @@ def _parameters(_context: click.Context, _option: click.Parameter, texts: tuple[
     metavar="LAT,LON,ALT_AMSL",
     help="Where the vehicle stands at the start.",
 )
-@click.option("--heading", "heading_deg", type=float, default=0.0, help="Heading at the start, degrees.")
-@click.option("--sysid", type=click.IntRange(1, 250), default=1, help="MAVLink system id.")
-@click.option("--speedup", type=click.FloatRange(0.0), default=1.0, help="Times real time; 0: as fast as possible.")
+@click.option(
+    "--heading", "heading_deg", type=float, default=0.0, callback=_finite, help="Heading at the start, degrees."
+)
+@click.option("--sysid", type=click.IntRange(1, MAX_SYSID), default=1, help="MAVLink system id.")
+@click.option(
+    "--speedup",
+    type=click.FloatRange(0.0),
+    default=1.0,
+    callback=_finite,
+    help="Times real time; 0: as fast as possible.",
+)
 @click.option("--seed", type=int, default=1, help="Seed of all noise.")
 @click.option("--param", "parameters", multiple=True, callback=_parameters, metavar="NAME=VALUE", help="A parameter.")
 @click.option("--wind", callback=_wind, metavar="SPEED,DIR[,TURB]", help="Wind, m/s and degrees it comes from.")
-@click.option("--ready-after", type=click.FloatRange(0.1), default=32.0, help="Seconds until ready to arm.")
+@click.option(
+    "--ready-after", type=click.FloatRange(0.1), default=32.0, callback=_finite, help="Seconds until ready to arm."
+)
 @click.option("--count", type=click.IntRange(1, 200), default=1, help="Number of vehicles; ports and ids count up.")
-@click.option("--spacing", type=float, default=10.0, help="Distance between vehicles, metres toward east.")
+@click.option(
+    "--spacing",
+    type=click.FloatRange(-1000.0, 1000.0),
+    default=10.0,
+    callback=_finite,
+    help="Distance between vehicles, metres toward east.",
+)
 @click.option("--store", type=click.Path(path_type=Path), help="File that keeps changed parameters.")
 @click.option(
     "--tlog",
@@ -129,7 +151,7 @@ def _parameters(_context: click.Context, _option: click.Parameter, texts: tuple[
     metavar="HOST:PORT",
     help="Advance only as a driver connected here asks: it writes a number of 10 ms steps a line, and reads the total.",
 )
-@click.option("--duration", type=float, help="End after so many simulated seconds.")
+@click.option("--duration", type=float, callback=_finite, help="End after so many simulated seconds.")
 def vehicle(
     *,
     links: tuple[str, ...],
@@ -149,6 +171,8 @@ def vehicle(
     duration: float | None,
 ) -> None:
     """Simulate ArduCopter-compatible vehicles that speak MAVLink 2."""
+    if sysid + count - 1 > MAX_SYSID:
+        raise click.ClickException(f"--sysid {sysid} with --count {count}: system ids end at {MAX_SYSID}")
     stop = _Stop()
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
@@ -174,7 +198,7 @@ def vehicle(
                     name = tlog if count == 1 else tlog.with_stem(f"{tlog.stem}-{craft.config.sysid}")
                     craft.record(stack.enter_context(name.open("wb")))
             conductor = None if lockstep is None else Conductor(hub, *_address(lockstep))
-        except (LinkError, OSError) as error:
+        except (LinkError, ParameterValueError, OSError) as error:
             raise click.ClickException(str(error)) from error
         except UnknownParameterError as error:
             raise click.ClickException(f"unknown parameter {error.args[0]}") from error

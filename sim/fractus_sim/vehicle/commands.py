@@ -270,6 +270,15 @@ def _mission_current(v: Vehicle, o: Order, c: Channel) -> Result:
     return Result.ACCEPTED
 
 
+def _jump_to_tag(v: Vehicle, o: Order, c: Channel) -> Result:
+    tag = o.params[0]
+    index = v.mission.tagged(int(tag)) if math.isfinite(tag) else None
+    if index is None or not set_current(v, index):
+        return Result.FAILED
+    v.send(c, "MISSION_CURRENT")
+    return Result.ACCEPTED
+
+
 def set_current(v: Vehicle, index: int) -> bool:
     """Make an item the current one; AUTO continues there."""
     if not 0 <= index < len(v.mission.items):
@@ -346,6 +355,7 @@ HANDLERS: dict[int, Callable[[Vehicle, Order, Channel], Result]] = {
     Command.DO_FENCE_ENABLE: _fence_enable,
     Command.MISSION_START: _mission_start,
     Command.DO_SET_MISSION_CURRENT: _mission_current,
+    Command.DO_JUMP_TAG: _jump_to_tag,
     Command.DO_PAUSE_CONTINUE: _pause,
     Command.DO_FLIGHTTERMINATION: _terminate,
     Command.PREFLIGHT_REBOOT_SHUTDOWN: _reboot,

@@ -21,6 +21,7 @@ READ_SIZE = 16 * 1024
 READS_PER_POLL = 8
 MAX_CLIENTS = 16
 DATAGRAM_SIZE = 1400
+MAX_PORT = 65535
 
 
 class LinkError(ValueError):
@@ -47,7 +48,7 @@ class LinkSpec:
         kind, _, rest = text.partition(":")
         if kind in ("tcp", "tcpin", "udpin", "udpout", "udp"):
             host, colon, port = rest.rpartition(":")
-            if not colon or not port.isdigit() or not 0 <= int(port) <= 65535:
+            if not colon or not port.isdigit() or int(port) > MAX_PORT:
                 raise LinkError(f"link {text!r}: expected {kind}:HOST:PORT")
             kind = {"tcpin": "tcp", "udp": "udpin"}.get(kind, kind)
             return cls(kind, host or "0.0.0.0", int(port))  # noqa: S104 - what `tcp::5760` means in MAVLink
@@ -59,12 +60,19 @@ class LinkSpec:
         raise LinkError(f"link {text!r}: expected tcp:, udpin:, udpout:, serial: or pty:")
 
     def shifted(self, by: int) -> LinkSpec:
-        """The same link for the vehicle that is `by` places further in a formation: next port (10 apart for TCP)."""
+        """The same link for the vehicle that is `by` places further in a formation: next port (10 apart for TCP).
+
+        Raises:
+            LinkError: there is no such port.
+        """
         if by == 0:
             return self
         if self.path:
             return replace(self, path=f"{self.path}-{by}")
-        return replace(self, port=self.port + by * (10 if self.kind == "tcp" else 1))
+        port = self.port + by * (10 if self.kind == "tcp" else 1)
+        if port > MAX_PORT:
+            raise LinkError(f"link {self}: vehicle {by + 1} would need port {port}; begin at a lower one")
+        return replace(self, port=port)
 
     def __str__(self) -> str:
         return f"{self.kind}:{self.path}" if self.path else f"{self.kind}:{self.host}:{self.port}"
@@ -275,9 +283,12 @@ class _Terminal:
         self._far: int | None = None
         self._link: Path | None = None
         if spec.kind == "pty":
+            path = Path(spec.path)
+            if path.exists() and not path.is_symlink():
+                raise LinkError(f"link {spec}: there is a file of that name; give another path")
             self._fd, self._far = os.openpty()
             tty.setraw(self._far)
-            self._link = Path(spec.path)
+            self._link = path
             self._link.unlink(missing_ok=True)
             self._link.symlink_to(os.ttyname(self._far))
         else:

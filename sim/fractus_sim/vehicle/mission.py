@@ -18,6 +18,17 @@ MAX_ITEMS = 724
 UPLOAD_TIMEOUT_S = 8.0
 RETRY_S = 1.0
 
+# Farther up no place lies.
+MAX_ALTITUDE_M = 83_000.0
+# Commands whose fourth parameter, a heading, may be NaN; no other parameter may.
+NAN_HEADINGS = frozenset({Command.NAV_WAYPOINT, Command.NAV_LAND, Command.NAV_TAKEOFF})
+# What is refused until an upload of the same list has ended.
+NOT_WHILE_UPLOADED = {
+    "MISSION_REQUEST_LIST": MissionResult.DENIED,
+    "MISSION_REQUEST": MissionResult.DENIED,
+    "MISSION_REQUEST_INT": MissionResult.DENIED,
+    "MISSION_CLEAR_ALL": MissionResult.ERROR,
+}
 FENCE_COMMANDS = frozenset(range(5000, 5005))
 SUPPORTED = frozenset(
     {
@@ -47,8 +58,8 @@ SUPPORTED = frozenset(
         Command.DO_SET_CAM_TRIGG_DIST,
         Command.DO_FENCE_ENABLE,
         Command.DO_PAUSE_CONTINUE,
-        205,
-        530,
+        Command.JUMP_TAG,
+        Command.DO_JUMP_TAG,
         531,
         532,
         1000,
@@ -151,8 +162,20 @@ def judge(item: Item, kind: MissionKind) -> MissionResult:
         return MissionResult.UNSUPPORTED
     if item.frame not in GLOBAL_FRAMES and item.frame != Frame.MISSION and item.has_place:
         return MissionResult.UNSUPPORTED_FRAME
-    if item.navigates and (not valid_coordinates(item.x, item.y) or not math.isfinite(item.z)):
-        return MissionResult.INVALID
+    if item.navigates and not valid_coordinates(item.x, item.y):
+        return MissionResult.INVALID_PARAM5_X if abs(item.x) > 900_000_000 else MissionResult.INVALID_PARAM6_Y
+    if item.navigates and not abs(item.z) < MAX_ALTITUDE_M:
+        return MissionResult.INVALID_PARAM7
+    return MissionResult.ACCEPTED
+
+
+def judge_numbers(message: Message) -> MissionResult:
+    """Whether the parameters of a mission's item are numbers, as ArduPilot wants them."""
+    may_be_nan = message.integer("command") in NAN_HEADINGS
+    for at in range(1, 5):
+        value = message.real(f"param{at}")
+        if not math.isfinite(value) and not (at == 4 and may_be_nan and math.isnan(value)):
+            return MissionResult(MissionResult.INVALID_PARAM1 + at - 1)
     return MissionResult.ACCEPTED
 
 
@@ -185,6 +208,8 @@ class Transfers:
             self._ack(channel, message, kind_number, MissionResult.ACCEPTED)
         elif kind_number not in set(MissionKind):
             self._ack(channel, message, kind_number, MissionResult.UNSUPPORTED)
+        elif self.upload is not None and self.upload.kind == kind_number and message.name in NOT_WHILE_UPLOADED:
+            self._ack(channel, message, kind_number, NOT_WHILE_UPLOADED[message.name])
         else:
             self._handle(channel, message, self.stores[MissionKind(kind_number)])
 
@@ -195,7 +220,8 @@ class Transfers:
                 self._begin(channel, message, store, range(message.integer("count")))
             case "MISSION_WRITE_PARTIAL_LIST":
                 start, end = message.integer("start_index"), message.integer("end_index")
-                if 0 <= start <= end < len(store.items):
+                # One item more than there are may be written: it is appended.
+                if 0 <= start <= end <= len(store.items):
                     self._begin(channel, message, store, range(start, end + 1))
                 else:
                     self._ack(channel, message, kind, MissionResult.ERROR)
@@ -269,15 +295,12 @@ class Transfers:
                 self._ack(channel, message, store.kind, MissionResult.INVALID_SEQUENCE)
             return
         item = item_from(message)
-        verdict = MissionResult.ACCEPTED if seq == 0 and store.kind is MissionKind.MISSION else judge(item, store.kind)
+        verdict = self._judge(message, item, store, up)
         if verdict is not MissionResult.ACCEPTED:
             self.upload = None
             self._ack(channel, message, store.kind, verdict)
             return
-        if up.partial:
-            up.items[seq] = item
-        else:
-            up.items.append(item)
+        up.items[seq : seq + 1] = [item]
         up.next += 1
         up.heard_s = self.now_s
         if up.next <= up.last:
@@ -285,6 +308,18 @@ class Transfers:
             return
         self.upload = None
         self._ack(channel, message, store.kind, self._replace(store, up.items))
+
+    @staticmethod
+    def _judge(message: Message, item: Item, store: ItemStore, up: Upload) -> MissionResult:
+        if store.kind is MissionKind.MISSION:
+            if message.integer("seq") == 0:
+                return MissionResult.ACCEPTED
+            verdict = judge_numbers(message)
+            if verdict is not MissionResult.ACCEPTED:
+                return verdict
+            if item.command == Command.DO_JUMP and not 0 < int(item.param1) < max(len(up.items), up.last + 1):
+                return MissionResult.ERROR
+        return judge(item, store.kind)
 
     @staticmethod
     def _replace(store: ItemStore, items: list[Item]) -> MissionResult:
@@ -380,16 +415,23 @@ class Mission:
             if at >= len(self.items):
                 return None
             item = self.items[at]
-            if item.command != Command.DO_JUMP:
+            if item.command not in (Command.DO_JUMP, Command.DO_JUMP_TAG):
                 return at
+            target = self.tagged(int(item.param1)) if item.command == Command.DO_JUMP_TAG else int(item.param1)
+            if target is None or not 0 < target < len(self.items):
+                return None
             done = self._jumps.get(at, 0)
-            target = int(item.param1)
-            if 0 < target < len(self.items) and (item.param2 < 0 or done < int(item.param2)):
+            if item.param2 < 0 or done < int(item.param2):
                 self._jumps[at] = done + 1
                 at = target
             else:
                 at += 1
         return None
+
+    def tagged(self, tag: int) -> int | None:
+        """The first item that carries a tag."""
+        marks = (at for at, item in enumerate(self.items) if item.command == Command.JUMP_TAG and item.param1 == tag)
+        return next(marks, None)
 
     def with_home(self, home: Item) -> None:
         """Keep item 0 equal to home."""

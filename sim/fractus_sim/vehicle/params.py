@@ -11,7 +11,12 @@ from importlib import resources
 from pathlib import Path
 
 TYPES = {"INT8": 2, "INT16": 4, "INT32": 6, "REAL32": 9}
-RANGES = {"INT8": (-128.0, 127.0), "INT16": (-32768.0, 32767.0), "INT32": (-2147483648.0, 2147483647.0)}
+RANGES = {
+    "INT8": (-128.0, 127.0),
+    "INT16": (-32768.0, 32767.0),
+    "INT32": (-2147483648.0, 2147483647.0),
+    "REAL32": (-3.4028234e38, 3.4028234e38),
+}
 # Names of later ArduCopter releases for the same thing, accepted beside the ones of this release.
 ALIASES = {"MAV_GCS_SYSID": "SYSID_MYGCS", "MAV_SYSID": "SYSID_THISMAV"}
 READ_ONLY = frozenset({"FORMAT_VERSION", "MIS_TOTAL", "FENCE_TOTAL", "RALLY_TOTAL", "SYSID_THISMAV"})
@@ -31,12 +36,19 @@ class Parameter:
         return TYPES[self.kind]
 
     def coerce(self, value: float) -> float:
-        """The value as this type stores it."""
+        """The value as this type stores it; the nearest one where it does not fit.
+
+        Raises:
+            ParameterValueError: the value is not a number.
+        """
+        if math.isnan(value):
+            raise ParameterValueError(f"parameter {self.name}: the value is not a number")
+        low, high = RANGES[self.kind]
+        value = min(max(value, low), high)
         if self.kind == "REAL32":
             rounded: float = struct.unpack("<f", struct.pack("<f", value))[0]
             return rounded
-        low, high = RANGES[self.kind]
-        return float(round(min(max(value, low), high)))
+        return float(round(value))
 
 
 @functools.cache
@@ -56,6 +68,24 @@ class UnknownParameterError(KeyError):
     """A parameter name that this vehicle does not have."""
 
 
+class ParameterValueError(ValueError):
+    """A value that no parameter can have, or a file of values that cannot be read."""
+
+
+def _stored(path: Path) -> Iterator[tuple[str, float]]:
+    """The lines of a file of changed parameters; one that is none of them is somebody else's, and must not be replaced."""
+    try:
+        lines = path.read_text(encoding="ascii").splitlines()
+    except UnicodeDecodeError as error:
+        raise ParameterValueError(f"{path}: is no file of parameters (NAME,VALUE a line)") from error
+    for number, line in enumerate(lines, start=1):
+        name, _, text = line.partition(",")
+        try:
+            yield name, float(text)
+        except ValueError as error:
+            raise ParameterValueError(f"{path}, line {number}: expected NAME,VALUE") from error
+
+
 class Parameters:
     """Current values; `changed` is called with the name after each change."""
 
@@ -64,10 +94,9 @@ class Parameters:
         self._store = store
         self.changed: Callable[[str], None] = lambda _name: None
         if store is not None and store.exists():
-            for line in store.read_text(encoding="ascii").splitlines():
-                stored, _, text = line.partition(",")
+            for stored, value in _stored(store):
                 if stored in self._values:
-                    self._values[stored] = table()[_index()[stored]].coerce(float(text))
+                    self._values[stored] = table()[_index()[stored]].coerce(value)
         for name, value in (overrides or {}).items():
             self.assign(name, value)
 
@@ -85,6 +114,7 @@ class Parameters:
 
         Raises:
             UnknownParameterError: there is no such parameter.
+            ParameterValueError: the value is not a number.
         """
         name = ALIASES.get(name, name)
         index = _index().get(name)

@@ -111,6 +111,7 @@ _TITLES = {
     Command.DO_SET_SERVO: "SetServo",
     Command.DO_SET_RELAY: "SetRelay",
     Command.DO_SET_ROI: "SetROI",
+    Command.JUMP_TAG: "JumpTag",
 }
 
 

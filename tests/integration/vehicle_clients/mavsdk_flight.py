@@ -10,7 +10,7 @@ from typing import Any
 from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
 from mavsdk.asyncio.plugins import action, geofence, mission, mission_raw, offboard, param, telemetry
 from mavsdk.plugins import geofence as shapes
-from mavsdk.plugins.mission import MissionItem, MissionPlan
+from mavsdk.plugins.mission import MissionError, MissionItem, MissionPlan
 from mavsdk.plugins.offboard import PositionNedYaw, VelocityNedYaw
 
 METRES = 111_319.0
@@ -55,6 +55,7 @@ async def fly(url: str) -> None:
     await steer(offboard.OffboardAsync(system), sense)
     await fence(geofence.GeofenceAsync(system), home)
     await missions(mission.MissionAsync(system), mission_raw.MissionRawAsync(system), home)
+    await act.return_to_launch()
     await first(sense.subscribe_armed(), lambda armed: not armed, "landed and disarmed", 60.0)
     print("DONE", flush=True)
 
@@ -93,7 +94,7 @@ async def fence(fences: geofence.GeofenceAsync, home: Any) -> None:
 
 
 async def missions(missions: mission.MissionAsync, raw: mission_raw.MissionRawAsync, home: Any) -> None:
-    """Upload, read back, fly, and return."""
+    """Upload, read back and fly."""
     items = [
         MissionItem(
             latitude_deg=home.latitude_deg + north / METRES,
@@ -104,7 +105,15 @@ async def missions(missions: mission.MissionAsync, raw: mission_raw.MissionRawAs
         )
         for north, east, altitude in ((10, 0, 10.0), (10, 10, 12.0), (0, 10, 10.0))
     ]
+    # MAVSDK fills the parameters of its own return with NaN, which ArduPilot refuses; so must whoever claims to be one.
     await missions.set_return_to_launch_after_mission(True)
+    try:
+        await missions.upload_mission(MissionPlan(items))
+    except MissionError as error:
+        print("ok: refused", error, flush=True)
+    else:
+        raise SystemExit("a return with NaN for parameters was accepted")
+    await missions.set_return_to_launch_after_mission(False)
     await missions.upload_mission(MissionPlan(items))
     assert len(await raw.download_mission()) >= len(items)
     await missions.start_mission()

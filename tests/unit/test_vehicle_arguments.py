@@ -1,0 +1,66 @@
+"""What `fractus-vehicle` is started with: numbers, links and the file of parameters."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from fractus_sim.vehicle.__main__ import vehicle
+from fractus_sim.vehicle.links import Hub, LinkError, LinkSpec
+from fractus_sim.vehicle.params import Parameters, ParameterValueError
+from fractus_sim.vehicle.simulation import Craft
+from vehicle_world import CONFIG
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--heading", "nan"], "finite"),
+        (["--speedup", "nan"], "finite"),
+        (["--speedup", "inf"], "finite"),
+        (["--ready-after", "nan"], "finite"),
+        (["--duration", "nan"], "finite"),
+        (["--spacing", "inf"], "--spacing"),
+        (["--wind", "3,nan"], "expected SPEED,DIR"),
+        (["--sysid", "240", "--count", "20"], "system ids end at 250"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_named(arguments: list[str], words: str):
+    done = CliRunner().invoke(vehicle, arguments)
+    assert done.exit_code in (1, 2)
+    assert words in done.output
+
+
+def test_a_row_of_vehicles_does_not_run_out_of_ports():
+    assert LinkSpec.parse("tcp:127.0.0.1:65525").shifted(1).port == 65535
+    with pytest.raises(LinkError, match="begin at a lower one"):
+        LinkSpec.parse("tcp:127.0.0.1:65525").shifted(2)
+
+
+def test_a_pseudoterminal_replaces_no_file(tmp_path: Path):
+    kept = tmp_path / "kept"
+    kept.write_text("mine")
+    hub = Hub()
+    with pytest.raises(LinkError, match="give another path"):
+        hub.open(LinkSpec.parse(f"pty:{kept}"), Craft(CONFIG), 0)
+    hub.close()
+    assert kept.read_text() == "mine"
+
+
+def test_values_that_do_not_fit_are_the_nearest_that_do():
+    assert Parameters({"WPNAV_SPEED": 1e300})["WPNAV_SPEED"] == pytest.approx(3.4028234e38)
+    assert Parameters({"MIS_RESTART": -math.inf})["MIS_RESTART"] == -128.0
+    with pytest.raises(ParameterValueError, match="WPNAV_SPEED"):
+        Parameters({"WPNAV_SPEED": math.nan})
+
+
+@pytest.mark.parametrize("content", [b"a letter to somebody\n", b"WPNAV_SPEED,fast\n", b"\xff\xfe"])
+def test_a_file_that_holds_no_parameters_is_neither_read_nor_replaced(content: bytes, tmp_path: Path):
+    store = tmp_path / "store"
+    store.write_bytes(content)
+    with pytest.raises(ParameterValueError, match="NAME,VALUE"):
+        Parameters(store=store)
+    store.write_text("WPNAV_SPEED,700\nOF_ANOTHER_RELEASE,1\n")
+    assert Parameters(store=store)["WPNAV_SPEED"] == 700.0

@@ -46,6 +46,18 @@ def eventually(look: Callable[[], int | None], timeout_s: float = 60.0) -> int:
     raise TimeoutError(f"nothing within {timeout_s:.0f} s")
 
 
+def pictured(port: int, path: str) -> tuple[int, dict[str, str], bytes]:
+    """The first answer with a picture: on a machine that is busy, a vehicle may be silent for a while."""
+    answers: list[tuple[int, dict[str, str], bytes]] = []
+
+    def look() -> int | None:
+        answers.append(get(port, path))
+        return answers[-1][0] if answers[-1][0] == 200 else None
+
+    eventually(look)
+    return answers[-1]
+
+
 @contextlib.contextmanager
 def running_world(*arguments: str) -> Iterator[int]:
     """The camera world as a process; its port."""
@@ -101,7 +113,7 @@ def test_camera_follows_the_vehicle_and_survives_its_restart() -> None:
             eventually(lambda: get(port, small)[0] == 200 or None)
             pilot = Client(links[0])
             pilot.take_off(20.0)
-            status, headers, body = get(port, small)
+            status, headers, body = pictured(port, small)
             assert status == 200
             assert headers["Content-Type"] == "image/jpeg"
             assert picture_of(body).shape == (180, 320, 3)

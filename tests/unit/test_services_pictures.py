@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import skimage.data
 from fractus_core.policy.values import Attitude, Filter, Home, Lens
-from fractus_services.camera.darkroom import NotHidden, recipe
+from fractus_services.camera.darkroom import NotHidden, is_upright, recipe
 from fractus_services.camera.drivers import BadConnection, CameraFailed, Wanted, driver_for
 from fractus_services.camera.faces import BadModel, CascadeDetector, ModelDetector, smallest_face_px
 from fractus_services.camera.filters import (
@@ -139,6 +139,23 @@ def test_the_smallest_face_follows_from_lens_distance_and_pixels() -> None:
     assert smallest_face_px(lens, 10.0, 2000) == pytest.approx(13.0)
     assert smallest_face_px(lens, float("inf"), 2000) == 0
     assert smallest_face_px(None, 10.0, 2000) == 0
+
+
+@pytest.mark.parametrize(
+    ("lens", "attitudes", "upright"),
+    [
+        (Lens(60, 45, -30, stabilised=True), [Attitude(20, -30, 0)], True),
+        (Lens(60, 45, -30), [Attitude(0, 5, 90), Attitude(10, -10, 0)], True),
+        (Lens(60, 45, -30), [Attitude(0, 0, 0), Attitude(20, 0, 0), Attitude(0, 0, 0)], False),
+        (Lens(60, 45, -30), [Attitude(0, -30, 0)], False),
+        (Lens(60, 45, -30, yaw_deg=90), [Attitude(0, -30, 0)], False),
+        (Lens(60, 45, -90, stabilised=True), [Attitude(0, 0, 0)], False),
+        (Lens(60, 45, -30), [None], False),
+        (None, [Attitude(0, 0, 0)], False),
+    ],
+)
+def test_people_stand_upright_only_where_every_pose_says_so(lens: Any, attitudes: list[Any], upright: bool) -> None:
+    assert is_upright([Pose.of(at(lens=lens, attitude=attitude)) for attitude in attitudes]) is upright
 
 
 def test_where_faces_are_not_found_reliably_the_fallback_applies(detector: CascadeDetector) -> None:

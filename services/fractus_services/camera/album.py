@@ -74,10 +74,10 @@ class Album:
 
     def room(self, owner: str) -> str:
         """Why an instance may not add a picture; empty when it may."""
-        shots = self.list(owner)
-        used = sum(shot.size_bytes for shot in shots)
-        if len(shots) >= self._keep:
-            return f"{len(shots)} pictures are kept, as many as allowed; delete some with DeleteImage"
+        sizes = _sizes(self._folder(owner).glob("*.jpg"))
+        used = sum(sizes)
+        if len(sizes) >= self._keep:
+            return f"{len(sizes)} pictures are kept, as many as allowed; delete some with DeleteImage"
         if used >= self._keep_bytes:
             return f"{used / 1e6:.0f} MB of pictures are kept, as much as allowed; delete some with DeleteImage"
         if self._total() >= self._keep_total_bytes and not self._make_room():
@@ -149,11 +149,7 @@ class Album:
         record.with_suffix(".jpg").unlink(missing_ok=True)
 
     def _total(self) -> int:
-        total = 0
-        for path in self._directory.glob("*/*.jpg"):
-            with contextlib.suppress(FileNotFoundError):
-                total += path.stat().st_size
-        return total
+        return sum(_sizes(self._directory.glob("*/*.jpg")))
 
     def _make_room(self) -> bool:
         """Remove pictures of owners that are gone, oldest folder first, until there is room."""
@@ -172,6 +168,8 @@ class Album:
         These are what a crash, a damaged disk or another release left.
         """
         for record in self._directory.glob("*/*.json"):
+            if not _NAME.fullmatch(record.with_suffix(".jpg").name):
+                continue
             try:
                 Shot.parse(json.loads(record.read_bytes()))
             except ValueError as error:
@@ -183,6 +181,15 @@ class Album:
             orphan = path.suffix == ".jpg" and not path.with_suffix(".json").exists()
             if orphan or path.suffix == ".new":
                 path.unlink(missing_ok=True)
+
+
+def _sizes(paths: Iterable[Path]) -> list[int]:
+    """Bytes of those files that are still there."""
+    sizes = []
+    for path in paths:
+        with contextlib.suppress(FileNotFoundError):
+            sizes.append(path.stat().st_size)
+    return sizes
 
 
 def _missing(name: str) -> NoSuchImage:

@@ -16,8 +16,8 @@ from fractus.environment import Endpoint
 from fractus.errors import NotConfigured, translate
 
 CALL_TIMEOUT_S = 10.0
-PATIENCE_S = 15.0
-"""How long a call waits for a service that is restarting; the drone's driver has as long to come back."""
+PATIENCE_S = 30.0
+"""How long a call waits for a service that is restarting. It then gives a drone's driver 15 s to come back."""
 
 _OPTIONS = (
     ("grpc.keepalive_time_ms", 10_000),
@@ -25,7 +25,7 @@ _OPTIONS = (
     ("grpc.keepalive_permit_without_calls", 0),
     ("grpc.http2.max_pings_without_data", 0),
     ("grpc.initial_reconnect_backoff_ms", 100),
-    ("grpc.min_reconnect_backoff_ms", 500),
+    ("grpc.min_reconnect_backoff_ms", 5_000),  # as long may a handshake take on a busy node
     ("grpc.max_reconnect_backoff_ms", 1_000),
     ("grpc.enable_retries", 0),
     ("grpc.enable_http_proxy", 0),

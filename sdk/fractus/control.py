@@ -17,6 +17,9 @@ from fractus.errors import ControlLost, FractusError, MissionComplete, Unavailab
 _log = logging.getLogger("fractus")
 _Event = mobility_pb2.ControlEvent
 
+AGAIN_S = 0.5
+"""Control is asked for again at least so often while the service is away: the drone hovers meanwhile, and not for long."""
+
 
 class Control:
     """The right to move the drone, for one control point.
@@ -147,7 +150,7 @@ class Control:
         """Keep the stream open; ends when control is lost or was returned."""
         loop = asyncio.get_running_loop()
         give_up = loop.time() + self._channel.patience_s
-        delays = backoff()
+        delays = backoff(cap_s=AGAIN_S)
         while True:
             try:
                 await self._follow()
@@ -160,7 +163,7 @@ class Control:
                 return
             if self._granted.is_set():
                 self._granted.clear()
-                delays, give_up = backoff(), loop.time() + self._channel.patience_s
+                delays, give_up = backoff(cap_s=AGAIN_S), loop.time() + self._channel.patience_s
                 _log.warning("the mobility service is away; waiting for it to come back")
             delay = next(delays)
             if not transient or loop.time() + delay > give_up:

@@ -248,6 +248,29 @@ async def test_a_call_waits_for_a_restarting_service_and_no_longer(stage: Stage)
         assert (await asyncio.wait_for(call, WAIT_S)).velocity.north == 1.0
 
 
+async def test_a_slow_handshake_is_waited_for(stage: Stage) -> None:
+    """A node with a busy processor takes longer over a handshake than a call waits between two attempts."""
+
+    async def pass_on(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(OSError):
+            while data := await source.read(65536):
+                sink.write(data)
+                await sink.drain()
+        sink.close()
+
+    async def relay(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await asyncio.sleep(1.5)
+        there = await asyncio.open_connection("127.0.0.1", stage.server.port)
+        await asyncio.gather(pass_on(reader, there[1]), pass_on(there[0], writer))
+
+    slow = await asyncio.start_server(relay, "127.0.0.1", 0)
+    port = slow.sockets[0].getsockname()[1]
+    endpoint = replace(stage.endpoint, address=f"127.0.0.1:{port}")
+    async with Mobility(endpoint, patience_s=WAIT_S) as drone:
+        assert (await drone.position()).velocity.north == 1.0
+    slow.close()
+
+
 async def test_a_renewed_certificate_is_used_without_ending_the_flight(stage: Stage) -> None:
     stage.drone.release = asyncio.Event()
     async with stage.client() as drone, drone.control() as control:

@@ -1,4 +1,4 @@
-# Images of Fractus: operator, agent, services, component (what applications build on), sim, and the example.
+# Images of Fractus: operator, agent, services, component (what applications build on), sim, and the examples.
 #
 #   docker build --target operator --tag localhost/fractus/operator:dev .
 #
@@ -117,6 +117,10 @@ COPY --from=code /images/component /usr/local/lib/python3.11/dist-packages
 
 FROM component AS example-traffic-monitoring
 COPY examples/traffic-monitoring/*.py /app/
+WORKDIR /app
+
+FROM component AS example-field
+COPY examples/field/*.py /app/
 WORKDIR /app
 
 FROM domain AS operator

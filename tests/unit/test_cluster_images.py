@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import shutil
 import tarfile
 from pathlib import Path
@@ -87,6 +88,13 @@ def test_every_target_is_in_the_dockerfile() -> None:
     assert set(TARGETS) <= stages
 
 
+def test_every_image_of_the_examples_can_be_built() -> None:
+    manifests = (ROOT / "examples").rglob("*.yaml")
+    named = {name for path in manifests for name in re.findall(r"image: localhost/fractus/(\S+):dev", path.read_text())}
+    assert "example-field" in named
+    assert named <= set(TARGETS)
+
+
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
     """A small copy of what images are made of."""
@@ -104,7 +112,7 @@ def checkout(tmp_path: Path) -> Path:
     [
         ("core/module.py", {"operator", "agent", "services", "sim"}),
         ("operator/module.py", {"operator"}),
-        ("sdk/module.py", {"component", "services", "sim", "example-traffic-monitoring"}),
+        ("sdk/module.py", {"component", "services", "sim", "example-traffic-monitoring", "example-field"}),
         ("examples/traffic-monitoring/navigator.py", {"example-traffic-monitoring"}),
         ("uv.lock", set(TARGETS)),
         ("core/__pycache__/module.pyc", set()),

@@ -32,6 +32,7 @@ _CODE: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "services": ("core", "services", "sdk", "proto"),
         "sim": ("core", "services", "sdk", "proto", "sim"),
         "example-traffic-monitoring": ("sdk", "proto", "examples/traffic-monitoring"),
+        "example-field": ("sdk", "proto", "examples/field"),
     }
 )
 TARGETS = tuple(_CODE)

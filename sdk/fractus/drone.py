@@ -17,7 +17,8 @@ from fractus.channel import CALL_TIMEOUT_S, PATIENCE_S, ServiceChannel, backoff
 from fractus.control import Control
 from fractus.environment import Endpoint, endpoint
 from fractus.errors import ControlLost, Corrected, FractusError, translate
-from fractus.questions import CanI, goto_request, velocity_request
+from fractus.questions import CanI
+from fractus.requests import goto_request, speed_request, takeoff_request, velocity_request
 from fractus.values import (
     AltitudeReference,
     Check,
@@ -206,7 +207,7 @@ class Mobility:
         Returns:
             The speed in force, after correction.
         """
-        reply = await self._call("SetSpeed", mobility_pb2.SetSpeedRequest(speed_mps=speed_mps))
+        reply = await self._call("SetSpeed", speed_request(speed_mps))
         return self._judged(SpeedResult(decision=Decision.from_proto(reply.decision), speed_mps=reply.speed_mps))
 
     async def set_velocity(
@@ -255,7 +256,7 @@ class Mobility:
         self, altitude_m: float, *, progress: OnProgress | None = None, timeout_s: float | None = None
     ) -> Motion:
         """Climb from the ground to an altitude above home."""
-        return self._motion("Takeoff", mobility_pb2.TakeoffRequest(altitude_m=altitude_m), progress, timeout_s)
+        return self._motion("Takeoff", takeoff_request(altitude_m), progress, timeout_s)
 
     def land(self, *, progress: OnProgress | None = None, timeout_s: float | None = None) -> Motion:
         """Land here, and disarm."""
@@ -291,8 +292,7 @@ class Mobility:
             progress: called with each step of the way.
             timeout_s: gives up, and hovers, after this long.
         """
-        request = goto_request(Position(lat, lon, alt, reference), yaw_deg, speed_mps)
-        request.acceptance_radius_m = acceptance_radius_m
+        request = goto_request(Position(lat, lon, alt, reference), yaw_deg, speed_mps, acceptance_radius_m)
         return self._motion("Goto", request, progress, timeout_s)
 
     async def telemetry(self, interval_s: float = 0.2) -> AsyncGenerator[Telemetry, None]:

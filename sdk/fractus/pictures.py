@@ -12,6 +12,7 @@ from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
 from fractus.channel import CALL_TIMEOUT_S, PATIENCE_S, ServiceChannel
 from fractus.environment import Endpoint, endpoint
 from fractus.errors import Unavailable, translate
+from fractus.requests import capture_request
 from fractus.values import Decision, ImageInfo, Result
 
 RETRIEVE_TIMEOUT_S = 60.0
@@ -51,7 +52,7 @@ class Camera:
             PolicyDenied: no pictures from here, or not of this.
             Unavailable: the camera gives no picture.
         """
-        request = camera_pb2.CaptureImageRequest(width=width, height=height)
+        request = capture_request(width, height)
         reply = await self._channel.unary("CaptureImage", request, timeout_s=timeout_s)
         return ImageInfo.from_proto(reply.image, reply.decision)
 

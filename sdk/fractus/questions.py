@@ -7,6 +7,7 @@ from typing import Any
 
 from fractus_proto.v1 import mobility_pb2
 
+from fractus.requests import goto_request, speed_request, takeoff_request, velocity_request
 from fractus.values import AltitudeReference, Check, Position, Velocity
 
 Ask = Callable[[mobility_pb2.CheckCallRequest], Awaitable[Check]]
@@ -32,7 +33,7 @@ class CanI:
 
     async def takeoff(self, altitude_m: float) -> Check:
         """Climb to an altitude above home?"""
-        return await self._of(takeoff=mobility_pb2.TakeoffRequest(altitude_m=altitude_m))
+        return await self._of(takeoff=takeoff_request(altitude_m))
 
     async def land(self) -> Check:
         """Land here?"""
@@ -61,7 +62,7 @@ class CanI:
 
     async def set_speed(self, speed_mps: float) -> Check:
         """Fly at this speed?"""
-        return await self._of(set_speed=mobility_pb2.SetSpeedRequest(speed_mps=speed_mps))
+        return await self._of(set_speed=speed_request(speed_mps))
 
     async def set_velocity(
         self,
@@ -86,13 +87,3 @@ class CanI:
 
     async def _of(self, **call: Any) -> Check:
         return await self._ask(mobility_pb2.CheckCallRequest(**call))
-
-
-def goto_request(target: Position, yaw_deg: float | None, speed_mps: float | None) -> mobility_pb2.GotoRequest:
-    """A goto as the wire has it."""
-    return mobility_pb2.GotoRequest(target=target.to_proto(), yaw_deg=yaw_deg, speed_mps=speed_mps or 0.0)
-
-
-def velocity_request(velocity: Velocity, yaw_deg: float | None, hold_s: float) -> mobility_pb2.SetVelocityRequest:
-    """A velocity setpoint as the wire has it."""
-    return mobility_pb2.SetVelocityRequest(velocity=velocity.to_proto(), yaw_deg=yaw_deg, hold_s=hold_s)

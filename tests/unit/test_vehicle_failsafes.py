@@ -129,6 +129,21 @@ def test_target_outside_the_fence_is_dropped_without_an_answer():
     assert distance_m(vehicle, 10.0, 0.0) < 0.7
 
 
+def test_the_fence_is_switched_as_a_whole_or_only_its_floor():
+    vehicle, pilot = alone(FENCE_TYPE=12, FENCE_ENABLE=1)
+    assert vehicle.fence.outside(0.0, 0.0, -20.0)
+    assert pilot.command(Command.DO_FENCE_ENABLE, 2) is Result.ACCEPTED
+    assert vehicle.fence.enabled
+    assert not vehicle.fence.outside(0.0, 0.0, -20.0)
+    assert pilot.command(Command.DO_FENCE_ENABLE, 0) is Result.ACCEPTED
+    assert not vehicle.fence.enabled
+    pilot.parameter("FENCE_TYPE", 4)
+    assert pilot.command(Command.DO_FENCE_ENABLE, 1) is Result.FAILED, "there is no polygon"
+    upload(pilot, 1, _square(Command.NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0))
+    assert pilot.command(Command.DO_FENCE_ENABLE, 1) is Result.ACCEPTED
+    assert vehicle.fence.enabled
+
+
 @pytest.mark.parametrize(
     ("item", "inside", "outside"),
     [

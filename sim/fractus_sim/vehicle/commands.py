@@ -24,7 +24,7 @@ from fractus_sim.vehicle.mav import (
 )
 from fractus_sim.vehicle.mission import Item
 from fractus_sim.vehicle.streams import BUILDERS
-from fractus_sim.vehicle.todo import item_target
+from fractus_sim.vehicle.todo import item_target, switch_fence
 from fractus_sim.vehicle.vehicle import Vehicle
 from fractus_sim.vehicle.wire import Message, layout_of
 
@@ -251,10 +251,7 @@ def _capabilities(v: Vehicle, o: Order, c: Channel) -> Result:
 
 
 def _fence_enable(v: Vehicle, o: Order, _c: Channel) -> Result:
-    if o.params[0] not in (0.0, 1.0, 2.0):
-        return Result.FAILED
-    v.params.assign("FENCE_ENABLE", 1.0 if o.params[0] == 1.0 else 0.0)
-    return Result.ACCEPTED
+    return Result.ACCEPTED if switch_fence(v, o.params[0]) else Result.FAILED
 
 
 def _mission_start(v: Vehicle, _o: Order, _c: Channel) -> Result:

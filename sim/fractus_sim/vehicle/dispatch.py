@@ -291,6 +291,7 @@ def _set_home(v: Vehicle, m: Message, _c: Channel) -> None:
 def _setup_signing(v: Vehicle, m: Message, _c: Channel) -> None:
     """A key of zeros turns signing off; refused while armed, as ArduPilot."""
     if v.armed:
+        v.say(Severity.DEBUG, "ERROR: Won't setup signing when armed")
         return
     key = bytes(int(value) for value in m.array("secret_key"))
     started = m.integer("initial_timestamp")

@@ -141,6 +141,11 @@ class Fence:
     breach_count: int = 0
     breach_time_s: float = 0.0
 
+    @property
+    def present(self) -> bool:
+        """Whether there is anything to enable: a limit, or a shape."""
+        return bool(self.types & ~Breach.POLYGON) or (bool(self.types & Breach.POLYGON) and bool(self.shapes))
+
     def outside(self, north: float, east: float, altitude_m: float, home: Vertex = (0.0, 0.0)) -> Breach:
         """What a point (local metres, altitude above home) would breach if the fence is enabled."""
         found = Breach.NONE

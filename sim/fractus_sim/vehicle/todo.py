@@ -6,6 +6,7 @@ import math
 from collections import deque
 from typing import TYPE_CHECKING
 
+from fractus_sim.vehicle.fence import Breach
 from fractus_sim.vehicle.mav import Command, Severity
 from fractus_sim.vehicle.shaping import wrap_pi
 
@@ -73,11 +74,22 @@ def _do(v: Vehicle, item: Item) -> None:
         case Command.DO_SET_ROI_NONE:
             v.yaw.look_at(None)
         case Command.DO_FENCE_ENABLE:
-            v.params.assign("FENCE_ENABLE", 1.0 if item.param1 > 0.5 else 0.0)
+            switch_fence(v, item.param1)
         case Command.DO_SET_HOME:
             v.set_home_here() if item.param1 > 0.5 else v.set_home_at(item.x, item.y, item.z)
         case _:
             pass  # servos, relays, cameras and mounts: there are none
+
+
+def switch_fence(v: Vehicle, action: float) -> bool:
+    """DO_FENCE_ENABLE: 0 off, 1 on, 2 only the floor off; False when there is nothing to switch on, or no such action."""
+    if action == 2.0:
+        v.fence.types &= ~Breach.ALT_MIN
+        return True
+    if action not in (0.0, 1.0) or (action == 1.0 and not v.fence.present):
+        return False
+    v.params.assign("FENCE_ENABLE", action)
+    return True
 
 
 def item_target(v: Vehicle, item: Item) -> tuple[float, float, float]:

@@ -20,7 +20,9 @@ from fractus_operator.store import NotFound, Store
 
 logger = logging.getLogger(__name__)
 
-_PARALLEL = 4
+_PARALLEL = 8
+_BESIDE = 2
+"""How many other objects than Deployments are applied at a time: what schedules pods needs the API server more."""
 
 
 class NameTaken(Exception):
@@ -35,6 +37,7 @@ class Children:
         self._live = live
         self._grantor = grantor
         self._parallel = asyncio.Semaphore(_PARALLEL)
+        self._beside = asyncio.Semaphore(_BESIDE)
         self._normalised: dict[tuple[Kind, Key], tuple[object, ...] | None] = {}
 
     async def look_around(self, key: Key) -> Mapping[Kind, set[str]] | None:
@@ -108,7 +111,7 @@ class Children:
     ) -> None:
         key = key_of(body)
         desired = stamped(body)
-        async with self._parallel:
+        async with self._parallel if kind is kinds.DEPLOYMENT else self._beside:
             observed = await self.observed(kind, key, taken)
             current = is_current(desired, observed) or self._is_normalised(kind, key, desired, observed)
             if kind is kinds.GRANT and observed is not None:

@@ -6,7 +6,6 @@ No kubelets: objects are real, nothing runs. Tests say of pods what kubelets wou
 from __future__ import annotations
 
 import json
-import signal
 import socket
 import ssl
 import subprocess
@@ -48,7 +47,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def wait_for(question: Callable[[], T | None], what: str | Callable[[], str], timeout_s: float = 20.0) -> T:
+def wait_for(question: Callable[[], T | None], what: str | Callable[[], str], timeout_s: float = 60.0) -> T:
     """Ask until the answer is true; fails with what was waited for."""
     end = time.monotonic() + timeout_s
     while True:
@@ -218,15 +217,11 @@ class ControlPlane:
         )
 
     def stop(self) -> None:
+        """Nothing of it is kept: a graceful end takes an API server that is still watched ten seconds."""
         self.admin.close()
         for process in reversed(self._processes):
-            process.send_signal(signal.SIGTERM)
-        for process in reversed(self._processes):
-            try:
-                process.wait(10)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait(10)
+            process.kill()
+            process.wait(10)
 
     def _run(self, program: str, *arguments: str) -> None:
         with (self._directory / f"{program}.log").open("wb") as log:

@@ -154,6 +154,8 @@ def test_a_killed_operator_finishes_what_it_began(world: World, operator: Operat
     world.put(traffic(namespace))
     wait_for(lambda: world.grants(namespace), "the first grant")
     operator.stop(signal.SIGKILL)
+    # By it the next operator knows whose drone it is.
+    assert "deploymentplans/traffic" in world.children(namespace)
     operator.start()
     deployed(world, namespace)
     deployments = [n for n in world.children(namespace) if n.startswith("deployments/")]

@@ -126,18 +126,28 @@ async def test_an_object_that_cannot_be_read_hides_no_other(monkeypatch: pytest.
 
 def test_an_own_write_is_told_and_outlives_older_news() -> None:
     changes: list[tuple[int | None, int | None]] = []
+    read: list[Body] = []
+
+    def value(body: Body) -> int:
+        read.append(body)
+        return int(body["value"])
+
     reflector: Reflector[int] = Reflector(
         Script(),  # type: ignore[arg-type]
         ZONE,
-        lambda body: body["value"],
+        value,
         lambda _key, old, new: changes.append((old, new)),
     )
     reflector.note(("", "a"), zone("a", 7, 2))
     reflector._take("MODIFIED", zone("a", 6, 1))
     assert reflector.get(("", "a")) == 2
     reflector._take("MODIFIED", zone("a", 7, 2))
+    assert len(read) == 1, "what the watch repeats is not read again"
     reflector._take("MODIFIED", zone("a", 8, 3))
     assert changes == [(None, 2), (2, 3)]
+    reflector.note(("", "a"), zone("a", 9, 4))
+    reflector._take("DELETED", zone("a", 9, 4))
+    assert reflector.get(("", "a")) is None
 
 
 # -- worklist --

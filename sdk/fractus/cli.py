@@ -114,6 +114,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 
 def _explain(error: Exception) -> int:
+    while isinstance(error, ExceptionGroup):
+        error = error.exceptions[0]  # what failed first; what it took along says less
     match error:
         case click.exceptions.NoArgsIsHelpError():
             click.echo(error.format_message())

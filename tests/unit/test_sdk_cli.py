@@ -22,6 +22,8 @@ def probe(how: str) -> None:
         raise Infeasible("no drone can fly\nso far")
     if how == "bug":
         raise RuntimeError("something broke")
+    if how == "task":
+        raise ExceptionGroup("unhandled errors in a TaskGroup", [ExceptionGroup("", [ValueError("no port in tcp:x")])])
     if how == "file":
         open("/no/such/file")  # noqa: PTH123, SIM115
     if how == "bad":
@@ -56,6 +58,7 @@ def fractus(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str,
         (["probe", "infeasible"], 2, "fractus: no drone can fly so far\n"),
         (["probe", "bug"], 1, "fractus: something broke\n"),
         (["probe", "file"], 1, "fractus: /no/such/file: No such file or directory\n"),
+        (["probe", "task"], 1, "fractus: no port in tcp:x\n"),
         (["probe", "bad"], 1, "fractus: latitude must be -90 to 90, not 95\n"),
         (["probe", "stop"], 130, "\nfractus: interrupted\n"),
         (["probe"], 1, "fractus: Missing argument 'HOW'. (see `fractus probe --help`)\n"),

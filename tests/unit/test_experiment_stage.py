@@ -13,6 +13,7 @@ from fractus_sim.experiment import lifeline, runner
 from fractus_sim.experiment.model import Experiment, parse
 from fractus_sim.experiment.stage import Moment, Stage
 from fractus_sim.interruption import uninterrupted
+from fractus_sim.report.page import write_page
 
 
 class Thing:
@@ -115,3 +116,17 @@ def test_the_guard_kills_what_it_was_not_told_to_leave_alone(monkeypatch: pytest
     monkeypatch.setattr(lifeline.os, "killpg", lambda group, _signal: killed.append(group))
     lifeline.guard(io.StringIO("41\n42\n43\n-42\n"))
     assert killed == [41, 43]
+
+
+def test_a_page_that_cannot_be_written_whole_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def half(path: Path, text: str) -> None:
+        path.write_bytes(text[:3].encode())
+        raise full()
+
+    write_page(tmp_path, "# Whole")
+    assert [path.name for path in tmp_path.iterdir()] == ["summary.md"]
+    (tmp_path / "summary.md").unlink()
+    monkeypatch.setattr(Path, "write_text", half)
+    with pytest.raises(OSError, match="No space left"):
+        write_page(tmp_path, "# Flight")
+    assert not list(tmp_path.iterdir())

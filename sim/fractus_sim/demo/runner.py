@@ -19,6 +19,7 @@ from fractus_sim.demo.place import EXAMPLE, ROOT, Place, documents
 from fractus_sim.demo.watch import GROUNDED, Mission, follow, wait_ready
 from fractus_sim.interruption import uninterrupted
 from fractus_sim.report import Record, write_report
+from fractus_sim.report.page import PAGE
 from fractus_sim.report.record import AUDIT, OBJECTS, PICTURES
 from fractus_sim.report.summary import figures
 
@@ -94,7 +95,7 @@ class Demo:
             ClusterError: the embedded cluster could not be brought up.
         """
         self.out.mkdir(parents=True, exist_ok=True)
-        for stale in ("summary.md", OBJECTS, "events.json", LOGS):
+        for stale in (PAGE, OBJECTS, "events.json", LOGS):
             (self.out / stale).unlink(missing_ok=True)
         for folder in (AUDIT, PICTURES):
             shutil.rmtree(self.out / folder, ignore_errors=True)

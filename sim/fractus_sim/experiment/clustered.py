@@ -130,9 +130,10 @@ class ClusterStage(Stage):
     def _take_down(self) -> None:
         """Take the cluster down, or only what was applied, if it ran before."""
         self._stop.set()
-        with _explained(), uninterrupted():
+        with _explained():
             if not self._was_running:
-                self._cluster.down()
+                with uninterrupted():
+                    self._cluster.down()
             elif self._kube is not None:
                 self._kube.delete(self._applications, DRONE_READY_S)
 

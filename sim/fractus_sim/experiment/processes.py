@@ -34,9 +34,7 @@ class Processes:
         self._running: dict[str, subprocess.Popen[bytes]] = {}
         self._lifeline = Lifeline()
 
-    def start(
-        self, name: str, argv: Sequence[str], environment: Mapping[str, str], folder: Path | None = None
-    ) -> subprocess.Popen[bytes]:
+    def start(self, name: str, argv: Sequence[str], environment: Mapping[str, str], folder: Path | None = None) -> None:
         """Start a process; its output is appended to `NAME.log`.
 
         Raises:
@@ -61,7 +59,6 @@ class Processes:
             self._running.pop(name, None)
             self._running[name] = process
             self._lifeline.hold(process.pid)
-        return process
 
     def log(self, name: str) -> Path:
         """The file with what a process writes."""
@@ -118,7 +115,9 @@ class Processes:
         try:
             if not kill:
                 for process in chosen:
-                    process.terminate()
+                    # Not by Popen, which would wait for one that has just ended, and leave its group alone.
+                    with contextlib.suppress(ProcessLookupError, PermissionError):
+                        os.kill(process.pid, signal.SIGTERM)
                 self._wait_ended(chosen)
         finally:
             for process in chosen:

@@ -16,7 +16,7 @@ from fractus_sim.report.drawing import save
 from fractus_sim.report.flightmap import draw_map
 from fractus_sim.report.geojson import feature, lonlat, path, point
 from fractus_sim.report.mission import marks_of, requests_of
-from fractus_sim.report.page import clock, table
+from fractus_sim.report.page import PAGE, clock, table, write_page
 from fractus_sim.report.profile import Limit, Profile, Span, draw_profile
 from fractus_sim.report.scene import DrawnZone, Mark, Scene
 from fractus_sim.report.summary import judged
@@ -40,13 +40,12 @@ def write_outcome(outcome: Outcome) -> None:
         save(draw_profile(profile_of(outcome)), folder / "profile.png")
     (folder / "tracks.geojson").write_text(json.dumps(features(outcome)) + "\n")
     (folder / "report.json").write_text(json.dumps(figures(outcome), indent=2) + "\n")
-    # Last, so that where there is a page the report is complete.
-    (folder / "summary.md").write_text(summary(outcome))
+    write_page(folder, summary(outcome))
 
 
 def remove_report(folder: Path) -> None:
     """Remove what an earlier run wrote there, so that a run that is broken off does not show another's report."""
-    for name in ("summary.md", "report.json", "tracks.geojson", "map.png", "profile.png"):
+    for name in (PAGE, "report.json", "tracks.geojson", "map.png", "profile.png"):
         (folder / name).unlink(missing_ok=True)
 
 

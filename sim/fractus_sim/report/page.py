@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+PAGE = "summary.md"
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -18,3 +21,13 @@ def clock(seconds: float | None) -> str:
         return "-"
     whole = round(seconds)
     return f"{seconds:.1f} s" if whole < 60 else f"{whole // 60} min {whole % 60:02d} s"
+
+
+def write_page(folder: Path, text: str) -> None:
+    """Write the page, whole or not at all; the last of a report, so that where there is a page there is all of it."""
+    scratch = folder / f".{PAGE}"
+    try:
+        scratch.write_text(text)
+        scratch.replace(folder / PAGE)
+    finally:
+        scratch.unlink(missing_ok=True)

@@ -10,6 +10,7 @@ import click
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.interruption import break_off_on_signals
 from fractus_sim.report.drawing import save
+from fractus_sim.report.page import PAGE, write_page
 from fractus_sim.scenarios.field.drawing import draw_altitudes, draw_ground
 from fractus_sim.scenarios.field.evidence import Evidence
 from fractus_sim.scenarios.field.expectations import Check, Judge
@@ -66,6 +67,7 @@ def experiment(out: Path, autopilot: Autopilot, names: tuple[str, ...] = ()) -> 
         ground = Field.read(EXAMPLE, standing.home)
         words = f"vehicle {standing.system_id} at {autopilot.link}"
     out.mkdir(parents=True, exist_ok=True)
+    (out / PAGE).unlink(missing_ok=True)
     runs: list[Evidence] = []
     checks: list[Check] = []
     for run in RUNS:
@@ -79,8 +81,8 @@ def experiment(out: Path, autopilot: Autopilot, names: tuple[str, ...] = ()) -> 
     area = ground.operation_area(ground.grants(ground.write(out), policies=True))
     save(draw_ground(ground, area, runs), out / "map.png")
     save(draw_altitudes(runs), out / "altitude.png")
-    (out / "summary.md").write_text(summary(ground, runs, checks, words))
     (out / "report.json").write_text(dump(figures(ground, runs, checks, words)))
+    write_page(out, summary(ground, runs, checks, words))
     return checks
 
 

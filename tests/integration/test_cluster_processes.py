@@ -78,7 +78,13 @@ def supervisor(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]
 
     def start(**scripts: str) -> subprocess.Popen[bytes]:
         units = [
-            {"name": name, "argv": ["/bin/sh", "-c", script], "log": str(tmp_path / f"{name}.log"), "env": ENVIRONMENT}
+            {
+                "name": name,
+                "argv": ["/bin/sh", "-c", script],
+                "log": str(tmp_path / f"{name}.log"),
+                "env": ENVIRONMENT,
+                "needs": str(tmp_path / "permission") if name == "patient" else "",
+            }
             for name, script in scripts.items()
         ]
         (tmp_path / "units.json").write_text(json.dumps({"units": units}))
@@ -106,6 +112,16 @@ def test_supervisor_restarts_what_ends_ever_more_slowly(
     first, second, third = (after - before for before, after in zip(starts(), starts()[1:4], strict=False))
     assert first < second < third
     assert (tmp_path / "steady.log").read_text() == "up\n"
+
+
+def test_a_unit_waits_for_the_file_that_it_needs(
+    supervisor: Callable[..., subprocess.Popen[bytes]], tmp_path: Path
+) -> None:
+    supervisor(patient="echo up; exec sleep 300", other="echo up; exec sleep 300")
+    until(lambda: (tmp_path / "other.log").exists() and (tmp_path / "other.log").read_text() == "up\n", "the other")
+    assert not (tmp_path / "patient.log").exists()
+    (tmp_path / "permission").touch()
+    until(lambda: (tmp_path / "patient.log").exists() and (tmp_path / "patient.log").read_text() == "up\n", "it")
 
 
 def test_units_die_with_their_supervisor(supervisor: Callable[..., subprocess.Popen[bytes]], tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ from fractus_sim.cluster.controlplane import (
     ControlPlaneFiles,
     administrator,
     control_plane_units,
+    let_dns_start,
     server_url,
     write_control_plane,
 )
@@ -49,7 +50,7 @@ from fractus_sim.cluster.state import Memory, StateDirectory, only_cluster, stat
 _LOCK_TIMEOUT_S = 300.0
 _API_TIMEOUT_S = 120.0
 _READY_TIMEOUT_S = 90.0
-_DNS_TIMEOUT_S = 30.0
+_DNS_TIMEOUT_S = 90.0
 _POLL_S = 0.1
 _CONFLICTS = 5
 _CONTROL_PLANE = "control-plane"
@@ -220,6 +221,7 @@ class Cluster:
             with self._api(authority, memory) as api:
                 api.wait_ready(timeout_s=_API_TIMEOUT_S)
                 self._apply_objects(api, nodes, memory)
+                let_dns_start(self._wiring(memory).addressing, self._files())
                 since = datetime.now(UTC).replace(microsecond=0)
                 started_nodes = {node.name for node in nodes if node.power_on()}
                 for node in nodes:

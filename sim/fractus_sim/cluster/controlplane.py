@@ -70,7 +70,8 @@ def administrator(authority: Authority) -> Credential:
 def write_control_plane(
     authority: Authority, addressing: Addressing, files: ControlPlaneFiles, *, cluster: str
 ) -> None:
-    """Write the kubeconfigs and the DNS configuration of the control plane."""
+    """Write the kubeconfigs of the control plane; its DNS server stays off until `let_dns_start`."""
+    files.corefile.unlink(missing_ok=True)
     users = {
         "kube-controller-manager": "system:kube-controller-manager",
         "kube-scheduler": "system:kube-scheduler",
@@ -80,8 +81,15 @@ def write_control_plane(
         credential = authority.issue(program, common_name=user)
         text = authority.kubeconfig(credential, server=server_url(addressing), cluster=cluster)
         write_private(files.kubeconfig(program), text)
-    files.corefile.write_text(corefile(addressing, files.kubeconfig("coredns")))
     files.logs.mkdir(parents=True, exist_ok=True)
+
+
+def let_dns_start(addressing: Addressing, files: ControlPlaneFiles) -> None:
+    """Write the DNS server's configuration, once it may read Services: refused, it asks again only after half a minute."""
+    if not files.corefile.exists():
+        fresh = files.corefile.with_suffix(".new")
+        fresh.write_text(corefile(addressing, files.kubeconfig("coredns")))
+        fresh.replace(files.corefile)
 
 
 def corefile(addressing: Addressing, kubeconfig: Path) -> str:
@@ -118,8 +126,15 @@ def control_plane_units(
         ],
         "coredns": ["-conf", str(files.corefile), "-dns.port=53"],
     }
+    needs = {"coredns": str(files.corefile)}
     return [
-        {"name": name, "argv": [str(binaries[name]), *argv], "log": str(files.logs / f"{name}.log"), "env": env}
+        {
+            "name": name,
+            "argv": [str(binaries[name]), *argv],
+            "log": str(files.logs / f"{name}.log"),
+            "env": env,
+            "needs": needs.get(name, ""),
+        }
         for name, argv in argvs.items()
     ]
 

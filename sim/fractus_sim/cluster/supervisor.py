@@ -1,7 +1,7 @@
 """The first process of a node or control plane: starts programs, restarts them, reaps orphans.
 
 It runs on the standard library alone, in its own process, and is told what to run by a JSON file:
-`{"units": [{"name", "argv", "log", "env", "priority"}]}`. It never ends; killing it ends all.
+`{"units": [{"name", "argv", "log", "env", "needs"}]}`. It never ends; killing it ends all.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ class Unit:
         argv: Program and arguments.
         log: File that its output is appended to.
         env: Its whole environment.
+        needs: File without which it is not started yet; empty for none.
         oom_score_adj: How readily the kernel may kill it.
     """
 
@@ -42,6 +43,7 @@ class Unit:
     argv: list[str]
     log: str
     env: dict[str, str]
+    needs: str = ""
     oom_score_adj: int = -900
     process: subprocess.Popen[bytes] | None = None
     started_s: float = 0.0
@@ -102,7 +104,10 @@ def supervise(units: list[Unit]) -> None:
         now_s = time.monotonic()
         for unit in units:
             if unit.process is None and unit.due_s <= now_s:
-                unit.start(now_s)
+                if unit.needs and not Path(unit.needs).exists():
+                    unit.due_s = now_s + _BACKOFF_FIRST_S
+                else:
+                    unit.start(now_s)
         if now_s - trimmed_s >= _LOG_CHECK_S:
             trimmed_s = now_s
             for unit in units:

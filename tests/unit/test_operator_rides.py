@@ -14,7 +14,7 @@ from fractus_core.planning.flight import Flight
 from fractus_operator.claims import OwnedPlan, claims
 from fractus_operator.hosts import Bookings, corrections
 from fractus_operator.pods import PodView
-from fractus_operator.reading import read_submitted
+from fractus_operator.reading import Makes, read_submitted
 from fractus_operator.rides import Flown, flights, ride_lost, ride_outcome
 from test_planning import PATH, VIEWER, application, at, drone, inventory, manifest, navigator
 
@@ -109,6 +109,17 @@ def test_of_two_that_fly_one_drone_the_older_grant_counts() -> None:
     old, new = grant("traffic", "t", "2026-01-01T00:00:00Z"), grant("a", "a", "2026-01-02T00:00:00Z")
     assert claims(plans, [old, new])["d"].uid == "t"
     assert claims(plans, [])["d"].uid == "a"
+
+
+def test_grants_share_the_areas_they_have_in_common() -> None:
+    ring = [{"lat": 0.0, "lon": 0.0}, {"lat": 0.0, "lon": 1.0}, {"lat": 1.0, "lon": 0.0}]
+    area = [{"polygon": {"exterior": ring}}]
+    spec = grant("a", "a", "2026-01-01T00:00:00Z").spec.to_dict()
+    makes = Makes(parts=2)
+    read = [makes.grant(manifest("Grant", name, {**spec, "operationArea": area, "corridor": area})) for name in "ab"]
+    first, second = (found.spec for found in read if found is not None)
+    assert first.operation_area is first.corridor is second.operation_area is second.corridor
+    assert makes.grant(manifest("Grant", "odd", {"node": 1})) is None
 
 
 # -- bookings --

@@ -211,6 +211,23 @@ def test_sentences_of_bad_schedules(time, sentence):
     assert str(caught.value).startswith(sentence)
 
 
+@pytest.mark.parametrize(
+    ("spec", "sentence"),
+    [
+        ({"components": "x"}, "spec.components: must be a list, not 'x'"),
+        ({"components": []}, "spec.components: must have at least 1 entries, not 0"),
+        ({"components": [STORE] * 51}, "spec.components: must have at most 50 entries, not 51"),
+        ([], "spec: must be an object with named fields"),
+        ({"components": [STORE | {"container": "x" * 500}]}, "spec.components[0].container: must be an object with"),
+    ],
+)
+def test_wrong_types_are_told_in_words_of_manifests(spec, sentence):
+    with pytest.raises(InvalidObject) as caught:
+        Application.from_body(manifest("Application", "a", spec))
+    assert str(caught.value).startswith(sentence)
+    assert len(str(caught.value)) < 200
+
+
 def test_too_many_waypoints_are_refused():
     path = [{"lat": 50 + i * 1e-6, "lon": 4} for i in range(1000)]
     point = {"navigation": "pathBased", "path": path}

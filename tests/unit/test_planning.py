@@ -5,7 +5,7 @@ import random
 
 import pytest
 import shapely
-from fractus_core.api import Application, Depot, Drone, EdgeNode
+from fractus_core.api import Application, Depot, Drone, EdgeNode, InvalidObject
 from fractus_core.geo import LocalFrame
 from fractus_core.planning import Host, Infeasible, Inventory, Settings, instance_name, plan
 
@@ -157,6 +157,23 @@ def test_unsuitable_drone_is_named_with_its_reason(fleet, reason):
 def test_no_drone_at_all_says_so():
     with pytest.raises(Infeasible, match="there is no drone"):
         plan(application(navigator(PATH)), inventory())
+
+
+def test_drones_on_another_continent_are_not_said_to_be_missing():
+    path = [{"lat": -33.0, "lon": 151.0, "alt": 20}]
+    with pytest.raises(Infeasible, match="of 1 known drones none is anywhere near the start"):
+        plan(application(navigator(path, point={"position": path[0]})), inventory([drone("d")]))
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [(name, math.nan) for name in ("safety_radius_m", "depot_radius_m", "coverage_share", "climb_speed_mps")]
+    + [("safety_radius_m", math.inf), ("safety_radius_m", 0), ("cruise_speed_mps", 0), ("battery_reserve", 1.1)],
+)
+def test_settings_that_no_plan_can_be_made_with_are_refused(setting, value):
+    spelled = setting.removesuffix("_m").removesuffix("_mps").removesuffix("_share").replace("_", " ")
+    with pytest.raises(InvalidObject, match=rf"^{spelled}: must be .* to .*, not {value:g}$"):
+        Settings(**{setting: value})
 
 
 def test_claimed_drone_is_left_alone():

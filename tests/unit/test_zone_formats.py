@@ -183,6 +183,22 @@ def test_ed269_schedules_are_never_shortened():
     assert any("active all day" in n for n in notes)
 
 
+def test_geojson_is_cut_at_the_antimeridian():
+    across = zone("a", {"circle": {"center": {"lat": 10.0, "lon": 180.0}, "radius": 500}})
+    written = formats.write_geojson([across])
+    geometry = json.loads(written.text)["features"][0]["geometry"]
+    assert geometry["type"] == "MultiPolygon"
+    for (ring,) in geometry["coordinates"]:
+        assert max(lon for lon, _ in ring) - min(lon for lon, _ in ring) < 0.01
+    assert written.notes[1] == "a: it crosses the antimeridian and is cut there, into parts"
+    assert len(formats.read_geojson(written.text).zones) == 2
+
+
+def test_geojson_tells_of_zones_around_a_pole():
+    polar = zone("n", {"circle": {"center": {"lat": 90.0, "lon": 0.0}, "radius": 500}})
+    assert any("contains a pole" in note for note in formats.write_geojson([polar]).notes)
+
+
 @pytest.mark.parametrize(
     ("volume", "upper", "note"),
     [

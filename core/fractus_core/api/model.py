@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic.alias_generators import to_camel
+from pydantic_core import ErrorDetails
 
 GROUP = "fractus.dev"
 VERSION = "v1alpha1"
@@ -170,11 +171,27 @@ class InvalidObject(ValueError):
             inner = context.field
             joint = "" if not inner or inner.startswith("[") or not path else "."
             return cls((path + joint + inner).lstrip("."), context.problem)
-        problem = str(context) if context is not None else finding["msg"]
+        problem = str(context) if context is not None else _problem(finding)
         shown = finding.get("input")
         if context is None and isinstance(shown, (str, int, float, bool)):
-            problem += f", not {shown!r}"
+            text = repr(shown)
+            problem += f", not {text if len(text) <= 80 else text[:77] + '...'}"
         return cls(path.lstrip("."), problem[:1].lower() + problem[1:])
+
+
+def _problem(finding: ErrorDetails) -> str:
+    """What is wrong, in words of manifests where pydantic uses those of Python."""
+    limits = finding.get("ctx", {})
+    match finding["type"]:
+        case "tuple_type" | "list_type":
+            return "must be a list"
+        case "model_type" | "model_attributes_type" | "dict_type":
+            return "must be an object with named fields"
+        case "too_long" if limits.get("field_type") == "Tuple":
+            return f"must have at most {limits['max_length']} entries, not {limits['actual_length']}"
+        case "too_short" if limits.get("field_type") == "Tuple":
+            return f"must have at least {limits['min_length']} entries, not {limits['actual_length']}"
+    return finding["msg"]
 
 
 def rules(*pairs: tuple[str, str]) -> dict[str, Any]:

@@ -81,7 +81,9 @@ def choose_drone(draft: Draft, area: OperationArea, candidates: DroneCandidates)
     if not ranked:
         busy = any(r.reason == "Claimed" for r in draft.rejections(leader))
         reason = "DroneBusy" if busy else "NoDrone"
-        raise draft.infeasible(leader, reason, f"no drone can fly {leader.name}", "there is no drone")
+        known = len(draft.inventory.drones)
+        nothing = f"of {known} known drones none is anywhere near the start" if known else "there is no drone"
+        raise draft.infeasible(leader, reason, f"no drone can fly {leader.name}", nothing)
     ranked.sort(key=lambda r: (not draft.flew(r.drone.name, shared=r.used), -r.score, r.drone.name))
     best = ranked[0]
     for component in components:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from fractus_core.api.geometry import Position
+from fractus_core.api.model import InvalidObject
 from fractus_core.api.nodes import Depot, Drone, EdgeNode
 from fractus_core.api.policies import Policy, Zone
 from fractus_core.planning.coverage import CoverStrategy
@@ -112,6 +114,16 @@ DroneScore = Callable[[DroneFacts], float]
 """Scores a drone, higher is better; equals go by name."""
 
 
+_BOUNDS = {
+    "safety_radius_m": ("safety radius", 0.1, 10_000.0),
+    "depot_radius_m": ("depot radius", 0.0, math.inf),
+    "coverage_share": ("coverage", 0.0, 1.0),
+    "cruise_speed_mps": ("cruise speed", 0.1, 1000.0),
+    "climb_speed_mps": ("climb speed", 0.1, 1000.0),
+    "battery_reserve": ("battery reserve", 0.0, 1.0),
+}
+
+
 @dataclass(frozen=True, slots=True)
 class Settings:
     """What an installation may tune.
@@ -143,3 +155,14 @@ class Settings:
     rejections_listed: int = 5000
     score_drone: DroneScore | None = None
     cover: CoverStrategy | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that no plan can be made with.
+
+        Raises:
+            InvalidObject: naming the setting.
+        """
+        for name, (spelled, least, most) in _BOUNDS.items():
+            value = getattr(self, name)
+            if not least <= value <= most:
+                raise InvalidObject(spelled, f"must be {least:g} to {most:g}, not {value:g}")

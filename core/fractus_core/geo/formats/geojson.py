@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterable
 from typing import Any
 
 from fractus_core.api import InvalidObject, Zone
+from fractus_core.geo.areas import geojson, middle, polygon
 from fractus_core.geo.formats.drafts import (
     Drafts,
     Exported,
@@ -21,6 +23,7 @@ from fractus_core.geo.formats.drafts import (
     round_area,
     unsaid,
 )
+from fractus_core.geo.frames import LocalFrame
 
 _KNOWN = frozenset({"name", "title", "description", "radius", "altitude", "schedule"})
 _STYLE = frozenset({"fill", "fill-opacity", "stroke", "stroke-width", "stroke-opacity", "marker-color"})
@@ -92,13 +95,27 @@ def _heights(coordinates: Any) -> bool:
 
 
 def write_geojson(zones: Iterable[Zone]) -> Exported:
-    """A FeatureCollection with a polygon for each zone; read_geojson takes it back."""
+    """A FeatureCollection with a polygon for each zone, cut at the antimeridian (RFC 7946); read_geojson takes it back."""
     zones = tuple(zones)
+    notes = unsaid(zones, "circle")
     features = []
     for zone in zones:
         spec = zone.spec.to_dict()
         properties = {"name": zone.name} | {k: spec[k] for k in ("altitude", "schedule", "description") if spec.get(k)}
-        geometry = {"type": "Polygon", "coordinates": area_rings(zone.spec.area)}
+        outline = area_rings(zone.spec.area)
+        geometry: dict[str, Any] = {"type": "Polygon", "coordinates": outline}
+        crossings = _crossings(outline[0])
+        if crossings % 2:
+            notes.append(f"{zone.name}: it contains a pole; programs that draw degrees on a plane show it wrong")
+        elif crossings:
+            frame = LocalFrame.at(middle(zone.spec.area))
+            geometry = geojson(frame, polygon(frame, zone.spec.area))
+            notes.append(f"{zone.name}: it crosses the antimeridian and is cut there, into parts")
         features.append({"type": "Feature", "properties": properties, "geometry": geometry})
     text = json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"
-    return Exported(text, tuple(unsaid(zones, "circle")))
+    return Exported(text, tuple(notes))
+
+
+def _crossings(ring: list[list[float]]) -> int:
+    """How often a ring crosses the antimeridian: an odd number only if it runs around a pole."""
+    return sum(abs(a[0] - b[0]) > 180 for a, b in itertools.pairwise(ring))

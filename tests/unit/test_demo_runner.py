@@ -11,13 +11,13 @@ import demo_flight
 import pytest
 import yaml
 from click.testing import CliRunner
-from fractus_sim.demo import watch
+from fractus_sim.demo import collect, watch
 from fractus_sim.demo.__main__ import demo
 from fractus_sim.demo.collect import fetch_logs, spread
 from fractus_sim.demo.kube import DemoError, Kube
 from fractus_sim.demo.place import ROOT, assign
 from fractus_sim.demo.watch import Mission
-from fractus_sim.report.record import of_mission
+from fractus_sim.report.record import Record, of_mission, taken_s
 
 
 def node(name: str, label: str | None = None) -> dict[str, Any]:
@@ -173,6 +173,27 @@ def test_pictures_are_spread_over_the_flight() -> None:
     chosen = spread(every, start_s + 10, start_s + 50)
     assert [path[-14:-12] for path in chosen] == ["20", "30", "40"]
     assert spread(every, start_s + 100, start_s + 200) == []
+
+
+def test_pictures_of_the_flight_come_from_the_node_s_album(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kubectl = tmp_path / "kubectl"
+    kubectl.write_text('#!/bin/sh\nif [ "$1" = get ]; then echo fractus-mobility-x; else shift 5; exec "$@"; fi\n')
+    kubectl.chmod(0o755)
+    album = tmp_path / "node" / ("a" * 32)
+    album.mkdir(parents=True)
+    monkeypatch.setattr(collect, "_ALBUMS", str(album.parent))
+    record = Record.of(demo_flight.content(), demo_flight.audit())
+    kube = Kube(kubectl, kubectl, tmp_path)
+    collect.fetch_pictures(kube, record, tmp_path / "out")
+    assert not list((tmp_path / "out" / "pictures").iterdir()), "none were taken"
+    for seconds in range(-100, 300, 5):
+        taken = datetime.fromtimestamp(demo_flight.TAKEOFF_S + seconds, UTC).strftime("%Y%m%d%H%M%S%f")[:17]
+        (album / f"{taken}-0001.jpg").write_bytes(b"\xff\xd8")
+        (album / f"{taken}-0001.json").touch()
+    collect.fetch_pictures(kube, record, tmp_path / "out")
+    copied = sorted((tmp_path / "out" / "pictures").iterdir())
+    assert [round(taken_s(path.name) - demo_flight.TAKEOFF_S) for path in copied] == [25, 50, 80]
+    assert {path.read_bytes() for path in copied} == {b"\xff\xd8"}
 
 
 def test_a_wrong_assignment_is_refused() -> None:

@@ -35,6 +35,18 @@ def test_values_take_the_type_of_their_parameter():
         params.assign("NO_SUCH", 1.0)
 
 
+def test_a_value_that_is_denied_is_told_and_one_that_is_no_number_is_not_answered():
+    vehicle, pilot = alone()
+    assert pilot.parameter("MIS_TOTAL", 9.0) == 0.0
+    assert pilot.texts[-1] == "Param write denied (MIS_TOTAL)"
+    target = {"target_system": 1, "target_component": 1, "param_id": b"WPNAV_SPEED", "param_type": 9}
+    pilot.last.clear()
+    pilot.send("PARAM_SET", target | {"param_value": float("nan")})
+    pilot.fly_on(0.1)
+    assert "PARAM_VALUE" not in pilot.last
+    assert vehicle.params["WPNAV_SPEED"] == 1000.0
+
+
 def test_changed_parameters_are_kept_on_disk(tmp_path: Path):
     store = tmp_path / "vehicle.parm"
     config = replace(CONFIG, store=store)

@@ -75,8 +75,11 @@ def _parameter_read(v: Vehicle, m: Message, c: Channel) -> None:
 
 
 def _parameter_set(v: Vehicle, m: Message, c: Channel) -> None:
-    name = m.text("param_id")
-    v.params.set(name, m.real("param_value"))
+    name, value = m.text("param_id"), m.real("param_value")
+    if not math.isfinite(value):
+        return
+    if not v.params.set(name, value) and v.params.find(name) is not None:
+        v.say(Severity.WARNING, f"Param write denied ({name})")
     for channel in v.channels:
         if channel is c or not channel.signing:
             v.voice.send_parameter(channel, name, -1, 65535)

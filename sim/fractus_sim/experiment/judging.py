@@ -267,7 +267,8 @@ def _audit(_check: kinds.AuditSound, evidence: Evidence) -> tuple[bool, str]:
     broken = [f"{log}: {problem}" for log, problem in evidence.audit_problems.items() if problem]
     if not evidence.audit_problems:
         return False, "there is no audit log"
-    return not broken, "; ".join(broken) or f"{len(evidence.audit_problems)} logs verify"
+    count = len(evidence.audit_problems)
+    return not broken, "; ".join(broken) or ("the log verifies" if count == 1 else f"{count} logs verify")
 
 
 def _phase(check: kinds.ApplicationPhase, evidence: Evidence) -> tuple[bool, str]:

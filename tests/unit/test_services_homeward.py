@@ -55,6 +55,23 @@ def test_a_driver_turns_home_from_standstill(tmp_path: Path) -> None:
     fly(flight)
 
 
+def test_a_drone_that_finds_no_rest_flies_home_all_the_same(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            tell = world.plane._tell
+
+            def gusty() -> None:
+                tell()
+                world.plane.vehicle.east_mps += 0.7
+
+            world.plane._tell = gusty  # type: ignore[method-assign]
+            await end(world.service.return_to_launch(held))
+
+    fly(flight)
+
+
 def test_one_refused_command_leads_through_no_zone(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:

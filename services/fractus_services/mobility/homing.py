@@ -129,7 +129,12 @@ class Homing:
         autopilot, permit = self._control.autopilot, trip.permit(motion)
         for _ in range(MAX_LEGS):
             if self._guard.situation().lat is not None and not at_rest(autopilot):
-                await come_to_rest(autopilot, motion, permit)
+                try:
+                    await come_to_rest(autopilot, motion, permit)
+                except Refused as refusal:
+                    if refusal.verdict.code == "NotStopping" and self._clear(trip.regime.grant):
+                        return  # in a wind that gives it no rest the drone flies home all the same
+                    raise
             leg = await self._leg(trip)
             if leg is None:
                 return

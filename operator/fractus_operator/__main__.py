@@ -44,9 +44,10 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         settings: How to run.
         stop: Set it to end the operator; signals do so as well.
     """
-    store = Store.connect()
+    # The Lease has a connection of its own: no burst of other requests keeps a renewal waiting.
+    store, beside = Store.connect(), Store.connect()
     identity = settings.identity or f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
-    lease = Lease(store, settings.namespace, identity, settings.lease_s, time.monotonic)
+    lease = Lease(beside, settings.namespace, identity, settings.lease_s, time.monotonic)
     store.may_write_s = lambda: lease.left_s
     keeping = asyncio.create_task(lease.run())
     try:
@@ -76,6 +77,7 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         keeping.cancel()
         await asyncio.gather(keeping, return_exceptions=True)
         await store.close()
+        await beside.close()
 
 
 async def _acting(lease: Lease, keeping: asyncio.Task[None]) -> None:

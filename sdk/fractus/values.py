@@ -237,7 +237,8 @@ class Ride:
 class Telemetry:
     """One sample of the drone's state; altitudes of `position` and `home` are above home and AMSL.
 
-    `attitude` is None while nobody knows it.
+    `attitude` is None while nobody knows it. `position_error_m` bounds the horizontal error; where it is None nobody knows where
+    the drone is, and `position` and `velocity` are zeros that mean nothing. `ready` says that the autopilot would arm.
     """
 
     time: datetime
@@ -254,6 +255,8 @@ class Telemetry:
     flight_state: str
     controller: str
     attitude: Attitude | None = None
+    position_error_m: float | None = None
+    autopilot_connected: bool = False
 
     @classmethod
     def from_proto(cls, message: mobility_pb2.Telemetry) -> Telemetry:
@@ -273,6 +276,8 @@ class Telemetry:
             flight_state=message.flight_state,
             controller=message.controller,
             attitude=Attitude.from_proto(message.attitude) if message.HasField("attitude") else None,
+            position_error_m=message.position_error_m if message.HasField("position") else None,
+            autopilot_connected=message.autopilot_connected,
         )
 
 

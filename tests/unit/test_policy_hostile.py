@@ -121,7 +121,7 @@ def test_home_inside_a_zone() -> None:
     assert ask(grant, Call("ReturnToLaunch"), at(60, 0)).action == "allow"
 
 
-NANS = [math.nan, math.inf, -math.inf]
+NANS = [math.nan, math.inf, -math.inf, 1e300, -1e300]
 
 
 @pytest.mark.parametrize("odd", NANS)

@@ -170,3 +170,12 @@ def test_the_way_home_stays_legal() -> None:
     assert ask(free, toward, behind).code == "WayHomeBlocked"
     assert ask(free, fly(0, 5), behind).permits
     assert ask(free, toward, at(110, 60, airframe=Airframe(retraces=True))).permits, "back as it came"
+
+
+def test_a_band_too_narrow_to_stop_in_turns_no_velocity_from_one_limit_beyond_the_other() -> None:
+    rising = at(alt=30.7, down_mps=-1.5, altitude_error_m=1.0)
+    low = ask(compiled(altitude(lowerLimit=31.0)), fly(3, 0, 1.0, hold=1.7), rising)
+    assert flown(low).down_mps < 0, "sinking, it would come below the limit"
+    band = ask(compiled(altitude(upperLimit=31.2, lowerLimit=31.0)), fly(3, 0, 1.0, hold=1.7), rising)
+    assert (band.action, band.code, band.policies) == ("deny", "AltitudeAboveLimit", ("altitudes",))
+    assert "Goto" in band.reason

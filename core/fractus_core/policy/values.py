@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, fields
 from operator import attrgetter
 from typing import Literal
@@ -246,7 +245,7 @@ class Situation:
 
     @property
     def sound(self) -> bool:
-        """Whether every figure is a number."""
+        """Whether every figure is a number, and one that can be of this world."""
         figures = (*_FIGURES(self), *_MOTION(self.airframe))
         if self.home is not None:
             figures += (self.home.lat, self.home.lon, self.home.amsl_m)
@@ -254,9 +253,12 @@ class Situation:
             figures += _TURNS(self.attitude)
         if self.lens is not None:
             figures += _VIEW(self.lens)
-        # A sum of figures is finite only if all of them are.
-        return math.isfinite(sum(figure for figure in figures if figure is not None))
+        # A sum of sizes is small only if all of them are; with NaN it is not less than anything.
+        return sum(abs(figure) for figure in figures if figure is not None) < _ABSURD
 
+
+_ABSURD = 1e12
+"""More than any figure of a Situation, also its time (s since 1970)."""
 
 _FIGURES = attrgetter(
     "time_s", "lat", "lon", "altitude_m", "north_mps", "east_mps", "down_mps", "position_error_m", "altitude_error_m",

@@ -145,10 +145,23 @@ def _within_heights(setpoint: _Setpoint) -> Verdict | None:
         every = bounds if above else [*bounds, ground]
         bound = strictest(every, above=above)
         if bound is not None:
+            asked = setpoint.args
             problem = _lead_back(setpoint, bound, above=above)
+            if problem is None and not above and setpoint.args != asked:
+                problem = _no_room(setpoint, bound, strictest(bounds, above=True))
             if problem is not None:
                 return problem
     return None
+
+
+def _no_room(setpoint: _Setpoint, lower: Bound, upper: Bound | None) -> Verdict | None:
+    """Deny where what was turned up to keep above one limit would rise beyond the other."""
+    edge = math.inf if upper is None or upper.upper is None else upper.upper
+    if upper is None or not _beyond(setpoint, setpoint.args, edge, above=True):
+        return None
+    names = tuple(dict.fromkeys(b.name for b in (upper, lower) if b.name))
+    reason = f"at this vertical speed the drone comes to rest neither below {edge:.1f} m nor above {lower.lower or 0.0:.1f} m"
+    return deny("AltitudeAboveLimit", f"{reason}; stop it first, then use Goto", names)
 
 
 def _lead_back(setpoint: _Setpoint, bound: Bound, *, above: bool) -> Verdict | None:

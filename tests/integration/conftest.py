@@ -12,7 +12,6 @@ import pytest
 from control_plane import ControlPlane, programs
 from operator_world import OperatorProcess, World, fresh_namespace
 
-
 LONG = ("test_scenario_field", "test_sdk_flight", "test_mobility_sdk", "test_mobility_lost")
 """Modules whose flights take longest: what begins first lets nobody wait for it at the end."""
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import re
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -22,6 +23,9 @@ from fractus_operator.grantor import Grantor
 from fractus_operator.kinds import Body
 
 LIFE = timedelta(days=365)
+
+_NAME = re.compile(r"[a-z0-9]([-a-z0-9.]{0,251}[a-z0-9])?")
+"""A DNS subdomain (RFC 1123), as Kubernetes names nodes; it becomes a directory here."""
 
 
 def _now() -> datetime:
@@ -75,7 +79,13 @@ class StandalonePki:
             raise BrokenAuthority(f"{folder}: tls.key and tls.crt are damaged or do not belong together") from None
 
     def node(self, name: str) -> Path:
-        """The directory with the certificate of a node's services, made anew."""
+        """The directory with the certificate of a node's services, made anew.
+
+        Raises:
+            InvalidObject: the name is none that a node can have.
+        """
+        if not _NAME.fullmatch(name):
+            raise InvalidObject("node", f"{name!r} is no name of a node; use lower-case letters, digits, - and .")
         return _write(self._directory / "nodes" / name, self._authority.issue_node(name, self._clock(), self._life))
 
     def component(self, identity: str) -> Path:
@@ -83,8 +93,13 @@ class StandalonePki:
 
         Args:
             identity: Its SPIFFE id; `GrantSpec.identity` of its grant.
+
+        Raises:
+            InvalidObject: its parts are no names.
         """
         part = identity.split("/")
+        if not _NAME.fullmatch(part[-1]) or not _NAME.fullmatch(part[4]):
+            raise InvalidObject("spec.instance", f"{identity!r} does not end in the name of an instance")
         folder = self._directory / "components" / f"{part[4]}.{part[-1]}"
         now = self._clock()
         if self._authority.still_good(_read(folder), identity, now):

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec
-from fractus_core.api import Grant
+from fractus_core.api import Grant, InvalidObject
 from fractus_core.api.plans import component_identity, node_identity
 from fractus_core.policy.signatures import (
     SIGNATURE_ANNOTATION,
@@ -358,6 +358,16 @@ def test_alone(tmp_path: Path) -> None:
     bad = CliRunner().invoke(grants, ["sign", str(file), "--tls", str(pki), "--to", str(to)])
     assert bad.exit_code == 1
     assert "grant.json" in bad.output
+
+
+@pytest.mark.parametrize("name", ["", "../x", "a/b", ".", "Drone"])
+def test_keys_go_nowhere_but_into_their_directory(tmp_path: Path, name: str) -> None:
+    made = CliRunner().invoke(grants, ["init", str(tmp_path / "pki"), "--node", name])
+    assert made.exit_code == 1
+    assert f"node: {name!r} is no name of a node" in made.output
+    assert not (tmp_path / "pki" / "nodes").exists()
+    with pytest.raises(InvalidObject, match=r"spec\.instance"):
+        StandalonePki.open(tmp_path / "pki").component(component_identity("ns", "app", "Navigator", name))
 
 
 def test_a_directory_of_keys_is_made_once(tmp_path: Path) -> None:

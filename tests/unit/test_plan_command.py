@@ -216,6 +216,9 @@ BOW_TIE = [{"lat": 0, "lon": 0}, {"lat": 1e-3, "lon": 1e-3}, {"lat": 0, "lon": 1
         ([TRAFFIC], "Application traffic: spec.components[0].controlPoints[0].point.depot: there is no Depot base"),
         ([DEPOT, DEPOT], "Depot base: metadata.name: "),
         ([node("n", "edge", cpu="lots")], "Node n: status.allocatable.cpu: 'lots' is not a quantity"),
+        ([node("n", "edge") | {"spec": "x"}], "Node n: spec: must be an object, not 'x'"),
+        ([node("n", "edge") | {"status": {"allocatable": [1]}}], "Node n: status.allocatable: must be an object"),
+        ([node("n", "edge") | {"status": {"conditions": ["Ready"]}}], "Node n: status.conditions: must be a list"),
         ([manifest("Policy", "p", SELECTS)], "p: spec.selector.zones[0]: there is no Zone nowhere"),
         (
             [manifest("Zone", "z", {"area": {"polygon": {"exterior": BOW_TIE}}})],
@@ -230,6 +233,11 @@ def test_bad_input_exits_1_with_one_sentence_that_names_file_object_and_field(ru
     assert sentence in result.stderr
     assert len(result.stderr.strip().splitlines()) == 1
     assert sentence.startswith("there is no App") or "all.yaml: " in result.stderr
+
+
+def test_a_kind_of_another_project_is_passed_over(run):
+    foreign = {"apiVersion": "argoproj.io/v1alpha1", "kind": "Application", "metadata": {"name": "a"}, "spec": {}}
+    assert "there is no Application in the manifests" in run([foreign]).stderr
 
 
 def test_broken_yaml_and_json_name_the_line(tmp_path):

@@ -133,6 +133,11 @@ async def test_the_owners_own_fence_stays_in_force(vehicle: Vehicle, tmp_path: P
     vehicle.items = (Item(5003, 30.0, 1, 2),)
     backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
     await backstop.raise_around(spec(area(-50, -50, 50, 50), **LIMITS), retraces=True)
+    assert [n for n in vehicle.written if n == "FENCE_ENABLE"] == ["FENCE_ENABLE"] * 2, (
+        "off, and on with all that is new"
+    )
+    assert (vehicle.written[0], vehicle.written[-1]) == ("FENCE_ENABLE", "FENCE_ENABLE")
+    assert vehicle.values["FENCE_ENABLE"] == 1.0
     assert vehicle.items[0] == Item(5003, 30.0, 1, 2)
     assert len(vehicle.items) == 5
     assert vehicle.values["FENCE_ALT_MAX"] == 40.0

@@ -254,7 +254,8 @@ class Situation:
         if self.lens is not None:
             figures += _VIEW(self.lens)
         # A sum of sizes is small only if all of them are; with NaN it is not less than anything.
-        return sum(abs(figure) for figure in figures if figure is not None) < _ABSURD
+        size: float = sum(abs(figure) for figure in figures if figure is not None)
+        return size < _ABSURD
 
 
 _ABSURD = 1e12

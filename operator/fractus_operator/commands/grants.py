@@ -31,10 +31,10 @@ def init(directory: Path, nodes: tuple[str, ...], days: int) -> None:
     """Make a certificate authority in DIRECTORY, once, and the certificates of nodes."""
     try:
         pki = StandalonePki.create(directory, life=timedelta(days=days))
-    except BrokenAuthority as error:
+        for node in nodes:
+            click.echo(f"--tls {pki.node(node)}    for the services of {node}")
+    except (BrokenAuthority, InvalidObject) as error:
         raise click.ClickException(str(error)) from None
-    for node in nodes:
-        click.echo(f"--tls {pki.node(node)}    for the services of {node}")
 
 
 @grants.command()

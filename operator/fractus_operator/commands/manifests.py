@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 
 import yaml
 from fractus_core.api import (
+    API_VERSION,
+    GROUP,
     Application,
     Condition,
     DeploymentPlan,
@@ -143,12 +145,14 @@ def _files(paths: Iterable[pathlib.Path]) -> Iterator[tuple[pathlib.Path, bool]]
 def _documents(file: pathlib.Path, *, strict: bool) -> Iterator[dict[str, Any]]:
     """The objects of a file; what is no Kubernetes object is an error in a file that was named, else passed over."""
     try:
-        text = file.read_text(encoding="utf-8")
+        text = file.read_text(encoding="utf-8-sig")
         documents = [json.loads(text)] if file.suffix == ".json" else list(yaml.safe_load_all(text))
     except OSError as error:
         raise BadManifest(f"{file}: {error.strerror}") from None
     except UnicodeDecodeError:
         raise BadManifest(f"{file}: this is no text file in UTF-8") from None
+    except RecursionError:
+        raise BadManifest(f"{file}: it is nested too deeply; flatten it") from None
     except json.JSONDecodeError as error:
         raise BadManifest(f"{file}:{error.lineno}: {error.msg[:1].lower()}{error.msg[1:]}") from None
     except yaml.YAMLError as error:
@@ -171,6 +175,8 @@ def _documents(file: pathlib.Path, *, strict: bool) -> Iterator[dict[str, Any]]:
 
 def _resource(document: dict[str, Any], origin: str) -> Resource | Host | None:
     kind = document.get("kind")
+    if kind in _KINDS and str(document.get("apiVersion", API_VERSION)).partition("/")[0] != GROUP:
+        return None  # another project's kind of the same name
     metadata = document.get("metadata")
     name = metadata.get("name") if isinstance(metadata, dict) else None
     if kind != "Node" and kind not in _KINDS:
@@ -187,27 +193,38 @@ def _host(document: dict[str, Any]) -> Host:
     """A Node as a host; one without allocatable resources has as much as anyone asks for.
 
     Raises:
-        InvalidObject: a quantity is none.
+        InvalidObject: a quantity is none, or a field has the wrong type.
     """
-    metadata, spec, status = document["metadata"], document.get("spec") or {}, document.get("status") or {}
-    described = status.get("allocatable") or status.get("capacity")
+    metadata, spec, status = document["metadata"], _part(document, "spec"), _part(document, "status")
+    labels = _part(metadata, "labels", "metadata.labels")
+    described = _part(status, "allocatable", "status.allocatable") or _part(status, "capacity", "status.capacity")
+    conditions = status.get("conditions") or ()
+    if not isinstance(conditions, list | tuple) or not all(isinstance(c, dict) for c in conditions):
+        raise InvalidObject("status.conditions", "must be a list of conditions")
     allocatable: Mapping[str, float] = Unlimited()
-    if isinstance(described, dict):
+    if described:
         amounts: dict[str, float] = {}
         for resource, amount in described.items():
             try:
                 amounts[resource] = amount_of(amount)
-            except ValueError:
+            except (ValueError, TypeError):
                 raise InvalidObject(f"status.allocatable.{resource}", f"{amount!r} is not a quantity") from None
         allocatable = amounts
-    ready = [c.get("status") == "True" for c in status.get("conditions") or () if c.get("type") == "Ready"]
+    ready = [c.get("status") == "True" for c in conditions if c.get("type") == "Ready"]
     return Host(
         name=metadata["name"],
-        labels=dict(metadata.get("labels") or {}),
+        labels=dict(labels),
         allocatable=allocatable,
         ready=all(ready),
         schedulable=not spec.get("unschedulable", False),
     )
+
+
+def _part(document: dict[str, Any], key: str, name: str = "") -> dict[str, Any]:
+    part = document.get(key)
+    if part is not None and not isinstance(part, dict):
+        raise InvalidObject(name or key, f"must be an object, not {part!r:.40}")
+    return part or {}
 
 
 def _add(manifests: Manifests, resource: Resource | Host, origin: str) -> None:

@@ -109,8 +109,7 @@ class Backstop:
             owned = await asyncio.to_thread(self._load) if idle() else None
             if owned is None:
                 return
-            first = {} if owned.enabled else {ENABLE: 0.0}
-            await self._set(first)
+            await self._set({ENABLE: 0.0})
             await self._write(owned.items)
             await self._set(owned.parameters)
             await asyncio.to_thread(self._path.unlink, True)
@@ -136,6 +135,8 @@ class Backstop:
             owned = await self._read()
             await asyncio.to_thread(self._store, owned)
         kept = owned.items if owned.enabled else ()
+        # ArduPilot works out which kinds of fence are in force when a fence is switched on, and not again.
+        await self._set({ENABLE: 0.0})
         await self._write((*kept, *bounds.items))
         await self._set(_wanted(owned, bounds, action))
         log.info("the vehicle's own fence stands: %d vertices, ceiling %s", len(bounds.items), bounds.altitude_m)

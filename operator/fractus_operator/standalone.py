@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Self
 
 from fractus_core.api import Grant, InvalidObject
+from fractus_core.api.plans import component_identity
 
 from fractus_operator.authority import Authority, BrokenAuthority, Data
 from fractus_operator.grantor import Grantor
@@ -26,6 +27,9 @@ LIFE = timedelta(days=365)
 
 _NAME = re.compile(r"[a-z0-9]([-a-z0-9.]{0,251}[a-z0-9])?")
 """A DNS subdomain (RFC 1123), as Kubernetes names nodes; it becomes a directory here."""
+
+
+_PARTS = component_identity("", "", "", "").count("/") + 1
 
 
 def _now() -> datetime:
@@ -98,8 +102,8 @@ class StandalonePki:
             InvalidObject: its parts are no names.
         """
         part = identity.split("/")
-        if not _NAME.fullmatch(part[-1]) or not _NAME.fullmatch(part[4]):
-            raise InvalidObject("spec.instance", f"{identity!r} does not end in the name of an instance")
+        if len(part) != _PARTS or not _NAME.fullmatch(part[4]) or not _NAME.fullmatch(part[-1]):
+            raise InvalidObject("spec.instance", f"{part[-1]!r}, in {identity}, is no name of an instance")
         folder = self._directory / "components" / f"{part[4]}.{part[-1]}"
         now = self._clock()
         if self._authority.still_good(_read(folder), identity, now):

@@ -81,7 +81,18 @@ class Kube:
             if found:
                 return found
             time.sleep(poll_s)
-        raise AssertionError(f"waited {timeout_s:.0f} s for: {what}" + (f" ({last})" if last else ""))
+        told = f" ({last})" if last else ""
+        raise AssertionError(f"waited {timeout_s:.0f} s for: {what}{told}\n{self.state()}")
+
+    def state(self) -> str:
+        """How everything stands, for the report of a test that waited in vain."""
+        looks = (
+            ("get", "applications.fractus.dev,deploymentplans.fractus.dev,grants.fractus.dev,drones.fractus.dev", "-A"),
+            ("get", "applications.fractus.dev", "-A", "-o", "jsonpath={range .items[*]}{.status}{\"\\n\"}{end}"),
+            ("get", "pods", "-A", "-o", "wide"),
+            ("logs", "-n", "fractus-system", "deployment/fractus-operator", "--tail=25"),
+        )
+        return "\n".join(done.stdout + done.stderr for done in (self.run(*look) for look in looks))
 
     def pod(self, selector: str, namespace: str, node: str | None = None) -> Object:
         """The one running pod that a selector finds."""

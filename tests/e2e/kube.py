@@ -88,7 +88,7 @@ class Kube:
         """How everything stands, for the report of a test that waited in vain."""
         looks = (
             ("get", "applications.fractus.dev,deploymentplans.fractus.dev,grants.fractus.dev,drones.fractus.dev", "-A"),
-            ("get", "applications.fractus.dev", "-A", "-o", "jsonpath={range .items[*]}{.status}{\"\\n\"}{end}"),
+            ("get", "applications.fractus.dev", "-A", "-o", 'jsonpath={range .items[*]}{.status}{"\\n"}{end}'),
             ("get", "pods", "-A", "-o", "wide"),
             ("logs", "-n", "fractus-system", "deployment/fractus-operator", "--tail=25"),
         )

@@ -6,6 +6,7 @@ import errno
 import io
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -100,6 +101,15 @@ def test_a_full_disk_at_the_end_closes_the_stage(
     assert thing.closed
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Hears SIGINT, which a shell's background jobs are told to ignore."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_signals_wait_until_the_block_is_over() -> None:
     steps = []
     with pytest.raises(KeyboardInterrupt):

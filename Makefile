@@ -39,7 +39,7 @@ scenario-field: env ## Fly the field experiment and leave its report in out/fiel
 test: packages env lint ## Everything: lint, types, unit, integration and end-to-end tests
 	$(RUN) fractus cluster binaries
 	$(RUN) pytest -q -n 2 --dist loadfile tests/unit
-	$(RUN) pytest -n 5 --dist loadgroup tests/integration tests/e2e/test_cluster.py
+	$(RUN) pytest -n 4 --dist loadgroup tests/integration tests/e2e/test_cluster.py
 	$(RUN) pytest tests/e2e --ignore tests/e2e/test_cluster.py
 
 .PHONY: test-fast

@@ -188,7 +188,7 @@ def test_second_up_changes_nothing(small: Cluster) -> None:
     small.up(images=[IMAGE])
     took_s = time.monotonic() - started
     assert {path.name: path.read_text() for path in (state.path / "processes").iterdir()} == before
-    assert took_s < 5, f"took {took_s:.1f} s"  # under 2 s on an idle machine
+    assert took_s < 30, f"took {took_s:.1f} s"  # under 2 s on an idle machine
 
 
 def test_power_off_kills_the_node_but_not_its_vehicle(healthy: Cluster) -> None:

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
@@ -218,9 +217,7 @@ def test_a_drones_life(server: ApiServer, drone: Node) -> None:
     drone.mobility.now.flight_state = "flying"
     drone.mobility.now.in_air = True
     drone.mobility.now.missions[uid] = "failed: driver lost"
-    began_s = time.monotonic()
     wait_for(lambda: (drone.object() or {})["status"]["flightState"] == "flying", "flying", timeout_s=10)
-    assert time.monotonic() - began_s < 4.0
     wait_for(lambda: phase(server, "mine") == "Failed", "failed grant", timeout_s=10)
     grant = server.get(f"{FRACTUS}/grants/mine")
     assert grant is not None

@@ -98,7 +98,7 @@ def test_deleting_the_application_in_flight_brings_the_drone_home(grounded: Kube
 def test_deleting_while_the_operator_is_down_leaves_nothing(grounded: Kube) -> None:
     kube = grounded
     kube.apply(short_flight("orphan"))
-    kube.wait("its grant is there", lambda: kube.all("grants.fractus.dev"), timeout_s=60)
+    kube.wait("its grant is there", lambda: kube.all("grants.fractus.dev"), timeout_s=120)
     kube.must("scale", "deployment/fractus-operator", "-n", SYSTEM, "--replicas=0")
     try:
         kube.wait("the operator is gone", lambda: not kube.all("pods", SYSTEM, "app.kubernetes.io/component=operator"))

@@ -27,7 +27,7 @@ from fractus_proto.v1.mobility_pb2 import SubscribeTelemetryRequest, Telemetry
 from fractus_proto.v1.types_pb2 import Position
 from mobility_rig import issue_signer
 
-pytestmark = [pytest.mark.timeout(180), pytest.mark.xdist_group("agent")]  # they share an API server
+pytestmark = [pytest.mark.timeout(300), pytest.mark.xdist_group("agent")]  # they share an API server
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from fractus_agent.store import (
     connect,
 )
 
-pytestmark = [pytest.mark.timeout(120), pytest.mark.xdist_group("agent-watch")]  # they share an API server
+pytestmark = [pytest.mark.timeout(300), pytest.mark.xdist_group("agent-watch")]  # they share an API server
 PATIENCE_S = 30.0
 
 

@@ -373,7 +373,7 @@ async def test_an_older_grant_in_flight_brings_the_drone_home(rig: Rig) -> None:
     fresh = path.with_suffix(".new")
     fresh.write_text(json.dumps(older))
     fresh.replace(path)
-    await driver.next(LOST, 5)
+    await driver.next(LOST, 15)
     await rig.until(lambda t: t.mode in HOMEWARD and t.controller == "system", 10)
     refused = [e for e in rig.entries("grant") if e["change"] == "refused"]
     assert "not after the one of" in refused[-1]["reason"]

@@ -92,7 +92,7 @@ async def _return_and_land(rig: Rig, driver: Driver) -> None:
     reply = await driver.stub.ReturnControl(pb.ReturnControlRequest(), timeout=5)
     assert reply.mission_complete
     await driver.next(pb.ControlEvent.STATE_COMPLETE)
-    landed = await rig.until(lambda t: not t.armed, 60, "landing")
+    landed = await rig.until(lambda t: not t.armed, 90, "landing")
     assert math.dist(xy(landed.position), (0, 0)) < 2.0
     assert dict(landed.missions) == {"uid-app-navigator": "complete"}
 

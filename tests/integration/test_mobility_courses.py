@@ -147,7 +147,7 @@ async def test_velocities_run_out_and_keep_inside(rig: Rig) -> None:
     set_velocity = driver.stub.SetVelocity
 
     await set_velocity(setpoint(3.0, hold_s=2.0), timeout=5)
-    moving = await rig.until(lambda t: t.velocity.north_mps > 1.5, 10, "flight with a velocity")
+    moving = await rig.until(lambda t: t.velocity.north_mps > 1.5, 20, "flight with a velocity")
     still = await rig.until(lambda t: abs(t.velocity.north_mps) < 0.2, 15, "end of the setpoint")
     assert still.controller == moving.controller
     assert xy(still.position)[1] < 25
@@ -235,7 +235,7 @@ async def test_the_owners_fence_comes_back_after_the_mission(rig: Rig) -> None:
     driver = Driver(rig)
     await driver.up(4.0)
     await driver.stub.ReturnControl(pb.ReturnControlRequest(), timeout=5)
-    await rig.until(lambda t: not t.armed, 60, "landing")
+    await rig.until(lambda t: not t.armed, 90, "landing")
     owner = Autopilot(rig.link)
     task = asyncio.create_task(owner.run())
     async with asyncio.timeout(20):

@@ -90,7 +90,7 @@ async def test_control_returned_through_the_sdk(rig: Rig) -> None:
             await drone.arm()
             await drone.takeoff(10)
         assert control.mission_complete
-        await rig.until(lambda t: not t.armed, 60, "landing")
+        await rig.until(lambda t: not t.armed, 90, "landing")
         with pytest.raises(MissionComplete):
             async with drone.control():
                 raise AssertionError("control after the mission")

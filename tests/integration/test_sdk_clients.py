@@ -17,7 +17,7 @@ from fractus.pictures import Camera
 from fractus_proto.v1 import mobility_pb2
 from sdk_service import NAVIGATOR, Authority, Drone, Event, Pictures, Server
 
-pytestmark = pytest.mark.timeout(60)
+pytestmark = pytest.mark.timeout(180)
 WAIT_S = 15.0
 
 

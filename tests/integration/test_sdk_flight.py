@@ -32,7 +32,7 @@ ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "traffic-monitoring"
 SPEEDUP = 3.0
 """The companion's heartbeats come once a second of real time, and the autopilot's failsafe waits 5 s of its own."""
-pytestmark = pytest.mark.timeout(150)
+pytestmark = pytest.mark.timeout(300)
 
 
 def documents(name: str) -> list[dict[str, Any]]:

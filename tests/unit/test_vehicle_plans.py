@@ -185,6 +185,17 @@ def test_jumps_lead_to_tags():
     assert pilot.command(Command.DO_JUMP_TAG, 9.0) is Result.FAILED
 
 
+@pytest.mark.parametrize(("times", "following"), [(-1.0, None), (1.0, 4)])
+def test_jumps_that_pass_no_waypoint_come_to_an_end(times, following):
+    vehicle, pilot = alone()
+    tag = {"command": 600, "param1": 1.0}
+    jump = {"command": 601, "param1": 1.0, "param2": times}
+    points = [_waypoint(north, 0.0, 10.0) for north in (1.0, 2.0)]
+    assert upload(pilot, 0, [HOME, points[0], tag, jump, points[1]]) == MissionResult.ACCEPTED
+    assert vehicle.mission.peek_after(1) == following
+    assert vehicle.mission.peek_after(1) == following, "nothing was counted as done"
+
+
 def test_too_many_items_are_refused():
     _, pilot = alone()
     pilot.send("MISSION_COUNT", {"target_system": 1, "target_component": 1, "count": 5000})

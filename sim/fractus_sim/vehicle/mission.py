@@ -400,11 +400,15 @@ class Mission:
         self._jumps.clear()
 
     def peek_after(self, index: int) -> int | None:
-        """The next item that navigates, without counting jumps as done."""
+        """The next item that navigates, without counting jumps as done; None where jumps only lead in a circle."""
         jumps = dict(self._jumps)
         at = self.next_after(index)
-        while at is not None and not self.items[at].navigates:
+        for _ in self.items:
+            if at is None or self.items[at].navigates:
+                break
             at = self.next_after(at)
+        else:
+            at = None
         self._jumps = jumps
         return at
 

@@ -47,6 +47,7 @@ class Reflector(Generic[T]):
         self._rng = rng or random.Random()  # noqa: S311  (jitter)
         self._objects: dict[Key, T] = {}
         self._noted: dict[Key, int] = {}
+        self._reached = 0
         self._last_contact = float("-inf")
 
     def get(self, key: Key) -> T | None:
@@ -66,8 +67,14 @@ class Reflector(Generic[T]):
         return len(self._objects)
 
     def note(self, key: Key, body: Body) -> None:
-        """Take what a write of our own returned, ahead of the watch, which then has nothing older to say of it."""
-        self._noted[key] = _version(body)
+        """Take what a write of our own returned, ahead of the watch, which then has nothing older to say of it.
+
+        An answer that comes after the watch or a list told of that moment is old news: it says nothing more.
+        """
+        version = _version(body)
+        if 0 < version <= self._reached:
+            return
+        self._noted[key] = version
         self._put(key, body)
 
     def age_s(self) -> float:
@@ -111,13 +118,15 @@ class Reflector(Generic[T]):
         while True:
             page = await self._store.list_page(self.kind, selectors=self._selectors, continue_=continue_)
             self._heard()
+            # All pages show the same moment: what a later one brings is no older than an answer that comes meanwhile.
+            self._reach(page.resource_version)
             for item in page.items:
                 listed.add(key_of(item))
                 self._take("MODIFIED", item)
             continue_ = page.continue_
             if not continue_:
                 break
-        version = int(page.resource_version) if page.resource_version.isdecimal() else 0
+        version = _number(page.resource_version)
         for key in self._objects.keys() - listed:
             # What was made while the list was on its way is not in it.
             if self._noted.get(key, 0) <= version:
@@ -137,7 +146,12 @@ class Reflector(Generic[T]):
             self._heard()
             if type_ != "BOOKMARK":
                 self._take(type_, body)
+            self._reach(body["metadata"]["resourceVersion"])
             yield body["metadata"]["resourceVersion"]
+
+    def _reach(self, version: str) -> None:
+        """Remember up to which moment everything was told."""
+        self._reached = max(self._reached, _number(version))
 
     def _take(self, type_: str, body: Body) -> None:
         key = key_of(body)
@@ -183,5 +197,8 @@ class Reflector(Generic[T]):
 
 def _version(body: Body) -> int:
     """An object's resource version as a number, which grows; 0 where it is none."""
-    version = str(body["metadata"].get("resourceVersion", ""))
+    return _number(str(body["metadata"].get("resourceVersion", "")))
+
+
+def _number(version: str) -> int:
     return int(version) if version.isdecimal() else 0

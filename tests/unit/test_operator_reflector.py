@@ -150,6 +150,48 @@ def test_an_own_write_is_told_and_outlives_older_news() -> None:
     assert reflector.get(("", "a")) is None
 
 
+async def test_a_late_answer_to_an_own_write_says_nothing_newer() -> None:
+    events = [
+        ("MODIFIED", zone("done", 10, 1)),
+        ("MODIFIED", zone("done", 11, 2)),
+        ("ADDED", zone("gone", 12, 1)),
+        ("DELETED", zone("gone", 13, 1)),
+        ("BOOKMARK", {"metadata": {"resourceVersion": "20"}}),
+    ]
+    script = Script(page(5, zone("done", 5, 0)), events)
+    reflector: Reflector[int] = Reflector(script, ZONE, lambda body: body["value"], lambda *_: None)  # type: ignore[arg-type]
+    task = asyncio.create_task(reflector.run())
+    async with asyncio.timeout(5):
+        await script.done.wait()
+    reflector.note(("", "done"), zone("done", 10, 1))
+    reflector.note(("", "gone"), zone("gone", 12, 1))
+    reflector.note(("", "older"), zone("older", 20, 1))
+    assert dict(reflector.items()) == {("", "done"): 2}
+    reflector.note(("", "done"), zone("done", 21, 3))
+    reflector.note(("", "gone"), zone("gone", 22, 4))
+    assert dict(reflector.items()) == {("", "done"): 3, ("", "gone"): 4}
+    task.cancel()
+
+
+async def test_an_answer_between_two_pages_is_no_newer_than_the_list() -> None:
+    late: list[Body] = []
+
+    class Between(Script):
+        async def _next(self) -> Any:
+            for body in late:
+                reflector.note(("", body["metadata"]["name"]), body)
+            late[:] = [zone("a", 10, 1)]
+            return await super()._next()
+
+    script = Between(page(12, zone("a", 11, 2), continue_="more"), page(12, zone("b", 2, 2)))
+    reflector: Reflector[int] = Reflector(script, ZONE, lambda body: body["value"], lambda *_: None)  # type: ignore[arg-type]
+    task = asyncio.create_task(reflector.run())
+    async with asyncio.timeout(5):
+        await script.done.wait()
+    assert dict(reflector.items()) == {("", "a"): 2, ("", "b"): 2}
+    task.cancel()
+
+
 # -- worklist --
 
 

@@ -16,6 +16,7 @@ NAME = "fractus-operator"
 _RENEWALS = 5
 _HELD_SHARE = 0.7
 _RETRY_S = 1.0
+_RETRIES = 20
 _ANSWER_SHARE = _HELD_SHARE / 2
 """How much of the duration an answer may take: one that stalls leaves time to ask again before the Lease is lost."""
 
@@ -72,16 +73,18 @@ class Lease:
         try:
             while True:
                 asked = self._time()
+                # After a renewal that came to nothing, whether it stalled or was refused, there is time for one more.
+                pause_s = min(_RETRY_S, self._duration_s / _RETRIES)
                 try:
                     async with asyncio.timeout(_ANSWER_SHARE * self._duration_s):
                         taken = await self._ask()
                     if taken:
                         self._hold(asked)
+                    pause_s = self._duration_s / _RENEWALS if taken else min(_RETRY_S, self._duration_s / _RENEWALS)
                 except StoreError as error:
                     logger.info("the lease: %s", error)
                 except TimeoutError:
                     logger.info("the lease: no answer in %.1f s", _ANSWER_SHARE * self._duration_s)
-                pause_s = self._duration_s / _RENEWALS if self.left_s else min(_RETRY_S, self._duration_s / _RENEWALS)
                 await asyncio.sleep(pause_s)
         finally:
             await self._give_back()
@@ -144,9 +147,10 @@ class Lease:
         return {**body, "spec": wanted}
 
     async def _give_back(self) -> None:
-        """Let the next one begin at once, once nothing of ours is under way any more."""
-        if not self.left_s:
-            return
+        """Let the next one begin at once, once nothing of ours is under way any more.
+
+        Whose Lease it is the API server tells: it may have taken a renewal whose answer never came.
+        """
         self._until = float("-inf")
         try:
             async with asyncio.timeout(2.0):

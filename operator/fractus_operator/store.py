@@ -22,6 +22,8 @@ from fractus_operator.kinds import EVENT, Body, Key, Kind
 
 FIELD_MANAGER = "fractus-operator"
 _REQUEST_TIMEOUT_S = 15.0
+_LIST_TIMEOUT_S = 120.0
+"""Lists are long where links are slow: one that makes progress goes on, so that it is not begun anew for ever."""
 _LIMITS = httpx2.Limits(max_connections=100, max_keepalive_connections=20, keepalive_expiry=60.0)
 """Connections stay open between two changes, for less than the API server's 90 s: each costs a TLS handshake."""
 _PAGE = 250
@@ -126,7 +128,7 @@ class Store:
         params = {"limit": str(limit), **(selectors or {})}
         if continue_:
             params["continue"] = continue_
-        return Page(await self._send("GET", kind.path(), params=params))
+        return Page(await self._send("GET", kind.path(), params=params, is_list=True))
 
     async def list(self, kind: Kind, *, selectors: Mapping[str, str] | None = None) -> list[Body]:
         """Read a whole collection over all namespaces."""
@@ -144,7 +146,8 @@ class Store:
         continue_ = ""
         while True:
             params = {"limit": str(_PAGE), **({"continue": continue_} if continue_ else {})}
-            page = Page(await self._send("GET", kind.path(namespace), params=params, accept=_NAMES_ONLY))
+            path = kind.path(namespace)
+            page = Page(await self._send("GET", path, params=params, accept=_NAMES_ONLY, is_list=True))
             found.update(item["metadata"]["name"] for item in page.items)
             continue_ = page.continue_
             if not continue_:
@@ -309,8 +312,9 @@ class Store:
         content_type: str = "application/json",
         accept: str = "application/json",
         guarded: bool = True,
+        is_list: bool = False,
     ) -> Body:
-        timeout_s = _REQUEST_TIMEOUT_S
+        timeout_s = _LIST_TIMEOUT_S if is_list else _REQUEST_TIMEOUT_S
         if method != "GET" and guarded:
             timeout_s = min(timeout_s, self.may_write_s())
             if timeout_s <= 0:
@@ -325,7 +329,7 @@ class Store:
                     params=params,
                     content=None if body is None else json.dumps(body),
                     headers=headers,
-                    timeout=timeout_s,
+                    timeout=min(timeout_s, _REQUEST_TIMEOUT_S),
                 )
         except TimeoutError as error:
             raise StoreError(0, "Unreachable", f"{method} {path}: no answer in {timeout_s:.1f} s") from error

@@ -8,6 +8,8 @@ from typing import Any, cast
 
 import httpx2
 import pytest
+from fractus_operator import lease as lease_module
+from fractus_operator import store as store_module
 from fractus_operator.kinds import LEASE, Body, Kind, key_of
 from fractus_operator.lease import Lease, LostLease
 from fractus_operator.store import NotFound, Store, StoreError, Taken
@@ -181,6 +183,73 @@ async def test_an_answer_that_stalls_is_given_up_in_time_to_ask_again() -> None:
     assert shelf.stalls == 0
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
+
+
+@pytest.mark.parametrize("failure", [StoreError(500, "InternalError", "not now"), TimeoutError()])
+async def test_after_a_failed_renewal_there_is_time_for_another(
+    monkeypatch: pytest.MonkeyPatch, failure: Exception
+) -> None:
+    shelf, clock = Shelf(), Clock()
+    pauses: list[float] = []
+    done = asyncio.Event()
+    failing = False
+
+    async def sleep(pause_s: float) -> None:
+        nonlocal failing
+        pauses.append(pause_s)
+        failing = len(pauses) == 1
+        if len(pauses) == 3:
+            done.set()
+            await asyncio.Event().wait()
+
+    answer = shelf.get
+
+    async def get(kind: Kind, name: str, namespace: str = "") -> Body:
+        if failing:
+            raise failure
+        return await answer(kind, name, namespace)
+
+    monkeypatch.setattr(shelf, "get", get)
+    monkeypatch.setattr(lease_module.asyncio, "sleep", sleep)
+    only = lease(shelf, clock, "only")
+    task = asyncio.create_task(only.run())
+    async with asyncio.timeout(10.0):
+        await done.wait()
+    assert pauses == [DURATION_S / 5, DURATION_S / 20, DURATION_S / 5]
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_a_renewal_whose_answer_never_came_is_given_back() -> None:
+    shelf, clock = Shelf(), Clock()
+    first, second = lease(shelf, clock, "first"), lease(shelf, clock, "second")
+    await step(first)
+    clock.now += DURATION_S
+    assert first.left_s == 0
+    await first._give_back()
+    await step(second)
+    assert second.left_s > 0
+    writes = shelf.writes
+    await first._give_back()
+    assert shelf.writes == writes, "what another holds is not given back"
+
+
+async def test_a_list_that_makes_progress_has_more_time_than_an_object(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store_module, "_REQUEST_TIMEOUT_S", 0.02)
+    parts: list[dict[str, float]] = []
+
+    async def slow(request: httpx2.Request) -> httpx2.Response:
+        parts.append(request.extensions["timeout"])
+        await asyncio.sleep(0.2)
+        return httpx2.Response(200, json={"metadata": {"name": "any", "resourceVersion": "7"}, "items": []})
+
+    store = Store(httpx2.AsyncClient(base_url="https://nowhere.test", transport=httpx2.MockTransport(slow)))
+    assert (await store.list_page(LEASE)).resource_version == "7"
+    assert await store.names(LEASE, "system") == set()
+    assert [part["read"] for part in parts] == [0.02, 0.02]
+    with pytest.raises(StoreError, match="no answer"):
+        await store.get(LEASE, "any", "system")
+    await store.close()
 
 
 async def test_a_write_to_an_api_server_that_stalls_ends_before_another_may_act() -> None:

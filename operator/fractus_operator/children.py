@@ -22,7 +22,9 @@ logger = logging.getLogger(__name__)
 
 _PARALLEL = 8
 _BESIDE = 2
-"""How many other objects than Deployments are applied at a time: what schedules pods needs the API server more."""
+"""How many objects are applied at a time that a pod merely waits for: what schedules pods needs the API server more."""
+_AHEAD = frozenset({kinds.DEPLOYMENT_PLAN, kinds.DEPLOYMENT, kinds.GRANT})
+"""What waits for none of these, so that a webhook which holds up Secrets delays neither plans nor grants."""
 
 
 class NameTaken(Exception):
@@ -111,7 +113,7 @@ class Children:
     ) -> None:
         key = key_of(body)
         desired = stamped(body)
-        async with self._parallel if kind is kinds.DEPLOYMENT else self._beside:
+        async with self._parallel if kind in _AHEAD else self._beside:
             observed = await self.observed(kind, key, taken)
             current = is_current(desired, observed) or self._is_normalised(kind, key, desired, observed)
             if kind is kinds.GRANT and observed is not None:

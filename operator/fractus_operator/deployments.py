@@ -46,7 +46,7 @@ RESYNC_S = 30.0
 _REFUSALS = frozenset({400, 403, 422})
 """HTTP statuses by which the API server says that it does not want an object: the user should know."""
 
-_ORDER = (kinds.DEPLOYMENT, kinds.SECRET, kinds.SERVICE, kinds.ENDPOINT_SLICE, kinds.GRANT)
+_ORDER = (kinds.DEPLOYMENT, kinds.GRANT, kinds.SECRET, kinds.SERVICE, kinds.ENDPOINT_SLICE)
 """What is applied once the plan is: at once, so that an object in the way of one stops no other, and begun in this order,
 because scheduling takes longest. A pod waits for its Secret, and can call nothing without its Grant."""
 
@@ -340,7 +340,7 @@ class Deployments:
         grants: tuple[GrantSpec, ...],
         pods: Sequence[PodView],
     ) -> None:
-        """Make the children what the plan says: what is stale goes first, then each kind in order."""
+        """Make the children what the plan says: the plan first, then what is stale goes, then each kind in order."""
         wanted: dict[Kind, list[Body]] = {kind: [] for kind in kinds.CHILDREN}
         wanted[kinds.DEPLOYMENT_PLAN] = [builders.deployment_plan(application, decided)]
         wanted[kinds.GRANT] = [builders.grant(application, spec) for spec in grants]
@@ -354,12 +354,19 @@ class Deployments:
             drone = self._live.drones.get(("", placed.node)) if placed.node is not None else None
             wanted[kinds.DEPLOYMENT].append(builders.deployment(application, placed, drone))
         secrets = {builders.secret_name(placed.instance): placed for placed in decided.placements}
-        await self._children.prune(application, wanted, keep_secrets=secrets.keys())
-        # The plan before any grant: it tells, also after a crash, who flies the drone and who comes along.
-        plan_first = {kinds.DEPLOYMENT_PLAN: wanted.pop(kinds.DEPLOYMENT_PLAN)}
-        _, taken = await asyncio.gather(
-            self._children.apply(application, plan_first), self._children.look_around(application.key)
+        # The plan before all else: it tells, also after a crash, who flies the drone and who comes along.
+        plan_first = {kinds.DEPLOYMENT_PLAN: wanted[kinds.DEPLOYMENT_PLAN]}
+        planned, taken = await asyncio.gather(
+            self._children.apply(application, plan_first),
+            self._children.look_around(application.key),
+            return_exceptions=True,
         )
+        # Raised once both are over: nothing is written any more when the next look at the application begins.
+        if isinstance(planned, BaseException):
+            raise planned
+        if isinstance(taken, BaseException):
+            raise taken
+        await self._children.prune(application, wanted, keep_secrets=secrets.keys())
         for placed in secrets.values():
             wanted[kinds.SECRET].append(await self._certificate(application, placed, taken))
         wanted[kinds.DEPLOYMENT] = [body for body in wanted[kinds.DEPLOYMENT] if not self._in_the_air(body, decided)]

@@ -4,12 +4,23 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+from fractus_core.api import InvalidObject
 from fractus_core.planning.inventory import Settings as PlanningSettings
 
 from fractus_operator.plugins import UnknownPlugin, load_plugin
+
+_PLANNING = {
+    "safety_radius_m": "FRACTUS_PLANNING_SAFETY_RADIUS",
+    "depot_radius_m": "FRACTUS_PLANNING_DEPOT_RADIUS",
+    "coverage_share": "FRACTUS_PLANNING_COVERAGE_SHARE",
+    "cruise_speed_mps": "FRACTUS_PLANNING_CRUISE_SPEED",
+    "climb_speed_mps": "FRACTUS_PLANNING_CLIMB_SPEED",
+    "battery_reserve": "FRACTUS_PLANNING_BATTERY_RESERVE",
+}
+"""Which variable sets what of the planning."""
 
 
 class BadSetting(ValueError):
@@ -53,15 +64,15 @@ class Settings:
         if level not in logging.getLevelNamesMapping():
             raise BadSetting(f"FRACTUS_LOG_LEVEL: {level} is no level; use DEBUG, INFO, WARNING or ERROR")
         planning = PlanningSettings(
-            safety_radius_m=_number(environment, "FRACTUS_PLANNING_SAFETY_RADIUS", default.planning.safety_radius_m),
-            depot_radius_m=_number(environment, "FRACTUS_PLANNING_DEPOT_RADIUS", default.planning.depot_radius_m),
-            coverage_share=_number(environment, "FRACTUS_PLANNING_COVERAGE_SHARE", default.planning.coverage_share),
-            cruise_speed_mps=_number(environment, "FRACTUS_PLANNING_CRUISE_SPEED", default.planning.cruise_speed_mps),
-            climb_speed_mps=_number(environment, "FRACTUS_PLANNING_CLIMB_SPEED", default.planning.climb_speed_mps),
-            battery_reserve=_number(environment, "FRACTUS_PLANNING_BATTERY_RESERVE", default.planning.battery_reserve),
             score_drone=_plugin(environment, "FRACTUS_PLANNING_RANKING"),
             cover=_plugin(environment, "FRACTUS_PLANNING_COVERING"),
         )
+        for name, variable in _PLANNING.items():
+            change: dict[str, Any] = {name: _number(environment, variable, getattr(planning, name))}
+            try:
+                planning = replace(planning, **change)
+            except InvalidObject as error:
+                raise BadSetting(f"{variable}: {error.problem}") from None
         return cls(
             namespace=environment.get("FRACTUS_SYSTEM_NAMESPACE", default.namespace),
             agent_account=environment.get("FRACTUS_AGENT_ACCOUNT", default.agent_account),

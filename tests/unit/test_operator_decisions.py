@@ -269,6 +269,8 @@ def test_settings_come_from_the_environment() -> None:
         {"FRACTUS_LOG_LEVEL": "LOUD"},
         {"FRACTUS_PLANNING_CRUISE_SPEED": "fast"},
         {"FRACTUS_PLANNING_CRUISE_SPEED": "-1"},
+        {"FRACTUS_PLANNING_CRUISE_SPEED": "0"},
+        {"FRACTUS_PLANNING_BATTERY_RESERVE": "20"},
         {"FRACTUS_PLANNING_RANKING": "best"},
         {"FRACTUS_LEASE": "0.5"},
     ],

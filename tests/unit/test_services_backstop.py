@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -49,6 +50,7 @@ class Vehicle:
         self.values |= {"FS_GCS_ENABLE": 1.0, "FENCE_OPTIONS": 1.0}
         self.items: tuple[Item, ...] = ()
         self.written: list[str] = []
+        self.vehicle = SimpleNamespace(armed=False)
 
     async def read_parameter(self, name: str, attempts: int = 4) -> float | None:
         del attempts
@@ -203,3 +205,78 @@ async def test_a_damaged_memory_of_the_owners_fence_is_no_memory(vehicle: Vehicl
     await asyncio.to_thread((tmp_path / "fence.json").write_text, json.dumps({"items": 3}))
     await Backstop(vehicle, tmp_path).lower(lambda: True)  # type: ignore[arg-type]
     assert not vehicle.written
+
+
+OWNED = {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 3.0, "FENCE_ALT_MAX": 40.0}
+
+
+async def test_no_fence_is_changed_while_the_motors_run(vehicle: Vehicle, tmp_path: Path) -> None:
+    vehicle.values |= OWNED
+    vehicle.vehicle.armed = True
+    backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
+    with pytest.raises(AutopilotError, match="the motors run"):
+        await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+    assert not vehicle.written
+    vehicle.vehicle.armed = False
+    await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+    vehicle.vehicle.armed = True
+    vehicle.written.clear()
+    with pytest.raises(AutopilotError, match="the motors run"):
+        await backstop.lower(lambda: True)
+    assert not vehicle.written
+    assert backstop.raised
+
+
+async def test_motors_that_start_while_the_fence_is_asked_for_keep_it_on(vehicle: Vehicle, tmp_path: Path) -> None:
+    vehicle.values |= OWNED
+    read, asked = vehicle.read_parameter, 0
+
+    async def slow(name: str, attempts: int = 4) -> float | None:
+        nonlocal asked
+        asked += name == "FENCE_ENABLE"
+        vehicle.vehicle.armed = asked >= 3
+        return await read(name, attempts)
+
+    vehicle.read_parameter = slow  # type: ignore[method-assign]
+    backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
+    with pytest.raises(AutopilotError, match="not switched off"):
+        await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+    assert not vehicle.written
+
+
+@pytest.mark.parametrize("how", ["refused", "given up"])
+async def test_a_fence_that_cannot_be_raised_leaves_the_owners(
+    vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    vehicle.values |= OWNED
+    vehicle.items = (Item(5003, 30.0, 1, 2),)
+    before = dict(vehicle.values)
+
+    async def full(_autopilot: Any, items: Any) -> None:
+        vehicle.items = tuple(items)
+        if len(items) > 1:
+            assert vehicle.values["FENCE_ENABLE"] == 0.0
+            raise AutopilotError("no space") if how == "refused" else asyncio.CancelledError
+
+    monkeypatch.setattr(module, "upload", full)
+    backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
+    with pytest.raises((AutopilotError, asyncio.CancelledError)):
+        await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+    assert vehicle.values == before
+    assert vehicle.items == (Item(5003, 30.0, 1, 2),)
+    assert not backstop.raised
+
+
+async def test_an_owners_fence_that_cannot_be_put_back_at_once_is_remembered(
+    vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vehicle.values |= OWNED
+
+    async def silent(*_: Any) -> None:
+        raise AutopilotError("the autopilot stopped answering", link=True)
+
+    monkeypatch.setattr(module, "upload", silent)
+    backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
+    with pytest.raises(AutopilotError, match="stopped answering"):
+        await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+    assert backstop.raised, "the supervisor puts it back later"

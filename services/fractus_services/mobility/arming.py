@@ -24,7 +24,9 @@ STRAY_M = 50.0
 
 
 async def arm(control: Control, held: Held, permit: Permit) -> None:
-    """Arm in GUIDED. Goes on to its end when the caller hangs up, so that nothing is armed that nobody asks for.
+    """Arm in GUIDED, unless it is armed by then; one caller at a time.
+
+    Goes on to its end when the caller hangs up, so that nothing is armed that nobody asks for.
 
     Args:
         control: the drone.
@@ -35,7 +37,15 @@ async def arm(control: Control, held: Held, permit: Permit) -> None:
         Refused: a failsafe is not verified, audit log or journal cannot be written, or the caller may no more.
         AutopilotError: the autopilot refuses.
     """
-    await asyncio.shield(control.tasks.keep(_arm(control, held, permit)))
+    await asyncio.shield(control.tasks.keep(_in_turn(control, held, permit)))
+
+
+async def _in_turn(control: Control, held: Held, permit: Permit) -> None:
+    """Arm when nobody else is at it: what is prepared on the ground must not be prepared under a drone that flies."""
+    async with control.autopilot.starting:
+        permit()
+        if not control.autopilot.vehicle.armed:
+            await _arm(control, held, permit)
 
 
 async def _arm(control: Control, held: Held, permit: Permit) -> None:

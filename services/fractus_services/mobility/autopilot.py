@@ -67,6 +67,7 @@ class Autopilot:
         on_message: called for every message after the state took it.
         on_found: called when the vehicle is heard first, again after each reconnection.
         alive: whether the companion does its duty; when not, no heartbeat holds off the autopilot's own failsafe.
+        starting: held by the one who prepares to start the motors.
     """
 
     def __init__(self, url: str) -> None:
@@ -75,6 +76,7 @@ class Autopilot:
         self.on_found: Callable[[], None] = lambda: None
         self.alive: Callable[[], bool] = lambda: True
         self.vehicle = Vehicle()
+        self.starting = asyncio.Lock()
         self._codec = Codec(SYSTEM_ID, COMPONENT_ID)
         self._transport: Transport | None = None
         self._target: tuple[int, int] | None = None

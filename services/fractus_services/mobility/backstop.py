@@ -27,6 +27,7 @@ _WITNESS = "FS_GCS_ENABLE"
 _TOP, _POLYGON = 1, 4
 _RETURN, _RETRACE = 1.0, 3.0
 _UNION = 2
+_RESTORE_S = 5.0
 _CLOSE_E7 = 2
 
 
@@ -82,7 +83,7 @@ class Backstop:
             retraces: whether the vehicle that breaches it is to fly back the way it came.
 
         Raises:
-            AutopilotError: the fence does not stand; the text says why.
+            AutopilotError: the fence does not stand, or the motors run; the text says why.
             OSError: what the owner had cannot be stored.
         """
         bounds = bounds_of(spec)
@@ -109,11 +110,7 @@ class Backstop:
             owned = await asyncio.to_thread(self._load) if idle() else None
             if owned is None:
                 return
-            await self._set({ENABLE: 0.0})
-            await self._write(owned.items)
-            await self._set(owned.parameters)
-            await asyncio.to_thread(self._path.unlink, True)
-            log.info("the vehicle's own fence is as its owner left it")
+            await self._put_back(owned)
 
     async def _offered(self) -> bool:
         """Whether the autopilot knows fences; only one that answers other questions surely does not."""
@@ -135,11 +132,32 @@ class Backstop:
             owned = await self._read()
             await asyncio.to_thread(self._store, owned)
         kept = owned.items if owned.enabled else ()
+        if self._autopilot.vehicle.armed:
+            raise AutopilotError("the motors run; the fence stays as it is")
         # ArduPilot works out which kinds of fence are in force when a fence is switched on, and not again.
-        await self._set({ENABLE: 0.0})
-        await self._write((*kept, *bounds.items))
-        await self._set(_wanted(owned, bounds, action))
+        try:
+            await self._set({ENABLE: 0.0})
+            await self._write((*kept, *bounds.items))
+            await self._set(_wanted(owned, bounds, action))
+        except (AutopilotError, asyncio.CancelledError):
+            await self._recover(owned)
+            raise
         log.info("the vehicle's own fence stands: %d vertices, ceiling %s", len(bounds.items), bounds.altitude_m)
+
+    async def _recover(self, owned: Owned) -> None:
+        """After a failure, put back what the owner had if that is possible at once; `lower` tries again later."""
+        try:
+            async with asyncio.timeout(_RESTORE_S):
+                await self._put_back(owned)
+        except (AutopilotError, OSError) as error:
+            log.warning("the owner's fence is not put back yet: %s", str(error) or "it takes too long")
+
+    async def _put_back(self, owned: Owned) -> None:
+        await self._set({ENABLE: 0.0})
+        await self._write(owned.items)
+        await self._set(owned.parameters)
+        await asyncio.to_thread(self._path.unlink, True)
+        log.info("the vehicle's own fence is as its owner left it")
 
     async def _read(self) -> Owned:
         found = {name: await self._autopilot.read_parameter(name) for name in PARAMETERS}
@@ -158,6 +176,8 @@ class Backstop:
         for name in PARAMETERS:
             if name not in values or await self._autopilot.read_parameter(name) == values[name]:
                 continue
+            if name == ENABLE and not values[name] and self._autopilot.vehicle.armed:
+                raise AutopilotError("the motors run; the fence is not switched off")
             after = await self._autopilot.write_parameter(name, values[name])
             if after is None or abs(after - values[name]) > 1e-3 * max(1.0, abs(values[name])):
                 raise AutopilotError(f"{name} cannot be set to {values[name]:g}; it stays {after}")

@@ -13,7 +13,7 @@ from fractus_core.policy.engine import judge
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, VelocityArgs
 from fractus_services.mobility.autopilot import AutopilotError
 from fractus_services.mobility.vehicle import GUIDED
-from mobility_world import World, at, end, fly, partial, refusal, spec, zone
+from mobility_world import World, area, at, end, fly, partial, refusal, spec, zone
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
 
@@ -181,6 +181,71 @@ def test_a_speed_that_is_corrected_holds_when_the_leg_is_sent_again(tmp_path: Pa
     fly(flight)
 
 
+SLOW_FROM = 60.0
+"""From here on north the speed is limited."""
+
+
+def slow_zone() -> dict[str, Any]:
+    slow = limit("speed", 3.0)
+    slow["spec"]["selector"] = {"zones": ["slow-zone"]}
+    return slow | {"zones": [{"name": "slow-zone", "area": area(-50, SLOW_FROM, 50, 180)}]}
+
+
+@pytest.mark.parametrize("asked_mps", [None, 3.0])
+def test_a_change_of_speed_keeps_to_what_the_leg_under_way_may_be_flown_with(
+    tmp_path: Path, asked_mps: float | None
+) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec(slow_zone()))
+            await world.up(held)
+            flying = asyncio.ensure_future(
+                fastest(world, world.service.goto(held, goto(0, 90, speed_mps=asked_mps), 0))
+            )
+            await world.until(lambda: world.plane.velocity[1] > 2.5)
+            verdict, speed = await world.service.set_speed(held, SetSpeedArgs(1.0))
+            assert (verdict.action, speed, world.plane.speed_mps) == ("allow", 1.0, 1.0)
+            verdict, speed = await world.service.set_speed(held, SetSpeedArgs(12.0))
+            assert (verdict.action, verdict.code, verdict.policies) == ("correct", "SpeedAboveLimit", ("limited",))
+            assert verdict.args == SetSpeedArgs(3.0)
+            assert speed == world.plane.speed_mps == 3.0
+            assert await flying == pytest.approx(3.0, abs=0.2)
+            assert await fastest(world, world.service.goto(held, goto(0, 65), 0)) == pytest.approx(3.0, abs=0.2)
+            await end(world.service.goto(held, goto(0, 0), 0))
+            assert await fastest(world, world.service.goto(held, goto(0, -120), 0)) > 10, "where nothing limits it"
+
+    fly(flight)
+
+
+def test_a_leg_under_way_is_flown_faster_where_that_is_legal(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec(slow_zone()))
+            await world.up(held)
+            flying = asyncio.ensure_future(fastest(world, world.service.goto(held, goto(0, -120, speed_mps=3.0), 0)))
+            await world.until(lambda: world.plane.velocity[1] < -2.5)
+            verdict, speed = await world.service.set_speed(held, SetSpeedArgs(10.0))
+            assert (verdict.action, speed) == ("allow", 10.0)
+            assert await flying == pytest.approx(10.0, abs=0.2)
+
+    fly(flight)
+
+
+def test_a_leg_that_cannot_be_judged_faster_gets_no_faster(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            flying = asyncio.ensure_future(fastest(world, world.service.goto(held, goto(0, 90, speed_mps=3.0), 0)))
+            await world.until(lambda: world.plane.velocity[1] > 2.5)
+            held = world.grants.put(spec(zone("new", "ignore", -30, 85, 30, 100)))
+            verdict, speed = await world.service.set_speed(held, SetSpeedArgs(10.0))
+            assert (verdict.action, verdict.policies, speed) == ("correct", ("new",), 3.0)
+            flying.cancel()
+
+    fly(flight)
+
+
 def test_the_next_driver_does_not_inherit_a_speed(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
@@ -237,6 +302,7 @@ def test_what_is_permitted_while_the_drone_brakes_before_a_new_zone_is_flown(
 ) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
+            world.plane.measured = True
             held = world.grants.put(spec())
             await world.up(held)
             flying = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 90), 0)))

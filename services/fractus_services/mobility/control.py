@@ -262,11 +262,11 @@ class Control:
         """The speed of legs that name none."""
         return self.speed_mps or (self.checked.speed_mps if self.checked is not None else DEFAULT_SPEED_MPS)
 
-    def cruise(self, speed_mps: float) -> None:
-        """Fly legs with this speed from now on, the one under way included."""
+    def cruise(self, speed_mps: float, leg_mps: float) -> None:
+        """Fly legs with this speed from now on, and the one under way with another: what is allowed all along it."""
         self.speed_mps = speed_mps
         if self.motion is not None and self.motion.speed_mps is not None:
-            self.motion.speed_mps = speed_mps
+            self.motion.speed_mps = leg_mps
 
     def begin(self, kind: str) -> Motion:
         """Start a motion; the one under way is replaced."""

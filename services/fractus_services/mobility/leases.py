@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from fractus_core.policy.compiled import CompiledGrant
+from fractus_core.policy.values import GotoArgs
 
 from fractus_services.grants import Held
 from fractus_services.replies import Refused
@@ -85,12 +86,14 @@ class Motion:
     Attributes:
         kind: what it is called.
         braking: whether the drone comes to rest first, so that nothing stops the motion before it begins.
-        speed_mps: with what its present leg is flown; None while it flies none.
+        leg: what it flies at present; None while it flies none.
+        speed_mps: with what that leg is flown.
     """
 
     def __init__(self, kind: str) -> None:
         self.kind = kind
         self.braking = False
+        self.leg: GotoArgs | None = None
         self.speed_mps: float | None = None
         self._stopped: Refused | None = None
 

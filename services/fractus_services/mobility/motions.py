@@ -75,7 +75,7 @@ async def fly_to(
     """
     altitude = args.alt if args.alt is not None else autopilot.vehicle.altitude_m
     frame = LocalFrame(args.lat, args.lon)
-    motion.speed_mps = args.speed_mps
+    motion.leg, motion.speed_mps = args, args.speed_mps
 
     async def begin() -> None:
         await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg, judged or permit)

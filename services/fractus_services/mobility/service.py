@@ -151,10 +151,26 @@ class MobilityService:
     async def set_speed(self, held: Held, args: SetSpeedArgs) -> tuple[Verdict, float]:
         """Change the speed of legs."""
         verdict = self._allow_motion(Call("SetSpeed", args), held)
-        speed = verdict.args.speed_mps if isinstance(verdict.args, SetSpeedArgs) else args.speed_mps
-        self._control.cruise(speed)
+        wanted = verdict.args.speed_mps if isinstance(verdict.args, SetSpeedArgs) else args.speed_mps
+        verdict, speed = self._on_leg(held, verdict, wanted)
+        self._control.cruise(wanted, speed)
         await self._autopilot.set_speed(speed, driver_permit(self._control, held))
         return verdict, speed
+
+    def _on_leg(self, held: Held, verdict: Verdict, wanted: float) -> tuple[Verdict, float]:
+        """A change of speed as the rest of the leg under way allows it; a leg that is not legal faster gets no faster."""
+        motion = self._control.motion
+        if motion is None or motion.leg is None or motion.speed_mps is None or wanted <= motion.speed_mps:
+            return verdict, wanted
+        leg, speed = replace(motion.leg, speed_mps=wanted), motion.speed_mps
+        rest = self._judge(Call("Goto", leg), held, kind="check")
+        if rest.permits and not rest.brake_first and isinstance(rest.args, GotoArgs):
+            legal_mps = rest.args.speed_mps or wanted
+            speed = min(legal_mps, wanted) if replace(rest.args, speed_mps=wanted) == leg else speed
+        if speed >= wanted:
+            return verdict, wanted
+        reason = f"the leg under way is flown with {speed:.1f} m/s: {rest.reason or 'it is not legal faster'}"
+        return Verdict("correct", SetSpeedArgs(speed), rest.code or "SpeedAboveLimit", reason, rest.policies), speed
 
     def take_off(self, held: Held, args: TakeoffArgs) -> AsyncIterator[Progress]:
         """Climb from the ground."""

@@ -1,4 +1,4 @@
-"""Commands that were overtaken are not sent; a companion that does not do its duty sends no heartbeats."""
+"""Commands that were overtaken are not sent, one parameter is asked for by one; no duty, no heartbeats."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from fractus_services.mobility import autopilot as module
 from fractus_services.mobility.autopilot import Autopilot
+from fractus_services.mobility.dialect import message
 
 
 class Overtaken(Exception):
@@ -47,3 +48,22 @@ async def test_no_duty_no_heartbeat(link: tuple[Autopilot, list[Any]]) -> None:
     autopilot.alive = lambda: True
     autopilot.beat()
     assert sent[-1].get_type() == "HEARTBEAT"
+
+
+async def test_two_that_read_one_parameter_both_hear_it(
+    link: tuple[Autopilot, list[Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    autopilot, sent = link
+    autopilot._target = (1, 1)
+    monkeypatch.setattr(module, "ACK_TIMEOUT_S", 5.0)
+    values = [1.0, 2.0]
+
+    def answered(outgoing: Any) -> None:
+        sent.append(outgoing)
+        told = message("PARAM_VALUE", param_id=b"FENCE_TYPE", param_value=values.pop(0), param_type=9)
+        asyncio.get_running_loop().call_soon(autopilot._take, told)
+
+    monkeypatch.setattr(autopilot, "send", answered)
+    both = await asyncio.gather(autopilot.read_parameter("FENCE_TYPE"), autopilot.write_parameter("FENCE_TYPE", 2.0))
+    assert both == [1.0, 2.0]
+    assert [m.get_type() for m in sent] == ["PARAM_REQUEST_READ", "PARAM_SET"]

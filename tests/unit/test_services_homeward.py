@@ -197,6 +197,26 @@ def test_failsafes_are_set_again_when_a_message_was_lost(tmp_path: Path) -> None
     fly(flight)
 
 
+def test_failsafes_are_set_again_when_setting_them_broke(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            control, plane = world.control, world.plane
+            plane.parameters |= {"SYSID_MYGCS": 244.0}
+            read, broken = plane.read_parameter, [KeyError("FENCE_ENABLE"), KeyError("FENCE_ENABLE")]
+
+            async def breaking(name: str, attempts: int = 4) -> float | None:
+                if broken:
+                    raise broken.pop()
+                return await read(name, attempts)
+
+            plane.read_parameter = breaking  # type: ignore[method-assign]
+            Observer(control).found()
+            await world.until(lambda: control.checked is not None and not control.checked.problem, 10)
+            assert not broken
+
+    fly(flight)
+
+
 @pytest.mark.parametrize("who", ["tour", "driver"])
 def test_a_fault_of_ours_ends_the_mission_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, who: str) -> None:
     def broken(*_: object, **__: object) -> None:

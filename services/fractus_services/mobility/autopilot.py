@@ -85,7 +85,7 @@ class Autopilot:
         self._acks: dict[int, asyncio.Queue[Any]] = {}
         self._params: dict[str, asyncio.Queue[float]] = {}
         self._listeners: list[tuple[frozenset[str], asyncio.Queue[Any]]] = []
-        self._locks: dict[int, asyncio.Lock] = {}
+        self._locks: dict[int | str, asyncio.Lock] = {}
         self._flying_rates: bool | None = None
 
     @property
@@ -409,17 +409,18 @@ class Autopilot:
         return await self._exchange(name, request, ATTEMPTS)
 
     async def _exchange(self, name: str, request: Any, attempts: int) -> float | None:
-        answers = self._params[name] = asyncio.Queue()
-        try:
-            for _ in range(attempts):
-                self.send(request)
-                try:
-                    async with asyncio.timeout(ACK_TIMEOUT_S):
-                        return await answers.get()
-                except TimeoutError:
-                    continue
-        finally:
-            del self._params[name]
+        async with self._locks.setdefault(name, asyncio.Lock()):
+            answers = self._params[name] = asyncio.Queue()
+            try:
+                for _ in range(attempts):
+                    self.send(request)
+                    try:
+                        async with asyncio.timeout(ACK_TIMEOUT_S):
+                            return await answers.get()
+                    except TimeoutError:
+                        continue
+            finally:
+                del self._params[name]
         return None
 
 

@@ -52,6 +52,8 @@ class Observer:
                         await self._control.tasks.attempt(autopilot.ask_home())
                 except AutopilotError as error:
                     log.warning("cannot prepare the autopilot yet: %s", error)
+                except Exception:
+                    log.exception("preparing the autopilot failed; it is tried again")
                 else:
                     again_s = min(2 * again_s, MOST_RETRY_S)
             else:

@@ -29,7 +29,7 @@ from fractus_services.mobility.service import MobilityService, Progress
 from fractus_services.mobility.streams import Streams
 from fractus_services.mobility.supervisor import Supervisor
 from fractus_services.mobility.tours import Tours
-from fractus_services.mobility.vehicle import BRAKE, GUIDED, LAND, RTL, SMART_RTL
+from fractus_services.mobility.vehicle import BRAKE, COURSE_S, GUIDED, LAND, RTL, SMART_RTL
 from fractus_services.mobility.watch import Watch
 from fractus_services.replies import Refused
 
@@ -110,6 +110,8 @@ class Plane(Autopilot):
         self.trace: list[tuple[float, float, float]] = []
         self.refuses: set[int] = set()
         self.deaf = False
+        self.measured = False
+        """Whether it tells velocities often enough to know how it speeds up."""
         self.parameters = {"FS_GCS_ENABLE": 3.0, "BATT_FS_LOW_ACT": 3.0}
         vehicle = self.vehicle
         vehicle.mode, vehicle.ready, vehicle.located, vehicle.position_error_m = GUIDED, True, True, 0.5
@@ -226,6 +228,10 @@ class Plane(Autopilot):
         vehicle.altitude_m, vehicle.yaw_deg = self.height, self.heading
         vehicle.east_mps, vehicle.north_mps = self.velocity
         vehicle.down_mps = -self.climb
+        if self.measured:
+            vehicle.courses.append((self.now, vehicle.north_mps, vehicle.east_mps))
+            while vehicle.courses[0][0] < self.now - COURSE_S:
+                vehicle.courses.popleft()
         vehicle.position_at = vehicle.heartbeat_at = vehicle.landed_at = self.now
         vehicle.landed_state = 2 if self.height > 0.2 else 1
         self._updated.set()

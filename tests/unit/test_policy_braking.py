@@ -10,8 +10,8 @@ from fractus_core.geo import area_of, corridor
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.engine import judge
 from fractus_core.policy.motion import stop_point
-from fractus_core.policy.values import GotoArgs, Situation
-from policy_world import FRAME, altitude, ask, at, box, compiled, exclusion, goto, inclusion
+from fractus_core.policy.values import Airframe, GotoArgs, Situation
+from policy_world import FRAME, altitude, ask, at, box, compiled, exclusion, goto, inclusion, ring
 
 
 def lane(radius_m: float, *points: tuple[float, float], **changes: Any) -> CompiledGrant:
@@ -85,6 +85,41 @@ def test_every_stop_it_offers_ends_where_it_is_legal(speed: float) -> None:
             x, y = stop_point(now, (3.0, 3.0))
             assert ask(grant, goto(0, 60), at(x, y)).action == "allow"
     assert offered or speed != 5
+
+
+RETRACES = Airframe(retraces=True)
+"""So that what is asked here is not denied for the way home."""
+
+
+@pytest.mark.parametrize(
+    ("corners", "start", "velocity", "end", "cruise"),
+    [
+        ([(2.1, 25.2), (-5.0, 24.5), (-6.5, 19.4), (-0.9, 18.3)], (0, 0), (-0.77, 7.12), (-15.2, 52), 9.9),
+        ([(-6.1, 69.1), (-35.6, 79.5), (-48.8, 50.1), (-20.3, 45.2)], (-7.2, 79.3), (-0.3, -3.7), (-29.4, -12), 5.6),
+    ],
+)
+def test_a_stop_that_need_not_lie_inside_a_zone_opens_no_way_through_it(
+    corners: list[tuple[float, float]],
+    start: tuple[float, float],
+    velocity: tuple[float, float],
+    end: tuple[float, float],
+    cruise: float,
+) -> None:
+    grant = compiled(exclusion(ring(corners)), operationArea=[])
+    east, north = velocity
+    hot = at(*start, east_mps=east, north_mps=north, airframe=RETRACES)
+    refused = ask(grant, goto(*end, speed_mps=cruise), hot)
+    assert (refused.action, refused.policies) == ("deny", ("no-fly",))
+    away = goto(start[0] - 3 * east, start[1] - 3 * north)
+    assert ask(grant, away, at(*start, airframe=RETRACES)).action == "allow", "at rest"
+
+
+def test_a_stop_that_need_not_lie_outside_an_area_opens_no_turn_beyond_its_border() -> None:
+    area = box(-50, -50, 20, 50)
+    for grant in (compiled(operationArea=[area]), compiled(inclusion(area), operationArea=[])):
+        leg = goto(10, 40, speed_mps=9.0)
+        assert not ask(grant, leg, at(6, 0, east_mps=5)).permits, "it may speed up already, or be told to stop in time"
+        assert ask(grant, leg, at(14, 0, east_mps=5)).permits, "it comes too close whatever it does, and leads back"
 
 
 def test_a_faster_leg_needs_a_wider_turn() -> None:

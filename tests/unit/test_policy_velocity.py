@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from fractus_core.policy.values import Airframe, Call, VelocityArgs, Verdict
-from policy_world import METHODS, altitude, ask, at, box, exclusion, inclusion, speed
+from policy_world import METHODS, altitude, ask, at, box, exclusion, inclusion, ring, speed
 from policy_world import compiled as granted
 
 VELOCITY = [{"service": "mobility", "methods": [*METHODS, "SetVelocity"]}]
@@ -92,6 +92,13 @@ def test_from_inside_a_zone_only_out() -> None:
     assert ask(grant, fly(9, hold=2.0), inside).permits
     assert not ask(grant, fly(-3), inside).permits
     assert not ask(grant, fly(0, 3), inside).permits
+
+
+def test_a_stop_that_need_not_lie_behind_a_zone_opens_no_way_through_it() -> None:
+    grant = compiled(exclusion(ring([(33.2, 9.5), (25.4, 12.8), (29.3, 5.4)])))
+    hot = {"north_mps": 4.9, "east_mps": 3.2, "speed_setpoint_mps": 8.8, "airframe": Airframe(retraces=True)}
+    assert ask(grant, fly(7.7, 5.9), at(20.2, -4.8, **hot)).code == "LegThroughExclusionZone"
+    assert ask(grant, fly(7.7, 5.9), at(33.2, 14.5, **hot)).action == "allow", "past it"
 
 
 def test_the_operation_area_and_the_way_to_it() -> None:

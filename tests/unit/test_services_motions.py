@@ -303,6 +303,7 @@ def test_what_is_permitted_while_the_drone_brakes_before_a_new_zone_is_flown(
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.plane.measured = True
+            world.plane.measured = True
             held = world.grants.put(spec())
             await world.up(held)
             flying = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 90), 0)))

@@ -113,7 +113,7 @@ def _operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: fl
         return
     working = operation.covers(leg.unavoidable) and not homeward and not vertical
     shape, edge = (operation, border) if working else (grant.passage, grant.passage_border)
-    if not _stays_inside(shape, edge, leg, margin_m):
+    if not _stays_inside(shape, edge, leg, now, margin_m):
         reason = f"the leg leaves the {'operation area' if working else 'way to the operation area'} or comes within {margin_m:.1f} m of its border"
         yield _area_breach(reason, not shape.covers(leg.ground))
 
@@ -144,7 +144,7 @@ def _exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Ite
         clearance_m = _clearance_outside(shape, leg.unavoidable)
         level = _is_level_with(patch, now, grant)
         if (
-            clearance_m < margin_m
+            shape.dwithin(_least_way(leg, now), margin_m)
             and (level or not _comes_level(patch, leg, now, grant))
             and _leads_out(shape, leg, margin_m, clearance_m)
         ):
@@ -154,16 +154,13 @@ def _exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Ite
         yield _exclusion_breach(patch, leg, margin_m, enters)
 
 
-def _surely_too_close(shape: BaseGeometry, leg: Leg, now: Situation, margin_m: float) -> bool:
-    """Whether a drone comes too close to a zone even if it brakes by now as hard as it can.
-
-    Where nobody knows whether it does, its way to rest is taken for long, which must not open ways past the zone.
-    """
-    return now.forward_mps2 is not None or bool(shape.dwithin(_least_way(leg, now), margin_m))
-
-
 def _least_way(leg: Leg, now: Situation) -> BaseGeometry:
-    """The shortest way to rest that is possible."""
+    """The part of a leg that the drone flies for all that is known, even if it brakes by now as hard as it can.
+
+    Where nobody knows whether it does, its way to rest is taken for long, which must not open ways past a fence.
+    """
+    if now.forward_mps2 is not None or leg.start == leg.stop:
+        return leg.unavoidable
     stop = stop_point(replace(now, forward_mps2=-now.airframe.accel_mps2), leg.start)
     return shapely.points(leg.start) if stop == leg.start else shapely.linestrings((leg.start, stop))
 
@@ -216,22 +213,10 @@ def _inclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Ite
         if not fence.rule.in_force(now.time_s):
             continue
         shape, border = fence.at(air.lower_m, air.upper_m, now, grant.flat_terrain)
-        if (
-            not _stays_inside(shape, border, leg, air.margin_m)
-            or (_turns_from_inside(shape, border, leg, now, air.margin_m))
-            or (fence.banded and _leaves_by_height(fence, shape, leg, now, grant))
+        if not _stays_inside(shape, border, leg, now, air.margin_m) or (
+            fence.banded and _leaves_by_height(fence, shape, leg, now, grant)
         ):
             yield _inclusion_breach(fence, shape, border, leg, air.margin_m)
-
-
-def _turns_from_inside(shape: BaseGeometry, border: BaseGeometry, leg: Leg, now: Situation, margin_m: float) -> bool:
-    """Whether a leg that may lead back in begins, for all that is known, well inside: see `_surely_too_close`."""
-    if now.forward_mps2 is not None or leg.start == leg.stop:
-        return False
-    if shape.covers(leg.ground) and not border.dwithin(leg.ground, margin_m):
-        return False
-    least = _least_way(leg, now)
-    return bool(shape.covers(least) and not border.dwithin(least, margin_m))
 
 
 def _leaves_by_height(fence: Inclusion, shape: BaseGeometry, leg: Leg, now: Situation, grant: CompiledGrant) -> bool:
@@ -276,12 +261,13 @@ def _clearance_outside(shape: BaseGeometry, unavoidable: BaseGeometry) -> float:
     return 0.0 if shape.intersects(unavoidable) else float(shape.distance(unavoidable))
 
 
-def _stays_inside(shape: BaseGeometry, border: BaseGeometry, leg: Leg, margin_m: float) -> bool:
+def _stays_inside(shape: BaseGeometry, border: BaseGeometry, leg: Leg, now: Situation, margin_m: float) -> bool:
     """Whether a leg keeps its margin inside a shape, or leads back into it."""
     ground = leg.ground
     if shape.covers(ground) and not border.dwithin(ground, margin_m):
         return True
-    if shape.covers(leg.unavoidable) and not border.dwithin(leg.unavoidable, margin_m):
+    least = _least_way(leg, now)
+    if shape.covers(least) and not border.dwithin(least, margin_m):
         return False
     if shape.covers(leg.unavoidable) and not shape.covers(ground):
         return False

@@ -350,7 +350,7 @@ def flights(seed: int, count: int, shared: int = 8, requests: int = 3) -> Tally:
     rng = np.random.default_rng(seed)
     scenes = [s for s in (scene(rng) for _ in range(math.ceil(count / shared))) for _ in range(shared)][:count]
     fleet, tally = Fleet(rng, scenes), Tally()
-    excused = _excused(fleet)
+    pardoned = excused(fleet)
     told: list[str] = [""] * count
     for turn in range(requests):
         _ask_all(fleet, tally, told, rng)
@@ -359,13 +359,13 @@ def flights(seed: int, count: int, shared: int = 8, requests: int = 3) -> Tally:
             fleet.step()
             if turn == requests - 1 and np.abs(fleet.speed).max() < 0.02:
                 break
-            found = fleet.trespassing() & ~excused
+            found = fleet.trespassing() & ~pardoned
             for i in np.flatnonzero(found.any(axis=1)):
                 # Where wind takes a drone that nothing was permitted to is nobody's doing.
                 if not told[i]:
                     continue
                 tally.wrong.append(f"seed {seed}, drone {i}, turn {turn}, {fleet.time_s:.2f} s: {told[i]}")
-                excused[i] = True
+                pardoned[i] = True
     return tally
 
 
@@ -427,7 +427,7 @@ def _odd(verdict: Verdict, now: Situation, place: Scene) -> Iterator[str]:
         yield "target inside the margin of a fence"
 
 
-def _excused(fleet: Fleet) -> Flags:
+def excused(fleet: Fleet) -> Flags:
     """Fences that a drone breaks, or comes too close to, whatever it is told at the beginning; shape (n, ZONES + 1).
 
     What it does before a request can have any effect is not the request's doing, nor are the ways back that the engine
@@ -439,11 +439,8 @@ def _excused(fleet: Fleet) -> Flags:
     trial.held[:], trial.wanted, trial.until[:] = True, trial.speed.copy(), LATENCY_S
     margin = _CIRCLE * (POSITION_ERROR_M + TRACKING_M + 0.1)
     tall = HEIGHT_ERROR_M + TRACKING_M + 0.1
-    bands = fleet.bands.copy()
-    wide, tight = bands + np.array([-tall, tall]), bands + np.array([tall, -tall])
-    bands = np.where(
-        (fleet.kinds == EXCLUSION)[..., None], wide, np.where((fleet.kinds == INCLUSION)[..., None], tight, bands)
-    )
+    around = np.where((fleet.kinds == EXCLUSION)[..., None], [-tall, tall], [tall, -tall])
+    bands = fleet.bands + around
     found = np.zeros((len(fleet.scenes), ZONES + 1), dtype=bool)
     for n in range(int(6.0 / STEP_S)):
         if n % 4 == 0:

@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 import random
 
+import numpy as np
 import pytest
 from fractus_core.policy import legs, velocities
 from fractus_core.policy.limits import LEAST_LEG_M
 from fractus_core.policy.values import Call, GotoArgs, TakeoffArgs
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from policy_flights import flights
+from policy_flights import CORNERS, LIMIT, ZONES, Fleet, Scene, excused, flights
 from policy_world import HOME, Corners, altitude, ask, at, compiled, exclusion, goto, inclusion, ring, target
 
 EARTH_M = 6_371_000.0
@@ -222,3 +223,15 @@ def test_the_oracle_would_notice(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (legs, velocities):
         monkeypatch.setattr(module, "margin_m", lambda _now: 0.5)
     assert flights(seed=3, count=200).wrong
+
+
+def test_who_begins_beyond_a_limit_of_altitude_breaks_it_by_no_request() -> None:
+    rings = np.full((ZONES, CORNERS, 2), 1e6)
+    rings[0] = [(-20, -20)] * 5 + [(20, -20), (20, 20), (-20, 20)]
+    limits = np.tile([-np.inf, np.inf], (ZONES, 1))
+    limits[0] = 21, 40
+    scene = Scene(compiled(), rings, np.array([LIMIT] + [0] * (ZONES - 1)), limits, (-np.inf, 120.0), 15.0)
+    fleet = Fleet(np.random.default_rng(1), [scene] * 4)
+    fleet.place[:], fleet.speed[:], fleet.gust[:] = (0, 0, 19), 0, 0
+    fleet.place[1:, 2] = 21.5, 39.5, 42
+    assert excused(fleet)[:, 0].tolist() == [True, False, False, True]

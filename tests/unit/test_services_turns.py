@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Generator
+import itertools
+import math
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
 
+import grpc
 import pytest
-from fractus_core.policy.values import Call
+from fractus_core.policy.values import Call, TakeoffArgs, Verdict
+from fractus_proto.v1 import mobility_pb2
+from fractus_services import answering
+from fractus_services.auth import Caller
+from fractus_services.grants import Held
 from fractus_services.mobility import background, courses, service
 from fractus_services.mobility.background import in_slices
-from mobility_world import World, fly, partial, spec, zone
+from fractus_services.mobility.handlers import MobilityHandlers
+from google.rpc import error_details_pb2, status_pb2
+from mobility_world import World, at, fly, partial, refusal, spec, zone
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
 
@@ -25,6 +34,57 @@ class Clock:
     def perf_counter(self) -> float:
         self.seconds += 0.001
         return self.seconds
+
+
+class Context:
+    """A call of one caller."""
+
+    def __init__(self, held: Held) -> None:
+        self.held = held
+
+    def auth_context(self) -> Held:
+        return self.held
+
+    def time_remaining(self) -> float:
+        return 5.0
+
+    async def write(self, message: Any) -> None:
+        """Nobody reads it."""
+
+    async def abort(self, code: grpc.StatusCode, text: str, metadata: Any) -> None:
+        status, why = status_pb2.Status(), error_details_pb2.ErrorInfo()
+        status.ParseFromString(dict(metadata)["grpc-status-details-bin"])
+        for detail in status.details:
+            if detail.Is(why.DESCRIPTOR):
+                detail.Unpack(why)
+        raise PermissionError(why.reason)
+
+
+@pytest.fixture
+def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], World]:
+    monkeypatch.setattr(answering, "caller_of", lambda held, _time: Caller(held.identity, 0.0, 1e12))
+    return lambda: World(tmp_path)
+
+
+def handlers_of(world: World) -> MobilityHandlers:
+    return MobilityHandlers(
+        world.service, world.control, world.streams, grants=world.grants, node="drone-1", clock=lambda: 1.8e9  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def costly(world: World, method: str, monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Let each judgement of a method take a tenth of a second of computing; gives when they are made."""
+    judge, clock, at_s = world.guard.judge, Clock(), list[float]()
+    monkeypatch.setattr(service, "time", clock)
+
+    def slow(call: Call, *args: Any, **options: Any) -> Verdict:
+        if call.method == method:
+            clock.seconds += 0.1
+            at_s.append(world.plane.now)
+        return judge(call, *args, **options)
+
+    monkeypatch.setattr(world.guard, "judge", slow)
+    return at_s
 
 
 async def test_others_have_their_turn_during_a_long_computation(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,5 +151,108 @@ def test_who_asks_much_waits_and_who_drives_waits_less(tmp_path: Path, monkeypat
             assert await ask(held, 101) == pytest.approx(0.1, abs=0.02)
             assert not flood.done()
             assert await flood == pytest.approx(0.4, abs=0.05)
+
+    fly(flight)
+
+
+def test_takeoffs_take_turns_as_any_costly_call(world: Callable[[], World], monkeypatch: pytest.MonkeyPatch) -> None:
+    async def flight() -> None:
+        async with world() as w:
+            held = w.grants.put(spec())
+            await w.drive(held)
+            await w.service.arm(held)
+            judged = costly(w, "Takeoff", monkeypatch)
+            handlers = handlers_of(w)
+            for _ in range(5):
+                with pytest.raises(PermissionError, match="InvalidArgument"):
+                    await handlers.Takeoff(mobility_pb2.TakeoffRequest(altitude_m=-5.0), Context(held))
+            assert len(judged) == 5
+            assert min(b - a for a, b in itertools.pairwise(judged)) > 0.09
+
+    fly(flight)
+
+
+def test_a_takeoff_that_cannot_be_is_not_judged(world: Callable[[], World], monkeypatch: pytest.MonkeyPatch) -> None:
+    async def flight() -> None:
+        async with world() as w:
+            held = w.grants.put(spec())
+            judged = costly(w, "Takeoff", monkeypatch)
+
+            async def why() -> str:
+                async def begun() -> None:
+                    w.service.take_off(held, TakeoffArgs(10.0))
+
+                return (await refusal(begun())).verdict.code
+
+            assert await why() == "NotInControl"
+            await w.drive(held)
+            assert await why() == "NotArmed"
+            await w.up(held)
+            judged.clear()
+            assert await why() == "AlreadyFlying"
+            assert not judged
+
+    fly(flight)
+
+
+def test_a_cheap_call_shortens_no_rest(world: Callable[[], World], monkeypatch: pytest.MonkeyPatch) -> None:
+    async def flight() -> None:
+        async with world() as w:
+            held = w.grants.put(spec())
+            other = w.grants.put(spec(instance="app-other"), "m2")
+            await w.up(held)
+            costly(w, "Goto", monkeypatch)
+            for who, rest_s in ((held, 0.1), (other, 0.4)):
+                await w.service.turn(who)
+                begun = w.plane.now
+                w.service.check(Call("Goto"), who)
+                w.service.check(Call("Hover"), who)
+                await w.service.turn(who)
+                assert w.plane.now - begun == pytest.approx(rest_s, abs=0.02)
+
+    fly(flight)
+
+
+def test_no_call_is_carried_out_after_a_later_one(world: Callable[[], World], monkeypatch: pytest.MonkeyPatch) -> None:
+    async def flight() -> None:
+        async with world() as w:
+            held = w.grants.put(spec())
+            other = w.grants.put(spec(instance="app-other"), "m2")
+            await w.up(held)
+            handlers = handlers_of(w)
+            costly(w, "GetSpeed", monkeypatch)
+            place = dict(zip(("latitude_deg", "longitude_deg", "altitude_m"), (*at(0, 90), 10.0), strict=True))
+            goto, hover = mobility_pb2.GotoRequest(target=place), mobility_pb2.HoverRequest()
+
+            def setpoint(east_mps: float) -> Any:
+                velocity = {"east_mps": east_mps}
+                return handlers.SetVelocity(mobility_pb2.SetVelocityRequest(velocity=velocity), Context(held))
+
+            async def waiting(*calls: Any) -> list[asyncio.Future[Any]]:
+                """The calls, which came one after the other while a judgement's rest lasts."""
+                w.service.check(Call("GetSpeed"), held)
+                tasks = [asyncio.ensure_future(call) for call in calls]
+                await asyncio.sleep(0.02)
+                return tasks
+
+            [stale] = await waiting(handlers.Goto(goto, Context(held)))
+            await handlers.Hover(hover, Context(held))
+            with pytest.raises(PermissionError, match="Replaced"):
+                await stale
+            assert w.control.motion is None
+            assert math.hypot(*w.plane.velocity) < 0.1
+
+            first, second, third = await waiting(setpoint(1.0), setpoint(2.0), setpoint(3.0))
+            assert (await third).velocity.east_mps == pytest.approx(3.0)
+            for replaced in (first, second):
+                with pytest.raises(PermissionError, match="Replaced"):
+                    await replaced
+
+            [kept] = await waiting(handlers.Goto(goto, Context(held)))
+            for call in (handlers.Hover(hover, Context(other)), handlers.Goto(goto, Context(other))):
+                with pytest.raises(PermissionError, match="NotInControl"):
+                    await call
+            await kept
+            assert w.plane.xy == pytest.approx([0.0, 90.0], abs=2.0)
 
     fly(flight)

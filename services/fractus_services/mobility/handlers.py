@@ -102,6 +102,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         """See mobility.proto."""
         async with self._reception.call(context, urgent=True) as caller:
             held = self._held(caller)
+            self._service.comes(held)
             self._service.allow(Call("ReturnControl"), held)
             last = await self._control.give_back(held)
             return mobility_pb2.ReturnControlResponse(mission_complete=last)
@@ -126,6 +127,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     async def SetSpeed(self, request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context) as caller:
+            await self._service.turn(self._held(caller))
             verdict, speed = await self._service.set_speed(self._held(caller), SetSpeedArgs(request.speed_mps))
             return mobility_pb2.SetSpeedResponse(decision=decision(verdict), speed_mps=speed)
 
@@ -140,7 +142,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         """See mobility.proto."""
         async with self._reception.call(context) as caller:
             args = velocity_args(request)
-            await self._service.turn(self._held(caller))
+            await self._service.turn_to_move(self._held(caller))
             verdict, flown = await self._service.set_velocity(self._held(caller), args)
             reply = mobility_pb2.SetVelocityResponse(decision=decision(verdict))
             reply.velocity.north_mps, reply.velocity.east_mps = flown.north_mps, flown.east_mps
@@ -170,15 +172,16 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     async def Takeoff(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context, lasting=True) as caller:
+            await self._service.turn_to_move(self._held(caller))
             progress = self._service.take_off(self._held(caller), TakeoffArgs(request.altitude_m))
             await self._report(progress, context)
 
     async def Goto(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context, lasting=True) as caller:
-            args = goto_args(request)
-            await self._service.turn(self._held(caller))
-            progress = self._service.goto(self._held(caller), args, _finite(request.acceptance_radius_m))
+            args, reached_m = goto_args(request), _finite(request.acceptance_radius_m)
+            await self._service.turn_to_move(self._held(caller))
+            progress = self._service.goto(self._held(caller), args, reached_m)
             await self._report(progress, context)
 
     async def Land(self, _request: Any, context: Any) -> None:  # noqa: N802

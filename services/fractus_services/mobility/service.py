@@ -68,6 +68,7 @@ class MobilityService:
         self._steering = Steering(control)
         self._autopilot: Autopilot = control.autopilot
         self._rested_at = {True: 0.0, False: 0.0}
+        self._came = 0
 
     def allow(self, call: Call, held: Held) -> Verdict:
         """Judge a call that moves nothing.
@@ -93,6 +94,22 @@ class MobilityService:
             await asyncio.sleep(left_s)  # others that waited may have been first
             left_s = self._rested_at[self._drives(held)] - self._autopilot.now
 
+    async def turn_to_move(self, held: Held) -> None:
+        """Wait as `turn` does, before a call that moves the drone: it is void once a later such call has come.
+
+        Raises:
+            Refused: who has the drone has said since what it shall do.
+        """
+        number = self.comes(held)
+        await self.turn(held)
+        if self._drives(held) and number != self._came:
+            raise aborted("Replaced", "a later call came before this one's turn")
+
+    def comes(self, held: Held) -> int:
+        """Number a call on what the drone shall do as it comes; those of who does not have the drone replace none."""
+        self._came += self._drives(held)
+        return self._came
+
     def _drives(self, held: Held) -> bool:
         lease = self._control.lease
         return lease is not None and lease.key == held.key
@@ -103,7 +120,7 @@ class MobilityService:
             return self._guard.judge(call, held, kind=kind, known=known)
         finally:
             rest_s = (time.perf_counter() - begun) * REST[drives]
-            self._rested_at[drives] = self._autopilot.now + rest_s
+            self._rested_at[drives] = max(self._rested_at[drives], self._autopilot.now + rest_s)
 
     def _not_a_driver(self, call: Call, held: Held, *, kind: str = "call") -> Verdict:
         verdict = Verdict("deny", None, "NotADriver", f"passengers ride along; only a driver may {call.method}")
@@ -136,12 +153,14 @@ class MobilityService:
 
     async def disarm(self, held: Held) -> Verdict:
         """Stop the motors on the ground."""
+        self.comes(held)
         verdict = self._allow_motion(Call("Disarm"), held)
         await self._autopilot.disarm(driver_permit(self._control, held))
         return verdict
 
     async def hover(self, held: Held) -> Verdict:
         """Stop and stay."""
+        self.comes(held)
         verdict = self._allow_motion(Call("Hover"), held)
         self._flying("Hover")
         self._control.finish(self._control.begin("Hover"))
@@ -174,11 +193,9 @@ class MobilityService:
 
     def take_off(self, held: Held, args: TakeoffArgs) -> AsyncIterator[Progress]:
         """Climb from the ground."""
-        verdict = self._allow_motion(Call("Takeoff", args), held)
-        if not self._autopilot.vehicle.armed:
-            raise precondition("NotArmed", "the motors are off; arm first")
-        if self._autopilot.vehicle.in_air and not self._autopilot.vehicle.standing:
-            raise precondition("AlreadyFlying", "the drone is in the air; use goto to climb")
+        call = Call("Takeoff", args)
+        self._standing_by(call, held)
+        verdict = self._allow_motion(call, held)
         altitude = verdict.args.altitude_m if isinstance(verdict.args, TakeoffArgs) else args.altitude_m
 
         async def steps(motion: Motion) -> AsyncIterator[Progress]:
@@ -270,6 +287,7 @@ class MobilityService:
 
     def land(self, held: Held) -> AsyncIterator[Progress]:
         """Come down here."""
+        self.comes(held)
         verdict = self._allow_motion(Call("Land"), held)
         self._flying("Land")
 
@@ -282,6 +300,7 @@ class MobilityService:
 
     def return_to_launch(self, held: Held) -> AsyncIterator[Progress]:
         """Fly home, around what is in the way, and land."""
+        self.comes(held)
         verdict = self._allow_motion(Call("ReturnToLaunch"), held)
         self._flying("ReturnToLaunch")
 
@@ -307,6 +326,16 @@ class MobilityService:
                 yield Progress(verdict, step)
 
         return self._run("ReturnToLaunch", steps)
+
+    def _standing_by(self, call: Call, held: Held) -> None:
+        """Refuse a takeoff that cannot be, before its costly judgement; methods that are not granted are left to that."""
+        if held.spec.class_ != "driver" or call.method not in held.compiled.methods:
+            return
+        self._control.require(held)
+        if not self._autopilot.vehicle.armed:
+            raise precondition("NotArmed", "the motors are off; arm first")
+        if self._autopilot.vehicle.in_air and not self._autopilot.vehicle.standing:
+            raise precondition("AlreadyFlying", "the drone is in the air; use goto to climb")
 
     def _flying(self, method: str) -> None:
         if not self._autopilot.vehicle.in_air:

@@ -19,6 +19,9 @@ CALL_TIMEOUT_S = 10.0
 PATIENCE_S = 30.0
 """How long a call waits for a service that is restarting. It then gives a drone's driver 15 s to come back."""
 
+ONCE = frozenset({"Arm", "SetVelocity"})
+"""Methods that are for this moment: they are not tried again, for late they would do what nobody wants any more."""
+
 _OPTIONS = (
     ("grpc.keepalive_time_ms", 10_000),
     ("grpc.keepalive_timeout_ms", 5_000),
@@ -97,7 +100,7 @@ class ServiceChannel:
             await self._close_unused()
 
     async def unary(self, method: str, request: Any, *, timeout_s: float | None = None) -> Any:
-        """One call with a deadline; while the service restarts it is tried again, for `patience_s` at most.
+        """One call with a deadline; while the service restarts it is tried again, for `patience_s` at most, unless in `ONCE`.
 
         Raises:
             FractusError: one of the typed errors; `Unavailable` when the service did not come back.
@@ -109,7 +112,8 @@ class ServiceChannel:
                 async with self.stub() as stub:
                     return await getattr(stub, method)(request, timeout=timeout_s or self._timeout_s)
             except grpc.aio.AioRpcError as error:
-                if error.code() is not grpc.StatusCode.UNAVAILABLE or loop.time() + delay > give_up:
+                again = error.code() is grpc.StatusCode.UNAVAILABLE and method not in ONCE
+                if not again or loop.time() + delay > give_up:
                     raise translate(error, method, self.address) from None
             await asyncio.sleep(delay)
         raise AssertionError("backoff is endless")

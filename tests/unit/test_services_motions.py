@@ -262,6 +262,84 @@ def test_the_next_driver_does_not_inherit_a_speed(tmp_path: Path) -> None:
     fly(flight)
 
 
+@pytest.mark.parametrize(("driven_mps", "limited"), [(0.3, False), (12.0, False), (12.0, True)])
+def test_the_system_flies_home_at_the_speed_of_the_vehicle_within_limits(
+    tmp_path: Path, driven_mps: float, limited: bool
+) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, retraces=True) as world:
+            wall = zone("wall", "ignore", *WALL)
+            held = world.grants.put(spec(wall))
+            await world.up(held)
+            for x, y in ((60, 30), (60, 70), (0, 70)):
+                await end(world.service.goto(held, goto(x, y), 0))
+            await world.service.set_speed(held, SetSpeedArgs(driven_mps))
+            if limited:
+                world.grants.put(spec(wall, limit("speed", 3.0)))
+            await world.control.give_back(held)
+            await world.until(lambda: world.control.motion is not None and world.control.motion.speed_mps is not None)
+            told = 3.0 if limited else 8.0
+            assert world.guard.situation().speed_setpoint_mps == 8.0
+            top = 0.0
+            while world.plane.vehicle.mode == GUIDED:
+                await world.plane.update(0.1)
+                top = max(top, math.hypot(*world.plane.velocity))
+            assert top == pytest.approx(told, abs=0.5)
+            await world.until(lambda: not world.plane.vehicle.armed)
+
+    fly(flight)
+
+
+def test_a_driver_that_comes_back_has_its_speed_again(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            stream = await world.up(held)
+            await world.service.set_speed(held, SetSpeedArgs(2.0))
+            stream.cancel()
+            await world.until(lambda: world.control.hands == "system", 10)
+            assert world.guard.situation().speed_setpoint_mps == 8.0
+            await world.drive(held)
+            assert world.guard.situation().speed_setpoint_mps == 2.0
+
+    fly(flight)
+
+
+def test_the_monitor_leads_a_slow_driver_back_at_the_speed_of_the_vehicle(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held, 25.0)
+            await world.service.set_speed(held, SetSpeedArgs(0.2))
+            world.grants.put(spec(limit("altitude", 15.0)))
+            await world.until(lambda: world.plane.speed_mps == 8.0, 5)
+            assert world.control.motion is not None
+            assert world.control.motion.kind == "Correction"
+            assert world.guard.situation().speed_setpoint_mps == 8.0
+            await world.until(lambda: world.control.motion is None, 20)
+            assert world.guard.situation().speed_setpoint_mps == 0.2
+
+    fly(flight)
+
+
+def test_a_correction_that_came_too_late_for_its_motion_is_made_for_the_next(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            flying = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 150), 0)))
+            await world.until(lambda: world.plane.velocity[1] > 7)
+            world.grants.put(spec(limit("speed", 3.0)))
+            world.watch.look()
+            world.control.begin("Goto").speed_mps = 8.0  # before the correction has begun
+            begun = world.plane.now
+            await world.until(lambda: world.plane.speed_mps == 3.0, 5)
+            assert world.plane.now - begun < 0.5
+            assert (await flying).verdict.code == "Replaced"
+
+    fly(flight)
+
+
 # Commands that are lost
 
 
@@ -302,7 +380,6 @@ def test_what_is_permitted_while_the_drone_brakes_before_a_new_zone_is_flown(
 ) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            world.plane.measured = True
             world.plane.measured = True
             held = world.grants.put(spec())
             await world.up(held)

@@ -30,6 +30,9 @@ log = logging.getLogger(__name__)
 
 Hands = Literal["driver", "system", "pilot"]
 
+CORRECTION = "Correction"
+"""What the motions are called with which the monitor leads a driver's drone back."""
+
 WAYPOINT_M = 5.0
 DEFAULT_SPEED_MPS = 5.0
 """Legs are taken to be flown so fast while the vehicle's parameters are not known."""
@@ -259,8 +262,11 @@ class Control:
 
     @property
     def cruise_mps(self) -> float:
-        """The speed of legs that name none."""
-        return self.speed_mps or (self.checked.speed_mps if self.checked is not None else DEFAULT_SPEED_MPS)
+        """The speed of legs that name none: the driver's on what the driver flies, else the vehicle's own."""
+        corrects = self.motion is not None and self.motion.kind == CORRECTION
+        if self.speed_mps is not None and self.hands == "driver" and not corrects:
+            return self.speed_mps
+        return self.checked.speed_mps if self.checked is not None else DEFAULT_SPEED_MPS
 
     def cruise(self, speed_mps: float, leg_mps: float) -> None:
         """Fly legs with this speed from now on, and the one under way with another: what is allowed all along it."""

@@ -8,7 +8,10 @@ from contextlib import aclosing
 from dataclasses import dataclass, replace
 
 import grpc
-from fractus_core.policy.compiled import CompiledGrant, height_m
+import shapely
+from fractus_core.policy.compiled import Air, CompiledGrant, height_m
+from fractus_core.policy.limits import speed_bounds
+from fractus_core.policy.motion import margin_m
 from fractus_core.policy.routes import searching
 from fractus_core.policy.values import Call, GotoArgs, Situation
 
@@ -94,6 +97,25 @@ async def _first_leg(
         if way is not None:
             return GotoArgs(*frame.latlon(*way[0]), height), len(way) == 1, height
     return None
+
+
+def limited_mps(speed_mps: float, leg: GotoArgs, now: Situation, grant: CompiledGrant) -> float:
+    """What the speed limits along a leg leave of a speed; lower limits do not hold, and none refuses.
+
+    Args:
+        speed_mps: wanted.
+        leg: altitude above home.
+        now: the state of the drone.
+        grant: whose limits.
+    """
+    at = grant.locate(now)
+    if at is None:
+        return speed_mps
+    target = grant.frame.xy(leg.lat, leg.lon)
+    heights = (now.altitude_m, now.altitude_m if leg.alt is None else leg.alt)
+    ground = shapely.points(at) if at == target else shapely.linestrings((at, target))
+    air = Air(ground, margin_m(now), min(heights), max(heights))
+    return min([speed_mps, *(bound.upper for bound in speed_bounds(grant, now, air) if bound.upper is not None)])
 
 
 class Courses:

@@ -16,7 +16,7 @@ from fractus_core.policy.values import GotoArgs, Situation
 from fractus_services.grants import Held
 from fractus_services.mobility.autopilot import AutopilotError
 from fractus_services.mobility.control import Control
-from fractus_services.mobility.courses import MAX_LEGS, REPLANS, Trip, first_leg, stopped_by_monitor
+from fractus_services.mobility.courses import MAX_LEGS, REPLANS, Trip, first_leg, limited_mps, stopped_by_monitor
 from fractus_services.mobility.guard import Guard
 from fractus_services.mobility.leases import Motion
 from fractus_services.mobility.motions import REACHED_M, Step, at_rest, come_to_rest, fly_to
@@ -162,7 +162,7 @@ class Homing:
         leg, last, _ = found
         if last and self._guard.distance_m(leg.lat, leg.lon) <= HOME_M:
             return None
-        return replace(leg, speed_mps=self._control.cruise_mps)
+        return replace(leg, speed_mps=limited_mps(self._control.cruise_mps, leg, now, grant))
 
 
 def _straight(now: Situation, grant: CompiledGrant) -> bool:

@@ -12,7 +12,8 @@ from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Verdict
 
 from fractus_services.audit import AuditLog
 from fractus_services.mobility.autopilot import AutopilotError, Permit
-from fractus_services.mobility.control import Control
+from fractus_services.mobility.control import CORRECTION, Control
+from fractus_services.mobility.courses import limited_mps
 from fractus_services.mobility.guard import Guard
 from fractus_services.mobility.leases import Motion
 from fractus_services.mobility.motions import REACHED_M, fly_to
@@ -83,7 +84,7 @@ class Watch:
         elif verdict.action in {"takeover", "deny"}:
             self._stop(verdict, fresh)
         elif fresh:
-            self._correct(verdict)
+            self._correct(verdict, grant)
 
     def _judge(self, grant: CompiledGrant) -> tuple[Verdict | None, bool]:
         """What is wrong, and whether the system flies the drone already, so that there is nobody to take it from."""
@@ -108,22 +109,23 @@ class Watch:
         else:
             control.autopilot.stop()
 
-    def _correct(self, verdict: Verdict) -> None:
+    def _correct(self, verdict: Verdict, grant: CompiledGrant) -> None:
         self._audit.append(
             "monitor", {"action": verdict.action, "code": verdict.code, "reason": verdict.reason, "policies": list(verdict.policies)}
         )  # fmt: skip
-        task = asyncio.get_running_loop().create_task(self._carry_out(verdict, self._control.motion))
+        task = asyncio.get_running_loop().create_task(self._carry_out(verdict, self._control.motion, grant))
         self._corrections.add(task)
         task.add_done_callback(self._corrections.discard)
 
-    async def _carry_out(self, verdict: Verdict, seen: Motion | None) -> None:
+    async def _carry_out(self, verdict: Verdict, seen: Motion | None, grant: CompiledGrant) -> None:
         if self._control.motion is not seen:
+            self._alarm = ""
             return  # the monitor looks at what flies now first
         try:
             if isinstance(verdict.args, SetSpeedArgs):
                 await self._slow_down(verdict.args.speed_mps)
             elif isinstance(verdict.args, GotoArgs):
-                await self._lead_back(verdict, verdict.args)
+                await self._lead_back(verdict, verdict.args, grant)
         except (AutopilotError, Refused) as error:
             log.warning("cannot correct the motion: %s", error)
 
@@ -145,12 +147,13 @@ class Watch:
             motion.speed_mps = speed_mps
         await self._control.autopilot.set_speed(speed_mps, self._permit(motion))
 
-    async def _lead_back(self, verdict: Verdict, place: GotoArgs) -> None:
+    async def _lead_back(self, verdict: Verdict, place: GotoArgs, grant: CompiledGrant) -> None:
         """Fly to where the limits hold, as a motion that follows the one that left them."""
         control = self._control
         control.stop_motion(aborted(verdict.code, verdict.reason, verdict.policies))
-        motion = control.begin("Correction")
-        leg = replace(place, speed_mps=control.cruise_mps)
+        motion = control.begin(CORRECTION)
+        speed = limited_mps(control.cruise_mps, place, self._guard.situation(), grant)
+        leg = replace(place, speed_mps=speed)
         try:
             async for _ in fly_to(control.autopilot, motion, leg, REACHED_M, self._permit(motion)):
                 pass

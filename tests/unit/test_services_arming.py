@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
+from typing import Any
 
+import pytest
 from fractus_core.api.plans import GrantSpec
-from fractus_core.policy.values import TakeoffArgs
+from fractus_core.policy.values import Airframe, TakeoffArgs
+from fractus_services.mobility.failsafes import Checked
+from fractus_services.mobility.vehicle import BRAKE
 from mobility_world import World, end, fly, refusal, spec
 
 
@@ -54,5 +58,57 @@ def test_who_waits_to_arm_must_still_be_allowed_to(tmp_path: Path) -> None:
                 await refusal(call)
             assert slow.began_armed == [False]
             assert 400 not in world.plane.commands
+
+    fly(flight)
+
+
+FRESH = Checked("", (), Airframe(retraces=True), 8.0, remembers=True)
+"""What is verified when the link is back: the way home of this flight is not chosen in it."""
+
+
+@pytest.mark.parametrize("found", [None, FRESH])
+@pytest.mark.parametrize("during", ["choice", "fence", "mode"])
+def test_failsafes_that_are_set_anew_meanwhile_forbid_arming(
+    tmp_path: Path, during: str, found: Checked | None
+) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, retraces=True) as world:
+            control, plane = world.control, world.plane
+            held = world.grants.put(spec())
+            await world.drive(held)
+            write, set_mode, raise_around = plane.write_parameter, plane.set_mode, world.fence.raise_around
+
+            async def chosen(name: str, value: float) -> float | None:
+                control.checked = found
+                return await write(name, value)
+
+            async def raised(grant: GrantSpec, *, retraces: bool) -> None:
+                control.checked = found
+                await raise_around(grant, retraces=retraces)
+
+            async def changed(mode: int, *_: object) -> None:
+                await set_mode(mode)
+                control.checked = found
+
+            if during == "choice":
+                control.journal.mission(held).home = (39.3604, 22.95, 10.0)
+                plane.write_parameter = chosen  # type: ignore[method-assign]
+            elif during == "fence":
+                world.fence.raise_around = raised  # type: ignore[method-assign]
+            else:
+                plane.set_to(BRAKE)
+                plane.set_mode = changed  # type: ignore[method-assign]
+            obey, motors = plane._obey, list[float]()
+
+            def noted(outgoing: Any) -> None:
+                if outgoing.command == 400:
+                    motors.append(outgoing.param1)
+                obey(outgoing)
+
+            plane._obey = noted  # type: ignore[method-assign]
+            why = await refusal(world.service.arm(held))
+            assert why.verdict.code == "FailsafesNotVerified"
+            assert control.checked is found, "what is known by then is not written over"
+            assert 1 not in motors
 
     fly(flight)

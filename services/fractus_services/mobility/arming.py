@@ -9,7 +9,7 @@ from fractus_core.geo import LocalFrame
 from fractus_services.grants import Held
 from fractus_services.mobility.autopilot import AutopilotError, Permit
 from fractus_services.mobility.control import Control
-from fractus_services.mobility.failsafes import choose_return, learn_return
+from fractus_services.mobility.failsafes import BEING_SET, Checked, choose_return, learn_return
 from fractus_services.mobility.journal import Mission
 from fractus_services.mobility.motions import distance_m
 from fractus_services.mobility.vehicle import GUIDED
@@ -60,9 +60,14 @@ async def _arm(control: Control, held: Held, permit: Permit) -> None:
     permit()
     helm.preparing += 1
     try:
-        await _prepare_ways_home(control, held, home)
-        permit()
-        await _start(control, home, permit)
+        checked = await _prepare_ways_home(control, held, home)
+
+        def still() -> None:
+            permit()
+            _check(control, checked)
+
+        still()
+        await _start(control, home, still)
     finally:
         helm.preparing -= 1
 
@@ -91,16 +96,18 @@ async def _start(control: Control, home: tuple[float, float, float], permit: Per
         helm.arming = False
 
 
-async def _prepare_ways_home(control: Control, held: Held, home: tuple[float, float, float]) -> None:
+async def _prepare_ways_home(control: Control, held: Held, home: tuple[float, float, float]) -> Checked:
     """Choose how the autopilot comes home by itself, raise its own fence around the mission, and learn how high it returns.
 
     A vehicle remembers its path from where it was armed last: armed elsewhere than at home, it must not go back on it.
+
+    Returns:
+        The failsafes to arm with; others that are set meanwhile were not chosen for this flight.
     """
     autopilot, vehicle = control.autopilot, control.autopilot.vehicle
     at_home = distance_m(LocalFrame(home[0], home[1]), vehicle.lat, vehicle.lon) <= HOME_M
-    if control.checked is not None:
-        control.checked = await choose_return(autopilot, control.checked, retrace=at_home)
-        _check(control)
+    checked = _check(control)
+    checked = _learnt(control, checked, await choose_return(autopilot, checked, retrace=at_home))
     try:
         async with asyncio.timeout(FENCE_S):
             await control.backstop.raise_around(held.spec, retraces=control.retraces)
@@ -108,17 +115,28 @@ async def _prepare_ways_home(control: Control, held: Held, home: tuple[float, fl
         said = str(error) or f"it takes longer than {FENCE_S:.0f} s"
         why = f"the vehicle's own fence cannot be raised around the operation area: {said}"
         raise precondition("FenceNotRaised", why) from error
-    if control.checked is not None and not control.backstop.missing:
-        control.checked = await learn_return(autopilot, control.checked)
-        _check(control)
+    _check(control, checked)
+    if not control.backstop.missing:
+        checked = _learnt(control, checked, await learn_return(autopilot, checked))
+    return checked
 
 
-def _check(control: Control) -> None:
-    if control.checked is None or control.checked.problem:
-        why = control.checked.problem if control.checked else "they are being set"
+def _learnt(control: Control, before: Checked, after: Checked) -> Checked:
+    """Take over what is known about the failsafes by now, unless they were set anew meanwhile."""
+    if control.checked is before:
+        control.checked = after
+    return _check(control, after)
+
+
+def _check(control: Control, chosen: Checked | None = None) -> Checked:
+    """The failsafes, if they are verified, and are those that were chosen."""
+    checked = control.checked
+    if checked is None or checked.problem or (chosen is not None and checked is not chosen):
+        why = (checked.problem if checked is not None else "") or BEING_SET
         raise precondition("FailsafesNotVerified", f"the autopilot's failsafes are not verified: {why}")
     if control.audit.failure:
         raise precondition("AuditUnavailable", control.audit.failure)
+    return checked
 
 
 def _home_of(control: Control, held: Held, mission: Mission) -> tuple[float, float, float]:

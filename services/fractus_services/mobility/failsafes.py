@@ -60,6 +60,9 @@ RANGE = Setting(("MAV_GCS_SYSID_HI",), 0, frozenset(float(n) for n in range(1, S
 """Releases that know the new name can take a whole range of systems for the companion."""
 
 
+BEING_SET = "they are being set"
+"""The problem of failsafes that are not read back yet."""
+
 Names = tuple[tuple[str, float], ...]
 """A parameter's name, and older or newer spellings of it, each with what its values are multiplied by."""
 

@@ -62,6 +62,7 @@ class Scene:
     """A camera that shows noise, and lets a test act during the exposure."""
 
     def __init__(self) -> None:
+        self.latency_s = 0.0
         self.taken: list[Wanted] = []
         self.during: Callable[[], None] = lambda: None
         self._begun = threading.Event()
@@ -187,6 +188,29 @@ async def test_a_camera_that_looks_aside_and_back_during_the_exposure_keeps_no_p
     assert await refusal(world.service.retrieve(held(), shot.name)) == "PrivacyZone"
 
 
+async def test_a_camera_that_shows_what_was_is_judged_by_where_it_was(world: World) -> None:
+    def came_from_private_ground() -> None:
+        for y in (0.0, 80.0):
+            world.drone.y = y
+            world.drone.situation(NOW)
+
+    came_from_private_ground()
+    await world.capture(held())
+    world.scene.latency_s = 600.0
+    came_from_private_ground()
+    assert await refusal(world.service.capture(held(), CaptureArgs())) == "PrivacyZone"
+
+
+async def test_a_zone_counts_that_was_active_when_the_camera_may_have_seen_it(world: World) -> None:
+    world.drone.y = 0.0
+    past = {**zone("z", box(-20, -20, 20, 20)), "schedule": [{"start": "08:00", "end": "11:50"}]}
+    grant = held(policy("p", "PrivacyControl", "camera", [past], action="refuse"))
+    world.scene.latency_s = 300.0
+    await world.capture(grant)
+    world.scene.latency_s = 900.0
+    assert await refusal(world.service.capture(grant, CaptureArgs())) == "PrivacyZone"
+
+
 async def test_those_who_wait_are_judged_and_placed_when_it_is_their_turn(world: World) -> None:
     held_up = threading.Event()
     world.scene.during = lambda: held_up.wait(10) and None
@@ -269,6 +293,20 @@ async def test_a_picture_is_judged_again_by_where_it_was_taken(world: World) -> 
     assert grain(await world.pixels(bound, shot)) < 12
     assert await refusal(world.service.retrieve(held(), shot.name)) == "PrivacyZone"
     assert grain(await world.pixels(free, shot)) > 30
+
+
+async def test_a_picture_is_judged_again_once_its_filters_are_applied(world: World) -> None:
+    far = [zone("far", box(500, 500, 510, 510))]
+    free, bound = held(policy("q", "PrivacyControl", "camera", far, action="refuse")), held(private("blurAverage"))
+    world.drone.y = 0.0
+    shot = await world.capture(free)
+    _, shown, _ = await world.service.retrieve(bound, shot.name, lambda: bound)
+    assert [one.action for one in shown.filters] == ["blurAverage"]
+    assert await refusal(world.service.retrieve(bound, shot.name, held)) == "PrivacyZone"
+    stricter = held(private("black"))
+    with pytest.raises(Refused, match="ask again") as caught:
+        await world.service.retrieve(bound, shot.name, lambda: stricter)
+    assert (caught.value.verdict.code, caught.value.verdict.policies) == ("PrivacyZone", ("p",))
 
 
 async def test_a_picture_from_elsewhere_is_judged_by_where_the_camera_is_now(world: World) -> None:
@@ -422,7 +460,7 @@ async def test_a_picture_whose_record_is_damaged_is_removed_and_never_handed_out
     records = [world.album.path(owner, shot.name).with_suffix(".json") for shot in shots]
     body = json.loads(records[0].read_text())
     poses = body.pop("poses")
-    records[0].write_text(json.dumps({**body, "before": poses[0], "after": poses[-1]}))  # as an older release wrote it
+    records[0].write_text(json.dumps({**body, "poses": poses, "colour": "red"}))
     records[1].write_text("{")
     records[2].write_text(json.dumps({**body, "poses": []}))
     records[3].write_text(json.dumps({**body, "poses": [{**poses[0], "lat": float("nan")}]}))
@@ -436,6 +474,22 @@ async def test_a_picture_whose_record_is_damaged_is_removed_and_never_handed_out
         await world.service.delete(held(), shots[0].name)
     assert Album(world.directory, 50, 10**9).list(owner) == (shots[4],)
     assert [path.name for path in world.directory.glob("*/*.jpg")] == [shots[4].name]
+    world.shutter.close()
+
+
+async def test_a_picture_of_an_earlier_release_was_taken_nobody_knows_where(tmp_path: Path) -> None:
+    world = World(tmp_path)
+    shot = await world.capture(held())
+    record = world.album.path(camera.owner_of(held()), shot.name).with_suffix(".json")
+    body = json.loads(record.read_text())
+    poses = body.pop("poses")
+    record.write_text(json.dumps({**body, "face_px": 900.0, "before": poses[0], "after": poses[-1]}))
+    world.service._album = Album(world.directory, 50, 10**9)
+    (kept,) = (await world.service.list(held()))[1]
+    assert (kept.name, kept.poses[0].lat, kept.face_px) == (shot.name, None, 0.0)
+    assert await refusal(world.service.retrieve(held(), shot.name)) == "PrivacyZone", "every policy in force holds"
+    verdict, _, _ = await world.service.retrieve(held(private("black")), shot.name)
+    assert verdict.policies == ("p",)
     world.shutter.close()
 
 

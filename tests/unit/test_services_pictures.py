@@ -271,6 +271,14 @@ def test_what_names_no_camera_is_refused(connection: str) -> None:
         driver_for(connection)
 
 
+@pytest.mark.parametrize(
+    ("connection", "latency_s"),
+    [("http://h/", 2.0), ("picamera2:0", 0.3), ("v4l2:/dev/video0", 0.0), ("directory:/", 0.0), ("test:", 0.0)],
+)
+def test_cameras_tell_how_old_their_pictures_may_be(connection: str, latency_s: float) -> None:
+    assert driver_for(connection).latency_s == latency_s
+
+
 def test_cameras_that_are_not_there_say_so(tmp_path: Path) -> None:
     no_camera = tmp_path / "video0"
     no_camera.write_bytes(b"no device")

@@ -38,7 +38,10 @@ class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
     async def RetrieveImage(self, request: Any, context: Any) -> None:  # noqa: N802
         """See camera.proto."""
         async with self._reception.call(context) as caller:
-            verdict, shot, source = await self._service.retrieve(self._reception.held(caller), request.name)
+            held = self._reception.held(caller)
+            verdict, shot, source = await self._service.retrieve(
+                held, request.name, lambda: self._reception.held(caller)
+            )
             head: dict[str, Any] = {"decision": decision(verdict), "image": _info(shot)}
             async for piece in _pieces(source, request.name):
                 for at in range(0, len(piece), CHUNK_BYTES):

@@ -17,7 +17,7 @@ import grpc
 from fractus_core.policy.engine import judge
 from fractus_core.policy.footprint import seen_from
 from fractus_core.policy.privacy import compose, judge_privacy, remaining
-from fractus_core.policy.values import Call, CaptureArgs, Filter, Situation, Verdict
+from fractus_core.policy.values import Call, CaptureArgs, Filter, Moment, Situation, Verdict, earliest
 
 from fractus_services.audit import AuditLog
 from fractus_services.camera.album import Album, AlbumFull, NoSuchImage
@@ -208,7 +208,8 @@ class CameraService:
         if not isinstance(args, CaptureArgs):
             raise TypeError("CaptureImage without its arguments")
         async with self._exposing.turn(owner):
-            begun_s = time.monotonic()
+            # A camera may give a picture that it had before it was asked.
+            begun_s = time.monotonic() - self._shutter.latency_s
             held, now = present(), self._whereabouts.situation(self._clock())
             verdict = self._allow(call, held, now)
             problem = await asyncio.to_thread(self._album.room, owner)
@@ -226,6 +227,8 @@ class CameraService:
             # A zone that was active when the picture was begun counts as well as one that is now.
             moments = [after, replace(after, time_s=now.time_s)]
             verdicts = [verdict, *(self._allow(call, held, moment, always=False) for moment in moments)]
+            first = replace(after, time_s=Moment(now.time_s, earliest(now.time_s) - self._shutter.latency_s))
+            verdicts.append(self._checked(call, held, judge_privacy(first, held.compiled), first))
             # Enlarging a picture does not make its faces easier to find.
             shown = min(width, pictures[len(pictures) // 2].shape[1])
             moment = datetime.fromtimestamp(after.time_s, UTC).strftime("%Y%m%d%H%M%S%f")[:17]
@@ -274,14 +277,23 @@ class CameraService:
             self._checked(call, held, denied, now)
             raise AssertionError("a denial always raises") from error
 
-    async def retrieve(self, held: Held, name: str) -> tuple[Verdict, Shot, bytes | Path]:
-        """A picture; policies hold for where it was taken and for where the camera is now, whichever asks for more."""
+    async def retrieve(
+        self, held: Held, name: str, present: Callable[[], Held] | None = None
+    ) -> tuple[Verdict, Shot, bytes | Path]:
+        """A picture; policies hold for where it was taken and for where the camera is now, whichever asks for more.
+
+        It is judged again when its filters are applied, as other pictures may come first.
+
+        Args:
+            held: the caller's grant.
+            name: of the picture.
+            present: as for `capture`.
+        """
         call, now = Call("RetrieveImage"), self._whereabouts.situation(self._clock())
         verdict = self._allow(call, held, now)
         owner = owner_of(held)
         shot = await asyncio.to_thread(self._album.find, owner, name)
-        way = tuple(pose.at(now) for pose in shot.poses)
-        taken = replace(way[-1], way=way)
+        taken = _taken_at(shot, now)
         verdict = _together([verdict, self._checked(call, held, judge_privacy(taken, held.compiled), taken)])
         todo = remaining(verdict.filters, shot.filters)
         path = self._album.path(owner, name)
@@ -291,11 +303,21 @@ class CameraService:
         face_px = 0.0 if shot.filters else shot.face_px
         chosen = self._recipe(call, held, replace(verdict, filters=todo), face_px, taken)
         data = await self._finished(self._redeveloped(owner, path, chosen, replace(shot, face_px=face_px)))
+        self._check_again(call, present() if present else held, shot, (*shot.filters, *chosen.filters))
         return (
             _noted(verdict, chosen),
             replace(shot, size_bytes=len(data), filters=(*shot.filters, *chosen.filters)),
             data,
         )
+
+    def _check_again(self, call: Call, held: Held, shot: Shot, done: tuple[Filter, ...]) -> None:
+        """Refuse a kept picture that by now needs more filters than it got."""
+        now = self._whereabouts.situation(self._clock())
+        verdict, taken = self._allow(call, held, now, always=False), _taken_at(shot, now)
+        verdict = _together([verdict, self._checked(call, held, judge_privacy(taken, held.compiled), taken)])
+        if remaining(verdict.filters, done):
+            reason = f"{verdict.reason}, which it did not when this picture was asked for; ask again"
+            self._checked(call, held, Verdict("deny", None, "PrivacyZone", reason, verdict.policies), now)
 
     async def _redeveloped(self, owner: str, path: Path, chosen: Recipe, shot: Shot) -> bytes:
         def work() -> bytes:
@@ -339,6 +361,12 @@ class CameraService:
         if not verdict.permits:
             raise refused(verdict)
         return verdict
+
+
+def _taken_at(shot: Shot, now: Situation) -> Situation:
+    """Where a picture was taken and on which way, at the time of another situation."""
+    way = tuple(pose.at(now) for pose in shot.poses)
+    return replace(way[-1], way=way)
 
 
 def _together(verdicts: list[Verdict]) -> Verdict:

@@ -77,12 +77,15 @@ class Shot:
 
     @classmethod
     def parse(cls, body: dict[str, Any]) -> Shot:
-        """The shot that JSON holds.
+        """The shot that JSON holds; one without poses, of an earlier release, was taken nobody knows where.
 
         Raises:
             ValueError: it holds none.
         """
         try:
+            if "poses" not in body:
+                known = {key: value for key, value in body.items() if key in cls.__slots__}
+                body = {**known, "poses": [asdict(Pose.of(Situation(0.0)))], "face_px": 0.0}
             poses = tuple(Pose.parse(pose) for pose in body["poses"])
             shot = cls(**{**body, "poses": poses, "filters": tuple(Filter(**one) for one in body["filters"])})
             sound = all(pose.at(Situation(0.0)).sound for pose in poses) and math.isfinite(shot.face_px + shot.time_s)

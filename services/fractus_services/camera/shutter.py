@@ -30,6 +30,11 @@ class Shutter:
         self._thread: threading.Thread | None = None
         self._busy_since_s: float | None = None
 
+    @property
+    def latency_s(self) -> float:
+        """How many seconds before `expose` begins its first picture may have been exposed, at most."""
+        return self._driver.latency_s
+
     async def expose(self, wanted: Wanted, count: int = 1, apart_s: float = 0.0) -> list[Pixels]:
         """Pictures one after the other; the one in the middle in full, the others reduced to `MOTION_PX`.
 

@@ -65,8 +65,12 @@ def as_described(picture: Pixels, wanted: Wanted) -> Pixels:
 class Driver(Protocol):
     """A camera. Its methods block, and are called from one thread, never two at a time."""
 
+    @property
+    def latency_s(self) -> float:
+        """How many seconds before it is asked for a picture may have been exposed, at most."""
+
     def capture(self, wanted: Wanted) -> Pixels:
-        """A picture of the present moment.
+        """A picture of the present moment, or of one at most `latency_s` ago.
 
         Raises:
             CameraFailed: the camera gives none.

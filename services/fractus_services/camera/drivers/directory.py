@@ -27,6 +27,8 @@ class GeotaggedDirectory:
         path: the directory; it is looked through again when it changes.
     """
 
+    latency_s = 0.0
+
     def __init__(self, path: Path) -> None:
         self._path = path
         self._stamp: int | None = None

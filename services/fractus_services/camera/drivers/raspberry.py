@@ -17,6 +17,9 @@ class RaspberryCamera:
         number: of the camera, as `rpicam-hello --list-cameras` counts.
     """
 
+    latency_s = 0.3
+    """The picture that is under way when one is asked for may be given, of a slow sensor in the dark."""
+
     def __init__(self, number: int) -> None:
         self._number = number
         self._camera: Any = None

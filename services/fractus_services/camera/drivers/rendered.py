@@ -15,6 +15,8 @@ GRID_PX = 80
 class Rendered:
     """Draws a grid, the node's name, and where and when it is."""
 
+    latency_s = 0.0
+
     def capture(self, wanted: Wanted) -> Pixels:
         """See `Driver`."""
         cv2 = opencv()

@@ -27,6 +27,9 @@ class Snapshot:
         BadConnection: it is no such URL.
     """
 
+    latency_s = 2.0
+    """IP cameras answer with the picture that they encoded last."""
+
     def __init__(self, url: str) -> None:
         parts = urllib.parse.urlsplit(url)
         try:

@@ -21,6 +21,8 @@ class VideoDevice:
         path: such as /dev/video0.
     """
 
+    latency_s = 0.0
+
     def __init__(self, path: str) -> None:
         self._path = path
         self._device: Any = None

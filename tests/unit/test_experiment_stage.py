@@ -10,11 +10,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fractus_sim.experiment import lifeline, runner
+from click.testing import CliRunner
+from fractus_sim.experiment import cli, lifeline, reporting, runner
+from fractus_sim.experiment.logbook import Flight
 from fractus_sim.experiment.model import Experiment, parse
-from fractus_sim.experiment.stage import Moment, Stage
+from fractus_sim.experiment.stage import Findings, Moment, Stage
 from fractus_sim.interruption import uninterrupted
 from fractus_sim.report.page import write_page
+from fractus_sim.report.track import Place, Sample
 
 
 class Thing:
@@ -140,3 +143,42 @@ def test_a_page_that_cannot_be_written_whole_is_not_there(tmp_path: Path, monkey
     with pytest.raises(OSError, match="No space left"):
         write_page(tmp_path, "# Flight")
     assert not list(tmp_path.iterdir())
+
+
+def test_the_figures_are_written_before_pictures_and_the_page_after_them(
+    experiment: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def undrawn(_scene: object) -> None:
+        raise full()
+
+    samples = [Sample(float(t), Place(50.0, 4.0, float(t)), 5.0, "GUIDED", t > 0, 0.8) for t in range(3)]
+    flights = {"d": Flight("d", samples)}
+    outcome = runner.Outcome(experiment, tmp_path, flights, (), (), Findings(), (), (), 2.0, 2.0)
+    monkeypatch.setattr(reporting, "draw_map", undrawn)
+    with pytest.raises(OSError, match="No space left"):
+        reporting.write_outcome(outcome)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.json", "tracks.geojson"]
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device", "out/x/map.png"), "cannot write below out: out/x/map.png No"),
+        (full(), "broken off: No space left on device"),
+        (TimeoutError("no answer"), "broken off: no answer"),
+        (ConnectionResetError(), "broken off: ConnectionResetError"),
+    ],
+)
+def test_only_what_names_a_file_is_said_to_be_one_that_cannot_be_written(
+    experiment: Experiment, error: OSError, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **_more: object) -> None:
+        raise error
+
+    monkeypatch.setattr(cli, "break_off_on_signals", lambda: None)
+    monkeypatch.setattr(cli, "load", lambda _file: experiment)
+    monkeypatch.setattr(cli, "run", broken)
+    result = CliRunner().invoke(cli.experiment, ["run", "x.yaml", "--out", "out"])
+    assert result.exit_code == 1
+    assert said in result.output
+    assert "None" not in result.output

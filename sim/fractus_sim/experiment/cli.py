@@ -49,8 +49,7 @@ def run_(file: Path, out: Path | None, seed: int | None, speedup: float | None, 
     except (ExperimentError, InvalidObject) as error:
         raise click.ClickException(str(error)) from None
     except OSError as error:
-        where = f" {error.filename}" if error.filename else ""
-        raise click.ClickException(f"cannot write below {folder}:{where} {error.strerror}") from None
+        raise click.ClickException(_problem(error, folder)) from None
     _tell_outcome(console, outcome)
     sys.exit(0 if outcome.holds else _FAILED)
 
@@ -73,6 +72,14 @@ def check(file: Path) -> None:
 def schema() -> None:
     """Print the JSON schema of experiments' files."""
     click.echo(json.dumps(Experiment.model_json_schema(), indent=2))
+
+
+def _problem(error: OSError, folder: Path) -> str:
+    """What the system refused; only an error that names a file is one of files."""
+    said = error.strerror or str(error) or type(error).__name__
+    if error.filename:
+        return f"cannot write below {folder}: {error.filename} {said}"
+    return f"the experiment was broken off: {said}"
 
 
 def _changed(found: Experiment, **changes: float | None) -> Experiment:

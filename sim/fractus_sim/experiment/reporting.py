@@ -33,13 +33,16 @@ _QUIET_SEVERITY = 6
 
 
 def write_outcome(outcome: Outcome) -> None:
-    """Write summary.md, report.json, tracks.geojson, map.png and profile.png into the experiment's folder."""
+    """Write report.json, tracks.geojson, map.png, profile.png and summary.md into the experiment's folder.
+
+    The figures first, so that no picture which cannot be drawn costs them; the page last, as it shows all else.
+    """
     folder = outcome.folder
+    (folder / "report.json").write_text(json.dumps(figures(outcome), indent=2) + "\n")
+    (folder / "tracks.geojson").write_text(json.dumps(features(outcome)) + "\n")
     if _tracks(outcome):
         save(draw_map(scene_of(outcome)), folder / "map.png")
         save(draw_profile(profile_of(outcome)), folder / "profile.png")
-    (folder / "tracks.geojson").write_text(json.dumps(features(outcome)) + "\n")
-    (folder / "report.json").write_text(json.dumps(figures(outcome), indent=2) + "\n")
     write_page(folder, summary(outcome))
 
 

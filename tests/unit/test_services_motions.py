@@ -371,6 +371,36 @@ def test_a_goto_whose_command_was_lost_is_judged_where_the_drone_is_by_then(tmp_
     fly(flight)
 
 
+@pytest.mark.parametrize(("lost", "arrives"), [(3, True), (100, False)])
+def test_a_leg_whose_speed_is_lost_is_stopped_and_begun_once_more(tmp_path: Path, lost: int, arrives: bool) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            plane = world.plane
+            held = world.grants.put(spec(limit("speed", 2.0)))
+            await world.up(held)
+            send, left, top = plane.send, lost, 0.0
+
+            def lossy(outgoing: Any) -> None:
+                nonlocal left, top
+                top = max(top, math.hypot(*plane.velocity))
+                if outgoing.get_type() == "COMMAND_LONG" and outgoing.command == 178 and left > 0:
+                    left -= 1
+                else:
+                    send(outgoing)
+
+            plane.send = lossy  # type: ignore[method-assign]
+            flying = asyncio.ensure_future(fastest(world, world.service.goto(held, goto(0, 60), 0)))
+            if arrives:
+                assert await flying == pytest.approx(2.0, abs=0.2)
+            else:
+                with pytest.raises(AutopilotError, match="how fast"):
+                    await flying
+                await world.until(lambda: math.hypot(*plane.velocity) < 0.2, 5)
+            assert top < 4.0, "it is not left to fly at its own speed"
+
+    fly(flight)
+
+
 # Motions that begin while the drone comes to rest
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.values import STANDING_MPS, GotoArgs
 
-from fractus_services.mobility.autopilot import Autopilot, Permit
+from fractus_services.mobility.autopilot import Autopilot, AutopilotError, Permit
 from fractus_services.mobility.leases import Motion
 from fractus_services.mobility.vehicle import Vehicle
 from fractus_services.replies import aborted, unavailable
@@ -21,6 +22,9 @@ STUCK_S = 6.0
 RESENDS = 3
 TURNED_DEG, TURN_S = 8.0, 8.0
 """A leg with a heading is complete when the nose points there, or had so long to turn."""
+
+SPEED_S = 1.3
+"""A leg whose speed is not acknowledged for so long, in which it is sent twice, is stopped and begun once more."""
 
 REST_S, REST_AGAIN_S = 12.0, 0.4
 FRESH_S = 1.0
@@ -79,8 +83,11 @@ async def fly_to(
 
     async def begin() -> None:
         await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg, judged or permit)
-        if motion.speed_mps is not None:
-            await autopilot.set_speed(motion.speed_mps, permit)
+        if not await _hears_speed(autopilot, motion, permit):
+            await come_to_rest(autopilot, motion, permit)
+            await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg, judged or permit)
+            if not await _hears_speed(autopilot, motion, permit):
+                raise AutopilotError("the autopilot does not answer how fast it shall fly", link=True)
         if args.yaw_deg is not None:
             await autopilot.turn(args.yaw_deg, permit)
 
@@ -107,6 +114,18 @@ async def fly_to(
             resends, sent = resends + 1, autopilot.now
             await begin()
         await _tick(autopilot, motion)
+
+
+async def _hears_speed(autopilot: Autopilot, motion: Motion, permit: Permit) -> bool:
+    """Tell the autopilot how fast the leg that it has begun is flown; whether it answers soon enough."""
+    if motion.speed_mps is None:
+        return True
+    try:
+        async with asyncio.timeout(SPEED_S):
+            await autopilot.set_speed(motion.speed_mps, permit)
+    except TimeoutError:
+        return False
+    return True
 
 
 async def come_down(autopilot: Autopilot, motion: Motion) -> AsyncIterator[Step]:

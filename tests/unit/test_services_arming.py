@@ -10,6 +10,7 @@ import pytest
 from fractus_core.api.plans import GrantSpec
 from fractus_core.policy.values import Airframe, TakeoffArgs
 from fractus_services.mobility.failsafes import Checked
+from fractus_services.mobility.observer import Observer
 from fractus_services.mobility.vehicle import BRAKE
 from mobility_world import World, end, fly, refusal, spec
 
@@ -110,5 +111,28 @@ def test_failsafes_that_are_set_anew_meanwhile_forbid_arming(
             assert why.verdict.code == "FailsafesNotVerified"
             assert control.checked is found, "what is known by then is not written over"
             assert 1 not in motors
+
+    fly(flight)
+
+
+def test_a_link_that_comes_back_in_flight_leaves_the_way_home_as_chosen(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, retraces=True) as world:
+            control, plane = world.control, world.plane
+            plane.parameters |= {"SRTL_POINTS": 300.0, "SYSID_MYGCS": 244.0, "WPNAV_ACCEL": 100.0}
+            control.checked = Checked("", (), Airframe(retraces=True, accel_mps2=1.0), 8.0, remembers=True)
+            held = world.grants.put(spec())
+            await world.drive(held)
+            control.journal.mission(held).home = (39.3604, 22.95, 10.0)
+            await world.service.arm(held)
+            await end(world.service.take_off(held, TakeoffArgs(10.0)))
+            assert plane.parameters["FS_GCS_ENABLE"] == 1.0
+            Observer(control).found()
+            assert control.checked.problem
+            assert world.guard.situation().airframe.accel_mps2 == 1.0, "it brakes as it did a moment ago"
+            await world.until(lambda: control.checked is not None and not control.checked.problem, 10)
+            assert plane.parameters["FS_GCS_ENABLE"] == 1.0
+            assert not control.retraces
+            assert world.guard.situation().airframe.accel_mps2 == 1.0
 
     fly(flight)

@@ -144,3 +144,64 @@ def test_a_fence_raised_later_caps_it_as_well() -> None:
         assert "FENCE_ALT_MAX is not a number" in (await learn_return(vehicle, checked)).problem
 
     asyncio.run(learnt())
+
+
+FENCED = {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 5.0, "FENCE_ALT_MAX": 65.0}
+
+
+@pytest.mark.parametrize("lost", ["RTL_ALT", "FENCE_ENABLE"])
+def test_a_return_altitude_that_is_lost_stays_and_forbids_arming(lost: str) -> None:
+    async def learnt() -> None:
+        vehicle: Any = Parameters(RETRACING | FENCED | {"RTL_ALT": 6000.0})
+        checked = await configure(vehicle)
+        assert checked.airframe.return_altitude_m == 60.0
+        vehicle.values |= {"RTL_ALT": 9000.0}
+        del vehicle.values[lost]
+        later = await learn_return(vehicle, checked)
+        assert later.airframe.return_altitude_m == 60.0
+        assert later.problem == f"{lost} cannot be read any more"
+        assert not (await learn_return(vehicle, await configure(vehicle))).problem, "what never was is not lost"
+
+    asyncio.run(learnt())
+
+
+def test_a_ceiling_that_cannot_be_read_forbids_arming() -> None:
+    async def learnt() -> None:
+        vehicle: Any = Parameters(RETRACING | {"RTL_ALT": 6000.0})
+        checked = await configure(vehicle)
+        vehicle.values |= FENCED
+        del vehicle.values["FENCE_ALT_MAX"]
+        assert (await learn_return(vehicle, checked)).problem == "FENCE_ALT_MAX cannot be read"
+
+    asyncio.run(learnt())
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("retrace", [True, False])
+def test_in_flight_the_way_home_stays_as_it_was_chosen(retrace: bool, known: bool) -> None:
+    async def flown() -> None:
+        vehicle: Any = Parameters(RETRACING)
+        chosen = await choose_return(vehicle, await configure(vehicle), retrace=retrace)
+        before = vehicle.values["FS_GCS_ENABLE"]
+        again = await configure(vehicle, flying=True, before=chosen if known else None)
+        assert again.airframe.retraces is retrace
+        assert vehicle.values["FS_GCS_ENABLE"] == before == (3.0 if retrace else 1.0)
+        landed = await configure(vehicle, before=chosen)
+        assert landed.airframe.retraces
+
+    asyncio.run(flown())
+
+
+def test_in_flight_what_cannot_be_read_is_as_it_was() -> None:
+    async def flown() -> None:
+        moves = {"WPNAV_ACCEL": 100.0, "RTL_ALT": 6000.0, "WPNAV_SPEED": 800.0}
+        vehicle: Any = Parameters(RETRACING | moves)
+        before = await configure(vehicle)
+        for name in (*moves, "SRTL_POINTS"):
+            del vehicle.values[name]
+        again = await configure(vehicle, flying=True, before=before)
+        assert (again.airframe, again.speed_mps) == (before.airframe, 8.0)
+        assert again.airframe.retraces
+        assert "WPNAV_ACCEL cannot be read any more" in again.problem
+
+    asyncio.run(flown())

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from fractus_core.policy.values import Airframe
 
-from fractus_services.mobility.autopilot import SYSTEM_ID, Autopilot
+from fractus_services.mobility.autopilot import ATTEMPTS, SYSTEM_ID, Autopilot
 
 log = logging.getLogger(__name__)
 
@@ -68,6 +68,7 @@ Names = tuple[tuple[str, float], ...]
 
 _RETURN_ALTITUDE: Names = (("RTL_ALT", 0.01), ("RTL_ALT_M", 1.0))
 _USUAL_FENCES, _USUAL_MARGIN_M, _CEILING = 7.0, 2.0, 1
+_USUAL_MPS = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +81,7 @@ class Checked:
         remembers: whether the vehicle can go back the way it came; `airframe.retraces` says that its failsafes will.
         airframe: how it moves, from its own parameters.
         speed_mps: the speed it flies legs with.
+        known: parameters of its movements that it has told.
     """
 
     problem: str
@@ -87,10 +89,51 @@ class Checked:
     airframe: Airframe
     speed_mps: float
     remembers: bool = False
+    known: frozenset[str] = frozenset()
 
 
-async def configure(autopilot: Autopilot) -> Checked:
+class _Reader:
+    """Reads parameters of how the vehicle moves, and keeps what is wrong with them.
+
+    Args:
+        autopilot: the link.
+        known: parameters that the vehicle has told before: they can only be lost, not missing.
+
+    Attributes:
+        known: those, and what it tells now.
+        problems: which are not numbers, or lost.
+    """
+
+    def __init__(self, autopilot: Autopilot, known: frozenset[str] = frozenset()) -> None:
+        self._autopilot = autopilot
+        self.known = known
+        self.problems: list[str] = []
+
+    async def read(self, names: Names, default: float) -> float:
+        """A parameter's value; the default when it has none that can be used."""
+        told = [name for name, _ in names if name in self.known]
+        for name, scale in names:
+            value = await self._autopilot.read_parameter(name, attempts=ATTEMPTS if name in told else 2)
+            if value is None:
+                continue
+            self.known |= {name}
+            if math.isfinite(value):
+                return value * scale
+            self.problems.append(f"{name} is not a number")
+            return default
+        self.problems.extend(f"{name} cannot be read any more" for name in told)
+        return default
+
+
+async def configure(autopilot: Autopilot, *, flying: bool = False, before: Checked | None = None) -> Checked:
     """Set the failsafes, read each one back, and learn how the vehicle moves.
+
+    In flight the way home stays as it was chosen when the drone was armed, and what cannot be read as it was.
+
+    Args:
+        autopilot: the link.
+        flying: whether the motors run.
+        before: what was known in this flight until now.
 
     Raises:
         AutopilotError: the link broke.
@@ -104,13 +147,16 @@ async def configure(autopilot: Autopilot) -> Checked:
         problems.extend(filter(None, [problem]))
         if name == _NEW_NAME:
             problems.extend(filter(None, [(await _establish(autopilot, RANGE))[1]]))
-    remembers = (await autopilot.read_parameter("SRTL_POINTS", attempts=2) or 0.0) >= PATH_POINTS
-    retraces, wrong = await _choose(autopilot, retrace=remembers)
-    problems += wrong
-    airframe, speed, unsound = await _airframe(autopilot)
-    problems.extend(_not_numbers(unsound))
+    before = before if flying else None
+    points = await autopilot.read_parameter("SRTL_POINTS", attempts=2)
+    remembers = before.remembers if before is not None and points is None else (points or 0.0) >= PATH_POINTS
+    retrace = remembers and (not flying or await _chosen(autopilot, before))
+    retraces, wrong = await _choose(autopilot, retrace=retrace)
+    reader = _Reader(autopilot, before.known if before is not None else frozenset())
+    airframe, speed = await _airframe(reader, before)
+    problems += wrong + reader.problems
     airframe = replace(airframe, retraces=retraces)
-    checked = Checked("; ".join(problems), tuple(missing), airframe, speed, remembers)
+    checked = Checked("; ".join(problems), tuple(missing), airframe, speed, remembers, reader.known)
     if checked.problem:
         log.error("failsafes are not verified, arming is refused: %s", checked.problem)
     else:
@@ -134,13 +180,25 @@ async def choose_return(autopilot: Autopilot, checked: Checked, *, retrace: bool
 async def learn_return(autopilot: Autopilot, checked: Checked) -> Checked:
     """Learn at which altitude the autopilot flies home by itself, under the fence that it has by now.
 
+    What was known and cannot be read now stays as it was, and is a problem.
+
     Raises:
         AutopilotError: the link broke.
     """
-    unsound: list[str] = []
-    height_m = await _return_altitude_m(autopilot, unsound)
-    problem = "; ".join(filter(None, [checked.problem, *_not_numbers(unsound)]))
-    return replace(checked, problem=problem, airframe=replace(checked.airframe, return_altitude_m=height_m))
+    reader = _Reader(autopilot, checked.known)
+    height_m = await _return_altitude_m(reader, checked.airframe.return_altitude_m)
+    problem = "; ".join(filter(None, [checked.problem, *reader.problems]))
+    airframe = replace(checked.airframe, return_altitude_m=height_m)
+    return replace(checked, problem=problem, airframe=airframe, known=reader.known)
+
+
+async def _chosen(autopilot: Autopilot, before: Checked | None) -> bool:
+    """Whether the path was chosen as the way home of the flight under way; the vehicle knows when nobody else does."""
+    if before is not None:
+        return before.airframe.retraces
+    companion = RETRACING[0]
+    value = await autopilot.read_parameter(companion.names[0])
+    return value is not None and value in companion.accepted | {companion.value}
 
 
 async def _choose(autopilot: Autopilot, *, retrace: bool) -> tuple[bool, list[str]]:
@@ -169,20 +227,16 @@ async def _establish(autopilot: Autopilot, setting: Setting) -> tuple[str, str]:
     return "", f"the autopilot has no {' or '.join(setting.names)} ({setting.why})" if setting.needed else ""
 
 
-async def _airframe(autopilot: Autopilot) -> tuple[Airframe, float, list[str]]:
-    """How the vehicle moves, the speed of its legs, and the parameters that are not numbers."""
-    unsound: list[str] = []
-
-    async def read(names: Names, default: float) -> float:
-        return await _read(autopilot, names, default, unsound)
-
-    standard = Airframe()
+async def _airframe(reader: _Reader, before: Checked | None) -> tuple[Airframe, float]:
+    """How the vehicle moves, and the speed of its legs."""
+    read = reader.read
+    standard, usual_mps = (before.airframe, before.speed_mps) if before is not None else (Airframe(), _USUAL_MPS)
     accel = await read((("WPNAV_ACCEL", 0.01), ("WP_ACC", 1.0)), standard.accel_mps2)
     gain = await read((("PSC_POSXY_P", 1.0), ("PSC_NE_POS_P", 1.0)), standard.position_gain)
     climb = await read((("WPNAV_ACCEL_Z", 0.01), ("WP_ACC_Z", 1.0)), standard.climb_accel_mps2)
     jerk = await read((("PSC_JERK_XY", 1.0), ("PSC_JERK_NE", 1.0)), standard.jerk_mps3)
-    height = await _return_altitude_m(autopilot, unsound)
-    speed = await read((("WPNAV_SPEED", 0.01), ("WP_SPD", 1.0)), 5.0)
+    height = await _return_altitude_m(reader, standard.return_altitude_m)
+    speed = await read((("WPNAV_SPEED", 0.01), ("WP_SPD", 1.0)), usual_mps)
     airframe = Airframe(
         accel_mps2=max(accel, 0.1),
         position_gain=max(gain, 0.1),
@@ -190,32 +244,21 @@ async def _airframe(autopilot: Autopilot) -> tuple[Airframe, float, list[str]]:
         jerk_mps3=max(jerk, 0.5),
         return_altitude_m=height,
     )
-    return airframe, speed, unsound
+    return airframe, speed
 
 
-async def _read(autopilot: Autopilot, names: Names, default: float, unsound: list[str]) -> float:
-    for name, scale in names:
-        value = await autopilot.read_parameter(name, attempts=2)
-        if value is not None and math.isfinite(value):
-            return value * scale
-        if value is not None:
-            unsound.append(name)
-            return default
-    return default
-
-
-async def _return_altitude_m(autopilot: Autopilot, unsound: list[str]) -> float:
+async def _return_altitude_m(reader: _Reader, usual_m: float) -> float:
     """How high the autopilot climbs to fly home: never above its own fence's ceiling, less the fence's margin."""
 
     async def read(name: str, default: float) -> float:
-        return await _read(autopilot, ((name, 1.0),), default, unsound)
+        return await reader.read(((name, 1.0),), default)
 
-    height_m = await _read(autopilot, _RETURN_ALTITUDE, Airframe().return_altitude_m, unsound)
+    wrong = len(reader.problems)
+    height_m = await reader.read(_RETURN_ALTITUDE, usual_m)
     fenced = await read("FENCE_ENABLE", 0.0) or await read("FENCE_AUTOENABLE", 0.0)
-    if not fenced or not int(await read("FENCE_TYPE", _USUAL_FENCES)) & _CEILING:
-        return height_m
-    return min(height_m, await read("FENCE_ALT_MAX", math.inf) - await read("FENCE_MARGIN", _USUAL_MARGIN_M))
-
-
-def _not_numbers(names: list[str]) -> list[str]:
-    return [f"{name} is not a number" for name in names]
+    if fenced and int(await read("FENCE_TYPE", _USUAL_FENCES)) & _CEILING:
+        ceiling_m = await read("FENCE_ALT_MAX", math.inf)
+        if math.isinf(ceiling_m) and len(reader.problems) == wrong:
+            reader.problems.append("FENCE_ALT_MAX cannot be read")
+        height_m = min(height_m, ceiling_m - await read("FENCE_MARGIN", _USUAL_MARGIN_M))
+    return usual_m if len(reader.problems) > wrong else height_m

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from dataclasses import replace
 
 from fractus_services.mobility.autopilot import AutopilotError
 from fractus_services.mobility.control import Control
-from fractus_services.mobility.failsafes import configure
+from fractus_services.mobility.failsafes import BEING_SET, configure
 from fractus_services.mobility.journal import Mission
 from fractus_services.mobility.vehicle import GUIDED, HOMEWARD, LAND, MODE_NAMES
 
@@ -32,7 +33,8 @@ class Observer:
 
     def found(self) -> None:
         """The autopilot is there, for the first time or again."""
-        self._control.checked = None
+        checked, flying = self._control.checked, self._control.autopilot.vehicle.armed
+        self._control.checked = replace(checked, problem=BEING_SET) if flying and checked is not None else None
         self._control.decided = False
         self._resume()
         self._control.decided = True
@@ -46,7 +48,9 @@ class Observer:
             if autopilot.connected and self._unverified():
                 try:
                     await autopilot.set_rates(flying=autopilot.vehicle.armed)
-                    self._control.checked = await configure(autopilot)
+                    self._control.checked = await configure(
+                        autopilot, flying=autopilot.vehicle.armed, before=self._control.checked
+                    )
                     self._control.wake()
                     if autopilot.vehicle.home is None:
                         await self._control.tasks.attempt(autopilot.ask_home())
@@ -62,7 +66,9 @@ class Observer:
 
     def _unverified(self) -> bool:
         checked, idle = self._control.checked, not self._control.autopilot.vehicle.armed
-        return checked is None or (bool(checked.problem) and idle and not self._control.helm.preparing)
+        if checked is None or checked.problem == BEING_SET:
+            return True
+        return bool(checked.problem) and idle and not self._control.helm.preparing
 
     def _resume(self) -> None:
         """Decide who has a vehicle that was there before us, or comes back from a broken link."""

@@ -340,6 +340,25 @@ def test_a_correction_that_came_too_late_for_its_motion_is_made_for_the_next(tmp
     fly(flight)
 
 
+def test_a_leg_that_begins_too_fast_is_not_told_to_fly_faster_than_it_may(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            replaced = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 150), 0)))
+            await world.until(lambda: world.plane.velocity[1] > 7)
+            flying = asyncio.ensure_future(end(world.service.goto(held, goto(0, 150, speed_mps=2.0), 0)))
+            await world.until(lambda: world.plane.speed_mps == 2.0)
+            world.grants.put(spec(limit("speed", 3.0)))
+            await world.until(lambda: world.kinds("monitor"), 5)
+            await asyncio.sleep(0.5)
+            assert world.plane.speed_mps == 2.0
+            assert (await replaced).verdict.code == "Replaced"
+            flying.cancel()
+
+    fly(flight)
+
+
 # Commands that are lost
 
 

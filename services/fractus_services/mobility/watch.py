@@ -144,7 +144,7 @@ class Watch:
         """Fly the present leg slower; the next one is judged anew."""
         motion = self._control.motion
         if motion is not None and motion.speed_mps is not None:
-            motion.speed_mps = speed_mps
+            speed_mps = motion.speed_mps = min(speed_mps, motion.speed_mps)
         await self._control.autopilot.set_speed(speed_mps, self._permit(motion))
 
     async def _lead_back(self, verdict: Verdict, place: GotoArgs, grant: CompiledGrant) -> None:

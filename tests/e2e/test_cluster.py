@@ -87,7 +87,9 @@ def leftovers(name: str) -> list[str]:
     """All that a cluster of this name has on the machine."""
     found = [f"mount {line}" for line in Path("/proc/self/mountinfo").read_text().splitlines() if f"/{name}/" in line]
     found += [f"netns {p}" for p in Path("/run/netns").glob(f"fractus.{name}*")]
-    found += [f"cgroup {p}" for p in Path("/sys/fs/cgroup").glob(f"**/fractus-sim/{name}")]
+    # os.walk passes over the groups of other clusters that vanish under its hands.
+    groups = ((Path(parent), below) for parent, below, _ in os.walk("/sys/fs/cgroup"))
+    found += [f"cgroup {parent / name}" for parent, below in groups if parent.name == "fractus-sim" and name in below]
     found += [f"state {p}" for p in (state_of(name).path, Path(f"/run/fractus-sim/cluster.{name}.lock")) if p.exists()]
     ledger = Path("/run/fractus-sim/machine.json")
     found += ["claim"] if ledger.exists() and name in json.loads(ledger.read_text())["claims"] else []

@@ -107,8 +107,11 @@ def test_infeasible_exits_2_with_the_reasons(run):
     assert result.exit_code == 2
     assert "default/traffic: infeasible (NoDrone)" in result.output
     result = run([DEPOT, spec_only(drone("d", minutes=2)), TRAFFIC], "-o", "yaml")
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert "FlightTooLong" not in result.stderr
+    assert result.exit_code == 2
+    plan = DeploymentPlan.from_body(yaml.safe_load(result.stdout)).spec
+    assert (plan.placements, plan.drone) == ((), None)
+    assert [r.node for r in plan.rejected] == ["d"]
+    assert "the mission takes" in plan.rejected[0].message
     assert "the mission takes" in result.stderr
 
 

@@ -71,7 +71,12 @@ class Manifests:
         namespace, name = application.key
         plans = [f.resource for f in self.found.values() if isinstance(f.resource, DeploymentPlan)]
         return next(
-            (p for p in plans if (p.metadata.namespace or "default") == namespace and p.spec.application == name), None
+            (
+                p
+                for p in plans
+                if (p.metadata.namespace or "default") == namespace and p.spec.application == name and p.spec.placements
+            ),
+            None,
         )
 
     def origin(self, application: Application) -> str:

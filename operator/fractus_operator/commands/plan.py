@@ -101,7 +101,8 @@ def plan(context: click.Context, /, paths: Sequence[pathlib.Path], more: Sequenc
     Several Applications are planned one after the other, those with a driver first, then by name; each takes its drone
     and its resources.
 
-    Exit code: 0 if all are feasible, 2 if one is not, 1 if the input is bad.
+    Exit code: 0 if all are feasible, 2 if one is not, 1 if the input is bad. In yaml and json, the plan of what is
+    infeasible has no placements, and says why each node was rejected.
     """
     try:
         manifests = read_manifests([*paths, *more])
@@ -210,26 +211,26 @@ def deployment_plan(application: Application, found: DeploymentPlanSpec) -> Depl
 
 
 def _bodies(decided: Sequence[Decided]) -> list[dict[str, Any]]:
+    """The plans; what is infeasible has one without placements, which says why each node was rejected."""
     bodies = []
     for answer in decided:
-        if answer.plan is not None:
-            body = deployment_plan(answer.application, answer.plan).to_dict()
-            body["metadata"] = {"name": body["metadata"]["name"], "namespace": body["metadata"]["namespace"]}
-            bodies.append(body)
+        rejected = answer.refusal.rejected if answer.refusal is not None else ()
+        found = answer.plan or DeploymentPlanSpec(application=answer.application.name, rejected=rejected)
+        body = deployment_plan(answer.application, found).to_dict()
+        body["metadata"] = {"name": body["metadata"]["name"], "namespace": body["metadata"]["namespace"]}
+        bodies.append(body)
     return bodies
 
 
 def _as_yaml(decided: Sequence[Decided], stock: Inventory, settings: Settings) -> str:
     del stock, settings
     bodies = _bodies(decided)
-    return yaml.safe_dump_all(bodies, sort_keys=False, width=120, explicit_start=len(bodies) > 1) if bodies else ""
+    return yaml.safe_dump_all(bodies, sort_keys=False, width=120, explicit_start=len(bodies) > 1)
 
 
 def _as_json(decided: Sequence[Decided], stock: Inventory, settings: Settings) -> str:
     del stock, settings
     bodies = _bodies(decided)
-    if not bodies:
-        return ""
     whole = bodies[0] if len(bodies) == 1 else {"apiVersion": "v1", "kind": "List", "items": bodies}
     return json.dumps(whole, indent=2) + "\n"
 

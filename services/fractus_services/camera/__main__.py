@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import click
-from fractus_core.api.model import InvalidObject
+
+from fractus_services.hosting import DIRECTORY, FILE, Address, CannotServe, one_sentence
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +34,6 @@ class Options:
     relief: float
 
 
-_PATH = click.Path(path_type=Path)
-
-
 @click.group()
 def camera() -> None:
     """The camera service of a node."""
@@ -44,28 +42,26 @@ def camera() -> None:
 @camera.command()
 @click.option(
     "--grants",
-    type=_PATH,
+    type=DIRECTORY,
     default="/var/lib/fractus/grants",
     show_default=True,
     help="Directory of Grant manifests (JSON).",
 )
 @click.option(
     "--tls",
-    type=_PATH,
+    type=DIRECTORY,
     default="/var/lib/fractus/tls",
     show_default=True,
     help="Directory of tls.crt, tls.key and ca.crt.",
 )
 @click.option(
-    "--state", type=_PATH, default="/var/lib/fractus/camera", show_default=True, help="Directory of the pictures."
+    "--state", type=DIRECTORY, default="/var/lib/fractus/camera", show_default=True, help="Directory of the pictures."
 )
-@click.option(
-    "--audit", type=_PATH, default="/var/lib/fractus/audit/camera.jsonl", show_default=True, help="Audit log."
-)
+@click.option("--audit", type=FILE, default="/var/lib/fractus/audit/camera.jsonl", show_default=True, help="Audit log.")
 @click.option("--node", envvar="FRACTUS_NODE", help="Name of this node; by default the description's, else the host's.")
 @click.option(
     "--description",
-    type=_PATH,
+    type=FILE,
     default="/etc/fractus/node.yaml",
     show_default=True,
     help="Drone or EdgeNode manifest of this node.",
@@ -73,7 +69,7 @@ def camera() -> None:
 @click.option(
     "--mobility", default="127.0.0.1:50051", show_default=True, help="Mobility service that tells a drone's position."
 )
-@click.option("--listen", default="[::]:50052", show_default=True, help="Address of the gRPC server.")
+@click.option("--listen", type=Address(), default="[::]:50052", show_default=True, help="Address of the gRPC server.")
 @click.option(
     "--keep",
     type=click.IntRange(min=1),
@@ -100,7 +96,7 @@ def camera() -> None:
     help="Where pictures come from: http://HOST/snapshot.jpg, v4l2:/dev/video0, picamera2:0, directory:/PATH or test:;"
     " by default what the description says.",
 )
-@click.option("--face-model", type=_PATH, help="Face detector (YuNet, ONNX) to use instead of OpenCV's cascades.")
+@click.option("--face-model", type=FILE, help="Face detector (YuNet, ONNX) to use instead of OpenCV's cascades.")
 @click.option(
     "--face-px",
     type=click.FloatRange(min=12, max=1000),
@@ -132,10 +128,10 @@ async def _until_signalled(options: Options) -> None:
         loop.add_signal_handler(number, stop.set)
     try:
         await run(options, stop)
-    except InvalidObject as error:
-        raise click.ClickException(f"{options.description}: {error}") from None
-    except (BadConnection, BadModel) as error:
+    except (BadConnection, BadModel, CannotServe) as error:
         raise click.ClickException(str(error)) from None
+    except ExceptionGroup as failures:
+        raise one_sentence(failures) from None
 
 
 if __name__ == "__main__":

@@ -6,12 +6,9 @@ import asyncio
 import logging
 import socket
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import grpc
-import yaml
-from fractus_core.api.model import InvalidObject
 from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_core.policy.footprint import lens_of
 from fractus_proto.v1 import camera_pb2_grpc
@@ -28,6 +25,7 @@ from fractus_services.camera.shutter import Shutter
 from fractus_services.camera.whereabouts import Airborne, Fixed
 from fractus_services.clock import Clock
 from fractus_services.grants import GrantFiles
+from fractus_services.hosting import open_door, read_description
 from fractus_services.seals import Seals
 
 if TYPE_CHECKING:
@@ -36,22 +34,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 STOP_S = 2.0
-
-
-def describe(path: Path) -> Drone | EdgeNode | None:
-    """This node's description, where there is one.
-
-    Raises:
-        InvalidObject: it is neither a Drone nor an EdgeNode manifest.
-    """
-    if not path.is_file():
-        return None
-    body = yaml.safe_load(path.read_text(encoding="utf-8"))
-    kinds: dict[str, type[Drone] | type[EdgeNode]] = {"Drone": Drone, "EdgeNode": EdgeNode}
-    kind = kinds.get(body.get("kind", "") if isinstance(body, dict) else "")
-    if kind is None:
-        raise InvalidObject("kind", f"{path} must hold a Drone or an EdgeNode")
-    return kind.from_body(body)
 
 
 def body_of(description: Drone | EdgeNode | None) -> Body:
@@ -80,9 +62,15 @@ def _whereabouts(options: Options, description: Drone | EdgeNode | None, node: s
 
 
 async def run(options: Options, stop: asyncio.Event) -> None:
-    """Serve until `stop` is set, or a part of the service fails."""
+    """Serve until `stop` is set, or a part of the service fails.
+
+    Raises:
+        CannotServe: an option is wrong; also within an ExceptionGroup.
+        BadConnection: there is no such camera.
+        BadModel: the face detector cannot be used.
+    """
     clock = Clock()
-    description = describe(options.description)
+    description = read_description(options.description, Drone, EdgeNode)
     node = options.node or (description.name if description is not None else socket.gethostname())
     tls = TlsFiles(options.tls)
     audit = AuditLog(options.audit, clock)
@@ -117,11 +105,9 @@ async def run(options: Options, stop: asyncio.Event) -> None:
 
 
 async def _serve(listen: str, tls: TlsFiles, handlers: CameraHandlers, whereabouts: Whereabouts) -> None:
-    await tls.wait()
     server = grpc.aio.server(options=KEEPALIVE)
     camera_pb2_grpc.add_CameraServiceServicer_to_server(handlers, server)  # type: ignore[no-untyped-call]
-    server.add_secure_port(listen, tls.server_credentials())
-    await server.start()
+    await open_door(server, listen, tls)
     log.info("camera service on %s", listen)
     try:
         await whereabouts.run()

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import click
-from fractus_core.api.model import InvalidObject
+
+from fractus_services.hosting import DIRECTORY, FILE, Address, CannotServe, one_sentence
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,28 +39,28 @@ def mobility() -> None:
 @mobility.command()
 @click.option(
     "--grants",
-    type=click.Path(path_type=Path),
+    type=DIRECTORY,
     default="/var/lib/fractus/grants",
     show_default=True,
     help="Directory of Grant manifests (JSON).",
 )
 @click.option(
     "--tls",
-    type=click.Path(path_type=Path),
+    type=DIRECTORY,
     default="/var/lib/fractus/tls",
     show_default=True,
     help="Directory of tls.crt, tls.key and ca.crt.",
 )
 @click.option(
     "--state",
-    type=click.Path(path_type=Path),
+    type=DIRECTORY,
     default="/var/lib/fractus/mobility",
     show_default=True,
     help="Directory of what survives a restart.",
 )
 @click.option(
     "--audit",
-    type=click.Path(path_type=Path),
+    type=FILE,
     default="/var/lib/fractus/audit/mobility.jsonl",
     show_default=True,
     help="Audit log.",
@@ -67,7 +68,7 @@ def mobility() -> None:
 @click.option("--node", envvar="FRACTUS_NODE", help="Name of this node; by default the description's, else the host's.")
 @click.option(
     "--description",
-    type=click.Path(path_type=Path),
+    type=FILE,
     default="/etc/fractus/node.yaml",
     show_default=True,
     help="Drone manifest of this node; optional.",
@@ -76,7 +77,7 @@ def mobility() -> None:
     "--autopilot",
     help="Link to the autopilot: tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD; by default the description's, else tcp:127.0.0.1:5760.",
 )
-@click.option("--listen", default="[::]:50051", show_default=True, help="Address of the gRPC server.")
+@click.option("--listen", type=Address(), default="[::]:50051", show_default=True, help="Address of the gRPC server.")
 @click.option(
     "--driver-grace",
     type=click.FloatRange(min=0),
@@ -114,8 +115,10 @@ async def _until_signalled(options: Options) -> None:
         loop.add_signal_handler(number, stop.set)
     try:
         await run(options, stop)
-    except InvalidObject as error:
-        raise click.ClickException(f"{options.description}: {error}") from None
+    except CannotServe as error:
+        raise click.ClickException(str(error)) from None
+    except ExceptionGroup as failures:
+        raise one_sentence(failures) from None
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from fractus_services.audit import AuditLog
 from fractus_services.auth import KEEPALIVE, TlsFiles
 from fractus_services.clock import Clock
 from fractus_services.grants import GrantFiles
+from fractus_services.hosting import open_door, read_description
 from fractus_services.mobility.autopilot import Autopilot
 from fractus_services.mobility.backstop import Backstop
 from fractus_services.mobility.chauffeur import Chauffeur
@@ -46,19 +47,21 @@ def describe(path: Path) -> tuple[str, str]:
     """Name and autopilot link of this node, from its description where there is one.
 
     Raises:
-        InvalidObject: the description is no Drone manifest.
+        CannotServe: the description is no Drone manifest.
     """
-    if not path.is_file():
+    drone = read_description(path, Drone)
+    if not isinstance(drone, Drone):
         return socket.gethostname(), DEFAULT_LINK
-    import yaml  # noqa: PLC0415 - only for this
-
-    drone = Drone.from_body(yaml.safe_load(path.read_text(encoding="utf-8")))
     features = drone.spec.services.mobility
     return drone.name, features.connection if features is not None else DEFAULT_LINK
 
 
 async def run(options: Options, stop: asyncio.Event) -> None:
-    """Serve until `stop` is set, or a part of the service fails."""
+    """Serve until `stop` is set, or a part of the service fails.
+
+    Raises:
+        CannotServe: an option is wrong; also within an ExceptionGroup.
+    """
     clock = Clock()
     name, link = describe(options.description)
     node, url = options.node or name, options.autopilot or link
@@ -114,11 +117,9 @@ def _record_grant(audit: AuditLog, old: Any, new: Any) -> None:
 
 
 async def _serve(options: Options, tls: TlsFiles, handlers: MobilityHandlers) -> None:
-    await tls.wait()
     server = grpc.aio.server(options=KEEPALIVE)
     mobility_pb2_grpc.add_MobilityServiceServicer_to_server(handlers, server)  # type: ignore[no-untyped-call]
-    server.add_secure_port(options.listen, tls.server_credentials())
-    await server.start()
+    await open_door(server, options.listen, tls)
     log.info("mobility service on %s", options.listen)
     try:
         await asyncio.Event().wait()

@@ -40,7 +40,7 @@ test: packages env lint ## Everything: lint, types, unit, integration and end-to
 	$(RUN) fractus cluster binaries
 	$(RUN) pytest -q -n 2 --dist loadfile tests/unit
 	$(RUN) pytest -n 4 --dist loadgroup tests/integration tests/e2e/test_cluster.py
-	$(RUN) pytest tests/e2e --ignore tests/e2e/test_cluster.py
+	$(RUN) pytest $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),,-n 2 --dist loadgroup) tests/e2e --ignore tests/e2e/test_cluster.py
 
 .PHONY: test-fast
 test-fast: env lint ## The inner loop: lint, types and unit tests

@@ -1,7 +1,8 @@
-"""One cluster with Fractus installed, shared by all end-to-end tests.
+"""One cluster with Fractus installed, shared by all end-to-end tests that a worker runs.
 
 FRACTUS_E2E_CLUSTER=current runs them on the cluster of KUBECONFIG (k3s, kind), where the images are loaded and the nodes
-carry fractus.dev/class labels; otherwise an embedded cluster comes up and goes down again (FRACTUS_E2E_KEEP=1 keeps it for the next run).
+carry fractus.dev/class labels, with one worker; otherwise an embedded cluster comes up and goes down again
+(FRACTUS_E2E_KEEP=1 keeps it for the next run).
 """
 
 from __future__ import annotations
@@ -27,11 +28,14 @@ DRONE = "drone-1"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Everything here needs a cluster, and time."""
+    """Everything here needs a cluster, and time; two workers, each with a cluster of its own, have half of it each."""
     for item in items:
         if pathlib.Path(__file__).parent in item.path.parents:
             item.add_marker(pytest.mark.e2e)
             item.add_marker(pytest.mark.timeout(600))
+        if "kube" in getattr(item, "fixturenames", ()):
+            half = "kills" if item.path.stem == "test_kills" else "others"
+            item.add_marker(pytest.mark.xdist_group(f"cluster-{half}"))
 
 
 def say(line: str) -> None:
@@ -46,7 +50,8 @@ def cluster() -> Iterator[Cluster | None]:
         yield None
         return
     built = build_images(ROOT, targets=TARGETS, report=say)
-    up = Cluster.load(ROOT / "examples" / "clusters" / "demo.yaml", name="e2e", report=say)
+    name = "-".join(filter(None, ("e2e", os.environ.get("PYTEST_XDIST_WORKER"))))
+    up = Cluster.load(ROOT / "examples" / "clusters" / "demo.yaml", name=name, report=say)
     keep = bool(os.environ.get("FRACTUS_E2E_KEEP"))
     if not keep:
         up.down()

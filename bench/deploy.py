@@ -370,7 +370,7 @@ class Bench:
             )
         wait_until(lambda: len(self._bound.at.get(namespace, ())) == wanted, "plain pods", timeout_s=60, pause_s=0.01)
         taken = max(self._bound.at[namespace].values()) - began
-        self._api.call("DELETE", f"/api/v1/namespaces/{namespace}")
+        self._remove(namespace)
         return taken
 
     def _at_once(self, found: Measured) -> None:
@@ -447,7 +447,14 @@ class Bench:
             self._api.call("DELETE", f"{API}/namespaces/{namespace}/applications/{name}")
         collections = (f"{API}/namespaces/{namespace}/applications", f"/api/v1/namespaces/{namespace}/pods")
         wait_until(lambda: not any(self._api.items(c) for c in collections), "deletion", timeout_s=180, pause_s=0.2)
-        self._api.call("DELETE", f"/api/v1/namespaces/{namespace}")
+        self._remove(namespace)
+
+    def _remove(self, namespace: str) -> None:
+        """Delete a namespace, and let the control plane come to rest: what one run leaves is no load on the next."""
+        path = f"/api/v1/namespaces/{namespace}"
+        self._api.call("DELETE", path)
+        wait_until(lambda: not self._api.call("GET", path), "the namespace to go", timeout_s=180, pause_s=0.2)
+        time.sleep(1.0)
 
 
 # -- reporting --

@@ -16,7 +16,7 @@ from fractus_operator.inventory import LiveInventory
 from fractus_operator.kinds import Body, Key, Kind, key_of
 from fractus_operator.labels import APPLICATION_LABEL, MANAGED_SELECTOR, NAMESPACE_LABEL, label_value
 from fractus_operator.reading import read
-from fractus_operator.store import NotFound, Store
+from fractus_operator.store import Store, Taken
 
 logger = logging.getLogger(__name__)
 
@@ -42,48 +42,18 @@ class Children:
         self._beside = asyncio.Semaphore(_BESIDE)
         self._normalised: dict[tuple[Kind, Key], tuple[object, ...] | None] = {}
 
-    async def look_around(self, key: Key) -> Mapping[Kind, set[str]] | None:
-        """Names of all that is in the namespace of a new application, of the kinds that are made there.
-
-        One look instead of one an object; None for an application that has children already.
-        """
-        if self._live.children_of(key, kinds.DEPLOYMENT):
-            return None
-        made_there = [kind for kind in kinds.CHILDREN if kind.namespaced and kind is not kinds.DEPLOYMENT_PLAN]
-        found = await asyncio.gather(*(self._store.names(kind, key[0]) for kind in made_there))
-        return dict(zip(made_there, found, strict=True))
-
-    async def observed(self, kind: Kind, key: Key, taken: Mapping[Kind, set[str]] | None = None) -> Body | None:
-        """The object as the watch last showed it; where it showed none, as the API server has it.
-
-        Args:
-            kind: Its kind.
-            key: Its namespace and name.
-            taken: Names that are known to be in use there, if somebody has just looked.
-        """
-        cached = self._live.children[kind].get(key)
-        if cached is not None:
-            return cached
-        if taken is not None and kind in taken and key[1] not in taken[kind]:
-            return None
-        try:
-            return await self._store.get(kind, key[1], key[0])
-        except NotFound:
-            return None
-
     async def apply(
         self,
         application: Application,
         wanted: Mapping[Kind, Sequence[Body]],
-        taken: Mapping[Kind, set[str]] | None = None,
     ) -> None:
-        """Apply those objects that are not as they should be; `taken` as for `observed`.
+        """Create those objects that are not there, and apply those that are not as they should be.
 
         Raises:
             NameTaken: somebody else's object has the name of one of them.
         """
         results = await asyncio.gather(
-            *(self._apply_one(application, kind, body, taken) for kind, bodies in wanted.items() for body in bodies),
+            *(self._apply_one(application, kind, body) for kind, bodies in wanted.items() for body in bodies),
             return_exceptions=True,
         )
         for result in results:
@@ -106,31 +76,44 @@ class Children:
         # With its uid, a grant that went meanwhile is not made anew.
         body["metadata"]["uid"] = observed["metadata"]["uid"]
         async with self._parallel:
+            await self._store.count_as_applied(kinds.GRANT, key)
             self._live.children[kinds.GRANT].note(key, await self._store.apply(kinds.GRANT, body))
 
-    async def _apply_one(
-        self, application: Application, kind: Kind, body: Body, taken: Mapping[Kind, set[str]] | None
-    ) -> None:
+    async def _apply_one(self, application: Application, kind: Kind, body: Body) -> None:
         key = key_of(body)
         desired = stamped(body)
         async with self._parallel if kind in _AHEAD else self._beside:
-            observed = await self.observed(kind, key, taken)
+            observed = self._live.children[kind].get(key)
+            if observed is None:
+                try:
+                    made = self._grantor.signed(desired) if kind is kinds.GRANT else desired
+                    self._note(kind, desired, await self._store.create(kind, made))
+                except Taken:
+                    observed = await self._store.get(kind, key[1], key[0])
+                else:
+                    return
             current = is_current(desired, observed) or self._is_normalised(kind, key, desired, observed)
-            if kind is kinds.GRANT and observed is not None:
+            if kind is kinds.GRANT:
                 current = (current or _says_the_same(observed, body)) and self._grantor.vouches_for(observed)
             if current:
                 return
-            if observed is not None and not _is_child(application, kind, observed):
+            if not _is_child(application, kind, observed):
                 raise NameTaken(f"{kind.name} {key[1]} exists and is not of this application; rename one of them")
-            if kind is kinds.GRANT and observed is not None and _moved(observed, body):
+            if kind is kinds.GRANT and _moved(observed, body):
                 # A Grant belongs to one node for its whole life: its status tells what happened there.
                 await self._store.delete(kind, key, observed["metadata"]["uid"])
+            else:
+                await self._store.count_as_applied(kind, key)
             wanted = self._grantor.signed(desired, _readable(observed)) if kind is kinds.GRANT else desired
-            applied = await self._store.apply(kind, wanted)
-            self._live.children[kind].note(key, applied)
-            if not is_current(desired, applied):
-                # The API server spells some value its own way (0.5 cores become 500m).
-                self._normalised[kind, key] = _state(desired, applied)
+            self._note(kind, desired, await self._store.apply(kind, wanted))
+
+    def _note(self, kind: Kind, desired: Body, applied: Body) -> None:
+        """Take what a write returned, ahead of the watch."""
+        key = key_of(applied)
+        self._live.children[kind].note(key, applied)
+        if not is_current(desired, applied):
+            # The API server spells some value its own way (0.5 cores become 500m).
+            self._normalised[kind, key] = _state(desired, applied)
 
     def _is_normalised(self, kind: Kind, key: Key, desired: Body, observed: Body | None) -> bool:
         known = self._normalised.get((kind, key))
@@ -187,9 +170,9 @@ def _is_child(application: Application, kind: Kind, body: Body) -> bool:
     return any(owner.get("uid") == application.metadata.uid for owner in owners)
 
 
-def _readable(observed: Body | None) -> Grant | None:
+def _readable(observed: Body) -> Grant | None:
     try:
-        return read(Grant, observed) if observed is not None else None
+        return read(Grant, observed)
     except InvalidObject:
         return None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 
@@ -46,9 +46,9 @@ RESYNC_S = 30.0
 _REFUSALS = frozenset({400, 403, 422})
 """HTTP statuses by which the API server says that it does not want an object: the user should know."""
 
-_ORDER = (kinds.DEPLOYMENT, kinds.GRANT, kinds.SECRET, kinds.SERVICE, kinds.ENDPOINT_SLICE)
-"""What is applied once the plan is: at once, so that an object in the way of one stops no other, and begun in this order,
-because scheduling takes longest. A pod waits for its Secret, and can call nothing without its Grant."""
+_BESIDE = (kinds.GRANT, kinds.SECRET, kinds.SERVICE, kinds.ENDPOINT_SLICE)
+"""What is made once the Deployments are, because scheduling takes longest: at once, and begun in this order. A pod waits for
+its Secret, and can call nothing without its Grant."""
 
 _OPTIONAL = frozenset({"NodeCordoned", "NodesAppeared"})
 """Reasons for a new plan that can do without: what runs goes on where there is no other."""
@@ -340,7 +340,7 @@ class Deployments:
         grants: tuple[GrantSpec, ...],
         pods: Sequence[PodView],
     ) -> None:
-        """Make the children what the plan says: the plan first, then what is stale goes, then each kind in order."""
+        """Make the children what the plan says: the plan first, then what is stale goes, then the Deployments and the rest."""
         wanted: dict[Kind, list[Body]] = {kind: [] for kind in kinds.CHILDREN}
         wanted[kinds.DEPLOYMENT_PLAN] = [builders.deployment_plan(application, decided)]
         wanted[kinds.GRANT] = [builders.grant(application, spec) for spec in grants]
@@ -355,22 +355,19 @@ class Deployments:
             wanted[kinds.DEPLOYMENT].append(builders.deployment(application, placed, drone))
         secrets = {builders.secret_name(placed.instance): placed for placed in decided.placements}
         # The plan before all else: it tells, also after a crash, who flies the drone and who comes along.
-        plan_first = {kinds.DEPLOYMENT_PLAN: wanted[kinds.DEPLOYMENT_PLAN]}
-        planned, taken = await asyncio.gather(
-            self._children.apply(application, plan_first),
-            self._children.look_around(application.key),
-            return_exceptions=True,
-        )
-        # Raised once both are over: nothing is written any more when the next look at the application begins.
-        if isinstance(planned, BaseException):
-            raise planned
-        if isinstance(taken, BaseException):
-            raise taken
+        await self._children.apply(application, {kinds.DEPLOYMENT_PLAN: wanted[kinds.DEPLOYMENT_PLAN]})
         await self._children.prune(application, wanted, keep_secrets=secrets.keys())
-        for placed in secrets.values():
-            wanted[kinds.SECRET].append(await self._certificate(application, placed, taken))
         wanted[kinds.DEPLOYMENT] = [body for body in wanted[kinds.DEPLOYMENT] if not self._in_the_air(body, decided)]
-        await self._children.apply(application, {kind: wanted[kind] for kind in _ORDER}, taken)
+        refused: StoreError | NameTaken | None = None
+        try:
+            await self._children.apply(application, {kinds.DEPLOYMENT: wanted[kinds.DEPLOYMENT]})
+        except (StoreError, NameTaken) as error:
+            refused = error  # said once the rest is there: an object in the way of one stops no other
+        for placed in secrets.values():
+            wanted[kinds.SECRET].append(self._certificate(application, placed))
+        await self._children.apply(application, {kind: wanted[kind] for kind in _BESIDE})
+        if refused is not None:
+            raise refused
 
     def _in_the_air(self, desired: Body, decided: DeploymentPlanSpec) -> bool:
         """Whether a Deployment is left alone: its drone flies, and its owner has asked for no change.
@@ -385,14 +382,12 @@ class Deployments:
         present = (observed["metadata"].get("annotations") or {}).get(CAUSE_ANNOTATION)
         return cause == present and cause.rpartition("@")[2] == drone
 
-    async def _certificate(
-        self, application: Application, placed: PlannedInstance, taken: Mapping[Kind, set[str]] | None
-    ) -> Body:
+    def _certificate(self, application: Application, placed: PlannedInstance) -> Body:
         """The Secret of an instance: the present certificate while it is good, so that a restart renews nothing."""
         namespace, name = application.key
         identity = component_identity(namespace, name, placed.component, placed.instance)
         place = (namespace, builders.secret_name(placed.instance))
-        observed = await self._children.observed(kinds.SECRET, place, taken)
+        observed = self._live.children[kinds.SECRET].get(place)
         data = dict((observed or {}).get("data") or {})
         now = self._clock()
         if not self._authority.still_good(data, identity, now):

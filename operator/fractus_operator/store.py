@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from datetime import datetime
 from typing import Any, Self
 
@@ -28,7 +28,7 @@ _LIMITS = httpx2.Limits(max_connections=100, max_keepalive_connections=20, keepa
 """Connections stay open between two changes, for less than the API server's 90 s: each costs a TLS handshake."""
 _PAGE = 250
 """Objects a page: while one is read it takes several times its size."""
-_NAMES_ONLY = "application/json;as=PartialObjectMetadataList;g=meta.k8s.io;v=v1"
+_TRIES = 3
 
 
 class StoreError(Exception):
@@ -140,19 +140,6 @@ class Store:
             items += page.items
         return items
 
-    async def names(self, kind: Kind, namespace: str) -> set[str]:
-        """Names of all objects of a kind in a namespace; nothing else of them is read."""
-        found: set[str] = set()
-        continue_ = ""
-        while True:
-            params = {"limit": str(_PAGE), **({"continue": continue_} if continue_ else {})}
-            path = kind.path(namespace)
-            page = Page(await self._send("GET", path, params=params, accept=_NAMES_ONLY, is_list=True))
-            found.update(item["metadata"]["name"] for item in page.items)
-            continue_ = page.continue_
-            if not continue_:
-                return found
-
     async def watch(
         self,
         kind: Kind,
@@ -224,6 +211,36 @@ class Store:
             body=body,
             content_type="application/apply-patch+yaml",
         )
+
+    async def count_as_applied(self, kind: Kind, key: Key) -> None:
+        """Let what this operator created count as applied by it: else no later apply takes a field of it away.
+
+        An apply could create it, too; but for what is new that costs the API server three times as much.
+
+        Raises:
+            Taken: somebody else keeps changing it.
+        """
+        for left in reversed(range(_TRIES)):
+            try:
+                metadata = (await self.get(kind, key[1], key[0]))["metadata"]
+                entries = _all_applied(metadata.get("managedFields") or [])
+                if entries is None:
+                    return
+                changes = {"managedFields": entries, "resourceVersion": metadata["resourceVersion"]}
+                await self._send(
+                    "PATCH",
+                    kind.path(key[0], key[1]),
+                    params={"fieldManager": FIELD_MANAGER},
+                    body=[{"op": "replace", "path": f"/metadata/{k}", "value": v} for k, v in changes.items()],
+                    content_type="application/json-patch+json",
+                )
+            except NotFound:
+                return
+            except Taken:
+                if not left:
+                    raise
+            else:
+                return
 
     async def label(self, kind: Kind, name: str, labels: Mapping[str, str | None]) -> None:
         """Set labels of somebody else's cluster-scoped object, and take off those that are None.
@@ -308,9 +325,8 @@ class Store:
         path: str,
         *,
         params: Mapping[str, str] | None = None,
-        body: Body | None = None,
+        body: Body | Sequence[Body] | None = None,
         content_type: str = "application/json",
-        accept: str = "application/json",
         guarded: bool = True,
         is_list: bool = False,
     ) -> Body:
@@ -319,7 +335,7 @@ class Store:
             timeout_s = min(timeout_s, self.may_write_s())
             if timeout_s <= 0:
                 raise StoreError(0, "NotActing", f"{method} {path}: the lease is not held, another operator may act")
-        headers = {"Accept": accept, **({"Content-Type": content_type} if body is not None else {})}
+        headers = {"Accept": "application/json", **({"Content-Type": content_type} if body is not None else {})}
         try:
             # As a whole: the client's own time-outs are for each part of a request, and begin anew with every byte.
             async with asyncio.timeout(timeout_s):
@@ -339,6 +355,22 @@ class Store:
             raise _error(response)
         result: Body = response.json()
         return result
+
+
+def _all_applied(entries: Sequence[Body]) -> list[Body] | None:
+    """metadata.managedFields with all fields of ours as applied ones; None where they are."""
+    ours = [e for e in entries if e.get("manager") == FIELD_MANAGER and not e.get("subresource")]
+    if all(entry["operation"] == "Apply" for entry in ours):
+        return None
+    fields: Body = {}
+    for entry in ours:
+        _unite(fields, entry.get("fieldsV1") or {})
+    return [*(entry for entry in entries if entry not in ours), {**ours[0], "operation": "Apply", "fieldsV1": fields}]
+
+
+def _unite(fields: Body, more: Body) -> None:
+    for name, below in more.items():
+        _unite(fields.setdefault(name, {}), below)
 
 
 def _place(body: Body) -> Key:

@@ -449,6 +449,37 @@ def test_a_small_change_moves_nothing_else(world: World, operator: OperatorProce
     assert "deployments/traffic-data-store" in changed
 
 
+def test_what_a_spec_does_not_say_any_more_is_taken_away(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    """Also from what was created: a field of no other owner goes with the apply that lacks it."""
+    manifest = traffic(namespace)
+    container = manifest["spec"]["components"][4]["container"]
+    container["env"] = [{"name": "COLOUR", "value": "red"}, {"name": "SIZE", "value": "large"}]
+    container["args"] = ["--verbose"]
+    world.put(manifest)
+    deployed(world, namespace)
+    path = f"/apis/apps/v1/namespaces/{namespace}/deployments/traffic-data-store"
+
+    def made() -> dict[str, Any]:
+        found: dict[str, Any] = (world.api.get(path) or {})["spec"]["template"]["spec"]["containers"][0]
+        return found
+
+    world.api.merge(path, {"metadata": {"annotations": {"their.org/note": "kept"}}})
+    assert made()["args"] == ["--verbose"]
+    generation = (world.api.get(path) or {})["metadata"]["generation"]
+    container["env"] = container["env"][1:]
+    del container["args"]
+    world.put(manifest)
+    wait_for(lambda: "args" not in made(), "the arguments to go")
+    assert {"COLOUR", "SIZE"} & {variable["name"] for variable in made()["env"]} == {"SIZE"}
+    metadata = (world.api.get(path) or {})["metadata"]
+    assert metadata["generation"] == generation + 1
+    assert metadata["annotations"]["their.org/note"] == "kept"
+    ours = [e for e in metadata["managedFields"] if e["manager"] == "fractus-operator"]
+    assert [entry["operation"] for entry in ours] == ["Apply"]
+
+
 def test_a_passenger_that_goes_is_removed(world: World, operator: OperatorProcess, namespace: str) -> None:
     store = component("DataStore", "cloud")
     passenger = viewer(egress=["DataStore"])

@@ -13,12 +13,11 @@ import pytest
 import yaml
 from fractus_core.api import Application
 from fractus_core.api.plans import DeploymentPlanSpec
-from fractus_operator import deployments as deployments_module
 from fractus_operator import kinds
 from fractus_operator.children import Children
 from fractus_operator.deployments import Deployments
 from fractus_operator.kinds import Body, Key, Kind
-from fractus_operator.store import NotFound, StoreError
+from fractus_operator.store import StoreError
 
 INPUT = yaml.safe_load((Path(__file__).parents[1] / "golden" / "operator" / "input.yaml").read_text())
 APPLICATION = Application.from_body(INPUT["application"])
@@ -47,10 +46,7 @@ class Webhooks:
         self.full = asyncio.Event()
         self.applied: list[Kind] = []
 
-    async def get(self, kind: Kind, name: str, namespace: str = "") -> Body:
-        raise NotFound(404, "NotFound", name)
-
-    async def apply(self, kind: Kind, body: Body) -> Body:
+    async def create(self, kind: Kind, body: Body) -> Body:
         if kind is self.hanging:
             self.hangs += 1
             if self.hangs == 2:
@@ -62,7 +58,7 @@ class Webhooks:
 
 async def test_secrets_that_hang_hold_up_neither_plans_nor_grants() -> None:
     store = Webhooks(kinds.SECRET)
-    grantor = SimpleNamespace(signed=lambda body, _: body)
+    grantor = SimpleNamespace(signed=lambda body: body)
     children = Children(cast(Any, store), live(), cast(Any, grantor))
     secrets = [kinds.SECRET.header(f"s{i}", "city") for i in range(5)]
     stuck = asyncio.create_task(children.apply(APPLICATION, {kinds.SECRET: secrets}))
@@ -76,25 +72,19 @@ async def test_secrets_that_hang_hold_up_neither_plans_nor_grants() -> None:
     await asyncio.gather(stuck, return_exceptions=True)
 
 
-def test_grants_come_directly_after_what_schedules_pods() -> None:
-    assert deployments_module._ORDER[:2] == (kinds.DEPLOYMENT, kinds.GRANT)
-
-
 class Recorder:
     """The children of an application, as the one that deploys asks for them."""
 
     def __init__(self) -> None:
         self.said: list[str] = []
-        self.blind = False
+        self.refused: Kind | None = None
 
     async def apply(self, _application: Application, wanted: dict[Kind, Any], *_: object) -> None:
         for _turn in range(5):
             await asyncio.sleep(0)
         self.said += [f"apply {kind.name}" for kind in wanted]
-
-    async def look_around(self, _key: Key) -> None:
-        if self.blind:
-            raise StoreError(0, "Unreachable", "nobody answers")
+        if self.refused in wanted:
+            raise StoreError(422, "Invalid", "no")
 
     async def prune(self, *_: object, **_more: object) -> None:
         self.said.append("prune")
@@ -117,10 +107,26 @@ async def test_the_plan_is_written_before_anything_is_removed() -> None:
     assert recorder.said[:2] == ["apply DeploymentPlan", "prune"]
 
 
-async def test_no_write_goes_on_when_a_look_around_fails() -> None:
+async def test_what_schedules_pods_comes_before_all_that_they_wait_for() -> None:
     one, recorder = deployer()
-    recorder.blind = True
     decided = PLAN.model_copy(update={"placements": (), "drone": None})
-    with pytest.raises(StoreError, match="nobody answers"):
+    await one._deploy(APPLICATION, decided, (), ())
+    assert recorder.said[2:4] == ["apply Deployment", "apply Grant"]
+
+
+async def test_a_deployment_that_is_refused_stops_no_grant() -> None:
+    one, recorder = deployer()
+    recorder.refused = kinds.DEPLOYMENT
+    decided = PLAN.model_copy(update={"placements": (), "drone": None})
+    with pytest.raises(StoreError, match="no"):
+        await one._deploy(APPLICATION, decided, (), ())
+    assert recorder.said[2:4] == ["apply Deployment", "apply Grant"]
+
+
+async def test_nothing_else_is_written_without_the_plan() -> None:
+    one, recorder = deployer()
+    recorder.refused = kinds.DEPLOYMENT_PLAN
+    decided = PLAN.model_copy(update={"placements": (), "drone": None})
+    with pytest.raises(StoreError, match="no"):
         await one._deploy(APPLICATION, decided, (), ())
     assert recorder.said == ["apply DeploymentPlan"]

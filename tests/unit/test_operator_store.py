@@ -1,0 +1,79 @@
+"""Whose fields an object has, as the operator tells the API server."""
+
+from __future__ import annotations
+
+import json
+
+import httpx2
+import pytest
+from fractus_operator.kinds import DEPLOYMENT, Body
+from fractus_operator.store import FIELD_MANAGER, Store, Taken
+
+KEY = ("city", "traffic")
+CREATED = {"manager": FIELD_MANAGER, "operation": "Update", "fieldsV1": {"f:spec": {"f:a": {}, "f:b": {"f:c": {}}}}}
+APPLIED = {"manager": FIELD_MANAGER, "operation": "Apply", "fieldsV1": {"f:spec": {"f:b": {"f:d": {}}}}}
+STATUS = {"manager": FIELD_MANAGER, "operation": "Update", "subresource": "status", "fieldsV1": {"f:status": {}}}
+THEIRS = {"manager": "kube-controller-manager", "operation": "Update", "fieldsV1": {"f:metadata": {}}}
+
+
+class Server:
+    """Answers with one object; refuses so many patches as made on an older one."""
+
+    def __init__(self, *entries: Body, there: bool = True, refusals: int = 0) -> None:
+        self.metadata = {"name": KEY[1], "namespace": KEY[0], "resourceVersion": "7", "managedFields": list(entries)}
+        self.there = there
+        self.refusals = refusals
+        self.patches: list[dict[str, object]] = []
+
+    def __call__(self, request: httpx2.Request) -> httpx2.Response:
+        if not self.there:
+            return httpx2.Response(404, json={"reason": "NotFound"})
+        if request.method == "PATCH":
+            assert request.headers["Content-Type"] == "application/json-patch+json"
+            if self.refusals:
+                self.refusals -= 1
+                return httpx2.Response(409, json={"reason": "Conflict"})
+            self.patches.append({step["path"]: step["value"] for step in json.loads(request.content)})
+        return httpx2.Response(200, json={"metadata": self.metadata})
+
+
+async def asked(server: Server) -> None:
+    store = Store(httpx2.AsyncClient(base_url="https://nowhere.test", transport=httpx2.MockTransport(server)))
+    try:
+        await store.count_as_applied(DEPLOYMENT, KEY)
+    finally:
+        await store.close()
+
+
+async def test_what_was_created_counts_as_applied_and_others_keep_theirs() -> None:
+    server = Server(CREATED, THEIRS, STATUS)
+    await asked(server)
+    (patch,) = server.patches
+    assert patch["/metadata/resourceVersion"] == "7"
+    assert patch["/metadata/managedFields"] == [THEIRS, STATUS, {**CREATED, "operation": "Apply"}]
+
+
+async def test_what_was_applied_too_is_one_set() -> None:
+    server = Server(APPLIED, CREATED)
+    await asked(server)
+    (entry,) = server.patches[0]["/metadata/managedFields"]  # type: ignore[misc]
+    assert entry["fieldsV1"] == {"f:spec": {"f:a": {}, "f:b": {"f:c": {}, "f:d": {}}}}
+
+
+@pytest.mark.parametrize("entries", [(), (THEIRS,), (APPLIED, THEIRS, STATUS)])
+async def test_nothing_is_written_where_all_is_applied(entries: tuple[Body, ...]) -> None:
+    server = Server(*entries)
+    await asked(server)
+    assert server.patches == []
+
+
+async def test_what_is_gone_is_no_trouble() -> None:
+    await asked(Server(there=False))
+
+
+async def test_a_change_meanwhile_is_looked_at_again() -> None:
+    server = Server(CREATED, refusals=2)
+    await asked(server)
+    assert len(server.patches) == 1
+    with pytest.raises(Taken):
+        await asked(Server(CREATED, refusals=3))

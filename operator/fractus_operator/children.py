@@ -16,15 +16,18 @@ from fractus_operator.inventory import LiveInventory
 from fractus_operator.kinds import Body, Key, Kind, key_of
 from fractus_operator.labels import APPLICATION_LABEL, MANAGED_SELECTOR, NAMESPACE_LABEL, label_value
 from fractus_operator.reading import read
-from fractus_operator.store import Store, Taken
+from fractus_operator.store import NotFound, Store, StoreError, Taken
 
 logger = logging.getLogger(__name__)
 
 _PARALLEL = 8
 _BESIDE = 2
 """How many objects are applied at a time that a pod merely waits for: what schedules pods needs the API server more."""
-_AHEAD = frozenset({kinds.DEPLOYMENT_PLAN, kinds.DEPLOYMENT, kinds.GRANT})
-"""What waits for none of these, so that a webhook which holds up Secrets delays neither plans nor grants."""
+_AHEAD = frozenset({kinds.DEPLOYMENT_PLAN, kinds.GRANT})
+"""What waits for no other kind, so that a webhook which holds up Secrets or Deployments delays neither plans nor grants."""
+
+_EXISTS = "AlreadyExists"
+_INADMISSIBLE = frozenset({403, 422})
 
 
 class NameTaken(Exception):
@@ -39,8 +42,10 @@ class Children:
         self._live = live
         self._grantor = grantor
         self._parallel = asyncio.Semaphore(_PARALLEL)
+        self._scheduling = asyncio.Semaphore(_PARALLEL)
         self._beside = asyncio.Semaphore(_BESIDE)
-        self._normalised: dict[tuple[Kind, Key], tuple[object, ...] | None] = {}
+        self._met: set[tuple[Kind, Key]] = set()
+        self._normalised: dict[tuple[Kind, Key], tuple[object, ...]] = {}
 
     async def apply(
         self,
@@ -76,36 +81,80 @@ class Children:
         # With its uid, a grant that went meanwhile is not made anew.
         body["metadata"]["uid"] = observed["metadata"]["uid"]
         async with self._parallel:
-            await self._store.count_as_applied(kinds.GRANT, key)
             self._live.children[kinds.GRANT].note(key, await self._store.apply(kinds.GRANT, body))
 
     async def _apply_one(self, application: Application, kind: Kind, body: Body) -> None:
-        key = key_of(body)
         desired = stamped(body)
-        async with self._parallel if kind in _AHEAD else self._beside:
-            observed = self._live.children[kind].get(key)
-            if observed is None:
-                try:
-                    made = self._grantor.signed(desired) if kind is kinds.GRANT else desired
-                    self._note(kind, desired, await self._store.create(kind, made))
-                except Taken:
-                    observed = await self._store.get(kind, key[1], key[0])
-                else:
-                    return
-            current = is_current(desired, observed) or self._is_normalised(kind, key, desired, observed)
+        async with self._turn(kind):
             if kind is kinds.GRANT:
-                current = (current or _says_the_same(observed, body)) and self._grantor.vouches_for(observed)
-            if current:
+                await self._grant(application, body, desired)
+            else:
+                await self._make(application, kind, desired)
+
+    def _turn(self, kind: Kind) -> asyncio.Semaphore:
+        if kind in _AHEAD:
+            return self._parallel
+        return self._scheduling if kind is kinds.DEPLOYMENT else self._beside
+
+    async def _grant(self, application: Application, body: Body, desired: Body) -> None:
+        """Apply a Grant. It is not created in another way, so that it always has exactly the fields that are signed."""
+        kind, key = kinds.GRANT, key_of(desired)
+        observed = self._live.children[kind].get(key) or await self._look(kind, key)
+        if observed is not None:
+            said = self._is_as_desired(kind, desired, observed) or _says_the_same(observed, body)
+            if said and self._grantor.vouches_for(observed):
                 return
-            if not _is_child(application, kind, observed):
-                raise NameTaken(f"{kind.name} {key[1]} exists and is not of this application; rename one of them")
-            if kind is kinds.GRANT and _moved(observed, body):
+            _check_own(application, kind, observed)
+            if _moved(observed, body):
                 # A Grant belongs to one node for its whole life: its status tells what happened there.
                 await self._store.delete(kind, key, observed["metadata"]["uid"])
+        signed = self._grantor.signed(desired, _readable(observed))
+        self._note(kind, desired, await self._store.apply(kind, signed))
+
+    async def _make(self, application: Application, kind: Kind, desired: Body) -> None:
+        """Create what is most likely new without a look: the answer tells. Apply over what is there.
+
+        What was once in the way is looked for: each creation in vain counts against the quota of its namespace.
+        """
+        key = key_of(desired)
+        observed = self._live.children[kind].get(key)
+        if observed is None and (kind, key) in self._met:
+            observed = await self._look(kind, key)
+        if observed is None:
+            try:
+                self._note(kind, desired, await self._store.create(kind, desired))
+            except Taken as taken:
+                if taken.reason != _EXISTS:
+                    raise
+                self._met.add((kind, key))
+                observed = await self._store.get(kind, key[1], key[0])
             else:
-                await self._store.count_as_applied(kind, key)
-            wanted = self._grantor.signed(desired, _readable(observed)) if kind is kinds.GRANT else desired
-            self._note(kind, desired, await self._store.apply(kind, wanted))
+                self._met.discard((kind, key))
+                return
+        if self._is_as_desired(kind, desired, observed):
+            return
+        _check_own(application, kind, observed)
+        try:
+            await self._store.count_as_applied(kind, key)
+        except StoreError as error:
+            if error.status not in _INADMISSIBLE:
+                raise
+            # What it says so far may not be said any more, not even by its fields' change of hands.
+            await self._store.apply(kind, desired)
+            await self._store.count_as_applied(kind, key)
+        self._note(kind, desired, await self._store.apply(kind, desired))
+
+    async def _look(self, kind: Kind, key: Key) -> Body | None:
+        try:
+            return await self._store.get(kind, key[1], key[0])
+        except NotFound:
+            return None
+
+    def _is_as_desired(self, kind: Kind, desired: Body, observed: Body) -> bool:
+        if is_current(desired, observed):
+            return True
+        known = self._normalised.get((kind, key_of(desired)))
+        return known is not None and known == _state(desired, observed)
 
     def _note(self, kind: Kind, desired: Body, applied: Body) -> None:
         """Take what a write returned, ahead of the watch."""
@@ -114,10 +163,6 @@ class Children:
         if not is_current(desired, applied):
             # The API server spells some value its own way (0.5 cores become 500m).
             self._normalised[kind, key] = _state(desired, applied)
-
-    def _is_normalised(self, kind: Kind, key: Key, desired: Body, observed: Body | None) -> bool:
-        known = self._normalised.get((kind, key))
-        return known is not None and known == _state(desired, observed)
 
     async def prune(
         self, application: Application, wanted: Mapping[Kind, Sequence[Body]], *, keep_secrets: Collection[str]
@@ -134,6 +179,7 @@ class Children:
         children = self._live.children_of(key, kind)
         for child in children:
             self._normalised.pop((kind, key_of(child)), None)
+            self._met.discard((kind, key_of(child)))
             await self._delete(kind, child)
         return bool(children)
 
@@ -154,12 +200,21 @@ class Children:
         await self._store.delete(kind, key_of(body), body["metadata"].get("uid"))
 
 
-def _state(desired: Body, observed: Body | None) -> tuple[object, ...] | None:
+def _state(desired: Body, observed: Body) -> tuple[object, ...]:
     """What tells that neither the desired nor the observed object changed; status changes do not count."""
-    if observed is None:
-        return None
     metadata = observed["metadata"]
     return (digest(desired), metadata.get("uid"), metadata.get("generation") or metadata.get("resourceVersion"))
+
+
+def _check_own(application: Application, kind: Kind, observed: Body) -> None:
+    """Check that an object was made for this application.
+
+    Raises:
+        NameTaken: it was not.
+    """
+    if not _is_child(application, kind, observed):
+        name = observed["metadata"]["name"]
+        raise NameTaken(f"{kind.name} {name} exists and is not of this application; rename one of them")
 
 
 def _is_child(application: Application, kind: Kind, body: Body) -> bool:
@@ -170,9 +225,9 @@ def _is_child(application: Application, kind: Kind, body: Body) -> bool:
     return any(owner.get("uid") == application.metadata.uid for owner in owners)
 
 
-def _readable(observed: Body) -> Grant | None:
+def _readable(observed: Body | None) -> Grant | None:
     try:
-        return read(Grant, observed)
+        return read(Grant, observed) if observed is not None else None
     except InvalidObject:
         return None
 

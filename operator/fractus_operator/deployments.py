@@ -46,6 +46,9 @@ RESYNC_S = 30.0
 _REFUSALS = frozenset({400, 403, 422})
 """HTTP statuses by which the API server says that it does not want an object: the user should know."""
 
+_HEAD_START_S = 0.5
+"""How long the rest waits for Deployments at most: a webhook that holds these up delays no Grant."""
+
 _BESIDE = (kinds.GRANT, kinds.SECRET, kinds.SERVICE, kinds.ENDPOINT_SLICE)
 """What is made once the Deployments are, because scheduling takes longest: at once, and begun in this order. A pod waits for
 its Secret, and can call nothing without its Grant."""
@@ -358,16 +361,20 @@ class Deployments:
         await self._children.apply(application, {kinds.DEPLOYMENT_PLAN: wanted[kinds.DEPLOYMENT_PLAN]})
         await self._children.prune(application, wanted, keep_secrets=secrets.keys())
         wanted[kinds.DEPLOYMENT] = [body for body in wanted[kinds.DEPLOYMENT] if not self._in_the_air(body, decided)]
-        refused: StoreError | NameTaken | None = None
-        try:
-            await self._children.apply(application, {kinds.DEPLOYMENT: wanted[kinds.DEPLOYMENT]})
-        except (StoreError, NameTaken) as error:
-            refused = error  # said once the rest is there: an object in the way of one stops no other
-        for placed in secrets.values():
-            wanted[kinds.SECRET].append(self._certificate(application, placed))
-        await self._children.apply(application, {kind: wanted[kind] for kind in _BESIDE})
-        if refused is not None:
-            raise refused
+        scheduling = asyncio.ensure_future(
+            self._children.apply(application, {kinds.DEPLOYMENT: wanted[kinds.DEPLOYMENT]})
+        )
+
+        async def beside() -> None:
+            await asyncio.wait({scheduling}, timeout=_HEAD_START_S)
+            for placed in secrets.values():
+                wanted[kinds.SECRET].append(self._certificate(application, placed))
+            await self._children.apply(application, {kind: wanted[kind] for kind in _BESIDE})
+
+        # Nothing is written any more when the next look begins; and an object in the way of one stops no other.
+        for result in await asyncio.gather(scheduling, beside(), return_exceptions=True):
+            if isinstance(result, BaseException):
+                raise result
 
     def _in_the_air(self, desired: Body, decided: DeploymentPlanSpec) -> bool:
         """Whether a Deployment is left alone: its drone flies, and its owner has asked for no change.

@@ -188,11 +188,13 @@ class Store:
     async def create(self, kind: Kind, body: Body, *, guarded: bool = True) -> Body:
         """Create an object; `guarded` as for every write, unless it is the Lease itself.
 
+        As strict as an apply: what the API server does not know is refused, not dropped.
+
         Raises:
-            Taken: one of that name exists.
+            Taken: one of that name exists; or, where its reason is not AlreadyExists, try again.
         """
         namespace, _ = _place(body)
-        params = {"fieldManager": FIELD_MANAGER}
+        params = {"fieldManager": FIELD_MANAGER, "fieldValidation": "Strict"}
         return await self._send("POST", kind.path(namespace), params=params, body=body, guarded=guarded)
 
     async def apply(self, kind: Kind, body: Body, *, subresource: str = "") -> Body:

@@ -23,17 +23,16 @@ DIRECTORY = click.Path(file_okay=False, path_type=Path)
 FILE = click.Path(dir_okay=False, path_type=Path)
 
 
-class Address(click.ParamType[str]):
-    """HOST:PORT; gRPC itself takes 99999 for port 34463."""
+def address(_context: click.Context, _parameter: click.Parameter, value: str) -> str:
+    """Check an option that says HOST:PORT; gRPC itself takes 99999 for port 34463.
 
-    name = "host:port"
-
-    def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Check the port."""
-        host, _, port = value.rpartition(":")
-        if not value.startswith("unix:") and not (host and port.isdecimal() and int(port) <= _LAST_PORT):
-            self.fail(f"{value!r} is not HOST:PORT with a port of at most {_LAST_PORT}", param, ctx)
-        return value
+    Raises:
+        click.BadParameter: it is none.
+    """
+    host, _, port = value.rpartition(":")
+    if not value.startswith("unix") and not (host and port.isdecimal() and int(port) <= _LAST_PORT):
+        raise click.BadParameter(f"{value!r} is not HOST:PORT with a port of at most {_LAST_PORT}")
+    return value
 
 
 class CannotServe(Exception):
@@ -41,7 +40,7 @@ class CannotServe(Exception):
 
 
 def read_description(path: Path, *kinds: type[Drone | EdgeNode]) -> Drone | EdgeNode | None:
-    """Read the manifest that describes this node; None where there is no such file.
+    """Read the manifest that describes this node; None where there is none.
 
     Raises:
         CannotServe: the file is not a valid manifest of one of these kinds.
@@ -50,13 +49,15 @@ def read_description(path: Path, *kinds: type[Drone | EdgeNode]) -> Drone | Edge
 
     try:
         body: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        log.info("no description of this node at %s", path)
-        return None
+    except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
+        body = None
     except (OSError, UnicodeDecodeError) as error:
         raise CannotServe(f"--description {path}: cannot be read: {error}") from None
     except yaml.YAMLError as error:
         raise CannotServe(f"--description {path}: is not YAML: {' '.join(str(error).split())}") from None
+    if body is None:
+        log.warning("there is no description of this node at %s", path)
+        return None
     said = body.get("kind") if isinstance(body, dict) else None
     kind = next((kind for kind in kinds if said == kind.KIND), None)
     if kind is None:
@@ -79,7 +80,8 @@ async def open_door(server: grpc.aio.Server, listen: str, tls: TlsFiles) -> None
         server.add_secure_port(listen, tls.server_credentials())
     except RuntimeError:
         raise CannotServe(
-            f"--listen {listen}: cannot listen there; give HOST:PORT with an address of this machine and a free port"
+            f"--listen {listen}: cannot listen there; give HOST:PORT with an address of this machine and a free port,"
+            " and in --tls a tls.key that belongs to tls.crt"
         ) from None
     await server.start()
 

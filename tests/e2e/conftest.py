@@ -34,8 +34,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.e2e)
             item.add_marker(pytest.mark.timeout(600))
         if "kube" in getattr(item, "fixturenames", ()):
-            half = "kills" if item.path.stem == "test_kills" else "others"
+            half = "kills" if item.path.stem == "test_kills" and not _current() else "others"
             item.add_marker(pytest.mark.xdist_group(f"cluster-{half}"))
+
+
+def _current() -> bool:
+    return os.environ.get("FRACTUS_E2E_CLUSTER", "embedded") == "current"
 
 
 def say(line: str) -> None:
@@ -46,7 +50,7 @@ def say(line: str) -> None:
 @pytest.fixture(scope="session")
 def cluster() -> Iterator[Cluster | None]:
     """The embedded cluster; None when the tests run on the user's."""
-    if os.environ.get("FRACTUS_E2E_CLUSTER", "embedded") == "current":
+    if _current():
         yield None
         return
     built = build_images(ROOT, targets=TARGETS, report=say)

@@ -13,9 +13,9 @@ from control_plane import ControlPlane, programs
 from operator_world import OperatorProcess, World, fresh_namespace
 
 # A shell's background jobs ignore the one, what nohup starts the other; and so would every program that they start.
-for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+for number in (signal.SIGINT, signal.SIGHUP):
     if signal.getsignal(number) is signal.SIG_IGN:
-        signal.signal(number, handler)
+        signal.signal(number, signal.default_int_handler)
 
 LONG = ("test_scenario_field", "test_sdk_flight", "test_mobility_sdk", "test_mobility_lost")
 """Modules whose flights take longest: what begins first lets nobody wait for it at the end."""

@@ -68,6 +68,9 @@ def test_sentences_of_bad_applications():
         ([STORE | {"container": {"image": "x", "volumes": [{"name": "v", "mountPath": "/v"}]}}], "spec.components[0].container.volumes[0]: give exactly one of emptyDir"),
         ([STORE | {"container": {"image": "x", "volumes": [{"name": "v", "mountPath": "/v", "secret": "other-tls"}]}}], "spec.components[0].container.volumes[0].secret: Secrets whose names end in -tls"),
         ([STORE | {"container": {"image": "x", "volumes": [{"name": "tls", "mountPath": "/v", "claim": "c"}]}}], "spec.components[0].container.volumes[0].name: tls is taken"),
+        ([STORE | {"container": {"image": "x", "env": [{"name": "A", "value": "1"}, {"name": "A"}]}}], "spec.components[0].container.env[1].name: A is there twice; remove one of them"),
+        ([STORE | {"container": {"image": "x", "ports": [{"port": 80}, {"port": 80}]}}], "spec.components[0].container.ports[1].port: 80 is there twice; remove one of them"),
+        ([STORE | {"container": {"image": "x", "ports": [{"port": 80, "name": "a"}, {"port": 81, "name": "a"}]}}], "spec.components[0].container.ports[1].name: a is taken; choose another name"),
         ([STORE | {"container": {"image": "x", "resources": {"limits": {"cpu": "much"}}}}], "spec.components[0].container.resources.limits.cpu: 'much' is not a quantity"),
     ]  # fmt: skip
     for components, sentence in cases:

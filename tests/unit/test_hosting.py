@@ -35,7 +35,6 @@ def serve(service: click.Group, tmp_path: Path, *more: str) -> Result:
         (b"\xff\xfe\x00", "cannot be read"),
         (b"- a list", "must hold one manifest of kind Drone"),
         (b"kind: Zone", "must hold one manifest of kind Drone"),
-        (b"", "must hold one manifest of kind Drone"),
         (b"{apiVersion: fractus.dev/v1alpha1, kind: Drone, metadata: {name: d}, spec: 5}", "spec"),
     ],
 )

@@ -14,10 +14,10 @@ import yaml
 from fractus_core.api import Application
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_operator import kinds
-from fractus_operator.children import Children
+from fractus_operator.children import Children, NameTaken
 from fractus_operator.deployments import Deployments
 from fractus_operator.kinds import Body, Key, Kind
-from fractus_operator.store import StoreError
+from fractus_operator.store import NotFound, StoreError, Taken
 
 INPUT = yaml.safe_load((Path(__file__).parents[1] / "golden" / "operator" / "input.yaml").read_text())
 APPLICATION = Application.from_body(INPUT["application"])
@@ -40,36 +40,92 @@ def live() -> Any:
 class Webhooks:
     """An API server that never answers writes of one kind."""
 
-    def __init__(self, hanging: Kind) -> None:
+    def __init__(self, hanging: Kind | None, full: int = 0) -> None:
         self.hanging = hanging
         self.hangs = 0
         self.full = asyncio.Event()
-        self.applied: list[Kind] = []
+        self.full_at = full
+        self.said: list[str] = []
+        self.there: dict[tuple[Kind, str], Body] = {}
+        self.frozen = False
+
+    async def get(self, kind: Kind, name: str, namespace: str = "") -> Body:
+        self.said.append(f"get {kind.name}")
+        if (kind, name) not in self.there:
+            raise NotFound(404, "NotFound", name)
+        return self.there[kind, name]
 
     async def create(self, kind: Kind, body: Body) -> Body:
+        if (kind, body["metadata"]["name"]) in self.there:
+            self.said.append(f"create {kind.name} in vain")
+            raise Taken(409, "AlreadyExists", "it is there")
+        return await self.written("create", kind, body)
+
+    async def apply(self, kind: Kind, body: Body) -> Body:
+        self.frozen = False
+        return await self.written("apply", kind, body)
+
+    async def count_as_applied(self, kind: Kind, _key: Key) -> None:
+        self.said.append(f"count {kind.name}")
+        if self.frozen:
+            raise StoreError(422, "Invalid", "its image may not be used any more")
+
+    async def written(self, how: str, kind: Kind, body: Body) -> Body:
         if kind is self.hanging:
             self.hangs += 1
-            if self.hangs == 2:
+            if self.hangs == self.full_at:
                 self.full.set()
             await asyncio.Event().wait()
-        self.applied.append(kind)
+        self.said.append(f"{how} {kind.name}")
         return body
 
 
-async def test_secrets_that_hang_hold_up_neither_plans_nor_grants() -> None:
-    store = Webhooks(kinds.SECRET)
-    grantor = SimpleNamespace(signed=lambda body: body)
-    children = Children(cast(Any, store), live(), cast(Any, grantor))
-    secrets = [kinds.SECRET.header(f"s{i}", "city") for i in range(5)]
-    stuck = asyncio.create_task(children.apply(APPLICATION, {kinds.SECRET: secrets}))
+def made_on(store: Webhooks) -> Children:
+    grantor = SimpleNamespace(signed=lambda body, _: body)
+    return Children(cast(Any, store), live(), cast(Any, grantor))
+
+
+@pytest.mark.parametrize(("hanging", "full"), [(kinds.SECRET, 2), (kinds.DEPLOYMENT, 8)])
+async def test_what_hangs_holds_up_neither_plans_nor_grants(hanging: Kind, full: int) -> None:
+    store = Webhooks(hanging, full)
+    children = made_on(store)
+    many = [hanging.header(f"s{i}", "city") for i in range(20)]
+    stuck = asyncio.create_task(children.apply(APPLICATION, {hanging: many}))
     async with asyncio.timeout(10.0):
         await store.full.wait()
     wanted = {kind: [kind.header("other", "city")] for kind in (kinds.DEPLOYMENT_PLAN, kinds.GRANT)}
     async with asyncio.timeout(10.0):
         await children.apply(APPLICATION, wanted)
-    assert store.applied == [kinds.DEPLOYMENT_PLAN, kinds.GRANT]
+    assert sorted(store.said) == ["apply Grant", "create DeploymentPlan", "get Grant"]
     stuck.cancel()
     await asyncio.gather(stuck, return_exceptions=True)
+
+
+def standing(kind: Kind, **metadata: Any) -> Body:
+    return {**kind.header("one", "city", uid="1", **metadata), "spec": {"old": True}}
+
+
+async def test_what_is_in_the_way_is_met_once_and_then_looked_for() -> None:
+    """Each creation in vain counts against the namespace's quota."""
+    store = Webhooks(None)
+    store.there[kinds.SERVICE, "one"] = standing(kinds.SERVICE)
+    children = made_on(store)
+    for _ in range(2):
+        with pytest.raises(NameTaken):
+            await children.apply(APPLICATION, {kinds.SERVICE: [kinds.SERVICE.header("one", "city")]})
+    assert store.said == ["create Service in vain", "get Service", "get Service"]
+    store.there.clear()
+    await children.apply(APPLICATION, {kinds.SERVICE: [kinds.SERVICE.header("one", "city")]})
+    assert store.said[3:] == ["get Service", "create Service"]
+
+
+async def test_what_may_not_be_said_any_more_is_replaced_first() -> None:
+    store = Webhooks(None)
+    owners = [{"uid": APPLICATION.metadata.uid}]
+    store.there[kinds.DEPLOYMENT, "one"] = standing(kinds.DEPLOYMENT, ownerReferences=owners)
+    store.frozen = True
+    await made_on(store).apply(APPLICATION, {kinds.DEPLOYMENT: [kinds.DEPLOYMENT.header("one", "city")]})
+    assert store.said[2:] == ["count Deployment", "apply Deployment", "count Deployment", "apply Deployment"]
 
 
 class Recorder:

@@ -108,7 +108,9 @@ def test_infeasible_exits_2_with_the_reasons(run):
     assert "default/traffic: infeasible (NoDrone)" in result.output
     result = run([DEPOT, spec_only(drone("d", minutes=2)), TRAFFIC], "-o", "yaml")
     assert result.exit_code == 2
-    plan = DeploymentPlan.from_body(yaml.safe_load(result.stdout)).spec
+    body = yaml.safe_load(result.stdout)
+    assert "the mission takes" in body["metadata"]["annotations"]["fractus.dev/infeasible"]
+    plan = DeploymentPlan.from_body(body).spec
     assert (plan.placements, plan.drone) == ((), None)
     assert [r.node for r in plan.rejected] == ["d"]
     assert "the mission takes" in plan.rejected[0].message

@@ -108,6 +108,18 @@ class Container(Model):
     volumes: tuple[Volume, ...] = Field(default=(), max_length=16)
 
     @model_validator(mode="after")
+    def _distinct_variables_and_ports(self) -> Self:
+        for i, variable in enumerate(self.env):
+            if any(v.name == variable.name for v in self.env[:i]):
+                raise InvalidObject(f"env[{i}].name", f"{variable.name} is there twice; remove one of them")
+        for i, port in enumerate(self.ports):
+            if any((p.port, p.protocol) == (port.port, port.protocol) for p in self.ports[:i]):
+                raise InvalidObject(f"ports[{i}].port", f"{port.port} is there twice; remove one of them")
+            if port.name is not None and any(p.name == port.name for p in self.ports[:i]):
+                raise InvalidObject(f"ports[{i}].name", f"{port.name} is taken; choose another name")
+        return self
+
+    @model_validator(mode="after")
     def _distinct_volumes(self) -> Self:
         for i, volume in enumerate(self.volumes):
             others = self.volumes[:i]

@@ -22,6 +22,7 @@ from fractus_core.validation import check_application
 from fractus_operator.commands.manifests import BadManifest, Manifests, read_manifests
 from fractus_operator.commands.plan_map import plan_map
 from fractus_operator.commands.plan_table import infeasible_table, plan_table
+from fractus_operator.labels import INFEASIBLE_ANNOTATION
 from fractus_operator.plugins import GROUP as PLUGINS
 from fractus_operator.plugins import UnknownPlugin, load_plugin
 
@@ -101,8 +102,8 @@ def plan(context: click.Context, /, paths: Sequence[pathlib.Path], more: Sequenc
     Several Applications are planned one after the other, those with a driver first, then by name; each takes its drone
     and its resources.
 
-    Exit code: 0 if all are feasible, 2 if one is not, 1 if the input is bad. In yaml and json, the plan of what is
-    infeasible has no placements, and says why each node was rejected.
+    Exit code: 0 if all are feasible, 2 if one is not, 1 if the input is bad. In yaml and json, what is infeasible has the
+    annotation fractus.dev/infeasible, no placements, and the nodes that were rejected; the operator writes no such plan.
     """
     try:
         manifests = read_manifests([*paths, *more])
@@ -211,15 +212,28 @@ def deployment_plan(application: Application, found: DeploymentPlanSpec) -> Depl
 
 
 def _bodies(decided: Sequence[Decided]) -> list[dict[str, Any]]:
-    """The plans; what is infeasible has one without placements, which says why each node was rejected."""
     bodies = []
     for answer in decided:
-        rejected = answer.refusal.rejected if answer.refusal is not None else ()
-        found = answer.plan or DeploymentPlanSpec(application=answer.application.name, rejected=rejected)
+        found = answer.plan or _without_placements(answer)
         body = deployment_plan(answer.application, found).to_dict()
         body["metadata"] = {"name": body["metadata"]["name"], "namespace": body["metadata"]["namespace"]}
+        if answer.refusal is not None:
+            body["metadata"]["annotations"] = {
+                INFEASIBLE_ANNOTATION: f"{answer.refusal.reason}: {answer.refusal.message}"
+            }
         bodies.append(body)
     return bodies
+
+
+def _without_placements(answer: Decided) -> DeploymentPlanSpec:
+    """What programs are told of an application that is infeasible."""
+    rejected = answer.refusal.rejected if answer.refusal is not None else ()
+    omitted = max(len(rejected) - _DEFAULTS.rejections_listed, 0)
+    return DeploymentPlanSpec(
+        application=answer.application.name,
+        rejected=rejected[: _DEFAULTS.rejections_listed],
+        rejected_omitted=omitted or None,
+    )
 
 
 def _as_yaml(decided: Sequence[Decided], stock: Inventory, settings: Settings) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import click
 
-from fractus_services.hosting import DIRECTORY, FILE, Address, CannotServe, one_sentence
+from fractus_services.hosting import DIRECTORY, FILE, CannotServe, address, one_sentence
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ def camera() -> None:
 @click.option("--node", envvar="FRACTUS_NODE", help="Name of this node; by default the description's, else the host's.")
 @click.option(
     "--description",
-    type=FILE,
+    type=click.Path(path_type=Path),
     default="/etc/fractus/node.yaml",
     show_default=True,
     help="Drone or EdgeNode manifest of this node.",
@@ -69,7 +69,7 @@ def camera() -> None:
 @click.option(
     "--mobility", default="127.0.0.1:50051", show_default=True, help="Mobility service that tells a drone's position."
 )
-@click.option("--listen", type=Address(), default="[::]:50052", show_default=True, help="Address of the gRPC server.")
+@click.option("--listen", callback=address, default="[::]:50052", show_default=True, help="Address of the gRPC server.")
 @click.option(
     "--keep",
     type=click.IntRange(min=1),

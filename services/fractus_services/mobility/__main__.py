@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from fractus_services.hosting import DIRECTORY, FILE, Address, CannotServe, one_sentence
+from fractus_services.hosting import DIRECTORY, FILE, CannotServe, address, one_sentence
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ def mobility() -> None:
 @click.option("--node", envvar="FRACTUS_NODE", help="Name of this node; by default the description's, else the host's.")
 @click.option(
     "--description",
-    type=FILE,
+    type=click.Path(path_type=Path),
     default="/etc/fractus/node.yaml",
     show_default=True,
     help="Drone manifest of this node; optional.",
@@ -77,7 +77,7 @@ def mobility() -> None:
     "--autopilot",
     help="Link to the autopilot: tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD; by default the description's, else tcp:127.0.0.1:5760.",
 )
-@click.option("--listen", type=Address(), default="[::]:50051", show_default=True, help="Address of the gRPC server.")
+@click.option("--listen", callback=address, default="[::]:50051", show_default=True, help="Address of the gRPC server.")
 @click.option(
     "--driver-grace",
     type=click.FloatRange(min=0),

@@ -431,6 +431,10 @@ class Bench:
         self._api.apply(
             f"/api/v1/namespaces/{name}", {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": name}}
         )
+        # Without it no pod is made.
+        account = f"/api/v1/namespaces/{name}/serviceaccounts/default"
+        wait_until(lambda: bool(self._api.call("GET", account)), "the service account", timeout_s=60)
+        time.sleep(0.5)
         return name
 
     def _phase(self, namespace: str, names: set[str], phases: set[str]) -> None:
@@ -507,7 +511,9 @@ def main() -> int:
     """Run and print; 1 if a claim does not hold."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="100 and 1,000 nodes, and few repetitions")
-    parser.add_argument("--nodes", type=int, nargs="+", help="other numbers of nodes than 100, 1,000 and 5,000, growing")
+    parser.add_argument(
+        "--nodes", type=int, nargs="+", help="other numbers of nodes than 100, 1,000 and 5,000, growing"
+    )
     parser.add_argument("--json", type=pathlib.Path, help="write the claims to this file")
     parser.add_argument("--keep", type=pathlib.Path, help="directory for logs, instead of one that is removed")
     arguments = parser.parse_args()

@@ -7,14 +7,13 @@ import hashlib
 import http.client
 import json
 import subprocess
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from fractus_sim.cluster.images.layout import Layout
 from fractus_sim.cluster.images.receiver import receiving
-
-NAME = "localhost/fractus-test/receiver:1"
 
 
 @pytest.fixture
@@ -33,16 +32,17 @@ def buildah(*arguments: str) -> str:
 
 @pytest.fixture
 def image(tmp_path: Path) -> Iterator[str]:
-    """A small image in buildah's storage."""
+    """A small image in buildah's storage, which other tests use at the same time."""
+    name = f"localhost/fractus-test/receiver:{uuid.uuid4().hex}"
     container = buildah("from", "scratch")
     try:
-        (tmp_path / "file").write_bytes(b"content " * 5000)
+        (tmp_path / "file").write_bytes(name.encode() * 1000)
         buildah("add", "--quiet", container, str(tmp_path / "file"), "/file")
-        buildah("commit", "--quiet", container, NAME)
+        buildah("commit", "--quiet", container, name)
     finally:
         buildah("rm", container)
-    yield NAME
-    buildah("rmi", NAME)
+    yield name
+    buildah("rmi", name)
 
 
 @pytest.mark.root

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _LAST_PORT = 65535
+_SOCKET_FILES = ("unix:", "unix-abstract:")
 
 DIRECTORY = click.Path(file_okay=False, path_type=Path)
 FILE = click.Path(dir_okay=False, path_type=Path)
@@ -30,7 +31,7 @@ def address(_context: click.Context, _parameter: click.Parameter, value: str) ->
         click.BadParameter: it is none.
     """
     host, _, port = value.rpartition(":")
-    if not value.startswith("unix") and not (host and port.isdecimal() and int(port) <= _LAST_PORT):
+    if not value.startswith(_SOCKET_FILES) and not (host and port.isdecimal() and int(port) <= _LAST_PORT):
         raise click.BadParameter(f"{value!r} is not HOST:PORT with a port of at most {_LAST_PORT}")
     return value
 

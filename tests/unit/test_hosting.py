@@ -59,7 +59,9 @@ def test_a_file_is_no_directory(tmp_path: Path, service: click.Group, option: st
 
 
 @SERVICES
-@pytest.mark.parametrize("listen", ["nonsense", "127.0.0.1", ":50051", "127.0.0.1:-1", "127.0.0.1:99999", "h:5x"])
+@pytest.mark.parametrize(
+    "listen", ["nonsense", "127.0.0.1", ":50051", "127.0.0.1:-1", "127.0.0.1:99999", "h:5x", "unix-box:99999"]
+)
 def test_an_address_that_is_none(tmp_path: Path, service: click.Group, listen: str) -> None:
     result = serve(service, tmp_path, "--listen", listen)
     assert result.exit_code == 2

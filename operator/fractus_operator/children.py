@@ -1,4 +1,4 @@
-"""What the operator makes for an Application: applied where it differs, removed where it is stale."""
+"""What the operator makes for an Application: created where it lacks, applied where it differs, removed where it is stale."""
 
 from __future__ import annotations
 
@@ -47,11 +47,7 @@ class Children:
         self._met: set[tuple[Kind, Key]] = set()
         self._normalised: dict[tuple[Kind, Key], tuple[object, ...]] = {}
 
-    async def apply(
-        self,
-        application: Application,
-        wanted: Mapping[Kind, Sequence[Body]],
-    ) -> None:
+    async def apply(self, application: Application, wanted: Mapping[Kind, Sequence[Body]]) -> None:
         """Create those objects that are not there, and apply those that are not as they should be.
 
         Raises:

@@ -49,7 +49,7 @@ _REFUSALS = frozenset({400, 403, 422})
 _HEAD_START_S = 0.5
 """How long the rest waits for Deployments at most: a webhook that holds these up delays no Grant."""
 
-_BESIDE = (kinds.GRANT, kinds.SECRET, kinds.SERVICE, kinds.ENDPOINT_SLICE)
+_AFTER = (kinds.GRANT, kinds.SECRET, kinds.SERVICE, kinds.ENDPOINT_SLICE)
 """What is made once the Deployments are, because scheduling takes longest: at once, and begun in this order. A pod waits for
 its Secret, and can call nothing without its Grant."""
 
@@ -365,14 +365,14 @@ class Deployments:
             self._children.apply(application, {kinds.DEPLOYMENT: wanted[kinds.DEPLOYMENT]})
         )
 
-        async def beside() -> None:
+        async def after() -> None:
             await asyncio.wait({scheduling}, timeout=_HEAD_START_S)
             for placed in secrets.values():
                 wanted[kinds.SECRET].append(self._certificate(application, placed))
-            await self._children.apply(application, {kind: wanted[kind] for kind in _BESIDE})
+            await self._children.apply(application, {kind: wanted[kind] for kind in _AFTER})
 
         # Nothing is written any more when the next look begins; and an object in the way of one stops no other.
-        for result in await asyncio.gather(scheduling, beside(), return_exceptions=True):
+        for result in await asyncio.gather(scheduling, after(), return_exceptions=True):
             if isinstance(result, BaseException):
                 raise result
 

@@ -134,11 +134,21 @@ class Recorder:
     def __init__(self) -> None:
         self.said: list[str] = []
         self.refused: Kind | None = None
+        self.hanging: Kind | None = None
+        self.gave_up = False
+        self.granted = asyncio.Event()
 
     async def apply(self, _application: Application, wanted: dict[Kind, Any], *_: object) -> None:
         for _turn in range(5):
             await asyncio.sleep(0)
+        if self.hanging in wanted:
+            try:
+                await asyncio.Event().wait()
+            finally:
+                self.gave_up = True
         self.said += [f"apply {kind.name}" for kind in wanted]
+        if kinds.GRANT in wanted:
+            self.granted.set()
         if self.refused in wanted:
             raise StoreError(422, "Invalid", "no")
 
@@ -156,33 +166,39 @@ def deployer() -> tuple[Deployments, Recorder]:
     return one, recorder
 
 
-async def test_the_plan_is_written_before_anything_is_removed() -> None:
+async def deployed_by(one: Deployments) -> None:
+    await one._deploy(APPLICATION, PLAN.model_copy(update={"placements": (), "drone": None}), (), ())
+
+
+async def test_the_plan_comes_first_then_what_makes_pods_then_the_rest() -> None:
     one, recorder = deployer()
-    decided = PLAN.model_copy(update={"placements": (), "drone": None})
-    await one._deploy(APPLICATION, decided, (), ())
-    assert recorder.said[:2] == ["apply DeploymentPlan", "prune"]
+    await deployed_by(one)
+    assert recorder.said[:4] == ["apply DeploymentPlan", "prune", "apply Deployment", "apply Grant"]
 
 
-async def test_what_schedules_pods_comes_before_all_that_they_wait_for() -> None:
+@pytest.mark.parametrize(
+    ("refused", "then"),
+    [
+        (kinds.DEPLOYMENT, ["apply DeploymentPlan", "prune", "apply Deployment", "apply Grant"]),
+        (kinds.DEPLOYMENT_PLAN, ["apply DeploymentPlan"]),
+    ],
+)
+async def test_a_refused_deployment_stops_no_grant_but_a_refused_plan_all(refused: Kind, then: list[str]) -> None:
     one, recorder = deployer()
-    decided = PLAN.model_copy(update={"placements": (), "drone": None})
-    await one._deploy(APPLICATION, decided, (), ())
-    assert recorder.said[2:4] == ["apply Deployment", "apply Grant"]
-
-
-async def test_a_deployment_that_is_refused_stops_no_grant() -> None:
-    one, recorder = deployer()
-    recorder.refused = kinds.DEPLOYMENT
-    decided = PLAN.model_copy(update={"placements": (), "drone": None})
+    recorder.refused = refused
     with pytest.raises(StoreError, match="no"):
-        await one._deploy(APPLICATION, decided, (), ())
-    assert recorder.said[2:4] == ["apply Deployment", "apply Grant"]
+        await deployed_by(one)
+    assert recorder.said[:4] == then
 
 
-async def test_nothing_else_is_written_without_the_plan() -> None:
+async def test_deployments_that_hang_hold_up_no_grant() -> None:
     one, recorder = deployer()
-    recorder.refused = kinds.DEPLOYMENT_PLAN
-    decided = PLAN.model_copy(update={"placements": (), "drone": None})
-    with pytest.raises(StoreError, match="no"):
-        await one._deploy(APPLICATION, decided, (), ())
-    assert recorder.said == ["apply DeploymentPlan"]
+    recorder.hanging = kinds.DEPLOYMENT
+    stuck = asyncio.create_task(deployed_by(one))
+    async with asyncio.timeout(20.0):
+        await recorder.granted.wait()
+    assert not stuck.done()
+    stuck.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await stuck
+    assert recorder.gave_up, "nothing is written any more when the next look begins"

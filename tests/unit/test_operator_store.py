@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import httpx2
 import pytest
@@ -23,7 +24,7 @@ class Server:
         self.metadata = {"name": KEY[1], "namespace": KEY[0], "resourceVersion": "7", "managedFields": list(entries)}
         self.there = there
         self.refusals = refusals
-        self.patches: list[dict[str, object]] = []
+        self.patches: list[dict[str, Any]] = []
 
     def __call__(self, request: httpx2.Request) -> httpx2.Response:
         if not self.there:
@@ -56,7 +57,7 @@ async def test_what_was_created_counts_as_applied_and_others_keep_theirs() -> No
 async def test_what_was_applied_too_is_one_set() -> None:
     server = Server(APPLIED, CREATED)
     await asked(server)
-    (entry,) = server.patches[0]["/metadata/managedFields"]  # type: ignore[misc]
+    (entry,) = server.patches[0]["/metadata/managedFields"]
     assert entry["fieldsV1"] == {"f:spec": {"f:a": {}, "f:b": {"f:c": {}, "f:d": {}}}}
 
 

@@ -8,6 +8,7 @@ import pytest
 import yaml
 from click.testing import CliRunner
 from fractus_core.api import DeploymentPlan
+from fractus_core.planning import Settings
 from fractus_core.planning import plan as decide
 from fractus_operator.commands import plan as command
 from fractus_operator.commands.manifests import read_manifests
@@ -115,6 +116,13 @@ def test_infeasible_exits_2_with_the_reasons(run):
     assert [r.node for r in plan.rejected] == ["d"]
     assert "the mission takes" in plan.rejected[0].message
     assert "the mission takes" in result.stderr
+
+
+def test_an_infeasible_plan_lists_no_more_nodes_than_any_other(run, monkeypatch):
+    monkeypatch.setattr(command, "_DEFAULTS", Settings(rejections_listed=1))
+    drones = [spec_only(drone(f"d{i}", minutes=2)) for i in range(3)]
+    spec = json.loads(run([DEPOT, *drones, TRAFFIC], "-o", "json").stdout)["spec"]
+    assert (len(spec["rejected"]), spec["rejectedOmitted"]) == (1, 2)
 
 
 def test_two_applications_never_get_one_drone(run):

@@ -117,6 +117,11 @@ class Channel:
             self.streams[name] = Stream(interval_s, AT_ONCE)
             self.next_due_s = AT_ONCE
 
+    @property
+    def speaks_s(self) -> float:
+        """When a stream is due or a parameter is sent next, in the vehicle's time."""
+        return AT_ONCE if self.parameters else self.next_due_s
+
     def due(self, now_s: float) -> list[str]:
         """Names of the messages to send now; keeps long-term rates exact and never bursts to catch up."""
         if now_s + TIME_SLACK_S < self.next_due_s:

@@ -25,7 +25,6 @@ ANNOUNCEMENTS = (
     (0.15, "EKF3 IMU0 MAG0 initial yaw alignment complete"),
     (FIRST_FIX, "GPS 1: detected u-blox"),
     (ORIGIN_SET, "EKF3 IMU0 origin set"),
-    (0.9, "EKF3 IMU0 is using GPS"),
 )
 
 _FLAGS_READY = 831  # all estimates, and predicted positions
@@ -137,10 +136,9 @@ class Estimator:
     def _judge(self, time_s: float) -> None:
         age_s = time_s - self._fix_s
         self._drift.step(GPS_INTERVAL_S, aided=self.origin is None or age_s <= 2.0 * GPS_INTERVAL_S)
-        settled = time_s >= ORIGIN_SET * self._ready_after_s
-        if self.origin is None and self.gps.fix_type >= 3 and settled:
+        if self.origin is None and self.gps.fix_type >= 3 and time_s >= ORIGIN_SET * self._ready_after_s:
             self.origin = self._start
-        ok = self.origin is not None and settled and age_s < GPS_TIMEOUT_S
-        if self.ready and ok != self.position_ok:
+        ok = self.origin is not None and self.ready and age_s < GPS_TIMEOUT_S
+        if ok != self.position_ok:
             self._say(Severity.INFO, "EKF3 IMU0 is using GPS" if ok else "EKF3 IMU0 stopped aiding")
         self.position_ok = ok

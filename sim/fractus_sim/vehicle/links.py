@@ -5,6 +5,7 @@ Everything is non-blocking and polled once per tick; a peer that does not read f
 
 from __future__ import annotations
 
+import math
 import os
 import selectors
 import socket
@@ -126,6 +127,13 @@ class Hub:
         """Take in what has arrived, waiting at most `timeout_s` for it."""
         for key, _ in self._selector.select(timeout_s):
             key.data()
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until something has arrived, which is left for the next poll; up to a millisecond short of `timeout_s`.
+
+        The system's clock for this ticks in milliseconds, and would be late otherwise.
+        """
+        return bool(self._selector.select(math.floor(timeout_s * 1e3) / 1e3))
 
     def flush(self) -> None:
         """Send what waits."""

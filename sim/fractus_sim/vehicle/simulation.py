@@ -121,6 +121,14 @@ class Simulation:
         for craft in self.crafts:
             craft.step()
 
+    def quiet_steps(self, most: int) -> int:
+        """Steps until the next one that has something to say on a link, from 1 to `most`; texts are not foreseen."""
+        quiet_s = min(
+            (channel.speaks_s - craft.vehicle.time_s for craft in self.crafts for channel in craft.vehicle.channels),
+            default=math.inf,
+        )
+        return math.ceil(min(max(quiet_s / CONTROL_STEP_S - 1e-3, 1.0), most))
+
     def advance(self, duration_s: float) -> None:
         """Advance by a duration, in lockstep with the caller."""
         for _ in range(round(duration_s / CONTROL_STEP_S)):

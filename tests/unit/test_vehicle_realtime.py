@@ -1,0 +1,108 @@
+"""The loop that keeps a vehicle in real time: how often it wakes, and that nobody on a link can tell."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+from fractus_sim.vehicle import __main__ as realtime
+from fractus_sim.vehicle.channel import Channel
+from fractus_sim.vehicle.links import Hub
+from fractus_sim.vehicle.simulation import Craft, Simulation
+from fractus_sim.vehicle.wire import Parser, encode, layout_named
+from vehicle_world import CONFIG
+
+STEP_S = 0.01
+GETTING_UP_S = 0.0003
+
+
+class Clock:
+    """Time that passes only while the loop sleeps, and a little whenever it wakes."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+        self.wakes = 0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def sleep(self, duration_s: float) -> None:
+        self.now_s += duration_s + GETTING_UP_S
+        self.wakes += 1
+
+
+class Line(Hub):
+    """One link whose far end sends bytes at given times and notes when which message reached it."""
+
+    def __init__(self, clock: Clock, craft: Craft, letters: dict[float, bytes]) -> None:
+        super().__init__()
+        self.clock, self.craft = clock, craft
+        self.letters = {clock.now_s + at_s: data for at_s, data in letters.items()}
+        self.channel: Channel = craft.open("line")
+        self.parser = Parser(lambda: None)
+        self.heard: list[tuple[float, float, str]] = []
+
+    def wait(self, timeout_s: float) -> bool:
+        end_s = self.clock.now_s + max(timeout_s, 0.0)
+        first_s = min(self.letters, default=math.inf)
+        if first_s <= end_s:
+            self.clock.now_s = max(first_s, self.clock.now_s)
+            self.clock.wakes += 1
+            return True
+        self.clock.now_s = end_s
+        return False
+
+    def poll(self, timeout_s: float = 0.0) -> None:
+        for at_s in [at_s for at_s in self.letters if at_s <= self.clock.now_s]:
+            self.craft.receive(self.channel, self.letters.pop(at_s))
+
+    def flush(self) -> None:
+        for message in self.parser.feed(self.channel.take()):
+            self.heard.append((self.clock.now_s - 1000.0, self.craft.vehicle.time_s, message.name))
+
+
+def _command(number: int, *parameters: float) -> bytes:
+    values = {f"param{at}": value for at, value in enumerate(parameters, 1)}
+    return encode(
+        layout_named("COMMAND_LONG"),
+        {"target_system": 1, "target_component": 1, "command": number} | values,
+        sequence=0,
+        sysid=255,
+        compid=190,
+    )
+
+
+def _ran(monkeypatch: pytest.MonkeyPatch, letters: dict[float, bytes], speedup: float = 1.0) -> tuple[Line, Simulation]:
+    clock = Clock()
+    monkeypatch.setattr(realtime, "time", clock)
+    simulation = Simulation([CONFIG])
+    line = Line(clock, simulation.crafts[0], letters)
+    realtime.run(simulation, line, speedup, realtime._Stop(), 10.0)
+    line.close()
+    return line, simulation
+
+
+def test_a_quiet_vehicle_wakes_seldom_and_keeps_time(monkeypatch: pytest.MonkeyPatch):
+    line, simulation = _ran(monkeypatch, {})
+    assert line.clock.wakes <= 10.0 / STEP_S / realtime.MAX_NAP + 20
+    assert line.clock.now_s - 1000.0 == pytest.approx(simulation.time_s, abs=(realtime.MAX_NAP + 1) * STEP_S)
+
+
+def test_streams_leave_in_the_step_in_which_they_are_due(monkeypatch: pytest.MonkeyPatch):
+    asks = b"".join(_command(511, number, us) for number, us in ((30, 70_000), (32, 110_000), (33, 250_000)))
+    line, _ = _ran(monkeypatch, {3.0: asks})
+    for name, interval_s in (("ATTITUDE", 0.07), ("LOCAL_POSITION_NED", 0.11), ("GLOBAL_POSITION_INT", 0.25)):
+        left = [(wall_s, time_s) for wall_s, time_s, heard in line.heard if heard == name]
+        assert len(left) == pytest.approx(7.0 / interval_s, abs=2)
+        assert all(-1e-6 < wall_s - time_s < 0.001 for wall_s, time_s in left)
+        gaps = [after[1] - before[1] for before, after in itertools.pairwise(left)]
+        assert gaps == pytest.approx([interval_s] * len(gaps), abs=1e-6)
+
+
+@pytest.mark.parametrize("speedup", [1.0, 5.0, 0.5])
+@pytest.mark.parametrize("at_s", [1.0, 1.0031, 1.0149, 1.0271, 1.0399])
+def test_what_arrives_is_answered_at_the_next_step(monkeypatch: pytest.MonkeyPatch, at_s: float, speedup: float):
+    line, _ = _ran(monkeypatch, {at_s: _command(512, 148)}, speedup)
+    (answered,) = [wall_s for wall_s, _, name in line.heard if name == "COMMAND_ACK"]
+    assert 0.0 <= answered - at_s <= STEP_S / speedup + 0.0015

@@ -74,10 +74,8 @@ class Children:
         if observed is None or "deletionTimestamp" in observed["metadata"]:
             return
         body = self._grantor.signed(stamped(builders.granted_again(observed, spec)), grant)
-        # With its uid, a grant that went meanwhile is not made anew.
-        body["metadata"]["uid"] = observed["metadata"]["uid"]
         async with self._parallel:
-            self._live.children[kinds.GRANT].note(key, await self._store.apply(kinds.GRANT, body))
+            self._live.children[kinds.GRANT].note(key, await self._store.rewrite(kinds.GRANT, observed, body))
 
     async def _apply_one(self, application: Application, kind: Kind, body: Body) -> None:
         desired = stamped(body)
@@ -93,41 +91,31 @@ class Children:
         return self._scheduling if kind is kinds.DEPLOYMENT else self._beside
 
     async def _grant(self, application: Application, body: Body, desired: Body) -> None:
-        """Apply a Grant. It is not created in another way, so that it always has exactly the fields that are signed."""
         kind, key = kinds.GRANT, key_of(desired)
-        observed = self._live.children[kind].get(key) or await self._look(kind, key)
-        if observed is not None:
-            said = self._is_as_desired(kind, desired, observed) or _says_the_same(observed, body)
-            if said and self._grantor.vouches_for(observed):
-                return
-            _check_own(application, kind, observed)
-            if _moved(observed, body):
-                # A Grant belongs to one node for its whole life: its status tells what happened there.
-                await self._store.delete(kind, key, observed["metadata"]["uid"])
+        observed = self._live.children[kind].get(key)
+        if observed is None:
+            observed = await self._create(kind, desired, self._grantor.signed(desired))
+        if observed is None:
+            return
+        said = self._is_as_desired(kind, desired, observed) or _says_the_same(observed, body)
+        if said and self._grantor.vouches_for(observed):
+            return
+        _check_own(application, kind, observed)
         signed = self._grantor.signed(desired, _readable(observed))
-        self._note(kind, desired, await self._store.apply(kind, signed))
+        if _moved(observed, body):
+            # A Grant belongs to one node for its whole life: its status tells what happened there.
+            await self._store.delete(kind, key, observed["metadata"]["uid"])
+            made = await self._store.create(kind, signed)
+        else:
+            made = await self._store.rewrite(kind, observed, signed)
+        self._note(kind, desired, made)
 
     async def _make(self, application: Application, kind: Kind, desired: Body) -> None:
-        """Create what is most likely new without a look: the answer tells. Apply over what is there.
-
-        What was once in the way is looked for: each creation in vain counts against the quota of its namespace.
-        """
         key = key_of(desired)
         observed = self._live.children[kind].get(key)
-        if observed is None and (kind, key) in self._met:
-            observed = await self._look(kind, key)
         if observed is None:
-            try:
-                self._note(kind, desired, await self._store.create(kind, desired))
-            except Taken as taken:
-                if taken.reason != _EXISTS:
-                    raise
-                self._met.add((kind, key))
-                observed = await self._store.get(kind, key[1], key[0])
-            else:
-                self._met.discard((kind, key))
-                return
-        if self._is_as_desired(kind, desired, observed):
+            observed = await self._create(kind, desired, desired)
+        if observed is None or self._is_as_desired(kind, desired, observed):
             return
         _check_own(application, kind, observed)
         try:
@@ -139,6 +127,26 @@ class Children:
             await self._store.apply(kind, desired)
             await self._store.count_as_applied(kind, key)
         self._note(kind, desired, await self._store.apply(kind, desired))
+
+    async def _create(self, kind: Kind, desired: Body, body: Body) -> Body | None:
+        """Create what is most likely new without a look: the answer tells. The object that has its name, if there is one.
+
+        What was once in the way is looked for: each creation in vain counts against the quota of its namespace.
+        """
+        key = key_of(desired)
+        if (kind, key) in self._met:
+            there = await self._look(kind, key)
+            if there is not None:
+                return there
+        try:
+            self._note(kind, desired, await self._store.create(kind, body))
+        except Taken as taken:
+            if taken.reason != _EXISTS:
+                raise
+            self._met.add((kind, key))
+            return await self._store.get(kind, key[1], key[0])
+        self._met.discard((kind, key))
+        return None
 
     async def _look(self, kind: Kind, key: Key) -> Body | None:
         try:

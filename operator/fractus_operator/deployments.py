@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
@@ -47,11 +49,12 @@ _REFUSALS = frozenset({400, 403, 422})
 """HTTP statuses by which the API server says that it does not want an object: the user should know."""
 
 _HEAD_START_S = 0.5
-"""How long the rest waits for Deployments at most: a webhook that holds these up delays no Grant."""
+"""How long what makes pods goes first at most, where there are new ones: neither a webhook that holds Deployments up nor pods
+that no node takes delay a Grant for longer."""
 
-_AFTER = (kinds.GRANT, kinds.SECRET, kinds.SERVICE, kinds.ENDPOINT_SLICE)
-"""What is made once the Deployments are, because scheduling takes longest: at once, and begun in this order. A pod waits for
-its Secret, and can call nothing without its Grant."""
+_AFTER = (kinds.GRANT, kinds.SERVICE, kinds.ENDPOINT_SLICE)
+"""What is made once the pods have their nodes, so that it does not take the API server from the scheduler: begun in this
+order. A pod starts without it, which takes longer, but can call nothing before it has its Grant."""
 
 _OPTIONAL = frozenset({"NodeCordoned", "NodesAppeared"})
 """Reasons for a new plan that can do without: what runs goes on where there is no other."""
@@ -361,20 +364,34 @@ class Deployments:
         await self._children.apply(application, {kinds.DEPLOYMENT_PLAN: wanted[kinds.DEPLOYMENT_PLAN]})
         await self._children.prune(application, wanted, keep_secrets=secrets.keys())
         wanted[kinds.DEPLOYMENT] = [body for body in wanted[kinds.DEPLOYMENT] if not self._in_the_air(body, decided)]
-        scheduling = asyncio.ensure_future(
-            self._children.apply(application, {kinds.DEPLOYMENT: wanted[kinds.DEPLOYMENT]})
-        )
+        there = self._live.children[kinds.DEPLOYMENT]
+        more = any(there.get(key_of(body)) is None for body in wanted[kinds.DEPLOYMENT])
+        made = asyncio.ensure_future(self._children.apply(application, {kinds.DEPLOYMENT: wanted[kinds.DEPLOYMENT]}))
+
+        async def beside() -> None:
+            await asyncio.wait({made}, timeout=_HEAD_START_S)
+            certificates = [self._certificate(application, placed) for placed in secrets.values()]
+            await self._children.apply(application, {kinds.SECRET: certificates})
 
         async def after() -> None:
-            await asyncio.wait({scheduling}, timeout=_HEAD_START_S)
-            for placed in secrets.values():
-                wanted[kinds.SECRET].append(self._certificate(application, placed))
+            if more:
+                await self._scheduled(application.key, decided, _HEAD_START_S)
             await self._children.apply(application, {kind: wanted[kind] for kind in _AFTER})
 
         # Nothing is written any more when the next look begins; and an object in the way of one stops no other.
-        for result in await asyncio.gather(scheduling, after(), return_exceptions=True):
+        for result in await asyncio.gather(made, beside(), after(), return_exceptions=True):
             if isinstance(result, BaseException):
                 raise result
+
+    async def _scheduled(self, key: Key, decided: DeploymentPlanSpec, timeout_s: float) -> None:
+        """Wait until every pod of a plan has its node."""
+        with self._live.subscription(key) as inputs, contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                while True:
+                    nodes = Counter(pod.instance for pod in self._live.pods_of(key) if pod.node is not None)
+                    if all(nodes[placed.instance] >= placed.replicas for placed in decided.placements):
+                        return
+                    await inputs.changed(timeout_s)
 
     def _in_the_air(self, desired: Body, decided: DeploymentPlanSpec) -> bool:
         """Whether a Deployment is left alone: its drone flies, and its owner has asked for no change.

@@ -91,11 +91,22 @@ async def follow(live: LiveInventory, deployments: Deployments, key: Key, stoppe
                 await asyncio.sleep(min(_REST * took_s, _LONGEST_S))
 
 
+class _Unchanged(kopf.DiffBaseStorage):
+    """Tells kopf that nothing changed: no handler asks, and a copy of its spec on each Application would cost a write."""
+
+    def fetch(self, *, body: kopf.Body) -> kopf.BodyEssence:
+        """What was handled last: what is there."""
+        return self.build(body=body)
+
+    def store(self, **_: object) -> None:
+        """Nothing is kept."""
+
+
 def configure(settings: kopf.OperatorSettings) -> None:
     """Set kopf up: our names on objects, no Events of its own, watches that cannot go silent."""
     settings.persistence.finalizer = FINALIZER
     settings.persistence.progress_storage = kopf.AnnotationsProgressStorage(prefix="kopf.fractus.dev")
-    settings.persistence.diffbase_storage = kopf.AnnotationsDiffBaseStorage(prefix="kopf.fractus.dev")
+    settings.persistence.diffbase_storage = _Unchanged()
     settings.posting.enabled = False
     settings.peering.standalone = True
     settings.scanning.disabled = True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -92,7 +93,7 @@ class LiveInventory:
             )
             for kind in kinds.CHILDREN
         }
-        self._subscriptions: dict[Key, Subscription] = {}
+        self._subscriptions: dict[Key, list[Subscription]] = {}
         self._listeners: dict[Kind, list[Callable[[Key], None]]] = {}
         self._decided: dict[Key, OwnedPlan] = {}
         self._plans: dict[Key, OwnedPlan] = {}
@@ -125,12 +126,13 @@ class LiveInventory:
     @contextmanager
     def subscription(self, key: Key) -> Iterator[Subscription]:
         """Wake-up calls for one application, as long as the context lasts."""
-        place = _place(key)
-        subscription = self._subscriptions[place] = Subscription()
+        place, subscription = _place(key), Subscription()
+        self._subscriptions.setdefault(place, []).append(subscription)
         try:
             yield subscription
         finally:
-            if self._subscriptions.get(place) is subscription:
+            self._subscriptions[place].remove(subscription)
+            if not self._subscriptions[place]:
                 del self._subscriptions[place]
 
     # -- reading --
@@ -262,13 +264,12 @@ class LiveInventory:
 
     def wake_all(self) -> None:
         """Wake every application: something they all depend on changed."""
-        for subscription in self._subscriptions.values():
+        for subscription in itertools.chain.from_iterable(self._subscriptions.values()):
             subscription.wake()
 
     def wake(self, key: Key) -> None:
         """Wake one application."""
-        subscription = self._subscriptions.get(_place(key))
-        if subscription is not None:
+        for subscription in self._subscriptions.get(_place(key), ()):
             subscription.wake()
 
     # -- what reflectors report --

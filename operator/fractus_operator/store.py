@@ -19,13 +19,12 @@ from lightkube.config.kubeconfig import KubeConfig
 from lightkube.core.exceptions import ConfigError
 
 from fractus_operator.kinds import EVENT, Body, Key, Kind
+from fractus_operator.transport import AiohttpTransport
 
 FIELD_MANAGER = "fractus-operator"
 _REQUEST_TIMEOUT_S = 15.0
 _LIST_TIMEOUT_S = 120.0
 """Lists are long where links are slow: one that makes progress goes on, so that it is not begun anew for ever."""
-_LIMITS = httpx2.Limits(max_connections=100, max_keepalive_connections=20, keepalive_expiry=60.0)
-"""Connections stay open between two changes, for less than the API server's 90 s: each costs a TLS handshake."""
 _PAGE = 250
 """Objects a page: while one is read it takes several times its size."""
 _TRIES = 3
@@ -97,7 +96,8 @@ class Store:
         if config is None:
             raise Unconfigured("the kubeconfig has no current context; choose one with kubectl config use-context")
         parameters = ConnectionParams(timeout=httpx2.Timeout(_REQUEST_TIMEOUT_S)).httpx_params(config)
-        return cls(httpx2.AsyncClient(**parameters, limits=_LIMITS))
+        parameters["transport"] = AiohttpTransport(parameters["verify"])
+        return cls(httpx2.AsyncClient(**parameters))
 
     async def close(self) -> None:
         """Close every connection."""
@@ -212,6 +212,30 @@ class Store:
             params={"fieldManager": FIELD_MANAGER, "force": "true"},
             body=body,
             content_type="application/apply-patch+yaml",
+        )
+
+    async def rewrite(self, kind: Kind, observed: Body, body: Body) -> Body:
+        """Give an object exactly this spec, and these labels and annotations beside those it has.
+
+        What is signed needs that: an apply leaves fields that others own. An object that is gone is not made anew, and one
+        that was made anew is refused (422).
+
+        Raises:
+            NotFound: the object is gone.
+        """
+        metadata = observed["metadata"]
+        changes: list[Body] = [{"op": "test", "path": "/metadata/uid", "value": metadata["uid"]}]
+        for name in ("labels", "annotations"):
+            together = {**(metadata.get(name) or {}), **(body["metadata"].get(name) or {})}
+            changes.append({"op": "add", "path": f"/metadata/{name}", "value": together})
+        changes.append({"op": "add", "path": "/spec", "value": body["spec"]})
+        namespace, name = _place(observed)
+        return await self._send(
+            "PATCH",
+            kind.path(namespace, name),
+            params={"fieldManager": FIELD_MANAGER, "fieldValidation": "Strict"},
+            body=changes,
+            content_type="application/json-patch+json",
         )
 
     async def count_as_applied(self, kind: Kind, key: Key) -> None:

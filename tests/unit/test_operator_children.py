@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections import defaultdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,6 +17,7 @@ from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_operator import kinds
 from fractus_operator.children import Children, NameTaken
 from fractus_operator.deployments import Deployments
+from fractus_operator.inventory import Subscription
 from fractus_operator.kinds import Body, Key, Kind
 from fractus_operator.store import NotFound, StoreError, Taken
 
@@ -26,6 +28,9 @@ PLAN = DeploymentPlanSpec.model_validate(INPUT["plan"])
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
 
 
+PLACED = PLAN.model_copy(update={"placements": PLAN.placements[:2], "drone": None})
+
+
 class Copy(dict[Key, Body]):
     """What the watch showed of a kind: nothing."""
 
@@ -33,8 +38,28 @@ class Copy(dict[Key, Body]):
         """Nothing is remembered."""
 
 
+class Pods(list[SimpleNamespace]):
+    """The pods that the watch has shown."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.news = Subscription()
+
+    def bound(self, *instances: str) -> None:
+        """Show that these have a node now."""
+        self += [SimpleNamespace(instance=instance, node="n1") for instance in instances]
+        self.news.wake()
+
+
 def live() -> Any:
-    return SimpleNamespace(children=defaultdict(Copy), children_of=lambda *_: [])
+    pods = Pods()
+    return SimpleNamespace(
+        children=defaultdict(Copy),
+        children_of=lambda *_: [],
+        pods=pods,
+        pods_of=lambda _key: pods,
+        subscription=lambda _key: contextlib.nullcontext(pods.news),
+    )
 
 
 class Webhooks:
@@ -65,6 +90,13 @@ class Webhooks:
         self.frozen = False
         return await self.written("apply", kind, body)
 
+    async def rewrite(self, kind: Kind, _observed: Body, body: Body) -> Body:
+        return await self.written("rewrite", kind, body)
+
+    async def delete(self, kind: Kind, key: Key, _uid: str) -> None:
+        self.said.append(f"delete {kind.name}")
+        del self.there[kind, key[1]]
+
     async def count_as_applied(self, kind: Kind, _key: Key) -> None:
         self.said.append(f"count {kind.name}")
         if self.frozen:
@@ -81,7 +113,7 @@ class Webhooks:
 
 
 def made_on(store: Webhooks) -> Children:
-    grantor = SimpleNamespace(signed=lambda body, _: body)
+    grantor = SimpleNamespace(signed=lambda body, _=None: body, vouches_for=lambda _body: False)
     return Children(cast(Any, store), live(), cast(Any, grantor))
 
 
@@ -96,7 +128,7 @@ async def test_what_hangs_holds_up_neither_plans_nor_grants(hanging: Kind, full:
     wanted = {kind: [kind.header("other", "city")] for kind in (kinds.DEPLOYMENT_PLAN, kinds.GRANT)}
     async with asyncio.timeout(10.0):
         await children.apply(APPLICATION, wanted)
-    assert sorted(store.said) == ["apply Grant", "create DeploymentPlan", "get Grant"]
+    assert sorted(store.said) == ["create DeploymentPlan", "create Grant"]
     stuck.cancel()
     await asyncio.gather(stuck, return_exceptions=True)
 
@@ -128,6 +160,27 @@ async def test_what_may_not_be_said_any_more_is_replaced_first() -> None:
     assert store.said[2:] == ["count Deployment", "apply Deployment", "count Deployment", "apply Deployment"]
 
 
+@pytest.mark.parametrize(
+    ("node", "then"), [("n1", ["rewrite Grant"]), ("n2", ["delete Grant", "create Grant"])], ids=["stays", "moved"]
+)
+async def test_a_grant_that_is_there_is_rewritten_unless_its_node_changes(node: str, then: list[str]) -> None:
+    store = Webhooks(None)
+    of = {"uid": APPLICATION.metadata.uid}
+    store.there[kinds.GRANT, "one"] = {**kinds.GRANT.header("one", uid="1"), "spec": {"application": of, "node": "n1"}}
+    wanted = {**kinds.GRANT.header("one", labels={}), "spec": {"application": of, "node": node}}
+    await made_on(store).apply(APPLICATION, {kinds.GRANT: [wanted]})
+    assert store.said == ["create Grant in vain", "get Grant", *then]
+
+
+async def test_the_grant_of_another_application_is_left_alone() -> None:
+    store = Webhooks(None)
+    spec = {"application": {"uid": "another"}, "node": "n1"}
+    store.there[kinds.GRANT, "one"] = {**kinds.GRANT.header("one", uid="1"), "spec": spec}
+    with pytest.raises(NameTaken):
+        await made_on(store).apply(APPLICATION, {kinds.GRANT: [{**kinds.GRANT.header("one", labels={}), "spec": spec}]})
+    assert store.said == ["create Grant in vain", "get Grant"]
+
+
 class Recorder:
     """The children of an application, as the one that deploys asks for them."""
 
@@ -136,7 +189,7 @@ class Recorder:
         self.refused: Kind | None = None
         self.hanging: Kind | None = None
         self.gave_up = False
-        self.granted = asyncio.Event()
+        self.granted, self.furnished = asyncio.Event(), asyncio.Event()
 
     async def apply(self, _application: Application, wanted: dict[Kind, Any], *_: object) -> None:
         for _turn in range(5):
@@ -149,6 +202,8 @@ class Recorder:
         self.said += [f"apply {kind.name}" for kind in wanted]
         if kinds.GRANT in wanted:
             self.granted.set()
+        if kinds.SECRET in wanted:
+            self.furnished.set()
         if self.refused in wanted:
             raise StoreError(422, "Invalid", "no")
 
@@ -156,43 +211,64 @@ class Recorder:
         self.said.append("prune")
 
 
-def deployer() -> tuple[Deployments, Recorder]:
+def deployer() -> tuple[Deployments, Recorder, Pods]:
     inventory = live()
     inventory.drones = {}
-    authority = SimpleNamespace(certificate=SimpleNamespace(not_valid_before_utc=NOW))
+    authority = SimpleNamespace(
+        certificate=SimpleNamespace(not_valid_before_utc=NOW), still_good=lambda *_: True, issue_component=None
+    )
     one = Deployments(cast(Any, None), inventory, cast(Any, authority), lambda: NOW)
     recorder = Recorder()
     one._children = cast(Any, recorder)
-    return one, recorder
+    return one, recorder, inventory.pods
 
 
 async def deployed_by(one: Deployments) -> None:
-    await one._deploy(APPLICATION, PLAN.model_copy(update={"placements": (), "drone": None}), (), ())
+    await one._deploy(APPLICATION, PLACED, (), ())
 
 
-async def test_the_plan_comes_first_then_what_makes_pods_then_the_rest() -> None:
-    one, recorder = deployer()
-    await deployed_by(one)
-    assert recorder.said[:4] == ["apply DeploymentPlan", "prune", "apply Deployment", "apply Grant"]
+FIRST = ["apply DeploymentPlan", "prune", "apply Deployment"]
+
+
+async def test_what_no_pod_waits_for_is_made_once_every_pod_has_its_node() -> None:
+    one, recorder, pods = deployer()
+    under_way = asyncio.create_task(deployed_by(one))
+    async with asyncio.timeout(20.0):
+        await recorder.furnished.wait()
+        pods.bound(PLACED.placements[0].instance)
+        for _ in range(50):
+            await asyncio.sleep(0)
+        assert recorder.said == [*FIRST, "apply Secret"]
+        pods.bound(*[PLACED.placements[1].instance] * PLACED.placements[1].replicas)
+        await under_way
+    assert recorder.said == [*FIRST, "apply Secret", "apply Grant", "apply Service", "apply EndpointSlice"]
+
+
+async def test_pods_that_no_node_takes_hold_up_no_grant() -> None:
+    one, recorder, _ = deployer()
+    async with asyncio.timeout(20.0):
+        await deployed_by(one)
+    assert recorder.said[3:5] == ["apply Secret", "apply Grant"]
 
 
 @pytest.mark.parametrize(
     ("refused", "then"),
     [
-        (kinds.DEPLOYMENT, ["apply DeploymentPlan", "prune", "apply Deployment", "apply Grant"]),
+        (kinds.DEPLOYMENT, [*FIRST, "apply Secret", "apply Grant"]),
+        (kinds.SECRET, [*FIRST, "apply Secret", "apply Grant"]),
         (kinds.DEPLOYMENT_PLAN, ["apply DeploymentPlan"]),
     ],
 )
 async def test_a_refused_deployment_stops_no_grant_but_a_refused_plan_all(refused: Kind, then: list[str]) -> None:
-    one, recorder = deployer()
+    one, recorder, _ = deployer()
     recorder.refused = refused
     with pytest.raises(StoreError, match="no"):
         await deployed_by(one)
-    assert recorder.said[:4] == then
+    assert recorder.said[:5] == then
 
 
 async def test_deployments_that_hang_hold_up_no_grant() -> None:
-    one, recorder = deployer()
+    one, recorder, _ = deployer()
     recorder.hanging = kinds.DEPLOYMENT
     stuck = asyncio.create_task(deployed_by(one))
     async with asyncio.timeout(20.0):

@@ -78,3 +78,20 @@ async def test_a_change_meanwhile_is_looked_at_again() -> None:
     assert len(server.patches) == 1
     with pytest.raises(Taken):
         await asked(Server(CREATED, refusals=3))
+
+
+async def test_a_rewrite_is_of_this_object_and_leaves_labels_of_others() -> None:
+    server = Server()
+    observed = {"metadata": {"name": KEY[1], "namespace": KEY[0], "uid": "u1", "labels": {"theirs": "1", "ours": "1"}}}
+    body = {"metadata": {"name": KEY[1], "labels": {"ours": "2"}, "annotations": {"signature": "s"}}, "spec": {"a": 1}}
+    store = Store(httpx2.AsyncClient(base_url="https://nowhere.test", transport=httpx2.MockTransport(server)))
+    await store.rewrite(DEPLOYMENT, observed, body)
+    await store.close()
+    assert server.patches == [
+        {
+            "/metadata/uid": "u1",
+            "/metadata/labels": {"theirs": "1", "ours": "2"},
+            "/metadata/annotations": {"signature": "s"},
+            "/spec": {"a": 1},
+        }
+    ]

@@ -40,7 +40,7 @@ from fractus_operator.missions import (
 from fractus_operator.pods import PodView
 from fractus_operator.reading import SETTLED, Submitted
 from fractus_operator.rides import flights, may_come_along, ride_lost, ride_outcome
-from fractus_operator.store import Store, StoreError, Taken
+from fractus_operator.store import NotFound, Store, StoreError, Taken
 
 logger = logging.getLogger(__name__)
 
@@ -195,7 +195,7 @@ class Deployments:
         except StoreError as error:
             # The watch of grants brings a newer one, or the next look finds it refused still.
             logger.warning("%s/%s: grants are not up to date: %s", *key, error)
-            if error.status not in _REFUSALS and not isinstance(error, Taken):
+            if error.status not in _REFUSALS and not isinstance(error, Taken | NotFound):
                 raise
 
     def _vouched(self, key: Key, uid: str) -> list[Grant]:
@@ -364,9 +364,13 @@ class Deployments:
         await self._children.apply(application, {kinds.DEPLOYMENT_PLAN: wanted[kinds.DEPLOYMENT_PLAN]})
         await self._children.prune(application, wanted, keep_secrets=secrets.keys())
         wanted[kinds.DEPLOYMENT] = [body for body in wanted[kinds.DEPLOYMENT] if not self._in_the_air(body, decided)]
-        there = self._live.children[kinds.DEPLOYMENT]
-        more = any(there.get(key_of(body)) is None for body in wanted[kinds.DEPLOYMENT])
-        made = asyncio.ensure_future(self._children.apply(application, {kinds.DEPLOYMENT: wanted[kinds.DEPLOYMENT]}))
+        standing = [body for body in wanted[kinds.GRANT] if self._is_there(kinds.GRANT, body)]
+        new = [body for body in wanted[kinds.GRANT] if body not in standing]
+        waits = not all(self._is_there(kinds.DEPLOYMENT, body) for body in wanted[kinds.DEPLOYMENT])
+        rules = self._live.rules_revision
+        # What is granted already may have to shrink: it waits for nothing.
+        first = {kinds.GRANT: standing, kinds.DEPLOYMENT: wanted[kinds.DEPLOYMENT]}
+        made = asyncio.ensure_future(self._children.apply(application, first))
 
         async def beside() -> None:
             await asyncio.wait({made}, timeout=_HEAD_START_S)
@@ -374,24 +378,31 @@ class Deployments:
             await self._children.apply(application, {kinds.SECRET: certificates})
 
         async def after() -> None:
-            if more:
-                await self._scheduled(application.key, decided, _HEAD_START_S)
-            await self._children.apply(application, {kind: wanted[kind] for kind in _AFTER})
+            if waits:
+                await self._scheduled(application.key, decided, made)
+            # Rules that changed meanwhile are in no Grant that was compiled before: the next look makes those.
+            granted = new if rules == self._live.rules_revision else []
+            await self._children.apply(application, {**{kind: wanted[kind] for kind in _AFTER}, kinds.GRANT: granted})
 
         # Nothing is written any more when the next look begins; and an object in the way of one stops no other.
         for result in await asyncio.gather(made, beside(), after(), return_exceptions=True):
             if isinstance(result, BaseException):
                 raise result
 
-    async def _scheduled(self, key: Key, decided: DeploymentPlanSpec, timeout_s: float) -> None:
-        """Wait until every pod of a plan has its node."""
+    def _is_there(self, kind: Kind, body: Body) -> bool:
+        return self._live.children[kind].get(key_of(body)) is not None
+
+    async def _scheduled(self, key: Key, decided: DeploymentPlanSpec, made: asyncio.Future[None]) -> None:
+        """Wait until every pod of a plan has its node, or will get none: the head start at most, and never when rules change."""
+        rules = self._live.rules_revision
         with self._live.subscription(key) as inputs, contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(timeout_s):
-                while True:
+            made.add_done_callback(lambda _: inputs.wake())
+            async with asyncio.timeout(_HEAD_START_S):
+                while rules == self._live.rules_revision and not (made.done() and made.exception()):
                     nodes = Counter(pod.instance for pod in self._live.pods_of(key) if pod.node is not None)
                     if all(nodes[placed.instance] >= placed.replicas for placed in decided.placements):
                         return
-                    await inputs.changed(timeout_s)
+                    await inputs.changed(_HEAD_START_S)
 
     def _in_the_air(self, desired: Body, decided: DeploymentPlanSpec) -> bool:
         """Whether a Deployment is left alone: its drone flies, and its owner has asked for no change.

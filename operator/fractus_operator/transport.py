@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import ssl
 from collections.abc import AsyncIterator
 
@@ -42,7 +43,8 @@ class AiohttpTransport(httpx2.AsyncBaseTransport):
             )
         except (aiohttp.ClientError, TimeoutError, OSError) as error:
             raise _translated(error, request) from error
-        return httpx2.Response(response.status, headers=response.raw_headers, stream=_Body(response, request))
+        body = _Body(response, request, limits.get("read"))
+        return httpx2.Response(response.status, headers=response.raw_headers, stream=body)
 
     async def aclose(self) -> None:
         """Close every connection."""
@@ -60,13 +62,19 @@ class AiohttpTransport(httpx2.AsyncBaseTransport):
 
 
 class _Body(httpx2.AsyncByteStream):
-    def __init__(self, response: aiohttp.ClientResponse, request: httpx2.Request) -> None:
+    def __init__(self, response: aiohttp.ClientResponse, request: httpx2.Request, silence_s: float | None) -> None:
         self._response = response
         self._request = request
+        self._silence_s = silence_s
 
     async def __aiter__(self) -> AsyncIterator[bytes]:
         try:
-            async for chunk in self._response.content.iter_any():
+            while True:
+                # aiohttp's own time-out ends with the connection, also where that never tells the reader.
+                async with asyncio.timeout(self._silence_s):
+                    chunk = await self._response.content.readany()
+                if not chunk:
+                    return
                 yield chunk
         except (aiohttp.ClientError, TimeoutError, OSError) as error:
             raise _translated(error, self._request) from error

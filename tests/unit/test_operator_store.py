@@ -8,7 +8,7 @@ from typing import Any
 import httpx2
 import pytest
 from fractus_operator.kinds import DEPLOYMENT, Body
-from fractus_operator.store import FIELD_MANAGER, Store, Taken
+from fractus_operator.store import FIELD_MANAGER, Store, StoreError, Taken
 
 KEY = ("city", "traffic")
 CREATED = {"manager": FIELD_MANAGER, "operation": "Update", "fieldsV1": {"f:spec": {"f:a": {}, "f:b": {"f:c": {}}}}}
@@ -21,7 +21,9 @@ class Server:
     """Answers with one object; refuses so many patches as made on an older one."""
 
     def __init__(self, *entries: Body, there: bool = True, refusals: int = 0) -> None:
-        self.metadata = {"name": KEY[1], "namespace": KEY[0], "resourceVersion": "7", "managedFields": list(entries)}
+        self.metadata: Body = {"name": KEY[1], "namespace": KEY[0], "uid": "u1", "resourceVersion": "7"}
+        self.metadata["managedFields"] = list(entries)
+        self.refusal = httpx2.Response(409, json={"reason": "Conflict"})
         self.there = there
         self.refusals = refusals
         self.patches: list[dict[str, Any]] = []
@@ -33,7 +35,7 @@ class Server:
             assert request.headers["Content-Type"] == "application/json-patch+json"
             if self.refusals:
                 self.refusals -= 1
-                return httpx2.Response(409, json={"reason": "Conflict"})
+                return self.refusal
             self.patches.append({step["path"]: step["value"] for step in json.loads(request.content)})
         return httpx2.Response(200, json={"metadata": self.metadata})
 
@@ -80,13 +82,26 @@ async def test_a_change_meanwhile_is_looked_at_again() -> None:
         await asked(Server(CREATED, refusals=3))
 
 
+OBSERVED: Body = {
+    "metadata": {"name": KEY[1], "namespace": KEY[0], "uid": "u1", "labels": {"theirs": "1", "ours": "1"}}
+}
+WANTED: Body = {
+    "metadata": {"name": KEY[1], "labels": {"ours": "2"}, "annotations": {"signature": "s"}},
+    "spec": {"a": 1},
+}
+
+
+async def rewritten(server: Server) -> None:
+    store = Store(httpx2.AsyncClient(base_url="https://nowhere.test", transport=httpx2.MockTransport(server)))
+    try:
+        await store.rewrite(DEPLOYMENT, OBSERVED, WANTED)
+    finally:
+        await store.close()
+
+
 async def test_a_rewrite_is_of_this_object_and_leaves_labels_of_others() -> None:
     server = Server()
-    observed = {"metadata": {"name": KEY[1], "namespace": KEY[0], "uid": "u1", "labels": {"theirs": "1", "ours": "1"}}}
-    body = {"metadata": {"name": KEY[1], "labels": {"ours": "2"}, "annotations": {"signature": "s"}}, "spec": {"a": 1}}
-    store = Store(httpx2.AsyncClient(base_url="https://nowhere.test", transport=httpx2.MockTransport(server)))
-    await store.rewrite(DEPLOYMENT, observed, body)
-    await store.close()
+    await rewritten(server)
     assert server.patches == [
         {
             "/metadata/uid": "u1",
@@ -95,3 +110,15 @@ async def test_a_rewrite_is_of_this_object_and_leaves_labels_of_others() -> None
             "/spec": {"a": 1},
         }
     ]
+
+
+@pytest.mark.parametrize(("uid", "error"), [("u1", StoreError), ("u2", Taken)])
+async def test_a_rewrite_that_is_refused_tells_whether_the_object_is_another_one(
+    uid: str, error: type[StoreError]
+) -> None:
+    server = Server(refusals=1)
+    server.refusal = httpx2.Response(422, json={"reason": "Invalid"})
+    server.metadata["uid"] = uid
+    with pytest.raises(StoreError) as raised:
+        await rewritten(server)
+    assert type(raised.value) is error

@@ -59,13 +59,17 @@ def run(simulation: Simulation, hub: Hub, speedup: float, stop: _Stop, until_s: 
         hub.flush()
         if speedup > 0.0:
             next_step = wall_0 + (simulation.time_s + CONTROL_STEP_S - time_0) / speedup
-            wake = next_step + (simulation.quiet_steps(MAX_NAP) - 1) * CONTROL_STEP_S / speedup
-            if wake > next_step and hub.wait(wake - time.monotonic()):
+            now = time.monotonic()
+            if now >= next_step:
+                continue
+            nap = simulation.quiet_steps(MAX_NAP) if speedup >= 1.0 else 1
+            wake = next_step + (nap - 1) * CONTROL_STEP_S / speedup
+            if nap > 1 and hub.wait(wake - now):
                 late = max(time.monotonic() - next_step, 0.0)
                 wake = next_step + math.ceil(late * speedup / CONTROL_STEP_S) * CONTROL_STEP_S / speedup
             ahead = wake - time.monotonic()
             if ahead > 0.0:
-                time.sleep(max(ahead, MIN_SLEEP_S))
+                time.sleep(ahead if nap > 1 else max(ahead, MIN_SLEEP_S))
 
 
 def _place(_context: click.Context, _option: click.Parameter, text: str) -> Place:

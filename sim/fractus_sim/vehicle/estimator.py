@@ -62,16 +62,12 @@ class Estimator:
         self.gps = Gps()
         self.origin: Place | None = None
         self.position_ok = False
+        self.ready = False  # whether the start is over
         self._drift = Drift(rng, noise_m)
         self._time_s = 0.0
         self._next_fix_s = 0.0
         self._fix_s = -1e9
         self._announced = 0
-
-    @property
-    def ready(self) -> bool:
-        """Whether the start is over."""
-        return self._time_s >= self._ready_after_s
 
     @property
     def healthy(self) -> bool:
@@ -138,6 +134,7 @@ class Estimator:
         self._drift.step(GPS_INTERVAL_S, aided=self.origin is None or age_s <= 2.0 * GPS_INTERVAL_S)
         if self.origin is None and self.gps.fix_type >= 3 and time_s >= ORIGIN_SET * self._ready_after_s:
             self.origin = self._start
+        self.ready = time_s >= self._ready_after_s
         ok = self.origin is not None and self.ready and age_s < GPS_TIMEOUT_S
         if ok != self.position_ok:
             self._say(Severity.INFO, "EKF3 IMU0 is using GPS" if ok else "EKF3 IMU0 stopped aiding")

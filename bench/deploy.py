@@ -1,8 +1,9 @@
 """Deploying on 100 to 5,000 simulated nodes: the operator against a real API server, scheduler and kwok.
 
 The traffic-monitoring example is applied as it stands, beside thousands of nodes elsewhere: how long until every pod is
-bound, until the application is Running with all that was made for it, what the operator takes in CPU and memory, how soon after its start it plans, and that 50 applications applied at
-once all end bound or queued. The comparator creates the same Deployments without Fractus: what Kubernetes takes anyway.
+bound, until the application is Running with all that was made for it, what the operator takes in CPU and memory, how soon
+after its start it plans, and that 50 applications applied at once all end bound or queued. The comparator creates the same
+Deployments without Fractus: what Kubernetes takes anyway.
 
 The simulated nodes send no heartbeats while this runs: at kubelet's rate those of 5,000 would take more than the two cores that
 it is meant for. The cost of nodes is in what is listed, watched, planned over and scheduled on.

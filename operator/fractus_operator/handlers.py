@@ -87,8 +87,8 @@ async def follow(live: LiveInventory, deployments: Deployments, key: Key, stoppe
                 logger.warning("%s/%s: %s; again in %.1f s", *key, error, again_s)
             took_s = loop.time() - began
             if await inputs.changed(again_s):
-                # Changes come in bursts, such as the pods of a plan: one reconcile for all.
-                await asyncio.sleep(min(_REST * took_s, _LONGEST_S))
+                # Changes come in bursts, such as the pods of a plan: one reconcile for all. Zones and policies do not wait.
+                await inputs.rest(min(_REST * took_s, _LONGEST_S))
 
 
 class _Unchanged(kopf.DiffBaseStorage):

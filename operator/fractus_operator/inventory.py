@@ -6,7 +6,7 @@ import asyncio
 import itertools
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
@@ -45,10 +45,13 @@ class Subscription:
 
     def __init__(self) -> None:
         self._changed = asyncio.Event()
+        self._urgent = asyncio.Event()
 
-    def wake(self) -> None:
-        """Note a change."""
+    def wake(self, *, urgent: bool = False) -> None:
+        """Note a change; an urgent one ends a rest."""
         self._changed.set()
+        if urgent:
+            self._urgent.set()
 
     async def changed(self, timeout_s: float) -> bool:
         """Wait for a change since the last call; False after the timeout."""
@@ -60,6 +63,13 @@ class Subscription:
         finally:
             self._changed.clear()
         return True
+
+    async def rest(self, duration_s: float) -> None:
+        """Let changes gather, unless one is urgent."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(duration_s):
+                await self._urgent.wait()
+        self._urgent.clear()
 
 
 class LiveInventory:
@@ -262,10 +272,10 @@ class LiveInventory:
         if self._decided.pop(key, None) is not None:
             self.wake_all()
 
-    def wake_all(self) -> None:
+    def wake_all(self, *, urgent: bool = False) -> None:
         """Wake every application: something they all depend on changed."""
         for subscription in itertools.chain.from_iterable(self._subscriptions.values()):
-            subscription.wake()
+            subscription.wake(urgent=urgent)
 
     def wake(self, key: Key) -> None:
         """Wake one application."""
@@ -330,7 +340,7 @@ class LiveInventory:
             self.rules_revision += 1
             self._report(kind, key)
             if old is None or new is None or type(old) is not type(new) or old.spec != new.spec:
-                self.wake_all()
+                self.wake_all(urgent=True)
 
         return changed
 

@@ -183,6 +183,30 @@ async def test_the_grant_of_another_application_is_left_alone() -> None:
     assert store.said == ["create Grant in vain", "get Grant"]
 
 
+async def test_only_what_is_urgent_ends_a_rest() -> None:
+    news = Subscription()
+    news.wake()
+    assert await news.changed(20.0)
+    resting = asyncio.create_task(news.rest(20.0))
+    await turns()
+    news.wake()
+    await turns()
+    assert not resting.done()
+    news.wake(urgent=True)
+    async with asyncio.timeout(10.0):
+        await resting
+    assert await news.changed(20.0)
+    news.wake(urgent=True)
+    assert await news.changed(20.0)
+    async with asyncio.timeout(10.0):
+        await news.rest(20.0)
+    resting = asyncio.create_task(news.rest(20.0))
+    await turns()
+    assert not resting.done(), "an urgent change ends one rest"
+    resting.cancel()
+    await asyncio.gather(resting, return_exceptions=True)
+
+
 class Recorder:
     """The children of an application, as the one that deploys asks for them."""
 

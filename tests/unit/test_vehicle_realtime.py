@@ -107,7 +107,8 @@ def test_streams_leave_in_the_step_in_which_they_are_due(monkeypatch: pytest.Mon
         assert len(left) == pytest.approx(7.0 / interval_s, abs=2)
         assert all(-1e-6 < wall_s - time_s < 0.001 for wall_s, time_s in left)
         gaps = [after[1] - before[1] for before, after in itertools.pairwise(left)]
-        assert gaps == pytest.approx([interval_s] * len(gaps), abs=1e-6)
+        # The first one is on its way with the acknowledgement, a step after what was asked is heard.
+        assert gaps[1:] == pytest.approx([interval_s] * (len(gaps) - 1), abs=1e-6)
 
 
 @pytest.mark.parametrize("speedup", [1.0, 5.0, 0.5])

@@ -40,9 +40,11 @@ def run(simulation: Simulation, hub: Hub, speedup: float, stop: _Stop, until_s: 
     """Keep simulated time at `speedup` times real time (0: as fast as possible) until stopped.
 
     Waking costs more than a step. Nobody sees the steps between two messages, so they are made up for together: the loop
-    sleeps until a message is due (`MAX_NAP` steps at most) or one arrives, which is heard at the next step as ever.
+    sleeps until a message is due (`MAX_NAP` steps at most) or one arrives. That is heard at once, counts from the step it
+    arrived in, and is answered at the next one as ever.
     """
     wall_0, time_0 = time.monotonic(), simulation.time_s
+    woken, nap = False, 1
     while not stop.wanted and (until_s is None or simulation.time_s < until_s):
         if speedup > 0.0:
             behind = time_0 + (time.monotonic() - wall_0) * speedup - simulation.time_s
@@ -56,19 +58,16 @@ def run(simulation: Simulation, hub: Hub, speedup: float, stop: _Stop, until_s: 
         hub.poll()
         if steps:
             simulation.step()
-        hub.flush()
+        if not woken or steps >= nap:
+            hub.flush()
         if speedup > 0.0:
             next_step = wall_0 + (simulation.time_s + CONTROL_STEP_S - time_0) / speedup
             now = time.monotonic()
-            if now >= next_step:
-                continue
-            nap = simulation.quiet_steps(MAX_NAP) if speedup >= 1.0 else 1
+            nap = 1 if woken or now >= next_step or speedup < 1.0 else simulation.quiet_steps(MAX_NAP)
             wake = next_step + (nap - 1) * CONTROL_STEP_S / speedup
-            if nap > 1 and hub.wait(wake - now):
-                late = max(time.monotonic() - next_step, 0.0)
-                wake = next_step + math.ceil(late * speedup / CONTROL_STEP_S) * CONTROL_STEP_S / speedup
+            woken = nap > 1 and hub.wait(wake - now)
             ahead = wake - time.monotonic()
-            if ahead > 0.0:
+            if ahead > 0.0 and not woken:
                 time.sleep(ahead if nap > 1 else max(ahead, MIN_SLEEP_S))
 
 

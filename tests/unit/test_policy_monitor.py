@@ -8,8 +8,9 @@ from dataclasses import replace
 import pytest
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
+from fractus_core.policy.motion import stop_point
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs
-from policy_world import NOW, altitude, at, box, compiled, exclusion, goto, inclusion, speed
+from policy_world import FRAME, NOW, altitude, at, box, compiled, exclusion, goto, inclusion, speed
 
 WALL = box(-50, 50, 50, 90)
 
@@ -199,5 +200,39 @@ def test_what_is_permitted_never_alarms(speed_mps: float) -> None:
             x, y, z, east_mps=east, north_mps=north, down_mps=-up, speed_setpoint_mps=speed_mps,
             forward_mps2=fleet.accel[0, 1],
         )  # fmt: skip
-        assert monitor(now, grant) is None, (y, north)
+        assert monitor(now, grant, goal=FRAME.latlon(0, 47.4)) is None, (y, north)
     assert fleet.place[0, 1] == pytest.approx(47.4, abs=0.1)
+
+
+@pytest.mark.parametrize("appears_s", [0.5, 1.0, 1.5, 2.0, 2.5, 3.0])
+def test_a_zone_that_appears_while_a_drone_speeds_up_stops_it_in_time(appears_s: float) -> None:
+    import numpy as np
+    from policy_flights import ACCEL, LATENCY_S, STEP_S, Fleet, scene
+
+    rng = np.random.default_rng(1)
+    fleet = Fleet(rng, [scene(rng)])
+    fleet.place[:], fleet.speed[:], fleet.gust[:], fleet.error[:] = [0, 0, 10], 0.0, 0.0, 0.0
+    fleet.goal[:], fleet.cruise[:], fleet.setpoint[:], fleet.held[:] = [0, 300, 10], 12.0, 12.0, False
+    while fleet.time_s < appears_s:
+        fleet.step()
+    assert fleet.accel[0, 1] > 0.8 * ACCEL
+    coasting = stop_point(at(north_mps=fleet.speed[0, 1], forward_mps2=0.0), (0.0, 0.0))[1]
+    wall_m = fleet.place[0, 1] + coasting + 16.0
+    grant = compiled(exclusion(box(-50, wall_m, 50, wall_m + 40)))
+    looks = 0
+    while True:
+        x, y, z = fleet.place[0]
+        now = at(x, y, z, north_mps=fleet.speed[0, 1], speed_setpoint_mps=12.0, forward_mps2=fleet.accel[0, 1])
+        if monitor(now, grant, goal=FRAME.latlon(0, 300)) is not None:
+            break
+        fleet.step()
+        looks += 1
+    assert looks > 2, "there was room to fly on"
+    for _ in range(int(LATENCY_S / STEP_S)):
+        fleet.step()
+    # Told, as it is by the service, to fly with no velocity.
+    fleet.held[:], fleet.wanted[:], fleet.until[:] = True, 0.0, math.inf
+    for _ in range(int(20 / STEP_S)):
+        fleet.step()
+    rest_m = wall_m - fleet.place[0, 1]
+    assert now.position_error_m < rest_m < 5.0, "neither inside for all that is known, nor needlessly far"

@@ -11,7 +11,7 @@ from shapely.geometry.base import BaseGeometry
 from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Patch
 from fractus_core.policy.fences import TAKEOVERS, breaches
 from fractus_core.policy.limits import Bound, altitude_bounds, speed_bounds, strictest
-from fractus_core.policy.motion import XY, margin_m, moving, standing, stop_altitude_m, stop_point
+from fractus_core.policy.motion import XY, margin_m, moving, rest_ahead, standing, stop_altitude_m, stop_point
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Situation, Verdict
 
 STRAY = 0.3
@@ -25,7 +25,9 @@ DEEPER_M = 0.6
 _RANK = {None: 0, "hover": 1, "returnToLaunch": 2, "land": 3, "revoke": 4}
 
 
-def monitor(now: Situation, grant: CompiledGrant, *, leaving: bool = False) -> Verdict | None:
+def monitor(
+    now: Situation, grant: CompiledGrant, *, goal: tuple[float, float] | None = None, leaving: bool = False
+) -> Verdict | None:
     """What the system must do about a flying drone at this moment.
 
     Judged is the way from the present position to where the drone comes to rest if it is told to stop now, with the
@@ -34,6 +36,7 @@ def monitor(now: Situation, grant: CompiledGrant, *, leaving: bool = False) -> V
     Args:
         now: the state of the drone.
         grant: whose fences.
+        goal: latitude and longitude at which its motion ends; None where that has no end of its own.
         leaving: whether the system flies the drone already, so that only what gets worse counts: where it is on the wrong
             side of a fence, the system's way leads back.
 
@@ -48,10 +51,8 @@ def monitor(now: Situation, grant: CompiledGrant, *, leaving: bool = False) -> V
     lat, lon = now.lat, now.lon
     if lat is None or lon is None or not now.sound:
         return Verdict("takeover", None, "PositionUnknown", "the drone's position is unknown", (), "hover")
-    # A drone that speeds up does so on a way that was judged with room for it, and brakes at its end in time.
-    now = replace(now, forward_mps2=min(now.forward_mps2 or 0.0, 0.0))
     start = grant.frame.xy(lat, lon)
-    stop = stop_point(now, start)
+    stop = rest_ahead(now, start, grant.frame.xy(*goal) if goal is not None else None)
     rest_m = stop_altitude_m(now)
     ahead = _look_ahead(now, start, stop, now.position_error_m + STRAY * now.airframe.tracking_m)
     found = _fences(now, grant, ahead, leaving=leaving)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.monitoring import monitor
-from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Verdict
+from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Situation, Verdict
 
 from fractus_services.audit import AuditLog
 from fractus_services.mobility.autopilot import AutopilotError, Permit
@@ -89,12 +89,20 @@ class Watch:
     def _judge(self, grant: CompiledGrant) -> tuple[Verdict | None, bool]:
         """What is wrong, and whether the system flies the drone already, so that there is nobody to take it from."""
         control, now = self._control, self._guard.situation()
+        goal = self._goal(now)
         if control.homeward:
-            return monitor(now, grant, leaving=True), True
-        verdict = monitor(now, grant)
+            return monitor(now, grant, goal=goal, leaving=True), True
+        verdict = monitor(now, grant, goal=goal)
         if verdict is None or verdict.takeover != "hover" or control.hands == "driver":
             return verdict, False
-        return monitor(now, grant, leaving=True), True
+        return monitor(now, grant, goal=goal, leaving=True), True
+
+    def _goal(self, now: Situation) -> tuple[float, float] | None:
+        """Where the drone stops of itself: at the end of its leg; without a motion, as soon as it can."""
+        motion = self._control.motion
+        if motion is not None:
+            return (motion.leg.lat, motion.leg.lon) if motion.leg is not None else None
+        return (now.lat, now.lon) if now.lat is not None and now.lon is not None else None
 
     def _stop(self, verdict: Verdict, fresh: bool) -> None:
         """End the motion that makes things worse; the system then looks for another way.

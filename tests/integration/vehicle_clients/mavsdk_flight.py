@@ -10,7 +10,7 @@ from typing import Any
 from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
 from mavsdk.asyncio.plugins import action, geofence, mission, mission_raw, offboard, param, telemetry
 from mavsdk.plugins import geofence as shapes
-from mavsdk.plugins.mission import MissionError, MissionItem, MissionPlan
+from mavsdk.plugins.mission import MissionError, MissionItem, MissionPlan, MissionResult
 from mavsdk.plugins.offboard import PositionNedYaw, VelocityNedYaw
 
 METRES = 111_319.0
@@ -93,6 +93,19 @@ async def fence(fences: geofence.GeofenceAsync, home: Any) -> None:
     print("ok: geofence", flush=True)
 
 
+async def upload(missions: mission.MissionAsync, plan: MissionPlan) -> None:
+    """Upload; MAVSDK counts itself as busy for a moment after it has told of the last transfer's end."""
+    for left in reversed(range(100)):
+        try:
+            await missions.upload_mission(plan)
+        except MissionError as error:
+            if error.result != MissionResult.BUSY or not left:
+                raise
+            await asyncio.sleep(0.1)
+        else:
+            return
+
+
 async def missions(missions: mission.MissionAsync, raw: mission_raw.MissionRawAsync, home: Any) -> None:
     """Upload, read back and fly."""
     items = [
@@ -114,7 +127,7 @@ async def missions(missions: mission.MissionAsync, raw: mission_raw.MissionRawAs
     else:
         raise SystemExit("a return with NaN for parameters was accepted")
     await missions.set_return_to_launch_after_mission(False)
-    await missions.upload_mission(MissionPlan(items))
+    await upload(missions, MissionPlan(items))
     assert len(await raw.download_mission()) >= len(items)
     await missions.start_mission()
     await first(missions.subscribe_mission_progress(), lambda p: 0 < p.total == p.current, "mission", timeout_s=60.0)

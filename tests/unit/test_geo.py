@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import shapely
 from fractus_core.api import InvalidObject
@@ -32,6 +33,18 @@ def test_frame_round_trips(lat, lon, x, y):
 def test_frame_says_when_a_point_is_beyond_the_horizon():
     with pytest.raises(ValueError, match="beyond the horizon"):
         LocalFrame(10, 20).latlon(9_000_000, 0)
+    with pytest.raises(ValueError, match="beyond the horizon"):
+        LocalFrame(10, 20).latlon_array(np.array([[5.0, 5.0], [9_000_000.0, 1.0]]))
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0), (39.36, 22.95), (-80.0, 179.99), (90.0, 0.0)])
+def test_many_points_are_converted_as_one_is(origin):
+    frame = LocalFrame(*origin)
+    xy = np.array([(x, y) for x in (-5e4, -3.0, 0.0, 120.5) for y in (-40.0, 0.0, 3e4)])
+    lats, lons = frame.latlon_array(xy)
+    for (x, y), lat, lon in zip(xy.tolist(), lats.tolist(), lons.tolist(), strict=True):
+        assert (lat, lon) == pytest.approx(frame.latlon(x, y), abs=1e-10)
+    assert frame.xy_array(lats, lons) == pytest.approx(xy, abs=1e-6)
 
 
 @pytest.mark.parametrize("lat", [0, 45, 80, -80])

@@ -113,8 +113,8 @@ def area_of(frame: LocalFrame, shape: BaseGeometry) -> tuple[Area, ...]:
     return tuple(
         Area(
             polygon=Polygon(
-                exterior=tuple(_point(frame, x, y) for x, y in part.exterior.coords[:-1]),
-                holes=tuple(tuple(_point(frame, x, y) for x, y in hole.coords[:-1]) for hole in part.interiors),
+                exterior=_points(frame, part.exterior),
+                holes=tuple(_points(frame, hole) for hole in part.interiors),
             )
         )
         for part in shapely.get_parts(shape)
@@ -126,7 +126,7 @@ def geojson(frame: LocalFrame, shape: BaseGeometry) -> dict[str, Any]:
     """A (multi)polygon in metres as a GeoJSON MultiPolygon, lon before lat, split at the antimeridian (RFC 7946)."""
     polygons = []
     for part in shapely.get_parts(shape):
-        rings = [_unwrapped(frame, part.exterior.coords)] + [_unwrapped(frame, hole.coords) for hole in part.interiors]
+        rings = [_unwrapped(frame, ring) for ring in (part.exterior, *part.interiors)]
         reference = rings[0][0][0]
         rings = [[(_near(lon, reference), lat) for lon, lat in ring] for ring in rings]
         whole = shapely.Polygon(rings[0], rings[1:])
@@ -157,22 +157,22 @@ def geojson_line(points: Sequence[Point]) -> dict[str, Any]:
     return {"type": "MultiLineString", "coordinates": coordinates}
 
 
-def _unwrapped(frame: LocalFrame, coords: Iterable[tuple[float, ...]]) -> list[tuple[float, float]]:
+def _unwrapped(frame: LocalFrame, ring: BaseGeometry) -> list[tuple[float, float]]:
     """Lon, lat of a ring, each longitude within 180 degrees of its neighbour."""
-    out: list[tuple[float, float]] = []
-    for c in coords:
-        lat, lon = frame.latlon(c[0], c[1])
-        out.append((_near(lon, out[-1][0]) if out else lon, lat))
-    return out
+    lats, lons = frame.latlon_array(shapely.get_coordinates(ring))
+    return list(zip(np.unwrap(lons, period=360.0).tolist(), lats.tolist(), strict=True))
 
 
 def _near(lon: float, reference: float) -> float:
     return lon + 360.0 * round((reference - lon) / 360.0)
 
 
-def _point(frame: LocalFrame, x: float, y: float) -> Point:
-    lat, lon = frame.latlon(x, y)
-    return Point(lat=round(lat, 9), lon=round(lon, 9))
+def _points(frame: LocalFrame, ring: BaseGeometry) -> tuple[Point, ...]:
+    """The corners of a ring, without the first once more."""
+    lats, lons = frame.latlon_array(shapely.get_coordinates(ring)[:-1])
+    return tuple(
+        Point(lat=round(lat, 9), lon=round(lon, 9)) for lat, lon in zip(lats.tolist(), lons.tolist(), strict=True)
+    )
 
 
 def ground(position: Position) -> Point:

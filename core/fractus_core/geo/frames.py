@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
 import numpy as np
 from geographiclib.geodesic import Geodesic
@@ -13,12 +14,13 @@ from fractus_core.api.geometry import Point
 SEMI_MAJOR_AXIS_M = 6_378_137.0
 FLATTENING = 1 / 298.257223563
 _E2 = FLATTENING * (2 - FLATTENING)
-_MAX_ITERATIONS = 12
+_PER_A2, _PER_B2 = SEMI_MAJOR_AXIS_M**-2, (SEMI_MAJOR_AXIS_M * (1 - FLATTENING)) ** -2
 
 CHORDS_TO_M = 200_000.0
 """Up to here geodesic distances come from chords; beyond from Karney's algorithm."""
 
 Coordinates = NDArray[np.float64]
+Metres = TypeVar("Metres", float, Coordinates)
 
 
 def geodesic_m(a: Point, b: Point) -> float:
@@ -64,7 +66,7 @@ class LocalFrame:
     Points beyond the horizon (a quarter of the globe away) have no meaning in it.
     """
 
-    __slots__ = ("_cos_lat", "_cos_lon", "_origin", "_sin_lat", "_sin_lon", "lat", "lon")
+    __slots__ = ("_cos_lat", "_cos_lon", "_origin", "_sin_lat", "_sin_lon", "_up", "lat", "lon")
 
     def __init__(self, lat: float, lon: float) -> None:
         self.lat = lat
@@ -78,6 +80,7 @@ class LocalFrame:
             n * self._cos_lat * self._sin_lon,
             n * (1 - _E2) * self._sin_lat,
         )
+        self._up = (self._cos_lat * self._cos_lon, self._cos_lat * self._sin_lon, self._sin_lat)
 
     @classmethod
     def at(cls, point: Point) -> LocalFrame:
@@ -114,39 +117,46 @@ class LocalFrame:
         Raises:
             ValueError: the point lies beyond the horizon of the frame.
         """
-        up = 0.0
-        for _ in range(_MAX_ITERATIONS):
-            p, q, z = self._ecef(x, y, up)
-            # How far the point is above the ellipsoid, to first order, along the frame's vertical.
-            a, b = SEMI_MAJOR_AXIS_M, SEMI_MAJOR_AXIS_M * (1 - FLATTENING)
-            f = (p * p + q * q) / (a * a) + z * z / (b * b) - 1
-            slope = 2 * (
-                (p * self._cos_lat * self._cos_lon + q * self._cos_lat * self._sin_lon) / (a * a)
-                + z * self._sin_lat / (b * b)
-            )
-            if slope <= 0:
-                break
-            step = f / slope
-            up -= step
-            if abs(step) < 1e-6:
-                p, q, z = self._ecef(x, y, up)
-                return (
-                    math.degrees(math.atan2(z, (1 - _E2) * math.hypot(p, q))),
-                    math.degrees(math.atan2(q, p)),
-                )
-        raise ValueError(f"({x:.0f}, {y:.0f}) m is beyond the horizon of the frame at {self.lat}, {self.lon}")
+        p, q, z = self._plane(x, y)
+        u, v, w = self._up
+        # The line through it along the frame's vertical meets the ellipsoid: a quadratic equation in the height.
+        curve = (u * u + v * v) * _PER_A2 + w * w * _PER_B2
+        slope = (p * u + q * v) * _PER_A2 + z * w * _PER_B2
+        over = (p * p + q * q) * _PER_A2 + z * z * _PER_B2 - 1
+        root = slope * slope - curve * over
+        if not root >= 0:
+            raise self._hidden(x, y)
+        up = -over / (slope + math.sqrt(root))
+        p, q, z = p + up * u, q + up * v, z + up * w
+        return math.degrees(math.atan2(z, (1 - _E2) * math.hypot(p, q))), math.degrees(math.atan2(q, p))
 
-    def _ecef(self, east: float, north: float, up: float) -> tuple[float, float, float]:
-        p = (
-            self._origin[0]
-            - self._sin_lon * east
-            - self._sin_lat * self._cos_lon * north
-            + self._cos_lat * self._cos_lon * up
+    def latlon_array(self, xy: Coordinates) -> tuple[Coordinates, Coordinates]:
+        """Degrees north and degrees east, shapes (n,), of points x metres east and y metres north, shape (n, 2).
+
+        Raises:
+            ValueError: a point lies beyond the horizon of the frame.
+        """
+        x, y = xy[:, 0], xy[:, 1]
+        p, q, z = self._plane(x, y)
+        u, v, w = self._up
+        curve = (u * u + v * v) * _PER_A2 + w * w * _PER_B2
+        slope = (p * u + q * v) * _PER_A2 + z * w * _PER_B2
+        over = (p * p + q * q) * _PER_A2 + z * z * _PER_B2 - 1
+        root = slope * slope - curve * over
+        hidden = np.flatnonzero(~(root >= 0))
+        if len(hidden):
+            raise self._hidden(float(x[hidden[0]]), float(y[hidden[0]]))
+        up = -over / (slope + np.sqrt(root))
+        p, q, z = p + up * u, q + up * v, z + up * w
+        return np.degrees(np.arctan2(z, (1 - _E2) * np.hypot(p, q))), np.degrees(np.arctan2(q, p))
+
+    def _hidden(self, x: float, y: float) -> ValueError:
+        return ValueError(f"({x:.0f}, {y:.0f}) m is beyond the horizon of the frame at {self.lat}, {self.lon}")
+
+    def _plane(self, east: Metres, north: Metres) -> tuple[Metres, Metres, Metres]:
+        """Earth-centred coordinates of what lies in the plane that touches the ellipsoid at the origin."""
+        return (
+            self._origin[0] - self._sin_lon * east - self._sin_lat * self._cos_lon * north,
+            self._origin[1] + self._cos_lon * east - self._sin_lat * self._sin_lon * north,
+            self._origin[2] + self._cos_lat * north,
         )
-        q = (
-            self._origin[1]
-            + self._cos_lon * east
-            - self._sin_lat * self._sin_lon * north
-            + self._cos_lat * self._sin_lon * up
-        )
-        return p, q, self._origin[2] + self._cos_lat * north + self._sin_lat * up

@@ -152,15 +152,17 @@ class SpatialIndex:
         """The points nearest to a place, further than `beyond_m` and not further than `within_m`; ordered as by within."""
         radius_m = min(max(_GROWTH * beyond_m, _CELLS_M[0]), within_m)
         while count > 0:
-            slots, distances = self._exactly(point, self._around(point.lat, point.lon, radius_m), radius_m)
-            outside = distances > beyond_m
-            if outside.sum() >= count or radius_m >= within_m:
-                slots, distances = slots[outside], distances[outside]
-                if len(slots) > count:
-                    limit = np.partition(distances, count - 1)[count - 1] + 1e-3
-                    slots, distances = slots[distances <= limit], distances[distances <= limit]
-                return self._ranked(slots, distances)[:count]
-            radius_m = min(_GROWTH * radius_m, within_m)
+            around = self._around(point.lat, point.lon, radius_m)
+            if len(around) >= count or radius_m >= within_m:
+                slots, distances = self._exactly(point, around, radius_m)
+                outside = distances > beyond_m
+                if outside.sum() >= count or radius_m >= within_m:
+                    slots, distances = slots[outside], distances[outside]
+                    if len(slots) > count:
+                        limit = np.partition(distances, count - 1)[count - 1] + 1e-3
+                        slots, distances = slots[distances <= limit], distances[distances <= limit]
+                    return self._ranked(slots, distances)[:count]
+            radius_m = min((_GROWTH if len(around) >= count / 4 else _GROWTH**3) * radius_m, within_m)
         return []
 
     def near_area(self, frame: LocalFrame, shape: BaseGeometry, margin_m: float) -> tuple[list[str], _Floats]:

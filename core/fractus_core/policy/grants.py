@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import shapely
@@ -291,16 +292,23 @@ def _zone(policy: Policy, index: int, name: str, inventory: Inventory) -> Grante
         )
     spec = inventory.zones[name].spec
     try:
-        polygon(LocalFrame.at(middle(spec.area)), spec.area)
+        _outline(spec.area)
     except InvalidObject as error:
         raise InvalidObject(f"Zone {name} spec.area.{error.field}", error.problem) from None
     return GrantedZone(name=name, area=spec.area, altitude=spec.altitude, schedule=spec.schedule)
 
 
-def _distance_m(area: Area, base: Point) -> float:
+@lru_cache(maxsize=256)
+def _outline(area: Area) -> tuple[LocalFrame, shapely.Polygon]:
+    """A zone's area in a frame of its own: every grant asks for the same ones."""
     frame = LocalFrame.at(middle(area))
+    return frame, polygon(frame, area)
+
+
+def _distance_m(area: Area, base: Point) -> float:
+    frame, outline = _outline(area)
     x, y = frame.xy(base.lat, base.lon)
-    return float(polygon(frame, area).distance(shapely.Point(x, y)))
+    return float(outline.distance(shapely.Point(x, y)))
 
 
 def selects(

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 
-from fractus_core.api import Application, Component, Condition, Grant, InvalidObject, component_identity
-from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec, PlannedInstance
+from fractus_core.api import Application, Condition, Grant, InvalidObject
+from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec
 from fractus_core.planning.growth import room_to_grow
 from fractus_core.planning.inventory import Flight, Inventory, Settings
 from fractus_core.planning.plan import Infeasible, plan
@@ -24,8 +22,8 @@ from fractus_operator.children import Children, NameTaken
 from fractus_operator.conditions import Fact, merge
 from fractus_operator.grantor import Grantor
 from fractus_operator.inventory import LiveInventory
-from fractus_operator.kinds import Body, Key, Kind, key_of
-from fractus_operator.labels import CAUSE_ANNOTATION, FINALIZER
+from fractus_operator.kinds import Body, Key, key_of
+from fractus_operator.labels import FINALIZER
 from fractus_operator.missions import (
     Hindered,
     Phase,
@@ -37,9 +35,9 @@ from fractus_operator.missions import (
     replan_reason,
     stuck_nodes,
 )
-from fractus_operator.pods import PodView
 from fractus_operator.reading import SETTLED, Submitted
 from fractus_operator.rides import flights, may_come_along, ride_lost, ride_outcome
+from fractus_operator.rollout import Rollout
 from fractus_operator.store import NotFound, Store, StoreError, Taken
 
 logger = logging.getLogger(__name__)
@@ -47,14 +45,6 @@ logger = logging.getLogger(__name__)
 RESYNC_S = 30.0
 _REFUSALS = frozenset({400, 403, 422})
 """HTTP statuses by which the API server says that it does not want an object: the user should know."""
-
-_HEAD_START_S = 0.5
-"""How long what makes pods goes first at most, where there are new ones: neither a webhook that holds Deployments up nor pods
-that no node takes delay a Grant for longer."""
-
-_AFTER = (kinds.GRANT, kinds.SERVICE, kinds.ENDPOINT_SLICE)
-"""What is made once the pods have their nodes, so that it does not take the API server from the scheduler: begun in this
-order. A pod starts without it, which takes longer, but can call nothing before it has its Grant."""
 
 _OPTIONAL = frozenset({"NodeCordoned", "NodesAppeared"})
 """Reasons for a new plan that can do without: what runs goes on where there is no other."""
@@ -94,11 +84,11 @@ class Deployments:
     ) -> None:
         self._store = store
         self._live = live
-        self._authority = authority
         self._clock = clock
         self._settings = settings or Settings()
         self._grantor = Grantor(authority, clock)
         self._children = Children(store, live, self._grantor)
+        self._rollout = Rollout(self._children, live, authority, clock)
         self._memories: dict[Key, _Memory] = {}
         self._torn_down: set[str] = set()
 
@@ -282,7 +272,7 @@ class Deployments:
         try:
             # One look at the pods for all that is said of them.
             pods = self._live.pods_of(key)
-            await self._deploy(application, decided, grants, pods)
+            await self._rollout.carry_out(application, decided, grants, pods)
         except NameTaken as error:
             raise Hindered("Pending", "Deployed", "NameTaken", str(error), again_s=2.0) from error
         except StoreError as error:
@@ -302,7 +292,7 @@ class Deployments:
         key, uid, now = application.key, application.metadata.uid or "", self._clock()
         previous = self._live.plan_of(key, uid)
         stuck, again_s = stuck_nodes(previous, self._live.pods_of(key), now)
-        aloft = self._aloft(previous)
+        aloft = self._live.aloft(previous)
         stuck = {node: why for node, why in stuck.items() if node != aloft}
         memory.excluded = {n: (until, why) for n, (until, why) in memory.excluded.items() if until > now}
         memory.excluded |= {node: (now + EXCLUSION, why) for node, why in stuck.items()}
@@ -333,101 +323,6 @@ class Deployments:
         present = self._live.plan_of(key, application.metadata.uid or "")
         flown = (host for host in self._live.flown() if host.application.key != key)
         return flights(flown, self._live.depots_by_name(), self._settings.safety_radius_m, present)
-
-    def _aloft(self, decided: DeploymentPlanSpec | None) -> str | None:
-        """The drone of a plan, while it flies."""
-        drone = _flies(decided) if decided is not None else None
-        return drone if drone is not None and self._live.in_the_air(drone) else None
-
-    async def _deploy(
-        self,
-        application: Application,
-        decided: DeploymentPlanSpec,
-        grants: tuple[GrantSpec, ...],
-        pods: Sequence[PodView],
-    ) -> None:
-        """Make the children what the plan says: the plan first, then what is stale goes, then the Deployments and the rest."""
-        wanted: dict[Kind, list[Body]] = {kind: [] for kind in kinds.CHILDREN}
-        wanted[kinds.DEPLOYMENT_PLAN] = [builders.deployment_plan(application, decided)]
-        wanted[kinds.GRANT] = [builders.grant(application, spec) for spec in grants]
-        for component in _with_service(application):
-            wanted[kinds.SERVICE].append(builders.service(application, component))
-            if component.placement == "hybrid":
-                instances = builders.base_instances(decided, component)
-                bases = [pod for pod in pods if pod.instance in instances]
-                wanted[kinds.ENDPOINT_SLICE].append(builders.endpoint_slice(application, component, bases))
-        for placed in decided.placements:
-            drone = self._live.drones.get(("", placed.node)) if placed.node is not None else None
-            wanted[kinds.DEPLOYMENT].append(builders.deployment(application, placed, drone))
-        secrets = {builders.secret_name(placed.instance): placed for placed in decided.placements}
-        # The plan before all else: it tells, also after a crash, who flies the drone and who comes along.
-        await self._children.apply(application, {kinds.DEPLOYMENT_PLAN: wanted[kinds.DEPLOYMENT_PLAN]})
-        await self._children.prune(application, wanted, keep_secrets=secrets.keys())
-        wanted[kinds.DEPLOYMENT] = [body for body in wanted[kinds.DEPLOYMENT] if not self._in_the_air(body, decided)]
-        standing = [body for body in wanted[kinds.GRANT] if self._is_there(kinds.GRANT, body)]
-        new = [body for body in wanted[kinds.GRANT] if body not in standing]
-        waits = not all(self._is_there(kinds.DEPLOYMENT, body) for body in wanted[kinds.DEPLOYMENT])
-        rules = self._live.rules_revision
-        # What is granted already may have to shrink: it waits for nothing.
-        first = {kinds.GRANT: standing, kinds.DEPLOYMENT: wanted[kinds.DEPLOYMENT]}
-        made = asyncio.ensure_future(self._children.apply(application, first))
-
-        async def beside() -> None:
-            await asyncio.wait({made}, timeout=_HEAD_START_S)
-            certificates = [self._certificate(application, placed) for placed in secrets.values()]
-            await self._children.apply(application, {kinds.SECRET: certificates})
-
-        async def after() -> None:
-            if waits:
-                await self._scheduled(application.key, decided, made)
-            # Rules that changed meanwhile are in no Grant that was compiled before: the next look makes those.
-            granted = new if rules == self._live.rules_revision else []
-            await self._children.apply(application, {**{kind: wanted[kind] for kind in _AFTER}, kinds.GRANT: granted})
-
-        # Nothing is written any more when the next look begins; and an object in the way of one stops no other.
-        for result in await asyncio.gather(made, beside(), after(), return_exceptions=True):
-            if isinstance(result, BaseException):
-                raise result
-
-    def _is_there(self, kind: Kind, body: Body) -> bool:
-        return self._live.children[kind].get(key_of(body)) is not None
-
-    async def _scheduled(self, key: Key, decided: DeploymentPlanSpec, made: asyncio.Future[None]) -> None:
-        """Wait until every pod of a plan has its node, or will get none: the head start at most, and never when rules change."""
-        rules = self._live.rules_revision
-        with self._live.subscription(key) as inputs, contextlib.suppress(TimeoutError):
-            made.add_done_callback(lambda _: inputs.wake())
-            async with asyncio.timeout(_HEAD_START_S):
-                while rules == self._live.rules_revision and not (made.done() and made.exception()):
-                    nodes = Counter(pod.instance for pod in self._live.pods_of(key) if pod.node is not None)
-                    if all(nodes[placed.instance] >= placed.replicas for placed in decided.placements):
-                        return
-                    await inputs.changed(_HEAD_START_S)
-
-    def _in_the_air(self, desired: Body, decided: DeploymentPlanSpec) -> bool:
-        """Whether a Deployment is left alone: its drone flies, and its owner has asked for no change.
-
-        So no upgrade of the operator, which may build pods in another way, restarts a driver in flight.
-        """
-        drone = self._aloft(decided)
-        observed = self._live.children[kinds.DEPLOYMENT].get(key_of(desired))
-        if drone is None or observed is None:
-            return False
-        cause = str(desired["metadata"]["annotations"][CAUSE_ANNOTATION])
-        present = (observed["metadata"].get("annotations") or {}).get(CAUSE_ANNOTATION)
-        return cause == present and cause.rpartition("@")[2] == drone
-
-    def _certificate(self, application: Application, placed: PlannedInstance) -> Body:
-        """The Secret of an instance: the present certificate while it is good, so that a restart renews nothing."""
-        namespace, name = application.key
-        identity = component_identity(namespace, name, placed.component, placed.instance)
-        place = (namespace, builders.secret_name(placed.instance))
-        observed = self._live.children[kinds.SECRET].get(place)
-        data = dict((observed or {}).get("data") or {})
-        now = self._clock()
-        if not self._authority.still_good(data, identity, now):
-            data = self._authority.issue_component(identity, now)
-        return builders.tls_secret(application, placed, data)
 
     async def _clear(self, key: Key) -> bool:
         """Remove what a mission that is over leaves, but the plan; True if there was anything."""
@@ -498,10 +393,6 @@ class Deployments:
 
 def _flies(decided: DeploymentPlanSpec) -> str | None:
     return decided.drone.node if decided.drone is not None else None
-
-
-def _with_service(application: Application) -> Iterator[Component]:
-    return (c for c in application.spec.components if c.container.ports)
 
 
 def _worth_telling(news: tuple[Fact, ...]) -> Iterator[Fact]:

@@ -238,6 +238,11 @@ class LiveInventory:
         drone = self.drones.get(("", node))
         return is_flying(drone) if drone is not None else node in self._aloft
 
+    def aloft(self, plan: DeploymentPlanSpec | None) -> str | None:
+        """The drone of a plan, while it flies."""
+        drone = plan.drone.node if plan is not None and plan.drone is not None else None
+        return drone if drone is not None and self.in_the_air(drone) else None
+
     def pods_of(self, key: Key) -> list[PodView]:
         """The pods of an application."""
         return list(self._pods.get(_place(key), {}).values())

@@ -126,6 +126,11 @@ def test_with_nothing_changed_nothing_is_written(world: World, operator: Operato
     world.api.merge("/api/v1/nodes/cloud-1", {"metadata": {"labels": {"some": "label"}}})
     wait_for(lambda: _geohash(world, "edge-1"), "the node's label")
     after = versions(world, namespace)
+    stored = world.api.get(world.path(traffic(namespace)))
+    assert stored is not None
+    assert not [name for name in stored["metadata"].get("annotations", {}) if "kopf" in name], (
+        "each is a write of its own"
+    )
     # The depot's radius is part of the drone's corridor: its grants follow, and nothing else.
     changed = {name for name in before if before[name] != after[name]}
     assert changed <= {f"grants/{namespace}.traffic-navigator", f"grants/{namespace}.traffic-aerial-viewer"}

@@ -5,11 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gzip
+import json
 import ssl
 from collections.abc import AsyncIterator
+from pathlib import Path
 
 import httpx2
 import pytest
+from fractus_operator.store import Store
 from fractus_operator.transport import AiohttpTransport
 
 HEAD = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\n"
@@ -130,3 +133,28 @@ async def test_a_request_that_is_given_up_leaves_no_connection() -> None:
         with pytest.raises(asyncio.CancelledError):
             await request
         await server.gone.wait()
+
+
+@pytest.mark.parametrize(("proxy", "ours"), [(None, True), ("http://127.0.0.1:9", False)])
+async def test_a_proxy_of_the_environment_is_left_to_httpx2(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, proxy: str | None, ours: bool
+) -> None:
+    """aiohttp below knows nothing of it."""
+    for name in ("http_proxy", "https_proxy", "all_proxy", "no_proxy"):
+        monkeypatch.delenv(name, raising=False)
+        monkeypatch.delenv(name.upper(), raising=False)
+    if proxy is not None:
+        monkeypatch.setenv("HTTPS_PROXY", proxy)
+    config = {
+        "apiVersion": "v1", "kind": "Config", "current-context": "c",
+        "clusters": [{"name": "c", "cluster": {"server": "https://127.0.0.1:1"}}],
+        "users": [{"name": "u", "user": {"token": "t"}}],
+        "contexts": [{"name": "c", "context": {"cluster": "c", "user": "u"}}],
+    }  # fmt: skip
+    (tmp_path / "config").write_text(json.dumps(config))
+    monkeypatch.setenv("KUBECONFIG", str(tmp_path / "config"))
+    store = Store.connect()
+    try:
+        assert isinstance(store._client._transport, AiohttpTransport) is ours
+    finally:
+        await store.close()

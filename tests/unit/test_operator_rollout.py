@@ -1,0 +1,202 @@
+"""In which order a plan becomes objects, and what waits for what."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import defaultdict
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+import yaml
+from fractus_core.api import Application
+from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_operator import builders, kinds, rollout
+from fractus_operator.inventory import Subscription
+from fractus_operator.kinds import Body, Key, Kind
+from fractus_operator.rollout import Rollout
+from fractus_operator.store import StoreError
+
+INPUT = yaml.safe_load((Path(__file__).parents[1] / "golden" / "operator" / "input.yaml").read_text())
+APPLICATION = Application.from_body(INPUT["application"])
+PLAN = DeploymentPlanSpec.model_validate(INPUT["plan"])
+PLACED = PLAN.model_copy(update={"placements": PLAN.placements[:2], "drone": None})
+NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
+
+
+class Pods(list[SimpleNamespace]):
+    """The pods that the watch has shown."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.news = Subscription()
+
+    def bound(self, *instances: str) -> None:
+        """Show that these have a node now."""
+        self += [SimpleNamespace(instance=instance, node="n1") for instance in instances]
+        self.news.wake()
+
+
+def live() -> Any:
+    pods = Pods()
+    children: defaultdict[Kind, dict[Key, Body]] = defaultdict(dict)
+    return SimpleNamespace(
+        children=children,
+        drones={},
+        aloft=lambda _plan: None,
+        pods=pods,
+        rules_revision=0,
+        pods_of=lambda _key: pods,
+        subscription=lambda _key: contextlib.nullcontext(pods.news),
+    )
+
+
+async def test_only_what_is_urgent_ends_a_rest() -> None:
+    news = Subscription()
+    news.wake()
+    assert await news.changed(20.0)
+    resting = asyncio.create_task(news.rest(20.0))
+    await turns()
+    news.wake()
+    await turns()
+    assert not resting.done()
+    news.wake(urgent=True)
+    async with asyncio.timeout(10.0):
+        await resting
+    assert await news.changed(20.0)
+    news.wake(urgent=True)
+    assert await news.changed(20.0)
+    async with asyncio.timeout(10.0):
+        await news.rest(20.0)
+    resting = asyncio.create_task(news.rest(20.0))
+    await turns()
+    assert not resting.done(), "an urgent change ends one rest"
+    resting.cancel()
+    await asyncio.gather(resting, return_exceptions=True)
+
+
+class Recorder:
+    """The children of an application, as the one that deploys asks for them."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+        self.refused: Kind | None = None
+        self.hanging: Kind | None = None
+        self.gave_up = False
+        self.granted = asyncio.Event()
+
+    async def apply(self, _application: Application, wanted: dict[Kind, Any], *_: object) -> None:
+        for _turn in range(5):
+            await asyncio.sleep(0)
+        if self.hanging in wanted:
+            try:
+                await asyncio.Event().wait()
+            finally:
+                self.gave_up = True
+        self.said += [f"apply {kind.name}" for kind, bodies in wanted.items() if bodies]
+        if kinds.GRANT in wanted:
+            self.granted.set()
+        if self.refused in wanted:
+            raise StoreError(422, "Invalid", "no")
+
+    async def prune(self, *_: object, **_more: object) -> None:
+        self.said.append("prune")
+
+
+@dataclass
+class Scene:
+    """One application to deploy, with a Grant that is there and one that is new."""
+
+    one: Rollout
+    recorder: Recorder
+    live: Any
+
+    async def deploy(self) -> None:
+        async with asyncio.timeout(20.0):
+            await self.one.carry_out(APPLICATION, PLACED, cast(Any, ("there", "new")), ())
+
+
+@pytest.fixture
+def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
+    monkeypatch.setattr(builders, "grant", lambda _application, name: kinds.GRANT.header(name))
+    monkeypatch.setattr(rollout, "_HEAD_START_S", 15.0)
+    inventory = live()
+    inventory.children[kinds.GRANT]["", "there"] = kinds.GRANT.header("there")
+    authority = SimpleNamespace(
+        certificate=SimpleNamespace(not_valid_before_utc=NOW), still_good=lambda *_: True, issue_component=None
+    )
+    recorder = Recorder()
+    one = Rollout(cast(Any, recorder), inventory, cast(Any, authority), lambda: NOW)
+    return Scene(one, recorder, inventory)
+
+
+FIRST = ["apply DeploymentPlan", "prune", "apply Grant", "apply Deployment"]
+
+
+async def turns() -> None:
+    for _ in range(50):
+        await asyncio.sleep(0)
+
+
+async def test_what_no_pod_waits_for_is_made_once_every_pod_has_its_node(scene: Scene) -> None:
+    under_way = asyncio.create_task(scene.deploy())
+    await turns()
+    scene.live.pods.bound(PLACED.placements[0].instance)
+    await turns()
+    assert scene.recorder.said == [*FIRST, "apply Secret"]
+    scene.live.pods.bound(*[PLACED.placements[1].instance] * PLACED.placements[1].replicas)
+    await under_way
+    assert scene.recorder.said[5:7] == ["apply Grant", "apply Service"]
+
+
+async def test_pods_that_no_node_takes_hold_up_no_grant(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rollout, "_HEAD_START_S", 0.05)
+    await scene.deploy()
+    assert scene.recorder.said[4:6] == ["apply Secret", "apply Grant"]
+
+
+async def test_rules_that_change_meanwhile_are_in_the_grants_of_the_next_look(scene: Scene) -> None:
+    under_way = asyncio.create_task(scene.deploy())
+    await turns()
+    scene.live.rules_revision += 1
+    scene.live.pods.news.wake()
+    await under_way
+    assert scene.recorder.said.count("apply Grant") == 1
+    assert "apply Service" in scene.recorder.said
+
+
+async def test_where_nothing_is_new_nothing_waits(scene: Scene) -> None:
+    for placed in PLACED.placements:
+        body = builders.deployment(APPLICATION, placed, None)
+        scene.live.children[kinds.DEPLOYMENT][kinds.key_of(body)] = body
+    await scene.deploy()
+    assert scene.recorder.said.count("apply Grant") == 2
+
+
+@pytest.mark.parametrize(("refused", "grants"), [(kinds.DEPLOYMENT, 2), (kinds.SERVICE, 2), (kinds.DEPLOYMENT_PLAN, 0)])
+async def test_a_refused_deployment_stops_no_grant_but_a_refused_plan_all(
+    scene: Scene, refused: Kind, grants: int
+) -> None:
+    scene.recorder.refused = refused
+    if refused is kinds.SERVICE:
+        scene.live.pods.bound(*(p.instance for p in PLACED.placements for _ in range(p.replicas)))
+    with pytest.raises(StoreError, match="no"):
+        await scene.deploy()
+    assert scene.recorder.said.count("apply Grant") == grants
+
+
+async def test_deployments_that_hang_hold_up_no_grant(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rollout, "_HEAD_START_S", 0.05)
+    scene.recorder.hanging = kinds.DEPLOYMENT
+    stuck = asyncio.create_task(scene.deploy())
+    async with asyncio.timeout(20.0):
+        await scene.recorder.granted.wait()
+    assert not stuck.done()
+    stuck.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await stuck
+    assert scene.recorder.gave_up, "nothing is written any more when the next look begins"

@@ -10,10 +10,11 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import shapely
 from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled import compile_grant
-from fractus_core.policy.values import Airframe, Home, TakeoffArgs
+from fractus_core.policy.values import Airframe, GotoArgs, Home, TakeoffArgs
 from fractus_services.grants import Held
 from fractus_services.mobility.autopilot import Autopilot
 from fractus_services.mobility.chauffeur import Chauffeur
@@ -427,3 +428,11 @@ def touring(*policies: dict[str, Any], tour: tuple[tuple[float, float], ...], **
 
 def _place(x: float, y: float, alt: float = 12.0) -> dict[str, float]:
     return dict(zip(("lat", "lon", "alt"), (*at(x, y), alt), strict=True))
+
+
+def goto(x: float, y: float, alt: float = 10.0, **more: Any) -> GotoArgs:
+    return GotoArgs(*at(x, y), alt, **more)
+
+
+def clear_m(world: World, *box: float) -> float:
+    return float(min(shapely.box(*box).distance(shapely.Point(x, y)) for x, y, _ in world.plane.trace))

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from fractus_core.api.plans import GrantSpec
 from fractus_core.policy.values import Airframe, TakeoffArgs
+from fractus_services.mobility.autopilot import AutopilotError
 from fractus_services.mobility.failsafes import Checked
 from fractus_services.mobility.observer import Observer
 from fractus_services.mobility.vehicle import BRAKE
@@ -134,5 +135,58 @@ def test_a_link_that_comes_back_in_flight_leaves_the_way_home_as_chosen(tmp_path
             assert plane.parameters["FS_GCS_ENABLE"] == 1.0
             assert not control.retraces
             assert world.guard.situation().airframe.accel_mps2 == 1.0
+
+    fly(flight)
+
+
+def test_nothing_arms_without_its_fence(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.drive(held)
+            world.fence.problem = AutopilotError("the autopilot refused the fence: no space")
+            why = await refusal(world.service.arm(held))
+            assert why.verdict.code == "FenceNotRaised"
+            assert "no space" in str(why)
+            assert 400 not in world.plane.commands
+            world.fence.problem = None
+            await world.service.arm(held)
+
+    fly(flight)
+
+
+def test_nothing_arms_far_from_the_home_of_its_grant(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.plane.xy = [60.0, 0.0]
+            held = world.grants.put(spec())
+            await asyncio.sleep(0.2)
+            await world.drive(held)
+            why = await refusal(world.service.arm(held))
+            assert why.verdict.code == "NotAtHome"
+            assert "60 m away" in str(why)
+            assert 400 not in world.plane.commands
+
+    fly(flight)
+
+
+@pytest.mark.parametrize("part", ["journal", "audit"])
+def test_nothing_arms_that_leaves_no_trace(tmp_path: Path, part: str) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.drive(held)
+
+            def full(_data: bytes) -> None:
+                raise OSError(28, "No space left on device")
+
+            if part == "journal":
+                world.journal._write = full  # type: ignore[method-assign]
+            else:
+                world.audit.failure = "cannot write the audit log: No space left on device"
+            why = await refusal(world.service.arm(held))
+            assert why.verdict.code in {"JournalUnavailable", "AuditUnavailable"}
+            assert "No space left" in str(why)
+            assert 400 not in world.plane.commands
 
     fly(flight)

@@ -3,132 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-import errno
-import json
 import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from fractus_core.policy.values import Attitude, CaptureArgs, Lens, Situation
-from fractus_services.audit import AuditLog
+from camera_world import Scene, World, grain, held, private, refusal
+from fractus_core.policy.values import CaptureArgs, Lens
 from fractus_services.camera import service as camera
-from fractus_services.camera.album import Album, AlbumFull, NoSuchImage
 from fractus_services.camera.drivers import CameraFailed, Wanted
-from fractus_services.camera.faces import Box
-from fractus_services.camera.imaging import Pixels, decoded
-from fractus_services.camera.service import MAX_OF_ONE, Body, CameraService
-from fractus_services.camera.shots import Shot
+from fractus_services.camera.service import MAX_OF_ONE
 from fractus_services.camera.shutter import Shutter
 from fractus_services.grants import Held
 from fractus_services.replies import Refused
-from policy_world import FRAME, NOW, at, box, compiled, policy, spec, zone
+from policy_world import FRAME, NOW, at, box, policy, zone
 
 SEEING = Lens(60.0, 60.0, stabilised=True, error_deg=0.0)
-
-
-def private(action: str = "refuse", name: str = "p", **fields: Any) -> dict[str, Any]:
-    return policy(name, "PrivacyControl", "camera", [zone("z", box(-20, -20, 20, 20))], action=action, **fields)
-
-
-class Drone:
-    """Whereabouts that a test moves; they remember what they told."""
-
-    def __init__(self) -> None:
-        self.x, self.y, self.alt, self.yaw = 0.0, 80.0, 10.0, 0.0
-        self.lens: Lens | None = SEEING
-        self.told: list[tuple[float, Situation]] = []
-
-    def situation(self, time_s: float) -> Situation:
-        now = at(
-            self.x, self.y, alt=self.alt, time_s=time_s, lens=self.lens, attitude=Attitude(0, 0, self.yaw, 0, 0)
-        )  # fmt: skip
-        self.told.append((time.monotonic(), now))
-        return now
-
-    def way(self, begun_s: float, time_s: float) -> tuple[Situation, ...]:
-        self.situation(time_s)
-        return tuple(one for told_at, one in self.told if told_at >= begun_s)
-
-    async def run(self) -> None:
-        """Nothing to follow."""
-
-
-class Scene:
-    """A camera that shows noise, and lets a test act during the exposure."""
-
-    def __init__(self) -> None:
-        self.latency_s = 0.0
-        self.taken: list[Wanted] = []
-        self.during: Callable[[], None] = lambda: None
-        self._begun = threading.Event()
-
-    async def begun(self) -> None:
-        assert await asyncio.to_thread(self._begun.wait, 10)
-
-    def capture(self, wanted: Wanted) -> Pixels:
-        self.taken.append(wanted)
-        self._begun.set()
-        self.during()
-        noise = np.random.default_rng(1).integers(0, 256, (wanted.height, wanted.width, 3))
-        return noise.astype(np.uint8)
-
-    def close(self) -> None:
-        """Nothing to let go of."""
-
-
-class Finder:
-    """A detector that finds what a test says."""
-
-    name = "test"
-    least_px = 40.0
-
-    def __init__(self) -> None:
-        self.boxes: list[Box] = []
-
-    def find(self, picture: Pixels, smallest_px: float, *, upright: bool) -> list[Box]:
-        assert smallest_px >= self.least_px
-        assert not upright
-        return self.boxes
-
-
-def held(*policies: dict[str, Any], uid: str = "u1", instance: str = "app-navigator") -> Held:
-    fields: dict[str, Any] = {
-        "application": {"namespace": "default", "name": "app", "uid": uid},
-        "instance": instance,
-        "services": [{"service": "camera", "methods": ["CaptureImage", "RetrieveImage", "ListImages", "DeleteImage"]}],
-    }
-    chosen = policies or (private(),)
-    return Held(uid, "g", spec(*chosen, **fields), compiled(*chosen, **fields))
-
-
-class World:
-    """A service with all that it stands on."""
-
-    def __init__(self, directory: Path, resolution: tuple[int, int] = (64, 64)) -> None:
-        self.directory = directory / "album"
-        self.drone, self.scene, self.finder = Drone(), Scene(), Finder()
-        self.shutter = Shutter(self.scene, timeout_s=5.0)
-        self.audit = AuditLog(directory / "audit.jsonl", lambda: NOW)
-        self.album = Album(self.directory, 50, 10**9)
-        self.service = CameraService(
-            self.drone, self.shutter, Body(resolution), detector=self.finder, album=self.album, audit=self.audit,
-            clock=lambda: NOW,
-        )  # fmt: skip
-
-    async def capture(self, grant: Held, **size: int) -> Shot:
-        return (await self.service.capture(grant, CaptureArgs(**size)))[1]
-
-    async def pixels(self, grant: Held, shot: Shot) -> Pixels:
-        source = (await self.service.retrieve(grant, shot.name))[2]
-        return decoded(source if isinstance(source, bytes) else source.read_bytes())
-
-    def stored(self, grant: Held, shot: Shot) -> Pixels:
-        return decoded(self.album.path(camera.owner_of(grant), shot.name).read_bytes())
 
 
 @pytest.fixture
@@ -136,17 +29,6 @@ def world(tmp_path: Path) -> Iterator[World]:
     world = World(tmp_path)
     yield world
     world.shutter.close()
-
-
-async def refusal(work: Any) -> str:
-    with pytest.raises(Refused) as caught:
-        await work
-    return caught.value.verdict.code
-
-
-def grain(picture: Pixels) -> float:
-    """How much neighbouring pixels differ."""
-    return float(np.abs(np.diff(picture.astype(float), axis=1)).mean())
 
 
 async def test_a_drone_that_flies_over_private_ground_during_the_exposure_keeps_no_picture(world: World) -> None:
@@ -431,92 +313,3 @@ async def test_a_driver_that_breaks_does_not_take_the_service_along(world: World
 
 
 # The album
-
-
-async def test_the_album_forgets_what_a_crash_left_and_makes_room(tmp_path: Path) -> None:
-    world = World(tmp_path)
-    shot = await world.capture(held())
-    folder = next(path for path in world.directory.iterdir() if path.is_dir())
-    (folder / "20260101000000000-0001.jpg").write_bytes(b"half")
-    (folder / "20260101000000000-0002.jpg.new").write_bytes(b"half")
-    (folder / "20260101000000000-0003.json").write_text('{"name": "old"}')
-    album = Album(world.directory, 50, 10**9)
-    assert [s.name for s in album.list(camera.owner_of(held()))] == [shot.name]
-    assert len(list(folder.glob("*.jpg*"))) == 1
-    assert album.list(camera.owner_of(held())) == (shot,), "a shot survives its record"
-
-    living = [camera.owner_of(held(instance="other"))]
-    small = Album(world.directory, 50, 10**9, 1000, lambda: living)
-    assert small.room(living[0]) == "", "pictures of those who are gone make room"
-    assert not folder.exists()
-    small.add(living[0], replace(shot, name="20260101000000000-0009.jpg"), b"x" * 2000)
-    assert "--keep-total-mb" in small.room(living[0])
-    world.shutter.close()
-
-
-async def test_a_picture_whose_record_is_damaged_is_removed_and_never_handed_out(tmp_path: Path) -> None:
-    world = World(tmp_path)
-    owner, shots = camera.owner_of(held()), [await world.capture(held()) for _ in range(5)]
-    records = [world.album.path(owner, shot.name).with_suffix(".json") for shot in shots]
-    body = json.loads(records[0].read_text())
-    poses = body.pop("poses")
-    records[0].write_text(json.dumps({**body, "poses": poses, "colour": "red"}))
-    records[1].write_text("{")
-    records[2].write_text(json.dumps({**body, "poses": []}))
-    records[3].write_text(json.dumps({**body, "poses": [{**poses[0], "lat": float("nan")}]}))
-    for shot in shots[:4]:
-        with pytest.raises(NoSuchImage, match=r"damaged.*DeleteImage"):
-            await world.service.retrieve(held(), shot.name)
-    assert world.album.list(owner) == (shots[4],)
-    await world.service.delete(held(), shots[0].name)
-    assert not records[0].with_suffix(".jpg").exists()
-    with pytest.raises(NoSuchImage, match="there is no picture"):
-        await world.service.delete(held(), shots[0].name)
-    assert Album(world.directory, 50, 10**9).list(owner) == (shots[4],)
-    assert [path.name for path in world.directory.glob("*/*.jpg")] == [shots[4].name]
-    world.shutter.close()
-
-
-async def test_a_picture_of_an_earlier_release_was_taken_nobody_knows_where(tmp_path: Path) -> None:
-    world = World(tmp_path)
-    shot = await world.capture(held())
-    record = world.album.path(camera.owner_of(held()), shot.name).with_suffix(".json")
-    body = json.loads(record.read_text())
-    poses = body.pop("poses")
-    record.write_text(json.dumps({**body, "face_px": 900.0, "before": poses[0], "after": poses[-1]}))
-    world.service._album = Album(world.directory, 50, 10**9)
-    (kept,) = (await world.service.list(held()))[1]
-    assert (kept.name, kept.poses[0].lat, kept.face_px) == (shot.name, None, 0.0)
-    assert await refusal(world.service.retrieve(held(), shot.name)) == "PrivacyZone", "every policy in force holds"
-    verdict, _, _ = await world.service.retrieve(held(private("black")), shot.name)
-    assert verdict.policies == ("p",)
-    world.shutter.close()
-
-
-async def test_a_full_disk_is_said_and_leaves_nothing_behind(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(_file: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as broken:
-        broken.setattr("fractus_services.camera.album.os.fsync", full)
-        with pytest.raises(OSError, match="No space left") as caught:
-            await world.capture(held())
-    refused = camera.known(caught.value)
-    assert refused is not None
-    assert (refused.status.name, refused.verdict.code) == ("RESOURCE_EXHAUSTED", "StorageFailed")
-    assert "make room on the node" in refused.verdict.reason
-    assert [path for path in world.directory.rglob("*") if path.is_file()] == []
-    await world.capture(held())
-
-
-async def test_a_full_album_says_what_to_do(tmp_path: Path) -> None:
-    world = World(tmp_path)
-    world.album._keep = 1
-    await world.capture(held())
-    with pytest.raises(AlbumFull, match="DeleteImage") as caught:
-        await world.capture(held())
-    refused = camera.known(caught.value)
-    assert refused is not None
-    assert refused.status.name == "RESOURCE_EXHAUSTED"
-    await world.capture(held(instance="other"))
-    world.shutter.close()

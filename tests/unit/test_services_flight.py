@@ -1,4 +1,4 @@
-"""How the mobility service flies: around zones, home, for passengers, at setpoints, and what it does not fly any more."""
+"""How the mobility service flies: around zones, home, for passengers, and what it does not fly any more."""
 
 from __future__ import annotations
 
@@ -6,27 +6,17 @@ import asyncio
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
-import shapely
-from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, VelocityArgs, Verdict
+from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, Verdict
 from fractus_services.grants import Held
 from fractus_services.mobility.autopilot import AutopilotError
 from fractus_services.mobility.leases import State
 from fractus_services.mobility.vehicle import GUIDED, LAND, RTL, SMART_RTL
 from fractus_services.replies import Refused
-from mobility_world import World, at, end, fly, partial, refusal, spec, touring, zone
+from mobility_world import World, clear_m, end, fly, goto, partial, refusal, spec, touring, zone
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
-
-
-def clear_m(world: World, *box: float) -> float:
-    return float(min(shapely.box(*box).distance(shapely.Point(x, y)) for x, y, _ in world.plane.trace))
-
-
-def goto(x: float, y: float, alt: float = 10.0, **more: Any) -> GotoArgs:
-    return GotoArgs(*at(x, y), alt, **more)
 
 
 # The system's ways
@@ -282,91 +272,6 @@ def test_a_tour_waits_while_a_driver_has_the_drone(tmp_path: Path) -> None:
 # Setpoints
 
 
-def test_a_setpoint_runs_out(tmp_path: Path) -> None:
-    async def flight() -> None:
-        async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            _, flown = await world.service.set_velocity(held, VelocityArgs(4.0, 0.0, hold_s=1.0))
-            assert flown.north_mps == 4.0
-            await asyncio.sleep(0.9)
-            assert world.plane.velocity[1] > 1.5
-            await world.until(lambda: abs(world.plane.velocity[1]) < 0.1, 10)
-            assert world.control.motion is None
-            assert world.control.controller == held.identity
-            assert world.plane.xy[1] < 15
-
-    fly(flight)
-
-
-def test_setpoints_that_follow_each_other_fly_on(tmp_path: Path) -> None:
-    async def flight() -> None:
-        async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            for _ in range(50):
-                await world.service.set_velocity(held, VelocityArgs(3.0, 1.0, -0.5, hold_s=0.5))
-                await asyncio.sleep(0.1)
-            assert world.plane.velocity == pytest.approx([1.0, 3.0], abs=0.1)
-            assert world.plane.height > 11
-            assert world.plane.commands.count(84) > 40
-
-    fly(flight)
-
-
-def test_a_setpoint_toward_a_zone_is_not_flown_into_it(tmp_path: Path) -> None:
-    async def flight() -> None:
-        async with World(tmp_path) as world:
-            held = world.grants.put(spec(zone("no-fly", "ignore", -50, 30, 50, 60)))
-            await world.up(held)
-            refused = 0
-            for _ in range(120):
-                try:
-                    await world.service.set_velocity(held, VelocityArgs(8.0, 0.0, hold_s=1.0))
-                except Exception as error:
-                    refused += 1
-                    assert "no-fly" in str(error)
-                await asyncio.sleep(0.2)
-            assert refused > 50
-            assert clear_m(world, -50, 30, 50, 60) > 0.5
-            assert world.control.controller == held.identity
-
-    fly(flight)
-
-
-def test_a_goto_ends_setpoints_and_setpoints_end_a_goto(tmp_path: Path) -> None:
-    async def flight() -> None:
-        async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            flying = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 100), 0)))
-            await world.until(lambda: world.plane.velocity[1] > 3)
-            await world.service.set_velocity(held, VelocityArgs(0.0, 3.0, hold_s=2.0))
-            assert (await flying).verdict.code == "Replaced"
-            await end(world.service.goto(held, goto(30, 30), 0))
-            await asyncio.sleep(5)
-            assert math.dist(world.plane.xy, (30, 30)) < 1.5, "the watchdog of the setpoint is gone"
-
-    fly(flight)
-
-
-def test_a_lost_driver_ends_its_setpoint(tmp_path: Path) -> None:
-    async def flight() -> None:
-        async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            stream = await world.up(held)
-            await world.service.set_velocity(held, VelocityArgs(5.0, 0.0, hold_s=2.0))
-            await asyncio.sleep(0.5)
-            sent = len(world.plane.commands)
-            stream.cancel()
-            await asyncio.sleep(0.5)
-            assert set(world.plane.commands[sent:]) <= {84, 176}
-            await world.until(lambda: abs(world.plane.velocity[1]) < 0.2, 5)
-            assert world.control.controller == "system"
-
-    fly(flight)
-
-
 # Turns, and what is not sent any more
 
 
@@ -500,59 +405,6 @@ async def _begun(world: World, held: Held, args: GotoArgs) -> None:
 
 
 # Arming
-
-
-def test_nothing_arms_without_its_fence(tmp_path: Path) -> None:
-    async def flight() -> None:
-        async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.drive(held)
-            world.fence.problem = AutopilotError("the autopilot refused the fence: no space")
-            why = await refusal(world.service.arm(held))
-            assert why.verdict.code == "FenceNotRaised"
-            assert "no space" in str(why)
-            assert 400 not in world.plane.commands
-            world.fence.problem = None
-            await world.service.arm(held)
-
-    fly(flight)
-
-
-def test_nothing_arms_far_from_the_home_of_its_grant(tmp_path: Path) -> None:
-    async def flight() -> None:
-        async with World(tmp_path) as world:
-            world.plane.xy = [60.0, 0.0]
-            held = world.grants.put(spec())
-            await asyncio.sleep(0.2)
-            await world.drive(held)
-            why = await refusal(world.service.arm(held))
-            assert why.verdict.code == "NotAtHome"
-            assert "60 m away" in str(why)
-            assert 400 not in world.plane.commands
-
-    fly(flight)
-
-
-@pytest.mark.parametrize("part", ["journal", "audit"])
-def test_nothing_arms_that_leaves_no_trace(tmp_path: Path, part: str) -> None:
-    async def flight() -> None:
-        async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.drive(held)
-
-            def full(_data: bytes) -> None:
-                raise OSError(28, "No space left on device")
-
-            if part == "journal":
-                world.journal._write = full  # type: ignore[method-assign]
-            else:
-                world.audit.failure = "cannot write the audit log: No space left on device"
-            why = await refusal(world.service.arm(held))
-            assert why.verdict.code in {"JournalUnavailable", "AuditUnavailable"}
-            assert "No space left" in str(why)
-            assert 400 not in world.plane.commands
-
-    fly(flight)
 
 
 def test_a_journal_that_fails_in_flight_ends_no_flight(tmp_path: Path) -> None:

@@ -1,0 +1,139 @@
+"""A camera service with a drone and a scene that do what a test says."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fractus_core.policy.values import Attitude, CaptureArgs, Lens, Situation
+from fractus_services.audit import AuditLog
+from fractus_services.camera import service as camera
+from fractus_services.camera.album import Album
+from fractus_services.camera.drivers import Wanted
+from fractus_services.camera.faces import Box
+from fractus_services.camera.imaging import Pixels, decoded
+from fractus_services.camera.service import Body, CameraService
+from fractus_services.camera.shots import Shot
+from fractus_services.camera.shutter import Shutter
+from fractus_services.grants import Held
+from fractus_services.replies import Refused
+from policy_world import NOW, at, box, compiled, policy, spec, zone
+
+SEEING = Lens(60.0, 60.0, stabilised=True, error_deg=0.0)
+
+
+def private(action: str = "refuse", name: str = "p", **fields: Any) -> dict[str, Any]:
+    return policy(name, "PrivacyControl", "camera", [zone("z", box(-20, -20, 20, 20))], action=action, **fields)
+
+
+class Drone:
+    """Whereabouts that a test moves; they remember what they told."""
+
+    def __init__(self) -> None:
+        self.x, self.y, self.alt, self.yaw = 0.0, 80.0, 10.0, 0.0
+        self.lens: Lens | None = SEEING
+        self.told: list[tuple[float, Situation]] = []
+
+    def situation(self, time_s: float) -> Situation:
+        now = at(
+            self.x, self.y, alt=self.alt, time_s=time_s, lens=self.lens, attitude=Attitude(0, 0, self.yaw, 0, 0)
+        )  # fmt: skip
+        self.told.append((time.monotonic(), now))
+        return now
+
+    def way(self, begun_s: float, time_s: float) -> tuple[Situation, ...]:
+        self.situation(time_s)
+        return tuple(one for told_at, one in self.told if told_at >= begun_s)
+
+    async def run(self) -> None:
+        """Nothing to follow."""
+
+
+class Scene:
+    """A camera that shows noise, and lets a test act during the exposure."""
+
+    def __init__(self) -> None:
+        self.latency_s = 0.0
+        self.taken: list[Wanted] = []
+        self.during: Callable[[], None] = lambda: None
+        self._begun = threading.Event()
+
+    async def begun(self) -> None:
+        assert await asyncio.to_thread(self._begun.wait, 10)
+
+    def capture(self, wanted: Wanted) -> Pixels:
+        self.taken.append(wanted)
+        self._begun.set()
+        self.during()
+        noise = np.random.default_rng(1).integers(0, 256, (wanted.height, wanted.width, 3))
+        return noise.astype(np.uint8)
+
+    def close(self) -> None:
+        """Nothing to let go of."""
+
+
+class Finder:
+    """A detector that finds what a test says."""
+
+    name = "test"
+    least_px = 40.0
+
+    def __init__(self) -> None:
+        self.boxes: list[Box] = []
+
+    def find(self, picture: Pixels, smallest_px: float, *, upright: bool) -> list[Box]:
+        assert smallest_px >= self.least_px
+        assert not upright
+        return self.boxes
+
+
+def held(*policies: dict[str, Any], uid: str = "u1", instance: str = "app-navigator") -> Held:
+    fields: dict[str, Any] = {
+        "application": {"namespace": "default", "name": "app", "uid": uid},
+        "instance": instance,
+        "services": [{"service": "camera", "methods": ["CaptureImage", "RetrieveImage", "ListImages", "DeleteImage"]}],
+    }
+    chosen = policies or (private(),)
+    return Held(uid, "g", spec(*chosen, **fields), compiled(*chosen, **fields))
+
+
+class World:
+    """A service with all that it stands on."""
+
+    def __init__(self, directory: Path, resolution: tuple[int, int] = (64, 64)) -> None:
+        self.directory = directory / "album"
+        self.drone, self.scene, self.finder = Drone(), Scene(), Finder()
+        self.shutter = Shutter(self.scene, timeout_s=5.0)
+        self.audit = AuditLog(directory / "audit.jsonl", lambda: NOW)
+        self.album = Album(self.directory, 50, 10**9)
+        self.service = CameraService(
+            self.drone, self.shutter, Body(resolution), detector=self.finder, album=self.album, audit=self.audit,
+            clock=lambda: NOW,
+        )  # fmt: skip
+
+    async def capture(self, grant: Held, **size: int) -> Shot:
+        return (await self.service.capture(grant, CaptureArgs(**size)))[1]
+
+    async def pixels(self, grant: Held, shot: Shot) -> Pixels:
+        source = (await self.service.retrieve(grant, shot.name))[2]
+        return decoded(source if isinstance(source, bytes) else source.read_bytes())
+
+    def stored(self, grant: Held, shot: Shot) -> Pixels:
+        return decoded(self.album.path(camera.owner_of(grant), shot.name).read_bytes())
+
+
+async def refusal(work: Any) -> str:
+    with pytest.raises(Refused) as caught:
+        await work
+    return caught.value.verdict.code
+
+
+def grain(picture: Pixels) -> float:
+    """How much neighbouring pixels differ."""
+    return float(np.abs(np.diff(picture.astype(float), axis=1)).mean())

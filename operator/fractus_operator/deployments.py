@@ -256,6 +256,7 @@ class Deployments:
         application = submitted.application
         if application is None:
             raise Hindered("Invalid", "Planned", "Invalid", str(submitted.error))
+        rules = self._live.rules_revision
         inventory = self._live.snapshot(key, submitted.uid, self._flights(key, application))
         try:
             check_application(application, inventory.depots)
@@ -272,7 +273,7 @@ class Deployments:
         try:
             # One look at the pods for all that is said of them.
             pods = self._live.pods_of(key)
-            await self._rollout.carry_out(application, decided, grants, pods)
+            await self._rollout.carry_out(application, decided, grants, pods, rules)
         except NameTaken as error:
             raise Hindered("Pending", "Deployed", "NameTaken", str(error), again_s=2.0) from error
         except StoreError as error:

@@ -45,8 +45,16 @@ class Rollout:
         decided: DeploymentPlanSpec,
         grants: Sequence[GrantSpec],
         pods: Sequence[PodView],
+        rules: int,
     ) -> None:
         """Write the plan, remove what is stale, then make the Deployments and the rest.
+
+        Args:
+            application: Whose plan it is.
+            decided: The plan.
+            grants: What its instances may do.
+            pods: Its pods as they are.
+            rules: The revision of the rules that the grants are made of; no new one is made once there is a later one.
 
         Raises:
             NameTaken: somebody else's object has the name of a child.
@@ -57,7 +65,6 @@ class Rollout:
         # The plan before all else: it tells, also after a crash, who flies the drone and who comes along.
         await self._children.apply(application, {kinds.DEPLOYMENT_PLAN: wanted[kinds.DEPLOYMENT_PLAN]})
         await self._children.prune(application, wanted, keep_secrets=secrets.keys())
-        rules = self._live.rules_revision
         running = [body for body in wanted[kinds.DEPLOYMENT] if not self._in_the_air(body, decided)]
         starts = not all(self._is_there(kinds.DEPLOYMENT, body) for body in running)
         granted = [body for body in wanted[kinds.GRANT] if self._is_there(kinds.GRANT, body)]

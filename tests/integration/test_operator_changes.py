@@ -152,7 +152,10 @@ def test_new_nodes_make_a_plan_grow(world: World, operator: OperatorProcess, nam
     wait_for(lambda: "traffic-ground-viewer-edge-9" in instances(world, namespace, ""), "the new node")
     after = {n: b["metadata"]["uid"] for n, b in world.children(namespace).items()}
     assert before.items() <= after.items()
-    assert deployed(world, namespace, pods=2)["pods"] == "2/2"
+    deployed(world, namespace, pods=2)
+    wait_for(
+        lambda: world.status(namespace)["pods"] == "2/2", lambda: f"both pods to be told: {world.status(namespace)}"
+    )
 
 
 # -- releases --

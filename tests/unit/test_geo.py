@@ -1,5 +1,6 @@
 """The local frame and areas against geodesics and closed forms."""
 
+import itertools
 import math
 
 import numpy as np
@@ -120,3 +121,13 @@ def test_corridor_of_a_path_that_crosses_itself_a_thousand_times_is_the_dilated_
     shape = corridor(frame, points, 7)
     assert shape.covers(whole)
     assert shape.area == pytest.approx(whole.area, rel=2e-3)
+
+
+def test_rings_across_the_antimeridian_stay_closed_and_repeat_no_corner():
+    for lon in (179.9999, -179.9998):
+        for radius in (20.0, 137.3, 900.0):
+            frame = LocalFrame(-41.0, lon)
+            for part in geojson(frame, shapely.Point(3.0, 5.0).buffer(radius))["coordinates"]:
+                for ring in part:
+                    assert ring[0] == ring[-1]
+                    assert all(a != b for a, b in itertools.pairwise(ring))

@@ -117,7 +117,7 @@ class Scene:
 
     async def deploy(self) -> None:
         async with asyncio.timeout(20.0):
-            await self.one.carry_out(APPLICATION, PLACED, cast(Any, ("there", "new")), ())
+            await self.one.carry_out(APPLICATION, PLACED, cast(Any, ("there", "new")), (), 0)
 
 
 @pytest.fixture
@@ -165,6 +165,13 @@ async def test_rules_that_change_meanwhile_are_in_the_grants_of_the_next_look(sc
     scene.live.rules_revision += 1
     scene.live.pods.news.wake()
     await under_way
+    assert scene.recorder.said.count("apply Grant") == 1
+    assert "apply Service" in scene.recorder.said
+
+
+async def test_rules_that_changed_since_grants_were_made_of_them_make_no_new_grant(scene: Scene) -> None:
+    scene.live.rules_revision = 1
+    await scene.deploy()
     assert scene.recorder.said.count("apply Grant") == 1
     assert "apply Service" in scene.recorder.said
 

@@ -10,7 +10,7 @@ from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.motion import stop_point
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs
-from policy_world import FRAME, NOW, altitude, at, box, compiled, exclusion, goto, inclusion, speed
+from policy_world import NOW, altitude, at, box, compiled, exclusion, goto, inclusion, speed
 
 WALL = box(-50, 50, 50, 90)
 
@@ -200,7 +200,7 @@ def test_what_is_permitted_never_alarms(speed_mps: float) -> None:
             x, y, z, east_mps=east, north_mps=north, down_mps=-up, speed_setpoint_mps=speed_mps,
             forward_mps2=fleet.accel[0, 1],
         )  # fmt: skip
-        assert monitor(now, grant, goal=FRAME.latlon(0, 47.4)) is None, (y, north)
+        assert monitor(now, grant) is None, (y, north)
     assert fleet.place[0, 1] == pytest.approx(47.4, abs=0.1)
 
 
@@ -218,16 +218,20 @@ def test_a_zone_that_appears_while_a_drone_speeds_up_stops_it_in_time(appears_s:
     assert fleet.accel[0, 1] > 0.8 * ACCEL
     coasting = stop_point(at(north_mps=fleet.speed[0, 1], forward_mps2=0.0), (0.0, 0.0))[1]
     wall_m = fleet.place[0, 1] + coasting + 16.0
-    grant = compiled(exclusion(box(-50, wall_m, 50, wall_m + 40)))
+    grant = compiled(exclusion(box(-50, wall_m, 50, wall_m + 40), "revoke"))
     looks = 0
     while True:
         x, y, z = fleet.place[0]
         now = at(x, y, z, north_mps=fleet.speed[0, 1], speed_setpoint_mps=12.0, forward_mps2=fleet.accel[0, 1])
-        if monitor(now, grant, goal=FRAME.latlon(0, 300)) is not None:
+        verdict = monitor(now, grant, changed=True)
+        if verdict is not None:
             break
+        assert monitor(now, grant) is None
         fleet.step()
         looks += 1
     assert looks > 2, "there was room to fly on"
+    assert (verdict.action, verdict.takeover) == ("deny", "hover"), "whether it would go in is not sure"
+    assert monitor(now, grant) is None, "on a way that was judged by these fences it has room"
     for _ in range(int(LATENCY_S / STEP_S)):
         fleet.step()
     # Told, as it is by the service, to fly with no velocity.

@@ -61,13 +61,36 @@ def test_a_zone_that_demands_the_drone_ends_the_transit(tmp_path: Path) -> None:
         async with World(tmp_path) as world:
             held = world.grants.put(partial())
             driving = asyncio.ensure_future(world.drive(held))
-            await world.until(lambda: world.plane.xy[1] > 8)
-            world.grants.put(partial(zone("wall", "revoke", *WALL)))
+            await world.until(lambda: world.plane.xy[1] > 16)
+            wall = (-40.0, 40.0, 40.0, 55.0)
+            world.grants.put(partial(zone("wall", "revoke", *wall)))
             await world.until(lambda: not world.plane.vehicle.armed)
             assert world.journal.missions["m1"].outcome.startswith("revoked:")
-            assert clear_m(world, *WALL) > 0.5
+            assert clear_m(world, *wall) > 0.5
             with pytest.raises(Refused, match="about to enter zone wall-zone"):
                 await driving
+
+    fly(flight)
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_a_drone_that_speeds_up_toward_a_new_zone_is_stopped_before_anybody_knows_that_it_will_enter(
+    tmp_path: Path, measured: bool
+) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.plane.measured = measured
+            held = world.grants.put(spec())
+            await world.up(held)
+            going = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 90), 0)))
+            await world.until(lambda: world.plane.xy[1] > 8)
+            assert math.hypot(*world.plane.velocity) < 7, "it still speeds up"
+            world.grants.put(spec(zone("wall", "revoke", *WALL)))
+            why = await going
+            assert (why.verdict.code, why.verdict.action) == ("ExclusionZoneAhead", "deny")
+            await asyncio.sleep(20)
+            assert world.control.hands == "driver", "nothing was in the zone, nor was it going to be"
+            assert clear_m(world, *WALL) > 5
 
     fly(flight)
 

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import math
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fractus_core.policy.engine import judge
+from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import Call, SetSpeedArgs, VelocityArgs
+from fractus_services.mobility import watch as watching
 from fractus_services.mobility.autopilot import AutopilotError
 from fractus_services.mobility.vehicle import GUIDED
+from fractus_services.replies import Refused
 from mobility_world import World, area, clear_m, end, fly, goto, partial, refusal, spec, zone
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
@@ -424,5 +428,65 @@ def test_a_drone_that_loses_its_position_on_the_way_home_flies_on_no_further(tmp
             assert codes == ["PositionUnknown"]
             await world.until(lambda: world.plane.vehicle.mode != GUIDED, 20)
             await world.until(lambda: not world.plane.vehicle.armed)
+
+    fly(flight)
+
+
+# Fences that change
+
+
+@pytest.fixture
+def changed(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """What the monitor is told at each look: whether the drone's way may have been judged by other fences."""
+    told: list[bool] = []
+
+    def look(*args: Any, changed: bool, **more: Any) -> Any:
+        told.append(changed)
+        return monitor(*args, changed=changed, **more)
+
+    monkeypatch.setattr(watching, "monitor", look)
+    return told
+
+
+def test_a_way_that_was_judged_by_earlier_fences_is_looked_at_with_other_eyes(
+    tmp_path: Path, changed: list[bool]
+) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            held = world.grants.put(spec())
+            await world.up(held)
+            going = asyncio.ensure_future(end(world.service.goto(held, goto(0, 90), 1.0)))
+            await world.until(lambda: world.plane.xy[1] > 3)
+            assert not any(changed[-20:]), "it began at rest, by the fences that still hold"
+            held = world.grants.put(spec(zone("far", "ignore", 60, 60, 90, 90)))
+            await asyncio.sleep(0.2)
+            assert changed[-1]
+            await world.service.hover(held)
+            with pytest.raises(Refused):
+                await going
+            assert changed[-1], "it still flies"
+            await world.until(lambda: math.hypot(*world.plane.velocity) < 0.01)
+            await end(world.service.goto(held, goto(0, 40), 1.0))
+            assert not any(changed[-20:])
+
+    fly(flight)
+
+
+def test_a_zone_whose_time_comes_is_a_change(tmp_path: Path, changed: list[bool]) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            begins_s = world.guard.situation().time_s + 60.0
+            begins, ends = (datetime.fromtimestamp(begins_s + 60.0 * more, UTC).strftime("%H:%M") for more in (0, 9))
+            later = zone("later", "ignore", 60, 60, 90, 90)
+            later["zones"][0]["schedule"] = [{"start": begins, "end": ends}]
+            held = world.grants.put(spec(later))
+            await world.up(held)
+            going = asyncio.ensure_future(end(world.service.goto(held, goto(0, 90, speed_mps=1.0), 1.0)))
+            await asyncio.sleep(1.0)
+            assert not changed[-1]
+            await world.until(lambda: changed[-1], 60)
+            assert world.guard.situation().time_s % 60 < 0.5
+            assert world.plane.xy[1] < 60
+            going.cancel()
 
     fly(flight)

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from fractus_core.policy.monitoring import monitor
 from fractus_services.mobility.dialect import message
 from fractus_services.mobility.telemetry import telemetry_of
 from fractus_services.mobility.vehicle import Vehicle
-from mobility_world import World, at, fly, spec, zone
 
 
 def place(vehicle: Vehicle, lat: float, now: float) -> None:
@@ -77,21 +74,3 @@ def test_telemetry_tells_how_old_the_attitude_is() -> None:
 def test_missions_are_for_the_node_alone() -> None:
     assert dict(told(Vehicle(), 0.0, missions=True).missions) == {"uid": "complete"}
     assert not told(Vehicle(), 0.0).missions
-
-
-def test_a_position_that_is_not_fresh_is_judged_by_where_the_drone_may_be_by_now(tmp_path: Path) -> None:
-    """At 8 m/s toward a wall that it can still stop before, half a second ago."""
-
-    async def flight() -> None:
-        async with World(tmp_path) as world:
-            grant = world.grants.put(spec(zone("wall", "ignore", -40.0, 40.0, 40.0, 60.0))).compiled
-            vehicle = world.plane.vehicle
-            vehicle.armed, vehicle.landed_state, vehicle.altitude_m = True, 2, 10.0
-            vehicle.lat, vehicle.lon = at(0.0, 18.0)
-            vehicle.north_mps = 8.0
-            for age_s, stops in ((0.0, False), (0.5, True)):
-                vehicle.position_at = vehicle.landed_at = world.plane.now - age_s
-                verdict = monitor(world.guard.situation(), grant, goal=at(0.0, 200.0))
-                assert (verdict is not None) == stops
-
-    fly(flight)

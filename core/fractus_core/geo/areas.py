@@ -160,7 +160,9 @@ def geojson_line(points: Sequence[Point]) -> dict[str, Any]:
 def _unwrapped(frame: LocalFrame, ring: BaseGeometry) -> list[tuple[float, float]]:
     """Lon, lat of a ring, each longitude within 180 degrees of its neighbour."""
     lats, lons = frame.latlon_array(shapely.get_coordinates(ring))
-    return list(zip(np.unwrap(lons, period=360.0).tolist(), lats.tolist(), strict=True))
+    # By whole turns, which are exact: so the ring stays closed.
+    lons[1:] -= 360.0 * np.cumsum(np.round(np.diff(lons) / 360.0))
+    return list(zip(lons.tolist(), lats.tolist(), strict=True))
 
 
 def _near(lon: float, reference: float) -> float:

@@ -137,12 +137,13 @@ class LocalFrame:
             ValueError: a point lies beyond the horizon of the frame.
         """
         x, y = xy[:, 0], xy[:, 1]
-        p, q, z = self._plane(x, y)
         u, v, w = self._up
-        curve = (u * u + v * v) * _PER_A2 + w * w * _PER_B2
-        slope = (p * u + q * v) * _PER_A2 + z * w * _PER_B2
-        over = (p * p + q * q) * _PER_A2 + z * z * _PER_B2 - 1
-        root = slope * slope - curve * over
+        with np.errstate(invalid="ignore", over="ignore"):
+            p, q, z = self._plane(x, y)
+            curve = (u * u + v * v) * _PER_A2 + w * w * _PER_B2
+            slope = (p * u + q * v) * _PER_A2 + z * w * _PER_B2
+            over = (p * p + q * q) * _PER_A2 + z * z * _PER_B2 - 1
+            root = slope * slope - curve * over
         hidden = np.flatnonzero(~(root >= 0))
         if len(hidden):
             raise self._hidden(float(x[hidden[0]]), float(y[hidden[0]]))

@@ -11,7 +11,7 @@ from shapely.geometry.base import BaseGeometry
 from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Patch
 from fractus_core.policy.fences import TAKEOVERS, breaches
 from fractus_core.policy.limits import Bound, altitude_bounds, speed_bounds, strictest
-from fractus_core.policy.motion import XY, margin_m, moving, rest_ahead, standing, stop_altitude_m, stop_point
+from fractus_core.policy.motion import XY, margin_m, moving, standing, stop_altitude_m, stop_point
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Situation, Verdict
 
 STRAY = 0.3
@@ -25,9 +25,7 @@ DEEPER_M = 0.6
 _RANK = {None: 0, "hover": 1, "returnToLaunch": 2, "land": 3, "revoke": 4}
 
 
-def monitor(
-    now: Situation, grant: CompiledGrant, *, goal: tuple[float, float] | None = None, leaving: bool = False
-) -> Verdict | None:
+def monitor(now: Situation, grant: CompiledGrant, *, leaving: bool = False, changed: bool = False) -> Verdict | None:
     """What the system must do about a flying drone at this moment.
 
     Judged is the way from the present position to where the drone comes to rest if it is told to stop now, with the
@@ -36,9 +34,10 @@ def monitor(
     Args:
         now: the state of the drone.
         grant: whose fences.
-        goal: latitude and longitude at which its motion ends; None where that has no end of its own.
         leaving: whether the system flies the drone already, so that only what gets worse counts: where it is on the wrong
             side of a fence, the system's way leads back.
+        changed: whether other fences may have been in force when the drone's way was judged. A drone that speeds up is
+            faster before it hears of a stop, and nobody has judged whether there is room for that: it is stopped in time.
 
     Returns:
         None when all is well; a takeover; a denial with `hover`, when the motion is to be stopped and the application
@@ -51,15 +50,29 @@ def monitor(
     lat, lon = now.lat, now.lon
     if lat is None or lon is None or not now.sound:
         return Verdict("takeover", None, "PositionUnknown", "the drone's position is unknown", (), "hover")
-    start = grant.frame.xy(lat, lon)
-    stop = rest_ahead(now, start, grant.frame.xy(*goal) if goal is not None else None)
+    start, margin = grant.frame.xy(lat, lon), now.position_error_m + STRAY * now.airframe.tracking_m
+    surging = stop_point(now, start)
+    # A drone that speeds up does so on a way that was judged with room for it, and brakes at its end in time.
+    now = replace(now, forward_mps2=min(now.forward_mps2 or 0.0, 0.0))
+    stop = stop_point(now, start)
     rest_m = stop_altitude_m(now)
-    ahead = _look_ahead(now, start, stop, now.position_error_m + STRAY * now.airframe.tracking_m)
-    found = _fences(now, grant, ahead, leaving=leaving)
-    if found:
-        worst = min(found, key=lambda f: (-_RANK[f[1].takeover if f[1].action == "takeover" else None], -f[0]))[1]
+    worst = _worst(_fences(now, grant, _look_ahead(now, start, stop, margin), leaving=leaving))
+    if worst is not None:
         return replace(worst, brake_first=worst.action == "takeover" and moving(now))
+    if changed and surging != stop:
+        # Its way may end before the fence: it is stopped, and taken over only if it really goes too far.
+        worst = _worst(_fences(now, grant, _look_ahead(now, start, surging, margin), leaving=True))
+        if worst is not None:
+            return replace(worst, action="deny", takeover="hover")
     return _heights(now, grant, start, stop, rest_m) or _speeds(now, grant, start)
+
+
+def _worst(found: list[tuple[int, Verdict]]) -> Verdict | None:
+    """What takes most from the application; of equals what has the highest priority."""
+    ranked = [
+        (-_RANK[v.takeover if v.action == "takeover" else None], -priority, i) for i, (priority, v) in enumerate(found)
+    ]
+    return found[min(ranked)[2]][1] if ranked else None
 
 
 def must_rest(now: Situation, grant: CompiledGrant) -> bool:

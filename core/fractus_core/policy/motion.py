@@ -113,25 +113,6 @@ def stop_point(situation: Situation, at: XY) -> XY:
     return at[0] + situation.east_mps / speed * run, at[1] + situation.north_mps / speed * run
 
 
-def rest_ahead(situation: Situation, at: XY, goal: XY | None) -> XY:
-    """Where a drone under way comes to rest, in frame metres, when it is told to stop now.
-
-    One that speeds up is faster by the time it hears of it. But at its goal it stops of itself, whatever it hears.
-
-    Args:
-        situation: the state of the drone.
-        at: where it is.
-        goal: where its motion ends; None where that has no end of its own.
-    """
-    coasting = stop_point(replace(situation, forward_mps2=min(situation.forward_mps2 or 0.0, 0.0)), at)
-    surging = stop_point(situation, at)
-    least, most = math.dist(at, coasting), math.dist(at, surging)
-    if most <= least:
-        return coasting
-    run = most if goal is None else min(max(math.dist(at, goal), least), most)
-    return at[0] + (surging[0] - at[0]) * run / most, at[1] + (surging[1] - at[1]) * run / most
-
-
 def turn_point(situation: Situation, at: XY, target: XY) -> XY:
     """The corner of the triangle in which a drone turns from its present velocity toward a target.
 

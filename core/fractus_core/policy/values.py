@@ -120,10 +120,6 @@ class Call:
 _CAMERA = frozenset({"CaptureImage", "RetrieveImage", "ListImages", "DeleteImage"})
 
 
-LATENCY_S = 0.3
-"""Time from a decision to its effect on the motion."""
-
-
 @dataclass(frozen=True, slots=True)
 class Home:
     """Where the drone took off and returns to: degrees, and metres above mean sea level."""
@@ -212,7 +208,7 @@ class Situation:
         home: None while it is unknown, and on fixed nodes.
         position_error_m: bound of the horizontal position error.
         altitude_error_m: bound of the vertical position error.
-        latency_s: time from this state to the effect that a decision on it has on the motion.
+        latency_s: time from a decision to its effect on the motion.
         speed_setpoint_mps: horizontal speed that the autopilot flies legs with, or that of the velocity it was told to
             hold, when that is higher: the speed that the present motion tends to.
         forward_mps2: how much the drone speeds up along its course (negative: slows down), from the last velocities; None
@@ -237,7 +233,7 @@ class Situation:
     in_air: bool = False
     position_error_m: float = 1.5
     altitude_error_m: float = 1.0
-    latency_s: float = LATENCY_S
+    latency_s: float = 0.3
     speed_setpoint_mps: float = 5.0
     forward_mps2: float | None = None
     vertical: bool = False

@@ -43,9 +43,8 @@ class Guard:
         speed = self._control.cruise_mps
         motion = self._control.motion
         vertical = motion is not None and motion.kind in {"Takeoff", "Land", "ReturnToLaunch"}
-        age_s = max(autopilot.now - autopilot.vehicle.position_at, 0.0)
-        now = autopilot.vehicle.situation(self._clock(), age_s, airframe, speed, vertical)
-        if age_s <= STALE_S:
+        now = autopilot.vehicle.situation(self._clock(), airframe, speed, vertical)
+        if autopilot.now - autopilot.vehicle.position_at <= STALE_S:
             return now
         return Situation(
             time_s=now.time_s,

@@ -7,7 +7,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
-from fractus_core.policy.values import LATENCY_S, Airframe, Home, Situation
+from fractus_core.policy.values import Airframe, Home, Situation
 
 GUIDED, RTL, LAND, SMART_RTL, BRAKE = 4, 6, 9, 21, 17
 MODE_NAMES = {
@@ -137,8 +137,8 @@ class Vehicle:
         if handler is not None:
             handler(self, message, now)
 
-    def situation(self, time_s: float, age_s: float, airframe: Airframe, speed_mps: float, vertical: bool) -> Situation:
-        """The state as the engine judges it, from a position of some age: so long the drone has flown on since."""
+    def situation(self, time_s: float, airframe: Airframe, speed_mps: float, vertical: bool) -> Situation:
+        """The state as the engine judges it."""
         return Situation(
             time_s=time_s,
             lat=self.lat,
@@ -151,7 +151,6 @@ class Vehicle:
             armed=self.armed,
             in_air=self.in_air,
             position_error_m=self.position_error_m,
-            latency_s=LATENCY_S + age_s,
             speed_setpoint_mps=speed_mps,
             forward_mps2=self.forward_mps2,
             vertical=vertical,

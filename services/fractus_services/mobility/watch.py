@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from dataclasses import replace
 
-from fractus_core.policy.compiled import CompiledGrant
+from fractus_core.policy.compiled import CompiledGrant, Patch
 from fractus_core.policy.monitoring import monitor
-from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Situation, Verdict
+from fractus_core.policy.values import STANDING_MPS, GotoArgs, SetSpeedArgs, Verdict
 
 from fractus_services.audit import AuditLog
 from fractus_services.mobility.autopilot import AutopilotError, Permit
@@ -31,6 +32,9 @@ IDLE_S = 0.5
 RECORD_S = 0.5
 CORRECT_AGAIN_S = 3.0
 
+CHANGED_S = 30.0
+"""So long after the fences changed a drone may still speed up on a way that was judged by those before."""
+
 
 class Watch:
     """Judges the flying drone's present state, and acts on what it finds."""
@@ -42,6 +46,10 @@ class Watch:
         self._supervisor = supervisor
         self._alarm = ""
         self._alarm_at = 0.0
+        self._grant: CompiledGrant | None = None
+        self._timed: tuple[Patch, ...] = ()
+        self._in_force: list[bool] = []
+        self._changed_at = -math.inf
         self._corrections: set[asyncio.Task[None]] = set()
 
     async def run(self) -> None:
@@ -89,20 +97,26 @@ class Watch:
     def _judge(self, grant: CompiledGrant) -> tuple[Verdict | None, bool]:
         """What is wrong, and whether the system flies the drone already, so that there is nobody to take it from."""
         control, now = self._control, self._guard.situation()
-        goal = self._goal(now)
+        changed = self._have_changed(grant, now.time_s)
         if control.homeward:
-            return monitor(now, grant, goal=goal, leaving=True), True
-        verdict = monitor(now, grant, goal=goal)
+            return monitor(now, grant, leaving=True, changed=changed), True
+        verdict = monitor(now, grant, changed=changed)
         if verdict is None or verdict.takeover != "hover" or control.hands == "driver":
             return verdict, False
-        return monitor(now, grant, goal=goal, leaving=True), True
+        return monitor(now, grant, leaving=True, changed=changed), True
 
-    def _goal(self, now: Situation) -> tuple[float, float] | None:
-        """Where the drone stops of itself: at the end of its leg; without a motion, as soon as it can."""
-        motion = self._control.motion
-        if motion is not None:
-            return (motion.leg.lat, motion.leg.lon) if motion.leg is not None else None
-        return (now.lat, now.lon) if now.lat is not None and now.lon is not None else None
+    def _have_changed(self, grant: CompiledGrant, time_s: float) -> bool:
+        """Whether other fences may have been in force when the drone's way was judged."""
+        now_s = self._control.autopilot.now
+        timed = grant.timed_fences() if grant is not self._grant else self._timed
+        in_force = [patch.in_force(time_s) for patch in timed]
+        if grant is not self._grant or in_force != self._in_force:
+            self._grant, self._timed, self._in_force, self._changed_at = grant, timed, in_force, now_s
+        motion, vehicle = self._control.motion, self._control.autopilot.vehicle
+        if (motion is None or motion.kind == "Takeoff") and vehicle.speed_mps < STANDING_MPS:
+            # Whatever moves it from here is judged by what is in force now, or later.
+            self._changed_at = -math.inf
+        return now_s - self._changed_at < CHANGED_S
 
     def _stop(self, verdict: Verdict, fresh: bool) -> None:
         """End the motion that makes things worse; the system then looks for another way.

@@ -273,14 +273,14 @@ class Deployments:
         try:
             # One look at the pods for all that is said of them.
             pods = self._live.pods_of(key)
-            await self._rollout.carry_out(application, decided, grants, pods, rules)
+            complete = await self._rollout.carry_out(application, decided, grants, pods, rules)
         except NameTaken as error:
             raise Hindered("Pending", "Deployed", "NameTaken", str(error), again_s=2.0) from error
         except StoreError as error:
             if error.status not in _REFUSALS:
                 raise
             raise Hindered("Pending", "Deployed", error.reason, str(error), again_s=10.0) from error
-        return deployed_standing(decided, pods, len(grants)), again_s
+        return deployed_standing(decided, pods, len(grants)), again_s if complete else 0.0
 
     def _plan(
         self, application: Application, inventory: Inventory, memory: _Memory

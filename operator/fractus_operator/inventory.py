@@ -319,7 +319,8 @@ class LiveInventory:
             self._where.remove_drone(key[1])
         if old is None or new is None or old.spec != new.spec or old.metadata.labels != new.metadata.labels:
             self.rules_revision += 1
-        if old is None or new is None or _planning_view(old) != _planning_view(new):
+            self.wake_all()
+        elif _planning_view(old) != _planning_view(new):
             self.wake_all()
 
     def _edge_node_changed(self, key: Key, old: EdgeNode | None, new: EdgeNode | None) -> None:
@@ -333,7 +334,6 @@ class LiveInventory:
             self.wake_all()
 
     def _depot_changed(self, key: Key, old: Depot | None, new: Depot | None) -> None:
-        self.rules_revision += 1
         if new is None:
             self._where.remove_depot(key[1])
         else:
@@ -342,9 +342,9 @@ class LiveInventory:
 
     def _spec_changed(self, kind: Kind) -> Callable[[Key, Any, Any], None]:
         def changed(key: Key, old: Any, new: Any) -> None:
-            self.rules_revision += 1
             self._report(kind, key)
             if old is None or new is None or type(old) is not type(new) or old.spec != new.spec:
+                self.rules_revision += 1
                 self.wake_all(urgent=True)
 
         return changed

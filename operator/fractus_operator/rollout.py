@@ -46,7 +46,7 @@ class Rollout:
         grants: Sequence[GrantSpec],
         pods: Sequence[PodView],
         rules: int,
-    ) -> None:
+    ) -> bool:
         """Write the plan, remove what is stale, then make the Deployments and the rest.
 
         Args:
@@ -55,6 +55,9 @@ class Rollout:
             grants: What its instances may do.
             pods: Its pods as they are.
             rules: The revision of the rules that the grants are made of; no new one is made once there is a later one.
+
+        Returns:
+            Whether that is all; else some grants are left to the next look.
 
         Raises:
             NameTaken: somebody else's object has the name of a child.
@@ -77,19 +80,23 @@ class Rollout:
             certificates = [self._certificate(application, placed) for placed in secrets.values()]
             await self._children.apply(application, {kinds.SECRET: certificates})
 
-        async def after() -> None:
+        async def after() -> bool:
             if starts:
                 await self._scheduled(application.key, decided, made, rules)
             last = {kind: wanted[kind] for kind in (kinds.SERVICE, kinds.ENDPOINT_SLICE)}
-            if rules == self._live.rules_revision:
+            # Rules that changed meanwhile are in no Grant that was compiled before.
+            valid = rules == self._live.rules_revision
+            if valid:
                 last = {kinds.GRANT: [body for body in wanted[kinds.GRANT] if body not in granted], **last}
-            # else: rules that changed meanwhile are in no Grant that was compiled before; the next look makes those.
             await self._children.apply(application, last)
+            return valid
 
         # Nothing is written any more when the next look begins; and an object in the way of one stops no other.
-        for result in await asyncio.gather(made, beside(), after(), return_exceptions=True):
+        results = await asyncio.gather(made, beside(), after(), return_exceptions=True)
+        for result in results:
             if isinstance(result, BaseException):
                 raise result
+        return results[2] is True
 
     def _wanted(
         self,

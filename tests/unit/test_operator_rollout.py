@@ -114,10 +114,11 @@ class Scene:
     one: Rollout
     recorder: Recorder
     live: Any
+    complete: bool | None = None
 
     async def deploy(self) -> None:
         async with asyncio.timeout(20.0):
-            await self.one.carry_out(APPLICATION, PLACED, cast(Any, ("there", "new")), (), 0)
+            self.complete = await self.one.carry_out(APPLICATION, PLACED, cast(Any, ("there", "new")), (), 0)
 
 
 @pytest.fixture
@@ -172,6 +173,7 @@ async def test_rules_that_change_meanwhile_are_in_the_grants_of_the_next_look(sc
 async def test_rules_that_changed_since_grants_were_made_of_them_make_no_new_grant(scene: Scene) -> None:
     scene.live.rules_revision = 1
     await scene.deploy()
+    assert scene.complete is False, "the next look comes at once"
     assert scene.recorder.said.count("apply Grant") == 1
     assert "apply Service" in scene.recorder.said
 
@@ -182,6 +184,7 @@ async def test_where_nothing_is_new_nothing_waits(scene: Scene) -> None:
         scene.live.children[kinds.DEPLOYMENT][kinds.key_of(body)] = body
     await scene.deploy()
     assert scene.recorder.said.count("apply Grant") == 2
+    assert scene.complete
 
 
 @pytest.mark.parametrize(("refused", "grants"), [(kinds.DEPLOYMENT, 2), (kinds.SERVICE, 2), (kinds.DEPLOYMENT_PLAN, 0)])

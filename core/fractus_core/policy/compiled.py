@@ -36,11 +36,6 @@ class Rule:
     valid_from_s: float
     valid_until_s: float
 
-    @property
-    def passing(self) -> bool:
-        """Whether there is a time at which the policy does not hold."""
-        return self.valid_from_s > -FOREVER or self.valid_until_s < FOREVER
-
     def in_force(self, time_s: float) -> bool:
         """Whether the policy is in its validity window."""
         return self.valid_from_s <= time_s and earliest(time_s) < self.valid_until_s
@@ -194,11 +189,6 @@ class CompiledGrant:
     passage: BaseGeometry | None
     passage_border: BaseGeometry | None
     flat_terrain: bool
-
-    def timed_fences(self) -> tuple[Patch, ...]:
-        """Fenced zones that come and go: by their schedule, or by the validity of their policy."""
-        fenced = (*self.exclusions.patches, *(patch for inclusion in self.inclusions for patch in inclusion.patches))
-        return tuple(patch for patch in fenced if patch.schedule or patch.rule.passing)
 
     def locate(self, now: Situation) -> tuple[float, float] | None:
         """Where the drone is, in metres of the frame; None while nobody knows."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from typing import Literal
 
 from fractus_core.geo import LocalFrame
@@ -51,6 +52,7 @@ class Control:
 
     Attributes:
         decided: whether it is settled who has the vehicle, since its link came up last.
+        began_at: when the last motion began, by the autopilot's clock.
         regime: the fences under which the system flies an application's drone; None while it does not.
         touring: key of the mission without a driver that the system is flying.
     """
@@ -71,6 +73,7 @@ class Control:
         self.hands: Hands = "system"
         self.lease: Lease | None = None
         self.motion: Motion | None = None
+        self.began_at = -math.inf
         self.checked: Checked | None = None
         self.speed_mps: float | None = None
         self.homeward = False
@@ -277,7 +280,7 @@ class Control:
     def begin(self, kind: str) -> Motion:
         """Start a motion; the one under way is replaced."""
         self.stop_motion(aborted("Replaced", f"{kind} replaced it"))
-        self.motion = Motion(kind)
+        self.motion, self.began_at = Motion(kind), self.autopilot.now
         return self.motion
 
     def finish(self, motion: Motion) -> None:

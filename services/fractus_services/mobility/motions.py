@@ -163,9 +163,13 @@ async def come_to_rest(autopilot: Autopilot, motion: Motion, permit: Permit) -> 
 
 def at_rest(autopilot: Autopilot) -> bool:
     """Whether the drone surely stands, in the sense of the policy engine."""
+    return stands(autopilot) and abs(autopilot.vehicle.down_mps) < STANDING_MPS
+
+
+def stands(autopilot: Autopilot) -> bool:
+    """Whether the drone surely stays above one place."""
     vehicle = autopilot.vehicle
-    known = autopilot.now - vehicle.position_at <= FRESH_S
-    return known and vehicle.speed_mps < STANDING_MPS and abs(vehicle.down_mps) < STANDING_MPS
+    return autopilot.now - vehicle.position_at <= FRESH_S and vehicle.speed_mps < STANDING_MPS
 
 
 def _turned(vehicle: Vehicle, yaw_deg: float) -> bool:

@@ -7,17 +7,18 @@ import logging
 import math
 from dataclasses import replace
 
-from fractus_core.policy.compiled import CompiledGrant, Patch
+from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.monitoring import monitor
-from fractus_core.policy.values import STANDING_MPS, GotoArgs, SetSpeedArgs, Verdict
+from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Verdict
 
 from fractus_services.audit import AuditLog
+from fractus_services.grants import Held
 from fractus_services.mobility.autopilot import AutopilotError, Permit
 from fractus_services.mobility.control import CORRECTION, Control
 from fractus_services.mobility.courses import limited_mps
 from fractus_services.mobility.guard import Guard
 from fractus_services.mobility.leases import Motion
-from fractus_services.mobility.motions import REACHED_M, fly_to
+from fractus_services.mobility.motions import REACHED_M, fly_to, stands
 from fractus_services.mobility.supervisor import Supervisor
 from fractus_services.mobility.telemetry import recorded
 from fractus_services.mobility.vehicle import GUIDED
@@ -33,7 +34,10 @@ RECORD_S = 0.5
 CORRECT_AGAIN_S = 3.0
 
 CHANGED_S = 30.0
-"""So long after the fences changed a drone may still speed up on a way that was judged by those before."""
+"""So long after its grant changed a drone may still speed up on a way that was judged by the one before."""
+
+BEGINS_S = 2.0
+"""So long a drone may stand that has been told to fly."""
 
 
 class Watch:
@@ -46,9 +50,7 @@ class Watch:
         self._supervisor = supervisor
         self._alarm = ""
         self._alarm_at = 0.0
-        self._grant: CompiledGrant | None = None
-        self._timed: tuple[Patch, ...] = ()
-        self._in_force: list[bool] = []
+        self._held: Held | None = None
         self._changed_at = -math.inf
         self._corrections: set[asyncio.Task[None]] = set()
 
@@ -97,7 +99,7 @@ class Watch:
     def _judge(self, grant: CompiledGrant) -> tuple[Verdict | None, bool]:
         """What is wrong, and whether the system flies the drone already, so that there is nobody to take it from."""
         control, now = self._control, self._guard.situation()
-        changed = self._have_changed(grant, now.time_s)
+        changed = self._has_changed(control.regime.held if control.regime is not None else control.mission_grant)
         if control.homeward:
             return monitor(now, grant, leaving=True, changed=changed), True
         verdict = monitor(now, grant, changed=changed)
@@ -105,18 +107,17 @@ class Watch:
             return verdict, False
         return monitor(now, grant, leaving=True, changed=changed), True
 
-    def _have_changed(self, grant: CompiledGrant, time_s: float) -> bool:
-        """Whether other fences may have been in force when the drone's way was judged."""
-        now_s = self._control.autopilot.now
-        timed = grant.timed_fences() if grant is not self._grant else self._timed
-        in_force = [patch.in_force(time_s) for patch in timed]
-        if grant is not self._grant or in_force != self._in_force:
-            self._grant, self._timed, self._in_force, self._changed_at = grant, timed, in_force, now_s
-        motion, vehicle = self._control.motion, self._control.autopilot.vehicle
-        if (motion is None or motion.kind == "Takeoff") and vehicle.speed_mps < STANDING_MPS:
-            # Whatever moves it from here is judged by what is in force now, or later.
+    def _has_changed(self, held: Held | None) -> bool:
+        """Whether the drone's way may have been judged by another grant than this."""
+        control = self._control
+        autopilot, motion = control.autopilot, control.motion
+        if held is not self._held:
+            self._held, self._changed_at = held, autopilot.now
+        begins = autopilot.now - control.began_at < BEGINS_S
+        if (motion is None or motion.kind == "Takeoff") and not begins and stands(autopilot):
+            # Whatever moves it from here is judged by what holds now, or later.
             self._changed_at = -math.inf
-        return now_s - self._changed_at < CHANGED_S
+        return autopilot.now - self._changed_at < CHANGED_S
 
     def _stop(self, verdict: Verdict, fresh: bool) -> None:
         """End the motion that makes things worse; the system then looks for another way.

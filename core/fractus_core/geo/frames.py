@@ -117,13 +117,9 @@ class LocalFrame:
         Raises:
             ValueError: the point lies beyond the horizon of the frame.
         """
-        p, q, z = self._plane(x, y)
         u, v, w = self._up
-        # The line through it along the frame's vertical meets the ellipsoid: a quadratic equation in the height.
-        curve = (u * u + v * v) * _PER_A2 + w * w * _PER_B2
-        slope = (p * u + q * v) * _PER_A2 + z * w * _PER_B2
-        over = (p * p + q * q) * _PER_A2 + z * z * _PER_B2 - 1
-        root = slope * slope - curve * over
+        p, q, z = self._plane(x, y)
+        over, slope, root = self._above(p, q, z)
         if not root >= 0:
             raise self._hidden(x, y)
         up = -over / (slope + math.sqrt(root))
@@ -140,16 +136,25 @@ class LocalFrame:
         u, v, w = self._up
         with np.errstate(invalid="ignore", over="ignore"):
             p, q, z = self._plane(x, y)
-            curve = (u * u + v * v) * _PER_A2 + w * w * _PER_B2
-            slope = (p * u + q * v) * _PER_A2 + z * w * _PER_B2
-            over = (p * p + q * q) * _PER_A2 + z * z * _PER_B2 - 1
-            root = slope * slope - curve * over
+            over, slope, root = self._above(p, q, z)
         hidden = np.flatnonzero(~(root >= 0))
         if len(hidden):
             raise self._hidden(float(x[hidden[0]]), float(y[hidden[0]]))
         up = -over / (slope + np.sqrt(root))
         p, q, z = p + up * u, q + up * v, z + up * w
         return np.degrees(np.arctan2(z, (1 - _E2) * np.hypot(p, q))), np.degrees(np.arctan2(q, p))
+
+    def _above(self, p: Metres, q: Metres, z: Metres) -> tuple[Metres, Metres, Metres]:
+        """What tells where the frame's vertical through a point meets the ellipsoid: a quadratic equation in the height.
+
+        Returns:
+            Its constant term, half its linear one, and a quarter of its discriminant, which is negative beyond the horizon.
+        """
+        u, v, w = self._up
+        curve = (u * u + v * v) * _PER_A2 + w * w * _PER_B2
+        slope = (p * u + q * v) * _PER_A2 + z * w * _PER_B2
+        over = (p * p + q * q) * _PER_A2 + z * z * _PER_B2 - 1
+        return over, slope, slope * slope - curve * over
 
     def _hidden(self, x: float, y: float) -> ValueError:
         return ValueError(f"({x:.0f}, {y:.0f}) m is beyond the horizon of the frame at {self.lat}, {self.lon}")

@@ -10,11 +10,8 @@ from pathlib import Path
 
 import pytest
 from camera_world import World, held, private, refusal
-from fractus_core.policy.values import Lens
 from fractus_services.camera import service as camera
 from fractus_services.camera.album import Album, AlbumFull, NoSuchImage
-
-SEEING = Lens(60.0, 60.0, stabilised=True, error_deg=0.0)
 
 
 @pytest.fixture

@@ -171,7 +171,7 @@ def test_nothing_arms_far_from_the_home_of_its_grant(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("part", ["journal", "audit"])
-def test_nothing_arms_that_leaves_no_trace(tmp_path: Path, part: str) -> None:
+def test_nothing_arms_that_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             held = world.grants.put(spec())
@@ -181,7 +181,7 @@ def test_nothing_arms_that_leaves_no_trace(tmp_path: Path, part: str) -> None:
                 raise OSError(28, "No space left on device")
 
             if part == "journal":
-                world.journal._write = full  # type: ignore[method-assign]
+                monkeypatch.setattr(world.journal, "_write", full)
             else:
                 world.audit.failure = "cannot write the audit log: No space left on device"
             why = await refusal(world.service.arm(held))

@@ -21,8 +21,6 @@ from fractus_services.grants import Held
 from fractus_services.replies import Refused
 from policy_world import FRAME, NOW, at, box, policy, zone
 
-SEEING = Lens(60.0, 60.0, stabilised=True, error_deg=0.0)
-
 
 @pytest.fixture
 def world(tmp_path: Path) -> Iterator[World]:

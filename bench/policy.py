@@ -16,7 +16,6 @@ import functools
 import json
 import math
 import random
-import socket
 import statistics
 import subprocess
 import sys
@@ -34,6 +33,7 @@ from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.routes import route
 from fractus_core.policy.values import Airframe, Call, GotoArgs, Home, Situation, VelocityArgs
+from fractus_sim.ports import free_port
 from pymavlink import mavutil
 
 HOME = Home(39.36, 22.95, 100.0)
@@ -98,9 +98,7 @@ class Autopilot:
     """A simulated ArduCopter in another process, asked for its position over MAVLink."""
 
     def __init__(self) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = probe.getsockname()[1]
+        port = free_port()
         place = f"{HOME.lat},{HOME.lon},{HOME.amsl_m}"
         command = [sys.executable, "-m", "fractus_sim.vehicle", "--listen", f"tcp:127.0.0.1:{port}", "--home", place]
         self._child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)

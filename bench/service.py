@@ -9,7 +9,6 @@ import argparse
 import json
 import os
 import re
-import socket
 import subprocess
 import sys
 import tempfile
@@ -19,16 +18,11 @@ from pathlib import Path
 from typing import Any
 
 from fractus_operator.standalone import StandalonePki
+from fractus_sim.ports import free_port
 
 NODE = "bench"
 TARGET = 10.0
 HOME = "39.36,22.95,10"
-
-
-def free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,6 @@ import http.server
 import json
 import math
 import os
-import socket
 import statistics
 import subprocess
 import sys
@@ -34,6 +33,7 @@ from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
 from fractus_services import answering
 from fractus_services.auth import Caller
 from fractus_services.camera.__main__ import camera
+from fractus_sim.ports import free_port
 from skimage.data import astronaut
 
 NODE = "bench"
@@ -102,12 +102,6 @@ def serve_plainly(arguments: list[str]) -> None:
     grpc.aio.server = server
     answering.caller_of = lambda _context, _time_s: Caller(IDENTITY, 0.0, math.inf)
     camera(arguments)
-
-
-def free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
 
 
 class Side:

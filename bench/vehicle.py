@@ -21,6 +21,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from fractus_sim.ports import free_port
 from fractus_sim.vehicle.earth import Place
 from fractus_sim.vehicle.mav import Command, Mode
 from fractus_sim.vehicle.pilot import Pilot
@@ -193,9 +194,7 @@ class Link:
 
 def process(duration_s: float) -> list[Claim]:
     """Processor time, memory, stream rate and acknowledgement time of the process in real time."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     command = [sys.executable, "-m", "fractus_sim.vehicle", "--listen", f"tcp:127.0.0.1:{port}", "--ready-after", "1"]
     child = subprocess.Popen([*command, "--param", "DISARM_DELAY=0"], stderr=subprocess.PIPE, text=True)
     assert child.stderr is not None

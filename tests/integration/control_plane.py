@@ -6,7 +6,6 @@ No kubelets: objects are real, nothing runs. Tests say of pods what kubelets wou
 from __future__ import annotations
 
 import json
-import socket
 import ssl
 import subprocess
 import time
@@ -20,6 +19,7 @@ from fractus_core.api import KINDS
 from fractus_core.api.crd import crd
 from fractus_sim.cluster.binaries import ensure_binaries
 from fractus_sim.cluster.pki import Authority
+from fractus_sim.ports import free_port
 
 T = TypeVar("T")
 Body = dict[str, Any]
@@ -39,12 +39,6 @@ def programs() -> dict[str, Path]:
     """The programs of a control plane; `fractus cluster binaries` builds them where the machine has none."""
     found = ensure_binaries(PROGRAMS, report=print)
     return {name: found[name] for name in PROGRAMS}
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def wait_for(question: Callable[[], T | None], what: str | Callable[[], str], timeout_s: float = 60.0) -> T:

@@ -7,7 +7,6 @@ import datetime
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -25,6 +24,7 @@ from fractus_core.geo import LocalFrame
 from fractus_core.policy.signatures import DOCUMENT_SIGNING, sign
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_proto.v1 import mobility_pb2_grpc, types_pb2
+from fractus_sim.ports import free_port
 from grpc_status import rpc_status
 
 HOME = (39.3600, 22.9500, 10.0)
@@ -32,12 +32,6 @@ FRAME = LocalFrame(HOME[0], HOME[1])
 NODE = "drone-1"
 DRIVER = component_identity("default", "app", "Navigator", "app-navigator")
 PASSENGER = component_identity("default", "app", "AerialViewer", "app-aerial-viewer")
-
-
-def free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
 
 
 def area(x0: float, y0: float, x1: float, y1: float) -> dict[str, Any]:

@@ -11,7 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from control_plane import Api, ControlPlane, Refused, free_port, wait_for
+from control_plane import Api, ControlPlane, Refused, wait_for
+from fractus_sim.ports import free_port
 
 Body = dict[str, Any]
 FRACTUS = "/apis/fractus.dev/v1alpha1"

@@ -19,6 +19,7 @@ import pytest
 import yaml
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
 from fractus_services.audit import verify
+from fractus_sim.ports import free_port
 from mobility_rig import (
     DRIVER,
     FRAME,
@@ -29,7 +30,6 @@ from mobility_rig import (
     Rig,
     area,
     denied,
-    free_port,
     grant,
     passenger_grant,
 )

@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from fractus_sim.ports import free_port
 from fractus_sim.world import server as server_module
 from fractus_sim.world.optics import Intrinsics, Mount, Pose
 from fractus_sim.world.server import CameraServer
@@ -23,7 +24,7 @@ from fractus_sim.world.studio import Studio
 from fractus_sim.world.whereabouts import Fixed
 from fractus_sim.world.world import WorldAround
 from geotagged import save
-from vehicle_process import HOME, Client, free_port, running_vehicle
+from vehicle_process import HOME, Client, running_vehicle
 
 
 def get(port: int, path: str, timeout_s: float = 60.0) -> tuple[int, dict[str, str], bytes]:

@@ -16,6 +16,7 @@ from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_proto.v1 import types_pb2
 from fractus_services.mobility.autopilot import Autopilot
 from fractus_services.mobility.itemlists import download
+from fractus_sim.ports import free_port
 from mobility_rig import (
     FRAME,
     NODE,
@@ -26,7 +27,6 @@ from mobility_rig import (
     area,
     denied,
     fence,
-    free_port,
     grant,
     passenger_grant,
     place,

@@ -12,7 +12,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from vehicle_process import free_port, running_vehicle
+from fractus_sim.ports import free_port
+from vehicle_process import running_vehicle
 
 SLOW = ("WPNAV_SPEED=450", "WPNAV_ACCEL=150", "WPNAV_SPEED_UP=200", "RTL_ALT=1300", "LAND_SPEED=70")
 SPEEDUP = "3"

@@ -6,7 +6,6 @@ import itertools
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -25,6 +24,7 @@ from fractus_core.planning import Inventory
 from fractus_core.policy.grants import compile_grants
 from fractus_core.policy.signatures import sign
 from fractus_services.chain import verify
+from fractus_sim.ports import free_port
 from mobility_rig import issue_signer
 from sdk_service import Authority
 
@@ -65,12 +65,6 @@ def navigator_grant(application: Application) -> Grant:
         application, DeploymentPlanSpec(application=application.name, placements=(placed,)), inventory
     )
     return Grant(metadata=Metadata(name="default.traffic-navigator", uid="uid-1"), spec=spec)
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 class Stage:

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from vehicle_process import HOME, Client, free_port, running_vehicle
+from fractus_sim.ports import free_port
+from vehicle_process import HOME, Client, running_vehicle
 
 SESSIONS = Path(__file__).with_name("vehicle_clients")
 PYTHON = os.environ.get("FRACTUS_CLIENTS_PYTHON", sys.executable)

@@ -14,8 +14,9 @@ from pathlib import Path
 
 import pymavlink.dialects.v20.ardupilotmega as dialect
 import pytest
+from fractus_sim.ports import free_port
 from pymavlink import mavutil
-from vehicle_process import HOME, Client, free_port, running_vehicle
+from vehicle_process import HOME, Client, running_vehicle
 
 FAST = ("--speedup", "10", "--ready-after", "3")
 
@@ -189,7 +190,7 @@ def _frame(writer: dialect.MAVLink, message: type, payload: bytes) -> bytes:
 
 
 def test_udp_in_and_out():
-    inward, outward = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM)
+    inward, outward = free_port(), free_port()
     server = Client(f"udpin:127.0.0.1:{outward}", sysid=254)
     with running_vehicle(*FAST, links=(f"udpin:127.0.0.1:{inward}", f"udpout:127.0.0.1:{outward}")):
         client = Client(f"udpout:127.0.0.1:{inward}")
@@ -250,7 +251,7 @@ def _send_serial(path: Path, frames: list[bytes]) -> None:
 
 @pytest.mark.parametrize("kind", ["udp", "serial"])
 def test_ten_thousand_bad_frames_on_other_links(kind: str, tmp_path: Path):
-    port, datagrams, path = free_port(), free_port(socket.SOCK_DGRAM), tmp_path / "tty"
+    port, datagrams, path = free_port(), free_port(), tmp_path / "tty"
     links = (f"tcp:127.0.0.1:{port}", f"udpin:127.0.0.1:{datagrams}", f"pty:{path}")
     with running_vehicle("--ready-after", "0.5", links=links) as process:
         good = Client(f"tcp:127.0.0.1:{port}")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import time
 from collections.abc import Callable
@@ -21,6 +20,7 @@ from fractus_sim.cluster.apiclient import ApiClient
 from fractus_sim.cluster.binaries import Binaries, ensure_binaries
 from fractus_sim.cluster.errors import ClusterError
 from fractus_sim.cluster.pki import Authority, write_private
+from fractus_sim.ports import free_port
 
 PROGRAMS = ("etcd", "kube-apiserver", "kube-controller-manager", "kube-scheduler", "kwok")
 NODE_LABEL, NODE_VALUE = "type", "kwok"
@@ -191,13 +191,6 @@ def simulated_node(name: str, node_class: str, allocatable: Body) -> Body:
         "metadata": {"name": name, "labels": labels, "annotations": {"kwok.x-k8s.io/node": "fake"}},
         "status": {"allocatable": allocatable, "capacity": allocatable},
     }
-
-
-def free_port() -> int:
-    """A port of loopback that nobody listens on now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def wait_until(question: Callable[[], bool], what: str, *, timeout_s: float, pause_s: float = 0.05) -> None:

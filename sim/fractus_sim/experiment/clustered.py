@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -21,7 +22,6 @@ from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.linktap import LinkTap
 from fractus_sim.experiment.model import ClusterPart, Experiment, VehicleSetup
 from fractus_sim.experiment.netns import connect_in, listen_in
-from fractus_sim.experiment.processes import Ports
 from fractus_sim.experiment.stage import Moment, Stage
 from fractus_sim.experiment.station import OBSERVER_ID, Station, TcpLink
 from fractus_sim.experiment.tlog import TlogWriter
@@ -52,7 +52,6 @@ class ClusterStage(Stage):
         self._was_running = self._cluster.running
         self._applications, self._surroundings = _manifests(self._part, base)
         self._kube: Kube | None = None
-        self._ports = Ports()
         self._watcher = threading.Thread(target=self._watch, name="phases", daemon=True)
         self._stop = threading.Event()
         self._phase: dict[str, str] = {}
@@ -148,7 +147,7 @@ class ClusterStage(Stage):
             return connect_in(namespace, BEHIND_TAP_PORT, CONNECT_S)
 
         self.keep(LinkTap(listen_in(namespace, port), connect, logs / f"{setup.name}.tlog"))
-        guest = self._ports.listen()
+        guest = socket.create_server(("127.0.0.1", 0))
         self.keep(LinkTap(guest, connect, logs / f"{setup.name}-guest.tlog"))
         self.endpoints[setup.name] = f"tcp:127.0.0.1:{guest.getsockname()[1]}"
         watch = self.keep(TlogWriter(logs / f"{setup.name}-observer.tlog"))

@@ -167,27 +167,6 @@ def _kill_group(group: int) -> None:
         os.killpg(group, signal.SIGKILL)
 
 
-class Ports:
-    """Free TCP ports of the loopback device; none is given out twice."""
-
-    def __init__(self) -> None:
-        self._given: set[int] = set()
-
-    def take(self) -> int:
-        """A port nobody listens on."""
-        while True:
-            with socket.socket() as probe:
-                probe.bind(("127.0.0.1", 0))
-                port = int(probe.getsockname()[1])
-            if port not in self._given:
-                self._given.add(port)
-                return port
-
-    def listen(self) -> socket.socket:
-        """A socket that listens on a free port."""
-        return socket.create_server(("127.0.0.1", self.take()))
-
-
 def listening(port: int) -> bool:
     """Whether somebody accepts connections on a port of the loopback device."""
     with socket.socket() as probe:

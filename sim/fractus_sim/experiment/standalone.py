@@ -34,7 +34,8 @@ from fractus_operator.standalone import StandalonePki
 
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.linktap import LinkTap
-from fractus_sim.experiment.processes import Ports, Processes, listening
+from fractus_sim.experiment.processes import Processes, listening
+from fractus_sim.ports import free_port
 
 START_TIMEOUT_S = 30.0
 LOOPBACK = "127.0.0.1"
@@ -103,7 +104,7 @@ class RunningDrone:
         tlog: what passed between service and autopilot.
     """
 
-    def __init__(self, ground: Standalone, setup: DroneSetup, processes: Processes, ports: Ports, logs: Path) -> None:
+    def __init__(self, ground: Standalone, setup: DroneSetup, processes: Processes, logs: Path) -> None:
         self.setup = setup
         self.folder = ground.folder / setup.name
         self.grants = self.folder / "grants"
@@ -111,10 +112,10 @@ class RunningDrone:
         self.tlog = logs / f"{setup.name}.tlog"
         self._processes = processes
         self._tls = ground.pki.node(setup.name)
-        self._vehicle_port, station, guest = ports.take(), ports.take(), ports.take()
-        self._tap_port, self._mobility_port = ports.take(), ports.take()
-        self._camera_port = ports.take() if setup.camera is not None else None
-        self._world_port = ports.take() if setup.camera is not None and setup.camera.world is not None else None
+        self._vehicle_port, station, guest = free_port(), free_port(), free_port()
+        self._tap_port, self._mobility_port = free_port(), free_port()
+        self._camera_port = free_port() if setup.camera is not None else None
+        self._world_port = free_port() if setup.camera is not None and setup.camera.world is not None else None
         self.station_link, self.guest_link = f"tcp:{LOOPBACK}:{station}", f"tcp:{LOOPBACK}:{guest}"
         self.mobility_address = f"{LOOPBACK}:{self._mobility_port}"
         self.camera_address = f"{LOOPBACK}:{self._camera_port}" if self._camera_port else None
@@ -274,7 +275,6 @@ class Standalone:
         self.pki = StandalonePki.create(self.folder / "pki")
         self.processes = Processes(self.folder / "logs")
         self.drones: dict[str, RunningDrone] = {}
-        self._ports = Ports()
         self._grants: dict[str, Grant] = {}
         self._programs: dict[str, _Program] = {}
         self._off: dict[str, tuple[str, ...]] = {}
@@ -298,7 +298,7 @@ class Standalone:
             raise ExperimentError(f"there are two drones {setup.name}; give each its own name")
         logs = self.folder / "logs"
         logs.mkdir(exist_ok=True)
-        drone = RunningDrone(self, setup, self.processes, self._ports, logs)
+        drone = RunningDrone(self, setup, self.processes, logs)
         self.drones[setup.name] = drone
         drone.start()
         return drone

@@ -11,10 +11,11 @@ from pathlib import Path
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.linktap import LinkTap
 from fractus_sim.experiment.model import Experiment, Program, VehicleSetup
-from fractus_sim.experiment.processes import Ports, Processes
+from fractus_sim.experiment.processes import Processes
 from fractus_sim.experiment.stage import Moment, Stage
 from fractus_sim.experiment.station import OBSERVER_ID, ChannelLink, Link, Station, TcpLink
 from fractus_sim.experiment.tlog import TlogWriter
+from fractus_sim.ports import free_port
 from fractus_sim.vehicle.earth import Place
 from fractus_sim.vehicle.links import Hub, LinkError, LinkSpec
 from fractus_sim.vehicle.params import UnknownParameterError
@@ -33,7 +34,6 @@ class VehicleStage(Stage):
         super().__init__(experiment, folder, base, tell)
         self._logs = folder / "logs"
         self._processes = Processes(self._logs)
-        self._ports = Ports()
         self._hub = self.keep(Hub())
         self._simulation = Simulation([])
         self._program_links: dict[str, str] = {}
@@ -154,7 +154,7 @@ class VehicleStage(Stage):
         return any(program.vehicle == vehicle for program in self.experiment.programs)
 
     def _open(self, craft: Craft) -> str:
-        link = f"tcp:127.0.0.1:{self._ports.take()}"
+        link = f"tcp:127.0.0.1:{free_port()}"
         try:
             self._hub.open(LinkSpec.parse(link), craft, 1)
         except LinkError as error:
@@ -162,7 +162,7 @@ class VehicleStage(Stage):
         return link
 
     def _tap(self, vehicle: str, program: str, link: str) -> str:
-        port = self._ports.take()
+        port = free_port()
         tap = LinkTap.between(
             port, ("127.0.0.1", int(link.rpartition(":")[2])), self._logs / f"{vehicle}-{program}.tlog"
         )

@@ -1,0 +1,67 @@
+"""Ports for programs that are told where to listen: nobody else gets them, not even between two starts."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from fractus_sim import ports
+
+ALL_OF_TEN = """
+from fractus_sim import ports
+ports._FIRST, ports._LAST = {first}, {last}
+while True:
+    try:
+        print(ports.free_port())
+    except OSError:
+        break
+"""
+
+
+@pytest.fixture
+def ten(monkeypatch: pytest.MonkeyPatch) -> range:
+    """The only ten ports there are; other tests ask for none of them."""
+    first = 19_000 + ports.free_port() % 1000 // 10 * 10
+    monkeypatch.setattr(ports, "_FIRST", first)
+    monkeypatch.setattr(ports, "_LAST", first + 9)
+    return range(first, first + 10)
+
+
+def given_to_another_process(among: range) -> set[int]:
+    script = ALL_OF_TEN.format(first=among[0], last=among[-1])
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60)
+    return {int(line) for line in done.stdout.split()}
+
+
+def test_no_other_process_gets_our_ports_and_theirs_are_free_when_they_end(ten: range) -> None:
+    ours = {ports.free_port() for _ in range(3)}
+    assert len(ours) == 3
+    theirs = given_to_another_process(ten)
+    assert theirs
+    assert not theirs & ours
+    assert given_to_another_process(ten) == theirs
+
+
+def test_a_port_where_somebody_listens_is_not_given(ten: range) -> None:
+    free = given_to_another_process(ten)
+    with socket.socket() as taken, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
+        taken.bind(("0.0.0.0", min(free)))
+        taken.listen()
+        bound.bind(("127.0.0.1", max(free)))
+        assert given_to_another_process(ten) == free - {min(free), max(free)}
+
+
+def test_without_a_free_port_it_says_which_were_tried(ten: range) -> None:
+    assert {ports.free_port() for _ in ten} == set(ten)
+    with pytest.raises(OSError, match=f"{ten[0]} to {ten[-1]} .* is free; end programs"):
+        ports.free_port()
+
+
+def test_connections_and_listeners_on_port_0_never_come_to_it() -> None:
+    lowest = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text("ascii").split()[0])
+    if lowest < 30000:
+        pytest.skip(f"this machine gives ports from {lowest} on to anybody")
+    assert ports.free_port() < lowest

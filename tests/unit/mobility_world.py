@@ -326,10 +326,10 @@ class World:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        tasks = [*self._tasks, *self.control.tasks._tasks]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        while tasks := [task for task in (*self._tasks, *self.control.tasks._tasks) if not task.done()]:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
 
     async def drive(self, held: Held) -> asyncio.Task[None]:
         """A driver's stream in the background, once it has the drone."""
@@ -342,6 +342,7 @@ class World:
                     granted.set()
 
         stream = asyncio.ensure_future(follow())
+        self._tasks.append(stream)
         waiting = asyncio.ensure_future(granted.wait())
         await asyncio.wait([stream, waiting], return_when=asyncio.FIRST_COMPLETED)
         waiting.cancel()

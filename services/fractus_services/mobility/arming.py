@@ -86,11 +86,11 @@ async def _start(control: Control, home: tuple[float, float, float], permit: Per
                     raise AutopilotError("the autopilot accepted to arm and did not")
                 await autopilot.update(WAIT_S)
             await autopilot.set_home(*home)
-            await control.tasks.attempt(autopilot.ask_home())
+            await control.tasks.attempt(autopilot.ask_home)
             permit()
         except Exception:
             if not autopilot.vehicle.in_air:
-                await control.tasks.attempt(autopilot.disarm())
+                await control.tasks.attempt(autopilot.disarm)
             raise
     finally:
         helm.arming = False

@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Coroutine, Generator
-from typing import Any, TypeVar
+from collections.abc import Awaitable, Callable, Coroutine, Generator
+from typing import Any, ParamSpec, TypeVar
 
 from fractus_services.mobility.autopilot import AutopilotError
 
@@ -15,6 +15,7 @@ log = logging.getLogger(__name__)
 SLICE_S = 0.004
 """Long computations let everything else in the loop have its turn so often: monitor, watchdog, heartbeats."""
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
@@ -56,10 +57,10 @@ class Background:
         if task is not None and task is not asyncio.current_task():
             task.cancel()
 
-    async def attempt(self, work: Coroutine[Any, Any, None]) -> None:
-        """Await something of the autopilot that may fail without harm."""
+    async def attempt(self, work: Callable[P, Awaitable[None]], *args: P.args, **kwargs: P.kwargs) -> None:
+        """Do something with the autopilot that may fail without harm."""
         try:
-            await work
+            await work(*args, **kwargs)
         except AutopilotError as error:
             log.warning("%s", error)
 

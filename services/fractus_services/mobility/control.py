@@ -299,14 +299,14 @@ class Control:
         if self.motion is motion and self.hands == "driver":
             self.motion = None
             motion.stop(aborted("Cancelled", "the call was cancelled"))
-            await self.tasks.attempt(self.hold(self.still))
+            await self.tasks.attempt(self.hold, self.still)
 
     def failed(self, motion: Motion) -> None:
         """A motion ended with an error, and the autopilot may fly on for it: hover."""
         if self.motion is motion:
             self.motion = None
             if self.hands == "driver" and self.autopilot.vehicle.in_air:
-                self.tasks.spawn(self.tasks.attempt(self.hold(self.still)))
+                self.tasks.spawn(self.tasks.attempt(self.hold, self.still))
 
     def still(self) -> None:
         """Permits what a driver's drone does after its motion: nothing else has begun.

@@ -53,7 +53,7 @@ class Observer:
                     )
                     self._control.wake()
                     if autopilot.vehicle.home is None:
-                        await self._control.tasks.attempt(autopilot.ask_home())
+                        await self._control.tasks.attempt(autopilot.ask_home)
                 except AutopilotError as error:
                     log.warning("cannot prepare the autopilot yet: %s", error)
                 except Exception:
@@ -141,7 +141,7 @@ class Observer:
     def _armed(self) -> None:
         if self._control.hands != "driver" and not self._control.helm.arming:
             self._pilot("armed the drone")
-        self._control.tasks.spawn(self._control.tasks.attempt(self._control.autopilot.set_rates(flying=True)))
+        self._control.tasks.spawn(self._control.tasks.attempt(self._control.autopilot.set_rates, flying=True))
 
     def _landed(self) -> None:
         """The motors stopped."""
@@ -156,7 +156,7 @@ class Observer:
                 self._control.journal.active = None
         self._control.note("landed", self._control.controller, "the motors are stopped")
         self._control.journal.save_soon()
-        self._control.tasks.spawn(self._control.tasks.attempt(self._control.autopilot.set_rates(flying=False)))
+        self._control.tasks.spawn(self._control.tasks.attempt(self._control.autopilot.set_rates, flying=False))
         self._control.wake()
 
     def _foreign_mode(self, mode: int) -> None:

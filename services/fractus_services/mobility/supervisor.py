@@ -71,7 +71,7 @@ class Supervisor:
         return over and not control.helm.preparing
 
     async def _lower(self) -> None:
-        await self._control.tasks.attempt(self._control.backstop.lower(self._idle))
+        await self._control.tasks.attempt(self._control.backstop.lower, self._idle)
 
     def _orphaned(self) -> bool:
         """Whether the motors run for nobody: no pilot, no driver, no chauffeur, no tour, no grace, no way home."""

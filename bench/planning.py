@@ -435,7 +435,7 @@ def claims(
     return [
         claim("plan at 10^5 edge nodes, fixed candidates", 1e3 * ours.total_s, 1e3 * theirs.total_s, unit="ms", target="< 50 ms", holds=ours.total_s < 0.05),
         claim("plan at 10^5 over plan at 10^3, fixed candidates", growth, linear_growth, unit="times", target="<= 3", holds=growth <= 3),
-        claim("linear method over ours at 10^5", 1.0, slower, unit="times", target=">= 50", holds=slower >= 50),
+        claim("linear method over ours at 10^5", slower, None, unit="times", target=">= 50", holds=slower >= 50),
         claim("plan at 10^5 with 15 % candidates", 1e3 * wide.total_s, 1e3 * wide_linear.total_s, unit="ms", target="< 1000 ms", holds=wide.total_s < 1),
         claim("index update of one moved node at 10^5 (p99; theirs: build anew)", 1e3 * update_s, 1e3 * build_s, unit="ms", target="< 1 ms", holds=update_s < 1e-3),
         claim("same plan as the linear method, all sizes", float(same), 1.0, unit="yes", target="1", holds=same),

@@ -57,6 +57,19 @@ def test_circle_area_anywhere(lat, lon):
     assert shape.area >= math.pi * 500**2
 
 
+@pytest.mark.parametrize("radius", [1e-6, 0.5, 7, 33, 500, 40_000])
+def test_rounds_are_never_cut_short_and_hardly_larger(radius):
+    frame = LocalFrame(50, 4)
+    here = Point(lat=50, lon=4)
+    exact = shapely.Point(0, 0).buffer(radius, quad_segs=2000)
+    for shape in (polygon(frame, Area(circle=Circle(center=here, radius=radius))), corridor(frame, [here], radius)):
+        assert shape.buffer(1e-12).covers(exact)
+        assert shape.area == pytest.approx(exact.area, rel=5e-3)
+        corners = shapely.get_coordinates(shape)
+        beyond = max(math.hypot(x, y) for x, y in corners) - radius
+        assert beyond <= max(0.0101, 3.1e-4 * radius)
+
+
 def square(lat, lon, half):
     corners = [(-half, -half), (-half, half), (half, half), (half, -half)]
     wrap = lambda v: (v + 180) % 360 - 180  # noqa: E731

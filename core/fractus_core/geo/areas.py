@@ -15,8 +15,11 @@ from fractus_core.api.geometry import Area, Circle, Point, Polygon, Position
 from fractus_core.api.model import InvalidObject
 from fractus_core.geo.frames import LocalFrame
 
-CIRCLE_SEGMENTS = 32
-"""Straight pieces per quarter of a circle."""
+_SEGMENTS = (8, 32)
+"""Straight pieces per quarter of a circle, at least and at most: the area is right within 0.4 %."""
+
+_CORNER_M = 0.01
+"""So many pieces are enough that their corners stick out of the circle by no more than this."""
 
 
 def points_xy(frame: LocalFrame, points: Iterable[Point]) -> list[tuple[float, float]]:
@@ -39,8 +42,8 @@ def polygon(frame: LocalFrame, area: Area) -> shapely.Polygon:
 
 def _circle(frame: LocalFrame, circle: Circle) -> shapely.Polygon:
     x, y = frame.xy(circle.center.lat, circle.center.lon)
-    circumscribed = circle.radius / math.cos(math.pi / (4 * CIRCLE_SEGMENTS))
-    return shapely.Point(x, y).buffer(circumscribed, quad_segs=CIRCLE_SEGMENTS)
+    circumscribed, segments = _circumscribed(circle.radius)
+    return shapely.Point(x, y).buffer(circumscribed, quad_segs=segments)
 
 
 def _polygon(frame: LocalFrame, spec: Polygon) -> shapely.Polygon:
@@ -81,9 +84,17 @@ def corridor(frame: LocalFrame, points: Iterable[Point], radius_m: float) -> Bas
     xy = points_xy(frame, points)
     ends = list(itertools.pairwise(xy)) or [(xy[0], xy[0])]
     legs = shapely.linestrings(np.asarray(ends))
-    circumscribed = radius_m / math.cos(math.pi / (4 * CIRCLE_SEGMENTS))
-    united: BaseGeometry = shapely.union_all(shapely.buffer(legs, circumscribed, quad_segs=CIRCLE_SEGMENTS))
+    circumscribed, segments = _circumscribed(radius_m)
+    united: BaseGeometry = shapely.union_all(shapely.buffer(legs, circumscribed, quad_segs=segments))
     return united
+
+
+def _circumscribed(radius_m: float) -> tuple[float, int]:
+    """How far the corners of a polygon around a circle lie from its middle, and how many pieces a quarter has."""
+    enough = math.ceil(math.pi / 4 / math.acos(radius_m / (radius_m + _CORNER_M)))
+    fewest, most = _SEGMENTS
+    segments = min(max(enough, fewest), most)
+    return radius_m / math.cos(math.pi / (4 * segments)), segments
 
 
 def middle(area: Area) -> Point:

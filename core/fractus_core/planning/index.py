@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 
@@ -151,9 +152,10 @@ class SpatialIndex:
     def nearest(self, point: Point, count: int, beyond_m: float = 0.0, within_m: float = CHORDS_TO_M) -> list[Near]:
         """The points nearest to a place, further than `beyond_m` and not further than `within_m`; ordered as by within."""
         radius_m = min(max(_GROWTH * beyond_m, _CELLS_M[0]), within_m)
+        too_near = 0
         while count > 0:
             around = self._around(point.lat, point.lon, radius_m)
-            if len(around) >= count or radius_m >= within_m:
+            if len(around) >= too_near + count or radius_m >= within_m:
                 slots, distances = self._exactly(point, around, radius_m)
                 outside = distances > beyond_m
                 if outside.sum() >= count or radius_m >= within_m:
@@ -162,7 +164,9 @@ class SpatialIndex:
                         limit = np.partition(distances, count - 1)[count - 1] + 1e-3
                         slots, distances = slots[distances <= limit], distances[distances <= limit]
                     return self._ranked(slots, distances)[:count]
-            radius_m = min((_GROWTH if len(around) >= count / 4 else _GROWTH**3) * radius_m, within_m)
+                too_near = len(slots) - int(outside.sum())
+            close = len(around) - too_near >= count / 4
+            radius_m = min((_GROWTH if close else _GROWTH**3) * radius_m, within_m)
         return []
 
     def near_area(self, frame: LocalFrame, shape: BaseGeometry, margin_m: float) -> tuple[list[str], _Floats]:
@@ -203,7 +207,7 @@ class SpatialIndex:
         else:
             return np.fromiter(self._slots.values(), dtype=np.int64, count=len(self._slots))
         total = sum(map(len, cells))
-        return np.fromiter((slot for cell in cells for slot in cell), dtype=np.int64, count=total)
+        return np.fromiter(itertools.chain.from_iterable(cells), dtype=np.int64, count=total)
 
     def _exactly(self, point: Point, slots: _Slots, radius_m: float) -> tuple[_Slots, _Floats]:
         estimates = _geodesics(np.array(ecef(point.lat, point.lon)), self._xyz[slots])

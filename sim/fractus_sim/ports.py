@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+import atexit
+import errno
 import random
 import socket
 from collections import deque
 
-# Below the ports that Linux gives to connections and to listeners on port 0 (32768 and up), below Kubernetes' NodePorts
-# (30000 and up), above its components' (10248 to 10259) and those usual for MAVLink (14540 to 18570).
+# Below the ports that Linux usually gives to connections and to listeners on port 0 (32768 and up), below Kubernetes'
+# NodePorts (30000 and up), above its components' (10248 to 10259) and those usual for MAVLink (14540 to 18570).
 _FIRST, _LAST = 20_000, 29_999
-_KEPT = 256
+_KEPT = 512
 
 _chance = random.SystemRandom()
-_reservations: deque[socket.socket] = deque(maxlen=_KEPT)
+_reservations: deque[socket.socket] = deque()
 
 
 def free_port() -> int:
-    """Reserve a port, TCP and UDP, that nobody listens on and that nobody else gets from here.
+    """Reserve a port, TCP and UDP, on which nobody listens at 127.0.0.1 and which nobody else gets from here.
 
-    The port stays reserved, also among processes, until this process ends or has asked for 256 more: a program that
-    listens there may end and start again. Nothing but such a program comes to listen there by chance.
+    The port stays reserved, also among processes, until this process ends or has asked for 512 more: a program that
+    listens there may end and start again. Elsewhere than on Linux, ports are only looked for and not reserved.
 
     Raises:
         OSError: no port is free.
@@ -31,11 +33,10 @@ def free_port() -> int:
         reservation = _reserve(port)
         if reservation is None:
             continue
-        if not _is_free(port):
-            reservation.close()
-            continue
-        _reservations.append(reservation)
-        return port
+        if _is_free(port):
+            _keep(reservation)
+            return port
+        reservation.close()
     message = f"none of the ports {_FIRST} to {_LAST} of 127.0.0.1 is free; end programs that listen there"
     raise OSError(message)
 
@@ -45,9 +46,11 @@ def _reserve(port: int) -> socket.socket | None:
     reservation = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     try:
         reservation.bind(f"\0fractus/port/{port}")
-    except OSError:
-        reservation.close()
-        return None
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            reservation.close()
+            return None
+        # Only Linux has such names.
     return reservation
 
 
@@ -59,3 +62,15 @@ def _is_free(port: int) -> bool:
             except OSError:
                 return False
     return True
+
+
+def _keep(reservation: socket.socket) -> None:
+    _reservations.append(reservation)
+    while len(_reservations) > _KEPT:
+        _reservations.popleft().close()
+
+
+@atexit.register
+def _give_back() -> None:
+    while _reservations:
+        _reservations.pop().close()

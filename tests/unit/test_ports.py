@@ -23,7 +23,7 @@ while True:
 
 @pytest.fixture
 def ten(monkeypatch: pytest.MonkeyPatch) -> range:
-    """The only ten ports there are; other tests ask for none of them."""
+    """The only ten ports there are; hardly anybody else asks for one of them."""
     first = 19_000 + ports.free_port() % 1000 // 10 * 10
     monkeypatch.setattr(ports, "_FIRST", first)
     monkeypatch.setattr(ports, "_LAST", first + 9)
@@ -58,6 +58,12 @@ def test_without_a_free_port_it_says_which_were_tried(ten: range) -> None:
     assert {ports.free_port() for _ in ten} == set(ten)
     with pytest.raises(OSError, match=f"{ten[0]} to {ten[-1]} .* is free; end programs"):
         ports.free_port()
+
+
+def test_the_oldest_reservations_end_first(ten: range, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ports, "_KEPT", 2)
+    given = [ports.free_port() for _ in range(4)]
+    assert given_to_another_process(ten) == set(ten) - set(given[-2:])
 
 
 def test_connections_and_listeners_on_port_0_never_come_to_it() -> None:

@@ -151,3 +151,16 @@ def test_a_move_takes_less_than_a_millisecond_among_many():
     name, lat, lon = moves[-1]
     assert index.within(Point(lat=lat, lon=lon), 0.01)[0][0] == name
     assert math.isclose(index.position(name).lat, lat)
+
+
+def test_equally_near_points_go_by_name_also_where_a_look_ends():
+    centre = Point(lat=50, lon=4)
+    points = {"b": away(centre, 10, 127.9998), "a": away(centre, 200, 128.0002)}
+    assert [n for n, _ in index_of(points).nearest(centre, 1)] == ["a"]
+    assert index_of(points).nearest(centre, 2) == index_of(points).within(centre, 200)
+
+
+@pytest.mark.parametrize("lat", [0.0, 45.0, -80.0])
+def test_one_place_on_both_sides_of_the_antimeridian(lat):
+    index = SpatialIndex.of([("west", lat, -180.0)])
+    assert index.within(Point(lat=lat, lon=180.0), 0.0) == [("west", 0.0)]

@@ -19,7 +19,10 @@ _SEGMENTS = (8, 32)
 """Straight pieces per quarter of a circle, at least and at most: the area is right within 0.4 %."""
 
 _CORNER_M = 0.01
-"""So many pieces are enough that their corners stick out of the circle by no more than this."""
+"""Between these, so many pieces that their corners stick out of the circle by no more than this."""
+
+_SNAPPED = 1e-5
+"""GEOS merges corners that are closer than about a millionth of the radius, which would cut short a leg as short."""
 
 
 def points_xy(frame: LocalFrame, points: Iterable[Point]) -> list[tuple[float, float]]:
@@ -84,7 +87,7 @@ def corridor(frame: LocalFrame, points: Iterable[Point], radius_m: float) -> Bas
     xy = points_xy(frame, points)
     ends = list(itertools.pairwise(xy)) or [(xy[0], xy[0])]
     legs = shapely.linestrings(np.asarray(ends))
-    circumscribed, segments = _circumscribed(radius_m)
+    circumscribed, segments = _circumscribed(radius_m * (1 + _SNAPPED))
     united: BaseGeometry = shapely.union_all(shapely.buffer(legs, circumscribed, quad_segs=segments))
     return united
 

@@ -158,7 +158,8 @@ class SpatialIndex:
             if len(around) >= too_near + count or radius_m >= within_m:
                 slots, distances = self._exactly(point, around, radius_m)
                 outside = distances > beyond_m
-                if outside.sum() >= count or radius_m >= within_m:
+                # What is as far as the last, to the millimetre, may come before it by name.
+                if (outside & (distances <= radius_m - 1e-3)).sum() >= count or radius_m >= within_m:
                     slots, distances = slots[outside], distances[outside]
                     if len(slots) > count:
                         limit = np.partition(distances, count - 1)[count - 1] + 1e-3
@@ -200,6 +201,7 @@ class SpatialIndex:
     def _around(self, lat: float, lon: float, radius_m: float) -> _Slots:
         """Slots that may be within the radius: a superset, since a chord is never longer than the geodesic."""
         x, y, z = ecef(lat, lon)
+        radius_m += 1e-6  # A place has coordinates on both sides of a cell, if only by their last digit.
         for grid, size in zip(self._grids, _CELLS_M, strict=True):
             if size >= radius_m / 2:
                 cells = [grid[key] for key in _cells_around(x, y, z, radius_m, size) if key in grid]

@@ -94,7 +94,7 @@ class RunningDrone:
     """A drone that was brought up.
 
     Attributes:
-        station_link: the vehicle's link for a ground station of ours, such as `tcp:127.0.0.1:41235`.
+        station_link: the vehicle's link for a ground station of ours, such as `tcp:127.0.0.1:21235`.
         guest_link: another one, for QGroundControl, Mission Planner or MAVProxy.
         mobility_address: host:port of its mobility service.
         camera_address: host:port of its camera service, if it has one.

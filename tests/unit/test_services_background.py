@@ -1,0 +1,45 @@
+"""Work beside the calls leaves nothing behind, also when it is cancelled before it begins."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import warnings
+
+import pytest
+from fractus_services.mobility.autopilot import AutopilotError
+from fractus_services.mobility.background import Background
+
+
+def test_what_is_cancelled_before_it_begins_was_never_made() -> None:
+    begun: list[str] = []
+
+    async def work(name: str) -> None:
+        begun.append(name)
+
+    async def scene() -> None:
+        background = Background()
+        background.spawn(background.attempt(work, "never")).cancel()
+        await background.spawn(background.attempt(work, name="once"))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        asyncio.run(scene())
+        gc.collect()
+    assert begun == ["once"]
+
+
+def test_an_autopilot_that_does_not_answer_is_logged_and_other_failures_are_told(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async def fail(error: Exception) -> None:
+        raise error
+
+    async def scene() -> None:
+        background = Background()
+        await background.attempt(fail, AutopilotError("no answer to command 176"))
+        with pytest.raises(ValueError, match="ours"):
+            await background.attempt(fail, ValueError("ours"))
+
+    asyncio.run(scene())
+    assert "no answer to command 176" in caplog.text

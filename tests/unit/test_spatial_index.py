@@ -160,6 +160,23 @@ def test_equally_near_points_go_by_name_also_where_a_look_ends():
     assert index_of(points).nearest(centre, 2) == index_of(points).within(centre, 200)
 
 
+def test_what_is_too_near_is_measured_once_and_not_again_for_every_wider_look(monkeypatch):
+    centre = Point(lat=50, lon=4)
+    points = {f"near{i}": away(centre, 9 * i, 50 + i) for i in range(40)}
+    points |= {f"far{i}": away(centre, 30 * i, 20_000 + i) for i in range(5)}
+    spatial = index_of(points)
+    looks = []
+    exactly = SpatialIndex._exactly
+
+    def counted(self, *args):
+        looks.append(args)
+        return exactly(self, *args)
+
+    monkeypatch.setattr(SpatialIndex, "_exactly", counted)
+    assert [n for n, _ in spatial.nearest(centre, 5, 150)] == [f"far{i}" for i in range(5)]
+    assert len(looks) == 2
+
+
 @pytest.mark.parametrize("lat", [0.0, 45.0, -80.0])
 def test_one_place_on_both_sides_of_the_antimeridian(lat):
     index = SpatialIndex.of([("west", lat, -180.0)])

@@ -93,7 +93,7 @@ RUN uv build --quiet --wheel --no-build-isolation --out-dir /wheel \
  && assemble operator fractus_core fractus_operator \
  && assemble agent fractus_core fractus_agent \
  && assemble services fractus fractus_core fractus_services \
- && assemble sim fractus_sim
+ && assemble sim fractus_vehicle fractus_world
 
 # ---- python: the common start of all images, with what the SDK needs
 FROM scratch AS python
@@ -144,5 +144,5 @@ COPY --from=code /images/services /usr/local/lib/python3.11/dist-packages
 # ---- sim: the simulated vehicle as a pod, for clusters whose nodes have no hardware beside them
 FROM services AS sim
 USER 10001:10001
-ENTRYPOINT ["python3", "-m", "fractus_sim.vehicle"]
+ENTRYPOINT ["python3", "-m", "fractus_vehicle"]
 COPY --from=code /images/sim /usr/local/lib/python3.11/dist-packages

@@ -71,7 +71,7 @@ generate: env ## Generate the CRDs from the models and the stubs from the .proto
 
 .PHONY: images
 images: packages env ## Build the container images
-	$(RUN) python -m fractus_sim.cluster.images build
+	$(RUN) python -m fractus_cluster.images build
 
 .PHONY: bench
 bench: env ## Run every benchmark

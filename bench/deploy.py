@@ -36,10 +36,10 @@ from typing import Any
 
 import httpx2
 import yaml
+from fractus_cluster.loopback import LoopbackCluster, simulated_node, wait_until
+from fractus_cluster.ports import free_port
 from fractus_core.api import KINDS
 from fractus_core.api.crd import crd
-from fractus_sim.cluster.loopback import LoopbackCluster, simulated_node, wait_until
-from fractus_sim.ports import free_port
 
 EXAMPLE = pathlib.Path(__file__).parents[1] / "examples" / "traffic-monitoring"
 API = "/apis/fractus.dev/v1alpha1"

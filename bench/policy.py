@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import shapely
+from fractus_cluster.ports import free_port
 from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled import CompiledGrant, compile_grant
@@ -33,7 +34,6 @@ from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.routes import route
 from fractus_core.policy.values import Airframe, Call, GotoArgs, Home, Situation, VelocityArgs
-from fractus_sim.ports import free_port
 from pymavlink import mavutil
 
 HOME = Home(39.36, 22.95, 100.0)
@@ -100,7 +100,7 @@ class Autopilot:
     def __init__(self) -> None:
         port = free_port()
         place = f"{HOME.lat},{HOME.lon},{HOME.amsl_m}"
-        command = [sys.executable, "-m", "fractus_sim.vehicle", "--listen", f"tcp:127.0.0.1:{port}", "--home", place]
+        command = [sys.executable, "-m", "fractus_vehicle", "--listen", f"tcp:127.0.0.1:{port}", "--home", place]
         self._child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         assert self._child.stderr is not None
         self._child.stderr.readline()

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fractus_cluster.ports import free_port
 from fractus_operator.standalone import StandalonePki
-from fractus_sim.ports import free_port
 
 NODE = "bench"
 TARGET = 10.0
@@ -101,7 +101,7 @@ def side_by_side(folder: Path, seconds: float, stream_rate: int) -> dict[str, tu
     program = Path(sys.executable).with_name("mavproxy.py")
     with Processes(folder) as processes:
         processes.start(
-            "vehicle", sys.executable, "-m", "fractus_sim.vehicle", "--listen", ours, "--listen", theirs, "--home", HOME
+            "vehicle", sys.executable, "-m", "fractus_vehicle", "--listen", ours, "--listen", theirs, "--home", HOME
         )
         pids = {
             "mobility service": processes.start(

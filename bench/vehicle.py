@@ -21,13 +21,13 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from fractus_sim.ports import free_port
-from fractus_sim.vehicle.earth import Place
-from fractus_sim.vehicle.mav import Command, Mode
-from fractus_sim.vehicle.pilot import Pilot
-from fractus_sim.vehicle.simulation import Simulation, formation
-from fractus_sim.vehicle.vehicle import CONTROL_STEP_S, VehicleConfig
-from fractus_sim.vehicle.wire import Parser, encode, layout_named
+from fractus_cluster.ports import free_port
+from fractus_vehicle.earth import Place
+from fractus_vehicle.mav import Command, Mode
+from fractus_vehicle.pilot import Pilot
+from fractus_vehicle.simulation import Simulation, formation
+from fractus_vehicle.vehicle import CONTROL_STEP_S, VehicleConfig
+from fractus_vehicle.wire import Parser, encode, layout_named
 
 START = Place.from_degrees(48.2, 16.37, 150.0)
 
@@ -195,7 +195,7 @@ class Link:
 def process(duration_s: float) -> list[Claim]:
     """Processor time, memory, stream rate and acknowledgement time of the process in real time."""
     port = free_port()
-    command = [sys.executable, "-m", "fractus_sim.vehicle", "--listen", f"tcp:127.0.0.1:{port}", "--ready-after", "1"]
+    command = [sys.executable, "-m", "fractus_vehicle", "--listen", f"tcp:127.0.0.1:{port}", "--ready-after", "1"]
     child = subprocess.Popen([*command, "--param", "DISARM_DELAY=0"], stderr=subprocess.PIPE, text=True)
     assert child.stderr is not None
     try:

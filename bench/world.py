@@ -20,10 +20,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from fractus_sim.world.optics import Intrinsics, Mount, Pose, View
-from fractus_sim.world.render import render_ground
-from fractus_sim.world.tiles import TILE_PX, TileStore
-from fractus_sim.world.world import World
+from fractus_world.optics import Intrinsics, Mount, Pose, View
+from fractus_world.render import render_ground
+from fractus_world.tiles import TILE_PX, TileStore
+from fractus_world.world import World
 
 LENS = Intrinsics(1920, 1080, 62.2)
 LAT, LON = 50.8637, 4.6785

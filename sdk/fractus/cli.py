@@ -18,7 +18,10 @@ EXIT_INFEASIBLE = 2
 EXIT_INTERRUPTED = 130
 
 _EXTRA_OF = {
+    "fractus_cluster": "sim",
     "fractus_sim": "sim",
+    "fractus_vehicle": "sim",
+    "fractus_world": "sim",
     "fractus_services": "services",
     "fractus_agent": "agent",
     "fractus_operator": "operator",

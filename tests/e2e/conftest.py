@@ -15,9 +15,9 @@ from collections.abc import Iterator
 
 import pytest
 import yaml
-from fractus_sim.cluster import Cluster
-from fractus_sim.cluster.binaries import ensure_binaries
-from fractus_sim.cluster.images.build import build_images
+from fractus_cluster import Cluster
+from fractus_cluster.binaries import ensure_binaries
+from fractus_cluster.images.build import build_images
 from kube import Kube, Object, condition
 
 ROOT = pathlib.Path(__file__).parents[2]

@@ -18,12 +18,12 @@ from typing import Any
 
 import pytest
 import yaml
-from fractus_sim.cluster import Cluster, ClusterError, ClusterSpec
-from fractus_sim.cluster.images.build import build_images
-from fractus_sim.cluster.network import host_link
-from fractus_sim.cluster.processes import kill, read_record
-from fractus_sim.cluster.spec import load_spec, parse_spec
-from fractus_sim.cluster.state import state_of
+from fractus_cluster import Cluster, ClusterError, ClusterSpec
+from fractus_cluster.images.build import build_images
+from fractus_cluster.network import host_link
+from fractus_cluster.processes import kill, read_record
+from fractus_cluster.spec import load_spec, parse_spec
+from fractus_cluster.state import state_of
 
 pytestmark = [
     pytest.mark.root,

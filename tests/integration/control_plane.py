@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import httpx2
+from fractus_cluster.binaries import ensure_binaries
+from fractus_cluster.pki import Authority
+from fractus_cluster.ports import free_port
 from fractus_core.api import KINDS
 from fractus_core.api.crd import crd
-from fractus_sim.cluster.binaries import ensure_binaries
-from fractus_sim.cluster.pki import Authority
-from fractus_sim.ports import free_port
 
 T = TypeVar("T")
 Body = dict[str, Any]

@@ -19,12 +19,12 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
+from fractus_cluster.ports import free_port
 from fractus_core.api.plans import OPERATOR_IDENTITY, component_identity, node_identity, node_server_name
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.signatures import DOCUMENT_SIGNING, sign
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_proto.v1 import mobility_pb2_grpc, types_pb2
-from fractus_sim.ports import free_port
 from grpc_status import rpc_status
 
 HOME = (39.3600, 22.9500, 10.0)
@@ -216,7 +216,7 @@ class Rig:
     def start_vehicle(self, speedup: float = 3.0, *more: str) -> None:
         home = ",".join(str(v) for v in HOME)
         self._start(
-            "vehicle", "-m", "fractus_sim.vehicle", "--listen", self.link, "--home", home, "--speedup", str(speedup),
+            "vehicle", "-m", "fractus_vehicle", "--listen", self.link, "--home", home, "--speedup", str(speedup),
             "--ready-after", "2", *more,
         )  # fmt: skip
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from control_plane import Api, ControlPlane, Refused, wait_for
-from fractus_sim.ports import free_port
+from fractus_cluster.ports import free_port
 
 Body = dict[str, Any]
 FRACTUS = "/apis/fractus.dev/v1alpha1"

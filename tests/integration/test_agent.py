@@ -20,12 +20,12 @@ import yaml
 from agent_pki import TestAuthority
 from agent_server import FRACTUS, REQUESTS, ApiServer, running
 from control_plane import wait_for
+from fractus_cluster.ports import free_port
 from fractus_core.api.plans import Grant
 from fractus_core.policy.signatures import sign
 from fractus_proto.v1 import mobility_pb2_grpc
 from fractus_proto.v1.mobility_pb2 import SubscribeTelemetryRequest, Telemetry
 from fractus_proto.v1.types_pb2 import Position
-from fractus_sim.ports import free_port
 from mobility_rig import issue_signer
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.xdist_group("agent")]  # they share an API server

@@ -17,9 +17,9 @@ import grpc
 import numpy as np
 import pytest
 import yaml
+from fractus_cluster.ports import free_port
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
 from fractus_services.audit import verify
-from fractus_sim.ports import free_port
 from mobility_rig import (
     DRIVER,
     FRAME,
@@ -229,7 +229,7 @@ BILLBOARD = (39.36009591, 22.95004318)
 async def test_a_face_in_the_simulated_world_is_hidden_and_the_rest_stays(rig: Rig) -> None:
     port = free_port()
     rig._start(
-        "world", "-m", "fractus_sim.world", "--listen", f"127.0.0.1:{port}", "--pose", f"{BILLBOARD[0]},{BILLBOARD[1]},4",
+        "world", "-m", "fractus_world", "--listen", f"127.0.0.1:{port}", "--pose", f"{BILLBOARD[0]},{BILLBOARD[1]},4",
         "--origin", "39.36,22.95", "--resolution", "640x360",
     )  # fmt: skip
     node = {

@@ -16,13 +16,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from fractus_sim.ports import free_port
-from fractus_sim.world import server as server_module
-from fractus_sim.world.optics import Intrinsics, Mount, Pose
-from fractus_sim.world.server import CameraServer
-from fractus_sim.world.studio import Studio
-from fractus_sim.world.whereabouts import Fixed
-from fractus_sim.world.world import WorldAround
+from fractus_cluster.ports import free_port
+from fractus_world import server as server_module
+from fractus_world.optics import Intrinsics, Mount, Pose
+from fractus_world.server import CameraServer
+from fractus_world.studio import Studio
+from fractus_world.whereabouts import Fixed
+from fractus_world.world import WorldAround
 from geotagged import save
 from vehicle_process import HOME, Client, running_vehicle
 
@@ -62,7 +62,7 @@ def pictured(port: int, path: str) -> tuple[int, dict[str, str], bytes]:
 @contextlib.contextmanager
 def running_world(*arguments: str) -> Iterator[int]:
     """The camera world as a process; its port."""
-    command = [sys.executable, "-m", "fractus_sim.world", "--listen", "127.0.0.1:0", *arguments]
+    command = [sys.executable, "-m", "fractus_world", "--listen", "127.0.0.1:0", *arguments]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
     try:
@@ -245,7 +245,7 @@ def test_other_methods_are_refused(served: CameraServer) -> None:
 )
 def test_bad_options_are_named(arguments: tuple[str, ...], words: str) -> None:
     from click.testing import CliRunner
-    from fractus_sim.world.__main__ import camera_world
+    from fractus_world.__main__ import camera_world
 
     result = CliRunner().invoke(camera_world, list(arguments))
     assert result.exit_code != 0

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import pytest
 from cryptography import x509
-from fractus_sim.cluster import ClusterError
-from fractus_sim.cluster.locking import locked
-from fractus_sim.cluster.pki import Authority
-from fractus_sim.cluster.processes import ProcessRecord, kill, read_record, record_of, spawn, write_record
+from fractus_cluster import ClusterError
+from fractus_cluster.locking import locked
+from fractus_cluster.pki import Authority
+from fractus_cluster.processes import ProcessRecord, kill, read_record, record_of, spawn, write_record
 
 ENVIRONMENT = {"PATH": os.environ["PATH"]}
 
@@ -89,7 +89,7 @@ def supervisor(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]
         ]
         (tmp_path / "units.json").write_text(json.dumps({"units": units}))
         with (tmp_path / "supervisor.log").open("wb") as log:
-            argv = [sys.executable, "-m", "fractus_sim.cluster.supervisor", str(tmp_path / "units.json")]
+            argv = [sys.executable, "-m", "fractus_cluster.supervisor", str(tmp_path / "units.json")]
             started.append(subprocess.Popen(argv, stdout=log, stderr=log))
         return started[-1]
 
@@ -152,7 +152,7 @@ def test_supervisor_goes_on_when_a_program_is_missing(
     process.kill()
     process.wait(timeout=10)
     (tmp_path / "units.json").write_text(json.dumps({"units": units}))
-    argv = [sys.executable, "-m", "fractus_sim.cluster.supervisor", str(tmp_path / "units.json")]
+    argv = [sys.executable, "-m", "fractus_cluster.supervisor", str(tmp_path / "units.json")]
     with subprocess.Popen(argv, stdout=subprocess.DEVNULL) as second:
         try:
             until(lambda: (tmp_path / "here.log").exists() and "up" in (tmp_path / "here.log").read_text(), "here")
@@ -162,7 +162,7 @@ def test_supervisor_goes_on_when_a_program_is_missing(
 
 def test_lock_is_held_by_one_and_freed_by_death(tmp_path: Path) -> None:
     script = (
-        "import sys, time; from pathlib import Path; from fractus_sim.cluster.locking import locked\n"
+        "import sys, time; from pathlib import Path; from fractus_cluster.locking import locked\n"
         "with locked(Path(sys.argv[1]), timeout_s=5, what='x'):\n    print('held', flush=True); time.sleep(300)"
     )
     path = tmp_path / "lock"

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fractus_sim.cluster.images.layout import Layout
-from fractus_sim.cluster.images.receiver import receiving
+from fractus_cluster.images.layout import Layout
+from fractus_cluster.images.receiver import receiving
 
 
 @pytest.fixture

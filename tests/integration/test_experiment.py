@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
+from fractus_cluster.ports import free_port
 from fractus_sim.experiment import parse, run
 from fractus_sim.experiment.cli import experiment as command
 from fractus_sim.experiment.processes import Processes, listening
-from fractus_sim.ports import free_port
 from mcap.reader import make_reader
 from pymavlink import mavutil
 
@@ -245,7 +245,7 @@ def test_an_autopilot_that_runs_already_is_flown_and_harmed_over_tcp(tmp_path: P
     processes, port = Processes(tmp_path), free_port()
     link, home = f"tcp:127.0.0.1:{port}", "50.8637,4.6785,25"
     arguments = ["--listen", link, "--home", home, "--speedup", "5", "--ready-after", "2"]
-    processes.start("sitl", [sys.executable, "-m", "fractus_sim.vehicle", *arguments], dict(os.environ))
+    processes.start("sitl", [sys.executable, "-m", "fractus_vehicle", *arguments], dict(os.environ))
     try:
         processes.wait("sitl", lambda: listening(port), 30)
         vehicle = {"name": "d", "connection": link, "task": TASK[:2]}

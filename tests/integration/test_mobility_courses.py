@@ -11,12 +11,12 @@ from typing import Any
 import grpc
 import pytest
 import shapely
+from fractus_cluster.ports import free_port
 from fractus_core.api.plans import node_identity
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_proto.v1 import types_pb2
 from fractus_services.mobility.autopilot import Autopilot
 from fractus_services.mobility.itemlists import download
-from fractus_sim.ports import free_port
 from mobility_rig import (
     FRAME,
     NODE,

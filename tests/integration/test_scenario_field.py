@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from fractus_sim.ports import free_port
+from fractus_cluster.ports import free_port
 from vehicle_process import running_vehicle
 
 SLOW = ("WPNAV_SPEED=450", "WPNAV_ACCEL=150", "WPNAV_SPEED_UP=200", "RTL_ALT=1300", "LAND_SPEED=70")

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 import yaml
 from cryptography import x509
+from fractus_cluster.ports import free_port
 from fractus_core.api import Application, Depot, Drone, Grant, Policy, Zone
 from fractus_core.api.model import Metadata
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
@@ -24,7 +25,6 @@ from fractus_core.planning import Inventory
 from fractus_core.policy.grants import compile_grants
 from fractus_core.policy.signatures import sign
 from fractus_services.chain import verify
-from fractus_sim.ports import free_port
 from mobility_rig import issue_signer
 from sdk_service import Authority
 
@@ -92,7 +92,7 @@ class Stage:
     def start_vehicle(self, speedup: float) -> None:
         depot = documents("depot.yaml")[0]["spec"]["location"]
         self._start(
-            "vehicle", "-m", "fractus_sim.vehicle", "--listen", self.autopilot, "--speedup", str(speedup),
+            "vehicle", "-m", "fractus_vehicle", "--listen", self.autopilot, "--speedup", str(speedup),
             "--ready-after", "2", "--home", f"{depot['lat']},{depot['lon']},25",
         )  # fmt: skip
 

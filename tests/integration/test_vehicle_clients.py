@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_sim.ports import free_port
+from fractus_cluster.ports import free_port
 from vehicle_process import HOME, Client, running_vehicle
 
 SESSIONS = Path(__file__).with_name("vehicle_clients")

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pymavlink.dialects.v20.ardupilotmega as dialect
 import pytest
-from fractus_sim.ports import free_port
+from fractus_cluster.ports import free_port
 from pymavlink import mavutil
 from vehicle_process import HOME, Client, running_vehicle
 
@@ -340,7 +340,7 @@ def test_bad_arguments_are_explained(tmp_path: Path):
         (["--listen", f"serial:{tmp_path / 'none'}"], "No such file"),
     ):
         done = subprocess.run(
-            [sys.executable, "-m", "fractus_sim.vehicle", *arguments],
+            [sys.executable, "-m", "fractus_vehicle", *arguments],
             capture_output=True,
             text=True,
             timeout=20,

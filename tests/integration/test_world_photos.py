@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fractus_core.api.geometry import Point
 from fractus_core.geo import geodesic_m
-from fractus_sim.world.photos import Photo, PhotoError, Photos, developed
+from fractus_world.photos import Photo, PhotoError, Photos, developed
 from geotagged import save
 from PIL import Image
 

@@ -8,9 +8,9 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from fractus_sim.vehicle.wire import Parser, encode, layout_named
-from fractus_sim.world import whereabouts
-from fractus_sim.world.whereabouts import Sighting, Vehicle, parse_address
+from fractus_vehicle.wire import Parser, encode, layout_named
+from fractus_world import whereabouts
+from fractus_world.whereabouts import Sighting, Vehicle, parse_address
 
 TIMEOUT_S = 20.0
 

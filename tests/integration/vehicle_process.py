@@ -17,7 +17,7 @@ HOME = (48.2, 16.37, 150.0)
 @contextlib.contextmanager
 def running_vehicle(*arguments: str, links: tuple[str, ...]) -> Iterator[subprocess.Popen[str]]:
     """Run a vehicle until the block ends; it must end cleanly on SIGTERM."""
-    command = [sys.executable, "-m", "fractus_sim.vehicle", "--home", ",".join(str(part) for part in HOME)]
+    command = [sys.executable, "-m", "fractus_vehicle", "--home", ",".join(str(part) for part in HOME)]
     for link in links:
         command += ["--listen", link]
     process = subprocess.Popen([*command, *arguments], stderr=subprocess.PIPE, text=True)

@@ -7,13 +7,13 @@ from importlib import resources
 from pathlib import Path
 
 import pytest
-from fractus_sim.cluster import ClusterError, PrerequisiteError, prerequisites
-from fractus_sim.cluster.binaries import CLUSTER_PROGRAMS, KUBERNETES_VERSION, PROGRAMS, ensure_binaries
-from fractus_sim.cluster.binaries import build as build_module
-from fractus_sim.cluster.binaries.catalog import MODULES
-from fractus_sim.cluster.prerequisites import check_root
+from fractus_cluster import ClusterError, PrerequisiteError, prerequisites
+from fractus_cluster.binaries import CLUSTER_PROGRAMS, KUBERNETES_VERSION, PROGRAMS, ensure_binaries
+from fractus_cluster.binaries import build as build_module
+from fractus_cluster.binaries.catalog import MODULES
+from fractus_cluster.prerequisites import check_root
 
-GOMOD = resources.files("fractus_sim.cluster.binaries") / "gomod"
+GOMOD = resources.files("fractus_cluster.binaries") / "gomod"
 
 REQUIRED = {
     "etcd": "go.etcd.io/etcd/server/v3",

@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 import yaml
-from fractus_sim.cluster import PrerequisiteError
-from fractus_sim.cluster.addressing import Addressing
-from fractus_sim.cluster.cgroups import find_hierarchies
-from fractus_sim.cluster.controlplane import corefile
-from fractus_sim.cluster.manifests import dns_objects, extended_resources_patch, is_ready, node_object, taints_patch
-from fractus_sim.cluster.network import host_link
-from fractus_sim.cluster.nodeconfig import Machine, cni_config, kubelet_config, node_units, shortfalls
-from fractus_sim.cluster.spec import NodeSpec
+from fractus_cluster import PrerequisiteError
+from fractus_cluster.addressing import Addressing
+from fractus_cluster.cgroups import find_hierarchies
+from fractus_cluster.controlplane import corefile
+from fractus_cluster.manifests import dns_objects, extended_resources_patch, is_ready, node_object, taints_patch
+from fractus_cluster.network import host_link
+from fractus_cluster.nodeconfig import Machine, cni_config, kubelet_config, node_units, shortfalls
+from fractus_cluster.spec import NodeSpec
 
 PLACE = Addressing(IPv4Network("10.200.0.0/16"))
 MACHINE = Machine(cpus=4, memory_bytes=16 * 2**30)

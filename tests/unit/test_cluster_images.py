@@ -10,9 +10,9 @@ import tarfile
 from pathlib import Path
 
 import pytest
-from fractus_sim.cluster import ClusterError
-from fractus_sim.cluster.images.build import TARGETS, build_images, find_source, image_name, source_digest
-from fractus_sim.cluster.images.layout import Layout
+from fractus_cluster import ClusterError
+from fractus_cluster.images.build import TARGETS, build_images, find_source, image_name, source_digest
+from fractus_cluster.images.layout import Layout
 
 ROOT = Path(__file__).parents[2]
 NAME = "localhost/test/tool:1"

@@ -10,6 +10,9 @@ from typing import Any
 import pytest
 import yaml
 from fractus.environment import control_points
+from fractus_cluster import hardware
+from fractus_cluster.hardware import hardware_commands
+from fractus_cluster.spec import load_spec
 from fractus_core.api import KINDS, Application, Depot, Drone, EdgeNode, Policy, Resource, Zone
 from fractus_core.geo import geodesic_m
 from fractus_core.planning import Host, Inventory, plan
@@ -18,9 +21,6 @@ from fractus_core.policy.engine import judge
 from fractus_core.policy.grants import compile_grants
 from fractus_core.policy.values import Call, GotoArgs, Home, SetSpeedArgs, Situation
 from fractus_core.validation import check_application, check_policy, check_zone
-from fractus_sim.cluster import hardware
-from fractus_sim.cluster.hardware import hardware_commands
-from fractus_sim.cluster.spec import load_spec
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "traffic-monitoring"

@@ -12,7 +12,7 @@ from fractus_sim.experiment.injection import Occurrence
 from fractus_sim.experiment.judging import Evidence, judge
 from fractus_sim.experiment.logbook import Flight, Text
 from fractus_sim.report.track import Place, Sample
-from fractus_sim.vehicle import earth
+from fractus_vehicle import earth
 
 HOME = earth.Place.from_degrees(50.0, 4.0, 0.0)
 

@@ -10,10 +10,10 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 
 import pytest
-from fractus_sim import ports
+from fractus_cluster import ports
 
 ALL_OF_TEN = """
-from fractus_sim import ports
+from fractus_cluster import ports
 ports._FIRST, ports._LAST = {first}, {last}
 while True:
     try:

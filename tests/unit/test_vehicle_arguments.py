@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from fractus_sim.vehicle.__main__ import vehicle
-from fractus_sim.vehicle.links import Hub, LinkError, LinkSpec
-from fractus_sim.vehicle.params import Parameters, ParameterValueError
-from fractus_sim.vehicle.simulation import Craft
+from fractus_vehicle.__main__ import vehicle
+from fractus_vehicle.links import Hub, LinkError, LinkSpec
+from fractus_vehicle.params import Parameters, ParameterValueError
+from fractus_vehicle.simulation import Craft
 from vehicle_world import CONFIG
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from fractus_sim.vehicle.mav import Command, Mode, Result
-from fractus_sim.vehicle.pilot import Pilot
-from fractus_sim.vehicle.vehicle import Vehicle
+from fractus_vehicle.mav import Command, Mode, Result
+from fractus_vehicle.pilot import Pilot
+from fractus_vehicle.vehicle import Vehicle
 from vehicle_world import START, airborne, alone, distance_m, upload
 
 

@@ -6,10 +6,10 @@ import itertools
 import math
 
 import pytest
-from fractus_sim.vehicle.mav import Command, Landed, Mode, Result
-from fractus_sim.vehicle.pilot import Pilot
-from fractus_sim.vehicle.shaping import sqrt_controller, stopping_distance, wrap_pi
-from fractus_sim.vehicle.vehicle import Vehicle
+from fractus_vehicle.mav import Command, Landed, Mode, Result
+from fractus_vehicle.pilot import Pilot
+from fractus_vehicle.shaping import sqrt_controller, stopping_distance, wrap_pi
+from fractus_vehicle.vehicle import Vehicle
 from vehicle_world import START, airborne, alone, distance_m
 
 
@@ -320,8 +320,8 @@ def test_sqrt_controller_is_monotonic_and_bounded():
 def _fly_pattern(seed: int) -> bytes:
     from dataclasses import replace
 
-    from fractus_sim.vehicle.pilot import Pilot
-    from fractus_sim.vehicle.simulation import Simulation
+    from fractus_vehicle.pilot import Pilot
+    from fractus_vehicle.simulation import Simulation
     from vehicle_world import CONFIG
 
     class Log:

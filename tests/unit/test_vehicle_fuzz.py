@@ -7,11 +7,11 @@ import random
 import struct
 
 import pytest
-from fractus_sim.vehicle import wire
-from fractus_sim.vehicle.dispatch import HANDLERS
-from fractus_sim.vehicle.mav import Command, Mode
-from fractus_sim.vehicle.pilot import Pilot
-from fractus_sim.vehicle.vehicle import Vehicle
+from fractus_vehicle import wire
+from fractus_vehicle.dispatch import HANDLERS
+from fractus_vehicle.mav import Command, Mode
+from fractus_vehicle.pilot import Pilot
+from fractus_vehicle.vehicle import Vehicle
 from vehicle_world import airborne, alone
 
 WILD = (math.nan, math.inf, -math.inf, 0.0, 1.0, -1.0, 2.0, 255.0, 1e38, -1e38, 1e-40, 21196.0, 400.0, 48.2)

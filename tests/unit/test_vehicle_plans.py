@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import pytest
-from fractus_sim.vehicle.mav import Command, MissionResult, Mode, Result
-from fractus_sim.vehicle.pilot import Pilot
-from fractus_sim.vehicle.vehicle import Vehicle
+from fractus_vehicle.mav import Command, MissionResult, Mode, Result
+from fractus_vehicle.pilot import Pilot
+from fractus_vehicle.vehicle import Vehicle
 from vehicle_world import START, airborne, alone, distance_m, upload
 
 HOME = {"command": 16, "frame": 0, "x": START.lat_e7, "y": START.lon_e7, "z": 150.0}

@@ -7,10 +7,10 @@ import math
 import random
 
 import pytest
-from fractus_sim.vehicle.breadcrumbs import Breadcrumbs, Point, distance_to_segment, segment_gap
-from fractus_sim.vehicle.mav import Command, Mode, Result
-from fractus_sim.vehicle.pilot import Pilot
-from fractus_sim.vehicle.vehicle import Vehicle
+from fractus_vehicle.breadcrumbs import Breadcrumbs, Point, distance_to_segment, segment_gap
+from fractus_vehicle.mav import Command, Mode, Result
+from fractus_vehicle.pilot import Pilot
+from fractus_vehicle.vehicle import Vehicle
 from vehicle_world import airborne, alone, distance_m
 
 

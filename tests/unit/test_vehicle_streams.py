@@ -5,9 +5,9 @@ from __future__ import annotations
 import itertools
 
 import pytest
-from fractus_sim.vehicle.channel import OUTBOX_LIMIT, Channel
-from fractus_sim.vehicle.mav import Command, Result
-from fractus_sim.vehicle.streams import ALL_GROUPS, BUILDERS, GROUPS
+from fractus_vehicle.channel import OUTBOX_LIMIT, Channel
+from fractus_vehicle.mav import Command, Result
+from fractus_vehicle.streams import ALL_GROUPS, BUILDERS, GROUPS
 from vehicle_world import airborne, alone
 
 

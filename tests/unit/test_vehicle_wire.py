@@ -8,7 +8,7 @@ import struct
 
 import pymavlink.dialects.v20.ardupilotmega as dialect
 import pytest
-from fractus_sim.vehicle import wire
+from fractus_vehicle import wire
 
 IDS = sorted(number for number in dialect.mavlink_map if number >= 0)
 

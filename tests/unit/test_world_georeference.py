@@ -10,11 +10,11 @@ import pytest
 import tifffile
 from fractus_core.api.geometry import Point
 from fractus_core.geo import LocalFrame, geodesic_m
-from fractus_sim.world.georeference import GeoreferenceError, Utm, parse_system, read_world_file
-from fractus_sim.world.optics import Intrinsics, Pose
-from fractus_sim.world.raster import NOTHING, read_raster
-from fractus_sim.world.survey import Sheet
-from fractus_sim.world.world import World
+from fractus_world.georeference import GeoreferenceError, Utm, parse_system, read_world_file
+from fractus_world.optics import Intrinsics, Pose
+from fractus_world.raster import NOTHING, read_raster
+from fractus_world.survey import Sheet
+from fractus_world.world import World
 
 LENS = Intrinsics(640, 480, 60.0)
 

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_sim.cluster import hardware
-from fractus_sim.cluster.errors import ClusterError
-from fractus_sim.cluster.hardware import hardware_commands
-from fractus_sim.cluster.spec import ClusterSpec, parse_spec
+from fractus_cluster import hardware
+from fractus_cluster.errors import ClusterError
+from fractus_cluster.hardware import hardware_commands
+from fractus_cluster.spec import ClusterSpec, parse_spec
 
 CAMERA = {
     "connection": "http://127.0.0.1:8090/snapshot.jpg",

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from fractus_core.geo import LocalFrame
-from fractus_sim.world.optics import Intrinsics, Mount, Pose, View
+from fractus_world.optics import Intrinsics, Mount, Pose, View
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -8,12 +8,12 @@ import itertools
 import cv2
 import numpy as np
 import pytest
-from fractus_sim.world.billboards import VARIATIONS, face_box, portrait
-from fractus_sim.world.bodies import parts_of
-from fractus_sim.world.optics import Intrinsics, Mount, Pose
-from fractus_sim.world.population import Thing
-from fractus_sim.world.truth import Seen, SeenFace, Truth
-from fractus_sim.world.world import World, WorldAround
+from fractus_world.billboards import VARIATIONS, face_box, portrait
+from fractus_world.bodies import parts_of
+from fractus_world.optics import Intrinsics, Mount, Pose
+from fractus_world.population import Thing
+from fractus_world.truth import Seen, SeenFace, Truth
+from fractus_world.world import World, WorldAround
 
 LAT, LON = 50.8637, 4.6785
 LENS = Intrinsics(640, 360, 62.2)

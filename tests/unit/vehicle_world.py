@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from fractus_sim.vehicle.earth import Place
-from fractus_sim.vehicle.pilot import Pilot
-from fractus_sim.vehicle.simulation import Simulation
-from fractus_sim.vehicle.vehicle import Vehicle, VehicleConfig
+from fractus_vehicle.earth import Place
+from fractus_vehicle.pilot import Pilot
+from fractus_vehicle.simulation import Simulation
+from fractus_vehicle.vehicle import Vehicle, VehicleConfig
 
 START = Place.from_degrees(48.2, 16.37, 150.0)
 CONFIG = VehicleConfig(start=START, ready_after_s=2.0, position_noise_m=0.05)

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Protocol
 
 import yaml
+from fractus_cluster import Cluster
+from fractus_cluster.binaries import ensure_binaries
+from fractus_cluster.images.build import build_images
 
-from fractus_sim.cluster import Cluster
-from fractus_sim.cluster.binaries import ensure_binaries
-from fractus_sim.cluster.images.build import build_images
 from fractus_sim.demo.kube import DemoError, Kube, Object
 
 ROOT = Path(__file__).parents[3]

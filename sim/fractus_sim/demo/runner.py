@@ -10,9 +10,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from fractus_cluster import ClusterError
 from rich.console import Console
 
-from fractus_sim.cluster import ClusterError
 from fractus_sim.demo.collect import collect, fetch_pictures
 from fractus_sim.demo.kube import SYSTEM, DemoError, Kube, Object
 from fractus_sim.demo.place import EXAMPLE, ROOT, Place, documents

@@ -10,10 +10,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from fractus_sim.cluster import Cluster, ClusterError
-from fractus_sim.cluster.binaries import ensure_binaries
-from fractus_sim.cluster.images.build import build_images
-from fractus_sim.cluster.spec import ClusterSpec, NodeSpec, VehicleHardware, load_spec
+from fractus_cluster import Cluster, ClusterError
+from fractus_cluster.binaries import ensure_binaries
+from fractus_cluster.images.build import build_images
+from fractus_cluster.spec import ClusterSpec, NodeSpec, VehicleHardware, load_spec
+
 from fractus_sim.demo.kube import DemoError, Kube
 from fractus_sim.demo.place import ROOT, documents
 from fractus_sim.demo.watch import wait_ready

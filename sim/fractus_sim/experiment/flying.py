@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Sequence
 
+from fractus_vehicle import earth
+from fractus_vehicle.mav import Command, Mode, Result
+
 from fractus_sim.experiment.station import Station
 from fractus_sim.experiment.tasks import (
     FlyMission,
@@ -18,8 +21,6 @@ from fractus_sim.experiment.tasks import (
     Step,
     Takeoff,
 )
-from fractus_sim.vehicle import earth
-from fractus_sim.vehicle.mav import Command, Mode, Result
 
 ANSWER_S = 1.0
 ATTEMPTS = 5

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import shapely
 from fractus_core.geo import LocalFrame, polygon
+from fractus_vehicle.earth import Place
 
 from fractus_sim.experiment import checks as kinds
 from fractus_sim.experiment.detections import Seen, score
@@ -19,7 +20,6 @@ from fractus_sim.experiment.injection import Occurrence
 from fractus_sim.experiment.logbook import Flight
 from fractus_sim.experiment.model import NamedZone
 from fractus_sim.report.track import Sample
-from fractus_sim.vehicle.earth import Place
 
 MATCH_S = 0.2
 

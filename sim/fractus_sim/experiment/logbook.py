@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from fractus_vehicle.wire import Message
 from mcap.writer import Writer
 
 from fractus_sim.experiment.station import Station
 from fractus_sim.report.track import Place, Sample, Track
-from fractus_sim.vehicle.wire import Message
 
 _NUMBER = {"type": "number"}
 _TEXT = {"type": "string"}

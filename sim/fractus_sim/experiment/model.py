@@ -12,6 +12,7 @@ from typing import Annotated, Literal, Self
 import yaml
 from fractus_core.api.geometry import AltitudeBand, Area, Latitude, Longitude
 from fractus_core.api.model import InvalidObject, Model, Name
+from fractus_vehicle.earth import Place
 from pydantic import Field, ValidationError, model_validator
 
 from fractus_sim.experiment.checks import (
@@ -27,7 +28,6 @@ from fractus_sim.experiment.checks import (
 )
 from fractus_sim.experiment.faults import LINK_OF_MODE, Fault, LinkLoss, NodePowerOff
 from fractus_sim.experiment.tasks import Step
-from fractus_sim.vehicle.earth import Place
 
 Mode = Literal["vehicles", "standalone", "cluster"]
 ParameterName = Annotated[str, Field(pattern=r"^[A-Z][A-Z0-9_]{0,15}$")]

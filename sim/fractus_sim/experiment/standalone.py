@@ -29,13 +29,13 @@ from types import TracebackType
 from typing import Any, Self
 
 import yaml
+from fractus_cluster.ports import free_port
 from fractus_core.api import API_VERSION, Drone, Grant
 from fractus_operator.standalone import StandalonePki
 
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.linktap import LinkTap
 from fractus_sim.experiment.processes import Processes, listening
-from fractus_sim.ports import free_port
 
 START_TIMEOUT_S = 30.0
 LOOPBACK = "127.0.0.1"
@@ -219,7 +219,7 @@ class RunningDrone:
     def _vehicle_command(self) -> list[str]:
         setup = self.setup
         command = [
-            *_module("fractus_sim.vehicle"),
+            *_module("fractus_vehicle"),
             "--listen", f"tcp:{LOOPBACK}:{self._vehicle_port}", "--listen", self.station_link,
             "--listen", self.guest_link,
             "--home", ",".join(f"{value:.7f}" for value in setup.home), "--heading", f"{setup.heading_deg:g}",
@@ -235,7 +235,7 @@ class RunningDrone:
         further = camera.world or () if camera is not None else ()
         lat, lon, alt = self.setup.home
         return [
-            *_module("fractus_sim.world"), "--vehicle", self.station_link, "--listen", f"{LOOPBACK}:{self._world_port}",
+            *_module("fractus_world"), "--vehicle", self.station_link, "--listen", f"{LOOPBACK}:{self._world_port}",
             "--origin", f"{lat:.7f},{lon:.7f}", "--ground", f"{alt:g}", *further,
         ]  # fmt: skip
 

@@ -9,12 +9,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from fractus_vehicle.channel import Channel
+from fractus_vehicle.mav import Command, Mode, ModeFlag
+from fractus_vehicle.simulation import Craft
+from fractus_vehicle.wire import Message, Parser, Value, encode, layout_named
+
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.tlog import TlogWriter
-from fractus_sim.vehicle.channel import Channel
-from fractus_sim.vehicle.mav import Command, Mode, ModeFlag
-from fractus_sim.vehicle.simulation import Craft
-from fractus_sim.vehicle.wire import Message, Parser, Value, encode, layout_named
 
 GROUND_STATION_ID = 255
 OBSERVER_ID = 254

@@ -8,6 +8,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from fractus_cluster.ports import free_port
+from fractus_vehicle.earth import Place
+from fractus_vehicle.links import Hub, LinkError, LinkSpec
+from fractus_vehicle.params import UnknownParameterError
+from fractus_vehicle.simulation import Craft, Simulation
+from fractus_vehicle.vehicle import CONTROL_STEP_S, REPEATABLE_EPOCH_US, VehicleConfig
+
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.linktap import LinkTap
 from fractus_sim.experiment.model import Experiment, Program, VehicleSetup
@@ -15,12 +22,6 @@ from fractus_sim.experiment.processes import Processes
 from fractus_sim.experiment.stage import Moment, Stage
 from fractus_sim.experiment.station import OBSERVER_ID, ChannelLink, Link, Station, TcpLink
 from fractus_sim.experiment.tlog import TlogWriter
-from fractus_sim.ports import free_port
-from fractus_sim.vehicle.earth import Place
-from fractus_sim.vehicle.links import Hub, LinkError, LinkSpec
-from fractus_sim.vehicle.params import UnknownParameterError
-from fractus_sim.vehicle.simulation import Craft, Simulation
-from fractus_sim.vehicle.vehicle import CONTROL_STEP_S, REPEATABLE_EPOCH_US, VehicleConfig
 
 STEPS_PER_TICK = 2
 MAX_BEHIND_S = 1.0

@@ -11,9 +11,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from fractus_vehicle.mav import Mode, ModeFlag
+from fractus_vehicle.wire import INCOMPAT_SIGNED, MAGIC_V1, SIGNATURE_LENGTH, Message, Parser
+
 from fractus_sim.report.track import Place, Sample, Track
-from fractus_sim.vehicle.mav import Mode, ModeFlag
-from fractus_sim.vehicle.wire import INCOMPAT_SIGNED, MAGIC_V1, SIGNATURE_LENGTH, Message, Parser
 
 _STAMP = struct.Struct(">Q")
 _SAMPLE_S = 0.2

@@ -6,10 +6,11 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from fractus_vehicle.mav import AUTOPILOT_ARDUPILOTMEGA, Command, ModeFlag
+from fractus_vehicle.wire import Message, Parser, Value, encode, layout_named
+
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.station import OBSERVER_ID, STATION_COMPONENT, TcpLink
-from fractus_sim.vehicle.mav import AUTOPILOT_ARDUPILOTMEGA, Command, ModeFlag
-from fractus_sim.vehicle.wire import Message, Parser, Value, encode, layout_named
 
 CONNECT_S = 5.0
 HEARTBEAT_S = 15.0

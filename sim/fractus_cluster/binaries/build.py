@@ -1,0 +1,175 @@
+"""Building programs from pinned Go modules, with visible progress and nothing half done."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+
+from fractus_cluster.binaries.catalog import MODULES, Module, Program
+from fractus_cluster.commands import run
+from fractus_cluster.errors import ClusterError, PrerequisiteError
+
+_BUILD_TIMEOUT_S = 3600.0
+_REPORT_EVERY_S = 10.0
+
+Report = Callable[[str], None]
+
+
+def module_digest(module: Module) -> str:
+    """Return a digest of all that decides the outcome of building a module: sources, pins, link variables."""
+    digest = hashlib.sha256()
+    for entry in sorted(_sources(module).iterdir(), key=lambda item: item.name):
+        digest.update(entry.name.encode() + b"\0" + entry.read_bytes() + b"\0")
+    digest.update(repr(sorted(module.link_variables.items())).encode())
+    return digest.hexdigest()[:16]
+
+
+def build(programs: Sequence[Program], into: Path, *, report: Report) -> None:
+    """Build programs of one module and move each into `into` when all of them are complete.
+
+    Args:
+        programs: What to build; all of the same module.
+        into: Directory of the finished programs; an interrupted build changes none of them.
+            The caller holds a lock on it.
+        report: Told about progress, a line at a time.
+
+    Raises:
+        PrerequisiteError: Go is missing or too old.
+        ClusterError: The build failed; the message ends with what the compiler said.
+    """
+    module = MODULES[programs[0].module]
+    check_go(module)
+    into.mkdir(parents=True, exist_ok=True)
+    names = ", ".join(program.name for program in programs)
+    report(f"building {names} {programs[0].version} from Go modules (once; kept in {into})")
+    started = time.monotonic()
+    for left in into.glob(".building-*"):  # of a build that was killed; we hold the lock
+        shutil.rmtree(left)
+    with tempfile.TemporaryDirectory(prefix=".building-", dir=into) as scratch:
+        source, output = Path(scratch) / "source", Path(scratch) / "bin"
+        output.mkdir()
+        with resources.as_file(_sources(module)) as folder:
+            shutil.copytree(folder, source)
+        _go_build(module, programs, source, output, report)
+        for program in programs:
+            built = output / program.name
+            check_version(built, program)
+            built.replace(into / program.name)
+    report(f"built {names} in {time.monotonic() - started:.0f} s")
+
+
+def _go_build(module: Module, programs: Sequence[Program], source: Path, output: Path, report: Report) -> None:
+    flags = " ".join(["-s", "-w", *(f"-X {key}={value}" for key, value in module.link_variables.items())])
+    packages = [program.package for program in programs]
+    target = output if packages != ["."] else output / programs[0].name
+    argv = ["go", "build", "-v", "-trimpath", "-mod=readonly", "-buildvcs=false"]
+    argv += ["-ldflags", flags, "-o", f"{target}/" if target == output else str(target), *packages]
+    environment = {**os.environ, "CGO_ENABLED": "0", "GOFLAGS": "", "GOWORK": "off"}
+    process = subprocess.Popen(
+        argv,
+        cwd=source,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+    )
+    timer = threading.Timer(_BUILD_TIMEOUT_S, process.kill)
+    timer.start()
+    try:
+        tail = _follow(process, programs[0].module, report)
+        code = process.wait()
+    finally:
+        timer.cancel()
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+    if code != 0:
+        raise ClusterError(f"go build of {module.name} failed with exit code {code}:\n" + "\n".join(tail))
+
+
+def _follow(process: subprocess.Popen[str], module: str, report: Report) -> list[str]:
+    """Read the compiler's lines until it ends; report now and then, return the last lines."""
+    tail: list[str] = []
+    packages = downloads = 0
+    started = reported = time.monotonic()
+    assert process.stderr is not None
+    for line in process.stderr:
+        text = line.rstrip()
+        tail = [*tail[-19:], text]
+        if text.startswith("go: downloading"):
+            downloads += 1
+        elif " " not in text:
+            packages += 1
+        now = time.monotonic()
+        if now - reported >= _REPORT_EVERY_S:
+            reported = now
+            report(
+                f"  {module}: {packages} packages compiled, {downloads} modules fetched, "
+                f"{now - started:.0f} s, at {text.removeprefix('go: downloading ')}"
+            )
+    return tail
+
+
+def check_go(module: Module) -> None:
+    """Check that a Go toolchain that can build a module is on PATH, or can be fetched by the one that is.
+
+    Raises:
+        PrerequisiteError: It is missing or too old.
+    """
+    wanted = _go_version((_sources(module) / "go.mod").read_text(), r"^go (\d+)\.(\d+)")
+    text = ".".join(map(str, wanted))
+    if shutil.which("go") is None:
+        raise PrerequisiteError(
+            f"{module.name} has to be built once, which needs Go {text} or newer on PATH "
+            "(or put ready-made programs into a directory and name it in KUBEBUILDER_ASSETS)"
+        )
+    found, toolchain = run(["go", "env", "GOVERSION", "GOTOOLCHAIN"], timeout_s=60).stdout.split()
+    if _go_version(found, r"go(\d+)\.(\d+)") < wanted and toolchain == "local":
+        raise PrerequisiteError(
+            f"Go {text} or newer is needed to build {module.name}, found {found}, "
+            "and GOTOOLCHAIN=local forbids it to fetch a newer one"
+        )
+
+
+def _sources(module: Module) -> Traversable:
+    return resources.files("fractus_cluster.binaries") / "gomod" / module.name
+
+
+def _go_version(text: str, pattern: str) -> tuple[int, int]:
+    found = re.search(pattern, text, re.MULTILINE)
+    if found is None:
+        raise ClusterError(f"no Go version in {text[:100]!r}")
+    return int(found[1]), int(found[2])
+
+
+def reported_version(path: Path, program: Program) -> str | None:
+    """Return the version that a program prints (without a leading v), or None when it prints none."""
+    if not program.version_arguments:
+        return None
+    done = run([path, *program.version_arguments], timeout_s=60, check=False)
+    found = re.search(r"\bv?(\d+\.\d+\.\d+)\b", done.stdout + done.stderr)
+    return found[1] if found else None
+
+
+def check_version(path: Path, program: Program) -> None:
+    """Check that a program just built runs and says the version that was asked for.
+
+    Raises:
+        ClusterError: It does not.
+    """
+    if program.version_arguments:
+        version = reported_version(path, program)
+        if version != program.version:
+            raise ClusterError(f"{program.name} was built as {program.version} but reports {version}")

@@ -1,0 +1,147 @@
+"""Providing programs: KUBEBUILDER_ASSETS first, then the cache, then PATH, and at last a build."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from fractus_cluster.binaries.build import build, module_digest, reported_version
+from fractus_cluster.binaries.catalog import CLUSTER_PROGRAMS, KUBERNETES_VERSION, MODULES, PROGRAMS, Program
+from fractus_cluster.errors import ClusterError
+from fractus_cluster.locking import locked
+
+_LOCK_TIMEOUT_S = 3600.0
+
+Report = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Binaries:
+    """Where each program is."""
+
+    paths: Mapping[str, Path]
+
+    def __getitem__(self, name: str) -> Path:
+        """Return the path of a program.
+
+        Raises:
+            ClusterError: The program was not provided.
+        """
+        try:
+            return self.paths[name]
+        except KeyError:
+            raise ClusterError(f"{name} was not provided; run `fractus cluster binaries --with {name}`") from None
+
+    def builds(self, *names: str) -> dict[str, int]:
+        """Return what changes when one of these programs is built anew: when its file was written, nanoseconds."""
+        return {name: self[name].stat().st_mtime_ns for name in names}
+
+
+def cache_directory() -> Path:
+    """Return where built programs are kept: FRACTUS_CACHE, or `fractus` in the user's cache directory."""
+    chosen = os.environ.get("FRACTUS_CACHE")
+    if chosen:
+        return Path(chosen)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "fractus"
+
+
+def ensure_binaries(names: Iterable[str] = CLUSTER_PROGRAMS, *, report: Report) -> Binaries:
+    """Return paths of the named programs, building those that the machine does not have.
+
+    Args:
+        names: Names from the catalog.
+        report: Told about progress, a line at a time.
+
+    Raises:
+        ClusterError: A name is unknown, or a build failed.
+        PrerequisiteError: Something has to be built and Go is missing or too old.
+    """
+    wanted = [_program(name) for name in names]
+    directory = cache_directory() / f"v{KUBERNETES_VERSION}"
+    paths = _present(wanted, directory)
+    if len(paths) < len(wanted):
+        with locked(
+            directory / "lock", timeout_s=_LOCK_TIMEOUT_S, what="another process is building binaries", report=report
+        ):
+            paths = _present(wanted, directory)
+            missing = [program for program in wanted if program.name not in paths]
+            for name in dict.fromkeys(program.module for program in missing):
+                group = [program for program in missing if program.module == name]
+                build(group, directory / "bin", report=report)
+                _stamp(group, directory)
+        paths = _present(wanted, directory)
+    return Binaries(paths)
+
+
+def _program(name: str) -> Program:
+    try:
+        return PROGRAMS[name]
+    except KeyError:
+        raise ClusterError(f"no program called {name}; there are {', '.join(sorted(PROGRAMS))}") from None
+
+
+def _present(wanted: Iterable[Program], directory: Path) -> dict[str, Path]:
+    assets = os.environ.get("KUBEBUILDER_ASSETS")
+    stamps = _read(directory / "built.json")
+    versions = _Versions(directory / "found.json")
+    paths: dict[str, Path] = {}
+    for program in wanted:
+        own = directory / "bin" / program.name
+        given = Path(assets) / program.name if assets else None
+        if given is not None and versions.acceptable(given, program):
+            paths[program.name] = given
+        elif own.is_file() and stamps.get(program.name) == module_digest(MODULES[program.module]):
+            paths[program.name] = own
+        elif (there := shutil.which(program.name)) and versions.acceptable(Path(there), program):
+            paths[program.name] = Path(there)
+    versions.save()
+    return paths
+
+
+def _stamp(programs: Iterable[Program], directory: Path) -> None:
+    stamps = _read(directory / "built.json")
+    stamps.update({program.name: module_digest(MODULES[program.module]) for program in programs})
+    _write(directory / "built.json", stamps)
+
+
+class _Versions:
+    """Versions of programs found on the machine, remembered by path, size and time so each is asked once."""
+
+    def __init__(self, memo: Path) -> None:
+        self._memo = memo
+        self._known = _read(memo)
+        self._changed = False
+
+    def acceptable(self, path: Path, program: Program) -> bool:
+        if program.accepts is None or not os.access(path, os.X_OK):
+            return False
+        facts = path.stat()
+        key = f"{path}:{facts.st_size}:{facts.st_mtime_ns}"
+        if key not in self._known:
+            self._known[key] = reported_version(path, program) or ""
+            self._changed = True
+        return self._known[key].startswith(program.accepts)
+
+    def save(self) -> None:
+        if self._changed:
+            _write(self._memo, self._known)
+
+
+def _read(path: Path) -> dict[str, str]:
+    try:
+        content = json.loads(path.read_text())
+    except (FileNotFoundError, json.JSONDecodeError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _write(path: Path, content: Mapping[str, str]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch = path.with_name(f".{path.name}.{os.getpid()}")
+    scratch.write_text(json.dumps(content, indent=1, sort_keys=True))
+    scratch.replace(path)

@@ -1,0 +1,210 @@
+"""Control groups of a cluster: one branch per node, with version 1 hierarchies or the one tree of version 2."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from fractus_cluster.errors import ClusterError, PrerequisiteError
+
+TOP = "fractus-sim"
+_NEEDED_V1 = ("cpu", "cpuacct", "cpuset", "memory", "devices", "freezer", "pids")
+_NEEDED_V2 = ("cpu", "cpuset", "memory", "pids")
+_DELEGATED_V2 = (*_NEEDED_V2, "io", "hugetlb")
+_DAEMONS = "daemons"
+_POLL_S = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Hierarchies:
+    """Where the kernel shows its control groups.
+
+    Attributes:
+        version: 1 (also for hybrid layouts, where the controllers are in version 1 hierarchies) or 2.
+        roots: Mount points; one for version 2.
+    """
+
+    version: int
+    roots: tuple[Path, ...]
+
+
+def find_hierarchies(mounts: str | None = None) -> Hierarchies:
+    """Read from /proc/self/mounts which control groups there are.
+
+    Args:
+        mounts: Text in the format of /proc/self/mounts; the kernel's own when None.
+
+    Raises:
+        PrerequisiteError: None are mounted, or a controller that Kubernetes needs is missing.
+    """
+    text = Path("/proc/self/mounts").read_text() if mounts is None else mounts
+    old: dict[Path, set[str]] = {}
+    new: list[Path] = []
+    for line in text.splitlines():
+        _, point, kind, options = line.split(" ")[:4]
+        if kind == "cgroup":
+            old[Path(point)] = set(options.split(","))
+        elif kind == "cgroup2":
+            new.append(Path(point))
+    if old:
+        missing = [name for name in _NEEDED_V1 if not any(name in options for options in old.values())]
+        if missing:
+            raise PrerequisiteError(f"the kernel's control groups lack {', '.join(missing)}; Kubernetes needs them")
+        return Hierarchies(1, (*old, *new))  # container runtimes fill the unified one of a hybrid layout too
+    if not new:
+        raise PrerequisiteError("no control groups are mounted at /sys/fs/cgroup; Kubernetes needs them")
+    return Hierarchies(2, (new[0],))
+
+
+@dataclass(frozen=True, slots=True)
+class Branch:
+    """One branch of the control groups: a cluster's, or below it a node's.
+
+    Attributes:
+        hierarchies: Where control groups are mounted.
+        path: Path below the mount points, such as `fractus-sim/demo/drone-1`.
+    """
+
+    hierarchies: Hierarchies
+    path: str
+
+    def below(self, name: str) -> Branch:
+        """Return the branch `name` inside this one."""
+        return Branch(self.hierarchies, f"{self.path}/{name}")
+
+    @property
+    def directories(self) -> list[Path]:
+        """The branch's directory in each hierarchy."""
+        return [root / self.path for root in self.hierarchies.roots]
+
+    def create(self) -> list[Path]:
+        """Make the branch where it is missing and return the files through which a process enters it."""
+        if self.hierarchies.version == 2:
+            return [self._create_v2()]
+        for root in self.hierarchies.roots:
+            directory = root
+            for part in Path(self.path).parts:
+                above, directory = directory, directory / part
+                directory.mkdir(exist_ok=True)
+                _fill_cpuset(above, directory)
+        return [directory / "cgroup.procs" for directory in self.directories]
+
+    def _create_v2(self) -> Path:
+        # Version 2 wants processes in leaves only: daemons get a leaf of their own beside the pods' branch.
+        directory = self.hierarchies.roots[0]
+        for part in (*Path(self.path).parts, _DAEMONS):
+            _delegate(directory)
+            directory /= part
+            directory.mkdir(exist_ok=True)
+        return directory / "cgroup.procs"
+
+    def process_ids(self) -> set[int]:
+        """Return the processes in the branch and everything below it."""
+        found: set[int] = set()
+        for directory in self.directories:
+            for folder in _walk(directory):
+                try:
+                    found.update(int(word) for word in (folder / "cgroup.procs").read_text().split())
+                except (FileNotFoundError, OSError):
+                    continue  # the group went away while we looked
+        return found - {0}
+
+    def kill_all(self, *, timeout_s: float = 20.0) -> None:
+        """Kill every process in the branch and wait until none is left.
+
+        Raises:
+            ClusterError: Some did not end in time.
+        """
+        deadline = time.monotonic() + timeout_s
+        while pids := self.process_ids():
+            if time.monotonic() > deadline:
+                raise ClusterError(f"processes {sorted(pids)} in control group {self.path} do not end")
+            for pid in pids:
+                try:
+                    os.kill(pid, signal.SIGKILL)
+                    os.waitpid(pid, os.WNOHANG)
+                except (ProcessLookupError, ChildProcessError):
+                    continue
+            time.sleep(_POLL_S)
+
+    def remove(self, *, timeout_s: float = 10.0) -> None:
+        """Remove the branch and all below it; its processes must have ended.
+
+        Raises:
+            ClusterError: The kernel still calls a group busy after the time limit.
+        """
+        deadline = time.monotonic() + timeout_s
+        for directory in self.directories:
+            while directory.exists():
+                busy = _remove_tree(directory)
+                if busy is None:
+                    break
+                if time.monotonic() > deadline:
+                    raise ClusterError(f"control group {directory} cannot be removed: {busy.strerror}")
+                time.sleep(_POLL_S)
+
+
+def cluster_branch(name: str) -> Branch:
+    """Return the branch of a cluster."""
+    return Branch(find_hierarchies(), f"{TOP}/{name}")
+
+
+def remove_top() -> None:
+    """Remove the branch above all clusters when it is empty."""
+    for root in find_hierarchies().roots:
+        try:
+            (root / TOP).rmdir()
+        except (FileNotFoundError, OSError):
+            continue  # not there, or another cluster's groups are in it
+
+
+def _walk(directory: Path) -> Iterator[Path]:
+    """Yield directories below and including this one, deepest first; those that vanish are skipped."""
+    try:
+        with os.scandir(directory) as entries:
+            below = [Path(entry.path) for entry in entries if entry.is_dir(follow_symlinks=False)]
+    except FileNotFoundError:
+        return
+    for folder in below:
+        yield from _walk(folder)
+    yield directory
+
+
+def _remove_tree(directory: Path) -> OSError | None:
+    last: OSError | None = None
+    for folder in _walk(directory):
+        try:
+            folder.rmdir()
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            last = error
+    return last
+
+
+def _fill_cpuset(above: Path, directory: Path) -> None:
+    for name in ("cpuset.cpus", "cpuset.mems"):
+        own = directory / name
+        if own.exists() and not own.read_text().strip():
+            own.write_text((above / name).read_text())
+
+
+def _delegate(directory: Path) -> None:
+    there = set((directory / "cgroup.controllers").read_text().split())
+    missing = [name for name in _NEEDED_V2 if name not in there]
+    if missing:
+        raise PrerequisiteError(f"the control groups at {directory} lack {', '.join(missing)}; Kubernetes needs them")
+    enabled = set((directory / "cgroup.subtree_control").read_text().split())
+    for name in _DELEGATED_V2:
+        if name in there and name not in enabled:
+            try:
+                (directory / "cgroup.subtree_control").write_text(f"+{name}")
+            except OSError as error:
+                raise PrerequisiteError(
+                    f"the control group {directory} cannot hand {name} on ({error.strerror}); inside a container "
+                    "without control groups of its own the embedded cluster does not run"
+                ) from error

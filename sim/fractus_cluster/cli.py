@@ -1,0 +1,187 @@
+"""`fractus cluster`: the embedded cluster on the command line."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import ParamSpec
+
+import click
+
+from fractus_cluster.binaries import CLUSTER_PROGRAMS, PROGRAMS, ensure_binaries
+from fractus_cluster.cluster import Cluster, NodeStatus, print_report
+from fractus_cluster.errors import ClusterError, PrerequisiteError
+from fractus_cluster.machine import holders
+from fractus_cluster.prerequisites import check_root
+from fractus_cluster.state import known_clusters, state_root
+
+_P = ParamSpec("_P")
+
+
+def _one_line_errors(command: Callable[_P, None]) -> Callable[_P, None]:
+    """Turn what went wrong into one line and an exit code: 3 for what the machine lacks, else 1."""
+
+    @wraps(command)
+    def wrapped(*args: _P.args, **kwargs: _P.kwargs) -> None:
+        try:
+            command(*args, **kwargs)
+        except PrerequisiteError as error:
+            click.echo(f"error: {error}", err=True)
+            sys.exit(3)
+        except ClusterError as error:
+            click.echo(f"error: {error}", err=True)
+            sys.exit(1)
+
+    return wrapped
+
+
+_name_option = click.option("--name", help="The cluster; may be left out when there is only one.")
+
+
+@click.group()
+def cluster() -> None:
+    """A real Kubernetes of several nodes on this machine, without Docker (Linux, root)."""
+
+
+@cluster.command()
+@click.argument("file", type=click.Path(path_type=Path, dir_okay=False, exists=True))
+@click.option("--name", help="Name of the cluster instead of the one in the file.")
+@click.option("--image", "images", multiple=True, help="Image that every node gets before pods start; repeatable.")
+@_one_line_errors
+def up(file: Path, name: str | None, images: tuple[str, ...]) -> None:
+    """Make the cluster be as FILE describes, whatever state it is in."""
+    Cluster.load(file, name=name, report=print_report).up(images=images)
+
+
+@cluster.command()
+@_name_option
+@click.option("--all", "every", is_flag=True, help="All clusters of this machine.")
+@_one_line_errors
+def down(name: str | None, every: bool) -> None:
+    """Take the cluster away with everything that it put on the machine."""
+    check_root()
+    # A cluster whose state directory was deleted is still in the machine's ledger.
+    ours = sorted({*known_clusters(), *(held for held, at in holders().items() if at.parent == state_root())})
+    if name is None and len(ours) > 1 and not every:
+        raise ClusterError(f"there are {', '.join(ours)}; name one with --name, or take all down with --all")
+    for each in [name] if name is not None else ours:
+        Cluster.bare(each, report=print_report).down()
+
+
+@cluster.command()
+@_name_option
+@_one_line_errors
+def status(name: str | None) -> None:
+    """Show how the cluster's nodes are; exit code 1 unless all are well."""
+    found = Cluster.existing(name)
+    states = found.status()
+    click.echo(f"cluster {found.name}: control plane {'runs' if found.running else 'is down'}")
+    for node in states:
+        click.echo(f"  {node.name:<20} {node.node_class:<6} {node.address:<15} {_words(node)}")
+    if not found.running or not all(_well(node) for node in states):
+        sys.exit(1)
+
+
+def _well(node: NodeStatus) -> bool:
+    hardware = node.vehicle_running is not False and node.camera_running is not False
+    return node.powered and node.linked and node.ready is True and hardware
+
+
+def _words(node: NodeStatus) -> str:
+    ready = {True: "Ready", False: "NotReady", None: "API server not in reach"}[node.ready]
+    words = [ready if node.powered else "off"]
+    if not node.linked:
+        words.append("link cut")
+    if node.vehicle_running is not None:
+        words.append("vehicle runs" if node.vehicle_running else "vehicle dead")
+    if node.camera_running is not None:
+        words.append("camera runs" if node.camera_running else "camera dead")
+    return ", ".join(words)
+
+
+@cluster.command()
+@_name_option
+@click.option("--path", "only_path", is_flag=True, help="Print where it is instead of its content.")
+@_one_line_errors
+def kubeconfig(name: str | None, only_path: bool) -> None:
+    """Print the administrator's kubeconfig."""
+    file = Cluster.existing(name).kubeconfig
+    if not file.exists():
+        raise ClusterError("the cluster has not come up yet; run `fractus cluster up FILE` again")
+    click.echo(str(file) if only_path else file.read_text(), nl=only_path)
+
+
+@cluster.command("load-image")
+@click.argument("images", nargs=-1, required=True, metavar="IMAGE...")
+@_name_option
+@_one_line_errors
+def load_image(images: tuple[str, ...], name: str | None) -> None:
+    """Deliver images to all nodes: names in buildah's storage, or OCI or Docker archives."""
+    delivered = Cluster.existing(name, report=print_report).load_images(images)
+    for node, count in delivered.items():
+        click.echo(f"{node}: {count} new")
+
+
+@cluster.command()
+@click.argument("state", type=click.Choice(["on", "off"]))
+@click.argument("node")
+@_name_option
+@_one_line_errors
+def power(state: str, node: str, name: str | None) -> None:
+    """Pull a node's power, or give it back; its vehicle keeps its own."""
+    Cluster.existing(name, report=print_report).set_power(node, on=state == "on")
+
+
+@cluster.command()
+@click.argument("state", type=click.Choice(["cut", "heal"]))
+@click.argument("node")
+@_name_option
+@_one_line_errors
+def link(state: str, node: str, name: str | None) -> None:
+    """Cut a node's uplink, or restore it."""
+    target = Cluster.existing(name).node(node)
+    if state == "cut":
+        target.cut_link()
+    else:
+        target.heal_link()
+
+
+@cluster.command("exec", context_settings={"ignore_unknown_options": True})
+@click.argument("node")
+@click.argument("command", nargs=-1, required=True, type=click.UNPROCESSED)
+@_name_option
+@_one_line_errors
+def exec_(node: str, command: tuple[str, ...], name: str | None) -> None:
+    """Run a command on a node, as root."""
+    argv = Cluster.existing(name).node(node).exec_command(command)
+    os.execvp(argv[0], argv)  # noqa: S606  (no shell wanted)
+
+
+@cluster.command()
+@click.argument("program")
+@click.argument("node", required=False)
+@click.option("--lines", default=100, show_default=True, help="How many of the last lines.")
+@_name_option
+@_one_line_errors
+def logs(program: str, node: str | None, lines: int, name: str | None) -> None:
+    """Print the log of PROGRAM (kubelet, containerd, etcd, ...) on NODE, or of the control plane's."""
+    folder = Cluster.existing(name).logs / (node or "control-plane")
+    file = folder / f"{program}.log"
+    if not file.is_file():
+        there = ", ".join(sorted(path.stem for path in folder.glob("*.log"))) if folder.is_dir() else "nothing"
+        raise ClusterError(f"no log {file}; there is {there}")
+    for line in file.read_text(errors="replace").splitlines()[-lines:]:
+        click.echo(line)
+
+
+@cluster.command()
+@click.option("--with", "extra", multiple=True, type=click.Choice(sorted(set(PROGRAMS) - set(CLUSTER_PROGRAMS))))
+@_one_line_errors
+def binaries(extra: tuple[str, ...]) -> None:
+    """Provide the Kubernetes programs, building those that are missing, and print where they are."""
+    found = ensure_binaries((*CLUSTER_PROGRAMS, *extra), report=print_report)
+    for program, path in sorted(found.paths.items()):
+        click.echo(f"{program} {path}")

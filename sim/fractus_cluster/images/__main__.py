@@ -1,0 +1,6 @@
+"""`python -m fractus_cluster.images`: building the images."""
+
+from fractus_cluster.images.cli import images
+
+if __name__ == "__main__":
+    images(prog_name="fractus images")

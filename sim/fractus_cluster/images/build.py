@@ -1,0 +1,206 @@
+"""Building the images of Fractus: each target of the Dockerfile, when something that it contains changed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import MappingProxyType
+
+from fractus_cluster.binaries import cache_directory
+from fractus_cluster.commands import run
+from fractus_cluster.errors import ClusterError, PrerequisiteError
+from fractus_cluster.images.store import image_ids
+from fractus_cluster.locking import locked
+from fractus_cluster.prerequisites import check_root
+
+PREFIX = "localhost/fractus"
+BASE_IMAGE = f"{PREFIX}/base:bookworm"
+
+_RECIPE = ("Dockerfile", ".dockerignore", "pyproject.toml", "uv.lock", "README.md", "LICENSE")
+_CODE: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "component": ("sdk", "proto"),
+        "operator": ("core", "operator", "proto"),
+        "agent": ("core", "agent", "proto"),
+        "services": ("core", "services", "sdk", "proto"),
+        "sim": ("core", "services", "sdk", "proto", "sim"),
+        "example-traffic-monitoring": ("sdk", "proto", "examples/traffic-monitoring"),
+        "example-field": ("sdk", "proto", "examples/field"),
+    }
+)
+TARGETS = tuple(_CODE)
+"""The targets of the Dockerfile that are images of their own."""
+
+_BUILD_TIMEOUT_S = 1800.0
+_LOCK_TIMEOUT_S = 1800.0
+_HOST_CA = Path("/etc/ssl/certs/ca-certificates.crt")
+_CA_IN_BUILD = "/run/host-ca.crt"
+
+Report = Callable[[str], None]
+
+
+def find_source(start: Path | None = None) -> Path:
+    """Return the checkout that has the Dockerfile: the working directory or one above it.
+
+    Raises:
+        ClusterError: There is none.
+    """
+    here = (start or Path.cwd()).resolve()
+    for folder in (here, *here.parents):
+        if all((folder / name).is_file() for name in ("Dockerfile", "pyproject.toml", "uv.lock")):
+            return folder
+    raise ClusterError(f"no Dockerfile of Fractus in {here} or above; name the checkout with --source")
+
+
+def image_name(target: str, tag: str = "dev") -> str:
+    """Return the full name of a target's image."""
+    return f"{PREFIX}/{target}:{tag}"
+
+
+def build_images(
+    source: Path,
+    *,
+    targets: Sequence[str] = TARGETS,
+    tag: str = "dev",
+    force: bool = False,
+    report: Report,
+) -> list[str]:
+    """Build targets of the Dockerfile with buildah and return the images' names.
+
+    Args:
+        source: The checkout.
+        targets: Which images; a target is left alone when nothing that it contains changed since it was built.
+        tag: The images' tag.
+        force: Build although nothing changed.
+        report: Told about progress, a line at a time.
+
+    Raises:
+        PrerequisiteError: buildah or debootstrap is missing, or this is not root.
+        ClusterError: A build failed; the message ends with what it said.
+    """
+    unknown = sorted(set(targets) - set(TARGETS))
+    if unknown:
+        raise ClusterError(f"no image {', '.join(unknown)}; there are {', '.join(TARGETS)}")
+    check_root()
+    if shutil.which("buildah") is None:
+        raise PrerequisiteError("images are built with buildah; install it: apt-get install buildah")
+    names = [image_name(target, tag) for target in targets]
+    ledger = cache_directory() / "images.json"
+    with locked(
+        cache_directory() / "images.lock",
+        timeout_s=_LOCK_TIMEOUT_S,
+        what="another process is building images",
+        report=report,
+    ):
+        digests = {image_name(target, tag): source_digest(source, target) for target in targets}
+        built = _read(ledger)
+        present = image_ids()
+        stale = [
+            target
+            for target, name in zip(targets, names, strict=True)
+            if force or name not in present or built.get(name) != f"{digests[name]} {present[name]}"
+        ]
+        if stale:
+            ensure_base(report=report)
+            _build_stale(source, stale, tag, report)
+            before, present = present, image_ids()
+            _remove_replaced(before[name] for name in names if name in before and before[name] != present[name])
+            built.update({name: f"{digests[name]} {present[name]}" for name in names})
+            _write(ledger, built)
+    return names
+
+
+def source_digest(source: Path, target: str) -> str:
+    """Return a digest of all files of the checkout that a target's image is made of."""
+    digest = hashlib.sha256()
+    for path in _files(source, (*_RECIPE, *_CODE[target])):
+        digest.update(f"{path.relative_to(source)}\0".encode() + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+def _files(source: Path, names: Iterable[str]) -> Iterator[Path]:
+    for name in names:
+        place = source / name
+        if place.is_file():
+            yield place
+        for path in sorted(place.rglob("*")) if place.is_dir() else ():
+            if path.is_file() and "__pycache__" not in path.parts:
+                yield path
+
+
+def _build_stale(source: Path, targets: Sequence[str], tag: str, report: Report) -> None:
+    """Build the first target alone, because it fills the cache that the others take most of their steps from."""
+
+    def one(target: str) -> None:
+        started = time.monotonic()
+        _build(source, target, tag)
+        report(f"built {image_name(target, tag)} in {time.monotonic() - started:.1f} s")
+
+    report(f"building images: {', '.join(targets)}")
+    one(targets[0])
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        list(pool.map(one, targets[1:]))
+
+
+def _remove_replaced(identities: Iterable[str]) -> None:
+    """Remove images that lost their names to newer ones, with the layers that nothing else uses.
+
+    Builds would fill the disk otherwise. An image in use stays, which is no failure.
+    """
+    for identity in identities:
+        run(["buildah", "rmi", identity], check=False)
+
+
+def _build(source: Path, target: str, tag: str) -> None:
+    argv = ["buildah", "build", "--quiet", "--layers", "--timestamp", "0", "--build-arg", f"BASE={BASE_IMAGE}"]
+    if _HOST_CA.is_file():
+        # Package indexes may be behind a proxy that only this machine's CA bundle vouches for; nothing of it is kept.
+        argv += ["--volume", f"{_HOST_CA}:{_CA_IN_BUILD}:ro"]
+        argv += ["--build-arg", f"SSL_CERT_FILE={_CA_IN_BUILD}", "--build-arg", f"PIP_CERT={_CA_IN_BUILD}"]
+    argv += ["--target", target, "--tag", image_name(target, tag), str(source)]
+    run(argv, timeout_s=_BUILD_TIMEOUT_S, env={**os.environ, "BUILDAH_ISOLATION": "chroot"})
+
+
+def ensure_base(*, report: Report) -> None:
+    """Make the Debian base image with debootstrap when buildah's storage has none.
+
+    Raises:
+        PrerequisiteError: debootstrap is missing.
+    """
+    if BASE_IMAGE in image_ids():
+        return
+    if shutil.which("debootstrap") is None:
+        raise PrerequisiteError("the base image is made with debootstrap; install it: apt-get install debootstrap")
+    started = time.monotonic()
+    report("making the Debian base image (once)")
+    with tempfile.TemporaryDirectory(prefix="fractus-base-") as scratch:
+        root = Path(scratch) / "root"
+        run(["debootstrap", "--variant=minbase", "bookworm", root], timeout_s=_BUILD_TIMEOUT_S)
+        container = run(["buildah", "from", "scratch"]).stdout.strip()
+        try:
+            run(["buildah", "add", "--quiet", container, root, "/"], timeout_s=_BUILD_TIMEOUT_S)
+            run(["buildah", "commit", "--quiet", container, BASE_IMAGE], timeout_s=_BUILD_TIMEOUT_S)
+        finally:
+            run(["buildah", "rm", container], check=False)
+    report(f"made the Debian base image in {time.monotonic() - started:.0f} s")
+
+
+def _read(path: Path) -> dict[str, str]:
+    try:
+        content = json.loads(path.read_text())
+    except (FileNotFoundError, json.JSONDecodeError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _write(path: Path, content: Mapping[str, str]) -> None:
+    scratch = path.with_name(f".{path.name}.{os.getpid()}")
+    scratch.write_text(json.dumps(content, indent=1, sort_keys=True))
+    scratch.replace(path)

@@ -1,0 +1,37 @@
+"""`fractus images`: the images of Fractus on the command line."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from fractus_cluster.cluster import print_report
+from fractus_cluster.errors import ClusterError
+from fractus_cluster.images.build import TARGETS, build_images, find_source
+
+
+@click.group()
+def images() -> None:
+    """The container images of Fractus, built from its Dockerfile with buildah."""
+
+
+@images.command()
+@click.argument("targets", nargs=-1, type=click.Choice(TARGETS), metavar="[TARGET]...")
+@click.option(
+    "--source", type=click.Path(path_type=Path, file_okay=False, exists=True), help="Checkout with the Dockerfile."
+)
+@click.option("--tag", default="dev", show_default=True)
+@click.option("--force", is_flag=True, help="Build although nothing changed.")
+def build(targets: tuple[str, ...], source: Path | None, tag: str, force: bool) -> None:
+    """Build the TARGETs, or all; those of which nothing changed are left alone. Prints the images' names."""
+    try:
+        built = build_images(
+            source or find_source(), targets=targets or TARGETS, tag=tag, force=force, report=print_report
+        )
+    except ClusterError as error:
+        click.echo(f"error: {error}", err=True)
+        sys.exit(1)
+    for image in built:
+        click.echo(image)

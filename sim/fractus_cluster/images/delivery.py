@@ -1,0 +1,82 @@
+"""Delivering images to running nodes: each gets an archive with exactly the layers that it lacks."""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import IO
+
+from fractus_cluster.errors import ClusterError
+from fractus_cluster.images.layout import Image, Layout
+from fractus_cluster.node import Node
+
+_CTR = ("ctr", "--namespace", "k8s.io")
+_IMPORT_TIMEOUT_S = 300.0
+
+
+def deliver(layout: Layout, images: Sequence[Image], nodes: Sequence[Node]) -> dict[str, int]:
+    """Make the images known to every node; a node that has them already is left alone.
+
+    Args:
+        layout: Where the images are kept.
+        images: Which to deliver.
+        nodes: Where to; nodes that are off are an error.
+
+    Returns:
+        For each node, how many images it got.
+
+    Raises:
+        ClusterError: A node is off or refuses the archive.
+    """
+    missing = {node.name: _missing(node, images) for node in nodes}
+    # Nodes in the same state get the same archive, so it is written once.
+    groups: dict[tuple[frozenset[str], frozenset[str]], list[Node]] = {}
+    for node in nodes:
+        if missing[node.name]:
+            wanted = frozenset(image.name for image in missing[node.name])
+            needed = {digest for image in missing[node.name] for digest in layout.digests(image)}
+            groups.setdefault((wanted, frozenset(_content(node) & needed)), []).append(node)
+    for (wanted, there), members in groups.items():
+        manifests = {image.digest for image in images}
+        with tempfile.TemporaryFile() as archive:
+            layout.write_archive(
+                [image for image in images if image.name in wanted], without=there - manifests, out=archive
+            )
+            archive.flush()
+            with ThreadPoolExecutor(max_workers=4) as pool:
+                list(pool.map(lambda node: _import(node, archive), members))
+    return {name: len(images) for name, images in missing.items()}
+
+
+def _missing(node: Node, images: Sequence[Image]) -> list[Image]:
+    there = node.exec([*_CTR, "images", "list"]).stdout
+    known = {fields[0]: fields[2] for line in there.splitlines()[1:] if len(fields := line.split()) > 2}
+    return [image for image in images if known.get(image.name) != image.digest]
+
+
+def _content(node: Node) -> set[str]:
+    return set(node.exec([*_CTR, "content", "list", "--quiet"]).stdout.split())
+
+
+def _import(node: Node, archive: IO[bytes]) -> None:
+    """Import an archive; asked a second time when containerd collected a layer's snapshot while it unpacked."""
+    said = _attempt(node, archive)
+    if said and "snapshot" in said:
+        said = _attempt(node, archive)
+    if said:
+        raise ClusterError(f"node {node.name} refused an image: {said[-1000:]}")
+
+
+def _attempt(node: Node, archive: IO[bytes]) -> str:
+    """Import an archive; returns what went wrong."""
+    argv = node.exec_command([*_CTR, "images", "import", "-"])
+    with open(f"/proc/self/fd/{archive.fileno()}", "rb") as own:  # noqa: PTH123  (a read position of its own)
+        try:
+            done = subprocess.run(
+                argv, stdin=own, capture_output=True, text=True, timeout=_IMPORT_TIMEOUT_S, check=False
+            )
+        except subprocess.TimeoutExpired as error:
+            raise ClusterError(f"node {node.name} did not take an image within {_IMPORT_TIMEOUT_S:.0f} s") from error
+    return "" if done.returncode == 0 else done.stderr.strip() or f"exit code {done.returncode}"

@@ -1,0 +1,209 @@
+"""An OCI image layout on disk: which images it holds, and archives with just what a node lacks of them."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import tarfile
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from fractus_cluster.errors import ClusterError
+
+Json = dict[str, Any]
+
+_INDEX_TYPE = "application/vnd.oci.image.index.v1+json"
+MANIFEST_TYPE = "application/vnd.oci.image.manifest.v1+json"
+CONFIG_TYPE = "application/vnd.oci.image.config.v1+json"
+LAYER_TYPE = "application/vnd.oci.image.layer.v1.tar"
+_REF_ANNOTATION = "org.opencontainers.image.ref.name"
+_NAME_ANNOTATION = "io.containerd.image.name"
+_EPOCH = "1970-01-01T00:00:00Z"
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """An image of a layout.
+
+    Attributes:
+        name: Its full name, such as `localhost/fractus/agent:dev`.
+        digest: Digest of its manifest; another digest means another content.
+        size_bytes: Size of its manifest.
+        media_type: Media type of its manifest.
+    """
+
+    name: str
+    digest: str
+    size_bytes: int
+    media_type: str
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """An OCI image layout.
+
+    Attributes:
+        path: Its directory.
+    """
+
+    path: Path
+
+    def create(self) -> None:
+        """Make an empty layout where there is none."""
+        (self.path / "blobs" / "sha256").mkdir(parents=True, exist_ok=True)
+        if not (self.path / "oci-layout").exists():
+            (self.path / "oci-layout").write_text('{"imageLayoutVersion": "1.0.0"}')
+        if not (self.path / "index.json").exists():
+            self._write_index([])
+
+    def images(self) -> dict[str, Image]:
+        """Return the images by name."""
+        found: dict[str, Image] = {}
+        for entry in self._index():
+            name = entry.get("annotations", {}).get(_REF_ANNOTATION)
+            if name:
+                found[name] = Image(name, entry["digest"], entry["size"], entry.get("mediaType", MANIFEST_TYPE))
+        return found
+
+    def image(self, name: str) -> Image:
+        """Return one image.
+
+        Raises:
+            ClusterError: The layout does not hold it.
+        """
+        try:
+            return self.images()[name]
+        except KeyError:
+            raise ClusterError(f"no image {name} in {self.path}") from None
+
+    def blob(self, digest: str) -> Path:
+        """Return the file of a blob."""
+        algorithm, _, value = digest.partition(":")
+        return self.path / "blobs" / algorithm / value
+
+    def digests(self, image: Image) -> list[str]:
+        """Return the digests of all that an image consists of, layers first."""
+        manifest = json.loads(self.blob(image.digest).read_text())
+        return [*(layer["digest"] for layer in manifest["layers"]), manifest["config"]["digest"], image.digest]
+
+    def image_id(self, image: Image) -> str:
+        """Return the digest of an image's configuration, which is what buildah calls its id."""
+        manifest = json.loads(self.blob(image.digest).read_text())
+        return str(manifest["config"]["digest"]).removeprefix("sha256:")
+
+    def size_bytes(self, image: Image) -> int:
+        """Return the size of an image: the sum of its layers."""
+        return sum(self.blob(digest).stat().st_size for digest in self.digests(image))
+
+    def remove_unused(self) -> None:
+        """Remove blobs that no image refers to."""
+        used = {digest for image in self.images().values() for digest in self.digests(image)}
+        for path in (self.path / "blobs" / "sha256").iterdir():
+            if f"sha256:{path.name}" not in used:
+                path.unlink()
+
+    def add_program(self, name: str, program: Path) -> Image:
+        """Add an image that consists of one static program, which is also what it runs."""
+        self.create()
+        layer = _layer_with(program)
+        layer_digest = self._add_blob(layer)
+        config = {
+            "architecture": _architecture(),
+            "os": "linux",
+            "created": _EPOCH,
+            "config": {"Entrypoint": [f"/{program.name}"], "User": "65535:65535"},
+            "rootfs": {"type": "layers", "diff_ids": [layer_digest]},
+            "history": [{"created": _EPOCH, "created_by": program.name}],
+        }
+        config_bytes = json.dumps(config, sort_keys=True).encode()
+        manifest = {
+            "schemaVersion": 2,
+            "mediaType": MANIFEST_TYPE,
+            "config": _descriptor(CONFIG_TYPE, self._add_blob(config_bytes), len(config_bytes)),
+            "layers": [_descriptor(LAYER_TYPE, layer_digest, len(layer))],
+        }
+        self.add_manifest(name, json.dumps(manifest, sort_keys=True).encode(), MANIFEST_TYPE)
+        return self.image(name)
+
+    def add_manifest(self, name: str, content: bytes, media_type: str) -> str:
+        """Give a name to a manifest whose layers are there already, and return its digest."""
+        digest = self._add_blob(content)
+        entry = _descriptor(media_type, digest, len(content))
+        entry["annotations"] = {_REF_ANNOTATION: name}
+        others = [other for other in self._index() if other.get("annotations", {}).get(_REF_ANNOTATION) != name]
+        self._write_index([*others, entry])
+        return digest
+
+    def write_archive(self, images: Iterable[Image], *, without: Collection[str], out: IO[bytes]) -> None:
+        """Write an archive that `ctr images import` reads.
+
+        Args:
+            images: What it is to contain.
+            without: Digests of layers to leave out because the receiver has them.
+            out: Where the archive goes.
+        """
+        wanted = list(images)
+        digests = {digest: None for image in wanted for digest in self.digests(image) if digest not in without}
+        manifests = []
+        for image in wanted:
+            entry = _descriptor(image.media_type, image.digest, image.size_bytes)
+            entry["annotations"] = {_NAME_ANNOTATION: image.name, _REF_ANNOTATION: image.name.rpartition(":")[2]}
+            entry["platform"] = {"architecture": _architecture(), "os": "linux"}
+            manifests.append(entry)
+        index = {"schemaVersion": 2, "mediaType": _INDEX_TYPE, "manifests": manifests}
+        with tarfile.open(fileobj=out, mode="w|", format=tarfile.GNU_FORMAT) as archive:
+            _add_bytes(archive, "oci-layout", b'{"imageLayoutVersion": "1.0.0"}')
+            _add_bytes(archive, "index.json", json.dumps(index).encode())
+            for digest in digests:
+                member = tarfile.TarInfo(f"blobs/{digest.replace(':', '/')}")
+                with self.blob(digest).open("rb") as content:
+                    member.size = os.fstat(content.fileno()).st_size
+                    archive.addfile(member, content)
+
+    def _index(self) -> list[Json]:
+        try:
+            content = json.loads((self.path / "index.json").read_text())
+        except FileNotFoundError:
+            return []
+        return list(content["manifests"])
+
+    def _write_index(self, manifests: list[Json]) -> None:
+        scratch = self.path / f".index.{os.getpid()}"
+        scratch.write_text(json.dumps({"schemaVersion": 2, "mediaType": _INDEX_TYPE, "manifests": manifests}))
+        scratch.replace(self.path / "index.json")
+
+    def _add_blob(self, content: bytes) -> str:
+        digest = "sha256:" + hashlib.sha256(content).hexdigest()
+        path = self.blob(digest)
+        if not path.exists():
+            scratch = path.with_name(f".{path.name}.{os.getpid()}")
+            scratch.write_bytes(content)
+            scratch.replace(path)
+        return digest
+
+
+def _descriptor(media_type: str, digest: str, size_bytes: int) -> Json:
+    return {"mediaType": media_type, "digest": digest, "size": size_bytes}
+
+
+def _layer_with(program: Path) -> bytes:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w", format=tarfile.GNU_FORMAT) as archive:
+        _add_bytes(archive, program.name, program.read_bytes(), mode=0o755)
+    return buffer.getvalue()
+
+
+def _add_bytes(archive: tarfile.TarFile, name: str, content: bytes, *, mode: int = 0o644) -> None:
+    member = tarfile.TarInfo(name)
+    member.size, member.mode = len(content), mode
+    archive.addfile(member, io.BytesIO(content))
+
+
+def _architecture() -> str:
+    machines: Mapping[str, str] = {"x86_64": "amd64", "aarch64": "arm64"}
+    machine = os.uname().machine
+    return machines.get(machine, machine)

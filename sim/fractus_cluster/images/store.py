@@ -1,0 +1,143 @@
+"""The machine's store of images for embedded clusters: filled from buildah or archives, emptied into nodes."""
+
+from __future__ import annotations
+
+import hashlib
+import tarfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+
+from fractus_cluster.commands import run
+from fractus_cluster.errors import ClusterError
+from fractus_cluster.images.delivery import deliver
+from fractus_cluster.images.layout import Image, Layout
+from fractus_cluster.images.receiver import receiving
+from fractus_cluster.images.template import Template
+from fractus_cluster.locking import locked
+from fractus_cluster.node import Node
+from fractus_cluster.nodeconfig import SANDBOX_IMAGE
+from fractus_cluster.state import state_root
+
+_LOCK_TIMEOUT_S = 600.0
+_COPY_TIMEOUT_S = 300.0
+_LISTINGS = 5
+_LISTING_PAUSE_S = 1.0
+
+Report = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class ImageStore:
+    """A directory with an OCI layout of all images, and templates of nodes that have them unpacked.
+
+    Attributes:
+        path: The directory; on the file system of the clusters' state, so that files can be shared by hard links.
+        report: Told about progress, a line at a time.
+    """
+
+    path: Path
+    report: Report
+
+    @classmethod
+    def default(cls, *, report: Report) -> ImageStore:
+        """Return the store beside the clusters' state."""
+        return cls(state_root() / ".images", report)
+
+    @property
+    def layout(self) -> Layout:
+        """The images."""
+        return Layout(self.path / "layout")
+
+    def fetch(self, names: Sequence[str]) -> list[Image]:
+        """Take images into the store; one that is there already and has not changed costs nothing.
+
+        Args:
+            names: Names in buildah's storage, or paths of OCI or Docker archives.
+
+        Raises:
+            ClusterError: One does not exist.
+        """
+        if not names:
+            return []
+        with self._locked():
+            self.layout.create()
+            wanted = [name for entry in names for name in _names_behind(entry)]
+            ids = image_ids()
+            missing = [name for name in wanted if name not in ids]
+            if missing:
+                raise ClusterError(f"no image {', '.join(missing)} in buildah's storage; there are {', '.join(ids)}")
+            here = {name: self.layout.image_id(image) for name, image in self.layout.images().items()}
+            stale = [name for name in dict.fromkeys(wanted) if here.get(name) != ids[name]]
+            if stale:
+                self._receive(stale)
+                self.layout.remove_unused()
+            return [self.layout.image(name) for name in dict.fromkeys(wanted)]
+
+    def _receive(self, names: Sequence[str]) -> None:
+        with receiving(self.layout) as address:
+            for name in names:
+                argv = ["buildah", "push", "--quiet", "--compression-level=1", "--tls-verify=false", name]
+                run([*argv, f"docker://{address}/{name}"], timeout_s=_COPY_TIMEOUT_S)
+
+    def template(self, images: Sequence[Image], pause: Path) -> Template:
+        """Return a node's container storage with these images unpacked, made when there is none yet."""
+        with self._locked():
+            sandbox = self._sandbox(pause)
+            wanted = [sandbox, *images]
+            digest = hashlib.sha256("\n".join(sorted(f"{i.name} {i.digest}" for i in wanted)).encode()).hexdigest()
+            template = Template(self.path / "templates" / digest[:16])
+            template.make(self.layout, wanted, report=self.report)
+            return template
+
+    def deliver(self, images: Sequence[Image], nodes: Sequence[Node]) -> dict[str, int]:
+        """Deliver images of the store to running nodes; return how many were new to each."""
+        return deliver(self.layout, images, nodes) if images else {node.name: 0 for node in nodes}
+
+    def _sandbox(self, pause: Path) -> Image:
+        self.layout.create()
+        return self.layout.add_program(SANDBOX_IMAGE, pause)
+
+    def _locked(self) -> AbstractContextManager[None]:
+        return locked(
+            self.path / "lock", timeout_s=_LOCK_TIMEOUT_S, what="another process works on images", report=self.report
+        )
+
+
+def image_ids() -> dict[str, str]:
+    """Return the ids of all images in buildah's storage, by name.
+
+    The listing fails when somebody else removes an image meanwhile, so it is asked for again a few times.
+    """
+    argv = ["buildah", "images", "--no-trunc", "--format", "{{.Name}}:{{.Tag}} {{.ID}}"]
+    for _ in range(_LISTINGS):
+        listed = run(argv, check=False)
+        if listed.returncode == 0:
+            break
+        time.sleep(_LISTING_PAUSE_S)
+    else:
+        listed = run(argv)
+    pairs = (line.split() for line in listed.stdout.splitlines())
+    return {pair[0]: pair[1].removeprefix("sha256:") for pair in pairs if len(pair) == 2 and "<none>" not in pair[0]}
+
+
+def _names_behind(entry: str) -> list[str]:
+    """Return the names of what is to be delivered: the entry itself, or what an archive contains."""
+    if not Path(entry).is_file():
+        return [entry]
+    with tarfile.open(entry) as archive:
+        kind = (
+            "oci-archive"
+            if "oci-layout" in {name.removeprefix("./") for name in archive.getnames()}
+            else "docker-archive"
+        )
+    before = image_ids()
+    identity = run(["buildah", "pull", "--quiet", f"{kind}:{entry}"], timeout_s=_COPY_TIMEOUT_S).stdout.strip()
+    after = image_ids()
+    names = [name for name, other in after.items() if other == identity]
+    fresh = [name for name in names if before.get(name) != identity]
+    if not names:
+        raise ClusterError(f"{entry}: the archive gives its image no name")
+    return fresh or names

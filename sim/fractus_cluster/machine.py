@@ -1,0 +1,181 @@
+"""What all clusters of a machine share: claims on names and addresses, and settings to put back at the end."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from ipaddress import IPv4Network
+from pathlib import Path
+
+from fractus_cluster.addressing import choose_block
+from fractus_cluster.cgroups import find_hierarchies, remove_top
+from fractus_cluster.commands import run
+from fractus_cluster.errors import ClusterError
+from fractus_cluster.locking import locked
+from fractus_cluster.network import NETNS_DIRECTORY, networks_in_use
+
+# On /run, because all of it is void after a reboot, as are the settings and addresses themselves.
+DIRECTORY = Path("/run/fractus-sim")
+_LEDGER = DIRECTORY / "machine.json"
+_LOCK = DIRECTORY / "lock"
+_LOCK_TIMEOUT_S = 60.0
+_RAISED_SYSCTLS = {"fs.inotify.max_user_instances": 8192, "fs.inotify.max_user_watches": 524288}
+
+Report = Callable[[str], None]
+
+
+@dataclass(slots=True)
+class _Claim:
+    """What one cluster holds of the machine."""
+
+    state: str
+    block: str
+
+
+@dataclass(slots=True)
+class _Ledger:
+    """All claims, and what the machine was like before the first."""
+
+    sysctls: dict[str, str] = field(default_factory=dict)
+    controllers: list[str] = field(default_factory=list)
+    netns_mounted: bool = False
+    netns_there: bool = False
+    claims: dict[str, _Claim] = field(default_factory=dict)
+
+
+def cluster_lock(name: str) -> Path:
+    """Return the lock file of a cluster."""
+    return DIRECTORY / f"cluster.{name}.lock"
+
+
+def claim(name: str, state: Path, block: IPv4Network | None) -> IPv4Network:
+    """Claim a cluster's name and addresses, and prepare the machine when it is the first cluster.
+
+    Args:
+        name: The cluster's name.
+        state: Its state directory.
+        block: The addresses it has already, or None to get some that are free.
+
+    Returns:
+        Its addresses.
+
+    Raises:
+        ClusterError: The name is in use by a cluster with another state directory, or the addresses are taken.
+    """
+    with locked(_LOCK, timeout_s=_LOCK_TIMEOUT_S, what="another cluster is coming up or going down"):
+        ledger = _read()
+        held = ledger.claims.get(name)
+        if held is not None:
+            if held.state != str(state):
+                raise ClusterError(f"there is a cluster {name} already, with its state in {held.state}")
+            return IPv4Network(held.block)
+        others = [IPv4Network(entry.block) for entry in ledger.claims.values()]
+        if block is None:
+            block = choose_block([*networks_in_use(), *others])
+        elif any(block.overlaps(other) for other in (*networks_in_use(), *others)):
+            raise ClusterError(f"{name}: its addresses {block} are in use by something else now; take it down first")
+        if not ledger.claims:
+            _note_machine(ledger)
+        ledger.claims[name] = _Claim(str(state), str(block))
+        _write(ledger)  # before anything changes, so that an interrupted start is undone too
+        _raise_sysctls(ledger)
+        return block
+
+
+def holders() -> dict[str, Path]:
+    """Return the state directory of each cluster that holds a name."""
+    if not _LEDGER.exists():
+        return {}
+    with locked(_LOCK, timeout_s=_LOCK_TIMEOUT_S, what="another cluster is coming up or going down"):
+        return {name: Path(held.state) for name, held in _read().claims.items()}
+
+
+def holder(name: str) -> Path | None:
+    """Return the state directory of the cluster that holds a name, or None."""
+    return holders().get(name)
+
+
+def release(name: str) -> None:
+    """Give up a cluster's claims; after the last one put the machine's settings back."""
+    with locked(_LOCK, timeout_s=_LOCK_TIMEOUT_S, what="another cluster is coming up or going down", remove=True):
+        ledger = _read()
+        ledger.claims.pop(name, None)
+        if ledger.claims:
+            _write(ledger)
+            return
+        remove_top()
+        _restore(ledger)
+        _LEDGER.unlink(missing_ok=True)
+
+
+def remove_directory() -> None:
+    """Remove the directory of claims and locks when nothing is in it any more."""
+    try:
+        DIRECTORY.rmdir()
+    except OSError:
+        return  # another cluster is in it
+
+
+def _note_machine(ledger: _Ledger) -> None:
+    ledger.netns_mounted = _mounted(NETNS_DIRECTORY)
+    ledger.netns_there = NETNS_DIRECTORY.exists()
+    hierarchies = find_hierarchies()
+    if hierarchies.version == 2:
+        ledger.controllers = (hierarchies.roots[0] / "cgroup.subtree_control").read_text().split()
+
+
+def _raise_sysctls(ledger: _Ledger) -> None:
+    for name, wanted in _RAISED_SYSCTLS.items():
+        path = _sysctl(name)
+        present = path.read_text().strip()
+        if int(present) < wanted:
+            ledger.sysctls.setdefault(name, present)
+            _write(ledger)
+            path.write_text(str(wanted))
+
+
+def _restore(ledger: _Ledger) -> None:
+    for name, value in ledger.sysctls.items():
+        path = _sysctl(name)
+        if path.read_text().strip() == str(_RAISED_SYSCTLS.get(name)):  # else somebody set it meanwhile
+            path.write_text(value)
+    # `ip netns add` mounts the directory on itself the first time.
+    if NETNS_DIRECTORY.is_dir() and not any(NETNS_DIRECTORY.iterdir()):
+        if not ledger.netns_mounted and _mounted(NETNS_DIRECTORY):
+            run(["umount", str(NETNS_DIRECTORY)], check=False)
+        if not ledger.netns_there:
+            NETNS_DIRECTORY.rmdir()
+    hierarchies = find_hierarchies()
+    if hierarchies.version == 2 and ledger.controllers:
+        control = hierarchies.roots[0] / "cgroup.subtree_control"
+        for name in set(control.read_text().split()) - set(ledger.controllers):
+            try:
+                control.write_text(f"-{name}")
+            except OSError:
+                continue  # something else uses it by now
+
+
+def _mounted(path: Path) -> bool:
+    lines = Path("/proc/self/mountinfo").read_text().splitlines()
+    return any(line.split(" ")[4] == str(path) for line in lines)
+
+
+def _sysctl(name: str) -> Path:
+    return Path("/proc/sys") / name.replace(".", "/")
+
+
+def _read() -> _Ledger:
+    try:
+        content = json.loads(_LEDGER.read_text())
+    except FileNotFoundError:
+        return _Ledger()
+    claims = {name: _Claim(**entry) for name, entry in content.pop("claims").items()}
+    return _Ledger(claims=claims, **content)
+
+
+def _write(ledger: _Ledger) -> None:
+    scratch = _LEDGER.with_name(f".machine.{os.getpid()}")
+    scratch.write_text(json.dumps(asdict(ledger), indent=1))
+    scratch.replace(_LEDGER)

@@ -1,0 +1,299 @@
+"""A node of an embedded cluster: its files, its power, its uplink, and commands run on it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from ipaddress import IPv4Address
+from pathlib import Path
+
+import yaml
+
+from fractus_cluster import network, nodeconfig
+from fractus_cluster.binaries import Binaries
+from fractus_cluster.cgroups import Branch
+from fractus_cluster.commands import run
+from fractus_cluster.controlplane import server_url
+from fractus_cluster.errors import ClusterError
+from fractus_cluster.hardware import hardware_commands, hardware_environment
+from fractus_cluster.pki import Authority, write_private
+from fractus_cluster.prerequisites import machine, plugin_directory
+from fractus_cluster.processes import kill, read_record, spawn, write_record
+from fractus_cluster.spec import NodeSpec, Place
+from fractus_cluster.state import StateDirectory
+
+_PROGRAMS = ("kubelet", "kube-proxy")
+_FOLDERS = ("etc", "etc-work", "var-lib", "var-log", "config")
+_ENVIRONMENT = {
+    "PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
+    "HOME": "/root",
+    "LANG": "C.UTF-8",
+}
+
+
+def init_command(config: Path, namespace: Path) -> list[str]:
+    """Return the command that runs the first program of a node or control plane in its own namespaces.
+
+    Its process is the parent of that program; when it is killed, everything in those namespaces ends.
+    """
+    return [
+        "nsenter",
+        f"--net={namespace}",
+        "unshare",
+        *("--mount", "--uts", "--ipc", "--pid", "--fork", "--kill-child", "--mount-proc"),
+        *(sys.executable, "-E", "-s", "-m", "fractus_cluster.nodeinit", str(config)),
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A node: real containerd, kubelet and kube-proxy in namespaces of their own.
+
+    Attributes:
+        spec: Its part of the cluster file.
+        index: Its place in the cluster's addressing.
+        wiring: The cluster's network.
+        state: The cluster's state directory.
+        branch: The cluster's control groups.
+        world_origin: The middle of the landscape that the cluster's cameras see.
+    """
+
+    spec: NodeSpec
+    index: int
+    wiring: network.Wiring
+    state: StateDirectory
+    branch: Branch
+    world_origin: Place | None = None
+
+    @property
+    def name(self) -> str:
+        """The name of the Kubernetes node."""
+        return self.spec.name
+
+    @property
+    def address(self) -> IPv4Address:
+        """Its address on the cluster's network."""
+        return self.wiring.addressing.node(self.index)
+
+    @property
+    def directory(self) -> Path:
+        """Its files on the machine; `var-lib/` and `etc/` below are its /var/lib and what differs in its /etc."""
+        return self.state.node(self.name)
+
+    @property
+    def powered(self) -> bool:
+        """Whether the node runs."""
+        record = read_record(self.state.process(f"node.{self.name}"))
+        return record is not None and record.alive
+
+    @property
+    def vehicle_running(self) -> bool | None:
+        """Whether the node's vehicle runs; None when it has none."""
+        return None if self.spec.vehicle() is None else self._runs("vehicle")
+
+    @property
+    def camera_running(self) -> bool | None:
+        """Whether the node's simulated camera runs; None when it has none."""
+        return None if self.spec.hardware.camera is None else self._runs("camera")
+
+    def _runs(self, hardware: str) -> bool:
+        record = read_record(self.state.process(f"{hardware}.{self.name}"))
+        return record is not None and record.alive
+
+    @property
+    def _cgroup(self) -> Branch:
+        return self.branch.below("nodes").below(self.name)
+
+    @property
+    def _hardware_cgroup(self) -> Branch:
+        return self.branch.below("hardware").below(self.name)
+
+    def init_pid(self) -> int:
+        """Return the process id of the node's first program.
+
+        Raises:
+            ClusterError: The node is off.
+        """
+        record = read_record(self.state.process(f"node.{self.name}"))
+        if record is not None and record.alive:
+            children = Path(f"/proc/{record.pid}/task/{record.pid}/children").read_text().split()
+            if children:
+                return int(children[0])
+        raise ClusterError(f"node {self.name} is off")
+
+    def exec_command(self, argv: Sequence[str]) -> list[str]:
+        """Return a command for this machine that runs `argv` on the node.
+
+        Raises:
+            ClusterError: The node is off.
+        """
+        enter = ["nsenter", f"--target={self.init_pid()}", "--mount", "--uts", "--ipc", "--net", "--pid"]
+        return [*enter, "--", *argv]
+
+    def exec(
+        self, argv: Sequence[str], *, input_text: str | None = None, timeout_s: float = 60.0, check: bool = True
+    ) -> subprocess.CompletedProcess[str]:
+        """Run a program on the node to its end, as root, and return what it wrote.
+
+        Raises:
+            ClusterError: The node is off, or the program failed (with `check`) or took too long.
+        """
+        return run(self.exec_command(argv), input_text=input_text, timeout_s=timeout_s, check=check, env=_ENVIRONMENT)
+
+    def cut_link(self) -> None:
+        """Cut the node's uplink; the node goes on without the rest of the cluster."""
+        network.cut_link(self.wiring, self.index)
+
+    def heal_link(self) -> None:
+        """Restore the node's uplink."""
+        network.heal_link(self.wiring, self.index)
+
+    def power_off(self) -> None:
+        """Pull the node's power: all its processes die at once, its vehicle does not."""
+        record_path = self.state.process(f"node.{self.name}")
+        record = read_record(record_path)
+        if record is not None:
+            kill(record)
+        self._cgroup.kill_all()
+        record_path.unlink(missing_ok=True)
+        # Groups of pods that are no more would make the next kubelet slow.
+        self._cgroup.remove()
+
+    def power_on(self) -> bool:
+        """Switch the node on with the configuration last written; a no-op when it runs.
+
+        Returns:
+            Whether it was off.
+        """
+        if self.powered:
+            return False
+        self.power_off()
+        network.flush_firewall(self.wiring, self.name)
+        record = spawn(
+            init_command(self.directory / "config" / "init.json", self.wiring.namespace_path(self.name)),
+            log=self.state.logs / self.name / "init.log",
+            cgroup_files=self._cgroup.create(),
+            env=_ENVIRONMENT,
+        )
+        write_record(self.state.process(f"node.{self.name}"), record)
+        return True
+
+    def start_hardware(self) -> None:
+        """Put the node's vehicle and camera in place; a no-op for what runs or the node has not.
+
+        Raises:
+            ClusterError: The simulator is not installed, or nothing says where the vehicle stands.
+        """
+        for name, command in hardware_commands(self.spec, self.world_origin).items():
+            if self._runs(name):
+                continue
+            record = spawn(
+                ["nsenter", f"--net={self.wiring.namespace_path(self.name)}", *command],
+                log=self.state.logs / self.name / f"{name}.log",
+                cgroup_files=self._hardware_cgroup.create(),
+                env=hardware_environment(),
+            )
+            write_record(self.state.process(f"{name}.{self.name}"), record)
+
+    def stop_hardware(self) -> None:
+        """Take the node's vehicle and camera away."""
+        for name in ("vehicle", "camera"):
+            path = self.state.process(f"{name}.{self.name}")
+            record = read_record(path)
+            if record is not None:
+                kill(record)
+            path.unlink(missing_ok=True)
+        self._hardware_cgroup.kill_all()
+        self._hardware_cgroup.remove()
+
+    def remove(self) -> None:
+        """Remove the node from the machine: processes, network namespace and files."""
+        self.power_off()
+        self.stop_hardware()
+        network.unwire_node(self.wiring, self.name, self.index)
+        shutil.rmtree(self.directory, ignore_errors=True)
+        shutil.rmtree(self.state.logs / self.name, ignore_errors=True)
+
+    def files(self, binaries: Binaries, authority: Authority) -> dict[str, str]:
+        """Return the files that make the node, by path below its directory; secrets are in `config/`."""
+        plugins = plugin_directory()
+        if plugins is None:
+            raise ClusterError("no CNI plugins; install containernetworking-plugins")
+        place = self.wiring.addressing
+        server = server_url(place)
+        kubelet = authority.issue(
+            f"kubelet.{self.name}",
+            common_name=f"system:node:{self.name}",
+            organizations=("system:nodes",),
+            alternative_names=(self.name, self.address),
+        )
+        proxy = authority.issue("kube-proxy", common_name="system:kube-proxy")
+        cluster = self.wiring.cluster
+        content = {
+            "etc/hostname": self.name + "\n",
+            "etc/machine-id": hashlib.sha256(f"{cluster}/{self.name}".encode()).hexdigest()[:32] + "\n",
+            "etc/hosts": nodeconfig.hosts_file(self.name),
+            "etc/resolv.conf": nodeconfig.resolver_file(place),
+            "config/ca.crt": authority.credential.certificate.read_text(),
+            "config/kubelet.crt": kubelet.certificate.read_text(),
+            "config/kubelet.key": kubelet.key.read_text(),
+            "config/kubelet.kubeconfig": authority.kubeconfig(kubelet, server=server, cluster=cluster),
+            "config/kube-proxy.kubeconfig": authority.kubeconfig(proxy, server=server, cluster=cluster),
+            "config/kubelet.yaml": nodeconfig.kubelet_config(
+                self.spec,
+                cgroup_root=self._cgroup.path,
+                cgroup_version=self._cgroup.hierarchies.version,
+                machine=machine(),
+            ),
+            "config/kube-proxy.yaml": nodeconfig.kube_proxy_config(self.spec, place),
+            "config/containerd.toml": nodeconfig.containerd_config(plugin_directory=plugins),
+            "config/cni/10-fractus-sim.conflist": nodeconfig.cni_config(self.index, place),
+            "config/init.json": self._init(binaries),
+        }
+        if self.spec.manifest is not None:
+            content["etc/fractus/node.yaml"] = yaml.safe_dump(self.spec.manifest, sort_keys=False, allow_unicode=True)
+        return content
+
+    def _init(self, binaries: Binaries) -> str:
+        view = {
+            "hostname": self.name,
+            "files": str(self.directory),
+            "logs": str(self.state.logs / self.name),
+            "programs": {name: str(binaries[name].resolve()) for name in _PROGRAMS},
+            "sysctls": nodeconfig.SHOWN_SYSCTLS,
+        }
+        return json.dumps(
+            {"view": view, "units": nodeconfig.node_units(self.spec, address=str(self.address))}, indent=1
+        )
+
+    def write_files(self, content: dict[str, str]) -> bool:
+        """Write the node's files when they differ from those it runs with; a running node is switched off first.
+
+        Returns:
+            Whether anything differed.
+        """
+        digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+        stamp = self.directory / "digest"
+        if stamp.exists() and stamp.read_text() == digest:
+            return False
+        self.power_off()
+        stamp.unlink(missing_ok=True)
+        for name in _FOLDERS:
+            (self.directory / name).mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(self.directory / "etc-work")
+        (self.directory / "etc-work").mkdir()
+        (self.state.logs / self.name).mkdir(parents=True, exist_ok=True)
+        for name, text in content.items():
+            path = self.directory / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if name.startswith("config/"):
+                write_private(path, text)
+            else:
+                path.write_text(text)
+        stamp.write_text(digest)
+        return True

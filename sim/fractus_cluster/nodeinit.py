@@ -1,0 +1,146 @@
+"""The first program of a node: gives it its own view of the machine, then supervises its daemons.
+
+It runs as root in fresh mount, uts, ipc and pid namespaces and in the node's network namespace, on the
+standard library alone, and changes nothing outside of them.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import socket
+import sys
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from fractus_cluster.supervisor import Unit, supervise
+
+_LIBC = ctypes.CDLL(None, use_errno=True)
+_MS_NOSUID, _MS_NODEV, _MS_NOEXEC = 2, 4, 8
+_MS_BIND, _MS_REC, _MS_SHARED = 4096, 16384, 1 << 20
+_MNT_DETACH = 2
+
+RUN = Path("/run/fractus")
+"""Where a node finds its own configuration, programs and logs: config/, bin/ and logs/ below it."""
+
+
+@dataclass(frozen=True, slots=True)
+class NodeView:
+    """What a node sees in place of the machine's own.
+
+    Attributes:
+        hostname: Its host name; None leaves the mount tree alone (a control plane needs no view of its own).
+        files: Directory with etc/, etc-work/, var-lib/, var-log/ and config/ of the node.
+        logs: Directory for its daemons' logs.
+        programs: Program name -> path on the machine.
+        sysctls: Values of machine-wide settings shown to the node, so that no daemon changes the real ones.
+    """
+
+    hostname: str | None
+    files: str
+    logs: str
+    programs: dict[str, str]
+    sysctls: dict[str, str]
+
+
+def main(argument: str) -> None:
+    """Read the JSON file that `argument` names, prepare the view, and supervise."""
+    content = json.loads(Path(argument).read_text())
+    view = NodeView(**content["view"])
+    units = [Unit(**entry) for entry in content["units"]]
+    release_namespaces()
+    if view.hostname is not None:
+        socket.sethostname(view.hostname)
+        prepare(view)
+    supervise(units)
+
+
+def release_namespaces() -> None:
+    """Drop our copies of other network namespaces' handles, which would keep them from ending."""
+    for line in Path("/proc/self/mountinfo").read_text().splitlines():
+        before, _, after = line.partition(" - ")
+        if after.split(" ", 1)[0] == "nsfs":
+            _umount(before.split(" ")[4].replace("\\040", " "))
+
+
+def prepare(view: NodeView) -> None:
+    """Build the node's mount tree."""
+    with ExitStack() as stack:
+        # Handles, because the paths may lie below what is about to be covered.
+        source = {name: _handle(Path(view.files) / name, stack) for name in ("etc", "etc-work", "var-lib", "var-log")}
+        source["config"] = _handle(Path(view.files) / "config", stack)
+        source["logs"] = _handle(Path(view.logs), stack)
+        programs = {name: _handle(Path(path), stack) for name, path in view.programs.items()}
+        _mount("tmpfs", "/run", "tmpfs", _MS_NOSUID | _MS_NODEV, "mode=755,size=256m")
+        for name in ("config", "logs"):
+            (RUN / name).mkdir(parents=True)
+            _bind(source[name], RUN / name)
+        (RUN / "bin").mkdir()
+        for name, handle in programs.items():
+            (RUN / "bin" / name).touch()
+            _bind(handle, RUN / "bin" / name)
+        _fresh_sysfs()
+        layers = f"lowerdir=/etc,upperdir={source['etc']},workdir={source['etc-work']}"
+        _mount("overlay", "/etc", "overlay", 0, layers)
+        _bind(source["var-log"], Path("/var/log"))
+        _bind(source["var-lib"], Path("/var/lib"))
+    _settings(view.sysctls)
+    _mount("none", "/", None, _MS_SHARED | _MS_REC, None)
+
+
+def _fresh_sysfs() -> None:
+    """Mount a sysfs that shows the node's own network devices, and put the control groups back into it."""
+    aside = Path("/run/.cgroup")
+    aside.mkdir()
+    _mount("/sys/fs/cgroup", str(aside), None, _MS_BIND | _MS_REC, None)
+    _mount("sysfs", "/sys", "sysfs", _MS_NOSUID | _MS_NODEV | _MS_NOEXEC, None)
+    _mount(str(aside), "/sys/fs/cgroup", None, _MS_BIND | _MS_REC, None)
+    _umount(str(aside))
+    aside.rmdir()
+
+
+def _settings(shown: dict[str, str]) -> None:
+    Path("/proc/sys/net/ipv4/ip_forward").write_text("1")
+    folder = RUN / "sysctl"
+    folder.mkdir()
+    for name, value in shown.items():
+        target = Path("/proc/sys") / name.replace(".", "/")
+        if target.exists():
+            copy = folder / name
+            copy.write_text(value + "\n")
+            _bind(str(copy), target)
+
+
+def _handle(path: Path, stack: ExitStack) -> str:
+    handle = os.open(path, os.O_PATH | os.O_CLOEXEC)
+    stack.callback(os.close, handle)
+    return f"/proc/self/fd/{handle}"
+
+
+def _bind(source: str, target: Path) -> None:
+    _mount(source, str(target), None, _MS_BIND, None)
+
+
+def _mount(source: str, target: str, kind: str | None, flags: int, options: str | None) -> None:
+    done = _LIBC.mount(
+        source.encode(),
+        target.encode(),
+        kind.encode() if kind else None,
+        ctypes.c_ulong(flags),
+        options.encode() if options else None,
+    )
+    if done != 0:
+        code = ctypes.get_errno()
+        raise OSError(code, f"mount {source} on {target}: {os.strerror(code)}")
+
+
+def _umount(target: str) -> None:
+    if _LIBC.umount2(target.encode(), _MNT_DETACH) != 0:
+        code = ctypes.get_errno()
+        raise OSError(code, f"unmount {target}: {os.strerror(code)}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,318 @@
+"""The YAML file that describes an embedded cluster, as validated values."""
+
+from __future__ import annotations
+
+import re
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
+
+import yaml
+from fractus_core.api import API_VERSION, Drone, EdgeNode, InvalidObject, Resource
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from fractus_cluster.errors import ClusterError
+
+NodeClass = Literal["drone", "edge", "cloud"]
+
+_NAME = r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$"
+_SUFFIXES: dict[str, Decimal | int] = {
+    "": 1,
+    "m": Decimal("0.001"),
+    "k": 10**3,
+    "M": 10**6,
+    "G": 10**9,
+    "T": 10**12,
+    "Ki": 2**10,
+    "Mi": 2**20,
+    "Gi": 2**30,
+    "Ti": 2**40,
+}
+_DEFAULT_CONNECTION = "tcp:127.0.0.1:5760"
+
+
+def parse_quantity(text: str) -> Decimal:
+    """Return the number that a Kubernetes quantity ("500m", "2Gi", "4") stands for.
+
+    Raises:
+        ValueError: It is not a quantity.
+    """
+    match = re.fullmatch(r"([0-9.]+)([A-Za-z]*)", text.strip())
+    if match is None or match[2] not in _SUFFIXES:
+        raise ValueError(f"{text!r} is not a quantity such as 2, 500m or 4Gi")
+    try:
+        return Decimal(match[1]) * _SUFFIXES[match[2]]
+    except InvalidOperation as error:
+        raise ValueError(f"{text!r} is not a quantity such as 2, 500m or 4Gi") from error
+
+
+class _Value(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Home(_Value):
+    """Where a vehicle stands when it is switched on.
+
+    Attributes:
+        lat: Latitude, degrees (WGS 84).
+        lon: Longitude, degrees (WGS 84).
+        alt: Altitude above mean sea level, metres.
+    """
+
+    lat: Annotated[float, Field(ge=-90, le=90)]
+    lon: Annotated[float, Field(ge=-180, le=180)]
+    alt: float = 0.0
+
+
+class VehicleHardware(_Value):
+    """The simulated vehicle of a drone node.
+
+    Attributes:
+        home: Where it stands; taken from `description.location` when absent.
+        listen: Address of its autopilot in the node's network namespace; taken from
+            `description.services.mobility.connection` when absent.
+        arguments: Further arguments of `fractus-vehicle`.
+    """
+
+    home: Home | None = None
+    listen: str | None = None
+    arguments: tuple[str, ...] = ()
+
+
+class Place(_Value):
+    """A point on the ground, degrees (WGS 84)."""
+
+    lat: Annotated[float, Field(ge=-85, le=85)]
+    lon: Annotated[float, Field(ge=-180, le=180)]
+
+
+class CameraHardware(_Value):
+    """The simulated camera of a drone or edge node; it sees what `description.services.camera` says.
+
+    Attributes:
+        origin: Middle of the landscape; by default all cameras of a cluster share the place of the first.
+        seed: Of the landscape and of all that moves; cameras that share a world have the same.
+        arguments: Further arguments of `fractus-camera-world`.
+    """
+
+    origin: Place | None = None
+    seed: int = 7
+    arguments: tuple[str, ...] = ()
+
+
+class Hardware(_Value):
+    """What stands beside a node and does not lose power with it."""
+
+    vehicle: VehicleHardware | None = None
+    camera: CameraHardware | None = None
+
+
+class NodeSpec(_Value):
+    """One node.
+
+    Attributes:
+        name: Name of the Kubernetes node.
+        node_class: Written `class` in the file.
+        resources: What the node offers to pods: cpu, memory, pods, and extended resources by full name.
+        labels: Further labels of the node.
+        description: The spec of the node's Drone or EdgeNode, put on it as /etc/fractus/node.yaml; when empty,
+            there is no such file and the node registers as nothing.
+        hardware: What stands beside the node.
+    """
+
+    name: Annotated[str, Field(pattern=_NAME, max_length=40)]
+    node_class: Annotated[NodeClass, Field(alias="class")]
+    resources: dict[str, str] = Field(default_factory=dict)
+    labels: dict[str, str] = Field(default_factory=dict)
+    description: dict[str, Any] = Field(default_factory=dict)
+    hardware: Hardware = Hardware()
+
+    @field_validator("resources", mode="before")
+    @classmethod
+    def _as_text(cls, value: object) -> object:
+        return {key: str(amount) for key, amount in value.items()} if isinstance(value, dict) else value
+
+    @field_validator("resources")
+    @classmethod
+    def _quantities(cls, value: dict[str, str]) -> dict[str, str]:
+        for key, amount in value.items():
+            if key not in ("cpu", "memory", "pods") and "/" not in key:
+                raise ValueError(f"{key!r}: resources are cpu, memory, pods or <domain>/<name>")
+            parse_quantity(amount)
+        return value
+
+    @model_validator(mode="after")
+    def _hardware_fits(self) -> NodeSpec:
+        if self.hardware.vehicle is not None and self.node_class != "drone":
+            raise ValueError(f"node {self.name}: hardware.vehicle is for nodes of class drone")
+        if self.hardware.camera is not None:
+            self._camera_fits()
+        return self
+
+    def _camera_fits(self) -> None:
+        if self.node_class == "cloud":
+            raise ValueError(f"node {self.name}: hardware.camera is for drones and edge nodes")
+        if self.vehicle() is None and self.place() is None:
+            raise ValueError(f"node {self.name}: hardware.camera needs a vehicle or description.location")
+        height = _dig(self.description, "services", "camera", "mount", "height")
+        if self.node_class == "edge" and height is None:
+            raise ValueError(
+                f"node {self.name}: hardware.camera hangs nowhere; "
+                "give description.services.camera.mount.height, metres above the ground"
+            )
+        if camera_address(self.camera_url) is None:
+            raise ValueError(
+                f"node {self.name}: hardware.camera serves http://127.0.0.1:8090/snapshot.jpg; "
+                f"write that as description.services.camera.connection, which is {self.camera_url!r}"
+            )
+
+    @model_validator(mode="after")
+    def _description_fits(self) -> NodeSpec:
+        if self.node_class == "cloud" and self.description:
+            raise ValueError(
+                f"node {self.name}: a cloud node has no description; only drones and edge nodes have kinds"
+            )
+        if self.manifest is not None:
+            kind: type[Resource] = Drone if self.node_class == "drone" else EdgeNode
+            try:
+                kind.from_body(self.manifest)
+            except InvalidObject as error:
+                raise ValueError(f"node {self.name}: description: {error}") from error
+        return self
+
+    @property
+    def extended_resources(self) -> dict[str, str]:
+        """The resources that are neither cpu, memory nor pods."""
+        return {key: amount for key, amount in self.resources.items() if "/" in key}
+
+    @property
+    def manifest(self) -> dict[str, Any] | None:
+        """The Drone or EdgeNode manifest of this node; None for one that the cluster file does not describe."""
+        if self.node_class == "cloud" or not self.description:
+            return None
+        kind = "Drone" if self.node_class == "drone" else "EdgeNode"
+        return {"apiVersion": API_VERSION, "kind": kind, "metadata": {"name": self.name}, "spec": self.description}
+
+    def vehicle(self) -> tuple[Home, str, tuple[str, ...]] | None:
+        """Return home, autopilot address and further arguments of the node's vehicle; None when it has none.
+
+        Raises:
+            ClusterError: The node is a drone and nothing says where its vehicle stands.
+        """
+        given = self.hardware.vehicle
+        connection = _dig(self.description, "services", "mobility", "connection")
+        if self.node_class != "drone" or (given is None and connection is None):
+            return None
+        given = given or VehicleHardware()
+        listen = given.listen or (connection if isinstance(connection, str) else _DEFAULT_CONNECTION)
+        home = given.home or self._location()
+        if home is None:
+            raise ClusterError(
+                f"node {self.name}: its vehicle stands nowhere; "
+                "give hardware.vehicle.home or description.location with lat and lon"
+            )
+        return home, listen, given.arguments
+
+    @property
+    def camera_url(self) -> str:
+        """Where the node's camera service gets its pictures from."""
+        url = _dig(self.description, "services", "camera", "connection")
+        return url if isinstance(url, str) else "test:"
+
+    def place(self) -> Home | None:
+        """Where the node is at the start; None when nothing says so."""
+        given = self.hardware.vehicle
+        return (given.home if given is not None else None) or self._location()
+
+    def _location(self) -> Home | None:
+        location = _dig(self.description, "location")
+        if not isinstance(location, dict) or "lat" not in location or "lon" not in location:
+            return None
+        return Home(lat=location["lat"], lon=location["lon"], alt=location.get("alt") or 0.0)
+
+
+class ClusterSpec(_Value):
+    """A cluster: its name and its nodes."""
+
+    name: Annotated[str, Field(pattern=_NAME, max_length=30)]
+    nodes: Annotated[tuple[NodeSpec, ...], Field(min_length=1, max_length=100)]
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> ClusterSpec:
+        names = [node.name for node in self.nodes]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"nodes: the name {', '.join(twice)} is given twice")
+        return self
+
+    @property
+    def world_origin(self) -> Place | None:
+        """The middle of the landscape that the cameras see; None when no node has one."""
+        seeing = [node for node in self.nodes if node.hardware.camera is not None]
+        given = [node.hardware.camera.origin for node in seeing if node.hardware.camera is not None]
+        places = [Place(lat=home.lat, lon=home.lon) for home in (node.place() for node in seeing) if home is not None]
+        return next((origin for origin in given if origin is not None), places[0] if places else None)
+
+    @classmethod
+    def placeholder(cls, name: str) -> ClusterSpec:
+        """Return a cluster of which only the name is known."""
+        return cls.model_validate({"name": name, "nodes": [{"name": "unknown", "class": "cloud"}]})
+
+    def to_yaml(self) -> str:
+        """Return the cluster as a file that `load_spec` reads back to an equal value."""
+        return yaml.safe_dump(self.model_dump(mode="json", by_alias=True), sort_keys=False)
+
+
+def parse_spec(content: object, *, source: str) -> ClusterSpec:
+    """Return the cluster that parsed YAML describes.
+
+    Args:
+        content: What the YAML parser returned.
+        source: Where it came from, for messages.
+
+    Raises:
+        ClusterError: A field is missing or wrong; the message names it.
+    """
+    try:
+        return ClusterSpec.model_validate(content)
+    except ValidationError as error:
+        found = [(".".join(str(part) for part in fault["loc"]), fault["msg"]) for fault in error.errors()]
+        # A list with a bad entry counts as too short as well; the entry says it all.
+        real = [(place, text) for place, text in found if not any(other.startswith(f"{place}.") for other, _ in found)]
+        faults = "; ".join(f"{place or 'file'}: {text.removeprefix('Value error, ')}" for place, text in real)
+        raise ClusterError(f"{source}: {faults}") from error
+
+
+def load_spec(path: Path) -> ClusterSpec:
+    """Read a cluster file.
+
+    Raises:
+        ClusterError: The file is missing, not YAML, or a field is wrong.
+    """
+    try:
+        content = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise ClusterError(f"cannot read {path}: {error.strerror}") from error
+    except yaml.YAMLError as error:
+        raise ClusterError(f"{path} is not YAML: {error}") from error
+    return parse_spec(content, source=str(path))
+
+
+def camera_address(url: str) -> tuple[str, int] | None:
+    """Host and port of a snapshot URL that a program on the same node can serve; None for any other."""
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname, parts.port or 80
+    except ValueError:
+        return None
+    local = parts.scheme == "http" and host in ("127.0.0.1", "localhost", "::1") and parts.path == "/snapshot.jpg"
+    return ("127.0.0.1" if host == "localhost" else str(host), port) if local else None
+
+
+def _dig(tree: object, *keys: str) -> object:
+    for key in keys:
+        if not isinstance(tree, dict):
+            return None
+        tree = tree.get(key)
+    return tree

@@ -1,6 +1,0 @@
-"""`python -m fractus_sim.cluster.images`: building the images."""
-
-from fractus_sim.cluster.images.cli import images
-
-if __name__ == "__main__":
-    images(prog_name="fractus images")

@@ -1,0 +1,231 @@
+"""AUTO: flying the stored mission."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from fractus_vehicle.breadcrumbs import Point
+from fractus_vehicle.descent import descend
+from fractus_vehicle.flight import Flight
+from fractus_vehicle.leg import Leg
+from fractus_vehicle.mav import Command, Mode, Severity
+from fractus_vehicle.spline import SplineLeg
+from fractus_vehicle.todo import Todo, item_target, title
+
+if TYPE_CHECKING:
+    from fractus_vehicle.mission import Item
+    from fractus_vehicle.vehicle import Vehicle
+
+# Legs that need not stop at their end.
+CURVES = frozenset({Command.NAV_WAYPOINT, Command.NAV_SPLINE_WAYPOINT})
+
+
+class AutoFlight(Flight):
+    """AUTO mode: runs NAV commands one after the other, DO commands at once when reached."""
+
+    def __init__(self) -> None:
+        self._item: Item | None = None
+        self._index = 0
+        self._arrived_s: float | None = None
+        self._started = False
+        self._landing = False
+        self._returning: Flight | None = None
+        self.paused = False
+        self._leg: Leg | SplineLeg | None = None
+        self._track: Point = (0.0, 0.0, 0.0)  # the direction in which the present leg arrives, if it does not stop
+        self._todo = Todo()
+        self._circle_centre: tuple[float, float] | None = None
+        self._turned = 0.0
+        self._angle = 0.0
+
+    @property
+    def landing(self) -> bool:
+        """Whether the mission's own landing or return is in its last descent."""
+        return self._landing or (self._returning is not None and self._returning.landing)
+
+    def begin(self, v: Vehicle) -> None:
+        """Hold; the mission starts with the first step, which needs running motors."""
+        v.control.hold_here()
+        v.yaw.follow_course()
+
+    def _start(self, v: Vehicle) -> None:
+        """Continue at the current item, or start over."""
+        self._started = True
+        mission = v.mission
+        if mission.complete or int(v.params["MIS_RESTART"]) == 1 or mission.current == 0:
+            mission.rewind()
+            self._start_from(v, mission.next_after(0))
+        else:
+            self._start_from(v, mission.current)
+
+    def pause(self, v: Vehicle, *, paused: bool) -> None:
+        """DO_PAUSE_CONTINUE: stop where it is; continuing repeats the current item."""
+        if paused and not self.paused:
+            v.control.hold_here()
+        elif not paused and self.paused and self._item is not None:
+            self._begin_item(v, self._index, self._item)
+        self.paused = paused
+
+    def jump_to(self, v: Vehicle, index: int) -> None:
+        """Continue at an item (DO_SET_MISSION_CURRENT)."""
+        self._started = True
+        self._returning = None
+        self._landing = False
+        v.mission.complete = False
+        self._start_from(v, index)
+
+    def _start_from(self, v: Vehicle, index: int | None) -> None:
+        """Begin the next NAV command; the DO and CONDITION commands before it run while it is flown."""
+        waiting: list[int] = []
+        for _ in range(len(v.mission.items) + 1):
+            if index is None or index >= len(v.mission.items):
+                self._todo.begin(v, waiting)
+                self._finish(v)
+                return
+            item = v.mission.items[index]
+            if item.navigates:
+                v.mission.current = index
+                v.say(Severity.INFO, f"Mission: {index} {title(item)}")
+                self._begin_item(v, index, item)
+                self._todo.begin(v, waiting)
+                return
+            waiting.append(index)
+            index = v.mission.next_after(index)
+
+    def _finish(self, v: Vehicle) -> None:
+        self._item = self._leg = None
+        v.mission.complete = True
+        if v.landed:
+            v.disarm("mission complete")
+        else:
+            v.control.hold_here()
+
+    def _place(self, v: Vehicle, item: Item) -> tuple[float, float, float]:
+        return item_target(v, item)
+
+    def _begin_item(self, v: Vehicle, index: int, item: Item) -> None:
+        self._item, self._index = item, index
+        self._arrived_s = None
+        self._landing = False
+        self._returning = self._leg = None
+        track, self._track = self._track, (0.0, 0.0, 0.0)
+        if item.has_place and v.altitude_base_m(item.frame) is None:
+            v.say(Severity.CRITICAL, "Failsafe: Terrain data missing")
+            if not v.set_mode(Mode.RTL):
+                v.set_mode(Mode.LAND)
+            return
+        north, east, down = self._place(v, item)
+        match item.command:
+            case Command.NAV_TAKEOFF:
+                if v.landed:
+                    v.begin_takeoff(down)
+                else:
+                    v.control.go_to(*v.control.target, down)
+            case Command.NAV_RETURN_TO_LAUNCH:
+                self._returning = v.new_return()
+                self._returning.begin(v)
+            case Command.NAV_LOITER_TURNS:
+                self._circle_centre = (north, east)
+                self._turned = 0.0
+                self._angle = math.atan2(v.est.east - east, v.est.north - north)
+                v.control.go_to(north, east, down)
+            case Command.NAV_DELAY:
+                self._arrived_s = v.time_s
+            case Command.NAV_SPLINE_WAYPOINT:
+                here = (v.control.pos[0], v.control.pos[1], v.control.pos[2])
+                self._track = self._arrival(v, item, here, (north, east, down))
+                self._leg = SplineLeg(v, (north, east, down), track, self._track)
+            case Command.NAV_LAND:
+                v.control.go_to(north, east)
+            case _:
+                here = (v.control.pos[0], v.control.pos[1], v.control.pos[2])
+                if self._following(v, item) is not None:
+                    self._track = (north - here[0], east - here[1], down - here[2])
+                self._leg = Leg(v, north, east, down)
+
+    def _following(self, v: Vehicle, item: Item) -> Item | None:
+        """The waypoint after this one, where it is a curve or begins one; a stay in between ends that."""
+        at = v.mission.peek_after(self._index)
+        if item.command not in CURVES or item.param1 > 0.0 or at is None:
+            return None
+        following = v.mission.items[at]
+        return following if following.command in CURVES else None
+
+    def _arrival(self, v: Vehicle, item: Item, start: Point, end: Point) -> Point:
+        """In which direction a curve ends: along a straight leg that follows, or past its end towards the next one."""
+        following = self._following(v, item)
+        if following is None:
+            return (0.0, 0.0, 0.0)
+        north, east, down = item_target(v, following)
+        base = start if following.command == Command.NAV_SPLINE_WAYPOINT else end
+        return (north - base[0], east - base[1], down - base[2])
+
+    def step(self, v: Vehicle, dt: float) -> None:
+        """Fly the current item and go on when it is done."""
+        if not self._started:
+            self._start(v)
+        item = self._item
+        if item is None or self.paused:
+            return
+        if self._returning is not None:
+            self._returning.step(v, dt)
+            self._finish_if_down(v)
+            return
+        self._todo.step(v)
+        if self._leg is not None:
+            self._leg.step(v)
+        if item.command == Command.NAV_LAND:
+            self._land(v)
+        elif item.command == Command.NAV_LOITER_TURNS and self._circle_centre is not None:
+            self._turn(v, item, dt)
+        elif self._done(v, item):
+            v.broadcast("MISSION_ITEM_REACHED", {"seq": self._index})
+            v.say(Severity.INFO, f"Reached command #{self._index}")
+            self._start_from(v, v.mission.next_after(self._index))
+        v.yaw.step(v, dt)
+
+    def _land(self, v: Vehicle) -> None:
+        north, east = v.control.target
+        if not self._landing and math.hypot(north - v.est.north, east - v.est.east) < 2.0:
+            self._landing = True
+            v.touch_time_s = 0.0
+        if self._landing:
+            descend(v)
+            self._finish_if_down(v)
+
+    def _finish_if_down(self, v: Vehicle) -> None:
+        """A landing or return ends with the motors off; then the next item, if any, waits for the next start."""
+        if v.armed:
+            return
+        self._item = None
+        v.broadcast("MISSION_ITEM_REACHED", {"seq": self._index})
+        following = v.mission.next_after(self._index)
+        v.mission.complete = following is None
+        if following is not None:
+            v.mission.current = following
+
+    def _turn(self, v: Vehicle, item: Item, dt: float) -> None:
+        radius = min(max(abs(item.param3) or v.params["CIRCLE_RADIUS"] / 100.0, 1.0), 500.0)
+        rate = min(math.radians(v.params["CIRCLE_RATE"]), v.control.limits.speed_mps / radius)
+        step = math.copysign(rate * dt, item.param3 or 1.0)
+        centre = self._circle_centre or (v.est.north, v.est.east)
+        self._angle += step
+        self._turned += abs(step)
+        v.control.target = (centre[0] + radius * math.cos(self._angle), centre[1] + radius * math.sin(self._angle))
+        if self._turned >= 2.0 * math.pi * max(item.param1, 1.0):
+            v.broadcast("MISSION_ITEM_REACHED", {"seq": self._index})
+            self._start_from(v, v.mission.next_after(self._index))
+
+    def _done(self, v: Vehicle, item: Item) -> bool:
+        if item.command == Command.NAV_TAKEOFF:
+            return v.takeoff_done()
+        if item.command == Command.NAV_LOITER_UNLIM:
+            return False
+        if item.command == Command.NAV_DELAY:
+            return v.time_s - (self._arrived_s or 0.0) >= max(item.param1, 0.0)
+        if self._arrived_s is None:
+            if self._leg is None or not self._leg.reached(v, max(v.params["WPNAV_RADIUS"] / 100.0, 0.3)):
+                return False
+            self._arrived_s = v.time_s
+        return v.time_s - self._arrived_s >= max(item.param1, 0.0)

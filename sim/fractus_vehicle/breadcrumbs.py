@@ -1,0 +1,227 @@
+"""The path that the vehicle has flown since it was armed, kept short enough to be flown back: SmartRTL's memory.
+
+The method is ArduPilot's (AP_SmartRTL), written anew: a point is dropped each SRTL_ACCURACY metres; points that lie
+within half of that of the line between their neighbours are removed (Ramer-Douglas-Peucker), and a loop is cut where
+two stretches of the path come closer than SRTL_ACCURACY. What does not fit into SRTL_POINTS ends it for the flight.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from fractus_vehicle.mav import Mode, Severity
+
+if TYPE_CHECKING:
+    from fractus_vehicle.vehicle import Vehicle
+
+POINTS_MAX = 500
+UPDATE_INTERVAL_S = 1.0 / 3.0
+TIMEOUT_S = 15.0
+TIDY_AFTER = 50  # new points
+LOW_SPACE = 10  # free points
+LOW_SPACE_SAID_EVERY_S = 10.0
+PRUNE_SHARE = 0.99  # of the accuracy: closer stretches than this have nothing between them
+COMPARISONS_PER_TICK = 400  # bounds what tidying costs at one control step
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """A stretch that may be replaced by one point: path[start] becomes `joint`, what follows up to `end` goes."""
+
+    start: int
+    end: int
+    joint: Point
+    weight: float
+
+
+class Breadcrumbs:
+    """The recorded path in local metres, home first."""
+
+    def __init__(self, points: float) -> None:
+        self.active = False
+        self.path: list[Point] = []
+        self._limit = min(max(int(points), 0), POINTS_MAX)  # as ArduPilot: read once, at the start
+        self._accuracy_m = 2.0
+        self._simplified = 0  # points that need no second look
+        self._pruned = 0
+        self._work: Iterator[None] | None = None
+        self._next_s = 0.0
+        self._good_s = self._saved_s = 0.0
+        self._low_said_s = -math.inf
+
+    def restart(self, v: Vehicle) -> None:
+        """Forget the path and begin at the present position, if it is known (at the start, and when armed)."""
+        self._accuracy_m = v.params["SRTL_ACCURACY"]
+        self.path.clear()
+        self._simplified = self._pruned = 0
+        self._work = None
+        if self._limit == 0 or self._accuracy_m <= 0.0:
+            self.active = False
+        elif not v.position_ok:
+            self._give_up(v, "bad position")
+        else:
+            self.active = True
+            self._good_s = self._saved_s = v.time_s
+            self.path.append((v.est.north, v.est.east, v.est.down))
+
+    def step(self, v: Vehicle) -> None:
+        """Record, three times a second while armed, and tidy up; SMART_RTL itself leaves no crumbs."""
+        if v.time_s >= self._next_s:
+            self._next_s = v.time_s + UPDATE_INTERVAL_S
+            if not self.path and not v.armed and v.position_ok:
+                self.restart(v)
+            if self.active and v.armed and v.mode is not Mode.SMART_RTL:
+                self._record(v)
+                self._work = self._work or self._routine()
+        if self._work is not None:
+            try:
+                next(self._work)
+            except StopIteration:
+                self._work = None
+
+    def _record(self, v: Vehicle) -> None:
+        now_s = v.time_s
+        if not v.position_ok:
+            if now_s - self._good_s > TIMEOUT_S:
+                self._give_up(v, "bad position")
+            return
+        self._good_s = now_s
+        if self.add((v.est.north, v.est.east, v.est.down)):
+            self._saved_s = now_s
+        elif now_s - self._saved_s > TIMEOUT_S:
+            self._give_up(v, "buffer full")
+            return
+        if len(self.path) >= self._limit - LOW_SPACE + 1 and now_s - self._low_said_s > LOW_SPACE_SAID_EVERY_S:
+            self._low_said_s = now_s
+            v.say(Severity.INFO, "SmartRTL Low on space!")
+
+    def _give_up(self, v: Vehicle, reason: str) -> None:
+        self.active = False
+        self._work = None
+        v.say(Severity.WARNING, f"SmartRTL deactivated: {reason}")
+
+    def add(self, point: Point) -> bool:
+        """Append a point unless it is too near to the last one; False when there is no room."""
+        if self.path and math.dist(self.path[-1], point) < self._accuracy_m:
+            return True
+        if len(self.path) >= self._limit:
+            return False
+        self.path.append(point)
+        return True
+
+    def pop(self) -> Point:
+        """Take the newest point, to fly there."""
+        point = self.path.pop()
+        self._simplified = min(self._simplified, len(self.path))
+        self._pruned = min(self._pruned, len(self.path))
+        return point
+
+    # -- tidying -----------------------------------------------------------------------------------------------
+
+    def thorough(self) -> Iterator[None]:
+        """Remove everything that can go; each turn is a bounded amount of work."""
+        self._work = None
+        self.simplify()
+        return self._prune(POINTS_MAX)
+
+    def _routine(self) -> Iterator[None] | None:
+        fresh = len(self.path) - self._simplified
+        low = self._limit - len(self.path) <= LOW_SPACE
+        if fresh >= TIDY_AFTER or (low and fresh >= LOW_SPACE):
+            self.simplify()
+        elif low and self._pruned < len(self.path):
+            return self._prune(LOW_SPACE)
+        return None
+
+    def simplify(self) -> None:
+        """Remove the new points that lie near the line between others."""
+        keep = set(range(len(self.path)))
+        stack = [(max(self._simplified - 1, 0), len(self.path) - 1)]
+        while stack:
+            first, last = stack.pop()
+            if last - first < 2:
+                continue
+            between = range(first + 1, last)
+            apart = [distance_to_segment(self.path[at], self.path[first], self.path[last]) for at in between]
+            farthest = between[apart.index(max(apart))]
+            if max(apart) > self._accuracy_m / 2.0:
+                stack += [(first, farthest), (farthest, last)]
+            else:
+                keep -= set(between)
+        self.path = [point for at, point in enumerate(self.path) if at in keep]
+        self._simplified = len(self.path)
+        self._pruned = min(self._pruned, len(self.path))
+
+    def _prune(self, enough: int) -> Iterator[None]:
+        """Find loops that end in new points, and cut them, newest first, until `enough` points are gone."""
+        loops: list[Loop] = []
+        count, done = 0, len(self.path)
+        for last in range(done - 1, max(self._pruned, 3) - 1, -1):
+            for first in range(1, last - 1):
+                count += 1
+                if count % COMPARISONS_PER_TICK == 0:
+                    yield
+                gap_m, joint = segment_gap(self.path[last], self.path[last - 1], self.path[first - 1], self.path[first])
+                if gap_m < self._accuracy_m * PRUNE_SHARE:
+                    loops = _with_loop(loops, self._loop(first, last - 1, joint))
+                    break
+        removed = 0
+        for loop in sorted(loops, key=lambda loop: loop.start, reverse=True):
+            if removed >= enough:
+                break
+            self.path[loop.start : loop.end + 1] = [loop.joint]
+            removed += loop.end - loop.start
+        self._pruned = max(done - removed, 0) if removed < enough else 0
+        self._simplified = min(self._simplified, len(self.path))
+
+    def _loop(self, start: int, end: int, joint: Point) -> Loop:
+        stretch = [joint, *self.path[start : end + 1], joint]
+        weight = sum(math.dist(a, b) ** 2 for a, b in itertools.pairwise(stretch))
+        return Loop(start, end, joint, weight)
+
+
+def _with_loop(loops: list[Loop], new: Loop) -> list[Loop]:
+    """The loops with a new one: of loops that overlap, the longer remains."""
+    if new.end <= new.start:
+        return loops
+    rivals = [loop for loop in loops if loop.start <= new.end and new.start <= loop.end]
+    if sum(loop.weight for loop in rivals) > new.weight:
+        return loops
+    return [loop for loop in loops if loop not in rivals] + [new]
+
+
+def distance_to_segment(point: Point, start: Point, end: Point) -> float:
+    """Distance of a point from a segment in space."""
+    dx, dy, dz = end[0] - start[0], end[1] - start[1], end[2] - start[2]
+    px, py, pz = point[0] - start[0], point[1] - start[1], point[2] - start[2]
+    length2 = dx * dx + dy * dy + dz * dz
+    share = 0.0 if length2 == 0.0 else min(1.0, max(0.0, (px * dx + py * dy + pz * dz) / length2))
+    return math.hypot(px - share * dx, py - share * dy, pz - share * dz)
+
+
+def segment_gap(a: Point, b: Point, c: Point, d: Point) -> tuple[float, Point]:
+    """The distance between the segments a-b and c-d, and the point half way between where they are closest.
+
+    The closest points of two segments in space, after Ericson, "Real-Time Collision Detection", 5.1.9.
+    """
+    ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    vx, vy, vz = d[0] - c[0], d[1] - c[1], d[2] - c[2]
+    wx, wy, wz = a[0] - c[0], a[1] - c[1], a[2] - c[2]
+    uu, vv = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz
+    uv, uw, vw = ux * vx + uy * vy + uz * vz, ux * wx + uy * wy + uz * wz, vx * wx + vy * wy + vz * wz
+    slant = uu * vv - uv * uv
+    s = min(1.0, max(0.0, (uv * vw - uw * vv) / slant)) if slant > 1e-12 else 0.0
+    t = (uv * s + vw) / vv if vv > 0.0 else 0.0
+    if not 0.0 <= t <= 1.0:
+        t = min(1.0, max(0.0, t))
+        s = min(1.0, max(0.0, (uv * t - uw) / uu)) if uu > 0.0 else 0.0
+    one = (a[0] + s * ux, a[1] + s * uy, a[2] + s * uz)
+    two = (c[0] + t * vx, c[1] + t * vy, c[2] + t * vz)
+    joint = ((one[0] + two[0]) / 2.0, (one[1] + two[1]) / 2.0, (one[2] + two[2]) / 2.0)
+    return math.dist(one, two), joint

@@ -1,0 +1,386 @@
+"""Answers to COMMAND_LONG and COMMAND_INT: what is allowed when, and the result that goes back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from fractus_vehicle.auto import AutoFlight
+from fractus_vehicle.channel import Channel
+from fractus_vehicle.earth import valid_coordinates
+from fractus_vehicle.guided import GuidedFlight
+from fractus_vehicle.mav import (
+    ABSOLUTE_FRAMES,
+    FORCE_ARM_MAGIC,
+    FORCE_MAGIC,
+    GLOBAL_FRAMES,
+    Command,
+    Frame,
+    Mode,
+    ModeFlag,
+    Result,
+    Severity,
+)
+from fractus_vehicle.mission import Item
+from fractus_vehicle.streams import BUILDERS
+from fractus_vehicle.todo import item_target, switch_fence
+from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.wire import Message, layout_of
+
+NOT_ARMABLE = frozenset({Mode.RTL, Mode.SMART_RTL, Mode.LAND, Mode.BRAKE, Mode.AUTO})
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """A command from either message, with its position as degrees times 1e7."""
+
+    command: int
+    params: tuple[float, float, float, float]
+    x: int
+    y: int
+    z: float
+    frame: int
+    has_place: bool
+    integer: bool
+
+    @property
+    def item(self) -> Item:
+        """The order's position as a mission item, for frame arithmetic."""
+        return Item(command=self.command, frame=self.frame, x=self.x, y=self.y, z=self.z)
+
+
+def read_order(message: Message) -> Order:
+    """Read COMMAND_LONG or COMMAND_INT."""
+    numbers = (
+        message.real("param1"),
+        message.real("param2"),
+        message.real("param3"),
+        message.real("param4"),
+    )
+    command = message.integer("command")
+    if message.name == "COMMAND_INT":
+        x, y, z = message.integer("x"), message.integer("y"), message.real("z")
+        frame = message.integer("frame")
+        return Order(command, numbers, x, y, z, frame, x != 0 or y != 0, integer=True)
+    lat, lon, z = message.real("param5"), message.real("param6"), message.real("param7")
+    known = math.isfinite(lat) and math.isfinite(lon) and (lat != 0.0 or lon != 0.0)
+    known = known and abs(lat) <= 90.0 and abs(lon) <= 180.0
+    x, y = (round(lat * 1e7), round(lon * 1e7)) if known else (0, 0)
+    absolute = command in (Command.DO_SET_HOME,)
+    frame = Frame.GLOBAL if absolute else Frame.GLOBAL_RELATIVE_ALT
+    return Order(command, numbers, x, y, z, frame, known, integer=False)
+
+
+def _arm_disarm(v: Vehicle, o: Order, _c: Channel) -> Result:
+    want, magic = o.params[0], o.params[1]
+    if want == 1.0:
+        if v.armed:
+            return Result.ACCEPTED
+        if magic != FORCE_ARM_MAGIC:
+            refusal = f"{v.mode.title} mode not armable" if v.mode in NOT_ARMABLE else v.arming_refusal()
+            if refusal is not None:
+                v.say(Severity.CRITICAL, f"Arm: {refusal}")
+                return Result.FAILED
+        v.arm()
+        return Result.ACCEPTED
+    if want == 0.0:
+        if v.armed and not v.landed and magic != FORCE_MAGIC:
+            return Result.FAILED
+        v.disarm("command", force=magic == FORCE_MAGIC)
+        return Result.ACCEPTED
+    return Result.UNSUPPORTED
+
+
+def _takeoff(v: Vehicle, o: Order, _c: Channel) -> Result:
+    if not v.armed or not v.landed or v.flying_wanted or not math.isfinite(o.z):
+        return Result.FAILED
+    if isinstance(v.flight, AutoFlight) or v.mode not in (Mode.GUIDED, Mode.LOITER, Mode.ALT_HOLD):
+        return Result.FAILED
+    if o.integer and o.frame not in (Frame.GLOBAL_RELATIVE_ALT, Frame.GLOBAL_RELATIVE_ALT_INT):
+        return Result.DENIED
+    if o.z <= 0.0:
+        return Result.FAILED
+    origin = v.origin or v.start
+    home = v.home or origin
+    down = min(origin.alt_m - home.alt_m - o.z, v.est.down - 0.1)
+    if isinstance(v.flight, GuidedFlight):
+        v.flight.take_off(v, down)
+    else:
+        v.begin_takeoff(down)
+    return Result.ACCEPTED
+
+
+def _mode_command(mode: Mode) -> Callable[[Vehicle, Order, Channel], Result]:
+    def change(v: Vehicle, _o: Order, _c: Channel) -> Result:
+        return Result.ACCEPTED if v.set_mode(mode) else Result.FAILED
+
+    return change
+
+
+def set_mode_number(v: Vehicle, base_mode: int, custom_mode: int) -> Result:
+    """DO_SET_MODE and SET_MODE: only custom modes, as ArduPilot."""
+    if not base_mode & ModeFlag.CUSTOM:
+        return Result.DENIED
+    if custom_mode not in set(Mode):
+        v.say(Severity.WARNING, f"No such mode {custom_mode}")
+        return Result.FAILED
+    return Result.ACCEPTED if v.set_mode(Mode(custom_mode)) else Result.FAILED
+
+
+def _set_mode(v: Vehicle, o: Order, _c: Channel) -> Result:
+    if not all(math.isfinite(value) for value in o.params[:2]):
+        return Result.DENIED
+    return set_mode_number(v, int(o.params[0]), int(o.params[1]))
+
+
+def _change_speed(v: Vehicle, o: Order, _c: Channel) -> Result:
+    if not math.isfinite(o.params[0]):
+        return Result.DENIED
+    return Result.ACCEPTED if v.change_speed(int(o.params[0]), o.params[1]) else Result.FAILED
+
+
+def _reposition(v: Vehicle, o: Order, _c: Channel) -> Result:
+    switch = bool(int(o.params[1]) & 1) if math.isfinite(o.params[1]) else False
+    if not v.armed or (v.mode is not Mode.GUIDED and not switch):
+        return Result.DENIED
+    placed = o.has_place and valid_coordinates(o.x, o.y) and math.isfinite(o.z)
+    if not placed or v.altitude_base_m(o.frame) is None:
+        return Result.DENIED
+    north, east, down = item_target(v, o.item)
+    if v.landed or outside_fence(v, north, east, down) or not v.set_mode(Mode.GUIDED):
+        return Result.FAILED
+    flight = v.flight
+    if not isinstance(flight, GuidedFlight):
+        return Result.FAILED
+    flight.go_to(v, north, east, down)
+    if math.isfinite(o.params[3]) and o.params[3] != 0.0:
+        v.turn_to(o.params[3] % 360.0, 0.0, 0, relative=False)
+    else:
+        v.yaw.follow_course()
+    return Result.ACCEPTED
+
+
+def outside_fence(v: Vehicle, north: float, east: float, down: float) -> bool:
+    """Whether a local target lies outside the autopilot's own fence."""
+    origin = v.origin or v.start
+    home = v.home or origin
+    return bool(v.fence.outside(north, east, origin.alt_m - down - home.alt_m, v.home_xy))
+
+
+def _yaw(v: Vehicle, o: Order, _c: Channel) -> Result:
+    angle, rate, direction, relative = o.params
+    if v.mode not in (Mode.GUIDED, Mode.AUTO) or not all(math.isfinite(p) for p in o.params):
+        return Result.FAILED
+    turned = v.turn_to(angle, rate, int(direction), relative=relative > 0.5)
+    return Result.ACCEPTED if turned else Result.FAILED
+
+
+def _roi(v: Vehicle, o: Order, _c: Channel) -> Result:
+    if o.command == Command.DO_SET_ROI_NONE or not o.has_place:
+        v.yaw.look_at(None)
+        return Result.ACCEPTED
+    if not valid_coordinates(o.x, o.y) or o.frame not in GLOBAL_FRAMES:
+        return Result.FAILED
+    north, east, _ = item_target(v, Item(command=o.command, frame=o.frame, x=o.x, y=o.y))
+    v.yaw.look_at((north, east))
+    return Result.ACCEPTED
+
+
+def _set_home(v: Vehicle, o: Order, _c: Channel) -> Result:
+    if o.params[0] == 1.0:
+        return Result.ACCEPTED if v.set_home_here() else Result.FAILED
+    if not o.has_place or not math.isfinite(o.z):
+        return Result.DENIED
+    if o.frame not in GLOBAL_FRAMES:
+        return Result.UNSUPPORTED_MAV_FRAME
+    altitude = o.z
+    if o.frame not in ABSOLUTE_FRAMES:
+        altitude += (v.home or v.start).alt_m
+    return Result.ACCEPTED if v.set_home_at(o.x, o.y, altitude) else Result.FAILED
+
+
+def _get_home(v: Vehicle, _o: Order, c: Channel) -> Result:
+    if not v.send(c, "HOME_POSITION"):
+        return Result.FAILED
+    v.send(c, "GPS_GLOBAL_ORIGIN")
+    return Result.ACCEPTED
+
+
+def _message_name(number: float) -> str | None:
+    layout = layout_of(int(number)) if math.isfinite(number) and number >= 0.0 else None
+    return layout.name if layout is not None and layout.name in BUILDERS else None
+
+
+def _set_interval(v: Vehicle, o: Order, c: Channel) -> Result:
+    name, interval_us = _message_name(o.params[0]), o.params[1]
+    if name is None or not math.isfinite(interval_us):
+        return Result.DENIED
+    if interval_us < 0.0:
+        c.set_interval(name, None)
+    elif interval_us == 0.0:
+        c.set_interval(name, 1.0 if name == "HEARTBEAT" else None)
+    else:
+        c.set_interval(name, max(interval_us, 10_000.0) / 1e6)
+    return Result.ACCEPTED
+
+
+def _get_interval(_v: Vehicle, o: Order, c: Channel) -> Result:
+    name = _message_name(o.params[0])
+    stream = c.streams.get(name) if name is not None else None
+    interval = 0 if name is None else -1 if stream is None else round(stream.interval_s * 1e6)
+    number = o.params[0]
+    if not math.isfinite(number) or not 0 <= number <= 65535:
+        return Result.DENIED
+    c.send("MESSAGE_INTERVAL", {"message_id": int(number), "interval_us": interval})
+    return Result.ACCEPTED if name is not None else Result.FAILED
+
+
+def _request_message(v: Vehicle, o: Order, c: Channel) -> Result:
+    name = _message_name(o.params[0])
+    if name is None:
+        return Result.FAILED
+    return Result.ACCEPTED if v.send(c, name) else Result.FAILED
+
+
+def _capabilities(v: Vehicle, o: Order, c: Channel) -> Result:
+    if o.params[0] != 1.0:
+        return Result.FAILED
+    v.send(c, "AUTOPILOT_VERSION")
+    return Result.ACCEPTED
+
+
+def _fence_enable(v: Vehicle, o: Order, _c: Channel) -> Result:
+    return Result.ACCEPTED if switch_fence(v, o.params[0]) else Result.FAILED
+
+
+def _mission_start(v: Vehicle, _o: Order, _c: Channel) -> Result:
+    return Result.ACCEPTED if v.set_mode(Mode.AUTO) else Result.FAILED
+
+
+def _mission_current(v: Vehicle, o: Order, c: Channel) -> Result:
+    if not math.isfinite(o.params[0]):
+        return Result.DENIED
+    if not set_current(v, int(o.params[0])):
+        return Result.FAILED
+    v.send(c, "MISSION_CURRENT")
+    return Result.ACCEPTED
+
+
+def _jump_to_tag(v: Vehicle, o: Order, c: Channel) -> Result:
+    tag = o.params[0]
+    index = v.mission.tagged(int(tag)) if math.isfinite(tag) else None
+    if index is None or not set_current(v, index):
+        return Result.FAILED
+    v.send(c, "MISSION_CURRENT")
+    return Result.ACCEPTED
+
+
+def set_current(v: Vehicle, index: int) -> bool:
+    """Make an item the current one; AUTO continues there."""
+    if not 0 <= index < len(v.mission.items):
+        return False
+    if isinstance(v.flight, AutoFlight) and v.armed:
+        v.flight.jump_to(v, max(index, 1))
+    else:
+        v.mission.current = index
+        v.mission.complete = False
+    return True
+
+
+def _pause(v: Vehicle, o: Order, _c: Channel) -> Result:
+    flight = v.flight
+    if not isinstance(flight, (AutoFlight, GuidedFlight)) or o.params[0] not in (0.0, 1.0):
+        return Result.DENIED
+    flight.pause(v, paused=o.params[0] == 0.0)
+    return Result.ACCEPTED
+
+
+def _terminate(v: Vehicle, o: Order, _c: Channel) -> Result:
+    if o.params[0] <= 0.5:
+        return Result.FAILED
+    v.disarm("termination", force=True)
+    return Result.ACCEPTED
+
+
+def _reboot(v: Vehicle, o: Order, _c: Channel) -> Result:
+    if v.armed:
+        return Result.FAILED
+    if o.params[0] not in (1.0, 3.0):
+        return Result.UNSUPPORTED
+    v.reboot_wanted = True
+    return Result.ACCEPTED
+
+
+def _prearm(v: Vehicle, _o: Order, _c: Channel) -> Result:
+    if v.armed:
+        return Result.TEMPORARILY_REJECTED
+    refusal = v.arming_refusal()
+    if refusal is not None:
+        v.say(Severity.CRITICAL, f"PreArm: {refusal}")
+    return Result.ACCEPTED
+
+
+def _banner(v: Vehicle, _o: Order, _c: Channel) -> Result:
+    v.voice.banner()
+    return Result.ACCEPTED
+
+
+def _grounded_only(v: Vehicle, _o: Order, _c: Channel) -> Result:
+    return Result.FAILED if v.armed else Result.ACCEPTED
+
+
+HANDLERS: dict[int, Callable[[Vehicle, Order, Channel], Result]] = {
+    Command.COMPONENT_ARM_DISARM: _arm_disarm,
+    Command.NAV_TAKEOFF: _takeoff,
+    Command.NAV_LAND: _mode_command(Mode.LAND),
+    Command.NAV_RETURN_TO_LAUNCH: _mode_command(Mode.RTL),
+    Command.NAV_LOITER_UNLIM: _mode_command(Mode.LOITER),
+    Command.DO_SET_MODE: _set_mode,
+    Command.DO_CHANGE_SPEED: _change_speed,
+    Command.DO_REPOSITION: _reposition,
+    Command.CONDITION_YAW: _yaw,
+    Command.DO_SET_ROI: _roi,
+    Command.DO_SET_ROI_LOCATION: _roi,
+    Command.DO_SET_ROI_NONE: _roi,
+    Command.DO_SET_HOME: _set_home,
+    Command.GET_HOME_POSITION: _get_home,
+    Command.SET_MESSAGE_INTERVAL: _set_interval,
+    Command.GET_MESSAGE_INTERVAL: _get_interval,
+    Command.REQUEST_MESSAGE: _request_message,
+    Command.REQUEST_AUTOPILOT_CAPABILITIES: _capabilities,
+    Command.DO_FENCE_ENABLE: _fence_enable,
+    Command.MISSION_START: _mission_start,
+    Command.DO_SET_MISSION_CURRENT: _mission_current,
+    Command.DO_JUMP_TAG: _jump_to_tag,
+    Command.DO_PAUSE_CONTINUE: _pause,
+    Command.DO_FLIGHTTERMINATION: _terminate,
+    Command.PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
+    Command.RUN_PREARM_CHECKS: _prearm,
+    Command.DO_SEND_BANNER: _banner,
+    Command.PREFLIGHT_CALIBRATION: _grounded_only,
+    Command.PREFLIGHT_STORAGE: _grounded_only,
+}
+# Commands that ArduPilot takes only with integer coordinates.
+INT_ONLY = frozenset({Command.DO_REPOSITION})
+
+
+def handle_command(v: Vehicle, message: Message, channel: Channel) -> None:
+    """Carry out a command and acknowledge it."""
+    order = read_order(message)
+    handler = HANDLERS.get(order.command)
+    if handler is None:
+        result = Result.UNSUPPORTED
+    elif order.command in INT_ONLY and not order.integer:
+        result = Result.COMMAND_INT_ONLY
+    else:
+        result = handler(v, order, channel)
+    channel.send(
+        "COMMAND_ACK",
+        {
+            "command": order.command,
+            "result": int(result),
+            "target_system": message.sysid,
+            "target_component": message.compid,
+        },
+    )

@@ -1,0 +1,336 @@
+"""The cascade from a target to motor thrusts: shaped trajectory, position, velocity, attitude, rate, mixer.
+
+A flight mode sets the targets; `Control.step` does the rest at every physics step.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+from typing import NamedTuple
+
+from fractus_vehicle.body import GRAVITY, Airframe
+from fractus_vehicle.shaping import (
+    BRAKING_SHARE,
+    clamp,
+    shape_position,
+    shape_position_xy,
+    shape_velocity,
+    shape_velocity_xy,
+    wrap_pi,
+)
+
+# Slower than this counts as stopped: the position is held from then on.
+STOPPED_MPS = 0.05
+# What the lean of the airframe allows when it has to stop.
+BRAKING_JERK_MPS3 = 10.0
+
+
+Vector = tuple[float, float, float]
+
+
+class Axis(Enum):
+    """What is controlled: a position, a velocity, an attitude given from outside, or a trajectory given point by point."""
+
+    POSITION = "position"
+    VELOCITY = "velocity"
+    ATTITUDE = "attitude"
+    PATH = "path"
+
+
+@dataclass(slots=True)
+class Limits:
+    """How fast the vehicle may move; filled from the parameters."""
+
+    speed_mps: float = 10.0
+    climb_mps: float = 2.5
+    sink_mps: float = 1.5
+    accel_mps2: float = 2.5
+    accel_z_mps2: float = 1.0
+    jerk_mps3: float = 5.0
+    tilt_max_rad: float = math.radians(30.0)
+    yaw_rate_rps: float = math.radians(60.0)
+
+
+class Estimate(NamedTuple):
+    """What the estimator tells the controllers: local NED position and velocity, attitude and body rates."""
+
+    north: float
+    east: float
+    down: float
+    vn: float
+    ve: float
+    vd: float
+    roll: float
+    pitch: float
+    yaw: float
+    p: float
+    q: float
+    r: float
+    quaternion: tuple[float, float, float, float]
+
+
+@dataclass(slots=True)
+class Gains:
+    """Feedback gains; the position and velocity ones are ArduPilot's PSC parameters."""
+
+    position: float = 1.0
+    velocity: float = 2.0
+    velocity_i: float = 1.0
+    altitude: float = 1.0
+    climb: float = 5.0
+    climb_i: float = 1.0
+    attitude: float = 5.0
+    yaw: float = 2.5
+    rate: float = 16.0
+    yaw_accel: float = 6.0
+    max_rate_rps: float = 4.0
+
+
+class Control:
+    """Targets, the shaped trajectory toward them, and the feedback that follows it."""
+
+    def __init__(self, airframe: Airframe) -> None:
+        self.airframe = airframe
+        self.limits = Limits()
+        self.gains = Gains()
+        self.horizontal = Axis.POSITION
+        self.vertical = Axis.POSITION
+        self.target = (0.0, 0.0)
+        self.target_velocity = (0.0, 0.0)
+        self.target_accel = (0.0, 0.0)
+        self.target_down = 0.0
+        self.target_vd = 0.0
+        self.target_yaw = 0.0
+        self.yaw_rate: float | None = None
+        self.attitude = (0.0, 0.0)  # roll and pitch targets, radians, for Axis.ATTITUDE
+        self.throttle: float | None = None  # direct thrust share, for STABILIZE
+        self.pos = [0.0, 0.0, 0.0]
+        self.vel = [0.0, 0.0, 0.0]
+        self.acc = [0.0, 0.0, 0.0]
+        self.yaw_setpoint = 0.0
+        self._integral = [0.0, 0.0, 0.0]
+        self._stopping = False
+        self.speed_cap_mps = math.inf  # of the present target, where its climb takes longer than its way
+        self._braking_mps2 = 0.0
+        self.thrust_share = 0.0
+        self.wanted_n = (0.0, 0.0, 0.0, 0.0)  # what each motor is asked for
+        self.lean = (0.0, 0.0)
+
+    def reset(self, est: Estimate) -> None:
+        """Start anew from where the vehicle is: no history, no targets elsewhere."""
+        self.horizontal = self.vertical = Axis.POSITION
+        self._stopping = False
+        self.pos = [est.north, est.east, est.down]
+        self.vel = [est.vn, est.ve, est.vd]
+        self.acc = [0.0, 0.0, 0.0]
+        self.target = (est.north, est.east)
+        self.target_down = est.down
+        self.target_velocity = self.target_accel = (0.0, 0.0)
+        self.target_vd = 0.0
+        self.target_yaw = self.yaw_setpoint = est.yaw
+        self.yaw_rate = None
+        self.throttle = None
+        self.attitude = (0.0, 0.0)
+        self._integral = [0.0, 0.0, 0.0]
+
+    def hold_here(self) -> None:
+        """Stop as soon as the limits allow, and hold position and altitude there."""
+        self.stop()
+        vd = self.vel[2]
+        self.go_to_altitude(self.pos[2] + vd * abs(vd) / (2.0 * BRAKING_SHARE * self.limits.accel_z_mps2))
+
+    def stop(self, accel_mps2: float | None = None) -> None:
+        """Brake with the full acceleration (or a given one), then hold the position where that ends."""
+        vn, ve = self.vel[0], self.vel[1]
+        speed = math.hypot(vn, ve)
+        self._braking_mps2 = accel_mps2 or self.limits.accel_mps2
+        reach = speed / (2.0 * self._braking_mps2)
+        self.fly(0.0, 0.0)
+        self.target = (self.pos[0] + vn * reach, self.pos[1] + ve * reach)
+        self._stopping = True
+
+    def go_to_altitude(self, down: float) -> None:
+        """Climb or sink to an altitude and stay there."""
+        self.vertical = Axis.POSITION
+        self.target_down = down
+        self.target_vd = 0.0
+
+    def go_to(self, north: float, east: float, down: float | None = None) -> None:
+        """Fly to a point and stay; without `down` the vertical target stays as it is."""
+        self.horizontal = Axis.POSITION
+        self._stopping = False
+        self.speed_cap_mps = math.inf
+        self.target = (north, east)
+        self.target_velocity = (0.0, 0.0)
+        if down is not None:
+            self.go_to_altitude(down)
+
+    def fly(self, vn: float, ve: float, vd: float | None = None) -> None:
+        """Fly with a velocity; without `vd` the vertical target stays as it is."""
+        self.horizontal = Axis.VELOCITY
+        self._stopping = False
+        self.target_velocity = (vn, ve)
+        if vd is not None:
+            self.climb(vd)
+
+    def track(self, position: Vector, velocity: Vector, acceleration: Vector) -> None:
+        """Follow a trajectory that somebody else shapes, from this point of it."""
+        self.horizontal = self.vertical = Axis.PATH
+        self._stopping = False
+        self.pos[:], self.vel[:], self.acc[:] = position, velocity, acceleration
+
+    def climb(self, vd: float) -> None:
+        """Follow a vertical speed (down positive)."""
+        self.vertical = Axis.VELOCITY
+        self.target_vd = vd
+
+    def step(self, dt: float, est: Estimate, thrust_full_n: float) -> tuple[float, float, float, float]:
+        """Advance the trajectory and return the thrust (newtons) each motor is asked for."""
+        accel_n, accel_e = (0.0, 0.0) if self.horizontal is Axis.ATTITUDE else self._follow_xy(dt, est)
+        accel_d = self._follow_z(dt, est)
+        self._turn(dt)
+        thrust = self._thrust_and_lean((accel_n, accel_e, accel_d), est, thrust_full_n)
+        return self._mix(thrust, est, thrust_full_n)
+
+    def _follow_xy(self, dt: float, est: Estimate) -> tuple[float, float]:
+        limits, gains = self.limits, self.gains
+        pos, vel, acc = self.pos, self.vel, self.acc
+        if self._stopping and math.hypot(vel[0], vel[1]) < STOPPED_MPS:
+            self.go_to(pos[0], pos[1])
+        here = (vel[0], vel[1])
+        bend = (acc[0], acc[1])
+        if self.horizontal is Axis.POSITION:
+            error = (self.target[0] - pos[0], self.target[1] - pos[1])
+            acc[0], acc[1] = shape_position_xy(
+                error,
+                here,
+                bend,
+                speed_max=min(limits.speed_mps, self.speed_cap_mps),
+                accel_max=limits.accel_mps2,
+                jerk_max=limits.jerk_mps3,
+                dt=dt,
+                feedforward=self.target_velocity,
+            )
+        elif self.horizontal is Axis.VELOCITY:
+            accel = self._braking_mps2 if self._stopping else limits.accel_mps2
+            jerk = BRAKING_JERK_MPS3 if self._stopping else limits.jerk_mps3
+            acc[0], acc[1] = shape_velocity_xy(self.target_velocity, here, bend, accel_max=accel, jerk_max=jerk, dt=dt)
+        vel[0] += acc[0] * dt
+        vel[1] += acc[1] * dt
+        pos[0] += vel[0] * dt
+        pos[1] += vel[1] * dt
+        error_n, error_e = pos[0] - est.north, pos[1] - est.east
+        distance = math.hypot(error_n, error_e)
+        if distance > 4.0:
+            # A gust or a failed motor: let the trajectory wait for the vehicle instead of running away.
+            pos[0] = est.north + error_n * 4.0 / distance
+            pos[1] = est.east + error_e * 4.0 / distance
+        if self.horizontal is Axis.VELOCITY and distance > 2.0:
+            pos[0] = est.north + error_n * 2.0 / distance
+            pos[1] = est.east + error_e * 2.0 / distance
+        slip_n = vel[0] + gains.position * error_n - est.vn
+        slip_e = vel[1] + gains.position * error_e - est.ve
+        integral = self._integral
+        integral[0] = clamp(integral[0] + gains.velocity_i * slip_n * dt, -4.0, 4.0)
+        integral[1] = clamp(integral[1] + gains.velocity_i * slip_e * dt, -4.0, 4.0)
+        return (
+            acc[0] + gains.velocity * slip_n + integral[0],
+            acc[1] + gains.velocity * slip_e + integral[1],
+        )
+
+    def _follow_z(self, dt: float, est: Estimate) -> float:
+        limits, gains = self.limits, self.gains
+        if self.throttle is not None:
+            return 0.0
+        pos, vel, acc = self.pos, self.vel, self.acc
+        if self.vertical is Axis.POSITION:
+            acc[2] = shape_position(
+                self.target_down - pos[2],
+                vel[2],
+                acc[2],
+                speed_low=-limits.climb_mps,
+                speed_high=limits.sink_mps,
+                accel_max=limits.accel_z_mps2,
+                jerk_max=limits.jerk_mps3,
+                dt=dt,
+            )
+        elif self.vertical is Axis.VELOCITY:
+            acc[2] = shape_velocity(
+                self.target_vd, vel[2], acc[2], accel_max=limits.accel_z_mps2, jerk_max=limits.jerk_mps3, dt=dt
+            )
+        vel[2] += acc[2] * dt
+        pos[2] += vel[2] * dt
+        error = clamp(pos[2] - est.down, -2.0, 2.0)
+        pos[2] = est.down + error
+        slip = vel[2] + gains.altitude * error - est.vd
+        self._integral[2] = clamp(self._integral[2] + gains.climb_i * slip * dt, -3.0, 3.0)
+        return acc[2] + gains.climb * slip + self._integral[2]
+
+    def _turn(self, dt: float) -> None:
+        if self.yaw_rate is not None:
+            self.target_yaw = wrap_pi(self.target_yaw + clamp(self.yaw_rate, -3.0, 3.0) * dt)
+            self.yaw_setpoint = self.target_yaw
+            return
+        step = self.limits.yaw_rate_rps * dt
+        self.yaw_setpoint = wrap_pi(
+            self.yaw_setpoint + clamp(wrap_pi(self.target_yaw - self.yaw_setpoint), -step, step)
+        )
+
+    def _thrust_and_lean(self, wanted: tuple[float, float, float], est: Estimate, full: float) -> float:
+        """Turn a wanted acceleration into a lean (kept in `self.lean`) and a collective thrust in newtons."""
+        an, ae, ad = wanted
+        yaw = self.yaw_setpoint
+        vertical = clamp(GRAVITY - ad, 0.2 * GRAVITY, 3.0 * GRAVITY)
+        if self.horizontal is Axis.ATTITUDE:
+            roll, pitch = self.attitude
+        else:
+            level = math.hypot(an, ae)
+            reach = GRAVITY * math.tan(self.limits.tilt_max_rad)
+            if level > reach:
+                an, ae = an * reach / level, ae * reach / level
+            forward = an * math.cos(yaw) + ae * math.sin(yaw)
+            right = ae * math.cos(yaw) - an * math.sin(yaw)
+            pitch = math.atan2(-forward, GRAVITY)
+            roll = math.atan2(right * math.cos(pitch), GRAVITY)
+        self.lean = (roll, pitch)
+        if self.throttle is not None:
+            return clamp(self.throttle, 0.0, 1.0) * 4.0 * full
+        tilt = math.cos(est.roll) * math.cos(est.pitch)
+        return self.airframe.mass_kg * vertical / max(tilt, 0.5)
+
+    def _mix(self, thrust: float, est: Estimate, full: float) -> tuple[float, float, float, float]:
+        gains, frame = self.gains, self.airframe
+        roll, pitch = self.lean
+        # The wanted direction of the body's down axis, in the world and then in the body: thrust first, heading apart, so
+        # that a turn of the nose does not bend the way flown.
+        cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
+        cy, sy = math.cos(self.yaw_setpoint), math.sin(self.yaw_setpoint)
+        dn, de, dd = cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp
+        w, x, y, z = est.quaternion
+        ax = (1.0 - 2.0 * (y * y + z * z)) * dn + 2.0 * (x * y + w * z) * de + 2.0 * (x * z - w * y) * dd
+        ay = 2.0 * (x * y - w * z) * dn + (1.0 - 2.0 * (x * x + z * z)) * de + 2.0 * (y * z + w * x) * dd
+        az = 2.0 * (x * z + w * y) * dn + 2.0 * (y * z - w * x) * de + (1.0 - 2.0 * (x * x + y * y)) * dd
+        level = math.hypot(ax, ay)
+        turn = math.atan2(level, az) / level if level > 1e-9 else 1.0
+        top = gains.max_rate_rps
+        rate_p = clamp(-gains.attitude * turn * ay, -top, top)
+        rate_q = clamp(gains.attitude * turn * ax, -top, top)
+        rate_r = clamp(gains.yaw * wrap_pi(self.yaw_setpoint - est.yaw), -1.5, 1.5) + (self.yaw_rate or 0.0)
+        tau_x = frame.inertia_xy * gains.rate * (rate_p - est.p) / frame.arm_m
+        tau_y = frame.inertia_xy * gains.rate * (rate_q - est.q) / frame.arm_m
+        tau_z = frame.inertia_z * gains.yaw_accel * (rate_r - est.r) / frame.yaw_lever_m
+        limit = 0.4 * full
+        tau_z = clamp(tau_z, -limit, limit)
+        self.thrust_share = thrust / (4.0 * full)
+        base = thrust / 4.0
+        x4, y4, z4 = tau_x / 4.0, tau_y / 4.0, tau_z / 4.0
+        low = 0.02 * full
+        self.wanted_n = (
+            clamp(base - x4 + y4 + z4, low, full),
+            clamp(base + x4 - y4 + z4, low, full),
+            clamp(base + x4 + y4 - z4, low, full),
+            clamp(base - x4 - y4 - z4, low, full),
+        )
+        return self.wanted_n

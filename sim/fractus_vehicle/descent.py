@@ -1,0 +1,33 @@
+"""How a vehicle comes down: fast when high, slowly near the ground, disarmed once it rests."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from fractus_vehicle.shaping import clamp
+
+if TYPE_CHECKING:
+    from fractus_vehicle.vehicle import Vehicle
+
+LANDING_CONFIRMED_S = 1.0
+
+
+def descend(v: Vehicle) -> None:
+    """Sink as LAND does: fast when high, slowly below LAND_ALT_LOW, disarm once down."""
+    p = v.params
+    slow = p["LAND_SPEED"] / 100.0
+    high = (p["LAND_SPEED_HIGH"] / 100.0) or v.control.limits.sink_mps
+    low_m = max(p["LAND_ALT_LOW"] / 100.0, 1.0)
+    above = v.height_m - low_m
+    speed = slow
+    if above > 0.0:
+        speed = clamp(slow + math.sqrt(2.0 * 0.7 * v.control.limits.accel_z_mps2 * above), slow, max(high, slow))
+    v.control.climb(speed)
+    if v.body.on_ground:
+        v.touch_time_s += v.control_step_s
+        if v.touch_time_s >= LANDING_CONFIRMED_S:
+            v.land_complete()
+            v.disarm("landed")
+    else:
+        v.touch_time_s = 0.0

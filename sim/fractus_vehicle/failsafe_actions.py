@@ -1,0 +1,92 @@
+"""What a failsafe may do, by the numbers that ArduCopter's parameters have for it, and what it falls back on."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import TYPE_CHECKING
+
+from fractus_vehicle.mav import Mode, Severity
+from fractus_vehicle.modes import Land
+
+if TYPE_CHECKING:
+    from fractus_vehicle.vehicle import Vehicle
+
+
+class Action(IntEnum):
+    """BATT_FS_*_ACT; the other parameters have tables of their own."""
+
+    NONE = 0
+    LAND = 1
+    RTL = 2
+    SMART_RTL = 3
+    SMART_RTL_LAND = 4
+    TERMINATE = 5
+    AUTO_LAND_START = 6
+    BRAKE_LAND = 7
+
+
+# FS_GCS_ENABLE; a value that is none of these returns.
+GCS_ACTIONS = {
+    3: Action.SMART_RTL,
+    4: Action.SMART_RTL_LAND,
+    5: Action.LAND,
+    6: Action.AUTO_LAND_START,
+    7: Action.BRAKE_LAND,
+}
+# FS_THR_ENABLE; a value that is none of these lands.
+RADIO_ACTIONS = {
+    1: Action.RTL,
+    2: Action.RTL,
+    4: Action.SMART_RTL,
+    5: Action.SMART_RTL_LAND,
+    6: Action.AUTO_LAND_START,
+    7: Action.BRAKE_LAND,
+}
+# FENCE_ACTION; 0 only reports.
+FENCE_ACTIONS = {
+    1: Action.RTL,
+    2: Action.LAND,
+    3: Action.SMART_RTL,
+    4: Action.BRAKE_LAND,
+    5: Action.SMART_RTL_LAND,
+}
+
+
+def act(v: Vehicle, action: Action) -> None:
+    """Carry an action out; a mode that cannot be flown now gives way to the next best, LAND in the end."""
+    match action:
+        case Action.NONE:
+            return
+        case Action.TERMINATE:
+            v.disarm("failsafe", force=True)
+        case Action.LAND:
+            _land(v)
+        case Action.RTL:
+            _return(v)
+        case Action.SMART_RTL:
+            if not v.set_mode(Mode.SMART_RTL):
+                v.say(Severity.WARNING, "SmartRTL Unavailable, Trying RTL Mode")
+                _return(v)
+        case Action.SMART_RTL_LAND:
+            if not v.set_mode(Mode.SMART_RTL):
+                v.say(Severity.WARNING, "SmartRTL Unavailable, Using Land Mode")
+                _land(v)
+        case Action.AUTO_LAND_START:
+            # Missions with a landing sequence to jump to are not flown here: the autopilot's own fallback.
+            v.say(Severity.WARNING, "Trying RTL Mode")
+            _return(v)
+        case Action.BRAKE_LAND:
+            if not v.set_mode(Mode.BRAKE):
+                v.say(Severity.WARNING, "Trying Land Mode")
+                _land(v)
+
+
+def _return(v: Vehicle) -> None:
+    if not v.set_mode(Mode.RTL):
+        _land(v)
+
+
+def _land(v: Vehicle) -> None:
+    v.set_mode(Mode.LAND)
+    if isinstance(v.flight, Land):
+        v.flight.pause(v)

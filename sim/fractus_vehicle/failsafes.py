@@ -1,0 +1,250 @@
+"""When the autopilot takes over by itself: station or radio lost, battery low, position lost, fence breached."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntFlag
+from typing import TYPE_CHECKING
+
+from fractus_vehicle.failsafe_actions import FENCE_ACTIONS, GCS_ACTIONS, RADIO_ACTIONS, Action, act
+from fractus_vehicle.fence import Breach, breach_names
+from fractus_vehicle.mav import Mode, Severity
+
+if TYPE_CHECKING:
+    from fractus_vehicle.vehicle import Vehicle
+
+CHECK_INTERVAL_S = 0.1
+POSITION_LOST_S = 1.0
+CRASH_ANGLE_DEG = 30.0
+CRASH_CONFIRMED_S = 2.0
+
+# Farther outside its fence than this, the autopilot only lands.
+FENCE_GIVE_UP_M = 100.0
+# FS_EKF_ACTION
+EKF_REPORTS_ONLY, EKF_HOLDS_ALTITUDE, EKF_LANDS_ALWAYS = 0, 2, 3
+# Full throttle for so long, level, and still sinking: a motor no longer pulls.
+THRUST_LOST_S = 1.0
+THRUST_LOST_SHARE = 0.9
+_PILOT_MODES = frozenset({Mode.STABILIZE, Mode.ALT_HOLD, Mode.LOITER})
+_LAND_ACTIONS = frozenset({Action.LAND, Action.TERMINATE})
+
+
+class Option(IntFlag):
+    """FS_OPTIONS: what to continue in spite of a failsafe."""
+
+    AUTO_ON_RADIO = 1
+    AUTO_ON_GCS = 2
+    GUIDED_ON_RADIO = 4
+    LANDING = 8
+    PILOT_ON_GCS = 16
+
+
+@dataclass(slots=True)
+class Failsafes:
+    """Which failsafes are active, and since when their conditions hold."""
+
+    gcs: bool = False
+    radio: bool = False
+    battery: bool = False
+    battery_critical: bool = False
+    ekf: bool = False
+    gcs_seen_s: float | None = None
+    _battery_action: Action = Action.NONE
+    _radio_lost_s: float | None = None
+    _low_since_s: float | None = None
+    _critical_since_s: float | None = None
+    _lost_since_s: float | None = None
+    _crash_since_s: float | None = None
+    _weak_since_s: float | None = None
+    _next_check_s: float = 0.0
+
+    @property
+    def any_active(self) -> bool:
+        """Whether any failsafe is active."""
+        return self.gcs or self.radio or self.battery or self.ekf
+
+    def step(self, v: Vehicle) -> None:
+        """Check everything; called at each control step, works at 10 Hz."""
+        if v.time_s < self._next_check_s:
+            return
+        self._next_check_s = v.time_s + CHECK_INTERVAL_S
+        self._check_gcs(v)
+        self._check_radio(v)
+        self._check_battery(v)
+        self._check_position(v)
+        self._check_fence(v)
+        self._check_thrust(v)
+        self._check_crash(v)
+
+    def _check_thrust(self, v: Vehicle) -> None:
+        """Warn when all thrust is asked for, in level flight, and the vehicle sinks all the same."""
+        roll, pitch, _ = v.body.euler()
+        level = math.hypot(roll - v.control.lean[0], pitch - v.control.lean[1]) < math.radians(CRASH_ANGLE_DEG)
+        weak = v.armed and not v.landed and level and v.control.thrust_share > THRUST_LOST_SHARE and v.body.vd > 0.0
+        if not weak:
+            self._weak_since_s = None
+            return
+        self._weak_since_s = v.time_s if self._weak_since_s is None else self._weak_since_s
+        if v.time_s - self._weak_since_s >= THRUST_LOST_S:
+            self._weak_since_s = None
+            hardest = max(range(len(v.body.motors)), key=lambda at: v.control.wanted_n[at])
+            v.say(Severity.EMERGENCY, f"Potential Thrust Loss ({hardest + 1})")
+
+    def _check_crash(self, v: Vehicle) -> None:
+        roll, pitch, _ = v.body.euler()
+        error_deg = math.degrees(math.hypot(roll - v.control.lean[0], pitch - v.control.lean[1]))
+        fallen = v.body.crashed or (v.body.on_ground and error_deg > CRASH_ANGLE_DEG)
+        if not (v.armed and fallen and not v.landed and int(v.params["FS_CRASH_CHECK"])):
+            self._crash_since_s = None
+            return
+        self._crash_since_s = v.time_s if self._crash_since_s is None else self._crash_since_s
+        if v.time_s - self._crash_since_s >= CRASH_CONFIRMED_S:
+            v.say(
+                Severity.EMERGENCY,
+                f"Crash: Disarming: AngErr={error_deg:.0f}>{CRASH_ANGLE_DEG:.0f}, Accel=0.0<3.0",
+            )
+            v.land_complete()
+            v.disarm("crash", force=True)
+
+    def _check_gcs(self, v: Vehicle) -> None:
+        setting = int(v.params["FS_GCS_ENABLE"])
+        if setting == 0 or self.gcs_seen_s is None:
+            return
+        silent = v.time_s - self.gcs_seen_s > max(v.params["FS_GCS_TIMEOUT"], 0.0)
+        if silent == self.gcs:
+            return
+        self.gcs = silent
+        if not silent:
+            v.say(Severity.WARNING, "GCS Failsafe Cleared")
+            return
+        v.receiver.release()
+        options = Option(int(v.params["FS_OPTIONS"]) & 31)
+        if v.armed and v.mode is Mode.AUTO and Option.AUTO_ON_GCS in options:
+            self._announce(v, "GCS", "Continuing Auto Mode")
+        elif v.armed and not v.landed and v.mode in _PILOT_MODES and Option.PILOT_ON_GCS in options:
+            self._announce(v, "GCS", "Continuing Pilot Control")
+        else:
+            self._take_over(v, "GCS", GCS_ACTIONS.get(setting, Action.RTL))
+
+    def _check_radio(self, v: Vehicle) -> None:
+        """The receiver is simulated: SIM_RC_FAIL silences it; a station that overrides the sticks replaces it."""
+        setting = int(v.params["FS_THR_ENABLE"])
+        silent = int(v.params["SIM_RC_FAIL"]) != 0 and not v.receiver.overridden
+        self._radio_lost_s = (v.time_s if self._radio_lost_s is None else self._radio_lost_s) if silent else None
+        lost = self._radio_lost_s is not None and v.time_s - self._radio_lost_s >= v.params["RC_FS_TIMEOUT"]
+        lost = lost and setting != 0
+        if lost == self.radio:
+            return
+        self.radio = lost
+        if not lost:
+            v.say(Severity.WARNING, "Radio Failsafe Cleared")
+            return
+        options = Option(int(v.params["FS_OPTIONS"]) & 31)
+        watched = int(v.params["FS_GCS_ENABLE"]) != 0
+        if v.armed and v.mode is Mode.AUTO and Option.AUTO_ON_RADIO in options:
+            self._announce(v, "Radio", "Continuing Auto Mode")
+        elif v.armed and v.mode is Mode.GUIDED and Option.GUIDED_ON_RADIO in options and watched:
+            self._announce(v, "Radio", "Continuing Guided Mode")
+        else:
+            self._take_over(v, "Radio", RADIO_ACTIONS.get(setting, Action.LAND))
+
+    def _take_over(self, v: Vehicle, what: str, action: Action) -> None:
+        """Say what happened and act, unless the vehicle is down, coming down, or disarmed."""
+        options = Option(int(v.params["FS_OPTIONS"]) & 31)
+        if not v.armed:
+            self._announce(v, what)
+        elif v.landed and not v.flying_wanted:
+            self._announce(v, what, "Disarming")
+            v.disarm(f"{what} failsafe")
+        elif v.flight.landing and self.battery and self._battery_action in _LAND_ACTIONS:
+            self._announce(v, f"{what} + Battery", "Continuing Landing")
+            act(v, Action.LAND)
+        elif v.flight.landing and Option.LANDING in options:
+            self._announce(v, what, "Continuing Landing")
+            act(v, Action.LAND)
+        else:
+            self._announce(v, what)
+            act(v, action)
+
+    @staticmethod
+    def _announce(v: Vehicle, what: str, done: str = "") -> None:
+        v.say(Severity.WARNING, f"{what} Failsafe - {done}" if done else f"{what} Failsafe")
+
+    def _check_battery(self, v: Vehicle) -> None:
+        if not v.armed:
+            self._low_since_s = self._critical_since_s = None
+            return
+        p, battery = v.params, v.battery
+        left = battery.capacity_mah - battery.used_mah
+        timer = p["BATT_LOW_TIMER"]
+        critical = 0.0 < battery.voltage_v < p["BATT_CRT_VOLT"]
+        low = 0.0 < battery.voltage_v < p["BATT_LOW_VOLT"]
+        self._critical_since_s = (self._critical_since_s or v.time_s) if critical else None
+        self._low_since_s = (self._low_since_s or v.time_s) if low else None
+        critical_now = self._critical_since_s is not None and v.time_s - self._critical_since_s > timer
+        low_now = self._low_since_s is not None and v.time_s - self._low_since_s > timer
+        critical_now = critical_now or left < p["BATT_CRT_MAH"]
+        low_now = low_now or left < p["BATT_LOW_MAH"]
+        if critical_now and not self.battery_critical:
+            self.battery = self.battery_critical = True
+            self._battery_event(v, "critical", int(p["BATT_FS_CRT_ACT"]))
+        elif low_now and not self.battery:
+            self.battery = True
+            self._battery_event(v, "low", int(p["BATT_FS_LOW_ACT"]))
+
+    def _battery_event(self, v: Vehicle, level: str, setting: int) -> None:
+        battery = v.battery
+        v.say(
+            Severity.WARNING,
+            f"Battery 1 is {level} {battery.voltage_v:.2f}V used {battery.used_mah:.0f} mAh",
+        )
+        action = Action(setting) if setting in set(Action) else Action.NONE
+        self._battery_action = action
+        landing = v.flight.landing and Option.LANDING in Option(int(v.params["FS_OPTIONS"]) & 31)
+        if v.landed and not v.flying_wanted:
+            self._announce(v, "Battery", "Disarming")
+            v.disarm("battery failsafe")
+        elif landing and action is not Action.NONE:
+            self._announce(v, "Battery", "Continuing Landing")
+            act(v, Action.LAND)
+        else:
+            self._announce(v, "Battery")
+            act(v, action)
+
+    def _check_position(self, v: Vehicle) -> None:
+        if v.position_ok or v.origin is None:
+            if self.ekf:
+                self.ekf = False
+                v.say(Severity.CRITICAL, "EKF Failsafe Cleared")
+            self._lost_since_s = None
+            return
+        self._lost_since_s = self._lost_since_s if self._lost_since_s is not None else v.time_s
+        if self.ekf or not v.armed or v.time_s - self._lost_since_s < POSITION_LOST_S:
+            return
+        self.ekf = True
+        v.say(Severity.CRITICAL, "EKF variance: position lost")
+        setting = int(v.params["FS_EKF_ACTION"])
+        if setting == EKF_REPORTS_ONLY or v.landed or v.mode is Mode.LAND:
+            return
+        if v.mode in (Mode.STABILIZE, Mode.ALT_HOLD) and setting != EKF_LANDS_ALWAYS:
+            return
+        if setting != EKF_HOLDS_ALTITUDE or self.radio or not v.set_mode(Mode.ALT_HOLD):
+            act(v, Action.LAND)
+        v.say(Severity.CRITICAL, f"EKF Failsafe: changed to {v.mode.title} Mode")
+
+    def _check_fence(self, v: Vehicle) -> None:
+        if not v.fence.enabled or v.home is None or v.origin is None:
+            v.fence.breaches = Breach.NONE
+            return
+        if not v.armed or v.landed:
+            v.fence.breaches = Breach.NONE
+            return
+        new = v.fence.check(v.est.north, v.est.east, v.altitude_m, v.home_xy, v.time_s)
+        if not new:
+            return
+        v.say(Severity.NOTICE, f"{breach_names(new)} breached")
+        action = FENCE_ACTIONS.get(int(v.params["FENCE_ACTION"]), Action.NONE)
+        if action is not Action.NONE and v.mode is not Mode.LAND:
+            far = v.fence.distance_m(v.est.north, v.est.east, v.altitude_m, v.home_xy) > FENCE_GIVE_UP_M
+            act(v, Action.LAND if far else action)

@@ -1,0 +1,107 @@
+"""Time that another process drives: the simulation advances only by as many steps as it is asked for.
+
+The protocol is lines over TCP: the driver writes a number of control steps (10 ms each), the simulation takes in what has
+arrived on its links, advances, sends, and answers with the number of steps since its start. Together with a seed this
+makes runs repeatable to the byte.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+
+from fractus_vehicle.links import Hub, LinkError
+from fractus_vehicle.simulation import Simulation
+
+MAX_STEPS = 1_000_000
+POLL_S = 0.2
+
+
+class Conductor:
+    """Listens for the driver and keeps what it asked for."""
+
+    def __init__(self, hub: Hub, host: str, port: int) -> None:
+        self._hub = hub
+        self._driver: socket.socket | None = None
+        self._input = b""
+        self._wanted = 0
+        self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            self._listener.bind((host, port))
+            self._listener.listen(1)
+        except OSError as error:
+            self._listener.close()
+            raise LinkError(f"lockstep {host}:{port}: {error.strerror or error}") from error
+        self._listener.setblocking(False)
+        hub.watch(self._listener.fileno(), self._accept)
+        hub.at_close(self._close)
+
+    def take(self) -> int:
+        """The steps asked for since the last call."""
+        wanted, self._wanted = self._wanted, 0
+        return wanted
+
+    def answer(self, ticks: int) -> None:
+        """Tell the driver how far the simulation is."""
+        if self._driver is None:
+            return
+        try:
+            self._driver.sendall(b"%d\n" % ticks)
+        except OSError:
+            self._drop()
+
+    def _accept(self) -> None:
+        try:
+            driver, _ = self._listener.accept()
+        except (BlockingIOError, ConnectionError):
+            return
+        self._drop()
+        driver.settimeout(1.0)
+        self._driver, self._input = driver, b""
+        self._hub.watch(driver.fileno(), self._read)
+
+    def _read(self) -> None:
+        if self._driver is None:
+            return
+        try:
+            data = self._driver.recv(4096)
+        except OSError:
+            data = b""
+        if not data:
+            self._drop()
+            return
+        *lines, self._input = (self._input + data).split(b"\n")
+        for line in lines:
+            if not line.strip().isdigit() or len(line) > 8:
+                self._drop()
+                return
+            self._wanted = min(self._wanted + int(line), MAX_STEPS)
+        if len(self._input) > 16:
+            self._drop()
+
+    def _drop(self) -> None:
+        if self._driver is not None:
+            self._hub.forget(self._driver.fileno())
+            self._driver.close()
+            self._driver = None
+
+    def _close(self) -> None:
+        self._drop()
+        self._listener.close()
+
+
+def conduct(simulation: Simulation, hub: Hub, conductor: Conductor, stopped: Callable[[], bool]) -> None:
+    """Advance as the driver asks until stopped."""
+    while not stopped():
+        hub.poll(POLL_S)
+        steps = conductor.take()
+        if not steps:
+            hub.flush()
+            continue
+        # What was sent before the request has arrived by now: the links are polled once more before time moves.
+        hub.poll()
+        for _ in range(steps):
+            simulation.step()
+            hub.flush()
+        conductor.answer(simulation.ticks)

@@ -1,0 +1,252 @@
+"""Telemetry of motion: positions, attitudes, and the targets they follow."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from fractus_vehicle.control import Axis
+from fractus_vehicle.mav import (
+    Mode,
+)
+from fractus_vehicle.reporting import UNKNOWN_U16, Values, boot_ms, boot_us, centi
+
+if TYPE_CHECKING:
+    from fractus_vehicle.vehicle import Vehicle
+
+
+def global_position_int(v: Vehicle) -> Values:
+    """GLOBAL_POSITION_INT: the estimate; zeros until there is one."""
+    e = v.est
+    if v.origin is None:
+        return {"time_boot_ms": boot_ms(v), "hdg": v.heading_cdeg}
+    place = v.place
+    relative = place.alt_m - (v.home.alt_m if v.home is not None else v.origin.alt_m)
+    return {
+        "time_boot_ms": boot_ms(v),
+        "lat": place.lat_e7,
+        "lon": place.lon_e7,
+        "alt": round(place.alt_m * 1000.0),
+        "relative_alt": round(relative * 1000.0),
+        "vx": centi(e.vn),
+        "vy": centi(e.ve),
+        "vz": centi(e.vd),
+        "hdg": v.heading_cdeg,
+    }
+
+
+def local_position_ned(v: Vehicle) -> Values | None:
+    """LOCAL_POSITION_NED, from the estimator's origin."""
+    if v.origin is None:
+        return None
+    e = v.est
+    return {"time_boot_ms": boot_ms(v), "x": e.north, "y": e.east, "z": e.down, "vx": e.vn, "vy": e.ve, "vz": e.vd}
+
+
+def attitude(v: Vehicle) -> Values:
+    """ATTITUDE."""
+    e = v.est
+    return {
+        "time_boot_ms": boot_ms(v),
+        "roll": e.roll,
+        "pitch": e.pitch,
+        "yaw": e.yaw,
+        "rollspeed": e.p,
+        "pitchspeed": e.q,
+        "yawspeed": e.r,
+    }
+
+
+def attitude_quaternion(v: Vehicle) -> Values:
+    """ATTITUDE_QUATERNION."""
+    w, x, y, z = v.est.quaternion
+    e = v.est
+    return {
+        "time_boot_ms": boot_ms(v),
+        "q1": w,
+        "q2": x,
+        "q3": y,
+        "q4": z,
+        "rollspeed": e.p,
+        "pitchspeed": e.q,
+        "yawspeed": e.r,
+    }
+
+
+def attitude_target(v: Vehicle) -> Values:
+    """ATTITUDE_TARGET."""
+    roll, pitch = v.control.lean
+    yaw = v.control.yaw_setpoint
+    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
+    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
+    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    q = (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+    return {"time_boot_ms": boot_ms(v), "type_mask": 0, "q": q, "thrust": v.control.thrust_share}
+
+
+def vfr_hud(v: Vehicle) -> Values:
+    """VFR_HUD; `alt` is above mean sea level."""
+    e = v.est
+    speed = math.hypot(e.vn, e.ve)
+    return {
+        "airspeed": speed,
+        "groundspeed": speed,
+        "heading": round(v.heading_cdeg / 100.0) % 360,
+        "throttle": v.throttle_percent,
+        "alt": v.place.alt_m,
+        "climb": -e.vd,
+    }
+
+
+def nav_controller_output(v: Vehicle) -> Values:
+    """NAV_CONTROLLER_OUTPUT."""
+    c = v.control
+    dn, de = c.target[0] - v.est.north, c.target[1] - v.est.east
+    distance = math.hypot(dn, de) if c.horizontal is Axis.POSITION and not v.landed else 0.0
+    bearing = round(math.degrees(math.atan2(de, dn))) if distance > 0.1 else 0
+    return {
+        "nav_roll": math.degrees(c.lean[0]),
+        "nav_pitch": math.degrees(c.lean[1]),
+        "nav_bearing": round(math.degrees(v.est.yaw)),
+        "target_bearing": bearing,
+        "wp_dist": int(min(distance, UNKNOWN_U16)),
+        "alt_error": (v.est.down - c.pos[2]) if not v.landed else 0.0,
+    }
+
+
+def position_target_global_int(v: Vehicle) -> Values | None:
+    """POSITION_TARGET_GLOBAL_INT while a guided or automatic flight has a target."""
+    if v.origin is None or v.mode not in (Mode.GUIDED, Mode.AUTO, Mode.RTL, Mode.SMART_RTL) or v.landed:
+        return None
+    c = v.control
+    place = v.origin.offset(c.target[0], c.target[1], c.target_down)
+    moving = c.horizontal is Axis.VELOCITY
+    return {
+        "time_boot_ms": boot_ms(v),
+        "coordinate_frame": 5,
+        "type_mask": 0xDC7 if moving else 0xDF8,
+        "lat_int": 0 if moving else place.lat_e7,
+        "lon_int": 0 if moving else place.lon_e7,
+        "alt": 0.0 if moving else place.alt_m,
+        "vx": c.target_velocity[0],
+        "vy": c.target_velocity[1],
+        "vz": c.target_vd,
+    }
+
+
+def position_target_local_ned(v: Vehicle) -> Values | None:
+    """POSITION_TARGET_LOCAL_NED while in GUIDED."""
+    if v.origin is None or v.mode is not Mode.GUIDED or v.landed:
+        return None
+    c = v.control
+    moving = c.horizontal is Axis.VELOCITY
+    return {
+        "time_boot_ms": boot_ms(v),
+        "coordinate_frame": 1,
+        "type_mask": 0xDC7 if moving else 0xDF8,
+        "x": 0.0 if moving else c.target[0],
+        "y": 0.0 if moving else c.target[1],
+        "z": 0.0 if moving else c.target_down,
+        "vx": c.target_velocity[0],
+        "vy": c.target_velocity[1],
+        "vz": c.target_vd,
+    }
+
+
+def home_position(v: Vehicle) -> Values | None:
+    """HOME_POSITION; None until home is known."""
+    if v.home is None or v.origin is None:
+        return None
+    north, east, down = v.origin.vector_to(v.home)
+    return {
+        "latitude": v.home.lat_e7,
+        "longitude": v.home.lon_e7,
+        "altitude": round(v.home.alt_m * 1000.0),
+        "x": north,
+        "y": east,
+        "z": down,
+        "q": (1.0, 0.0, 0.0, 0.0),
+        "time_usec": boot_us(v),
+    }
+
+
+def gps_global_origin(v: Vehicle) -> Values | None:
+    """GPS_GLOBAL_ORIGIN: where the local frame begins."""
+    if v.origin is None:
+        return None
+    return {
+        "latitude": v.origin.lat_e7,
+        "longitude": v.origin.lon_e7,
+        "altitude": round(v.origin.alt_m * 1000.0),
+        "time_usec": boot_us(v),
+    }
+
+
+def altitude(v: Vehicle) -> Values:
+    """ALTITUDE."""
+    place = v.place
+    home = v.home.alt_m if v.home is not None else v.start.alt_m
+    relative = place.alt_m - home
+    return {
+        "time_usec": boot_us(v),
+        "altitude_monotonic": place.alt_m,
+        "altitude_amsl": place.alt_m,
+        "altitude_local": -v.est.down,
+        "altitude_relative": relative,
+        "altitude_terrain": place.alt_m - v.start.alt_m if int(v.params["TERRAIN_ENABLE"]) else math.nan,
+        "bottom_clearance": math.nan,
+    }
+
+
+def terrain_report(v: Vehicle) -> Values | None:
+    """TERRAIN_REPORT: the ground is flat, at the start's altitude, unless TERRAIN_ENABLE says that it is unknown."""
+    if not int(v.params["TERRAIN_ENABLE"]):
+        return None
+    place = v.place
+    return {
+        "lat": place.lat_e7,
+        "lon": place.lon_e7,
+        "spacing": 100,
+        "terrain_height": v.start.alt_m,
+        "current_height": place.alt_m - v.start.alt_m,
+        "loaded": 504,
+    }
+
+
+def ahrs2(v: Vehicle) -> Values:
+    """AHRS2: the secondary estimate."""
+    e = v.est
+    place = v.place
+    return {
+        "roll": e.roll,
+        "pitch": e.pitch,
+        "yaw": e.yaw,
+        "altitude": place.alt_m,
+        "lat": place.lat_e7,
+        "lng": place.lon_e7,
+    }
+
+
+def simstate(v: Vehicle) -> Values:
+    """SIMSTATE: the truth behind the estimate."""
+    roll, pitch, yaw = v.body.euler()
+    fn, fe, fd = v.body.specific_force
+    place = v.true_place
+    return {
+        "roll": roll,
+        "pitch": pitch,
+        "yaw": yaw,
+        "xacc": fn,
+        "yacc": fe,
+        "zacc": fd,
+        "xgyro": v.body.p,
+        "ygyro": v.body.q,
+        "zgyro": v.body.r,
+        "lat": place.lat_e7,
+        "lng": place.lon_e7,
+    }

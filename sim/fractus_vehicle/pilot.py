@@ -1,0 +1,149 @@
+"""A ground station in the same process: flies a vehicle in lockstep, for experiments, benchmarks and tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from fractus_vehicle.mav import Command, Mode, ModeFlag, Result
+from fractus_vehicle.simulation import Craft, Simulation
+from fractus_vehicle.wire import Message, Parser, Value, encode, layout_named
+
+HEARTBEAT_INTERVAL_S = 1.0
+
+
+class PilotTimeoutError(TimeoutError):
+    """Something that was waited for did not happen within its simulated time."""
+
+
+class Pilot:
+    """One link to one vehicle; every wait advances the whole simulation."""
+
+    def __init__(self, simulation: Simulation, craft: Craft, sysid: int = 255, compid: int = 190) -> None:
+        self.simulation = simulation
+        self.craft = craft
+        self.sysid, self.compid = sysid, compid
+        self.channel = craft.open("pilot")
+        self.parser = Parser()
+        self.last: dict[str, Message] = {}
+        self.texts: list[str] = []
+        self.heartbeats = True
+        self._sequence = 0
+        self._next_heartbeat_s = 0.0
+
+    def send(self, name: str, values: Mapping[str, Value]) -> None:
+        """Send a message to the vehicle."""
+        frame = encode(layout_named(name), values, sequence=self._sequence, sysid=self.sysid, compid=self.compid)
+        self._sequence = (self._sequence + 1) & 0xFF
+        self.craft.receive(self.channel, frame)
+
+    def read(self) -> list[Message]:
+        """Take what the vehicle has sent since."""
+        messages = self.parser.feed(self.channel.take())
+        for message in messages:
+            self.last[message.name] = message
+            if message.name == "STATUSTEXT":
+                self.texts.append(message.text("text"))
+        return messages
+
+    def step(self) -> list[Message]:
+        """Advance by one control step and read; beats the heart once a second."""
+        if self.heartbeats and self.simulation.time_s >= self._next_heartbeat_s:
+            self._next_heartbeat_s = self.simulation.time_s + HEARTBEAT_INTERVAL_S
+            self.send("HEARTBEAT", {"type": 6, "autopilot": 8, "mavlink_version": 3})
+        self.simulation.step()
+        return self.read()
+
+    def wait(self, condition: Callable[[], bool], timeout_s: float) -> float:
+        """Advance until a condition holds and return the simulated seconds it took.
+
+        Raises:
+            PilotTimeoutError: it did not hold within `timeout_s`.
+        """
+        begun = self.simulation.time_s
+        while not condition():
+            if self.simulation.time_s - begun > timeout_s:
+                raise PilotTimeoutError(f"not within {timeout_s} s; last texts: {self.texts[-5:]}")
+            self.step()
+        return self.simulation.time_s - begun
+
+    def fly_on(self, duration_s: float) -> None:
+        """Advance by a duration."""
+        end = self.simulation.time_s + duration_s
+        while self.simulation.time_s < end:
+            self.step()
+
+    def expect(self, name: str, timeout_s: float = 2.0) -> Message:
+        """Advance until a message of that name arrives.
+
+        Raises:
+            PilotTimeoutError: none arrived within `timeout_s`.
+        """
+        end = self.simulation.time_s + timeout_s
+        found = [message for message in self.read() if message.name == name]
+        while not found:
+            if self.simulation.time_s > end:
+                raise PilotTimeoutError(f"no {name} within {timeout_s} s")
+            found = [message for message in self.step() if message.name == name]
+        return found[-1]
+
+    def command(self, command: int, *params: float) -> Result:
+        """Send COMMAND_LONG and return the result."""
+        values: dict[str, Value] = {f"param{at}": float(value) for at, value in enumerate(params, start=1)}
+        target: dict[str, Value] = {"target_system": self.craft.config.sysid, "target_component": 1}
+        self.send("COMMAND_LONG", values | target | {"command": command})
+        return Result(self.expect("COMMAND_ACK").integer("result"))
+
+    def command_int(self, command: int, values: Mapping[str, Value]) -> Result:
+        """Send COMMAND_INT and return the result."""
+        target: dict[str, Value] = {"target_system": self.craft.config.sysid, "target_component": 1}
+        self.send("COMMAND_INT", dict(values) | target | {"command": command})
+        return Result(self.expect("COMMAND_ACK").integer("result"))
+
+    def mode(self, mode: Mode) -> Result:
+        """Ask for a mode."""
+        return self.command(Command.DO_SET_MODE, ModeFlag.CUSTOM, mode)
+
+    def parameter(self, name: str, value: float) -> float:
+        """Set a parameter and return what the vehicle answers."""
+        self.send(
+            "PARAM_SET",
+            {
+                "target_system": self.craft.config.sysid,
+                "target_component": 1,
+                "param_id": name.encode("ascii"),
+                "param_value": value,
+                "param_type": 9,
+            },
+        )
+        return self.expect("PARAM_VALUE").real("param_value")
+
+    def take_off(self, altitude_m: float, timeout_s: float = 90.0) -> float:
+        """Switch to GUIDED, arm, climb, and return the seconds from the takeoff command to 95 % of the altitude.
+
+        Raises:
+            PilotTimeoutError: a step was refused or took too long.
+        """
+        vehicle = self.craft.vehicle
+        if self.mode(Mode.GUIDED) is not Result.ACCEPTED:
+            raise PilotTimeoutError("GUIDED was refused")
+        self.wait(lambda: vehicle.arming_refusal() is None, timeout_s)
+        if self.command(Command.COMPONENT_ARM_DISARM, 1.0) is not Result.ACCEPTED:
+            raise PilotTimeoutError(f"arming was refused: {self.texts[-1:]}")
+        if self.command(Command.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m) is not Result.ACCEPTED:
+            raise PilotTimeoutError("takeoff was refused")
+        return self.wait(lambda: vehicle.altitude_m > 0.95 * altitude_m, timeout_s)
+
+    def go_to(self, north_m: float, east_m: float, altitude_m: float) -> None:
+        """Send a position target in the local frame."""
+        self.send(
+            "SET_POSITION_TARGET_LOCAL_NED",
+            {
+                "target_system": self.craft.config.sysid,
+                "target_component": 1,
+                "coordinate_frame": 1,
+                "type_mask": 0xDF8,
+                "x": north_m,
+                "y": east_m,
+                "z": -altitude_m,
+            },
+        )

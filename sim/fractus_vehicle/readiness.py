@@ -1,0 +1,29 @@
+"""Why a vehicle would not arm: ArduCopter's checks before the motors start, in its order and words."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fractus_vehicle.vehicle import Vehicle
+
+
+def arming_refusal(v: Vehicle, *, needs_position: bool) -> str | None:
+    """The first check that fails, or None."""
+    volts, failsafes, params = v.battery.voltage_v, v.failsafes, v.params
+    checks = (
+        (not v.estimator.healthy, "AHRS: EKF3 not healthy"),
+        (needs_position and v.gps.fix_type < 3, "GPS 1: Bad fix"),
+        (not v.position_ok and (needs_position or v.fence.enabled), "Need Position Estimate"),
+        (not v.estimator.ready, "AHRS: waiting for home"),
+        (0.0 < volts < params["BATT_ARM_VOLT"], "Battery 1 below minimum arming voltage"),
+        (failsafes.battery, "Battery 1 low voltage failsafe"),
+        (volts < params["BATT_CRT_VOLT"], "Battery 1 critical voltage failsafe"),
+        (failsafes.gcs, "GCS failsafe on"),
+        (failsafes.radio, "Radio failsafe on"),
+        (
+            v.home is not None and bool(v.fence.outside(v.est.north, v.est.east, 0.0, v.home_xy)),
+            "Vehicle outside fence",
+        ),
+    )
+    return next((text for failed, text in checks if failed), None)

@@ -1,0 +1,39 @@
+"""The radio receiver: sticks at rest, or what a ground station puts in their place."""
+
+from __future__ import annotations
+
+from fractus_vehicle.shaping import clamp
+
+STICKS_CENTRED = (1500,) * 4 + (1800,) + (1000,) * 3 + (0,) * 10
+RELEASED, UNCHANGED = 0, 65535
+
+
+class Receiver:
+    """The channels in microseconds; overrides last for RC_OVERRIDE_TIME."""
+
+    def __init__(self) -> None:
+        self.channels: tuple[int, ...] = STICKS_CENTRED
+        self.overridden = False
+        self._until_s = 0.0
+
+    def override(self, values: tuple[int, ...], until_s: float) -> None:
+        """Take a ground station's channels; 0 releases one, 65535 leaves it as it is."""
+        channels = list(self.channels)
+        for at, value in enumerate(values[: len(channels)]):
+            if value == RELEASED:
+                channels[at] = STICKS_CENTRED[at]
+            elif value != UNCHANGED:
+                channels[at] = int(clamp(value, 800, 2200))
+        self.channels = tuple(channels)
+        self.overridden = True
+        self._until_s = until_s
+
+    def release(self) -> None:
+        """Back to the sticks themselves."""
+        self.channels = STICKS_CENTRED
+        self.overridden = False
+
+    def step(self, now_s: float) -> None:
+        """End overrides that are too old."""
+        if self.overridden and now_s > self._until_s:
+            self.release()

@@ -1,0 +1,37 @@
+"""What the builders of telemetry messages share: their type and the units of the wire."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+from fractus_vehicle.shaping import clamp
+
+if TYPE_CHECKING:
+    from fractus_vehicle.vehicle import Vehicle
+    from fractus_vehicle.wire import Value
+
+Values = Mapping[str, "Value"]
+Builder = Callable[["Vehicle"], "Values | None"]
+
+UNKNOWN_U16 = 65535
+
+
+def boot_ms(vehicle: Vehicle) -> int:
+    """Milliseconds since boot."""
+    return round(vehicle.time_s * 1000.0) & 0xFFFFFFFF
+
+
+def boot_us(vehicle: Vehicle) -> int:
+    """Microseconds since boot."""
+    return round(vehicle.time_s * 1e6)
+
+
+def centi(value: float) -> int:
+    """Hundredths, within 16 bits."""
+    return int(clamp(round(value * 100.0), -32768, 32767))
+
+
+def milli(value: float) -> int:
+    """Thousandths, within 16 bits."""
+    return int(clamp(round(value * 1000.0), -32768, 32767))

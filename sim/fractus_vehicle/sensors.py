@@ -1,0 +1,137 @@
+"""What the vehicle senses: the battery it drains, the GPS receiver, and the errors of its position estimate."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+from dataclasses import dataclass
+
+from fractus_vehicle.earth import Place
+from fractus_vehicle.shaping import clamp
+
+# Open-circuit voltage of a lithium polymer cell against the share of charge that is left.
+_CELL_CURVE = ((0.0, 3.27), (0.05, 3.60), (0.1, 3.69), (0.2, 3.75), (0.4, 3.80), (0.6, 3.90), (0.8, 4.03), (1.0, 4.20))
+IDLE_CURRENT_A = 0.4
+# How far an estimated attitude wanders from the truth: roll, pitch, yaw.
+TILT_SIGMA_RAD = (math.radians(0.15), math.radians(0.15), math.radians(0.6))
+TILT_CORRELATION_S = 20.0
+HOVER_CURRENT_A = 14.0
+
+
+class Battery:
+    """A lithium polymer pack: charge drawn by the motors, voltage that sags under load."""
+
+    def __init__(self, full_v: float, capacity_mah: float, resistance_ohm: float = 0.035) -> None:
+        self.full_v = full_v
+        self.capacity_mah = max(capacity_mah, 1.0)
+        self.resistance_ohm = resistance_ohm
+        self.used_mah = 0.0
+        self.used_j = 0.0
+        self.current_a = IDLE_CURRENT_A
+        self.voltage_v = full_v
+        self._rest_v = full_v
+        self._rest_for: tuple[float, float] | None = None
+
+    @property
+    def left(self) -> float:
+        """Share of charge left, 0 to 1."""
+        return clamp(1.0 - self.used_mah / self.capacity_mah, 0.0, 1.0)
+
+    @property
+    def percent(self) -> int:
+        """Charge left in percent, as the autopilot counts it."""
+        return round(self.left * 100.0)
+
+    def _rest_voltage(self) -> float:
+        """Voltage without load; looked up anew for each thousandth of the charge."""
+        left = round(self.left, 3)
+        if self._rest_for != (left, self.full_v):
+            self._rest_for = (left, self.full_v)
+            self._rest_v = self._curve(left)
+        return self._rest_v
+
+    def _curve(self, left: float) -> float:
+        for (low, low_v), (high, high_v) in itertools.pairwise(_CELL_CURVE):
+            if left <= high:
+                return self.full_v / 4.2 * (low_v + (high_v - low_v) * (left - low) / (high - low))
+        return self.full_v
+
+    def step(self, dt: float, load: float) -> None:
+        """Draw current for `dt` seconds; `load` is thrust as a multiple of the hover thrust."""
+        wanted = IDLE_CURRENT_A + HOVER_CURRENT_A * max(load, 0.0) ** 1.5
+        self.current_a += (wanted - self.current_a) * min(1.0, dt / 0.1)
+        self.used_mah += self.current_a * dt / 3.6
+        self.used_j += self.current_a * self.voltage_v * dt
+        self.voltage_v = max(self._rest_voltage() - self.current_a * self.resistance_ohm, 0.0)
+
+    @property
+    def thrust_share(self) -> float:
+        """Full thrust at this voltage against full thrust on a full battery."""
+        return clamp(self.voltage_v / 12.6, 0.3, 1.4) ** 2
+
+
+@dataclass(slots=True)
+class Gps:
+    """The receiver: when it has a fix, where it believes to be."""
+
+    fix_type: int = 0
+    satellites: int = 0
+    place: Place | None = None
+    vn: float = 0.0
+    ve: float = 0.0
+
+    def update(
+        self, truth: Place, velocity: tuple[float, float], *, noise_m: float, satellites: int, rng: random.Random
+    ) -> None:
+        """Take a fix."""
+        if noise_m > 0.0:
+            truth = truth.offset(rng.gauss(0.0, noise_m), rng.gauss(0.0, noise_m), rng.gauss(0.0, 1.5 * noise_m))
+        self.place = truth
+        self.vn, self.ve = velocity
+        self.satellites = satellites
+        self.fix_type = 6 if satellites >= 10 else 3 if satellites >= 6 else 1
+
+    def lose(self) -> None:
+        """Lose the fix."""
+        self.fix_type = 1
+        self.satellites = 0
+
+
+class Drift:
+    """The estimator's error: a slow wander while GPS holds it, running away by dead reckoning when it does not."""
+
+    def __init__(self, rng: random.Random, sigma_m: float = 0.12, correlation_s: float = 40.0) -> None:
+        self._rng = rng
+        self._sigma_m = sigma_m
+        self._correlation_s = correlation_s
+        self._wander = [0.0, 0.0]
+        self._blind = [0.0, 0.0]
+        self._blind_rate = [0.0, 0.0]
+        self.north = self.east = self.down = 0.0
+        self.tilt = [0.0, 0.0, 0.0]  # attitude error about the body axes, radians
+        self.rate_n = self.rate_e = 0.0
+
+    def step(self, dt: float, *, aided: bool) -> None:
+        """Advance the errors by `dt` seconds."""
+        keep = math.exp(-dt / self._correlation_s)
+        kick = self._sigma_m * math.sqrt(1.0 - keep * keep)
+        gauss = self._rng.gauss
+        for axis in (0, 1):
+            self._wander[axis] = self._wander[axis] * keep + kick * gauss(0.0, 1.0)
+            if aided:
+                fade = math.exp(-dt / 1.5)
+                self._blind[axis] *= fade
+                self._blind_rate[axis] = 0.0
+            else:
+                self._blind_rate[axis] += 0.05 * gauss(0.0, 1.0) * math.sqrt(dt)
+                self._blind[axis] += self._blind_rate[axis] * dt
+        if self._sigma_m > 0.0:
+            steady = math.exp(-dt / TILT_CORRELATION_S)
+            for axis, sigma in enumerate(TILT_SIGMA_RAD):
+                kick_rad = sigma * math.sqrt(1.0 - steady * steady)
+                self.tilt[axis] = self.tilt[axis] * steady + kick_rad * gauss(0.0, 1.0)
+        self.down = self.down * keep + 0.4 * kick * gauss(0.0, 1.0)
+        self.north = self._wander[0] + self._blind[0]
+        self.east = self._wander[1] + self._blind[1]
+        self.rate_n, self.rate_e = self._blind_rate

@@ -1,0 +1,62 @@
+"""What parameters mean: limits, gains, fence, battery and wind, set from their values."""
+
+from __future__ import annotations
+
+import math
+
+from fractus_vehicle.body import Wind
+from fractus_vehicle.control import Control
+from fractus_vehicle.fence import Fence
+from fractus_vehicle.params import Parameters
+from fractus_vehicle.sensors import Battery
+from fractus_vehicle.shaping import clamp
+
+# The attitude controllers leave this share of the jerk that the parameter allows.
+JERK_SHARE = 0.6
+
+LIMIT_PREFIXES = frozenset({"WPNAV", "PSC", "ANGLE", "ATC", "MOT", "LOIT"})
+
+
+def leg_speeds_mps(params: Parameters) -> tuple[float, float, float]:
+    """How fast legs are flown: over ground, up, and down."""
+    return (
+        max(params["WPNAV_SPEED"] / 100.0, 0.2),
+        max(params["WPNAV_SPEED_UP"] / 100.0, 0.1),
+        max(params["WPNAV_SPEED_DN"] / 100.0, 0.1),
+    )
+
+
+def set_limits(params: Parameters, control: Control) -> None:
+    """Speeds, accelerations, jerk, lean and gains of the controllers."""
+    limits, gains = control.limits, control.gains
+    limits.speed_mps, limits.climb_mps, limits.sink_mps = leg_speeds_mps(params)
+    limits.accel_mps2 = max(params["WPNAV_ACCEL"] / 100.0, 0.5)
+    limits.accel_z_mps2 = max(params["WPNAV_ACCEL_Z"] / 100.0, 0.5)
+    limits.jerk_mps3 = max(JERK_SHARE * params["PSC_JERK_XY"], 1.0)
+    lean_deg = params["PSC_ANGLE_MAX"] or params["ANGLE_MAX"] / 100.0
+    limits.tilt_max_rad = math.radians(clamp(lean_deg, 10.0, 80.0))
+    limits.yaw_rate_rps = math.radians(clamp(params["ATC_SLEW_YAW"] / 100.0, 5.0, 180.0))
+    gains.position = clamp(params["PSC_POSXY_P"], 0.2, 3.0)
+    gains.velocity = clamp(params["PSC_VELXY_P"], 0.1, 6.0)
+    gains.velocity_i = clamp(params["PSC_VELXY_I"], 0.0, 2.0)
+
+
+def set_fence(params: Parameters, fence: Fence) -> None:
+    """The fence's switches and simple limits."""
+    fence.enabled = int(params["FENCE_ENABLE"]) != 0
+    fence.types = int(params["FENCE_TYPE"])
+    fence.alt_max_m, fence.alt_min_m = params["FENCE_ALT_MAX"], params["FENCE_ALT_MIN"]
+    fence.radius_m = params["FENCE_RADIUS"]
+
+
+def set_battery(params: Parameters, battery: Battery) -> None:
+    """Capacity and voltage of the full battery."""
+    battery.capacity_mah = max(params["BATT_CAPACITY"], 1.0)
+    battery.full_v = params["SIM_BATT_VOLTAGE"]
+
+
+def set_wind(params: Parameters, wind: Wind) -> None:
+    """Mean wind and gusts."""
+    wind.speed_mps = max(params["SIM_WIND_SPD"], 0.0)
+    wind.from_deg = params["SIM_WIND_DIR"]
+    wind.turbulence_mps = max(params["SIM_WIND_TURB"], 0.0)

@@ -1,0 +1,150 @@
+"""Some vehicles and their links' channels under one simulated time: receive, advance, forward, record."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import replace
+from typing import BinaryIO
+
+from fractus_vehicle.channel import Channel
+from fractus_vehicle.dispatch import dispatch
+from fractus_vehicle.streams import ALL_GROUPS, GROUPS
+from fractus_vehicle.vehicle import CONTROL_STEP_S, Vehicle, VehicleConfig
+from fractus_vehicle.wire import Message, Signing
+
+# Never passed on from one link to another: they speak about the link itself.
+_LINK_LOCAL = frozenset({"RADIO_STATUS", "RADIO", "SETUP_SIGNING"})
+
+
+class Craft:
+    """One vehicle with its links; survives a reboot of the vehicle."""
+
+    def __init__(self, config: VehicleConfig) -> None:
+        self.config = config
+        self.vehicle = Vehicle(config)
+        self._recorder: BinaryIO | None = None
+
+    def open(self, name: str, port: int | None = None) -> Channel:
+        """Open a link and return its channel; `port` selects the SRn_ parameters of its default streams."""
+        channel = Channel(self.config.sysid, name=name, port=port)
+        key = self.vehicle.signing_key
+        if key is not None:
+            channel.signing = Signing(key, signing_clock(self.vehicle.unix_us))
+        self.vehicle.voice.attach(channel)
+        return channel
+
+    def close(self, channel: Channel) -> None:
+        """Close a link."""
+        if channel in self.vehicle.channels:
+            self.vehicle.voice.detach(channel)
+
+    def receive(self, channel: Channel, data: bytes) -> None:
+        """Take bytes that arrived on a link."""
+        for message in channel.receive(data):
+            if self._recorder is not None:
+                self._log(message.frame)
+            self._route(channel, message)
+            dispatch(self.vehicle, message, channel)
+
+    def _route(self, source: Channel, message: Message) -> None:
+        """Pass a message on to the links where its target was heard, as ArduPilot does."""
+        if len(self.vehicle.channels) < 2 or message.name in _LINK_LOCAL or message.sysid == self.config.sysid:
+            return
+        system = message.integer("target_system") if message.has("target_system") else 0
+        component = message.integer("target_component") if message.has("target_component") else 0
+        if system == self.config.sysid and component in (0, self.vehicle.compid):
+            return
+        for channel in self.vehicle.channels:
+            if channel is not source and (
+                any(system in (0, peer) and component in (0, part) for peer, part in channel.peers)
+            ):
+                channel.forward(message.frame)
+
+    def step(self) -> None:
+        """Advance by one control step."""
+        vehicle = self.vehicle
+        vehicle.step()
+        if vehicle.reboot_wanted:
+            self._reboot()
+
+    def _reboot(self) -> None:
+        """Start anew where the vehicle stands, with what a real one keeps: parameters, plans and the signing key."""
+        old = self.vehicle
+        place = replace(old.true_place, alt_m=self.config.start.alt_m)
+        heading_deg = math.degrees(old.body.euler()[2]) % 360.0
+        self.vehicle = Vehicle(
+            replace(self.config, start=place, heading_deg=heading_deg, parameters=old.params.changes())
+        )
+        self.vehicle.signing_key = old.signing_key
+        self.vehicle.plans.restore(old.plans)
+        for channel in old.channels:
+            channel.streams.clear()
+            channel.parameters.clear()
+            self.vehicle.voice.attach(channel)
+
+    def _log(self, frame: bytes) -> None:
+        if self._recorder is not None:
+            self._recorder.write(struct.pack(">Q", self.vehicle.unix_us) + frame)
+
+    def record(self, file: BinaryIO, rate_hz: float = 4.0) -> None:
+        """Write a tlog: what the vehicle says on a link of its own, with every stream at `rate_hz`, and all it is told."""
+        vehicle = self.vehicle
+        self._recorder = file
+        channel = Channel(self.config.sysid, name="recorder", tap=self._log, discard=True)
+        vehicle.voice.attach(channel)
+        for group in ALL_GROUPS:
+            for name in GROUPS[group][1]:
+                channel.set_interval(name, 1.0 / rate_hz)
+
+
+def signing_clock(unix_us: int) -> int:
+    """The time of MAVLink signing: units of 10 µs since 1 January 2015."""
+    return (unix_us - 1_420_070_400_000_000) // 10
+
+
+class Simulation:
+    """A fleet that shares time."""
+
+    def __init__(self, configs: list[VehicleConfig]) -> None:
+        self.crafts = [Craft(config) for config in configs]
+        self.ticks = 0
+
+    @property
+    def time_s(self) -> float:
+        """Simulated time since the start."""
+        return self.ticks * CONTROL_STEP_S
+
+    def step(self) -> None:
+        """Advance every vehicle by one control step."""
+        self.ticks += 1
+        for craft in self.crafts:
+            craft.step()
+
+    def quiet_steps(self, most: int) -> int:
+        """Steps until the next one that has something to say on a link, from 1 to `most`; texts are not foreseen."""
+        quiet_s = min(
+            (channel.speaks_s - craft.vehicle.time_s for craft in self.crafts for channel in craft.vehicle.channels),
+            default=math.inf,
+        )
+        return math.ceil(min(max(quiet_s / CONTROL_STEP_S - 1e-3, 1.0), most))
+
+    def advance(self, duration_s: float) -> None:
+        """Advance by a duration, in lockstep with the caller."""
+        for _ in range(round(duration_s / CONTROL_STEP_S)):
+            self.step()
+
+
+def formation(config: VehicleConfig, count: int, spacing_m: float) -> list[VehicleConfig]:
+    """`count` vehicles in a row toward east, with consecutive system ids."""
+    return [
+        replace(
+            config,
+            sysid=config.sysid + at,
+            start=config.start.offset(0.0, at * spacing_m),
+            store=config.store.with_name(f"{config.store.stem}-{config.sysid + at}{config.store.suffix}")
+            if config.store is not None and count > 1
+            else config.store,
+        )
+        for at in range(count)
+    ]

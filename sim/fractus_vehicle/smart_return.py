@@ -1,0 +1,109 @@
+"""SMART_RTL: home along the path that was flown, and down where it began."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from enum import Enum
+from typing import TYPE_CHECKING
+
+from fractus_vehicle.breadcrumbs import Point
+from fractus_vehicle.descent import descend
+from fractus_vehicle.flight import Flight
+from fractus_vehicle.leg import Leg
+from fractus_vehicle.mav import Severity
+
+if TYPE_CHECKING:
+    from fractus_vehicle.vehicle import Vehicle
+
+# The last point is approached this much above it.
+ABOVE_LAST_M = 2.0
+STOPPED_MPS = 0.5
+
+
+class SmartStage(Enum):
+    """The stages of SMART_RTL, as ArduCopter names them."""
+
+    WAIT_FOR_PATH_CLEANUP = 1
+    PATH_FOLLOW = 2
+    PRELAND_POSITION = 3
+    DESCEND = 4
+    LAND = 5
+
+
+class SmartReturn(Flight):
+    """Tidies the path while it stops, follows it backward, pauses 2 m above its beginning, lands, disarms."""
+
+    def __init__(self) -> None:
+        self.stage = SmartStage.WAIT_FOR_PATH_CLEANUP
+        self._tidying: Iterator[None] = iter(())
+        self._leg: Leg | None = None
+        self._popped: Point | None = None
+
+    @property
+    def landing(self) -> bool:
+        """Whether it comes down for good."""
+        return self.stage is SmartStage.LAND
+
+    def begin(self, v: Vehicle) -> None:
+        """Stop, and begin to tidy the path."""
+        v.control.hold_here()
+        v.yaw.follow_course()
+        v.touch_time_s = 0.0
+        self._tidying = v.breadcrumbs.thorough()
+
+    def end(self, v: Vehicle) -> None:
+        """Give back the point that was not reached, so that the path remains whole."""
+        if self.stage is SmartStage.PATH_FOLLOW and self._popped is not None and not v.breadcrumbs.add(self._popped):
+            v.say(Severity.ERROR, "SmartRTL: lost one point")
+
+    def step(self, v: Vehicle, dt: float) -> None:
+        """Go through the stages."""
+        if self.stage is SmartStage.WAIT_FOR_PATH_CLEANUP:
+            try:
+                next(self._tidying)
+            except StopIteration:
+                self.stage = SmartStage.PATH_FOLLOW
+        elif self.stage is SmartStage.PATH_FOLLOW:
+            self._follow(v)
+        elif self.stage is SmartStage.PRELAND_POSITION:
+            self._come_down(v)
+        elif self.stage is SmartStage.LAND:
+            descend(v)
+        if self._leg is not None:
+            self._leg.step(v)
+        if self.stage is not SmartStage.LAND:
+            v.yaw.step(v, dt)
+
+    def _follow(self, v: Vehicle) -> None:
+        waiting = not self._stopped(v) if self._leg is None else not self._leg.reached(v, _radius_m(v))
+        if waiting:
+            return
+        if not v.breadcrumbs.path:
+            self.stage = SmartStage.PRELAND_POSITION
+            return
+        north, east, down = self._popped = v.breadcrumbs.pop()
+        if not v.breadcrumbs.path:
+            self.stage = SmartStage.PRELAND_POSITION
+            down -= ABOVE_LAST_M
+        self._leg = Leg(v, north, east, down)
+
+    @staticmethod
+    def _stopped(v: Vehicle) -> bool:
+        return math.hypot(v.est.vn, v.est.ve) < STOPPED_MPS
+
+    def _come_down(self, v: Vehicle) -> None:
+        if self._leg is not None and not (self._stopped(v) and self._leg.reached(v, _radius_m(v))):
+            return
+        final_m = v.params["RTL_ALT_FINAL"] / 100.0
+        if final_m <= 0.0 or v.failsafes.radio or self._leg is None:
+            self.stage = SmartStage.LAND
+        else:
+            self.stage = SmartStage.DESCEND
+            north, east, _ = self._leg.end
+            v.control.go_to(north, east, v.return_point().base_down - final_m)
+        self._leg = None
+
+
+def _radius_m(v: Vehicle) -> float:
+    return max(v.params["WPNAV_RADIUS"] / 100.0, 0.3)

@@ -1,0 +1,121 @@
+"""A curved leg of a mission: a cubic Hermite curve through its ends, as ArduPilot's spline waypoints."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from fractus_vehicle.breadcrumbs import Point
+from fractus_vehicle.control import Axis
+from fractus_vehicle.shaping import BRAKING_SHARE, shape_velocity
+
+if TYPE_CHECKING:
+    from fractus_vehicle.vehicle import Vehicle
+
+_SAMPLES = 64
+_SLOWEST_MPS = 0.3
+# The tangent of an end where the vehicle stands, as a share of the way: with none, the curve has no direction there.
+AT_REST = 0.1
+
+
+class SplineLeg:
+    """From where the trajectory is to a local point, along a curve that leaves and arrives in given directions."""
+
+    def __init__(self, v: Vehicle, end: Point, leave: Point, arrive: Point) -> None:
+        pos, vel = v.control.pos, v.control.vel
+        self.end = end
+        self._stops = not any(arrive)
+        start = (pos[0], pos[1], pos[2])
+        straight = (end[0] - start[0], end[1] - start[1], end[2] - start[2])
+        self._speed_mps = math.hypot(vel[0], vel[1], vel[2]) if any(leave) else 0.0
+        leave = leave if any(leave) else _scaled(straight, AT_REST)
+        arrive = _scaled(straight, AT_REST) if self._stops else arrive
+        size, room = math.hypot(*leave) + math.hypot(*arrive), 4.0 * math.dist(start, end)
+        scale = room / size if size > room else 1.0
+        self._curve = tuple(
+            (a, la, -3.0 * a - 2.0 * la + 3.0 * b - lb, 2.0 * a + la - 2.0 * b + lb)
+            for a, b, la, lb in zip(start, end, _scaled(leave, scale), _scaled(arrive, scale), strict=True)
+        )
+        self._share = 0.0
+        self._accel_mps2 = 0.0
+        self._allowed_mps = self._profile(v)
+
+    def _profile(self, v: Vehicle) -> list[float]:
+        """The greatest speed at each sample of the curve, so that bends, climbs and the end can be braked for."""
+        allowed = [self._local_limit(v, step / _SAMPLES) for step in range(_SAMPLES + 1)]
+        allowed[-1] = 0.0 if self._stops else allowed[-1]
+        braking = 2.0 * BRAKING_SHARE * v.control.limits.accel_mps2
+        for step in range(_SAMPLES - 1, -1, -1):
+            way = math.dist(self.at(step / _SAMPLES), self.at((step + 1) / _SAMPLES))
+            allowed[step] = min(allowed[step], math.sqrt(allowed[step + 1] ** 2 + braking * way))
+        return allowed
+
+    def at(self, share: float) -> Point:
+        """The point at a share (0 to 1) of the curve's parameter."""
+        x, y, z = (((d * share + c) * share + b) * share + a for a, b, c, d in self._curve)
+        return (x, y, z)
+
+    def _slopes(self, share: float) -> tuple[Point, Point]:
+        dx, dy, dz = ((3.0 * d * share + 2.0 * c) * share + b for _, b, c, d in self._curve)
+        ddx, ddy, ddz = (6.0 * d * share + 2.0 * c for _, _, c, d in self._curve)
+        return (dx, dy, dz), (ddx, ddy, ddz)
+
+    def _local_limit(self, v: Vehicle, share: float) -> float:
+        limits, (slope, bend) = v.control.limits, self._slopes(share)
+        size, level = max(math.hypot(*slope), 1e-6), max(math.hypot(slope[0], slope[1]), 1e-6)
+        wanted = limits.speed_mps * size / level
+        if slope[2]:
+            wanted = min(wanted, (limits.climb_mps if slope[2] < 0.0 else limits.sink_mps) * size / abs(slope[2]))
+        curvature = abs(slope[0] * bend[1] - slope[1] * bend[0]) / level**3
+        return min(wanted, math.sqrt(limits.accel_mps2 / curvature)) if curvature > 1e-6 else wanted
+
+    def step(self, v: Vehicle) -> None:
+        """Move the trajectory along the curve."""
+        control, dt = v.control, v.control_step_s
+        if self._share >= 1.0:
+            if control.horizontal is Axis.PATH:
+                if self._stops:
+                    control.track(self.end, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+                control.go_to(*self.end)
+            return
+        at = self._share * _SAMPLES
+        low = min(int(at), _SAMPLES - 1)
+        wanted = self._allowed_mps[low] + (at - low) * (self._allowed_mps[low + 1] - self._allowed_mps[low])
+        self._accel_mps2 = shape_velocity(
+            max(wanted, _SLOWEST_MPS),
+            self._speed_mps,
+            self._accel_mps2,
+            accel_max=control.limits.accel_mps2,
+            jerk_max=control.limits.jerk_mps3,
+            dt=dt,
+        )
+        self._speed_mps = max(self._speed_mps + self._accel_mps2 * dt, 0.0)
+        slope, bend = self._slopes(self._share)
+        pace = self._speed_mps / max(math.hypot(*slope), 1e-6)
+        self._share = min(1.0, self._share + pace * dt)
+        control.target, control.target_down = self.end[:2], self.end[2]
+        control.track(
+            self.at(self._share),
+            (slope[0] * pace, slope[1] * pace, slope[2] * pace),
+            self._acceleration(slope, bend, pace),
+        )
+
+    def _acceleration(self, slope: Point, bend: Point, pace: float) -> Point:
+        """What keeps the vehicle on the curve, and what changes its speed."""
+        size2 = max(slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2, 1e-12)
+        along = (slope[0] * bend[0] + slope[1] * bend[1] + slope[2] * bend[2]) / size2
+        push, pace2 = self._accel_mps2 / math.sqrt(size2), pace * pace
+        return (
+            (bend[0] - along * slope[0]) * pace2 + push * slope[0],
+            (bend[1] - along * slope[1]) * pace2 + push * slope[1],
+            (bend[2] - along * slope[2]) * pace2 + push * slope[2],
+        )
+
+    def reached(self, v: Vehicle, radius_m: float) -> bool:
+        """Whether the curve is flown."""
+        here = (v.est.north, v.est.east, v.est.down)
+        return self._share >= 1.0 and (not self._stops or math.dist(here, self.end) <= radius_m)
+
+
+def _scaled(vector: Point, scale: float) -> Point:
+    return (vector[0] * scale, vector[1] * scale, vector[2] * scale)

@@ -1,0 +1,82 @@
+"""Which telemetry messages there are, and ArduCopter's grouping of them into streams."""
+
+from __future__ import annotations
+
+from fractus_vehicle import motion_reports, sensor_reports, status_reports
+from fractus_vehicle.reporting import Builder
+
+BUILDERS: dict[str, Builder] = {
+    "HEARTBEAT": status_reports.heartbeat,
+    "GLOBAL_POSITION_INT": motion_reports.global_position_int,
+    "LOCAL_POSITION_NED": motion_reports.local_position_ned,
+    "ATTITUDE": motion_reports.attitude,
+    "ATTITUDE_QUATERNION": motion_reports.attitude_quaternion,
+    "ATTITUDE_TARGET": motion_reports.attitude_target,
+    "VFR_HUD": motion_reports.vfr_hud,
+    "SYS_STATUS": status_reports.sys_status,
+    "BATTERY_STATUS": sensor_reports.battery_status,
+    "GPS_RAW_INT": sensor_reports.gps_raw_int,
+    "HOME_POSITION": motion_reports.home_position,
+    "GPS_GLOBAL_ORIGIN": motion_reports.gps_global_origin,
+    "EKF_STATUS_REPORT": sensor_reports.ekf_status_report,
+    "EXTENDED_SYS_STATE": status_reports.extended_sys_state,
+    "AUTOPILOT_VERSION": status_reports.autopilot_version,
+    "MISSION_CURRENT": status_reports.mission_current,
+    "RAW_IMU": sensor_reports.raw_imu,
+    "SCALED_IMU2": sensor_reports.scaled_imu2,
+    "SCALED_PRESSURE": sensor_reports.scaled_pressure,
+    "POWER_STATUS": status_reports.power_status,
+    "MEMINFO": status_reports.meminfo,
+    "NAV_CONTROLLER_OUTPUT": motion_reports.nav_controller_output,
+    "FENCE_STATUS": status_reports.fence_status,
+    "POSITION_TARGET_GLOBAL_INT": motion_reports.position_target_global_int,
+    "POSITION_TARGET_LOCAL_NED": motion_reports.position_target_local_ned,
+    "SERVO_OUTPUT_RAW": sensor_reports.servo_output_raw,
+    "RC_CHANNELS": sensor_reports.rc_channels,
+    "AHRS": sensor_reports.ahrs,
+    "AHRS2": motion_reports.ahrs2,
+    "SIMSTATE": motion_reports.simstate,
+    "SYSTEM_TIME": status_reports.system_time,
+    "WIND": sensor_reports.wind,
+    "VIBRATION": sensor_reports.vibration,
+    "TERRAIN_REPORT": motion_reports.terrain_report,
+    "ESC_TELEMETRY_1_TO_4": sensor_reports.esc_telemetry,
+    "ALTITUDE": motion_reports.altitude,
+}
+
+# MAV_DATA_STREAM groups as ArduCopter fills them; the second column names the SRn_ parameter.
+GROUPS: dict[int, tuple[str, tuple[str, ...]]] = {
+    1: ("RAW_SENS", ("RAW_IMU", "SCALED_IMU2", "SCALED_PRESSURE")),
+    2: (
+        "EXT_STAT",
+        (
+            "SYS_STATUS",
+            "POWER_STATUS",
+            "MEMINFO",
+            "MISSION_CURRENT",
+            "GPS_RAW_INT",
+            "NAV_CONTROLLER_OUTPUT",
+            "FENCE_STATUS",
+            "POSITION_TARGET_GLOBAL_INT",
+        ),
+    ),
+    3: ("RC_CHAN", ("SERVO_OUTPUT_RAW", "RC_CHANNELS")),
+    4: ("RAW_CTRL", ()),
+    6: ("POSITION", ("GLOBAL_POSITION_INT", "LOCAL_POSITION_NED")),
+    10: ("EXTRA1", ("ATTITUDE", "SIMSTATE", "AHRS2")),
+    11: ("EXTRA2", ("VFR_HUD",)),
+    12: (
+        "EXTRA3",
+        (
+            "AHRS",
+            "SYSTEM_TIME",
+            "WIND",
+            "TERRAIN_REPORT",
+            "BATTERY_STATUS",
+            "EKF_STATUS_REPORT",
+            "VIBRATION",
+            "ESC_TELEMETRY_1_TO_4",
+        ),
+    ),
+}
+ALL_GROUPS = (1, 2, 3, 4, 6, 10, 11, 12)

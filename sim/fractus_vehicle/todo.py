@@ -1,0 +1,132 @@
+"""DO and CONDITION commands of a mission: they run one after the other while the vehicle flies on."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import TYPE_CHECKING
+
+from fractus_vehicle.fence import Breach
+from fractus_vehicle.mav import Command, Severity
+from fractus_vehicle.shaping import wrap_pi
+
+if TYPE_CHECKING:
+    from fractus_vehicle.mission import Item
+    from fractus_vehicle.vehicle import Vehicle
+
+YAW_REACHED_RAD = math.radians(2.0)
+
+
+class Todo:
+    """What waits beside the present NAV command; the next NAV command drops what is left."""
+
+    def __init__(self) -> None:
+        self._indices: deque[int] = deque()
+        self._begun_s: float | None = None
+
+    def begin(self, v: Vehicle, indices: list[int]) -> None:
+        """Take the commands that stand before a NAV command that has just begun, and run what need not wait."""
+        self._indices = deque(indices)
+        self._begun_s = None
+        self.step(v)
+
+    def step(self, v: Vehicle) -> None:
+        """Go on until a condition has to be waited for."""
+        while self._indices:
+            index = self._indices[0]
+            if index >= len(v.mission.items):
+                self._indices.clear()
+                return
+            item = v.mission.items[index]
+            if self._begun_s is None:
+                self._begun_s = v.time_s
+                v.say(Severity.INFO, f"Mission: {index} {title(item)}")
+                _do(v, item)
+            if not _fulfilled(v, item, v.time_s - self._begun_s):
+                return
+            self._indices.popleft()
+            self._begun_s = None
+            v.broadcast("MISSION_ITEM_REACHED", {"seq": index})
+
+
+def _fulfilled(v: Vehicle, item: Item, waited_s: float) -> bool:
+    match item.command:
+        case Command.CONDITION_DELAY:
+            return waited_s >= item.param1
+        case Command.CONDITION_DISTANCE:
+            target = v.control.target
+            return math.hypot(target[0] - v.est.north, target[1] - v.est.east) <= max(item.param1, 0.0)
+        case Command.CONDITION_YAW:
+            return abs(wrap_pi(v.control.target_yaw - v.est.yaw)) <= YAW_REACHED_RAD
+        case _:
+            return True
+
+
+def _do(v: Vehicle, item: Item) -> None:
+    match item.command:
+        case Command.DO_CHANGE_SPEED:
+            v.change_speed(int(item.param1), item.param2)
+        case Command.CONDITION_YAW:
+            v.turn_to(item.param1, item.param2, int(item.param3), relative=item.param4 > 0.5)
+        case Command.DO_SET_ROI | Command.DO_SET_ROI_LOCATION:
+            north, east, _ = item_target(v, item)
+            v.yaw.look_at((north, east) if item.has_place else None)
+        case Command.DO_SET_ROI_NONE:
+            v.yaw.look_at(None)
+        case Command.DO_FENCE_ENABLE:
+            switch_fence(v, item.param1)
+        case Command.DO_SET_HOME:
+            v.set_home_here() if item.param1 > 0.5 else v.set_home_at(item.x, item.y, item.z)
+        case _:
+            pass  # servos, relays, cameras and mounts: there are none
+
+
+def switch_fence(v: Vehicle, action: float) -> bool:
+    """DO_FENCE_ENABLE: 0 off, 1 on, 2 only the floor off; False when there is nothing to switch on, or no such action."""
+    if action == 2.0:
+        v.fence.types &= ~Breach.ALT_MIN
+        return True
+    if action not in (0.0, 1.0) or (action == 1.0 and not v.fence.present):
+        return False
+    v.params.assign("FENCE_ENABLE", action)
+    return True
+
+
+def item_target(v: Vehicle, item: Item) -> tuple[float, float, float]:
+    """Where an item lies in the local frame; a missing position means here."""
+    origin = v.origin or v.start
+    base = v.altitude_base_m(item.frame)
+    if base is None:
+        base = (v.home or origin).alt_m
+    down = origin.alt_m - (base + item.z)
+    if not item.has_place:
+        return (v.control.target[0], v.control.target[1], down)
+    north, east, _ = origin.vector_to(type(origin)(item.x, item.y, 0.0))
+    return (north, east, down)
+
+
+_TITLES = {
+    Command.NAV_WAYPOINT: "WP",
+    Command.NAV_SPLINE_WAYPOINT: "SplineWP",
+    Command.NAV_TAKEOFF: "Takeoff",
+    Command.NAV_LAND: "Land",
+    Command.NAV_RETURN_TO_LAUNCH: "RTL",
+    Command.NAV_LOITER_UNLIM: "LoitUnlim",
+    Command.NAV_LOITER_TIME: "LoitTime",
+    Command.NAV_LOITER_TURNS: "LoitTurns",
+    Command.NAV_DELAY: "Delay",
+    Command.CONDITION_DELAY: "CondDelay",
+    Command.CONDITION_DISTANCE: "CondDist",
+    Command.CONDITION_YAW: "CondYaw",
+    Command.DO_CHANGE_SPEED: "ChangeSpeed",
+    Command.DO_SET_HOME: "SetHome",
+    Command.DO_SET_SERVO: "SetServo",
+    Command.DO_SET_RELAY: "SetRelay",
+    Command.DO_SET_ROI: "SetROI",
+    Command.JUMP_TAG: "JumpTag",
+}
+
+
+def title(item: Item) -> str:
+    """ArduPilot's word for a command."""
+    return _TITLES.get(Command(item.command), "Cmd") if item.command in set(Command) else "Cmd"

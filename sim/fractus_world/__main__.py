@@ -1,0 +1,179 @@
+"""`fractus-camera-world`: a simulated camera above a simulated world, served like an IP camera."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import click
+
+from fractus_world.optics import Intrinsics, Mount, Pose
+
+DEFAULT_LISTEN = "127.0.0.1:8090"
+DEFAULT_VEHICLE = "tcp:127.0.0.1:5762"
+
+
+def _listen(_context: click.Context, _option: click.Parameter, text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdigit() or int(port) > 65535:
+        raise click.BadParameter(f"{text!r} is not HOST:PORT, such as {DEFAULT_LISTEN}")
+    return host.strip("[]"), int(port)
+
+
+def _pose(_context: click.Context, _option: click.Parameter, text: str | None) -> Pose | None:
+    if text is None:
+        return None
+    try:
+        numbers = [float(part) for part in text.split(",")]
+        if not 3 <= len(numbers) <= 6:
+            raise ValueError(f"{len(numbers)} numbers")
+        lat, lon, height_m, yaw, pitch, roll = [*numbers, 0.0, 0.0, 0.0][:6]
+        return Pose(lat, lon, height_m, roll, pitch, yaw)
+    except ValueError as error:
+        raise click.BadParameter(f"expected LAT,LON,HEIGHT[,HEADING[,PITCH[,ROLL]]]: {error}") from error
+
+
+def _resolution(_context: click.Context, _option: click.Parameter, text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise click.BadParameter(f"{text!r} is not WIDTHxHEIGHT, such as 1920x1080")
+    return int(width), int(height)
+
+
+def _origin(_context: click.Context, _option: click.Parameter, text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    try:
+        lat, lon = (float(part) for part in text.split(","))
+        Pose(lat, lon, 0.0)
+    except ValueError as error:
+        raise click.BadParameter(f"expected LAT,LON: {error}") from error
+    return lat, lon
+
+
+@click.command()
+@click.option(
+    "--listen", callback=_listen, default=DEFAULT_LISTEN, show_default=True, metavar="HOST:PORT", help="Where to serve."
+)
+@click.option(
+    "--vehicle",
+    default=DEFAULT_VEHICLE,
+    show_default=True,
+    metavar="tcp:HOST:PORT",
+    help="MAVLink server of the vehicle that carries the camera.",
+)
+@click.option(
+    "--pose",
+    callback=_pose,
+    metavar="LAT,LON,HEIGHT[,HEADING[,PITCH[,ROLL]]]",
+    help="A camera that stays where it is, so many metres above the ground; instead of --vehicle.",
+)
+@click.option(
+    "--ground",
+    "ground_amsl_m",
+    type=float,
+    help="Altitude of the ground above mean sea level, metres; by default the vehicle's home is on it.",
+)
+@click.option(
+    "--fov", "fov_deg", type=float, default=62.2, show_default=True, help="Horizontal field of view, degrees."
+)
+@click.option(
+    "--resolution", callback=_resolution, default="1920x1080", show_default=True, help="Pixels, WIDTHxHEIGHT."
+)
+@click.option(
+    "--mount-pitch", "mount_pitch_deg", type=float, default=-90.0, show_default=True, help="-90 looks down, 0 ahead."
+)
+@click.option(
+    "--mount-yaw", "mount_yaw_deg", type=float, default=0.0, show_default=True, help="Clockwise from the nose."
+)
+@click.option(
+    "--stabilised/--fixed-mount", default=True, show_default=True, help="Whether a gimbal takes roll and pitch away."
+)
+@click.option("--seed", type=int, default=7, show_default=True, help="Seed of the landscape and of all that moves.")
+@click.option(
+    "--origin",
+    callback=_origin,
+    metavar="LAT,LON",
+    help="Middle of the landscape; cameras that share a world share it.  [default: the first position, to 0.1 degrees]",
+)
+@click.option(
+    "--orthophoto",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Your own aerial picture instead of the landscape: a GeoTIFF, or a PNG or JPEG with a world file.",
+)
+@click.option(
+    "--crs",
+    help="System of the orthophoto's world file: EPSG:4326 (the default), a UTM zone such as EPSG:32633, or local "
+    "(metres from --origin).",
+)
+@click.option(
+    "--photos",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Geotagged pictures instead of a world: the one taken nearest is served; thermal ones in ir/ or named *_ir.",
+)
+def camera_world(**given: object) -> None:
+    """Serve what a camera above a simulated world sees: /snapshot.jpg, /truth.json, /orthophoto.png."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    _serve(**given)  # type: ignore[arg-type]
+
+
+def _serve(
+    *,
+    listen: tuple[str, int],
+    vehicle: str,
+    pose: Pose | None,
+    ground_amsl_m: float | None,
+    fov_deg: float,
+    resolution: tuple[int, int],
+    mount_pitch_deg: float,
+    mount_yaw_deg: float,
+    stabilised: bool,
+    seed: int,
+    origin: tuple[float, float] | None,
+    orthophoto: Path | None,
+    crs: str | None,
+    photos: Path | None,
+) -> None:
+    from fractus_world.photos import Photos  # noqa: PLC0415 - the command line stays quick
+    from fractus_world.raster import read_raster  # noqa: PLC0415
+    from fractus_world.server import CameraServer  # noqa: PLC0415
+    from fractus_world.studio import Studio  # noqa: PLC0415
+    from fractus_world.whereabouts import Fixed, Vehicle, parse_address  # noqa: PLC0415
+    from fractus_world.world import World, WorldAround  # noqa: PLC0415
+
+    try:
+        intrinsics = Intrinsics(*resolution, fov_deg)
+        mount = Mount(mount_pitch_deg, mount_yaw_deg, stabilised)
+        whereabouts: Vehicle | Fixed = Vehicle(parse_address(vehicle), ground_amsl_m)
+        if pose is not None:
+            whereabouts = Fixed(pose, ground_amsl_m or 0.0)
+        own = None if orthophoto is None else World.on(read_raster(orthophoto, crs, origin), seed)
+        album = None if photos is None else Photos.of(photos)
+    except ValueError as error:
+        raise click.ClickException(str(error)) from error
+    world = WorldAround(seed, origin, own)
+    studio = Studio(world, whereabouts, intrinsics, mount, now=time.time, photos=album)
+    try:
+        server = CameraServer(listen, studio)
+    except OSError as error:
+        raise click.ClickException(f"--listen {listen[0]}:{listen[1]}: {error}") from error
+    if isinstance(whereabouts, Vehicle):
+        whereabouts.start()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: threading.Thread(target=server.shutdown).start())
+    click.echo(f"camera world at http://{listen[0]}:{server.port}/", err=True)
+    server.serve_forever()
+    server.server_close()
+
+
+def main() -> None:
+    """Entry point of `fractus-camera-world`."""
+    camera_world.main(args=sys.argv[1:], prog_name="fractus-camera-world")
+
+
+if __name__ == "__main__":
+    main()

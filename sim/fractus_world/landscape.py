@@ -1,0 +1,262 @@
+"""The procedural ground: paints a tile of any level straight from the layout of roads and blocks."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from fractus_core.geo import LocalFrame
+from numpy.typing import NDArray
+
+from fractus_world.blocks import Block, Blocks, Kind, Patch, Roof
+from fractus_world.canvas import SUN_SHADOW, Canvas, Colour, Noise
+from fractus_world.roads import Road, Roads, lengthened, strip
+from fractus_world.tiles import TILE_PX, Picture
+
+Points = NDArray[np.float64]
+
+FINEST_M = 0.03125
+LEVELS = 12
+_GRASS: Colour = (82, 126, 110)
+_ASPHALT: Colour = (106, 106, 108)
+_KERB: Colour = (156, 160, 162)
+_TRACK: Colour = (128, 152, 166)
+_PAINT: Colour = (214, 218, 220)
+_TREES_DOWN_TO_M = 0.7
+_DETAIL_DOWN_TO_M = 2.1
+_AFAR: dict[Kind, Colour] = {
+    "wood": (44, 72, 54),
+    "houses": (92, 112, 112),
+    "works": (140, 144, 146),
+    "park": (72, 116, 92),
+    "meadow": (78, 130, 112),
+}
+_SHADOW_DEPTH = 0.56
+_EARTHY, _LEAFY = np.array([0.86, 1.0, 0.98], np.float32), np.array([0.8, 1.0, 1.0], np.float32)
+_LIGHT = np.clip(np.outer(np.arange(256), [0.97, 1.0, 1.03]), 0, 255).astype(np.uint8).reshape(256, 1, 3)
+"""The colour of an afternoon."""
+_DASH_M, _DASH_EVERY_M, _JUNCTION_M = 3.0, 9.0, 11.0
+
+
+class Landscape:
+    """A ground that a seed makes; see `tiles.Ground`."""
+
+    def __init__(self, frame: LocalFrame, seed: int) -> None:
+        self.frame = frame
+        self.finest_m = FINEST_M
+        self.levels = LEVELS
+        self.roads = Roads(seed)
+        self.blocks = Blocks(self.roads)
+        self._noise = Noise(seed)
+
+    def tile(self, level: int, column: int, row: int) -> Picture:
+        """Paint one tile."""
+        pixel_m = FINEST_M * 2**level
+        extent = TILE_PX * pixel_m
+        canvas = Canvas(column * extent, -row * extent, pixel_m, TILE_PX, _GRASS)
+        west, south, east, north = canvas.box
+        near = self.blocks.near(west, south, east, north)
+        if pixel_m > _DETAIL_DOWN_TO_M:
+            self._from_afar(canvas, near)
+            self._grain(canvas)
+        else:
+            blocks = [self.blocks.block(i, j) for i, j in near]
+            blocks = [block for block in blocks if canvas.sees(block.outline, 12.0)]
+            for block in blocks:
+                _patches(canvas, block)
+            self._roads(canvas, near)
+            self._grain(canvas)
+            _stand_up(canvas, blocks)
+        return np.asarray(cv2.LUT(canvas.colour, _LIGHT), np.uint8)
+
+    def _from_afar(self, canvas: Canvas, near: list[tuple[int, int]]) -> None:
+        """Only what shows from kilometres away: what each block is used for, with straight borders."""
+        vertex = self.roads.vertex
+        for i, j in near:
+            kind = self.blocks.kind(i, j)
+            colour = self.blocks.crop(i, j) if kind == "fields" else _AFAR[kind]
+            outline = np.array([vertex(i, j), vertex(i + 1, j), vertex(i + 1, j + 1), vertex(i, j + 1)])
+            canvas.fill(outline, colour, 90)
+        for i, j in near if canvas.pixel_m < 10.0 else ():
+            for road, corner in ((Road("east", j), (i + 1, j)), (Road("north", i), (i, j + 1))):
+                if road.main:
+                    canvas.line(np.array([vertex(i, j), vertex(*corner)]), _ASPHALT, 9.0)
+
+    def _roads(self, canvas: Canvas, near: list[tuple[int, int]]) -> None:
+        pieces = [(road, step) for i, j in near for road, step in ((Road("east", j), i), (Road("north", i), j))]
+        pieces = [piece for piece in pieces if canvas.sees(self.roads.edge(*piece), 8.0)]
+        pieces = sorted(pieces, key=lambda piece: piece[0].main)
+        for paved in (False, True):
+            for road, step in pieces:
+                self._carriageway(canvas, road, step, paved=paved)
+        for road, step in pieces:
+            if road.main or self.roads.built_up(road, step):
+                x, y = self.roads.vertex(*road.vertex(step))
+                canvas.disc(x, y, self.roads.width_m(road, step) / 2 + 2.0, _ASPHALT, 36)
+        for road, step in pieces:
+            if road.main or self.roads.built_up(road, step):
+                _marks(canvas, self.roads.edge(road, step), self.roads.width_m(road, step), road.main)
+
+    def _carriageway(self, canvas: Canvas, road: Road, step: int, *, paved: bool) -> None:
+        """One piece of road: first what lies beside it, then, over the verges of its neighbours, its surface."""
+        edge, half = lengthened(self.roads.edge(road, step), 2.5), self.roads.width_m(road, step) / 2
+        built_up = self.roads.built_up(road, step)
+        if not paved:
+            if built_up:
+                canvas.fill(strip(edge, half + 2.2, -half - 2.2), _KERB, 40)
+                canvas.fill(strip(edge, half + 0.15, -half - 0.15), (122, 126, 128), 30)
+            elif road.main:
+                canvas.fill(strip(edge, half + 1.6, -half - 1.6), (92, 136, 124), 130)
+                canvas.fill(strip(edge, half + 0.4, -half - 0.4), (112, 128, 134), 70)
+            else:
+                canvas.fill(strip(edge, half + 1.0, -half - 1.0), (84, 132, 116), 130)
+                canvas.fill(strip(edge, half, -half), _TRACK, 90)
+                canvas.fill(strip(edge, 0.45, -0.45), (96, 134, 128), 140)
+        elif built_up or road.main:
+            canvas.fill(strip(edge, half, -half), _ASPHALT, 36)
+            if canvas.pixel_m < 0.3:
+                for wheel in (-0.72, -0.3, 0.3, 0.72):
+                    canvas.line(edge[:, :2] + wheel * half * edge[:, 2:], (98, 98, 100), 0.5)
+
+    def _grain(self, canvas: Canvas) -> None:
+        """Uneven ground: clods, tufts and stains, as rough as each material is."""
+        fine = self._noise.between(0.0, 0.6, canvas) * 6.5 + self._noise.between(1.0, 4.5, canvas) * 5.5
+        shift = fine * (canvas.rough.astype(np.float32) / 128.0)
+        shift += self._noise.between(8.0, 70.0, canvas) * 3.6 + self._noise.between(120.0, 300.0, canvas) * 2.0
+        shifts = cv2.merge([shift * part for part in _EARTHY])
+        canvas.colour = np.asarray(cv2.add(canvas.colour, shifts, dtype=cv2.CV_8U), np.uint8)
+
+
+def _patches(canvas: Canvas, block: Block) -> None:
+    for index in canvas.within(block.patch_boxes):
+        patch = block.patches[index]
+        canvas.fill(patch.outline, patch.colour, patch.rough)
+        if patch.rows_deg is not None and canvas.pixel_m < 1.2:
+            _rows(canvas, patch, patch.rows_deg)
+
+
+def _rows(canvas: Canvas, patch: Patch, heading_deg: float) -> None:
+    """Rows of a crop, swaths, and the tramlines that a tractor leaves every 18 m."""
+    mask = canvas.mask(patch.outline)
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if len(rows) == 0:
+        return
+    y0, y1, x0, x1 = int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+    across = math.radians(heading_deg + 90.0)
+    east = (canvas.left_m + (np.arange(x0, x1) + 0.5) * canvas.pixel_m) * math.sin(across)
+    north = (canvas.top_m - (np.arange(y0, y1) + 0.5) * canvas.pixel_m) * math.cos(across)
+    first = float(east.min() + north.min())
+    fine = max(canvas.pixel_m / 2, 0.02)
+    count = int((float(east.max() + north.max()) - first) / fine) + 2
+    profile = _profile(first + fine * np.arange(count), canvas.pixel_m)
+    index = ((east[None, :] + north[:, None] - first) / fine).astype(np.int32)
+    shift = profile[index] * (mask[y0:y1, x0:x1].astype(np.float32) / 255.0)
+    part = canvas.colour[y0:y1, x0:x1]
+    part[:] = np.clip(part + shift[..., None] * _LEAFY, 0, 255).astype(np.uint8)
+
+
+def _profile(across_m: NDArray[np.floating], pixel_m: float) -> NDArray[np.float32]:
+    """Brightness across the rows of a field."""
+    seen = np.clip(0.8 - pixel_m / 0.75, 0.0, 1.0)
+    rows = 7.0 * seen * np.sin(across_m * (2 * math.pi / 0.75))
+    swath = np.where((across_m // 6.0) % 2 < 1.0, 2.2, -2.2)
+    tram = across_m % 18.0
+    lines = np.where((np.abs(tram - 8.1) < 0.28) | (np.abs(tram - 9.9) < 0.28), -17.0, 0.0)
+    if pixel_m > 0.28:
+        lines = lines * 0.28 / pixel_m * (np.abs(tram - 9.0) < 1.2)
+    return np.asarray(rows + swath + lines, np.float32)
+
+
+def _marks(canvas: Canvas, edge: Points, width_m: float, main: bool) -> None:
+    """Lines along both sides of a main road, dashes in the middle."""
+    if canvas.pixel_m > 0.5:
+        return
+    way = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(edge[:, :2], axis=0), axis=1))))
+
+    def between(start_m: float, end_m: float, offset_m: float, count: int) -> Points:
+        at = np.linspace(start_m, end_m, count)
+        line = np.column_stack([np.interp(at, way, edge[:, k]) for k in range(4)])
+        points: Points = line[:, :2] + offset_m * line[:, 2:]
+        return points
+
+    length = float(way[-1])
+    if main:
+        for side in (-1.0, 1.0):
+            points = between(_JUNCTION_M, length - _JUNCTION_M, side * (width_m / 2 - 0.35), 48)
+            canvas.line(points, _PAINT, 0.14)
+    at = _JUNCTION_M
+    while at + _DASH_M < length - _JUNCTION_M:
+        dash = between(at, at + _DASH_M, 0.0, 3)
+        if canvas.sees(dash, 1.0):
+            canvas.line(dash, _PAINT, 0.14)
+        at += _DASH_EVERY_M
+
+
+def _stand_up(canvas: Canvas, blocks: list[Block]) -> None:
+    """What is higher than the ground, after its shadow."""
+    roofs = [block.roofs[index] for block in blocks for index in canvas.within(block.roof_boxes, 10.0)]
+    trees = _trees(canvas, blocks) if canvas.pixel_m <= _TREES_DOWN_TO_M else np.empty((0, 4))
+    for roof in roofs:
+        canvas.shadow(roof.corners, roof.height_m)
+    for x, y, radius, _ in trees:
+        canvas.round_shadow(x, y, radius, 1.5 * radius)
+    canvas.cast(_SHADOW_DEPTH)
+    for roof in roofs:
+        _roof(canvas, roof)
+    for x, y, radius, looks in trees:
+        canvas.crown(x, y, radius, looks)
+
+
+def _trees(canvas: Canvas, blocks: list[Block]) -> Points:
+    west, south, east, north = canvas.box
+    margin = 9.0
+    found = [block.trees for block in blocks if len(block.trees)]
+    if not found:
+        return np.empty((0, 4))
+    trees = np.vstack(found)
+    x, y = trees[:, 0], trees[:, 1]
+    keep = (x > west - margin) & (x < east + margin) & (y > south - margin) & (y < north + margin)
+    keep &= trees[:, 2] > 1.1 * canvas.pixel_m
+    return np.asarray(trees[keep])
+
+
+def _roof(canvas: Canvas, roof: Roof) -> None:
+    a, b, c, d = roof.corners
+    if not roof.gabled:
+        canvas.fill(roof.corners, _lit(roof.colour, 1.12), 20)
+        middle = roof.corners.mean(axis=0)
+        canvas.fill(middle + (roof.corners - middle) * 0.95, roof.colour, 30)
+        for u, v in ((0.3, 0.35), (0.62, 0.6), (0.75, 0.3)):
+            at = a + u * (b - a) + v * (d - a)
+            box = at + np.array([(-0.9, -0.9), (0.9, -0.9), (0.9, 0.9), (-0.9, 0.9)])
+            canvas.fill(box + np.array(SUN_SHADOW) * 0.8, _lit(roof.colour, 0.62))
+            canvas.fill(box, (178, 178, 176))
+        return
+    start, end = (a + d) / 2, (b + c) / 2
+    for near, far in ((a, b), (d, c)):
+        outward = (near + far) / 2 - (start + end) / 2
+        facing = float(outward @ np.array(SUN_SHADOW)) / float(np.linalg.norm(outward))
+        half = np.array([near, far, end, start])
+        canvas.fill(half, _lit(roof.colour, 1.0 - 0.26 * facing))
+        if canvas.pixel_m < 0.07:
+            _courses(canvas, half, _lit(roof.colour, 0.9 - 0.26 * facing))
+    canvas.line(np.array([start, end]), _lit(roof.colour, 0.78), 0.16)
+    chimney = start + 0.3 * (end - start) + 0.18 * (d - a)
+    box = chimney + np.array([(-0.4, -0.4), (0.4, -0.4), (0.4, 0.4), (-0.4, 0.4)])
+    canvas.fill(np.vstack((box[:2] + np.array(SUN_SHADOW) * 1.2, box[2:])), _lit(roof.colour, 0.6))
+    canvas.fill(box, (92, 96, 112))
+
+
+def _courses(canvas: Canvas, half: Points, colour: Colour) -> None:
+    """The courses of tiles on one side of a roof, parallel to the ridge."""
+    near, far, end, start = half
+    count = int(np.linalg.norm(start - near) / 0.36)
+    for k in range(1, count):
+        share = k / count
+        canvas.line(np.array([near + share * (start - near), far + share * (end - far)]), colour, 0.05)
+
+
+def _lit(colour: Colour, factor: float) -> Colour:
+    blue, green, red = (min(max(int(part * factor), 0), 255) for part in colour)
+    return blue, green, red

@@ -1,0 +1,160 @@
+"""Photographs of a place instead of a rendered world: of a directory of geotagged pictures, the one taken nearest."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+from scipy.spatial import cKDTree
+
+from fractus_world.render import Band
+
+Picture = NDArray[np.uint8]
+
+MAX_FILES = 200_000
+MAX_PIXELS = 120_000_000
+_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"})
+_THERMAL_FOLDERS = frozenset({"ir", "thermal"})
+_THERMAL_ENDINGS = ("_ir", "-ir", "_t", "_thermal")
+_GPS_IFD = 0x8825
+_LAT_REF, _LAT, _LON_REF, _LON, _ALT_REF, _ALT = range(1, 7)
+_A = 6_378_137.0
+_E2 = (2 - 1 / 298.257223563) / 298.257223563
+
+
+class PhotoError(ValueError):
+    """A directory or picture that cannot be used."""
+
+
+@dataclass(frozen=True, slots=True)
+class Photo:
+    """A geotagged picture.
+
+    Attributes:
+        path: The file.
+        lat: Latitude, degrees.
+        lon: Longitude, degrees.
+        amsl_m: Altitude above mean sea level; 0 where the file does not tell.
+        band: What it was taken in.
+    """
+
+    path: Path
+    lat: float
+    lon: float
+    amsl_m: float
+    band: Band
+
+
+class Photos:
+    """An index of geotagged pictures, of daylight and thermal ones apart.
+
+    A file is thermal when a folder on its path below the directory is called `ir` or `thermal`, or when its name ends in
+    `_ir`, `-ir`, `_thermal` or `_T` (as drones of DJI name them).
+
+    Args:
+        photos: The pictures.
+
+    Raises:
+        PhotoError: There are none.
+    """
+
+    def __init__(self, photos: list[Photo]) -> None:
+        if not photos:
+            raise PhotoError("no picture has a GPS position in its EXIF data")
+        self._bands: dict[Band, list[Photo]] = {}
+        for photo in photos:
+            self._bands.setdefault(photo.band, []).append(photo)
+        self._trees = {
+            band: cKDTree([_cartesian(photo.lat, photo.lon, photo.amsl_m) for photo in found])
+            for band, found in self._bands.items()
+        }
+
+    @classmethod
+    def of(cls, directory: Path) -> Photos:
+        """Index a directory and everything below it.
+
+        Raises:
+            PhotoError: It does not exist, is too large, or holds no geotagged picture.
+        """
+        if not directory.is_dir():
+            raise PhotoError(f"{directory}: is no directory")
+        paths = sorted(path for path in directory.rglob("*") if path.suffix.lower() in _SUFFIXES and path.is_file())
+        if len(paths) > MAX_FILES:
+            raise PhotoError(f"{directory}: has {len(paths):,} pictures; at most {MAX_FILES:,} are indexed")
+        found = [photo for photo in (_read(path, directory) for path in paths) if photo is not None]
+        if not found:
+            raise PhotoError(f"{directory}: none of its {len(paths)} pictures has a GPS position in its EXIF data")
+        return cls(found)
+
+    def nearest(self, lat: float, lon: float, amsl_m: float, band: Band) -> tuple[Photo, float]:
+        """The picture of a band taken nearest to a place in three dimensions, and how far away, metres.
+
+        Raises:
+            PhotoError: There is no picture of the band.
+        """
+        tree = self._trees.get(band)
+        if tree is None:
+            raise PhotoError(f"band: there is no {band} picture")
+        away, index = tree.query(_cartesian(lat, lon, amsl_m))
+        return self._bands[band][int(index)], float(away)
+
+
+def _cartesian(lat: float, lon: float, amsl_m: float) -> tuple[float, float, float]:
+    """Earth-centred coordinates, so that distances are metres wherever the pictures are."""
+    phi, lam = math.radians(lat), math.radians(lon)
+    n = _A / math.sqrt(1 - _E2 * math.sin(phi) ** 2)
+    flat = (n + amsl_m) * math.cos(phi)
+    return flat * math.cos(lam), flat * math.sin(lam), (n * (1 - _E2) + amsl_m) * math.sin(phi)
+
+
+def _read(path: Path, directory: Path) -> Photo | None:
+    try:
+        with Image.open(path) as image:
+            gps = image.getexif().get_ifd(_GPS_IFD)
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError):
+        return None  # not a picture: the directory may hold anything
+    try:
+        lat, lon = _angle(gps[_LAT], gps[_LAT_REF], "S"), _angle(gps[_LON], gps[_LON_REF], "W")
+        amsl_m = float(gps.get(_ALT, 0.0)) * (-1.0 if gps.get(_ALT_REF) in (1, b"\x01") else 1.0)
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None
+    if not (abs(lat) <= 90.0 and abs(lon) <= 180.0 and abs(amsl_m) < 50_000.0):
+        return None
+    below = path.relative_to(directory)
+    thermal = any(part.lower() in _THERMAL_FOLDERS for part in below.parts[:-1])
+    thermal = thermal or below.stem.lower().endswith(_THERMAL_ENDINGS)
+    return Photo(path, lat, lon, amsl_m, "ir" if thermal else "rgb")
+
+
+def _angle(parts: Any, reference: Any, negative: str) -> float:
+    degrees, minutes, seconds = (float(part) for part in parts)
+    sign = -1.0 if str(reference).upper().startswith(negative) else 1.0
+    return sign * (degrees + minutes / 60.0 + seconds / 3600.0)
+
+
+def developed(photo: Photo, width: int, height: int) -> Picture:
+    """A photograph in a size, shape (height, width, 3); what does not fit its shape is cut off at the edges.
+
+    Raises:
+        PhotoError: The file cannot be read any more.
+    """
+    try:
+        with Image.open(photo.path) as image:
+            if image.width * image.height > MAX_PIXELS:
+                raise PhotoError(f"{photo.path}: more than {MAX_PIXELS:,} pixels")
+            image.draft("RGB", (width, height))
+            pixels = np.asarray(image.convert("RGB"))[..., ::-1]
+    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+        raise PhotoError(f"{photo.path}: cannot be read: {error}") from error
+    scale = max(width / pixels.shape[1], height / pixels.shape[0])
+    w, h = round(width / scale), round(height / scale)
+    x, y = (pixels.shape[1] - w) // 2, (pixels.shape[0] - h) // 2
+    part = np.ascontiguousarray(pixels[y : y + h, x : x + w])
+    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(part, (width, height), interpolation=way), np.uint8)

@@ -1,0 +1,159 @@
+"""The user's own aerial picture as a ground: a GeoTIFF, or a PNG or JPEG with a world file."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import tifffile
+from fractus_core.geo import LocalFrame
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from fractus_world.georeference import Georeference, GeoreferenceError, from_geotiff, parse_system, read_world_file
+from fractus_world.optics import Matrix
+from fractus_world.tiles import TILE_PX, Picture
+
+MAX_PIXELS = 400_000_000
+NOTHING = (112, 118, 116)
+"""Colour of what lies outside the picture: blue, green, red."""
+_GRID = 16
+_LEVELS = 12
+
+
+class Raster:
+    """A ground that is a picture; see `tiles.Ground`.
+
+    Args:
+        picture: Shape (height, width, 3); blue, green, red.
+        reference: Where it lies.
+    """
+
+    def __init__(self, picture: Picture, reference: Georeference) -> None:
+        height, width = picture.shape[:2]
+        lat, lon = reference.place(width / 2, height / 2)
+        self.frame = LocalFrame(lat, lon)
+        self.levels = _LEVELS
+        self._reference = reference
+        self._halved = [picture]
+        across = [self.frame.xy(*reference.place(width / 2 + dx, height / 2 + dy)) for dx, dy in ((1, 0), (0, 1))]
+        (ax, ay), (bx, by) = across
+        self.finest_m = math.sqrt(abs(ax * by - ay * bx))
+        if not 1e-4 < self.finest_m < 1000.0:
+            raise GeoreferenceError(
+                f"a pixel is {self.finest_m:g} m wide; is the world file in the units of its system?"
+            )
+
+    def tile(self, level: int, column: int, row: int) -> Picture:
+        """Cut a tile out of the picture, as large and as turned as it lies."""
+        grid = self._source(level, column, row) / 2.0**level
+        source = self._half(level)
+        low = np.floor(grid.reshape(-1, 2).min(axis=0)).astype(int) - 2
+        high = np.ceil(grid.reshape(-1, 2).max(axis=0)).astype(int) + 3
+        low, high = np.maximum(low, 0), np.minimum(high, [source.shape[1], source.shape[0]])
+        blank = np.empty((TILE_PX, TILE_PX, 3), np.uint8)
+        blank[:] = NOTHING
+        if bool((low >= high).any()):
+            return blank
+        part = np.ascontiguousarray(source[low[1] : high[1], low[0] : high[0]])
+        maps = [_interpolated(grid[..., axis] - low[axis] - 0.5) for axis in (0, 1)]
+        border = cv2.BORDER_CONSTANT
+        drawn = cv2.remap(part, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=border, borderValue=NOTHING)
+        return np.asarray(drawn, np.uint8)
+
+    def _source(self, level: int, column: int, row: int) -> Matrix:
+        """Pixels of the whole picture at the corners of a tile's cells, shape (n, n, 2)."""
+        metres = self.finest_m * 2**level
+        at = np.linspace(0.0, TILE_PX, _GRID + 1)
+        x, y = np.meshgrid((column * TILE_PX + at) * metres, -(row * TILE_PX + at) * metres)
+        places = np.array([self._place(float(e), float(n)) for e, n in zip(x.ravel(), y.ravel(), strict=True)])
+        return self._reference.pixels(places[:, 0], places[:, 1]).reshape(_GRID + 1, _GRID + 1, 2)
+
+    def _place(self, east_m: float, north_m: float) -> tuple[float, float]:
+        # Beyond a thousand kilometres is nothing but the colour of nothing.
+        away = math.hypot(east_m, north_m)
+        share = min(1.0, 1e6 / away) if away else 1.0
+        return self.frame.latlon(east_m * share, north_m * share)
+
+    def _half(self, level: int) -> Picture:
+        """The picture, halved so many times."""
+        while len(self._halved) <= level:
+            last = self._halved[-1]
+            size = (max(-(-last.shape[1] // 2), 1), max(-(-last.shape[0] // 2), 1))
+            # Of odd sizes the last row or column is repeated, so that pixels stay where they are.
+            even = cv2.copyMakeBorder(
+                last, 0, 2 * size[1] - last.shape[0], 0, 2 * size[0] - last.shape[1], cv2.BORDER_REPLICATE
+            )
+            self._halved.append(np.asarray(cv2.resize(even, size, interpolation=cv2.INTER_AREA), np.uint8))
+        return self._halved[level]
+
+
+def _interpolated(grid: Matrix) -> NDArray[np.float32]:
+    at = (np.arange(TILE_PX) + 0.5) * (_GRID / TILE_PX)
+    first = np.minimum(at.astype(int), _GRID - 1)
+    weights = np.zeros((TILE_PX, _GRID + 1))
+    weights[np.arange(TILE_PX), first] = 1.0 - (at - first)
+    weights[np.arange(TILE_PX), first + 1] = at - first
+    return np.asarray(weights @ grid @ weights.T, np.float32)
+
+
+def read_raster(path: Path, crs: str | None = None, origin: tuple[float, float] | None = None) -> Raster:
+    """Read a GeoTIFF, or a picture with a world file.
+
+    Args:
+        path: TIFF, PNG or JPEG.
+        crs: System of the world file: `local`, `EPSG:4326` (the default) or a UTM zone; a GeoTIFF says it itself.
+        origin: Latitude and longitude that `local` coordinates count from.
+
+    Raises:
+        GeoreferenceError: It cannot be read, or does not say where it lies.
+    """
+    if path.suffix.lower() in (".tif", ".tiff"):
+        return _read_tiff(path, crs, origin)
+    try:
+        with Image.open(path) as image:
+            _check_size(path, image.width, image.height)
+            pixels = np.asarray(image.convert("RGB"))
+    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+        raise GeoreferenceError(f"{path}: is not a picture that can be read: {error}") from error
+    reference = read_world_file(path, parse_system(crs or "EPSG:4326", origin))
+    return Raster(np.ascontiguousarray(pixels[..., ::-1]), reference)
+
+
+def _read_tiff(path: Path, crs: str | None, origin: tuple[float, float] | None) -> Raster:
+    try:
+        with tifffile.TiffFile(path) as file:
+            page = file.pages.first
+            _check_size(path, page.imagewidth, page.imagelength)
+            tags = file.geotiff_metadata
+            pixels = page.asarray()
+            planar = int(page.planarconfig) == 2
+    except (OSError, tifffile.TiffFileError, ValueError, IndexError, KeyError) as error:
+        raise GeoreferenceError(f"{path}: is not a TIFF that can be read: {error}") from error
+    if pixels.dtype != np.uint8:
+        raise GeoreferenceError(
+            f"{path}: has {pixels.dtype} samples; convert them to 8 bits (gdal_translate -ot Byte -scale)"
+        )
+    if pixels.ndim == 3 and planar:
+        pixels = np.moveaxis(pixels, 0, -1)
+    if pixels.ndim == 2:
+        pixels = np.repeat(pixels[..., None], 3, axis=2)
+    if pixels.ndim != 3 or pixels.shape[2] < 3:
+        raise GeoreferenceError(f"{path}: has {pixels.shape} samples; red, green and blue are expected")
+    if tags and crs is None:
+        reference = from_geotiff(tags, str(path), origin)
+    else:
+        reference = read_world_file(path, parse_system(crs or "EPSG:4326", origin))
+    picture = np.ascontiguousarray(pixels[..., 2::-1])
+    if pixels.shape[2] == 4:
+        picture[pixels[..., 3] == 0] = NOTHING
+    return Raster(picture, reference)
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
+    if width * height > MAX_PIXELS:
+        raise GeoreferenceError(
+            f"{path}: {width}x{height} is more than {MAX_PIXELS:,} pixels; make it smaller or cut it (gdal_translate)"
+        )

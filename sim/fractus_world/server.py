@@ -1,0 +1,131 @@
+"""The simulated world as an IP camera: the HTTP server, which no number of slow clients can stall."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+import time
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import parse_qsl, urlsplit
+
+from fractus_world.studio import Answer, Refused, Studio
+
+log = logging.getLogger(__name__)
+
+MAX_CLIENTS = 32
+CLIENT_TIMEOUT_S = 10.0
+CLIENT_LIFE_S = 30.0
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """One request a connection, so that an idle client holds nothing."""
+
+    server: CameraServer
+    server_version = "fractus-camera-world"
+    sys_version = ""
+    timeout = CLIENT_TIMEOUT_S
+
+    def do_GET(self) -> None:
+        if self._deserted():
+            # A connection that breaks off in the middle of a request looks like its end; nobody waits for the picture.
+            self.close_connection = True
+            return
+        parts = urlsplit(self.path)
+        try:
+            answer = self.server.studio.answer(parts.path, dict(parse_qsl(parts.query, max_num_fields=16)))
+        except Refused as refusal:
+            self._send(refusal.status, Answer("text/plain; charset=utf-8", f"{refusal}\n".encode()))
+        except ValueError as error:
+            self._send(HTTPStatus.BAD_REQUEST, Answer("text/plain; charset=utf-8", f"query: {error}\n".encode()))
+        else:
+            self._send(HTTPStatus.OK, answer)
+
+    def _deserted(self) -> bool:
+        """Whether nobody is at the other end any more."""
+        self.connection.settimeout(0.0)
+        try:
+            return not self.connection.recv(1, socket.MSG_PEEK)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+        finally:
+            self.connection.settimeout(self.timeout)
+
+    def _send(self, status: HTTPStatus, answer: Answer) -> None:
+        try:
+            self.send_response(status)
+            self.send_header("Content-Type", answer.content_type)
+            self.send_header("Content-Length", str(len(answer.body)))
+            self.send_header("Cache-Control", "no-store")
+            for name, value in answer.headers:
+                self.send_header(name, value)
+            self.end_headers()
+            self.wfile.write(answer.body)
+        except OSError as error:
+            log.debug("a client went away: %s", error)
+            self.close_connection = True
+
+    def log_message(self, format: str, *args: object) -> None:
+        log.debug("%s %s", self.client_address[0], format % args)
+
+
+class CameraServer(ThreadingHTTPServer):
+    """Serves a studio to a limited number of clients, each for a limited time.
+
+    Args:
+        address: Host and port to listen on; port 0 takes a free one.
+        studio: Answers the requests.
+    """
+
+    daemon_threads = True
+    request_queue_size = 64
+    allow_reuse_address = True
+
+    def __init__(self, address: tuple[str, int], studio: Studio) -> None:
+        if ":" in address[0]:
+            self.address_family = socket.AF_INET6
+        self.studio = studio
+        self._clients: dict[socket.socket, float] = {}
+        self._lock = threading.Lock()
+        super().__init__(address, _Handler)
+
+    @property
+    def port(self) -> int:
+        """The port it listens on."""
+        return int(self.server_address[1])
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Serve a client in a thread of its own, or close the connection when there are too many."""
+        with self._lock:
+            full = len(self._clients) >= MAX_CLIENTS
+            if not full:
+                self._clients[request] = time.monotonic()
+        if full:
+            self.shutdown_request(request)
+            return
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Close a connection."""
+        with self._lock:
+            self._clients.pop(request, None)
+        super().shutdown_request(request)
+
+    def service_actions(self) -> None:
+        """Cut off clients that have been connected for too long."""
+        now_s = time.monotonic()
+        with self._lock:
+            old = [client for client, since_s in self._clients.items() if now_s - since_s > CLIENT_LIFE_S]
+        for client in old:
+            try:
+                client.shutdown(socket.SHUT_RDWR)
+            except OSError as error:
+                log.debug("a slow client is gone already: %s", error)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Note what went wrong with one client; the others are not concerned."""
+        log.warning("request of %s failed", client_address, exc_info=True)

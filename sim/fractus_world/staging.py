@@ -1,0 +1,357 @@
+"""Draws what stands and moves on the ground into a picture, and finds out what of it can be seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from fractus_core.geo import LocalFrame
+from numpy.typing import NDArray
+
+from fractus_world.billboards import Billboard, Gallery, portrait
+from fractus_world.bodies import Colour, Part, parts_of, silhouette
+from fractus_world.canvas import SUN_SHADOW
+from fractus_world.optics import NEAR_M, Matrix, View
+from fractus_world.population import Population, Thing, nearest
+from fractus_world.render import Band
+from fractus_world.truth import Box, Seen, SeenFace
+
+Picture = NDArray[np.uint8]
+Labels = NDArray[np.int32]
+Fixed = NDArray[np.int32]
+
+_SHIFT = 4
+_MOST_THINGS = 500
+_SMALL_PX = 14.0
+_SILHOUETTE_PX = 7.0
+_SHADELESS_PX = 5.0
+_TINY_PX = 1.2
+_LEAST_BOARD_PX = 6.0
+_REACH = 0.55
+"""Things are drawn as far away as so many focal lengths in pixels are metres."""
+_SHADOW = 0.5
+_BOARD_BACK = (96, 100, 104)
+_FRAME_WARMTH = 118
+_FAR_PX = 30_000.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Shape:
+    """A convex piece of something.
+
+    Attributes:
+        hull: Its corners in fixed-point pixels, shape (n, 1, 2).
+        colour: Blue, green, red.
+        warmth: Grey value for a thermal camera.
+    """
+
+    hull: Fixed
+    colour: Colour
+    warmth: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Actor:
+    """A thing or billboard in sight.
+
+    Attributes:
+        what: The thing or billboard.
+        away_m: From the camera; what is nearer covers what is farther.
+        shapes: Its parts as they are drawn; a billboard's one.
+        shadow: Its shadow in fixed-point pixels; None when it has none or a corner of it is out of sight.
+        points: All its corners in pixels.
+    """
+
+    what: Thing | Billboard
+    away_m: float
+    shapes: tuple[_Shape, ...]
+    shadow: Fixed | None
+    points: Matrix
+
+
+class Stage:
+    """What stands and moves on a ground."""
+
+    def __init__(self, population: Population, gallery: Gallery) -> None:
+        self._population = population
+        self._gallery = gallery
+
+    def actors(self, view: View, time_s: float, hidden: frozenset[str] = frozenset()) -> list[_Actor]:
+        """What is in sight at a time, the farthest first."""
+        box = view.ground_within(_REACH * view.intrinsics.focal_px)
+        if box is None:
+            return []
+        box = box + np.array([[-14.0, -14.0], [14.0, 14.0]])
+        things = nearest(self._population.within(box, time_s), view.place, _MOST_THINGS)
+        actors = _thing_actors(view, [thing for thing in things if thing.id not in hidden])
+        boards = [_board_actor(view, board) for board in self._gallery.within(box) if board.id not in hidden]
+        actors += [actor for actor in boards if actor is not None]
+        return sorted(actors, key=lambda actor: (-actor.away_m, actor.what.id))
+
+    def draw(self, picture: Picture, view: View, actors: list[_Actor], band: Band) -> None:
+        """Draw what is in sight."""
+        if band == "rgb":
+            for actor in actors:
+                if actor.shadow is not None:
+                    _darken(picture, actor.shadow)
+        for actor in actors:
+            if isinstance(actor.what, Billboard):
+                _draw_board(picture, view, actor, actor.what, band)
+            else:
+                for shape in actor.shapes:
+                    _fill(picture, shape, band)
+
+    def truth(
+        self, view: View, actors: list[_Actor], frame: LocalFrame
+    ) -> tuple[tuple[Seen, ...], tuple[SeenFace, ...]]:
+        """What of each can be seen."""
+        lens = view.intrinsics
+        labels = np.zeros((lens.height, lens.width), np.int32)
+        for number, actor in enumerate(actors, start=1):
+            for shape in actor.shapes:
+                cv2.fillConvexPoly(labels, shape.hull, (number,), cv2.LINE_8, _SHIFT)
+        objects, faces = [], []
+        for number, actor in enumerate(actors, start=1):
+            if isinstance(actor.what, Billboard):
+                face = _seen_face(view, actor.what, labels, number, frame)
+                if face is not None:
+                    faces.append(face)
+            else:
+                shares = _shares(view, (shape.hull for shape in actor.shapes), labels, number)
+                seen = _seen_thing(view, actor, actor.what, shares, frame)
+                if seen is not None:
+                    objects.append(seen)
+        return tuple(objects), tuple(faces)
+
+
+def _thing_actors(view: View, things: list[Thing]) -> list[_Actor]:
+    """The things that are in sight; their corners are projected all at once."""
+    if not things:
+        return []
+    place = np.array([(thing.x, thing.y) for thing in things]) - view.place
+    away = np.hypot(np.hypot(place[:, 0], place[:, 1]), view.height_m)
+    sizes = np.array([max(thing.size_m) for thing in things]) * view.intrinsics.focal_px / np.maximum(away, 0.1)
+    parts = [_parts(thing, float(size)) for thing, size in zip(things, sizes, strict=True)]
+    counts = np.array([sum(len(part.points) for part in found) for found in parts])
+    corners = np.vstack([part.points for found in parts for part in found])
+    world = _placed(things, corners, counts)
+    pixels, depth = view.project(world)
+    fallen = world.copy()
+    fallen[:, :2] += world[:, 2:] * np.array(SUN_SHADOW)
+    fallen[:, 2] = 0.0
+    shade, shade_depth = view.project(fallen)
+    starts = np.concatenate(([0], np.cumsum(counts)[:-1]))
+    near = np.minimum.reduceat(depth, starts) < NEAR_M
+    low, high = np.minimum.reduceat(pixels, starts), np.maximum.reduceat(pixels, starts)
+    lens = view.intrinsics
+    outside = (high <= 0).any(axis=1) | (low[:, 0] >= lens.width) | (low[:, 1] >= lens.height)
+    shadeless = (np.minimum.reduceat(shade_depth, starts) < NEAR_M) | (sizes < _SHADELESS_PX)
+    fixed, fixed_shade = _fixed(pixels), _fixed(shade)
+    actors = []
+    for k in np.flatnonzero(~near & ~outside & (sizes >= _TINY_PX)):
+        span = np.s_[starts[k] : starts[k] + counts[k]]
+        shadow = None if shadeless[k] else cv2.convexHull(fixed_shade[span])
+        shapes = _shapes(fixed[span], parts[k])
+        actors.append(_Actor(things[k], float(away[k]), shapes, _as_fixed(shadow), pixels[span]))
+    return actors
+
+
+def _parts(thing: Thing, size_px: float) -> tuple[Part, ...]:
+    """The parts that show at a size; of what is only a few pixels long, its silhouette."""
+    if size_px < _SILHOUETTE_PX:
+        return silhouette(thing)
+    parts = parts_of(thing)
+    return parts if size_px >= _SMALL_PX else tuple(part for part in parts if not part.detail)
+
+
+def _placed(things: list[Thing], corners: Matrix, counts: NDArray[np.int64]) -> Matrix:
+    """Corners of bodies in the world's frame, shape (n, 3)."""
+    angles = np.radians([thing.heading_deg for thing in things])
+    sines, cosines = np.repeat(np.sin(angles), counts), np.repeat(np.cos(angles), counts)
+    x = np.repeat([thing.x for thing in things], counts) + corners[:, 0] * sines + corners[:, 1] * cosines
+    y = np.repeat([thing.y for thing in things], counts) + corners[:, 0] * cosines - corners[:, 1] * sines
+    return np.column_stack((x, y, corners[:, 2]))
+
+
+def _shapes(fixed: Fixed, parts: tuple[Part, ...]) -> tuple[_Shape, ...]:
+    shapes, start = [], 0
+    for part in parts:
+        hull = np.asarray(cv2.convexHull(fixed[start : start + len(part.points)]), np.int32)
+        shapes.append(_Shape(hull, part.colour, part.warmth))
+        start += len(part.points)
+    return tuple(shapes)
+
+
+def _as_fixed(hull: object) -> Fixed | None:
+    return None if hull is None else np.asarray(hull, np.int32)
+
+
+def _board_actor(view: View, board: Billboard) -> _Actor | None:
+    corners = board.corners()
+    pixels, depth = view.project(corners)
+    if bool((depth < NEAR_M).any()) or _outside(view, pixels):
+        return None
+    away = float(np.linalg.norm(corners.mean(axis=0) - [*view.place, view.height_m]))
+    if float(np.ptp(pixels, axis=0).max()) < _LEAST_BOARD_PX:
+        return None
+    shape = _Shape(_hull(pixels), _BOARD_BACK, _FRAME_WARMTH)
+    return _Actor(board, away, (shape,), _shadow(view, corners) if board.standing else None, pixels)
+
+
+def _outside(view: View, pixels: Matrix) -> bool:
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    lens = view.intrinsics
+    return bool(high[0] <= 0 or high[1] <= 0 or low[0] >= lens.width or low[1] >= lens.height)
+
+
+def _shadow(view: View, world: Matrix) -> Fixed | None:
+    fallen = world.copy()
+    fallen[:, :2] += world[:, 2:] * np.array(SUN_SHADOW)
+    fallen[:, 2] = 0.0
+    pixels, depth = view.project(fallen)
+    return None if bool((depth < NEAR_M).any()) else _hull(pixels)
+
+
+def _hull(pixels: Matrix) -> Fixed:
+    return np.asarray(cv2.convexHull(_fixed(pixels)), np.int32)
+
+
+def _fixed(points: Matrix) -> Fixed:
+    """Pixel coordinates as OpenCV's fixed-point numbers, whose origin is the middle of the first pixel."""
+    return np.round((np.clip(points, -_FAR_PX, _FAR_PX) - 0.5) * (1 << _SHIFT)).astype(np.int32)
+
+
+def _fill(picture: Picture, shape: _Shape, band: Band) -> None:
+    grey = shape.warmth
+    colour = shape.colour if band == "rgb" else (grey, grey, grey)
+    cv2.fillConvexPoly(picture, shape.hull, colour, cv2.LINE_AA, _SHIFT)
+
+
+def _clip(low: Matrix, high: Matrix, shape: tuple[int, ...]) -> tuple[int, int, int, int] | None:
+    """The whole pixels of a picture that a box touches; None when there are none."""
+    x0, y0 = max(math.floor(low[0]) - 1, 0), max(math.floor(low[1]) - 1, 0)
+    x1, y1 = min(math.ceil(high[0]) + 1, shape[1]), min(math.ceil(high[1]) + 1, shape[0])
+    return None if x0 >= x1 or y0 >= y1 else (x0, y0, x1, y1)
+
+
+def _darken(picture: Picture, hull: Fixed) -> None:
+    corners = hull[:, 0, :] / (1 << _SHIFT) + 0.5
+    found = _clip(corners.min(axis=0), corners.max(axis=0), picture.shape)
+    if found is None:
+        return
+    x0, y0, x1, y1 = found
+    light = np.full((y1 - y0, x1 - x0, 3), 255, np.uint8)
+    dark = int(255 * (1 - _SHADOW))
+    shifted = hull - np.array([x0, y0], np.int32) * (1 << _SHIFT)
+    cv2.fillConvexPoly(light, shifted.astype(np.int32), (dark + 10, dark, dark - 4), cv2.LINE_AA, _SHIFT)
+    part = picture[y0:y1, x0:x1]
+    part[:] = cv2.multiply(part, light, scale=1 / 255)
+
+
+def _draw_board(picture: Picture, view: View, actor: _Actor, board: Billboard, band: Band) -> None:
+    viewer = np.array([*view.place, view.height_m])
+    if board.standing:
+        _draw_posts(picture, view, board, band)
+    if not board.faces(viewer):
+        _fill(picture, actor.shapes[0], band)
+        return
+    found = _clip(actor.points.min(axis=0), actor.points.max(axis=0), picture.shape)
+    if found is None:
+        return
+    x0, y0, x1, y1 = found
+    size_px = max(
+        float(np.linalg.norm(actor.points[3] - actor.points[0])),
+        float(np.linalg.norm(actor.points[2] - actor.points[1])),
+    )
+    source = portrait(board.variation, max(math.floor(math.log2(max(300.0 / max(size_px, 1.0), 1.0))), 0))
+    if band == "ir":
+        source = np.full_like(source, 112)
+    height, width = source.shape[:2]
+    corners = np.array([(0, 0), (width, 0), (width, height), (0, height)], np.float32) - 0.5
+    target = (actor.points - [x0, y0] - 0.5).astype(np.float32)
+    matrix = cv2.getPerspectiveTransform(corners, target)
+    drawn = cv2.warpPerspective(
+        source, matrix, (x1 - x0, y1 - y0), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    cover = np.zeros((y1 - y0, x1 - x0), np.uint8)
+    cv2.fillConvexPoly(cover, _hull(actor.points - [x0, y0]), (255,), cv2.LINE_AA, _SHIFT)
+    weight = cover.astype(np.float32) / 255.0
+    part = picture[y0:y1, x0:x1]
+    part[:] = cv2.blendLinear(np.asarray(drawn, np.uint8), np.ascontiguousarray(part), weight, 1.0 - weight)
+
+
+def _draw_posts(picture: Picture, view: View, board: Billboard, band: Band) -> None:
+    lower = board.corners()[2:]
+    for share in (0.15, 0.85):
+        top = lower[0] + share * (lower[1] - lower[0])
+        foot = np.array([top[0], top[1], 0.0])
+        pixels, depth = view.project(np.array([top, foot]))
+        if not bool((depth < NEAR_M).any()):
+            width = max(0.12 * view.intrinsics.focal_px / float(depth.min()), 1.0)
+            ends = _fixed(pixels)
+            colour = _BOARD_BACK if band == "rgb" else (_FRAME_WARMTH,) * 3
+            cv2.line(picture, ends[0], ends[1], colour, min(round(width), 60), cv2.LINE_AA, _SHIFT)
+
+
+def _box(points: Matrix, view: View) -> Box | None:
+    lens = view.intrinsics
+    low, high = points.min(axis=0), points.max(axis=0)
+    left, top = max(float(low[0]), 0.0), max(float(low[1]), 0.0)
+    right, bottom = min(float(high[0]), float(lens.width)), min(float(high[1]), float(lens.height))
+    return None if left >= right or top >= bottom else (left, top, right, bottom)
+
+
+def _shares(view: View, hulls: Iterable[Fixed], labels: Labels, number: int) -> tuple[float, float]:
+    """Which share of some hulls is in the picture, and which is also labelled with a number."""
+    pieces = list(hulls)
+    points = np.vstack(pieces)[:, 0, :] / (1 << _SHIFT)
+    low, high = np.floor(points.min(axis=0)) - 1, np.ceil(points.max(axis=0)) + 2
+    limit = 4.0 * max(view.intrinsics.width, view.intrinsics.height)
+    low, high = np.maximum(low, -limit).astype(int), np.minimum(high, limit).astype(int)
+    whole = np.zeros((int(high[1] - low[1]), int(high[0] - low[0])), np.uint8)
+    for piece in pieces:
+        cv2.fillConvexPoly(whole, piece - (low << _SHIFT).astype(np.int32), (1,), cv2.LINE_8, _SHIFT)
+    total = int(np.count_nonzero(whole))
+    x0, y0 = max(int(low[0]), 0), max(int(low[1]), 0)
+    x1, y1 = min(int(high[0]), labels.shape[1]), min(int(high[1]), labels.shape[0])
+    if total == 0 or x0 >= x1 or y0 >= y1:
+        return 0.0, 0.0
+    inside = whole[y0 - low[1] : y1 - low[1], x0 - low[0] : x1 - low[0]] > 0
+    visible = inside & (labels[y0:y1, x0:x1] == number)
+    return float(np.count_nonzero(inside) / total), float(np.count_nonzero(visible) / total)
+
+
+def _true_heading(view: View, heading_deg: float) -> float:
+    """A direction of the world's frame as one from true north at the camera."""
+    angle = math.radians(heading_deg)
+    east, north = view.unturn @ np.array([math.sin(angle), math.cos(angle)])
+    return math.degrees(math.atan2(east, north))
+
+
+def _seen_thing(view: View, actor: _Actor, thing: Thing, shares: tuple[float, float], frame: LocalFrame) -> Seen | None:
+    box = _box(actor.points, view)
+    in_frame, visible = shares
+    if box is None or in_frame == 0.0:
+        return None
+    lat, lon = frame.latlon(thing.x, thing.y)
+    heading = _true_heading(view, thing.heading_deg)
+    return Seen(thing.id, thing.kind, lat, lon, heading, thing.speed_mps, box, in_frame, visible)
+
+
+def _seen_face(view: View, board: Billboard, labels: Labels, number: int, frame: LocalFrame) -> SeenFace | None:
+    corners = board.face_corners()
+    pixels, _ = view.project(corners)
+    box = _box(pixels, view)
+    if box is None:
+        return None
+    in_frame, visible = _shares(view, [_hull(pixels)], labels, number)
+    if in_frame == 0.0:
+        return None
+    if not board.faces(np.array([*view.place, view.height_m])):
+        visible = 0.0
+    lat, lon = frame.latlon(board.x, board.y)
+    height = float(np.linalg.norm(pixels[2:].mean(axis=0) - pixels[:2].mean(axis=0)))
+    return SeenFace(board.id, lat, lon, board.standing, box, height, in_frame, visible)

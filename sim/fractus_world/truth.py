@@ -1,0 +1,115 @@
+"""The ground truth of a picture: which objects and faces it shows, where, and how much of each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from fractus_world.optics import Pose
+
+Box = tuple[float, float, float, float]
+"""Left, top, right, bottom in pixels; (0, 0) is the upper left corner of the picture."""
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """An object in a picture.
+
+    Attributes:
+        id: The same in every picture.
+        kind: Its class.
+        lat: Latitude, degrees.
+        lon: Longitude, degrees.
+        heading_deg: Clockwise from north.
+        speed_mps: Over the ground.
+        box: Around what of it is in the picture.
+        in_frame: Share of it that is in the picture, from 0 to 1.
+        visible: Share of it that is in the picture and behind nothing else, from 0 to 1.
+    """
+
+    id: str
+    kind: str
+    lat: float
+    lon: float
+    heading_deg: float
+    speed_mps: float
+    box: Box
+    in_frame: float
+    visible: float
+
+    def as_json(self) -> dict[str, Any]:
+        """As the server tells it."""
+        return {
+            "id": self.id,
+            "class": self.kind,
+            "lat": round(self.lat, 8),
+            "lon": round(self.lon, 8),
+            "headingDeg": round(self.heading_deg % 360.0, 2),
+            "speedMps": round(self.speed_mps, 3),
+            "box": [round(edge, 2) for edge in self.box],
+            "inFrame": round(self.in_frame, 4),
+            "visible": round(self.visible, 4),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class SeenFace:
+    """A photographed face in a picture.
+
+    Attributes:
+        id: The same in every picture.
+        lat: Latitude, degrees.
+        lon: Longitude, degrees.
+        standing: Whether its billboard stands upright; else it lies on the ground.
+        box: Around the face, as far as it is in the picture.
+        height_px: How high the whole face is, foreshortened as it is.
+        in_frame: Share of it that is in the picture.
+        visible: Share of it that is in the picture and behind nothing else; 0 from behind its billboard.
+    """
+
+    id: str
+    lat: float
+    lon: float
+    standing: bool
+    box: Box
+    height_px: float
+    in_frame: float
+    visible: float
+
+    def as_json(self) -> dict[str, Any]:
+        """As the server tells it."""
+        return {
+            "id": self.id,
+            "lat": round(self.lat, 8),
+            "lon": round(self.lon, 8),
+            "standing": self.standing,
+            "box": [round(edge, 2) for edge in self.box],
+            "heightPx": round(self.height_px, 2),
+            "inFrame": round(self.in_frame, 4),
+            "visible": round(self.visible, 4),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What a picture shows."""
+
+    pose: Pose
+    objects: tuple[Seen, ...]
+    faces: tuple[SeenFace, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """As the server tells it."""
+        pose = self.pose
+        return {
+            "pose": {
+                "lat": round(pose.lat, 8),
+                "lon": round(pose.lon, 8),
+                "heightM": round(pose.height_m, 3),
+                "rollDeg": round(pose.roll_deg, 3),
+                "pitchDeg": round(pose.pitch_deg, 3),
+                "yawDeg": round(pose.yaw_deg, 3),
+            },
+            "objects": [seen.as_json() for seen in self.objects],
+            "faces": [face.as_json() for face in self.faces],
+        }

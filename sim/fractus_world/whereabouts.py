@@ -1,0 +1,225 @@
+"""Where the camera is: at a fixed place, or on a vehicle that tells by MAVLink."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import socket
+import threading
+import time
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from fractus_vehicle.wire import Message, Parser, encode, layout_named
+
+from fractus_world.optics import Mount, Pose
+
+log = logging.getLogger(__name__)
+
+STALE_S = 2.0
+CONNECT_TIMEOUT_S = 3.0
+READ_TIMEOUT_S = 0.5
+SILENCE_S = 5.0
+"""A link that brings nothing for so long is opened again."""
+RETRY_S = (0.2, 3.0)
+ASK_EVERY_S = 5.0
+SYSTEM, COMPONENT = 242, 100
+"""MAVLink ids of a camera; no heartbeats are sent, so that none can hold off an autopilot's failsafe."""
+_STREAMS = {"GLOBAL_POSITION_INT": 20.0, "ATTITUDE": 20.0, "GIMBAL_DEVICE_ATTITUDE_STATUS": 10.0}
+_SET_MESSAGE_INTERVAL = 511
+_NO_AUTOPILOT = 8
+_YAW_IN_EARTH_FRAME = 64
+_YAW_LOCK = 16
+_YAW_IN_VEHICLE_FRAME = 32
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """Where the camera is now.
+
+    Attributes:
+        pose: Of the airframe.
+        ground_amsl_m: Altitude of the ground above mean sea level.
+        mount: What a gimbal reports; None when there is none.
+    """
+
+    pose: Pose
+    ground_amsl_m: float = 0.0
+    mount: Mount | None = None
+
+
+class Whereabouts(Protocol):
+    """Tells where the camera is."""
+
+    def now(self) -> Sighting | None:
+        """Where it is; None while that is unknown."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fixed:
+    """A camera on a mast."""
+
+    pose: Pose
+    ground_amsl_m: float = 0.0
+
+    def now(self) -> Sighting | None:
+        """Always the same."""
+        return Sighting(self.pose, self.ground_amsl_m)
+
+
+@dataclass(slots=True)
+class _Heard:
+    position: Message | None = None
+    position_s: float = -math.inf
+    attitude: Message | None = None
+    attitude_s: float = -math.inf
+    mount: Mount | None = None
+    mount_s: float = -math.inf
+
+
+class Vehicle:
+    """A vehicle's position and attitude, followed in a thread of its own; the link is opened again when it breaks.
+
+    Args:
+        address: Host and port of the autopilot's TCP server.
+        ground_amsl_m: Altitude of the ground; None: the ground is as high as the vehicle's home.
+    """
+
+    def __init__(self, address: tuple[str, int], ground_amsl_m: float | None = None) -> None:
+        self._address = address
+        self._ground_amsl_m = ground_amsl_m
+        self._heard = _Heard()
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="vehicle", daemon=True)
+        self._sequence = 0
+
+    def start(self) -> None:
+        """Begin to follow."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End, within a few seconds."""
+        self._stop.set()
+        self._thread.join(CONNECT_TIMEOUT_S + 2 * READ_TIMEOUT_S)
+
+    def now(self) -> Sighting | None:
+        """The last position, carried on with its speed; None when it or the attitude is more than two seconds old."""
+        with self._lock:
+            heard = replace(self._heard)
+        now_s = time.monotonic()
+        if heard.position is None or heard.attitude is None:
+            return None
+        if now_s - min(heard.position_s, heard.attitude_s) > STALE_S:
+            return None
+        mount = heard.mount if now_s - heard.mount_s < STALE_S else None
+        ground_m = self._ground_amsl_m
+        if ground_m is None:
+            ground_m = (heard.position.real("alt") - heard.position.real("relative_alt")) / 1000.0
+        return Sighting(_pose(heard.position, heard.attitude, now_s - heard.position_s, ground_m), ground_m, mount)
+
+    def _run(self) -> None:
+        wait_s = RETRY_S[0]
+        while not self._stop.is_set():
+            try:
+                with socket.create_connection(self._address, timeout=CONNECT_TIMEOUT_S) as link:
+                    log.info("connected to the vehicle at %s:%d", *self._address)
+                    if self._follow(link):
+                        wait_s = RETRY_S[0]
+            except OSError as error:
+                log.info("no vehicle at %s:%d: %s", *self._address, error)
+            self._stop.wait(wait_s)
+            wait_s = min(2 * wait_s, RETRY_S[1])
+
+    def _follow(self, link: socket.socket) -> bool:
+        """Listen until the link breaks; returns whether anything was heard."""
+        link.settimeout(READ_TIMEOUT_S)
+        parser = Parser()
+        autopilot: tuple[int, int] | None = None
+        asked_s = -math.inf
+        heard_s = opened_s = time.monotonic()
+        while not self._stop.is_set():
+            data = None
+            with contextlib.suppress(TimeoutError):
+                data = link.recv(65536)
+            now_s = time.monotonic()
+            if data == b"" or now_s - heard_s > SILENCE_S:
+                break
+            for message in parser.feed(data or b""):
+                heard_s = now_s
+                if message.name == "HEARTBEAT" and message.integer("autopilot") != _NO_AUTOPILOT and autopilot is None:
+                    autopilot = (message.sysid, message.compid)
+                if autopilot is not None and message.sysid == autopilot[0]:
+                    self._take(message, now_s)
+            if autopilot is not None and now_s - asked_s > ASK_EVERY_S:
+                asked_s = now_s
+                self._ask(link, autopilot)
+        return heard_s > opened_s
+
+    def _ask(self, link: socket.socket, autopilot: tuple[int, int]) -> None:
+        """Ask for the streams; a restarted autopilot has forgotten them, so this is done again and again."""
+        for name, rate_hz in _STREAMS.items():
+            values: dict[str, float] = {f"param{k}": 0.0 for k in range(3, 8)}
+            values |= {"target_system": autopilot[0], "target_component": autopilot[1], "confirmation": 0}
+            values |= {"command": _SET_MESSAGE_INTERVAL, "param1": layout_named(name).msgid, "param2": 1e6 / rate_hz}
+            frame = encode(
+                layout_named("COMMAND_LONG"), values, sequence=self._sequence, sysid=SYSTEM, compid=COMPONENT
+            )
+            self._sequence += 1
+            link.sendall(frame)
+
+    def _take(self, message: Message, now_s: float) -> None:
+        with self._lock:
+            if message.name == "GLOBAL_POSITION_INT":
+                # Zeroes are what an autopilot without a fix says.
+                if message.integer("lat") != 0 or message.integer("lon") != 0:
+                    self._heard.position, self._heard.position_s = message, now_s
+            elif message.name == "ATTITUDE":
+                self._heard.attitude, self._heard.attitude_s = message, now_s
+            elif message.name == "GIMBAL_DEVICE_ATTITUDE_STATUS":
+                self._heard.mount, self._heard.mount_s = _gimbal(message, self._heard.attitude), now_s
+
+
+def _pose(position: Message, attitude: Message, age_s: float, ground_amsl_m: float) -> Pose:
+    north, east = position.real("vx") / 100.0 * age_s, position.real("vy") / 100.0 * age_s
+    lat = position.real("lat") * 1e-7
+    shrink = max(math.cos(math.radians(lat)), 0.01)
+    lon = position.real("lon") * 1e-7 + math.degrees(east / 6_378_137.0) / shrink
+    above_m = position.real("alt") / 1000.0 - ground_amsl_m
+    return Pose(
+        min(max(lat + math.degrees(north / 6_371_000.0), -90.0), 90.0),
+        (lon + 180.0) % 360.0 - 180.0,
+        min(above_m - position.real("vz") / 100.0 * age_s, 50_000.0),
+        math.degrees(attitude.real("roll")),
+        math.degrees(attitude.real("pitch")),
+        math.degrees(attitude.real("yaw")),
+    )
+
+
+def _gimbal(message: Message, attitude: Message | None) -> Mount | None:
+    """The mount that a gimbal's quaternion and flags describe; None when they are no attitude."""
+    w, x, y, z = (float(part) for part in message.array("q") if not isinstance(part, bytes))
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    if not 0.5 < norm < 2.0:
+        return None
+    pitch = math.degrees(math.asin(min(max(2 * (w * y - z * x) / norm**2, -1.0), 1.0)))
+    yaw = math.degrees(math.atan2(2 * (w * z + x * y), norm**2 - 2 * (y * y + z * z)))
+    flags = message.integer("flags")
+    earth = flags & _YAW_IN_EARTH_FRAME or (flags & _YAW_LOCK and not flags & _YAW_IN_VEHICLE_FRAME)
+    if earth and attitude is not None:
+        yaw -= math.degrees(attitude.real("yaw"))
+    return Mount(pitch, (yaw + 180.0) % 360.0 - 180.0, stabilised=True)
+
+
+def parse_address(text: str) -> tuple[str, int]:
+    """Host and port of `tcp:HOST:PORT`.
+
+    Raises:
+        ValueError: It is not that.
+    """
+    kind, _, rest = text.partition(":")
+    host, _, port = rest.rpartition(":")
+    if kind != "tcp" or not host or not port.isdigit() or not 0 < int(port) < 65536:
+        raise ValueError(f"vehicle: {text!r} is not tcp:HOST:PORT, such as tcp:127.0.0.1:5762")
+    return host.strip("[]"), int(port)

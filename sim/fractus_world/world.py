@@ -1,0 +1,121 @@
+"""The world as its users see it: a ground and what moves on it, from which pictures and their truth are made."""
+
+from __future__ import annotations
+
+import threading
+
+import cv2
+from fractus_core.geo import LocalFrame
+
+from fractus_world.billboards import AroundOrigin, Everywhere
+from fractus_world.landscape import Landscape
+from fractus_world.optics import Intrinsics, Mount, Pose, View
+from fractus_world.population import Nobody, Townsfolk
+from fractus_world.render import Band, render_ground
+from fractus_world.staging import Stage
+from fractus_world.survey import Sheet, draw_sheet
+from fractus_world.thermal import ThermalGround
+from fractus_world.tiles import Ground, Picture, TileStore
+from fractus_world.truth import Truth
+
+DEFAULT_MOUNT = Mount()
+
+
+class World:
+    """A ground with everything on it. Pictures depend on nothing but the arguments.
+
+    Args:
+        ground: What the earth looks like from above.
+        stage: What stands and moves on it.
+    """
+
+    def __init__(self, ground: Ground, stage: Stage) -> None:
+        self.ground = ground
+        self._stage = stage
+        self._store = TileStore(ground)
+        self._warmth = TileStore(ThermalGround(self._store), 30_000_000)
+        self._lock = threading.Lock()
+        cv2.setNumThreads(1)
+
+    @classmethod
+    def procedural(cls, lat: float, lon: float, seed: int = 7) -> World:
+        """A world made up from a seed, around a place."""
+        land = Landscape(LocalFrame(lat, lon), seed)
+        return cls(land, Stage(Townsfolk(land.roads, land.blocks), Everywhere(land.roads, land.blocks)))
+
+    @classmethod
+    def on(cls, ground: Ground, seed: int = 7) -> World:
+        """A world on a ground of the user's, whose roads nobody knows: billboards with faces near its middle, no traffic."""
+        return cls(ground, Stage(Nobody(), AroundOrigin(seed)))
+
+    @property
+    def frame(self) -> LocalFrame:
+        """Metres east and north of the world's origin."""
+        return self.ground.frame
+
+    def view(self, pose: Pose, intrinsics: Intrinsics, mount: Mount = DEFAULT_MOUNT) -> View:
+        """The geometry of a picture."""
+        return View.of(pose, mount, intrinsics, self.frame)
+
+    def render(
+        self,
+        pose: Pose,
+        intrinsics: Intrinsics,
+        *,
+        mount: Mount = DEFAULT_MOUNT,
+        time_s: float = 0.0,
+        band: Band = "rgb",
+        hidden: frozenset[str] = frozenset(),
+    ) -> Picture:
+        """The picture that a camera takes.
+
+        Args:
+            pose: Where the airframe is.
+            intrinsics: Lens and sensor.
+            mount: How the camera sits on the airframe.
+            time_s: Any clock's seconds; everything that moves is a function of it.
+            band: Daylight or thermal.
+            hidden: Ids of objects to leave out.
+
+        Returns:
+            Shape (height, width, 3); blue, green, red.
+        """
+        with self._lock:
+            view = self.view(pose, intrinsics, mount)
+            picture = render_ground(view, self._warmth if band == "ir" else self._store, band)
+            self._stage.draw(picture, view, self._stage.actors(view, time_s, hidden), band)
+            return picture
+
+    def truth(self, pose: Pose, intrinsics: Intrinsics, *, mount: Mount = DEFAULT_MOUNT, time_s: float = 0.0) -> Truth:
+        """What the picture of the same arguments shows."""
+        with self._lock:
+            view = self.view(pose, intrinsics, mount)
+            return Truth(pose, *self._stage.truth(view, self._stage.actors(view, time_s), self.frame))
+
+    def map(self, sheet: Sheet) -> Picture:
+        """The ground on a sheet of a map, without what moves, shape (pixels, pixels, 3)."""
+        with self._lock:
+            return draw_sheet(sheet, self._store, self.frame)
+
+
+class WorldAround:
+    """A world that is made around the first place from which somebody looks, unless its origin is given.
+
+    Args:
+        seed: Of the landscape and of who is where.
+        origin: Latitude and longitude; None: those of the first place to a tenth of a degree, which cameras near each
+            other share.
+        world: The world itself, when it is known already.
+    """
+
+    def __init__(self, seed: int, origin: tuple[float, float] | None = None, world: World | None = None) -> None:
+        self._seed = seed
+        self._lock = threading.Lock()
+        self._world = world if origin is None or world is not None else World.procedural(*origin, seed)
+
+    def seen_from(self, pose: Pose | None) -> World | None:
+        """The world; None as long as there is no place to make it around."""
+        with self._lock:
+            if self._world is None and pose is not None:
+                self._world = World.procedural(round(pose.lat, 1), round(pose.lon, 1), self._seed)
+            return self._world

@@ -13,7 +13,7 @@ import grpc
 from fractus_core.policy.values import Verdict
 
 from fractus_services.auth import Caller, NotAuthenticated, caller_of
-from fractus_services.grants import GrantFiles, Held
+from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.replies import Refused, abort, refused
 
 log = logging.getLogger(__name__)
@@ -133,13 +133,13 @@ class Reception:
             verdict = Verdict("deny", None, "TooManyCalls", reason)
             raise Refused(grpc.StatusCode.RESOURCE_EXHAUSTED, verdict, again_s)
 
-    def held(self, caller: Caller) -> Held:
+    def grant_of(self, caller: Caller) -> ActiveGrant:
         """The grant of a caller.
 
         Raises:
             Refused: it has none here.
         """
-        held = self._grants.of(caller.identity)
-        if held is None:
+        grant = self._grants.of(caller.identity)
+        if grant is None:
             raise refused(Verdict("deny", None, "NoGrant", f"{caller.identity} has no grant on this node"))
-        return held
+        return grant

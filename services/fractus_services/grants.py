@@ -23,7 +23,7 @@ _Stamp = tuple[int, int, int]
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class ActiveGrant:
     """One grant that is in force on this node.
 
     Attributes:
@@ -43,7 +43,7 @@ class Held:
         return self.compiled.identity
 
 
-Listener = Callable[[Held | None, Held | None], None]
+Listener = Callable[[ActiveGrant | None, ActiveGrant | None], None]
 """Called with the grant before and after a change; None: there is none."""
 
 Complaint = Callable[[str, str], None]
@@ -79,18 +79,18 @@ class GrantFiles:
         self._refused = refused
         self._saving: asyncio.Task[None] | None = None
         self._stamps: dict[Path, _Stamp] = {}
-        self._loaded: dict[Path, Held | None] = {}
-        self._held: dict[str, Held] = {}
+        self._loaded: dict[Path, ActiveGrant | None] = {}
+        self._active: dict[str, ActiveGrant] = {}
         self._listeners: list[Listener] = []
 
     @property
-    def held(self) -> Mapping[str, Held]:
+    def active(self) -> Mapping[str, ActiveGrant]:
         """Grants in force by identity."""
-        return self._held
+        return self._active
 
-    def of(self, identity: str) -> Held | None:
+    def of(self, identity: str) -> ActiveGrant | None:
         """The grant of a caller."""
-        return self._held.get(identity)
+        return self._active.get(identity)
 
     def listen(self, listener: Listener) -> None:
         """Call a listener at every change."""
@@ -135,7 +135,7 @@ class GrantFiles:
                 self._loaded[path] = self._load(path)
         self._stamps = found
         if whole:
-            renamed = {held.digest for held in self._loaded.values() if held is not None}
+            renamed = {grant.digest for grant in self._loaded.values() if grant is not None}
             for path in before.keys() - self._loaded.keys():
                 gone = before[path]
                 if gone is not None and gone.digest not in renamed:
@@ -162,11 +162,11 @@ class GrantFiles:
             log.critical("cannot read the grants in %s: %s; nothing is granted", self._directory, error)
         return found, whole and self._directory.is_dir()
 
-    def _load(self, path: Path) -> Held | None:
+    def _load(self, path: Path) -> ActiveGrant | None:
         """The grant of a file; one that it held before and holds no more is revoked."""
         before = self._loaded.get(path)
         try:
-            held = self._read(path)
+            grant = self._read(path)
         except (OSError, ValueError, InvalidObject, BadSignature) as error:
             log.critical("%s is no grant, so nothing is granted by it: %s", path, error)
             self._refused(path.name, str(error))
@@ -177,36 +177,36 @@ class GrantFiles:
             log.exception("%s cannot be made sense of, so nothing is granted by it", path)
             self._refused(path.name, f"{type(error).__name__}: {error}")
             return None
-        if held is None or (before is not None and before.identity != held.identity):
+        if grant is None or (before is not None and before.identity != grant.identity):
             self._revoke(before)
-        return held
+        return grant
 
-    def _read(self, path: Path) -> Held | None:
+    def _read(self, path: Path) -> ActiveGrant | None:
         grant = Grant.from_body(json.loads(path.read_bytes()))
         if grant.spec.node != self._node:
             log.error("%s is a grant for node %s, not for %s; ignored", path, grant.spec.node, self._node)
             return None
         digest = self._seals.check(grant)
         compiled = compile_grant(grant.spec, flat_terrain=self._flat_terrain)
-        return Held(grant.metadata.uid or grant.spec.identity, grant.name, grant.spec, compiled, digest)
+        return ActiveGrant(grant.metadata.uid or grant.spec.identity, grant.name, grant.spec, compiled, digest)
 
-    def _revoke(self, held: Held | None) -> None:
-        if held is not None:
-            self._seals.revoke(held.identity, held.digest)
+    def _revoke(self, grant: ActiveGrant | None) -> None:
+        if grant is not None:
+            self._seals.revoke(grant.identity, grant.digest)
 
     def _replace(self) -> None:
-        fresh: dict[str, Held] = {}
-        for path, held in sorted(self._loaded.items()):
-            if held is None:
+        fresh: dict[str, ActiveGrant] = {}
+        for path, grant in sorted(self._loaded.items()):
+            if grant is None:
                 continue
-            if not self._seals.holds(held.identity, held.digest):
-                log.error("%s was replaced by a later grant of %s; ignored", path, held.identity)
+            if not self._seals.holds(grant.identity, grant.digest):
+                log.error("%s was replaced by a later grant of %s; ignored", path, grant.identity)
                 continue
-            if held.identity in fresh:
-                log.error("%s grants %s a second time; ignored", path, held.identity)
+            if grant.identity in fresh:
+                log.error("%s grants %s a second time; ignored", path, grant.identity)
                 continue
-            fresh[held.identity] = held
-        before, self._held = self._held, fresh
+            fresh[grant.identity] = grant
+        before, self._active = self._active, fresh
         for identity in sorted(before.keys() | fresh.keys()):
             old, new = before.get(identity), fresh.get(identity)
             if old is not new:
@@ -215,7 +215,7 @@ class GrantFiles:
                 )
                 self._tell(old, new)
 
-    def _tell(self, old: Held | None, new: Held | None) -> None:
+    def _tell(self, old: ActiveGrant | None, new: ActiveGrant | None) -> None:
         for listener in self._listeners:
             try:
                 listener(old, new)

@@ -21,7 +21,7 @@ from fractus_services.camera.imaging import Pixels, decoded
 from fractus_services.camera.service import Body, CameraService
 from fractus_services.camera.shots import Shot
 from fractus_services.camera.shutter import Shutter
-from fractus_services.grants import Held
+from fractus_services.grants import ActiveGrant
 from fractus_services.replies import Refused
 from policy_world import NOW, at, box, compiled, policy, spec, zone
 
@@ -93,14 +93,14 @@ class Finder:
         return self.boxes
 
 
-def held(*policies: dict[str, Any], uid: str = "u1", instance: str = "app-navigator") -> Held:
+def active_grant(*policies: dict[str, Any], uid: str = "u1", instance: str = "app-navigator") -> ActiveGrant:
     fields: dict[str, Any] = {
         "application": {"namespace": "default", "name": "app", "uid": uid},
         "instance": instance,
         "services": [{"service": "camera", "methods": ["CaptureImage", "RetrieveImage", "ListImages", "DeleteImage"]}],
     }
     chosen = policies or (private(),)
-    return Held(uid, "g", spec(*chosen, **fields), compiled(*chosen, **fields))
+    return ActiveGrant(uid, "g", spec(*chosen, **fields), compiled(*chosen, **fields))
 
 
 class World:
@@ -117,14 +117,14 @@ class World:
             clock=lambda: NOW,
         )  # fmt: skip
 
-    async def capture(self, grant: Held, **size: int) -> Shot:
+    async def capture(self, grant: ActiveGrant, **size: int) -> Shot:
         return (await self.service.capture(grant, CaptureArgs(**size)))[1]
 
-    async def pixels(self, grant: Held, shot: Shot) -> Pixels:
+    async def pixels(self, grant: ActiveGrant, shot: Shot) -> Pixels:
         source = (await self.service.retrieve(grant, shot.name))[2]
         return decoded(source if isinstance(source, bytes) else source.read_bytes())
 
-    def stored(self, grant: Held, shot: Shot) -> Pixels:
+    def stored(self, grant: ActiveGrant, shot: Shot) -> Pixels:
         return decoded(self.album.path(camera.owner_of(grant), shot.name).read_bytes())
 
 

@@ -15,7 +15,7 @@ from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled import compile_grant
 from fractus_core.policy.values import Airframe, GotoArgs, Home, TakeoffArgs
-from fractus_services.grants import Held
+from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.autopilot import Autopilot
 from fractus_services.mobility.chauffeur import Chauffeur
 from fractus_services.mobility.control import Control
@@ -243,27 +243,27 @@ class Grants:
     """Grants in force, without files."""
 
     def __init__(self) -> None:
-        self.held: dict[str, Held] = {}
+        self.active: dict[str, ActiveGrant] = {}
         self._listeners: list[Any] = []
 
-    def of(self, identity: str) -> Held | None:
-        return self.held.get(identity)
+    def of(self, identity: str) -> ActiveGrant | None:
+        return self.active.get(identity)
 
     def listen(self, listener: Any) -> None:
         self._listeners.append(listener)
 
-    def put(self, spec: GrantSpec, key: str = "m1") -> Held:
-        fresh = Held(key, spec.instance, spec, compile_grant(spec))
-        before = self.held.get(fresh.identity)
-        self.held[fresh.identity] = fresh
+    def put(self, spec: GrantSpec, key: str = "m1") -> ActiveGrant:
+        fresh = ActiveGrant(key, spec.instance, spec, compile_grant(spec))
+        before = self.active.get(fresh.identity)
+        self.active[fresh.identity] = fresh
         for listener in self._listeners:
             listener(before, fresh)
         return fresh
 
-    def remove(self, held: Held) -> None:
-        del self.held[held.identity]
+    def remove(self, grant: ActiveGrant) -> None:
+        del self.active[grant.identity]
         for listener in self._listeners:
-            listener(held, None)
+            listener(grant, None)
 
 
 class Fence:
@@ -331,12 +331,12 @@ class World:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def drive(self, held: Held) -> asyncio.Task[None]:
+    async def drive(self, grant: ActiveGrant) -> asyncio.Task[None]:
         """A driver's stream in the background, once it has the drone."""
         granted = asyncio.Event()
 
         async def follow() -> None:
-            async for news in self.streams.follow(held):
+            async for news in self.streams.follow(grant):
                 self.news.append(news)
                 if news.state is State.GRANTED:
                     granted.set()
@@ -350,11 +350,11 @@ class World:
             await stream
         return stream
 
-    async def up(self, held: Held, altitude_m: float = 10.0) -> asyncio.Task[None]:
+    async def up(self, grant: ActiveGrant, altitude_m: float = 10.0) -> asyncio.Task[None]:
         """A driver that has armed and taken off."""
-        stream = await self.drive(held)
-        await self.service.arm(held)
-        await end(self.service.take_off(held, TakeoffArgs(altitude_m)))
+        stream = await self.drive(grant)
+        await self.service.arm(grant)
+        await end(self.service.take_off(grant, TakeoffArgs(altitude_m)))
         return stream
 
     async def until(self, condition: Callable[[], object], timeout_s: float = 120.0) -> None:

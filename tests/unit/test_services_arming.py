@@ -33,12 +33,12 @@ class Slow:
 def test_who_asks_twice_arms_once(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.drive(held)
+            grant = world.grants.put(spec())
+            await world.drive(grant)
             slow = world.fence.raise_around = Slow(world)
-            first, second = (asyncio.ensure_future(world.service.arm(held)) for _ in range(2))
+            first, second = (asyncio.ensure_future(world.service.arm(grant)) for _ in range(2))
             await first
-            await end(world.service.take_off(held, TakeoffArgs(10.0)))
+            await end(world.service.take_off(grant, TakeoffArgs(10.0)))
             await second
             assert slow.began_armed == [False], "nothing is prepared under a drone that flies"
             assert world.plane.commands.count(400) == 1
@@ -50,12 +50,12 @@ def test_who_asks_twice_arms_once(tmp_path: Path) -> None:
 def test_who_waits_to_arm_must_still_be_allowed_to(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.drive(held)
+            grant = world.grants.put(spec())
+            await world.drive(grant)
             slow = world.fence.raise_around = Slow(world)
-            calls = [asyncio.ensure_future(world.service.arm(held)) for _ in range(2)]
+            calls = [asyncio.ensure_future(world.service.arm(grant)) for _ in range(2)]
             await asyncio.sleep(1)
-            await world.control.give_back(held)
+            await world.control.give_back(grant)
             for call in calls:
                 await refusal(call)
             assert slow.began_armed == [False]
@@ -76,8 +76,8 @@ def test_failsafes_that_are_set_anew_meanwhile_forbid_arming(
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             control, plane = world.control, world.plane
-            held = world.grants.put(spec())
-            await world.drive(held)
+            grant = world.grants.put(spec())
+            await world.drive(grant)
             write, set_mode, raise_around = plane.write_parameter, plane.set_mode, world.fence.raise_around
 
             async def chosen(name: str, value: float) -> float | None:
@@ -93,7 +93,7 @@ def test_failsafes_that_are_set_anew_meanwhile_forbid_arming(
                 control.checked = found
 
             if during == "choice":
-                control.journal.mission(held).home = (39.3604, 22.95, 10.0)
+                control.journal.mission(grant).home = (39.3604, 22.95, 10.0)
                 plane.write_parameter = chosen  # type: ignore[method-assign]
             elif during == "fence":
                 world.fence.raise_around = raised  # type: ignore[method-assign]
@@ -108,7 +108,7 @@ def test_failsafes_that_are_set_anew_meanwhile_forbid_arming(
                 obey(outgoing)
 
             plane._obey = noted  # type: ignore[method-assign]
-            why = await refusal(world.service.arm(held))
+            why = await refusal(world.service.arm(grant))
             assert why.verdict.code == "FailsafesNotVerified"
             assert control.checked is found, "what is known by then is not written over"
             assert 1 not in motors
@@ -122,11 +122,11 @@ def test_a_link_that_comes_back_in_flight_leaves_the_way_home_as_chosen(tmp_path
             control, plane = world.control, world.plane
             plane.parameters |= {"SRTL_POINTS": 300.0, "SYSID_MYGCS": 244.0, "WPNAV_ACCEL": 100.0}
             control.checked = Checked("", (), Airframe(retraces=True, accel_mps2=1.0), 8.0, remembers=True)
-            held = world.grants.put(spec())
-            await world.drive(held)
-            control.journal.mission(held).home = (39.3604, 22.95, 10.0)
-            await world.service.arm(held)
-            await end(world.service.take_off(held, TakeoffArgs(10.0)))
+            grant = world.grants.put(spec())
+            await world.drive(grant)
+            control.journal.mission(grant).home = (39.3604, 22.95, 10.0)
+            await world.service.arm(grant)
+            await end(world.service.take_off(grant, TakeoffArgs(10.0)))
             assert plane.parameters["FS_GCS_ENABLE"] == 1.0
             Observer(control).found()
             assert control.checked.problem
@@ -142,15 +142,15 @@ def test_a_link_that_comes_back_in_flight_leaves_the_way_home_as_chosen(tmp_path
 def test_nothing_arms_without_its_fence(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.drive(held)
+            grant = world.grants.put(spec())
+            await world.drive(grant)
             world.fence.problem = AutopilotError("the autopilot refused the fence: no space")
-            why = await refusal(world.service.arm(held))
+            why = await refusal(world.service.arm(grant))
             assert why.verdict.code == "FenceNotRaised"
             assert "no space" in str(why)
             assert 400 not in world.plane.commands
             world.fence.problem = None
-            await world.service.arm(held)
+            await world.service.arm(grant)
 
     fly(flight)
 
@@ -159,10 +159,10 @@ def test_nothing_arms_far_from_the_home_of_its_grant(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.plane.xy = [60.0, 0.0]
-            held = world.grants.put(spec())
+            grant = world.grants.put(spec())
             await asyncio.sleep(0.2)
-            await world.drive(held)
-            why = await refusal(world.service.arm(held))
+            await world.drive(grant)
+            why = await refusal(world.service.arm(grant))
             assert why.verdict.code == "NotAtHome"
             assert "60 m away" in str(why)
             assert 400 not in world.plane.commands
@@ -174,8 +174,8 @@ def test_nothing_arms_far_from_the_home_of_its_grant(tmp_path: Path) -> None:
 def test_nothing_arms_that_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.drive(held)
+            grant = world.grants.put(spec())
+            await world.drive(grant)
 
             def full(_data: bytes) -> None:
                 raise OSError(28, "No space left on device")
@@ -184,7 +184,7 @@ def test_nothing_arms_that_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.M
                 monkeypatch.setattr(world.journal, "_write", full)
             else:
                 world.audit.failure = "cannot write the audit log: No space left on device"
-            why = await refusal(world.service.arm(held))
+            why = await refusal(world.service.arm(grant))
             assert why.verdict.code in {"JournalUnavailable", "AuditUnavailable"}
             assert "No space left" in str(why)
             assert 400 not in world.plane.commands

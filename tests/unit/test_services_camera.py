@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camera_world import Scene, World, grain, held, private, refusal
+from camera_world import Scene, World, active_grant, grain, private, refusal
 from fractus_core.policy.values import CaptureArgs, Lens
 from fractus_services.camera import service as camera
 from fractus_services.camera.drivers import CameraFailed, Wanted
 from fractus_services.camera.service import MAX_OF_ONE
 from fractus_services.camera.shutter import Shutter
-from fractus_services.grants import Held
+from fractus_services.grants import ActiveGrant
 from fractus_services.replies import Refused
 from policy_world import FRAME, NOW, at, box, policy, zone
 
@@ -31,15 +31,15 @@ def world(tmp_path: Path) -> Iterator[World]:
 
 async def test_a_drone_that_flies_over_private_ground_during_the_exposure_keeps_no_picture(world: World) -> None:
     world.scene.during = lambda: setattr(world.drone, "y", 0.0)
-    assert await refusal(world.service.capture(held(), CaptureArgs())) == "PrivacyZone"
+    assert await refusal(world.service.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
     world.drone.y = 80.0
     assert len(world.scene.taken) == 1
-    assert (await world.service.list(held()))[1] == ()
+    assert (await world.service.list(active_grant()))[1] == ()
 
 
 async def test_a_drone_that_crosses_private_ground_during_the_exposure_keeps_no_picture(world: World) -> None:
     world.scene.during = lambda: setattr(world.drone, "y", -80.0)
-    assert await refusal(world.service.capture(held(), CaptureArgs())) == "PrivacyZone"
+    assert await refusal(world.service.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
 
 
 async def test_a_camera_that_looks_aside_and_back_during_the_exposure_keeps_no_picture(world: World) -> None:
@@ -54,18 +54,18 @@ async def test_a_camera_that_looks_aside_and_back_during_the_exposure_keeps_no_p
             world.drone.situation(NOW)
 
     world.scene.during = lambda: looked(yaw=45.0)
-    shot = await world.capture(held())
+    shot = await world.capture(active_grant())
     assert {round(pose.attitude.yaw_deg) for pose in shot.poses if pose.attitude} == {0, 45}
     world.scene.during = lambda: looked(yaw=180.0)
-    assert await refusal(world.service.capture(held(), CaptureArgs())) == "PrivacyZone"
+    assert await refusal(world.service.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
     world.scene.during = lambda: looked(y=0.0)
-    assert await refusal(world.service.capture(held(), CaptureArgs())) == "PrivacyZone"
+    assert await refusal(world.service.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
     blind = policy("a", "AccessControl", "denial", [zone("z", box(-20, -20, 20, 20))], methods=["CaptureImage"])
-    assert await refusal(world.service.capture(held(blind), CaptureArgs())) == "MethodDenied"
+    assert await refusal(world.service.capture(active_grant(blind), CaptureArgs())) == "MethodDenied"
     elsewhere = policy("q", "PrivacyControl", "camera", [zone("z", box(500, 500, 510, 510))], action="refuse")
     world.scene.during = lambda: looked(yaw=180.0)
-    shot = await world.capture(held(elsewhere))
-    assert await refusal(world.service.retrieve(held(), shot.name)) == "PrivacyZone"
+    shot = await world.capture(active_grant(elsewhere))
+    assert await refusal(world.service.retrieve(active_grant(), shot.name)) == "PrivacyZone"
 
 
 async def test_a_camera_that_shows_what_was_is_judged_by_where_it_was(world: World) -> None:
@@ -75,16 +75,16 @@ async def test_a_camera_that_shows_what_was_is_judged_by_where_it_was(world: Wor
             world.drone.situation(NOW)
 
     came_from_private_ground()
-    await world.capture(held())
+    await world.capture(active_grant())
     world.scene.latency_s = 600.0
     came_from_private_ground()
-    assert await refusal(world.service.capture(held(), CaptureArgs())) == "PrivacyZone"
+    assert await refusal(world.service.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
 
 
 async def test_a_zone_counts_that_was_active_when_the_camera_may_have_seen_it(world: World) -> None:
     world.drone.y = 0.0
     past = {**zone("z", box(-20, -20, 20, 20)), "schedule": [{"start": "08:00", "end": "11:50"}]}
-    grant = held(policy("p", "PrivacyControl", "camera", [past], action="refuse"))
+    grant = active_grant(policy("p", "PrivacyControl", "camera", [past], action="refuse"))
     world.scene.latency_s = 300.0
     await world.capture(grant)
     world.scene.latency_s = 900.0
@@ -94,10 +94,10 @@ async def test_a_zone_counts_that_was_active_when_the_camera_may_have_seen_it(wo
 async def test_those_who_wait_are_judged_and_placed_when_it_is_their_turn(world: World) -> None:
     held_up = threading.Event()
     world.scene.during = lambda: held_up.wait(10) and None
-    waiting = [asyncio.create_task(world.capture(held())) for _ in range(MAX_OF_ONE)]
+    waiting = [asyncio.create_task(world.capture(active_grant())) for _ in range(MAX_OF_ONE)]
     await world.scene.begun()
-    assert await refusal_of_queue(world.capture(held()))
-    other = asyncio.create_task(world.capture(held(instance="other")))
+    assert await refusal_of_queue(world.capture(active_grant()))
+    other = asyncio.create_task(world.capture(active_grant(instance="other")))
     await asyncio.sleep(0)
     world.drone.y = 60.0
     held_up.set()
@@ -118,28 +118,28 @@ async def refusal_of_queue(work: Any) -> bool:
 async def test_a_caller_that_hangs_up_does_not_free_the_shutter(world: World) -> None:
     held_up = threading.Event()
     world.scene.during = lambda: held_up.wait(10) and None
-    task = asyncio.create_task(world.service.capture(held(), CaptureArgs()))
+    task = asyncio.create_task(world.service.capture(active_grant(), CaptureArgs()))
     await world.scene.begun()
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
     assert world.service._exposing.busy
     held_up.set()
-    await asyncio.gather(world.capture(held()), *world.service._tasks)
-    assert len((await world.service.list(held()))[1]) == 2
+    await asyncio.gather(world.capture(active_grant()), *world.service._tasks)
+    assert len((await world.service.list(active_grant()))[1]) == 2
 
 
 async def test_a_grant_that_ends_while_its_caller_waits_takes_no_picture(world: World) -> None:
-    def gone() -> Held:
+    def gone() -> ActiveGrant:
         raise camera.refused(camera.Verdict("deny", None, "NoGrant", "gone"))
 
-    assert await refusal(world.service.capture(held(), CaptureArgs(), gone)) == "NoGrant"
+    assert await refusal(world.service.capture(active_grant(), CaptureArgs(), gone)) == "NoGrant"
     assert not world.scene.taken
 
 
 async def test_an_application_of_the_same_name_does_not_inherit_pictures(world: World) -> None:
-    await world.capture(held())
-    assert len((await world.service.list(held()))[1]) == 1
-    assert (await world.service.list(held(uid="u2")))[1] == ()
+    await world.capture(active_grant())
+    assert len((await world.service.list(active_grant()))[1]) == 1
+    assert (await world.service.list(active_grant(uid="u2")))[1] == ()
 
 
 # Filters
@@ -148,7 +148,7 @@ async def test_an_application_of_the_same_name_does_not_inherit_pictures(world: 
 @pytest.mark.parametrize("action", ["black", "blurAverage", "blurMedian", "removeBackground"])
 async def test_a_filtered_picture_is_never_on_disk_without_its_filter(world: World, action: str) -> None:
     world.drone.y = 0.0
-    grant = held(private(action))
+    grant = active_grant(private(action))
     verdict, shot = await world.service.capture(grant, CaptureArgs())
     assert (verdict.action, verdict.code, verdict.policies) == ("correct", "PrivacyFilter", ("p",))
     assert len(world.scene.taken) == (3 if action == "removeBackground" else 1)
@@ -161,8 +161,8 @@ async def test_a_filtered_picture_is_never_on_disk_without_its_filter(world: Wor
 
 
 async def test_a_picture_is_judged_again_by_where_it_was_taken(world: World) -> None:
-    free, bound = held(policy("q", "PrivacyControl", "camera", [zone("far", box(500, 500, 510, 510))],
-                              action="refuse")), held(private("blurAverage"))  # fmt: skip
+    free, bound = active_grant(policy("q", "PrivacyControl", "camera", [zone("far", box(500, 500, 510, 510))],
+                              action="refuse")), active_grant(private("blurAverage"))  # fmt: skip
     world.drone.y = 0.0
     shot = await world.capture(free)
     assert grain(world.stored(free, shot)) > 30
@@ -171,35 +171,38 @@ async def test_a_picture_is_judged_again_by_where_it_was_taken(world: World) -> 
     assert (verdict.action, verdict.policies) == ("correct", ("p",))
     assert shown.filters
     assert grain(await world.pixels(bound, shot)) < 12
-    assert await refusal(world.service.retrieve(held(), shot.name)) == "PrivacyZone"
+    assert await refusal(world.service.retrieve(active_grant(), shot.name)) == "PrivacyZone"
     assert grain(await world.pixels(free, shot)) > 30
 
 
 async def test_a_picture_is_judged_again_once_its_filters_are_applied(world: World) -> None:
     far = [zone("far", box(500, 500, 510, 510))]
-    free, bound = held(policy("q", "PrivacyControl", "camera", far, action="refuse")), held(private("blurAverage"))
+    free, bound = (
+        active_grant(policy("q", "PrivacyControl", "camera", far, action="refuse")),
+        active_grant(private("blurAverage")),
+    )
     world.drone.y = 0.0
     shot = await world.capture(free)
     _, shown, _ = await world.service.retrieve(bound, shot.name, lambda: bound)
     assert [one.action for one in shown.filters] == ["blurAverage"]
-    assert await refusal(world.service.retrieve(bound, shot.name, held)) == "PrivacyZone"
-    stricter = held(private("black"))
+    assert await refusal(world.service.retrieve(bound, shot.name, active_grant)) == "PrivacyZone"
+    stricter = active_grant(private("black"))
     with pytest.raises(Refused, match="ask again") as caught:
         await world.service.retrieve(bound, shot.name, lambda: stricter)
     assert (caught.value.verdict.code, caught.value.verdict.policies) == ("PrivacyZone", ("p",))
 
 
 async def test_a_picture_from_elsewhere_is_judged_by_where_the_camera_is_now(world: World) -> None:
-    shot = await world.capture(held(private("black")))
+    shot = await world.capture(active_grant(private("black")))
     world.drone.y = 0.0
-    assert (await world.pixels(held(private("black")), shot)).max() == 0
+    assert (await world.pixels(active_grant(private("black")), shot)).max() == 0
 
 
 async def test_faces_are_hidden_where_they_are_large_enough_to_be_found(tmp_path: Path) -> None:
     world = World(tmp_path, (1600, 1600))
     world.drone.y, world.drone.alt = 0.0, 2.0
     world.finder.boxes = [(700, 700, 100, 100)]
-    grant = held(private("blurFaces"))
+    grant = active_grant(private("blurFaces"))
     kept = world.stored(grant, await world.capture(grant))
     assert grain(kept[700:800, 700:800]) < 12
     assert grain(kept[:600]) > 30
@@ -207,9 +210,9 @@ async def test_faces_are_hidden_where_they_are_large_enough_to_be_found(tmp_path
     verdict, shot = await world.service.capture(grant, CaptureArgs())
     assert "blurAverage instead" in verdict.reason
     assert grain(world.stored(grant, shot)) < 12
-    strict = held(private("blurFaces", fallback="refuse"))
+    strict = active_grant(private("blurFaces", fallback="refuse"))
     assert await refusal(world.service.capture(strict, CaptureArgs())) == "FacesNotFound"
-    assert grain(await world.pixels(held(private("black")), shot)) == 0
+    assert grain(await world.pixels(active_grant(private("black")), shot)) == 0
     world.shutter.close()
 
 
@@ -217,15 +220,15 @@ async def test_faces_that_were_hidden_too_softly_are_not_looked_for_again(tmp_pa
     world = World(tmp_path, (1600, 1600))
     world.drone.y, world.drone.alt = 0.0, 2.0
     world.finder.boxes = [(700, 700, 100, 100)]
-    soft = held(private("blurFaces", faces="gaussian"))
+    soft = active_grant(private("blurFaces", faces="gaussian"))
     shot = await world.capture(soft)
     assert shot.filters[0].faces == "gaussian"
     assert grain(await world.pixels(soft, shot)) > 30
     world.finder.boxes = []
     for fallback, most in (("blurAverage", 12), ("black", 0)):
-        hard = held(private("blurFaces", faces="pixelate", fallback=fallback))
+        hard = active_grant(private("blurFaces", faces="pixelate", fallback=fallback))
         assert grain(await world.pixels(hard, shot)) <= most
-    strict = held(private("blurFaces", faces="pixelate", fallback="refuse"))
+    strict = active_grant(private("blurFaces", faces="pixelate", fallback="refuse"))
     assert await refusal(world.service.retrieve(strict, shot.name)) == "FacesNotFound"
     world.shutter.close()
 
@@ -241,17 +244,17 @@ async def test_no_more_is_kept_than_the_view_that_was_judged(
     picture[top : top + shown[1], left : left + shown[0]] = 200
     monkeypatch.setattr(world.scene, "capture", lambda _wanted: picture)
     for asked in ({"width": 64, "height": 64}, {"width": 64, "height": 36}, {"width": 90, "height": 160}):
-        kept = world.stored(held(), await world.capture(held(), **asked))
+        kept = world.stored(active_grant(), await world.capture(active_grant(), **asked))
         assert kept.min() > 150, asked
     world.drone.lens = None
-    elsewhere = held(private("black"), uid="u9")
+    elsewhere = active_grant(private("black"), uid="u9")
     assert (await world.capture(elsewhere, width=64, height=64)).filters, "without a lens it sees everything"
     world.shutter.close()
 
 
 async def test_without_a_lens_nobody_knows_how_small_faces_are(world: World) -> None:
     world.drone.lens = None
-    verdict, _ = await world.service.capture(held(private("blurFaces")), CaptureArgs())
+    verdict, _ = await world.service.capture(active_grant(private("blurFaces")), CaptureArgs())
     assert "nobody knows how small" in verdict.reason
     assert verdict.policies == ("p",), "80 m away, but who knows what the camera sees"
 
@@ -261,7 +264,7 @@ async def test_a_picture_that_was_enlarged_has_no_larger_faces(tmp_path: Path, m
     world.drone.y, world.drone.alt = 0.0, 2.0
     small = np.zeros((100, 100, 3), np.uint8)
     monkeypatch.setattr(world.scene, "capture", lambda _wanted: small)
-    verdict, shot = await world.service.capture(held(private("blurFaces")), CaptureArgs())
+    verdict, shot = await world.service.capture(active_grant(private("blurFaces")), CaptureArgs())
     assert (shot.width, shot.height) == (1600, 1600)
     assert "faces may be as small as 3 pixels" in verdict.reason
     world.shutter.close()
@@ -269,7 +272,7 @@ async def test_a_picture_that_was_enlarged_has_no_larger_faces(tmp_path: Path, m
 
 @pytest.mark.parametrize(("width", "height"), [(15, 64), (64, 9000), (8192, 8192), (8000, 16)])
 async def test_sizes_beyond_measure_are_refused(world: World, width: int, height: int) -> None:
-    assert await refusal(world.service.capture(held(), CaptureArgs(width, height))) == "InvalidArgument"
+    assert await refusal(world.service.capture(active_grant(), CaptureArgs(width, height))) == "InvalidArgument"
     assert not world.scene.taken
 
 
@@ -305,9 +308,9 @@ async def test_a_driver_that_breaks_does_not_take_the_service_along(world: World
 
     world.scene.during = broken
     with pytest.raises(CameraFailed):
-        await world.capture(held())
+        await world.capture(active_grant())
     world.scene.during = lambda: None
-    await world.capture(held())
+    await world.capture(active_grant())
 
 
 # The album

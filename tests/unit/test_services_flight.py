@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, Verdict
-from fractus_services.grants import Held
+from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.autopilot import AutopilotError
 from fractus_services.mobility.leases import State
 from fractus_services.mobility.vehicle import GUIDED, LAND, RTL, SMART_RTL
@@ -25,13 +25,13 @@ WALL = (-40.0, 25.0, 40.0, 40.0)
 def test_the_chauffeur_flies_around_a_wall_there_and_home(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
-            held = world.grants.put(partial(zone("wall", "ignore", *WALL), corridor=[]))
-            stream = await world.drive(held)
+            grant = world.grants.put(partial(zone("wall", "ignore", *WALL), corridor=[]))
+            stream = await world.drive(grant)
             assert math.dist(world.plane.xy, (0, 70)) < 1.5
             assert [n.reason for n in world.news if n.state is State.WAITING][
                 -1
             ] == "the system flies to the control point"
-            assert await world.control.give_back(held)
+            assert await world.control.give_back(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
             assert math.dist(world.plane.xy, (0, 0)) < 1.5
             assert clear_m(world, *WALL) > 1.0
@@ -44,8 +44,8 @@ def test_the_chauffeur_flies_around_a_wall_there_and_home(tmp_path: Path) -> Non
 def test_a_zone_that_appears_on_the_way_is_flown_around(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
-            held = world.grants.put(partial())
-            driving = asyncio.ensure_future(world.drive(held))
+            grant = world.grants.put(partial())
+            driving = asyncio.ensure_future(world.drive(grant))
             await world.until(lambda: world.plane.xy[1] > 8)
             world.grants.put(partial(zone("wall", "ignore", *WALL)))
             await driving
@@ -59,8 +59,8 @@ def test_a_zone_that_appears_on_the_way_is_flown_around(tmp_path: Path) -> None:
 def test_a_zone_that_demands_the_drone_ends_the_transit(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(partial())
-            driving = asyncio.ensure_future(world.drive(held))
+            grant = world.grants.put(partial())
+            driving = asyncio.ensure_future(world.drive(grant))
             await world.until(lambda: world.plane.xy[1] > 16)
             wall = (-40.0, 40.0, 40.0, 55.0)
             world.grants.put(partial(zone("wall", "revoke", *wall)))
@@ -80,9 +80,9 @@ def test_a_drone_that_speeds_up_toward_a_new_zone_is_stopped_before_anybody_know
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.plane.measured = measured
-            held = world.grants.put(spec())
-            await world.up(held)
-            going = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 90), 0)))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            going = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 90), 0)))
             await world.until(lambda: world.plane.xy[1] > 8)
             assert math.hypot(*world.plane.velocity) < 7, "it still speeds up"
             world.grants.put(spec(zone("wall", "revoke", *WALL)))
@@ -98,8 +98,8 @@ def test_a_drone_that_speeds_up_toward_a_new_zone_is_stopped_before_anybody_know
 def test_no_way_to_the_control_point_is_told(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(partial(zone("around", "ignore", -20, 50, 20, 90)))
-            why = await refusal(world.drive(held))
+            grant = world.grants.put(partial(zone("around", "ignore", -20, 50, 20, 90)))
+            why = await refusal(world.drive(grant))
             assert why.verdict.code == "NoLegalWay"
             assert "around" in str(why)
             assert world.control.hands == "system"
@@ -113,13 +113,13 @@ def test_without_any_legal_way_home_the_drone_comes_home_all_the_same(
 ) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=retraces) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            await end(world.service.goto(held, goto(0, 70), 0))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            await end(world.service.goto(grant, goto(0, 70), 0))
             world.grants.put(spec(zone("home", "ignore", -15, -15, 15, 15)))
-            why = await refusal(world.service.return_to_launch(held)) if not retraces else None
+            why = await refusal(world.service.return_to_launch(grant)) if not retraces else None
             assert why is None or why.verdict.code == "NoLegalWay"
-            await world.control.give_back(held)
+            await world.control.give_back(grant)
             await world.until(lambda: world.plane.vehicle.mode == mode)
             assert "NoLegalWay" in {e["code"] for e in world.kinds("control")}
             await world.until(lambda: not world.plane.vehicle.armed)
@@ -140,11 +140,11 @@ def test_a_path_that_the_vehicle_forgot_is_not_relied_on(tmp_path: Path) -> None
 def test_a_removed_grant_keeps_its_fences_on_the_way_home(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
-            held = world.grants.put(spec(zone("wall", "ignore", *WALL)))
-            await world.up(held)
+            grant = world.grants.put(spec(zone("wall", "ignore", *WALL)))
+            await world.up(grant)
             for x, y in ((60, 30), (60, 70), (0, 70)):
-                await end(world.service.goto(held, goto(x, y), 0))
-            world.grants.remove(held)
+                await end(world.service.goto(grant, goto(x, y), 0))
+            world.grants.remove(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
             assert clear_m(world, *WALL) > 1.0
             assert world.journal.missions["m1"].outcome == "revoked: the grant was removed"
@@ -155,11 +155,11 @@ def test_a_removed_grant_keeps_its_fences_on_the_way_home(tmp_path: Path) -> Non
 def test_a_lost_driver_is_brought_home_around_the_wall(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
-            held = world.grants.put(spec(zone("wall", "ignore", *WALL)))
-            stream = await world.up(held)
+            grant = world.grants.put(spec(zone("wall", "ignore", *WALL)))
+            stream = await world.up(grant)
             for x, y in ((60, 30), (60, 70)):
-                await end(world.service.goto(held, goto(x, y), 0))
-            flying = asyncio.ensure_future(end(world.service.goto(held, goto(-60, 70), 0)))
+                await end(world.service.goto(grant, goto(x, y), 0))
+            flying = asyncio.ensure_future(end(world.service.goto(grant, goto(-60, 70), 0)))
             await world.until(lambda: world.plane.xy[0] < 20)
             stream.cancel()
             await world.until(lambda: abs(world.plane.velocity[0]) < 0.2)
@@ -178,11 +178,11 @@ def test_a_lost_driver_is_brought_home_around_the_wall(tmp_path: Path) -> None:
 def test_a_new_wall_on_the_way_home_is_flown_around(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
-            held = world.grants.put(spec(zone("wall", "ignore", *WALL)))
-            await world.up(held)
+            grant = world.grants.put(spec(zone("wall", "ignore", *WALL)))
+            await world.up(grant)
             for x, y in ((60, 30), (60, 70), (0, 70)):
-                await end(world.service.goto(held, goto(x, y), 0))
-            await world.control.give_back(held)
+                await end(world.service.goto(grant, goto(x, y), 0))
+            await world.control.give_back(grant)
             await world.until(lambda: math.hypot(*world.plane.velocity) > 3)
             east = world.plane.velocity[0] > 0
             second = (41.0, 20.0, 90.0, 60.0) if east else (-90.0, 20.0, -41.0, 60.0)
@@ -202,10 +202,10 @@ def test_a_new_wall_on_the_way_home_is_flown_around(tmp_path: Path) -> None:
 def test_a_tour_visits_its_points_and_comes_home(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True, boarding_s=30) as world:
-            held = world.grants.put(touring(zone("wall", "ignore", *WALL), tour=((0, 70), (60, 70))))
+            grant = world.grants.put(touring(zone("wall", "ignore", *WALL), tour=((0, 70), (60, 70))))
             await asyncio.sleep(5)
             assert not world.plane.vehicle.armed
-            world.tours.heard(held)
+            world.tours.heard(grant)
             await world.until(
                 lambda: world.journal.missions["m1"].outcome == "complete" if world.journal.missions else 0
             )
@@ -281,12 +281,12 @@ def test_a_tour_goes_on_with_the_service_that_follows(tmp_path: Path) -> None:
 def test_a_tour_waits_while_a_driver_has_the_drone(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
+            grant = world.grants.put(spec())
+            await world.up(grant)
             world.grants.put(touring(tour=((0, 30),)), "m2")
             await asyncio.sleep(10)
-            assert world.control.controller == held.identity
-            await world.control.give_back(held)
+            assert world.control.controller == grant.identity
+            await world.control.give_back(grant)
             await world.until(lambda: world.journal.missions.get("m2") and world.journal.missions["m2"].outcome)
 
     fly(flight)
@@ -301,13 +301,13 @@ def test_a_tour_waits_while_a_driver_has_the_drone(tmp_path: Path) -> None:
 def test_a_sharp_turn_is_flown_from_standstill(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec(zone("no-fly", "ignore", -200, 63, 200, 100)))
-            await world.up(held)
-            flying = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 56), 0)))
+            grant = world.grants.put(spec(zone("no-fly", "ignore", -200, 63, 200, 100)))
+            await world.up(grant)
+            flying = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 56), 0)))
             await world.until(lambda: world.plane.velocity[1] > 5 and world.plane.xy[1] > 35)
-            first = world.service.check(Call("Goto", goto(-60, 50)), held)
+            first = world.service.check(Call("Goto", goto(-60, 50)), grant)
             assert first.brake_first, first
-            there = await end(world.service.goto(held, goto(-60, 50), 0))
+            there = await end(world.service.goto(grant, goto(-60, 50), 0))
             assert there.verdict.permits
             assert not there.verdict.brake_first
             assert (await flying).verdict.code == "Replaced"
@@ -319,13 +319,13 @@ def test_a_sharp_turn_is_flown_from_standstill(tmp_path: Path) -> None:
 def test_a_drone_that_does_not_stop_begins_no_leg(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec(zone("no-fly", "ignore", -200, 190, 200, 199)))
-            await world.up(held)
-            flying = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 180), 0)))
+            grant = world.grants.put(spec(zone("no-fly", "ignore", -200, 190, 200, 199)))
+            await world.up(grant)
+            flying = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 180), 0)))
             await world.until(lambda: world.plane.velocity[1] > 5)
             world.guard.judge = lambda *_args, **_more: replace(Verdict("allow", goto(-60, 50)), brake_first=True)  # type: ignore[method-assign]
             world.plane._command = lambda: (0.0, 1.0, 0.0)  # type: ignore[method-assign]
-            why = await refusal(world.service.goto(held, goto(-60, 50), 0))
+            why = await refusal(world.service.goto(grant, goto(-60, 50), 0))
             assert why.verdict.code == "NotStopping"
             assert world.plane.commands.count(192) == 1
             await flying
@@ -337,17 +337,17 @@ def test_a_drone_that_does_not_stop_begins_no_leg(tmp_path: Path) -> None:
 def test_a_command_that_waits_is_not_sent_once_it_is_stale(tmp_path: Path, event: str) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            stream = await world.up(held)
+            grant = world.grants.put(spec())
+            stream = await world.up(grant)
             world.plane.deaf = True  # the autopilot neither acts nor answers: commands are tried again
-            asking = asyncio.ensure_future(refusal(world.service.set_speed(held, SetSpeedArgs(3.0))))
+            asking = asyncio.ensure_future(refusal(world.service.set_speed(grant, SetSpeedArgs(3.0))))
             await asyncio.sleep(0.3)
             if event == "takeover":
-                world.control.take_over(world.service.check(Call("Goto", goto(0, 5000)), held))
+                world.control.take_over(world.service.check(Call("Goto", goto(0, 5000)), grant))
             elif event == "returned":
-                await world.control.give_back(held)
+                await world.control.give_back(grant)
             elif event == "revoked":
-                world.grants.remove(held)
+                world.grants.remove(grant)
             else:
                 stream.cancel()
                 await asyncio.sleep(0)
@@ -363,10 +363,10 @@ def test_a_command_that_waits_is_not_sent_once_it_is_stale(tmp_path: Path, event
 def test_a_goto_that_is_sent_again_is_judged_again(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
+            grant = world.grants.put(spec())
+            await world.up(grant)
             world.plane.deaf = True
-            asking = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 70, speed_mps=5.0), 0)))
+            asking = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 70, speed_mps=5.0), 0)))
             await asyncio.sleep(0.3)
             world.grants.put(spec(zone("wall", "ignore", *WALL)))
             world.plane.deaf = False
@@ -380,12 +380,12 @@ def test_a_goto_that_is_sent_again_is_judged_again(tmp_path: Path) -> None:
 def test_armed_elsewhere_the_vehicle_does_not_rely_on_its_path(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            await end(world.service.goto(held, goto(0, 60), 0))
-            await end(world.service.land(held))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            await end(world.service.goto(grant, goto(0, 60), 0))
+            await end(world.service.land(grant))
             assert world.control.retraces
-            await world.service.arm(held)
+            await world.service.arm(grant)
             assert not world.control.retraces
             assert world.plane.parameters["FS_GCS_ENABLE"] == 1.0
 
@@ -398,13 +398,13 @@ def test_armed_elsewhere_the_vehicle_does_not_rely_on_its_path(tmp_path: Path) -
 def test_a_leg_with_a_heading_waits_for_the_nose(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            await end(world.service.goto(held, goto(0, 30, yaw_deg=90.0), 0))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            await end(world.service.goto(grant, goto(0, 30, yaw_deg=90.0), 0))
             assert world.plane.heading == 90.0
             world.plane.refuses.add(115)
             with pytest.raises(AutopilotError, match="failed command 115"):
-                await end(world.service.goto(held, goto(0, 40, yaw_deg=180.0), 0))
+                await end(world.service.goto(grant, goto(0, 40, yaw_deg=180.0), 0))
 
     fly(flight)
 
@@ -412,19 +412,19 @@ def test_a_leg_with_a_heading_waits_for_the_nose(tmp_path: Path) -> None:
 def test_altitudes_are_flown_in_the_datum_they_are_given_in(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            there = await end(world.service.goto(held, goto(0, 30, 28.0, reference="amsl"), 0))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            there = await end(world.service.goto(grant, goto(0, 30, 28.0, reference="amsl"), 0))
             assert there.verdict.args == replace(goto(0, 30, 18.0), speed_mps=there.verdict.args.speed_mps)  # type: ignore[union-attr]
             assert world.plane.height == pytest.approx(18.0, abs=0.9)
-            why = await refusal(_begun(world, held, goto(0, 40, 20.0, reference="terrain")))
+            why = await refusal(_begun(world, grant, goto(0, 40, 20.0, reference="terrain")))
             assert why.verdict.code == "TerrainUnknown"
 
     fly(flight)
 
 
-async def _begun(world: World, held: Held, args: GotoArgs) -> None:
-    await end(world.service.goto(held, args, 0))
+async def _begun(world: World, grant: ActiveGrant, args: GotoArgs) -> None:
+    await end(world.service.goto(grant, args, 0))
 
 
 # Arming
@@ -433,15 +433,15 @@ async def _begun(world: World, held: Held, args: GotoArgs) -> None:
 def test_a_journal_that_fails_in_flight_ends_no_flight(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
+            grant = world.grants.put(spec())
+            await world.up(grant)
 
             def full(_data: bytes) -> None:
                 raise OSError(28, "No space left on device")
 
             world.journal._write = full  # type: ignore[method-assign]
-            await end(world.service.goto(held, goto(0, 30), 0))
-            await world.control.give_back(held)
+            await end(world.service.goto(grant, goto(0, 30), 0))
+            await world.control.give_back(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
 
     fly(flight)
@@ -453,8 +453,8 @@ def test_a_journal_that_fails_in_flight_ends_no_flight(tmp_path: Path) -> None:
 def test_an_orphan_is_adopted(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
+            grant = world.grants.put(spec())
+            await world.up(grant)
             world.control.lease, world.control.hands = None, "system"  # a fault of ours
             await world.until(lambda: world.kinds("takeover"))
             assert world.kinds("takeover")[0]["code"] == "Orphaned"
@@ -470,11 +470,11 @@ def test_a_planner_that_fails_brings_the_drone_home_straight(tmp_path: Path, mon
 
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec(zone("far", "ignore", 150, 150, 160, 160)))
-            await world.up(held)
-            await end(world.service.goto(held, goto(0, 30), 0))
+            grant = world.grants.put(spec(zone("far", "ignore", 150, 150, 160, 160)))
+            await world.up(grant)
+            await end(world.service.goto(grant, goto(0, 30), 0))
             monkeypatch.setattr("fractus_services.mobility.homing.straight_home_blocked", broken)
-            await world.control.give_back(held)
+            await world.control.give_back(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
             assert math.dist(world.plane.xy, (0, 0)) < 1.5
 

@@ -11,7 +11,7 @@ from fractus_core.policy.values import Moment, earliest
 from fractus_services.answering import Allowance
 from fractus_services.auth import Caller, NotAuthenticated, caller_of
 from fractus_services.clock import TRUST_S, Clock
-from fractus_services.grants import GrantFiles, Held
+from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.seals import Seals
 from grant_signing import CA_PEM, signed
 from policy_world import spec
@@ -45,14 +45,14 @@ def test_files_come_change_and_go(tmp_path: Path) -> None:
     path.write_text(body())
     files.scan()
     files.scan()
-    (held,) = files.held.values()
-    assert isinstance(held, Held)
-    assert files.of(held.identity) is held
+    (grant,) = files.active.values()
+    assert isinstance(grant, ActiveGrant)
+    assert files.of(grant.identity) is grant
     path.write_text(body(uid="u2"))
     files.scan()
     path.write_text("{")
     files.scan()
-    assert not files.held
+    assert not files.active
     path.write_text(body(uid="u3"))
     files.scan()
     path.unlink()
@@ -73,7 +73,7 @@ def test_what_is_not_understood_grants_nothing(tmp_path: Path, text: str) -> Non
     (tmp_path / "g.json").write_text(text)
     files = grant_files(tmp_path)
     files.scan()
-    assert not files.held
+    assert not files.active
 
 
 def test_two_files_for_one_instance(tmp_path: Path) -> None:
@@ -81,16 +81,16 @@ def test_two_files_for_one_instance(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(body(uid="second"))
     files = grant_files(tmp_path)
     files.scan()
-    assert [held.key for held in files.held.values()] == ["second"], "the later one counts"
+    assert [grant.key for grant in files.active.values()] == ["second"], "the later one counts"
     (tmp_path / "a.json").unlink()
     files.scan()
-    assert not files.held, "the earlier one does not come back"
+    assert not files.active, "the earlier one does not come back"
 
 
 def test_a_missing_directory_is_empty(tmp_path: Path) -> None:
     files = grant_files(tmp_path / "none")
     files.scan()
-    assert not files.held
+    assert not files.active
 
 
 def test_callers() -> None:
@@ -146,7 +146,7 @@ def test_an_odd_file_does_not_stop_the_others(tmp_path: Path, odd: bytes) -> Non
     (tmp_path / "loop.json").symlink_to("loop.json")
     files = grant_files(tmp_path)
     files.scan()
-    assert [held.key for held in files.held.values()] == ["sound"]
+    assert [grant.key for grant in files.active.values()] == ["sound"]
 
 
 def test_whatever_a_file_breaks_it_grants_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,15 +156,15 @@ def test_whatever_a_file_breaks_it_grants_nothing(tmp_path: Path, monkeypatch: p
     (tmp_path / "a.json").write_text(body())
     files = grant_files(tmp_path)
     files.scan()
-    assert files.held
+    assert files.active
     monkeypatch.setattr("fractus_services.grants.compile_grant", broken)
     (tmp_path / "a.json").write_text(body(uid="changed"))
     files.scan()
-    assert not files.held, "the grant that was there before is gone, too"
+    assert not files.active, "the grant that was there before is gone, too"
 
 
 def test_a_listener_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
-    def broken(_old: Held | None, _new: Held | None) -> None:
+    def broken(_old: ActiveGrant | None, _new: ActiveGrant | None) -> None:
         raise ZeroDivisionError
 
     told: list[str] = []

@@ -23,19 +23,19 @@ def clear_m(world: World, *box: float) -> float:
 
 async def beyond_the_wall(world: World) -> None:
     """A driver whose way home is behind a wall gives the drone back."""
-    held = world.grants.put(spec(zone("wall", "ignore", *WALL)))
-    await world.up(held)
+    grant = world.grants.put(spec(zone("wall", "ignore", *WALL)))
+    await world.up(grant)
     for x, y in ((60, 30), (60, 70), (0, 70)):
-        await end(world.service.goto(held, GotoArgs(*at(x, y), 10.0), 0))
-    await world.control.give_back(held)
+        await end(world.service.goto(grant, GotoArgs(*at(x, y), 10.0), 0))
+    await world.control.give_back(grant)
 
 
 def test_a_driver_turns_home_from_standstill(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            flying = asyncio.ensure_future(end(world.service.goto(held, GotoArgs(*at(0, 90), 10.0), 0)))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            flying = asyncio.ensure_future(end(world.service.goto(grant, GotoArgs(*at(0, 90), 10.0), 0)))
             await world.until(lambda: world.plane.velocity[1] > 6)
             turned: list[float] = []
             obey = world.plane.set_to
@@ -46,7 +46,7 @@ def test_a_driver_turns_home_from_standstill(tmp_path: Path) -> None:
                 obey(mode)
 
             world.plane.set_to = noted  # type: ignore[method-assign]
-            await end(world.service.return_to_launch(held))
+            await end(world.service.return_to_launch(grant))
             assert turned
             assert max(turned) < 0.5
             with pytest.raises(Exception, match="replaced"):
@@ -58,8 +58,8 @@ def test_a_driver_turns_home_from_standstill(tmp_path: Path) -> None:
 def test_a_drone_that_finds_no_rest_flies_home_all_the_same(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
+            grant = world.grants.put(spec())
+            await world.up(grant)
             tell = world.plane._tell
 
             def gusty() -> None:
@@ -67,7 +67,7 @@ def test_a_drone_that_finds_no_rest_flies_home_all_the_same(tmp_path: Path) -> N
                 world.plane.vehicle.east_mps += 0.7
 
             world.plane._tell = gusty  # type: ignore[method-assign]
-            await end(world.service.return_to_launch(held))
+            await end(world.service.return_to_launch(grant))
 
     fly(flight)
 
@@ -99,11 +99,11 @@ def test_an_autopilot_that_refuses_again_and_again_brings_the_drone_home_itself(
             if remembers:
                 await beyond_the_wall(world)
             else:
-                held = world.grants.put(spec())
-                await world.up(held)
-                await end(world.service.goto(held, GotoArgs(*at(0, 70), 10.0), 0))
+                grant = world.grants.put(spec())
+                await world.up(grant)
+                await end(world.service.goto(grant, GotoArgs(*at(0, 70), 10.0), 0))
                 world.grants.put(spec(zone("wall", "ignore", *WALL)))
-                await world.control.give_back(held)
+                await world.control.give_back(grant)
             plane.commands.clear()
             plane.refuses.add(REPOSITION)
             await world.until(lambda: plane.vehicle.mode in {RTL, SMART_RTL, LAND})
@@ -119,29 +119,29 @@ def test_an_autopilot_that_refuses_again_and_again_brings_the_drone_home_itself(
 def test_no_fence_outlives_its_mission(tmp_path: Path, how: str) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
+            grant = world.grants.put(spec())
             if how in {"refused", "unused"}:
-                await world.drive(held)
+                await world.drive(grant)
                 world.plane.refuses |= {400} if how == "refused" else set()
-                arming = asyncio.ensure_future(world.service.arm(held))
+                arming = asyncio.ensure_future(world.service.arm(grant))
                 await world.until(lambda: world.fence.raised)
                 await asyncio.wait([arming])
                 if how == "unused":
                     assert world.fence.raised, "while the motors run"
-                    await world.service.disarm(held)
+                    await world.service.disarm(grant)
                 else:
                     assert "command 400" in str(arming.exception())
             else:
-                stream = await world.up(held)
-                await end(world.service.land(held))
+                stream = await world.up(grant)
+                await end(world.service.land(grant))
                 await asyncio.sleep(15)
                 assert world.fence.raised, "the driver may take off again"
                 if how == "returned":
-                    await world.control.give_back(held)
+                    await world.control.give_back(grant)
                 elif how == "grace":
                     stream.cancel()
                 else:
-                    world.grants.remove(held)
+                    world.grants.remove(grant)
             await world.until(lambda: not world.fence.raised)
             assert not world.plane.vehicle.armed
 
@@ -151,8 +151,8 @@ def test_no_fence_outlives_its_mission(tmp_path: Path, how: str) -> None:
 def test_a_fence_is_not_lowered_under_who_arms(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.drive(held)
+            grant = world.grants.put(spec())
+            await world.drive(grant)
             raising = world.fence.raise_around
 
             async def slowly(*what: object, **how: object) -> None:
@@ -160,7 +160,7 @@ def test_a_fence_is_not_lowered_under_who_arms(tmp_path: Path) -> None:
                 await asyncio.sleep(12)
 
             world.fence.raise_around = slowly  # type: ignore[method-assign]
-            await world.service.arm(held)
+            await world.service.arm(grant)
             assert world.fence.raised
 
     fly(flight)
@@ -169,10 +169,10 @@ def test_a_fence_is_not_lowered_under_who_arms(tmp_path: Path) -> None:
 def test_the_way_home_is_judged_below_the_fence_of_the_mission(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.drive(held)
+            grant = world.grants.put(spec())
+            await world.drive(grant)
             world.plane.parameters |= {"RTL_ALT": 9000.0, "FENCE_ENABLE": 1.0, "FENCE_TYPE": 5.0, "FENCE_ALT_MAX": 65.0}
-            await world.service.arm(held)
+            await world.service.arm(grant)
             assert world.guard.situation().airframe.return_altitude_m == 63.0
 
     fly(flight)
@@ -182,7 +182,7 @@ def test_failsafes_are_set_again_when_a_message_was_lost(tmp_path: Path) -> None
     async def flight() -> None:
         async with World(tmp_path) as world:
             control, plane = world.control, world.plane
-            held = world.grants.put(spec())
+            grant = world.grants.put(spec())
             plane.parameters |= {"SYSID_MYGCS": 244.0}
             lost = plane.parameters.pop("FS_GCS_ENABLE")
             Observer(control).found()
@@ -191,8 +191,8 @@ def test_failsafes_are_set_again_when_a_message_was_lost(tmp_path: Path) -> None
             assert "FS_GCS_ENABLE" in control.checked.problem
             plane.parameters["FS_GCS_ENABLE"] = lost
             await world.until(lambda: control.checked is not None and not control.checked.problem, 10)
-            await world.drive(held)
-            await world.service.arm(held)
+            await world.drive(grant)
+            await world.service.arm(grant)
 
     fly(flight)
 
@@ -225,11 +225,11 @@ def test_a_fault_of_ours_ends_the_mission_once(tmp_path: Path, monkeypatch: pyte
     async def flight() -> None:
         async with World(tmp_path) as world:
             monkeypatch.setattr("fractus_services.mobility.courses.searching", broken)
-            held = world.grants.put(touring(tour=((0.0, 60.0),)) if who == "tour" else partial())
+            grant = world.grants.put(touring(tour=((0.0, 60.0),)) if who == "tour" else partial())
             if who == "driver":
-                why = await refusal(world.drive(held))
+                why = await refusal(world.drive(grant))
                 assert "has a fault" in str(why)
-            await world.until(lambda: held.key in world.journal.missions and world.journal.missions["m1"].outcome)
+            await world.until(lambda: grant.key in world.journal.missions and world.journal.missions["m1"].outcome)
             assert world.journal.missions["m1"].outcome.startswith("failed: the mobility service has a fault")
             await world.until(lambda: not world.plane.vehicle.armed)
             assert world.plane.commands.count(400) == 1, "not armed again"

@@ -43,16 +43,16 @@ async def fastest(world: World, motion: Any) -> float:
 def test_a_leg_is_flown_with_its_speed_whatever_was_flown_before(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
+            grant = world.grants.put(spec())
+            await world.up(grant)
             go = world.service.goto
-            assert await fastest(world, go(held, goto(0, 40, speed_mps=3.0), 0)) == pytest.approx(3.0, abs=0.2)
-            assert await fastest(world, go(held, goto(0, -30), 0)) == pytest.approx(8.0, abs=0.5)
-            await world.service.set_speed(held, SetSpeedArgs(4.0))
-            await world.service.set_velocity(held, VelocityArgs(2.0, 0.0, hold_s=0.5))
-            assert await fastest(world, go(held, goto(0, 40), 0)) == pytest.approx(4.0, abs=0.2)
-            assert await fastest(world, go(held, goto(0, 0, speed_mps=6.0), 0)) == pytest.approx(6.0, abs=0.2)
-            assert await fastest(world, go(held, goto(0, 40), 0)) == pytest.approx(4.0, abs=0.2)
+            assert await fastest(world, go(grant, goto(0, 40, speed_mps=3.0), 0)) == pytest.approx(3.0, abs=0.2)
+            assert await fastest(world, go(grant, goto(0, -30), 0)) == pytest.approx(8.0, abs=0.5)
+            await world.service.set_speed(grant, SetSpeedArgs(4.0))
+            await world.service.set_velocity(grant, VelocityArgs(2.0, 0.0, hold_s=0.5))
+            assert await fastest(world, go(grant, goto(0, 40), 0)) == pytest.approx(4.0, abs=0.2)
+            assert await fastest(world, go(grant, goto(0, 0, speed_mps=6.0), 0)) == pytest.approx(6.0, abs=0.2)
+            assert await fastest(world, go(grant, goto(0, 40), 0)) == pytest.approx(4.0, abs=0.2)
 
     fly(flight)
 
@@ -60,8 +60,8 @@ def test_a_leg_is_flown_with_its_speed_whatever_was_flown_before(tmp_path: Path)
 def test_the_system_keeps_to_speed_limits(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(partial(limit("speed", 3.0)))
-            bringing = asyncio.ensure_future(world.drive(held))
+            grant = world.grants.put(partial(limit("speed", 3.0)))
+            bringing = asyncio.ensure_future(world.drive(grant))
             top = 0.0
             while not bringing.done():
                 await world.plane.update(0.1)
@@ -75,9 +75,9 @@ def test_the_system_keeps_to_speed_limits(tmp_path: Path) -> None:
 def test_a_speed_that_is_corrected_holds_when_the_leg_is_sent_again(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            flying = asyncio.ensure_future(end(world.service.goto(held, goto(0, 150), 0)))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            flying = asyncio.ensure_future(end(world.service.goto(grant, goto(0, 150), 0)))
             await world.until(lambda: world.plane.velocity[1] > 6)
             world.grants.put(spec(limit("speed", 3.0)))
             await world.until(lambda: world.plane.speed_mps == 3.0)
@@ -87,8 +87,8 @@ def test_a_speed_that_is_corrected_holds_when_the_leg_is_sent_again(tmp_path: Pa
             await world.until(lambda: world.plane.xy[1] > stayed)
             assert world.plane.velocity[1] == pytest.approx(3.0, abs=0.2)
             await flying
-            held = world.grants.put(spec())
-            assert await fastest(world, world.service.goto(held, goto(0, 90), 0)) > 6, "where nothing limits it"
+            grant = world.grants.put(spec())
+            assert await fastest(world, world.service.goto(grant, goto(0, 90), 0)) > 6, "where nothing limits it"
 
     fly(flight)
 
@@ -109,22 +109,22 @@ def test_a_change_of_speed_keeps_to_what_the_leg_under_way_may_be_flown_with(
 ) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec(slow_zone()))
-            await world.up(held)
+            grant = world.grants.put(spec(slow_zone()))
+            await world.up(grant)
             flying = asyncio.ensure_future(
-                fastest(world, world.service.goto(held, goto(0, 90, speed_mps=asked_mps), 0))
+                fastest(world, world.service.goto(grant, goto(0, 90, speed_mps=asked_mps), 0))
             )
             await world.until(lambda: world.plane.velocity[1] > 2.5)
-            verdict, speed = await world.service.set_speed(held, SetSpeedArgs(1.0))
+            verdict, speed = await world.service.set_speed(grant, SetSpeedArgs(1.0))
             assert (verdict.action, speed, world.plane.speed_mps) == ("allow", 1.0, 1.0)
-            verdict, speed = await world.service.set_speed(held, SetSpeedArgs(12.0))
+            verdict, speed = await world.service.set_speed(grant, SetSpeedArgs(12.0))
             assert (verdict.action, verdict.code, verdict.policies) == ("correct", "SpeedAboveLimit", ("limited",))
             assert verdict.args == SetSpeedArgs(3.0)
             assert speed == world.plane.speed_mps == 3.0
             assert await flying == pytest.approx(3.0, abs=0.2)
-            assert await fastest(world, world.service.goto(held, goto(0, 65), 0)) == pytest.approx(3.0, abs=0.2)
-            await end(world.service.goto(held, goto(0, 0), 0))
-            assert await fastest(world, world.service.goto(held, goto(0, -120), 0)) > 10, "where nothing limits it"
+            assert await fastest(world, world.service.goto(grant, goto(0, 65), 0)) == pytest.approx(3.0, abs=0.2)
+            await end(world.service.goto(grant, goto(0, 0), 0))
+            assert await fastest(world, world.service.goto(grant, goto(0, -120), 0)) > 10, "where nothing limits it"
 
     fly(flight)
 
@@ -132,11 +132,11 @@ def test_a_change_of_speed_keeps_to_what_the_leg_under_way_may_be_flown_with(
 def test_a_leg_under_way_is_flown_faster_where_that_is_legal(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec(slow_zone()))
-            await world.up(held)
-            flying = asyncio.ensure_future(fastest(world, world.service.goto(held, goto(0, -120, speed_mps=3.0), 0)))
+            grant = world.grants.put(spec(slow_zone()))
+            await world.up(grant)
+            flying = asyncio.ensure_future(fastest(world, world.service.goto(grant, goto(0, -120, speed_mps=3.0), 0)))
             await world.until(lambda: world.plane.velocity[1] < -2.5)
-            verdict, speed = await world.service.set_speed(held, SetSpeedArgs(10.0))
+            verdict, speed = await world.service.set_speed(grant, SetSpeedArgs(10.0))
             assert (verdict.action, speed) == ("allow", 10.0)
             assert await flying == pytest.approx(10.0, abs=0.2)
 
@@ -146,12 +146,12 @@ def test_a_leg_under_way_is_flown_faster_where_that_is_legal(tmp_path: Path) -> 
 def test_a_leg_that_cannot_be_judged_faster_gets_no_faster(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            flying = asyncio.ensure_future(fastest(world, world.service.goto(held, goto(0, 90, speed_mps=3.0), 0)))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            flying = asyncio.ensure_future(fastest(world, world.service.goto(grant, goto(0, 90, speed_mps=3.0), 0)))
             await world.until(lambda: world.plane.velocity[1] > 2.5)
-            held = world.grants.put(spec(zone("new", "ignore", -30, 85, 30, 100)))
-            verdict, speed = await world.service.set_speed(held, SetSpeedArgs(10.0))
+            grant = world.grants.put(spec(zone("new", "ignore", -30, 85, 30, 100)))
+            verdict, speed = await world.service.set_speed(grant, SetSpeedArgs(10.0))
             assert (verdict.action, verdict.policies, speed) == ("correct", ("new",), 3.0)
             flying.cancel()
 
@@ -161,15 +161,15 @@ def test_a_leg_that_cannot_be_judged_faster_gets_no_faster(tmp_path: Path) -> No
 def test_the_next_driver_does_not_inherit_a_speed(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            await world.service.set_speed(held, SetSpeedArgs(2.0))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            await world.service.set_speed(grant, SetSpeedArgs(2.0))
             assert world.guard.situation().speed_setpoint_mps == 2.0
-            await world.control.give_back(held)
+            await world.control.give_back(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
-            held = world.grants.put(spec(), "m2")
-            await world.up(held)
-            assert await fastest(world, world.service.goto(held, goto(0, 60), 0)) > 6
+            grant = world.grants.put(spec(), "m2")
+            await world.up(grant)
+            assert await fastest(world, world.service.goto(grant, goto(0, 60), 0)) > 6
 
     fly(flight)
 
@@ -181,14 +181,14 @@ def test_the_system_flies_home_at_the_speed_of_the_vehicle_within_limits(
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             wall = zone("wall", "ignore", *WALL)
-            held = world.grants.put(spec(wall))
-            await world.up(held)
+            grant = world.grants.put(spec(wall))
+            await world.up(grant)
             for x, y in ((60, 30), (60, 70), (0, 70)):
-                await end(world.service.goto(held, goto(x, y), 0))
-            await world.service.set_speed(held, SetSpeedArgs(driven_mps))
+                await end(world.service.goto(grant, goto(x, y), 0))
+            await world.service.set_speed(grant, SetSpeedArgs(driven_mps))
             if limited:
                 world.grants.put(spec(wall, limit("speed", 3.0)))
-            await world.control.give_back(held)
+            await world.control.give_back(grant)
             await world.until(lambda: world.control.motion is not None and world.control.motion.speed_mps is not None)
             told = 3.0 if limited else 8.0
             assert world.guard.situation().speed_setpoint_mps == 8.0
@@ -205,13 +205,13 @@ def test_the_system_flies_home_at_the_speed_of_the_vehicle_within_limits(
 def test_a_driver_that_comes_back_has_its_speed_again(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            stream = await world.up(held)
-            await world.service.set_speed(held, SetSpeedArgs(2.0))
+            grant = world.grants.put(spec())
+            stream = await world.up(grant)
+            await world.service.set_speed(grant, SetSpeedArgs(2.0))
             stream.cancel()
             await world.until(lambda: world.control.hands == "system", 10)
             assert world.guard.situation().speed_setpoint_mps == 8.0
-            await world.drive(held)
+            await world.drive(grant)
             assert world.guard.situation().speed_setpoint_mps == 2.0
 
     fly(flight)
@@ -220,9 +220,9 @@ def test_a_driver_that_comes_back_has_its_speed_again(tmp_path: Path) -> None:
 def test_the_monitor_leads_a_slow_driver_back_at_the_speed_of_the_vehicle(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held, 25.0)
-            await world.service.set_speed(held, SetSpeedArgs(0.2))
+            grant = world.grants.put(spec())
+            await world.up(grant, 25.0)
+            await world.service.set_speed(grant, SetSpeedArgs(0.2))
             world.grants.put(spec(limit("altitude", 15.0)))
             await world.until(lambda: world.plane.speed_mps == 8.0, 5)
             assert world.control.motion is not None
@@ -237,9 +237,9 @@ def test_the_monitor_leads_a_slow_driver_back_at_the_speed_of_the_vehicle(tmp_pa
 def test_a_correction_that_came_too_late_for_its_motion_is_made_for_the_next(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            flying = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 150), 0)))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            flying = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 150), 0)))
             await world.until(lambda: world.plane.velocity[1] > 7)
             world.grants.put(spec(limit("speed", 3.0)))
             world.watch.look()
@@ -255,11 +255,11 @@ def test_a_correction_that_came_too_late_for_its_motion_is_made_for_the_next(tmp
 def test_a_leg_that_begins_too_fast_is_not_told_to_fly_faster_than_it_may(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            replaced = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 150), 0)))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            replaced = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 150), 0)))
             await world.until(lambda: world.plane.velocity[1] > 7)
-            flying = asyncio.ensure_future(end(world.service.goto(held, goto(0, 150, speed_mps=2.0), 0)))
+            flying = asyncio.ensure_future(end(world.service.goto(grant, goto(0, 150, speed_mps=2.0), 0)))
             await world.until(lambda: world.plane.speed_mps == 2.0)
             world.grants.put(spec(limit("speed", 3.0)))
             await world.until(lambda: world.kinds("monitor"), 5)
@@ -278,9 +278,9 @@ def test_a_goto_whose_command_was_lost_is_judged_where_the_drone_is_by_then(tmp_
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
-            held = world.grants.put(spec(zone("no-fly", "ignore", -200, 63, 200, 100)))
-            await world.up(held)
-            first = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 56), 0)))
+            grant = world.grants.put(spec(zone("no-fly", "ignore", -200, 63, 200, 100)))
+            await world.up(grant)
+            first = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 56), 0)))
             await world.until(lambda: plane.velocity[1] > 5 and plane.xy[1] > 22)
             send, lost = plane.send, []
 
@@ -292,7 +292,7 @@ def test_a_goto_whose_command_was_lost_is_judged_where_the_drone_is_by_then(tmp_
 
             plane.send = lossy  # type: ignore[method-assign]
             begun = len(plane.commands)
-            there = await end(world.service.goto(held, goto(-60, 50), 0))
+            there = await end(world.service.goto(grant, goto(-60, 50), 0))
             assert there.verdict.permits
             assert min(lost[:2]) > 5, "it flew on, unheard"
             assert plane.commands[begun] == 84, "by then it had to stop first"
@@ -307,8 +307,8 @@ def test_a_leg_whose_speed_is_lost_is_stopped_and_begun_once_more(tmp_path: Path
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
-            held = world.grants.put(spec(limit("speed", 2.0)))
-            await world.up(held)
+            grant = world.grants.put(spec(limit("speed", 2.0)))
+            await world.up(grant)
             send, left, top = plane.send, lost, 0.0
 
             def lossy(outgoing: Any) -> None:
@@ -320,7 +320,7 @@ def test_a_leg_whose_speed_is_lost_is_stopped_and_begun_once_more(tmp_path: Path
                     send(outgoing)
 
             plane.send = lossy  # type: ignore[method-assign]
-            flying = asyncio.ensure_future(fastest(world, world.service.goto(held, goto(0, 60), 0)))
+            flying = asyncio.ensure_future(fastest(world, world.service.goto(grant, goto(0, 60), 0)))
             if arrives:
                 assert await flying == pytest.approx(2.0, abs=0.2)
             else:
@@ -342,16 +342,16 @@ def test_what_is_permitted_while_the_drone_brakes_before_a_new_zone_is_flown(
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.plane.measured = True
-            held = world.grants.put(spec())
-            await world.up(held)
-            flying = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 90), 0)))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            flying = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 90), 0)))
             await world.until(lambda: world.plane.velocity[1] > 7.5 and world.plane.xy[1] > 30)
-            held = world.grants.put(spec(zone("new", "ignore", -30, 50, 30, 70)))
+            grant = world.grants.put(spec(zone("new", "ignore", -30, 50, 30, 70)))
             assert (await flying).verdict.code == "ExclusionZoneAhead"
             back = goto(*target)
-            await world.until(lambda: judge(Call("Goto", back), world.guard.situation(), held.compiled).permits, 5)
+            await world.until(lambda: judge(Call("Goto", back), world.guard.situation(), grant.compiled).permits, 5)
             assert world.plane.velocity[1] > 5, "it still flies toward the zone"
-            await end(world.service.goto(held, back, 0))
+            await end(world.service.goto(grant, back, 0))
             assert clear_m(world, -30, 50, 30, 70) > 0.0
             codes = [note["code"] for note in world.kinds("control") if note["action"] == "brake"]
             assert codes == ["ExclusionZoneAhead"], "the monitor stopped one motion, not two"
@@ -362,9 +362,9 @@ def test_what_is_permitted_while_the_drone_brakes_before_a_new_zone_is_flown(
 def test_a_correction_is_not_undone_by_the_motion_that_it_ends(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            flying = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 60, 45.0), 0)))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            flying = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 60, 45.0), 0)))
             await world.until(lambda: world.plane.height > 25)
             world.grants.put(spec(limit("altitude", 15.0)))
             assert (await flying).verdict.code == "AltitudeAboveLimit"
@@ -372,7 +372,7 @@ def test_a_correction_is_not_undone_by_the_motion_that_it_ends(tmp_path: Path) -
             await world.until(lambda: world.plane.height < 16.0, 8)
             assert 84 not in world.plane.commands[begun:], "nothing stops it on its way down"
             await world.until(lambda: world.control.motion is None, 10)
-            assert world.control.controller == held.identity
+            assert world.control.controller == grant.identity
 
     fly(flight)
 
@@ -382,11 +382,11 @@ def test_a_correction_is_not_undone_by_the_motion_that_it_ends(tmp_path: Path) -
 
 async def homeward(world: World) -> bool:
     """A drone on its way home around a wall; whether it flies east."""
-    held = world.grants.put(spec(zone("wall", "ignore", *WALL)))
-    await world.up(held)
+    grant = world.grants.put(spec(zone("wall", "ignore", *WALL)))
+    await world.up(grant)
     for x, y in ((60, 30), (60, 70), (0, 70)):
-        await end(world.service.goto(held, goto(x, y), 0))
-    await world.control.give_back(held)
+        await end(world.service.goto(grant, goto(x, y), 0))
+    await world.control.give_back(grant)
     await world.until(lambda: abs(world.plane.velocity[0]) > 3)
     return world.plane.velocity[0] > 0
 
@@ -452,21 +452,21 @@ def test_a_way_that_was_judged_by_an_earlier_grant_is_looked_at_with_other_eyes(
 ) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            going = asyncio.ensure_future(end(world.service.goto(held, goto(0, 90), 1.0)))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            going = asyncio.ensure_future(end(world.service.goto(grant, goto(0, 90), 1.0)))
             await world.until(lambda: world.plane.xy[1] > 3)
             assert not any(changed[-20:]), "it began at rest, by the fences that still hold"
-            held = world.grants.put(spec(zone("far", "ignore", 60, 60, 90, 90)))
+            grant = world.grants.put(spec(zone("far", "ignore", 60, 60, 90, 90)))
             await asyncio.sleep(0.2)
             assert changed[-1]
-            await world.service.hover(held)
+            await world.service.hover(grant)
             with pytest.raises(Refused):
                 await going
             assert changed[-1], "it still flies"
             await world.until(lambda: math.hypot(*world.plane.velocity) < 0.01)
             await asyncio.sleep(2.0)
-            await end(world.service.goto(held, goto(0, 40), 1.0))
+            await end(world.service.goto(grant, goto(0, 40), 1.0))
             assert not any(changed[-20:])
 
     fly(flight)
@@ -477,9 +477,9 @@ def test_a_goto_that_counts_as_complete_at_once_has_still_been_judged_before(
 ) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            await end(world.service.goto(held, goto(0, 45), 50.0))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            await end(world.service.goto(grant, goto(0, 45), 50.0))
             assert world.control.motion is None
             world.grants.put(spec(zone("far", "ignore", 60, 60, 90, 90)))
             await world.until(lambda: world.plane.xy[1] > 3)

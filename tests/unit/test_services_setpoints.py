@@ -18,15 +18,15 @@ WALL = (-40.0, 25.0, 40.0, 40.0)
 def test_a_setpoint_runs_out(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            _, flown = await world.service.set_velocity(held, VelocityArgs(4.0, 0.0, hold_s=1.0))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            _, flown = await world.service.set_velocity(grant, VelocityArgs(4.0, 0.0, hold_s=1.0))
             assert flown.north_mps == 4.0
             await asyncio.sleep(0.9)
             assert world.plane.velocity[1] > 1.5
             await world.until(lambda: abs(world.plane.velocity[1]) < 0.1, 10)
             assert world.control.motion is None
-            assert world.control.controller == held.identity
+            assert world.control.controller == grant.identity
             assert world.plane.xy[1] < 15
 
     fly(flight)
@@ -35,10 +35,10 @@ def test_a_setpoint_runs_out(tmp_path: Path) -> None:
 def test_setpoints_that_follow_each_other_fly_on(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
+            grant = world.grants.put(spec())
+            await world.up(grant)
             for _ in range(50):
-                await world.service.set_velocity(held, VelocityArgs(3.0, 1.0, -0.5, hold_s=0.5))
+                await world.service.set_velocity(grant, VelocityArgs(3.0, 1.0, -0.5, hold_s=0.5))
                 await asyncio.sleep(0.1)
             assert world.plane.velocity == pytest.approx([1.0, 3.0], abs=0.1)
             assert world.plane.height > 11
@@ -50,19 +50,19 @@ def test_setpoints_that_follow_each_other_fly_on(tmp_path: Path) -> None:
 def test_a_setpoint_toward_a_zone_is_not_flown_into_it(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec(zone("no-fly", "ignore", -50, 30, 50, 60)))
-            await world.up(held)
+            grant = world.grants.put(spec(zone("no-fly", "ignore", -50, 30, 50, 60)))
+            await world.up(grant)
             refused = 0
             for _ in range(120):
                 try:
-                    await world.service.set_velocity(held, VelocityArgs(8.0, 0.0, hold_s=1.0))
+                    await world.service.set_velocity(grant, VelocityArgs(8.0, 0.0, hold_s=1.0))
                 except Exception as error:
                     refused += 1
                     assert "no-fly" in str(error)
                 await asyncio.sleep(0.2)
             assert refused > 50
             assert clear_m(world, -50, 30, 50, 60) > 0.5
-            assert world.control.controller == held.identity
+            assert world.control.controller == grant.identity
 
     fly(flight)
 
@@ -70,13 +70,13 @@ def test_a_setpoint_toward_a_zone_is_not_flown_into_it(tmp_path: Path) -> None:
 def test_a_goto_ends_setpoints_and_setpoints_end_a_goto(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            flying = asyncio.ensure_future(refusal(world.service.goto(held, goto(0, 100), 0)))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            flying = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 100), 0)))
             await world.until(lambda: world.plane.velocity[1] > 3)
-            await world.service.set_velocity(held, VelocityArgs(0.0, 3.0, hold_s=2.0))
+            await world.service.set_velocity(grant, VelocityArgs(0.0, 3.0, hold_s=2.0))
             assert (await flying).verdict.code == "Replaced"
-            await end(world.service.goto(held, goto(30, 30), 0))
+            await end(world.service.goto(grant, goto(30, 30), 0))
             await asyncio.sleep(5)
             assert math.dist(world.plane.xy, (30, 30)) < 1.5, "the watchdog of the setpoint is gone"
 
@@ -86,9 +86,9 @@ def test_a_goto_ends_setpoints_and_setpoints_end_a_goto(tmp_path: Path) -> None:
 def test_a_lost_driver_ends_its_setpoint(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            stream = await world.up(held)
-            await world.service.set_velocity(held, VelocityArgs(5.0, 0.0, hold_s=2.0))
+            grant = world.grants.put(spec())
+            stream = await world.up(grant)
+            await world.service.set_velocity(grant, VelocityArgs(5.0, 0.0, hold_s=2.0))
             await asyncio.sleep(0.5)
             sent = len(world.plane.commands)
             stream.cancel()
@@ -103,12 +103,12 @@ def test_a_lost_driver_ends_its_setpoint(tmp_path: Path) -> None:
 def test_a_setpoint_right_after_another_motion_runs_out_as_well(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            await world.service.set_velocity(held, VelocityArgs(3.0, 0.0, hold_s=2.0))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            await world.service.set_velocity(grant, VelocityArgs(3.0, 0.0, hold_s=2.0))
             await asyncio.sleep(0.5)
-            await world.service.hover(held)
-            await world.service.set_velocity(held, VelocityArgs(4.0, 0.0, hold_s=0.5))
+            await world.service.hover(grant)
+            await world.service.set_velocity(grant, VelocityArgs(4.0, 0.0, hold_s=0.5))
             await asyncio.sleep(0.4)
             assert world.plane.wanted == (0.0, 4.0, 0.0)
             await asyncio.sleep(0.2)
@@ -121,14 +121,14 @@ def test_a_setpoint_right_after_another_motion_runs_out_as_well(tmp_path: Path) 
 def test_a_second_stream_of_the_driver_ends_the_setpoint_of_the_first(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            await world.service.set_velocity(held, VelocityArgs(4.0, 0.0, hold_s=2.0))
-            await world.drive(held)
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            await world.service.set_velocity(grant, VelocityArgs(4.0, 0.0, hold_s=2.0))
+            await world.drive(grant)
             await asyncio.sleep(0.3)
             assert world.plane.wanted == (0.0, 0.0, 0.0), "nobody watches it but us"
             assert world.control.motion is None
-            await world.service.set_velocity(held, VelocityArgs(0.0, 2.0, hold_s=0.5))
+            await world.service.set_velocity(grant, VelocityArgs(0.0, 2.0, hold_s=0.5))
             assert world.plane.wanted == (2.0, 0.0, 0.0)
 
     fly(flight)
@@ -137,9 +137,9 @@ def test_a_second_stream_of_the_driver_ends_the_setpoint_of_the_first(tmp_path: 
 def test_a_setpoint_that_fails_ends_the_one_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            await world.service.set_velocity(held, VelocityArgs(4.0, 0.0, hold_s=2.0))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            await world.service.set_velocity(grant, VelocityArgs(4.0, 0.0, hold_s=2.0))
             await asyncio.sleep(0.3)
 
             async def refuses(*_: object) -> None:
@@ -148,7 +148,7 @@ def test_a_setpoint_that_fails_ends_the_one_before(tmp_path: Path, monkeypatch: 
             with monkeypatch.context() as broken:
                 broken.setattr(world.control.helm, "change_mode", refuses)
                 with pytest.raises(AutopilotError, match="not now"):
-                    await world.service.set_velocity(held, VelocityArgs(5.0, 0.0, hold_s=2.0))
+                    await world.service.set_velocity(grant, VelocityArgs(5.0, 0.0, hold_s=2.0))
                 await asyncio.sleep(0.05)
             for _ in range(10):
                 await asyncio.sleep(0.1)
@@ -160,9 +160,9 @@ def test_a_setpoint_that_fails_ends_the_one_before(tmp_path: Path, monkeypatch: 
 def test_a_setpoint_that_waited_is_watched_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
-            await world.up(held)
-            await world.service.set_velocity(held, VelocityArgs(4.0, 0.0, hold_s=0.5))
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            await world.service.set_velocity(grant, VelocityArgs(4.0, 0.0, hold_s=0.5))
             change_mode = world.control.helm.change_mode
 
             async def slow(*args: Any) -> None:
@@ -171,7 +171,7 @@ def test_a_setpoint_that_waited_is_watched_as_well(tmp_path: Path, monkeypatch: 
                 await change_mode(*args)
 
             monkeypatch.setattr(world.control.helm, "change_mode", slow)
-            await world.service.set_velocity(held, VelocityArgs(0.0, 3.0, hold_s=0.5))
+            await world.service.set_velocity(grant, VelocityArgs(0.0, 3.0, hold_s=0.5))
             assert world.plane.wanted == (3.0, 0.0, 0.0)
             await asyncio.sleep(0.7)
             assert world.plane.wanted == (0.0, 0.0, 0.0), "it ran out"

@@ -15,7 +15,7 @@ from fractus_core.policy.values import Call, TakeoffArgs, Verdict
 from fractus_proto.v1 import mobility_pb2
 from fractus_services import answering
 from fractus_services.auth import Caller
-from fractus_services.grants import Held
+from fractus_services.grants import ActiveGrant
 from fractus_services.mobility import background, courses, service
 from fractus_services.mobility.background import in_slices
 from fractus_services.mobility.handlers import MobilityHandlers
@@ -39,11 +39,11 @@ class Clock:
 class Context:
     """A call of one caller."""
 
-    def __init__(self, held: Held) -> None:
-        self.held = held
+    def __init__(self, grant: ActiveGrant) -> None:
+        self.grant = grant
 
-    def auth_context(self) -> Held:
-        return self.held
+    def auth_context(self) -> ActiveGrant:
+        return self.grant
 
     def time_remaining(self) -> float:
         return 5.0
@@ -62,7 +62,7 @@ class Context:
 
 @pytest.fixture
 def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], World]:
-    monkeypatch.setattr(answering, "caller_of", lambda held, _time: Caller(held.identity, 0.0, 1e12))
+    monkeypatch.setattr(answering, "caller_of", lambda grant, _time: Caller(grant.identity, 0.0, 1e12))
     return lambda: World(tmp_path)
 
 
@@ -111,7 +111,7 @@ async def test_others_have_their_turn_during_a_long_computation(monkeypatch: pyt
 def test_fences_that_change_during_a_search_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
-            held = world.grants.put(partial())
+            grant = world.grants.put(partial())
             searches = 0
 
             async def slowly(search: Any) -> Any:
@@ -122,7 +122,7 @@ def test_fences_that_change_during_a_search_count(tmp_path: Path, monkeypatch: p
                 return await in_slices(search)
 
             monkeypatch.setattr(courses, "in_slices", slowly)
-            await world.drive(held)
+            await world.drive(grant)
             assert searches > 2
             assert max(abs(x) for x, _, _ in world.plane.trace) > 41, "around the wall from the first leg on"
             assert not [e for e in world.kinds("control") if e["action"] == "brake"]
@@ -133,9 +133,9 @@ def test_fences_that_change_during_a_search_count(tmp_path: Path, monkeypatch: p
 def test_who_asks_much_waits_and_who_drives_waits_less(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            held = world.grants.put(spec())
+            grant = world.grants.put(spec())
             other = world.grants.put(spec(instance="app-viewer", **{"class": "passenger", "control": None}), "m2")
-            await world.drive(held)
+            await world.drive(grant)
             monkeypatch.setattr(service, "time", Clock())
 
             async def ask(who: Any, times: int) -> float:
@@ -148,7 +148,7 @@ def test_who_asks_much_waits_and_who_drives_waits_less(tmp_path: Path, monkeypat
                 return world.plane.now - begun
 
             flood = asyncio.ensure_future(ask(other, 101))
-            assert await ask(held, 101) == pytest.approx(0.1, abs=0.02)
+            assert await ask(grant, 101) == pytest.approx(0.1, abs=0.02)
             assert not flood.done()
             assert await flood == pytest.approx(0.4, abs=0.05)
 
@@ -158,14 +158,14 @@ def test_who_asks_much_waits_and_who_drives_waits_less(tmp_path: Path, monkeypat
 def test_takeoffs_take_turns_as_any_costly_call(world: Callable[[], World], monkeypatch: pytest.MonkeyPatch) -> None:
     async def flight() -> None:
         async with world() as w:
-            held = w.grants.put(spec())
-            await w.drive(held)
-            await w.service.arm(held)
+            grant = w.grants.put(spec())
+            await w.drive(grant)
+            await w.service.arm(grant)
             judged = costly(w, "Takeoff", monkeypatch)
             handlers = handlers_of(w)
             for _ in range(5):
                 with pytest.raises(PermissionError, match="InvalidArgument"):
-                    await handlers.Takeoff(mobility_pb2.TakeoffRequest(altitude_m=-5.0), Context(held))
+                    await handlers.Takeoff(mobility_pb2.TakeoffRequest(altitude_m=-5.0), Context(grant))
             assert len(judged) == 5
             assert min(b - a for a, b in itertools.pairwise(judged)) > 0.09
 
@@ -175,19 +175,19 @@ def test_takeoffs_take_turns_as_any_costly_call(world: Callable[[], World], monk
 def test_a_takeoff_that_cannot_be_is_not_judged(world: Callable[[], World], monkeypatch: pytest.MonkeyPatch) -> None:
     async def flight() -> None:
         async with world() as w:
-            held = w.grants.put(spec())
+            grant = w.grants.put(spec())
             judged = costly(w, "Takeoff", monkeypatch)
 
             async def why() -> str:
                 async def begun() -> None:
-                    w.service.take_off(held, TakeoffArgs(10.0))
+                    w.service.take_off(grant, TakeoffArgs(10.0))
 
                 return (await refusal(begun())).verdict.code
 
             assert await why() == "NotInControl"
-            await w.drive(held)
+            await w.drive(grant)
             assert await why() == "NotArmed"
-            await w.up(held)
+            await w.up(grant)
             judged.clear()
             assert await why() == "AlreadyFlying"
             assert not judged
@@ -198,11 +198,11 @@ def test_a_takeoff_that_cannot_be_is_not_judged(world: Callable[[], World], monk
 def test_a_cheap_call_shortens_no_rest(world: Callable[[], World], monkeypatch: pytest.MonkeyPatch) -> None:
     async def flight() -> None:
         async with world() as w:
-            held = w.grants.put(spec())
+            grant = w.grants.put(spec())
             other = w.grants.put(spec(instance="app-other"), "m2")
-            await w.up(held)
+            await w.up(grant)
             costly(w, "Goto", monkeypatch)
-            for who, rest_s in ((held, 0.1), (other, 0.4)):
+            for who, rest_s in ((grant, 0.1), (other, 0.4)):
                 await w.service.turn(who)
                 begun = w.plane.now
                 w.service.check(Call("Goto"), who)
@@ -216,9 +216,9 @@ def test_a_cheap_call_shortens_no_rest(world: Callable[[], World], monkeypatch: 
 def test_no_call_is_carried_out_after_a_later_one(world: Callable[[], World], monkeypatch: pytest.MonkeyPatch) -> None:
     async def flight() -> None:
         async with world() as w:
-            held = w.grants.put(spec())
+            grant = w.grants.put(spec())
             other = w.grants.put(spec(instance="app-other"), "m2")
-            await w.up(held)
+            await w.up(grant)
             handlers = handlers_of(w)
             costly(w, "GetSpeed", monkeypatch)
             place = dict(zip(("latitude_deg", "longitude_deg", "altitude_m"), (*at(0, 90), 10.0), strict=True))
@@ -226,17 +226,17 @@ def test_no_call_is_carried_out_after_a_later_one(world: Callable[[], World], mo
 
             def setpoint(east_mps: float) -> Any:
                 velocity = {"east_mps": east_mps}
-                return handlers.SetVelocity(mobility_pb2.SetVelocityRequest(velocity=velocity), Context(held))
+                return handlers.SetVelocity(mobility_pb2.SetVelocityRequest(velocity=velocity), Context(grant))
 
             async def waiting(*calls: Any) -> list[asyncio.Future[Any]]:
                 """The calls, which came one after the other while a judgement's rest lasts."""
-                w.service.check(Call("GetSpeed"), held)
+                w.service.check(Call("GetSpeed"), grant)
                 tasks = [asyncio.ensure_future(call) for call in calls]
                 await asyncio.sleep(0.02)
                 return tasks
 
-            [stale] = await waiting(handlers.Goto(goto, Context(held)))
-            await handlers.Hover(hover, Context(held))
+            [stale] = await waiting(handlers.Goto(goto, Context(grant)))
+            await handlers.Hover(hover, Context(grant))
             with pytest.raises(PermissionError, match="Replaced"):
                 await stale
             assert w.control.motion is None
@@ -248,7 +248,7 @@ def test_no_call_is_carried_out_after_a_later_one(world: Callable[[], World], mo
                 with pytest.raises(PermissionError, match="Replaced"):
                     await replaced
 
-            [kept] = await waiting(handlers.Goto(goto, Context(held)))
+            [kept] = await waiting(handlers.Goto(goto, Context(grant)))
             for call in (handlers.Hover(hover, Context(other)), handlers.Goto(goto, Context(other))):
                 with pytest.raises(PermissionError, match="NotInControl"):
                     await call

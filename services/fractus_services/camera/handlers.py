@@ -30,17 +30,17 @@ class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
     async def CaptureImage(self, request: Any, context: Any) -> Any:  # noqa: N802 - the protocol's name
         """See camera.proto."""
         async with self._reception.call(context) as caller:
-            held = self._reception.held(caller)
+            grant = self._reception.grant_of(caller)
             args = CaptureArgs(request.width, request.height)
-            verdict, shot = await self._service.capture(held, args, lambda: self._reception.held(caller))
+            verdict, shot = await self._service.capture(grant, args, lambda: self._reception.grant_of(caller))
             return camera_pb2.CaptureImageResponse(decision=decision(verdict), image=_info(shot))
 
     async def RetrieveImage(self, request: Any, context: Any) -> None:  # noqa: N802
         """See camera.proto."""
         async with self._reception.call(context) as caller:
-            held = self._reception.held(caller)
+            grant = self._reception.grant_of(caller)
             verdict, shot, source = await self._service.retrieve(
-                held, request.name, lambda: self._reception.held(caller)
+                grant, request.name, lambda: self._reception.grant_of(caller)
             )
             head: dict[str, Any] = {"decision": decision(verdict), "image": _info(shot)}
             async for piece in _pieces(source, request.name):
@@ -51,13 +51,13 @@ class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
     async def ListImages(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See camera.proto."""
         async with self._reception.call(context) as caller:
-            verdict, shots = await self._service.list(self._reception.held(caller))
+            verdict, shots = await self._service.list(self._reception.grant_of(caller))
             return camera_pb2.ListImagesResponse(decision=decision(verdict), images=[_info(shot) for shot in shots])
 
     async def DeleteImage(self, request: Any, context: Any) -> Any:  # noqa: N802
         """See camera.proto."""
         async with self._reception.call(context) as caller:
-            verdict = await self._service.delete(self._reception.held(caller), request.name)
+            verdict = await self._service.delete(self._reception.grant_of(caller), request.name)
             return camera_pb2.DeleteImageResponse(decision=decision(verdict))
 
 

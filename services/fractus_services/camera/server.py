@@ -86,7 +86,7 @@ async def run(options: Options, stop: asyncio.Event) -> None:
         options.keep,
         options.keep_mb * 1_000_000,
         options.keep_total_mb * 1_000_000,
-        lambda: [owner_of(held) for held in grants.held.values()],
+        lambda: [owner_of(grant) for grant in grants.active.values()],
     )
     service = CameraService(
         whereabouts, shutter, body_of(description), detector=detector_of(options), album=album, audit=audit, clock=clock

@@ -30,7 +30,7 @@ from fractus_services.camera.metadata import tagged
 from fractus_services.camera.shots import Pose, Shot, facts
 from fractus_services.camera.shutter import Shutter
 from fractus_services.camera.turns import QueueFull, Turns
-from fractus_services.grants import Held
+from fractus_services.grants import ActiveGrant
 from fractus_services.replies import Refused, refused
 
 log = logging.getLogger(__name__)
@@ -48,9 +48,9 @@ APART_S = 0.25
 _T = TypeVar("_T")
 
 
-def owner_of(held: Held) -> str:
+def owner_of(grant: ActiveGrant) -> str:
     """Whose pictures they are: an instance of this very application, not of a later one of the same name."""
-    return f"{held.spec.application.uid}/{held.identity}"
+    return f"{grant.spec.application.uid}/{grant.identity}"
 
 
 class Whereabouts(Protocol):
@@ -89,7 +89,7 @@ class _Exposed:
 
     Attributes:
         name: of the picture.
-        held: by which grant it was judged.
+        grant: by which grant it was judged.
         verdict: what became of it.
         after: where the camera was at the end, and on which way it got there.
         pictures: what the camera gave.
@@ -97,7 +97,7 @@ class _Exposed:
     """
 
     name: str
-    held: Held
+    grant: ActiveGrant
     verdict: Verdict
     after: Situation
     pictures: list[Pixels]
@@ -143,7 +143,7 @@ class CameraService:
         self._tasks: set[asyncio.Task[Any]] = set()
 
     async def capture(
-        self, held: Held, args: CaptureArgs, present: Callable[[], Held] | None = None
+        self, grant: ActiveGrant, args: CaptureArgs, present: Callable[[], ActiveGrant] | None = None
     ) -> tuple[Verdict, Shot]:
         """Take a picture and keep it.
 
@@ -151,7 +151,7 @@ class CameraService:
         on the way: the drone moves meanwhile, and grants change.
 
         Args:
-            held: the caller's grant.
+            grant: the caller's grant.
             args: pixels; 0 means the camera's own.
             present: the caller's grant at a later moment; raises when there is none any more.
         """
@@ -159,7 +159,7 @@ class CameraService:
         self._check_size(width, height)
         # A caller that hangs up does not free the shutter before the picture is done.
         return await self._finished(
-            self._taken(owner_of(held), replace(args, width=width, height=height), present or (lambda: held))
+            self._taken(owner_of(grant), replace(args, width=width, height=height), present or (lambda: grant))
         )
 
     def _check_size(self, width: int, height: int) -> None:
@@ -190,7 +190,7 @@ class CameraService:
         if not task.cancelled() and task.exception() is not None:
             log.debug("no picture: %s", task.exception())
 
-    async def _taken(self, owner: str, args: CaptureArgs, present: Callable[[], Held]) -> tuple[Verdict, Shot]:
+    async def _taken(self, owner: str, args: CaptureArgs, present: Callable[[], ActiveGrant]) -> tuple[Verdict, Shot]:
         call = Call("CaptureImage", args)
         expected = judge_privacy(self._whereabouts.situation(self._clock()), present().compiled)
         if not expected.filters:
@@ -203,44 +203,44 @@ class CameraService:
         async with self._developing.turn(owner):
             return await self._kept(call, await self._exposed(owner, call, present))
 
-    async def _exposed(self, owner: str, call: Call, present: Callable[[], Held]) -> _Exposed:
+    async def _exposed(self, owner: str, call: Call, present: Callable[[], ActiveGrant]) -> _Exposed:
         args = call.args
         if not isinstance(args, CaptureArgs):
             raise TypeError("CaptureImage without its arguments")
         async with self._exposing.turn(owner):
             # A camera may give a picture that it had before it was asked.
             begun_s = time.monotonic() - self._shutter.latency_s
-            held, now = present(), self._whereabouts.situation(self._clock())
-            verdict = self._allow(call, held, now)
+            grant, now = present(), self._whereabouts.situation(self._clock())
+            verdict = self._allow(call, grant, now)
             problem = await asyncio.to_thread(self._album.room, owner)
             if problem:
                 raise AlbumFull(problem)
             width, height = source_size(args.width, args.height, self._body.resolution)
-            wanted = Wanted(width, height, self._body.resolution, self._body.sensor, now, held.spec.node)
+            wanted = Wanted(width, height, self._body.resolution, self._body.sensor, now, grant.spec.node)
             three = any(one.action == "removeBackground" for one in verdict.filters)
             pictures = await self._shutter.expose(wanted, 3 if three else 1, APART_S)
             if now.lens is not None:
                 # It is judged by a view in these proportions, whatever the camera gave.
                 pictures = [cropped(one, *self._body.resolution) for one in pictures]
-            way, held = self._whereabouts.way(begun_s, self._clock()), present()
+            way, grant = self._whereabouts.way(begun_s, self._clock()), present()
             after = replace(way[-1], way=way)
             # A zone that was active when the picture was begun counts as well as one that is now.
             moments = [after, replace(after, time_s=now.time_s)]
-            verdicts = [verdict, *(self._allow(call, held, moment, always=False) for moment in moments)]
+            verdicts = [verdict, *(self._allow(call, grant, moment, always=False) for moment in moments)]
             first = replace(after, time_s=Moment(now.time_s, earliest(now.time_s) - self._shutter.latency_s))
-            verdicts.append(self._checked(call, held, judge_privacy(first, held.compiled), first))
+            verdicts.append(self._checked(call, grant, judge_privacy(first, grant.compiled), first))
             # Enlarging a picture does not make its faces easier to find.
             shown = min(width, pictures[len(pictures) // 2].shape[1])
             moment = datetime.fromtimestamp(after.time_s, UTC).strftime("%Y%m%d%H%M%S%f")[:17]
             name = f"{moment}-{next(self._numbers) % 10000:04d}.jpg"
-            return _Exposed(name, held, _together(verdicts), after, pictures, shown)
+            return _Exposed(name, grant, _together(verdicts), after, pictures, shown)
 
     async def _kept(self, call: Call, exposed: _Exposed) -> tuple[Verdict, Shot]:
-        args, held, verdict = call.args, exposed.held, exposed.verdict
+        args, grant, verdict = call.args, exposed.grant, exposed.verdict
         if not isinstance(args, CaptureArgs):
             raise TypeError("CaptureImage without its arguments")
         face_px = self._face_px(exposed)
-        chosen = self._recipe(call, held, verdict, face_px, exposed.after)
+        chosen = self._recipe(call, grant, verdict, face_px, exposed.after)
         poses = tuple(Pose.of(one) for one in exposed.after.way)
         moment_s = float(exposed.after.time_s)
         upright = is_upright(poses)
@@ -260,64 +260,64 @@ class CameraService:
 
         data = await asyncio.to_thread(work)
         shot = Shot(exposed.name, moment_s, args.width, args.height, len(data), poses, face_px, chosen.filters)
-        await asyncio.to_thread(self._album.add, owner_of(held), shot, data)
+        await asyncio.to_thread(self._album.add, owner_of(grant), shot, data)
         return _noted(verdict, chosen), shot
 
     def _face_px(self, exposed: _Exposed) -> float:
         """Width of the smallest face that the picture may show; 0 when nobody knows."""
-        view = seen_from(exposed.after.way, exposed.held.compiled.frame)
+        view = seen_from(exposed.after.way, exposed.grant.compiled.frame)
         farthest_m = view.farthest_m if view is not None else math.inf
         return smallest_face_px(exposed.after.lens, farthest_m, exposed.whole_width)
 
-    def _recipe(self, call: Call, held: Held, verdict: Verdict, face_px: float, now: Situation) -> Recipe:
+    def _recipe(self, call: Call, grant: ActiveGrant, verdict: Verdict, face_px: float, now: Situation) -> Recipe:
         try:
             return recipe(verdict.filters, face_px, self._detector)
         except NotHidden as error:
             denied = Verdict("deny", None, "FacesNotFound", f"{verdict.reason}; {error}", verdict.policies)
-            self._checked(call, held, denied, now)
+            self._checked(call, grant, denied, now)
             raise AssertionError("a denial always raises") from error
 
     async def retrieve(
-        self, held: Held, name: str, present: Callable[[], Held] | None = None
+        self, grant: ActiveGrant, name: str, present: Callable[[], ActiveGrant] | None = None
     ) -> tuple[Verdict, Shot, bytes | Path]:
         """A picture; policies hold for where it was taken and for where the camera is now, whichever asks for more.
 
         It is judged again when its filters are applied, as other pictures may come first.
 
         Args:
-            held: the caller's grant.
+            grant: the caller's grant.
             name: of the picture.
             present: as for `capture`.
         """
         call, now = Call("RetrieveImage"), self._whereabouts.situation(self._clock())
-        verdict = self._allow(call, held, now)
-        owner = owner_of(held)
+        verdict = self._allow(call, grant, now)
+        owner = owner_of(grant)
         shot = await asyncio.to_thread(self._album.find, owner, name)
         taken = _taken_at(shot, now)
-        verdict = _together([verdict, self._checked(call, held, judge_privacy(taken, held.compiled), taken)])
+        verdict = _together([verdict, self._checked(call, grant, judge_privacy(taken, grant.compiled), taken)])
         todo = remaining(verdict.filters, shot.filters)
         path = self._album.path(owner, name)
         if not todo:
             return verdict, shot, path
         # Nobody knows which faces are still found in a picture that was filtered before.
         face_px = 0.0 if shot.filters else shot.face_px
-        chosen = self._recipe(call, held, replace(verdict, filters=todo), face_px, taken)
+        chosen = self._recipe(call, grant, replace(verdict, filters=todo), face_px, taken)
         data = await self._finished(self._redeveloped(owner, path, chosen, replace(shot, face_px=face_px)))
-        self._check_again(call, present() if present else held, shot, (*shot.filters, *chosen.filters))
+        self._check_again(call, present() if present else grant, shot, (*shot.filters, *chosen.filters))
         return (
             _noted(verdict, chosen),
             replace(shot, size_bytes=len(data), filters=(*shot.filters, *chosen.filters)),
             data,
         )
 
-    def _check_again(self, call: Call, held: Held, shot: Shot, done: tuple[Filter, ...]) -> None:
+    def _check_again(self, call: Call, grant: ActiveGrant, shot: Shot, done: tuple[Filter, ...]) -> None:
         """Refuse a kept picture that by now needs more filters than it got."""
         now = self._whereabouts.situation(self._clock())
-        verdict, taken = self._allow(call, held, now, always=False), _taken_at(shot, now)
-        verdict = _together([verdict, self._checked(call, held, judge_privacy(taken, held.compiled), taken)])
+        verdict, taken = self._allow(call, grant, now, always=False), _taken_at(shot, now)
+        verdict = _together([verdict, self._checked(call, grant, judge_privacy(taken, grant.compiled), taken)])
         if remaining(verdict.filters, done):
             reason = f"{verdict.reason}, which it did not when this picture was asked for; ask again"
-            self._checked(call, held, Verdict("deny", None, "PrivacyZone", reason, verdict.policies), now)
+            self._checked(call, grant, Verdict("deny", None, "PrivacyZone", reason, verdict.policies), now)
 
     async def _redeveloped(self, owner: str, path: Path, chosen: Recipe, shot: Shot) -> bytes:
         def work() -> bytes:
@@ -327,32 +327,34 @@ class CameraService:
         async with self._developing.turn(owner):
             return await asyncio.to_thread(work)
 
-    async def list(self, held: Held) -> tuple[Verdict, tuple[Shot, ...]]:
+    async def list(self, grant: ActiveGrant) -> tuple[Verdict, tuple[Shot, ...]]:
         """The pictures of the caller."""
-        verdict = self._allow(Call("ListImages"), held, self._whereabouts.situation(self._clock()))
-        return verdict, await asyncio.to_thread(self._album.list, owner_of(held))
+        verdict = self._allow(Call("ListImages"), grant, self._whereabouts.situation(self._clock()))
+        return verdict, await asyncio.to_thread(self._album.list, owner_of(grant))
 
-    async def delete(self, held: Held, name: str) -> Verdict:
+    async def delete(self, grant: ActiveGrant, name: str) -> Verdict:
         """Remove a picture of the caller."""
-        verdict = self._allow(Call("DeleteImage"), held, self._whereabouts.situation(self._clock()))
-        await asyncio.to_thread(self._album.delete, owner_of(held), name)
+        verdict = self._allow(Call("DeleteImage"), grant, self._whereabouts.situation(self._clock()))
+        await asyncio.to_thread(self._album.delete, owner_of(grant), name)
         return verdict
 
-    def _allow(self, call: Call, held: Held, now: Situation, always: bool = True) -> Verdict:
+    def _allow(self, call: Call, grant: ActiveGrant, now: Situation, always: bool = True) -> Verdict:
         try:
-            verdict = judge(call, now, held.compiled)
+            verdict = judge(call, now, grant.compiled)
         except Exception:
             log.exception("the policy engine failed on %s; refused", call.method)
             verdict = Verdict("deny", None, "InternalError", f"the policy engine failed on {call.method}")
-        return self._checked(call, held, verdict, now, always)
+        return self._checked(call, grant, verdict, now, always)
 
-    def _checked(self, call: Call, held: Held, verdict: Verdict, now: Situation, always: bool = False) -> Verdict:
+    def _checked(
+        self, call: Call, grant: ActiveGrant, verdict: Verdict, now: Situation, always: bool = False
+    ) -> Verdict:
         """Refuse what is denied; write down what is decided."""
         if always or not verdict.permits:
             self._audit.append(
                 "call",
                 {
-                    "caller": held.identity, "method": call.method, "args": asdict(call.args) if call.args else {},
+                    "caller": grant.identity, "method": call.method, "args": asdict(call.args) if call.args else {},
                     "action": verdict.action, "code": verdict.code, "reason": verdict.reason,
                     "policies": list(verdict.policies), "filters": [one.action for one in verdict.filters],
                     "lat": now.lat, "lon": now.lon, "alt": now.altitude_m,

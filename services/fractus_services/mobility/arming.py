@@ -6,7 +6,7 @@ import asyncio
 
 from fractus_core.geo import LocalFrame
 
-from fractus_services.grants import Held
+from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.autopilot import AutopilotError, Permit
 from fractus_services.mobility.control import Control
 from fractus_services.mobility.failsafes import BEING_SET, Checked, choose_return, learn_return
@@ -23,36 +23,36 @@ STRAY_M = 50.0
 """A drone that stands further than this from the home of its grant would be brought to the wrong place."""
 
 
-async def arm(control: Control, held: Held, permit: Permit) -> None:
+async def arm(control: Control, grant: ActiveGrant, permit: Permit) -> None:
     """Arm in GUIDED, unless it is armed by then; one caller at a time.
 
     Goes on to its end when the caller hangs up, so that nothing is armed that nobody asks for.
 
     Args:
         control: the drone.
-        held: the grant to fly under.
+        grant: the grant to fly under.
         permit: raises when the caller may not arm any more.
 
     Raises:
         Refused: a failsafe is not verified, audit log or journal cannot be written, or the caller may no more.
         AutopilotError: the autopilot refuses.
     """
-    await asyncio.shield(control.tasks.keep(_in_turn(control, held, permit)))
+    await asyncio.shield(control.tasks.keep(_in_turn(control, grant, permit)))
 
 
-async def _in_turn(control: Control, held: Held, permit: Permit) -> None:
+async def _in_turn(control: Control, grant: ActiveGrant, permit: Permit) -> None:
     """Arm when nobody else is at it: what is prepared on the ground must not be prepared under a drone that flies."""
     async with control.autopilot.starting:
         permit()
         if not control.autopilot.vehicle.armed:
-            await _arm(control, held, permit)
+            await _arm(control, grant, permit)
 
 
-async def _arm(control: Control, held: Held, permit: Permit) -> None:
+async def _arm(control: Control, grant: ActiveGrant, permit: Permit) -> None:
     helm = control.helm
     _check(control)
-    mission = control.journal.mission(held)
-    home = mission.home = _home_of(control, held, mission)
+    mission = control.journal.mission(grant)
+    home = mission.home = _home_of(control, grant, mission)
     control.journal.active = mission.key
     await control.journal.save(timeout_s=ARMED_S)
     if control.journal.failure:
@@ -60,7 +60,7 @@ async def _arm(control: Control, held: Held, permit: Permit) -> None:
     permit()
     helm.preparing += 1
     try:
-        checked = await _prepare_ways_home(control, held, home)
+        checked = await _prepare_ways_home(control, grant, home)
 
         def still() -> None:
             permit()
@@ -96,7 +96,7 @@ async def _start(control: Control, home: tuple[float, float, float], permit: Per
         helm.arming = False
 
 
-async def _prepare_ways_home(control: Control, held: Held, home: tuple[float, float, float]) -> Checked:
+async def _prepare_ways_home(control: Control, grant: ActiveGrant, home: tuple[float, float, float]) -> Checked:
     """Choose how the autopilot comes home by itself, raise its own fence around the mission, and learn how high it returns.
 
     A vehicle remembers its path from where it was armed last: armed elsewhere than at home, it must not go back on it.
@@ -110,7 +110,7 @@ async def _prepare_ways_home(control: Control, held: Held, home: tuple[float, fl
     checked = _learnt(control, checked, await choose_return(autopilot, checked, retrace=at_home))
     try:
         async with asyncio.timeout(FENCE_S):
-            await control.backstop.raise_around(held.spec, retraces=control.retraces)
+            await control.backstop.raise_around(grant.spec, retraces=control.retraces)
     except (AutopilotError, OSError) as error:
         said = str(error) or f"it takes longer than {FENCE_S:.0f} s"
         why = f"the vehicle's own fence cannot be raised around the operation area: {said}"
@@ -139,13 +139,13 @@ def _check(control: Control, chosen: Checked | None = None) -> Checked:
     return checked
 
 
-def _home_of(control: Control, held: Held, mission: Mission) -> tuple[float, float, float]:
+def _home_of(control: Control, grant: ActiveGrant, mission: Mission) -> tuple[float, float, float]:
     """Home is where the mission armed first: landing on the way and arming again does not move it."""
     vehicle = control.autopilot.vehicle
     if vehicle.lat is None or vehicle.lon is None:
         raise precondition("PositionUnknown", "the position is not known yet")
     lat, lon, amsl_m = mission.home or (vehicle.lat, vehicle.lon, vehicle.amsl_m)
-    base = held.spec.home or held.spec.depot
+    base = grant.spec.home or grant.spec.depot
     if base is not None:
         away = distance_m(LocalFrame(base.lat, base.lon), lat, lon)
         if away > STRAY_M:

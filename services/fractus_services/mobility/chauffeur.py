@@ -65,8 +65,8 @@ class Chauffeur:
             AutopilotError: the autopilot refuses.
         """
         control = self._control
-        start = start_of(lease.held.spec.control_points[mission.points_done])
-        regime = control.begin_transit(lease.held, mission)
+        start = start_of(lease.grant.spec.control_points[mission.points_done])
+        regime = control.begin_transit(lease.grant, mission)
         trip = Trip(regime, "Transit", lambda motion: transit_permit(control, lease, motion))
         try:
             async for news in self.lift(trip, start):
@@ -77,7 +77,7 @@ class Chauffeur:
         except (Refused, AutopilotError):
             raise
         except Exception as error:
-            log.exception("the drone cannot be brought to %s", lease.held.identity)
+            log.exception("the drone cannot be brought to %s", lease.grant.identity)
             raise self._give_up(lease, mission) from error
         finally:
             control.relieve(regime)
@@ -112,7 +112,7 @@ class Chauffeur:
                 yield "the system arms the drone"
                 self._allow(Call("Arm"), trip)
                 if not vehicle.armed:
-                    await arm(control, trip.regime.held, permit)
+                    await arm(control, trip.regime.grant, permit)
                 climbed = self._allow(Call("Takeoff", TakeoffArgs(self._height_m(place, trip))), trip)
                 yield "the system takes off"
                 await control.helm.change_mode(GUIDED, permit)
@@ -126,14 +126,14 @@ class Chauffeur:
     def _height_m(self, place: Position, trip: Trip) -> float:
         if place.alt is None:
             return CRUISE_M
-        home, flat = self._control.autopilot.vehicle.home, trip.regime.grant.flat_terrain
+        home, flat = self._control.autopilot.vehicle.home, trip.regime.compiled.flat_terrain
         height = height_m(place.alt, place.altitude_reference, home, flat)
         if height is None:
             raise precondition("TerrainUnknown", "the altitude is given above terrain, and no terrain model is loaded")
         return height
 
     def _allow(self, call: Call, trip: Trip) -> object:
-        verdict = self._guard.judge(call, trip.regime.held, trip.regime.grant)
+        verdict = self._guard.judge(call, trip.regime.grant, trip.regime.compiled)
         if not verdict.permits:
             raise precondition("ControlPointUnreachable", f"the system cannot bring the drone there: {verdict.reason}")
         return verdict.args

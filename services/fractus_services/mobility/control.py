@@ -16,7 +16,7 @@ from fractus_core.policy.compiled import CompiledGrant, for_transit
 from fractus_core.policy.values import Takeover, Verdict
 
 from fractus_services.audit import AuditLog
-from fractus_services.grants import GrantFiles, Held
+from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.autopilot import Autopilot, AutopilotError, Permit, always
 from fractus_services.mobility.background import Background
 from fractus_services.mobility.backstop import Backstop
@@ -87,8 +87,8 @@ class Control:
         self.was_armed: bool | None = None
         self.system: asyncio.Task[None] | None = None
         self._grace: asyncio.Task[None] | None = None
-        self._removed: Held | None = None
-        self._transit: tuple[Held, CompiledGrant] | None = None
+        self._removed: ActiveGrant | None = None
+        self._transit: tuple[ActiveGrant, CompiledGrant] | None = None
         self.tasks = Background()
         self._changed = asyncio.Event()
         grants.listen(self._grant_changed)
@@ -97,20 +97,20 @@ class Control:
     def controller(self) -> str:
         """Who flies, as telemetry tells it."""
         if self.hands == "driver" and self.lease is not None:
-            return self.lease.held.identity
+            return self.lease.grant.identity
         return "pilot" if self.hands == "pilot" else "system"
 
     @property
-    def mission_grant(self) -> Held | None:
+    def mission_grant(self) -> ActiveGrant | None:
         """The grant under which the drone is in the air."""
         if self.lease is not None:
-            return self.lease.held
+            return self.lease.grant
         mission = self.journal.flying
-        held = self._grants.of(mission.identity) if mission is not None else None
-        return held if held is not None and mission is not None and held.key == mission.key else None
+        grant = self._grants.of(mission.identity) if mission is not None else None
+        return grant if grant is not None and mission is not None and grant.key == mission.key else None
 
     @property
-    def last_grant(self) -> Held | None:
+    def last_grant(self) -> ActiveGrant | None:
         """The grant whose fences hold on the way home: the mission's, or what it was before it was taken away."""
         return self.mission_grant or self._removed
 
@@ -166,7 +166,7 @@ class Control:
         self.hands = "driver"
         lease.granted = True
         self.adopt(mission)
-        self.note("granted", lease.held.identity, f"control point {mission.points_done}")
+        self.note("granted", lease.grant.identity, f"control point {mission.points_done}")
         return News(State.GRANTED, mission.points_done, "", mission.waypoints)
 
     def adopt(self, mission: Mission) -> None:
@@ -177,19 +177,19 @@ class Control:
         self.journal.active = mission.key
         self.journal.save_soon()
 
-    def valid(self, held: Held) -> bool:
+    def valid(self, grant: ActiveGrant) -> bool:
         """Whether a grant is still in force."""
-        now = self._grants.of(held.identity)
-        return now is not None and now.key == held.key
+        now = self._grants.of(grant.identity)
+        return now is not None and now.key == grant.key
 
-    def require(self, held: Held) -> Lease:
+    def require(self, grant: ActiveGrant) -> Lease:
         """The lease of a caller that moves the drone.
 
         Raises:
             Refused: it does not have the drone.
         """
         lease = self.lease
-        if lease is None or lease.key != held.key or not self.drives(lease):
+        if lease is None or lease.key != grant.key or not self.drives(lease):
             raise precondition("NotInControl", f"the drone is not yours: {self.controller} has it; use GetControl")
         if not self.autopilot.connected:
             raise unavailable("the autopilot is not connected")
@@ -199,16 +199,16 @@ class Control:
         """Whether the driver of a lease has the drone."""
         return lease.granted and self.hands == "driver"
 
-    async def give_back(self, held: Held) -> bool:
+    async def give_back(self, grant: ActiveGrant) -> bool:
         """A driver returns control at the end of a control point; True when that was the last one."""
-        lease = self.require(held)
-        mission = self.journal.mission(held)
+        lease = self.require(grant)
+        mission = self.journal.mission(grant)
         mission.points_done, mission.waypoints = mission.points_done + 1, 0
-        last = mission.points_done >= len(held.spec.control_points)
+        last = mission.points_done >= len(grant.spec.control_points)
         self.lease = None
         self.hands = "system"
         self.stop_motion(aborted("ControlReturned", "control was returned"))
-        self.note("returned", held.identity, "the mission is complete" if last else "")
+        self.note("returned", grant.identity, "the mission is complete" if last else "")
         if last:
             mission.outcome = "complete"
             lease.tell(News(State.COMPLETE, mission.points_done - 1, "every control point is done"))
@@ -221,10 +221,10 @@ class Control:
         await self.journal.save()
         return last
 
-    def reached(self, held: Held, lat: float, lon: float) -> None:
+    def reached(self, grant: ActiveGrant, lat: float, lon: float) -> None:
         """A goto of the driver is complete: count the waypoint."""
-        mission = self.journal.mission(held)
-        points = held.spec.control_points
+        mission = self.journal.mission(grant)
+        points = grant.spec.control_points
         path = points[mission.points_done].path if mission.points_done < len(points) else None
         if path and mission.waypoints < len(path):
             ahead = path[mission.waypoints]
@@ -239,16 +239,16 @@ class Control:
         self.tasks.drop(self._grace)
         self.tasks.drop(self.system)
 
-    def begin_transit(self, held: Held, mission: Mission) -> Regime:
+    def begin_transit(self, grant: ActiveGrant, mission: Mission) -> Regime:
         """The system flies for an application, under its fences."""
         self.stop_system()
         self.hands = "system"
         self.adopt(mission)
-        return self.under(held)
+        return self.under(grant)
 
-    def under(self, held: Held) -> Regime:
+    def under(self, grant: ActiveGrant) -> Regime:
         """What the system flies from now on keeps to the fences of a grant, as they are at each moment."""
-        self.regime = Regime(held, self._for_transit(held))
+        self.regime = Regime(grant, self._for_transit(grant))
         return self.regime
 
     def relieve(self, regime: Regime) -> None:
@@ -256,9 +256,9 @@ class Control:
         if self.regime is regime:
             self.regime = None
 
-    def _for_transit(self, held: Held) -> CompiledGrant:
-        if self._transit is None or self._transit[0] is not held:
-            self._transit = held, for_transit(held.spec, flat_terrain=held.compiled.flat_terrain)
+    def _for_transit(self, grant: ActiveGrant) -> CompiledGrant:
+        if self._transit is None or self._transit[0] is not grant:
+            self._transit = grant, for_transit(grant.spec, flat_terrain=grant.compiled.flat_terrain)
         return self._transit[1]
 
     # Motions
@@ -414,12 +414,12 @@ class Control:
             mission.flown = True
             self.journal.save_soon()
 
-    def _grant_changed(self, old: Held | None, new: Held | None) -> None:
+    def _grant_changed(self, old: ActiveGrant | None, new: ActiveGrant | None) -> None:
         if old is not None and new is not None and old.key == new.key:
             if self.lease is not None and self.lease.key == new.key:
-                self.lease.held = new
-            if self.regime is not None and self.regime.held.key == new.key:
-                self.regime.held, self.regime.grant = new, self._for_transit(new)
+                self.lease.grant = new
+            if self.regime is not None and self.regime.grant.key == new.key:
+                self.regime.grant, self.regime.compiled = new, self._for_transit(new)
             return
         self.wake()
         if old is None or not (old.spec.class_ == "driver" or old.spec.tour):

@@ -80,9 +80,9 @@ async def first_leg(
     """
     heights = tuple(dict.fromkeys(heights_m))
     for _ in range(REPLANS + 1):
-        grant = trip.regime.grant
+        grant = trip.regime.compiled
         found = await _first_leg(goal, heights, now, grant)
-        if trip.regime.grant is grant:
+        if trip.regime.compiled is grant:
             return found
     raise aborted("FencesChanged", "the fences change faster than a way is found")
 
@@ -163,7 +163,7 @@ class Courses:
         raise aborted("NotFollowing", f"the drone did not arrive within {MAX_LEGS} legs")
 
     async def _next(self, trip: Trip, target: GotoArgs) -> tuple[GotoArgs, bool]:
-        now, grant = self._guard.situation(), trip.regime.grant
+        now, grant = self._guard.situation(), trip.regime.compiled
         if now.lat is None or now.lon is None:
             raise unavailable("the drone's position is not known")
         wanted = now.altitude_m
@@ -190,13 +190,13 @@ class Courses:
 
     def _unreachable(self, trip: Trip, target: GotoArgs) -> Refused:
         """No way is found: what the policies say of the straight one tells why."""
-        verdict = self._guard.judge(Call("Goto", target), trip.regime.held, trip.regime.grant)
+        verdict = self._guard.judge(Call("Goto", target), trip.regime.grant, trip.regime.compiled)
         why = verdict.reason or "no way around the zones is found"
         return precondition("NoLegalWay", f"the system cannot fly to {target.lat:.6f}, {target.lon:.6f}: {why}")
 
     def _allowed(self, trip: Trip, leg: GotoArgs) -> GotoArgs:
         """A leg as the policies allow it."""
-        verdict = self._guard.judge(Call("Goto", leg), trip.regime.held, trip.regime.grant)
+        verdict = self._guard.judge(Call("Goto", leg), trip.regime.grant, trip.regime.compiled)
         if not verdict.permits or not isinstance(verdict.args, GotoArgs):
             raise precondition("NoLegalWay", f"the system cannot fly there: {verdict.reason}")
         return replace(verdict.args, speed_mps=verdict.args.speed_mps or self._control.cruise_mps)

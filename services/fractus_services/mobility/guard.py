@@ -12,7 +12,7 @@ from fractus_core.policy.engine import judge
 from fractus_core.policy.values import Airframe, Call, Situation, Verdict
 
 from fractus_services.audit import AuditLog
-from fractus_services.grants import Held
+from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.control import Control
 from fractus_services.mobility.motions import distance_m
 
@@ -64,8 +64,8 @@ class Guard:
     def judge(
         self,
         call: Call,
-        held: Held,
-        grant: CompiledGrant | None = None,
+        grant: ActiveGrant,
+        compiled: CompiledGrant | None = None,
         *,
         kind: str = "call",
         known: Verdict | None = None,
@@ -76,14 +76,14 @@ class Guard:
 
         Args:
             call: method and arguments.
-            held: the caller's grant.
-            grant: what it is judged under instead, when the system flies.
+            grant: the caller's grant.
+            compiled: what it is judged under instead, when the system flies.
             kind: of the audit entry; `check` when the call is not carried out.
             known: the verdict that was written down a moment ago; the same again is not.
         """
         now = self.situation()
         try:
-            verdict = judge(call, now, grant or held.compiled)
+            verdict = judge(call, now, compiled or grant.compiled)
         except Exception:
             log.exception("the policy engine failed on %s; refused", call.method)
             verdict = Verdict(
@@ -95,7 +95,7 @@ class Guard:
                 "hover",
             )
         if verdict != known and (call.method not in QUIET or not verdict.permits):
-            self.record(call, held.identity, verdict, now, kind=kind)
+            self.record(call, grant.identity, verdict, now, kind=kind)
         return verdict
 
     def record(self, call: Call, caller: str, verdict: Verdict, now: Situation, *, kind: str = "call") -> None:

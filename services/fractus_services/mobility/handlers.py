@@ -15,7 +15,7 @@ from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 from fractus_services.answering import Reception
 from fractus_services.auth import Caller
 from fractus_services.clock import Clock
-from fractus_services.grants import GrantFiles, Held
+from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.arguments import call_of, checked, goto_args, velocity_args
 from fractus_services.mobility.autopilot import AutopilotError
 from fractus_services.mobility.control import Control
@@ -60,7 +60,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         grants: GrantFiles,
         node: str,
         clock: Clock,
-        heard: Callable[[Held], None] = lambda _held: None,
+        heard: Callable[[ActiveGrant], None] = lambda _grant: None,
     ) -> None:
         self._service = service
         self._control = control
@@ -70,11 +70,11 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         self._clock = clock
         self._reception = Reception(grants, clock, _known, self._failed)
 
-    def _held(self, caller: Caller) -> Held:
+    def _grant_of(self, caller: Caller) -> ActiveGrant:
         """The grant of a caller, who thereby shows that it is there."""
-        held = self._reception.held(caller)
-        self._heard(held)
-        return held
+        grant = self._reception.grant_of(caller)
+        self._heard(grant)
+        return grant
 
     def _failed(self, verdict: Verdict) -> None:
         """Something in here broke: hold the drone of a driver where it is."""
@@ -86,12 +86,12 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     async def GetControl(self, _request: Any, context: Any) -> None:  # noqa: N802 - the protocol's name
         """See mobility.proto."""
         async with self._reception.call(context, lasting=True) as caller:
-            held = self._held(caller)
-            self._service.allow(Call("GetControl"), held)
+            grant = self._grant_of(caller)
+            self._service.allow(Call("GetControl"), grant)
             try:
                 async with (
                     asyncio.timeout(max(caller.valid_until_s - self._clock(), 0.0)),
-                    aclosing(self._streams.follow(held)) as events,  # type: ignore[type-var]
+                    aclosing(self._streams.follow(grant)) as events,  # type: ignore[type-var]
                 ):
                     async for news in events:
                         await context.write(_event(news))
@@ -101,10 +101,10 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     async def ReturnControl(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context, urgent=True) as caller:
-            held = self._held(caller)
-            self._service.comes(held)
-            self._service.allow(Call("ReturnControl"), held)
-            last = await self._control.give_back(held)
+            grant = self._grant_of(caller)
+            self._service.comes(grant)
+            self._service.allow(Call("ReturnControl"), grant)
+            last = await self._control.give_back(grant)
             return mobility_pb2.ReturnControlResponse(mission_complete=last)
 
     # Calls that answer at once
@@ -112,29 +112,29 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     async def Arm(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context) as caller:
-            return mobility_pb2.ArmResponse(decision=decision(await self._service.arm(self._held(caller))))
+            return mobility_pb2.ArmResponse(decision=decision(await self._service.arm(self._grant_of(caller))))
 
     async def Disarm(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context) as caller:
-            return mobility_pb2.DisarmResponse(decision=decision(await self._service.disarm(self._held(caller))))
+            return mobility_pb2.DisarmResponse(decision=decision(await self._service.disarm(self._grant_of(caller))))
 
     async def Hover(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context, urgent=True) as caller:
-            return mobility_pb2.HoverResponse(decision=decision(await self._service.hover(self._held(caller))))
+            return mobility_pb2.HoverResponse(decision=decision(await self._service.hover(self._grant_of(caller))))
 
     async def SetSpeed(self, request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context) as caller:
-            await self._service.turn(self._held(caller))
-            verdict, speed = await self._service.set_speed(self._held(caller), SetSpeedArgs(request.speed_mps))
+            await self._service.turn(self._grant_of(caller))
+            verdict, speed = await self._service.set_speed(self._grant_of(caller), SetSpeedArgs(request.speed_mps))
             return mobility_pb2.SetSpeedResponse(decision=decision(verdict), speed_mps=speed)
 
     async def GetSpeed(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context) as caller:
-            verdict = self._service.allow(Call("GetSpeed"), self._held(caller))
+            verdict = self._service.allow(Call("GetSpeed"), self._grant_of(caller))
             speed = self._control.autopilot.vehicle.speed_mps
             return mobility_pb2.GetSpeedResponse(decision=decision(verdict), speed_mps=speed)
 
@@ -142,8 +142,8 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         """See mobility.proto."""
         async with self._reception.call(context) as caller:
             args = velocity_args(request)
-            await self._service.turn_to_move(self._held(caller))
-            verdict, flown = await self._service.set_velocity(self._held(caller), args)
+            await self._service.turn_to_move(self._grant_of(caller))
+            verdict, flown = await self._service.set_velocity(self._grant_of(caller), args)
             reply = mobility_pb2.SetVelocityResponse(decision=decision(verdict))
             reply.velocity.north_mps, reply.velocity.east_mps = flown.north_mps, flown.east_mps
             reply.velocity.down_mps = flown.down_mps
@@ -153,13 +153,13 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         """See mobility.proto."""
         async with self._reception.call(context) as caller:
             call = call_of(request)
-            await self._service.turn(self._held(caller))
-            return checked(self._service.check(call, self._held(caller)))
+            await self._service.turn(self._grant_of(caller))
+            return checked(self._service.check(call, self._grant_of(caller)))
 
     async def GetPosition(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context) as caller:
-            verdict = self._service.allow(Call("GetPosition"), self._held(caller))
+            verdict = self._service.allow(Call("GetPosition"), self._grant_of(caller))
             vehicle = self._control.autopilot.vehicle
             if not located(self._control):
                 raise unavailable("the drone's position is not known yet")
@@ -172,27 +172,27 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     async def Takeoff(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context, lasting=True) as caller:
-            await self._service.turn_to_move(self._held(caller))
-            progress = self._service.take_off(self._held(caller), TakeoffArgs(request.altitude_m))
+            await self._service.turn_to_move(self._grant_of(caller))
+            progress = self._service.take_off(self._grant_of(caller), TakeoffArgs(request.altitude_m))
             await self._report(progress, context)
 
     async def Goto(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context, lasting=True) as caller:
             args, reached_m = goto_args(request), _finite(request.acceptance_radius_m)
-            await self._service.turn_to_move(self._held(caller))
-            progress = self._service.goto(self._held(caller), args, reached_m)
+            await self._service.turn_to_move(self._grant_of(caller))
+            progress = self._service.goto(self._grant_of(caller), args, reached_m)
             await self._report(progress, context)
 
     async def Land(self, _request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context, urgent=True) as caller:
-            await self._report(self._service.land(self._held(caller)), context)
+            await self._report(self._service.land(self._grant_of(caller)), context)
 
     async def ReturnToLaunch(self, _request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context, urgent=True) as caller:
-            await self._report(self._service.return_to_launch(self._held(caller)), context)
+            await self._report(self._service.return_to_launch(self._grant_of(caller)), context)
 
     async def _report(self, progress: AsyncIterator[Progress], context: Any) -> None:
         first = True
@@ -225,7 +225,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
                     judged = loop.time()
                     caller.check(self._clock())
                     if not node:
-                        self._service.allow(Call("GetPosition"), self._held(caller))
+                        self._service.allow(Call("GetPosition"), self._grant_of(caller))
                 if loop.time() >= due:
                     due = loop.time() + interval
                     await context.write(telemetry_of(self._control, self._clock(), missions=node))

@@ -13,7 +13,7 @@ from fractus_core.policy.motion import height_margin_m, margin_m
 from fractus_core.policy.returning import straight_home_blocked
 from fractus_core.policy.values import GotoArgs, Situation
 
-from fractus_services.grants import Held
+from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.autopilot import AutopilotError
 from fractus_services.mobility.control import Control
 from fractus_services.mobility.courses import MAX_LEGS, REPLANS, Trip, first_leg, limited_mps, stopped_by_monitor
@@ -54,11 +54,11 @@ class Homing:
             AutopilotError: the autopilot refuses, or its link broke.
         """
         control = self._control
-        held, vehicle = control.last_grant, control.autopilot.vehicle
-        if held is None or not vehicle.in_air or vehicle.mode in HOMEWARD:
+        grant, vehicle = control.last_grant, control.autopilot.vehicle
+        if grant is None or not vehicle.in_air or vehicle.mode in HOMEWARD:
             return RTL
         try:
-            why = await self._bring(held, wanted) if tries < TRIES else self._give_up(held, tries)
+            why = await self._bring(grant, wanted) if tries < TRIES else self._give_up(grant, tries)
         except AutopilotError:
             raise
         except Exception:
@@ -72,16 +72,16 @@ class Homing:
         log.error("no legal way home is known (%s); the drone %s", why, how)
         return SMART_RTL if back else RTL
 
-    def _give_up(self, held: Held, tries: int) -> str:
+    def _give_up(self, grant: ActiveGrant, tries: int) -> str:
         """Why the way home is not flown by us any more; nothing where the straight one is legal."""
-        return "" if self._clear(held.compiled) else f"the autopilot refused {tries} times"
+        return "" if self._clear(grant.compiled) else f"the autopilot refused {tries} times"
 
-    async def _bring(self, held: Held, wanted: Callable[[], bool]) -> str:
+    async def _bring(self, grant: ActiveGrant, wanted: Callable[[], bool]) -> str:
         """Fly to where the straight way home is legal; why that is impossible, or nothing."""
         control = self._control
-        if self._clear(held.compiled):
+        if self._clear(grant.compiled):
             return ""
-        regime = control.under(held)
+        regime = control.under(grant)
 
         def permit() -> None:
             if not wanted() or control.regime is not regime:
@@ -132,7 +132,7 @@ class Homing:
                 try:
                     await come_to_rest(autopilot, motion, permit)
                 except Refused as refusal:
-                    if refusal.verdict.code == "NotStopping" and self._clear(trip.regime.grant):
+                    if refusal.verdict.code == "NotStopping" and self._clear(trip.regime.compiled):
                         return  # in a wind that gives it no rest the drone flies home all the same
                     raise
             leg = await self._leg(trip)
@@ -150,7 +150,7 @@ class Homing:
         return _straight(now, grant)
 
     async def _leg(self, trip: Trip) -> GotoArgs | None:
-        now, grant = self._guard.situation(), trip.regime.grant
+        now, grant = self._guard.situation(), trip.regime.compiled
         if now.lat is None or now.lon is None or now.home is None or _straight(now, grant):
             return None
         # The whole way is flown by us, so the autopilot's own straight one need not be legal from its waypoints.

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from fractus_services.grants import Held
+from fractus_services.grants import ActiveGrant
 
 log = logging.getLogger(__name__)
 
@@ -98,11 +98,11 @@ class Journal:
         """The mission that the drone is armed or in the air for."""
         return self.missions.get(self.active) if self.active else None
 
-    def mission(self, held: Held) -> Mission:
+    def mission(self, grant: ActiveGrant) -> Mission:
         """The mission of a grant, begun when it is new."""
-        found = self.missions.get(held.key)
+        found = self.missions.get(grant.key)
         if found is None:
-            found = self.missions[held.key] = Mission(held.key, held.identity)
+            found = self.missions[grant.key] = Mission(grant.key, grant.identity)
             for key in list(self.missions)[: max(len(self.missions) - REMEMBERED, 0)]:
                 del self.missions[key]
         return found

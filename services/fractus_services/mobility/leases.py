@@ -9,7 +9,7 @@ from enum import Enum
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.values import GotoArgs
 
-from fractus_services.grants import Held
+from fractus_services.grants import ActiveGrant
 from fractus_services.replies import Refused
 
 
@@ -42,13 +42,13 @@ class Lease:
     """A driver's hold on the drone.
 
     Attributes:
-        held: the grant, as it is now.
+        grant: the grant, as it is now.
         granted: whether the driver drives, or still waits.
         transit: whether the system flies, or flew, for the waiting driver.
     """
 
-    def __init__(self, held: Held) -> None:
-        self.held = held
+    def __init__(self, grant: ActiveGrant) -> None:
+        self.grant = grant
         self.granted = False
         self.transit = False
         self._news: asyncio.Queue[News | None] = asyncio.Queue()
@@ -56,7 +56,7 @@ class Lease:
     @property
     def key(self) -> str:
         """The mission."""
-        return self.held.key
+        return self.grant.key
 
     def tell(self, news: News | None) -> None:
         """Send an event to the driver; None ends the stream without one."""
@@ -76,8 +76,8 @@ class Lease:
 class Regime:
     """The fences under which the system flies an application's drone; they follow the grant when it changes."""
 
-    held: Held
-    grant: CompiledGrant
+    grant: ActiveGrant
+    compiled: CompiledGrant
 
 
 class Motion:

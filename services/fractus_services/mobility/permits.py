@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from fractus_services.grants import Held
+from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.autopilot import Permit
 from fractus_services.mobility.control import Control
 from fractus_services.mobility.leases import Lease, Motion, Regime
 from fractus_services.replies import precondition
 
 
-def driver_permit(control: Control, held: Held, motion: Motion | None = None) -> Permit:
+def driver_permit(control: Control, grant: ActiveGrant, motion: Motion | None = None) -> Permit:
     """A driver's commands go only while it may still move the drone.
 
     Args:
         control: who has the drone.
-        held: the driver's grant.
+        grant: the driver's grant.
         motion: the motion that commands; none for calls that are no motions.
     """
     lease = control.lease
@@ -22,7 +22,7 @@ def driver_permit(control: Control, held: Held, motion: Motion | None = None) ->
     def check() -> None:
         if motion is not None:
             motion.check()
-        if control.require(held) is not lease or not control.valid(held):
+        if control.require(grant) is not lease or not control.valid(grant):
             raise precondition("ControlLost", "the drone is not yours any more")
 
     return check
@@ -33,7 +33,7 @@ def transit_permit(control: Control, lease: Lease, motion: Motion) -> Permit:
 
     def check() -> None:
         motion.check()
-        if control.lease is not lease or control.hands != "system" or not control.valid(lease.held):
+        if control.lease is not lease or control.hands != "system" or not control.valid(lease.grant):
             raise precondition("ControlLost", "the driver is gone")
 
     return check
@@ -44,7 +44,7 @@ def tour_permit(control: Control, regime: Regime, motion: Motion) -> Permit:
 
     def check() -> None:
         motion.check()
-        if control.regime is not regime or control.hands != "system" or not control.valid(regime.held):
+        if control.regime is not regime or control.hands != "system" or not control.valid(regime.grant):
             raise precondition("ControlLost", "the system does not fly this mission any more")
 
     return check

@@ -111,9 +111,9 @@ async def run(options: Options, stop: asyncio.Event) -> None:
 
 
 def _record_grant(audit: AuditLog, old: Any, new: Any) -> None:
-    held = new or old
+    grant = new or old
     change = "added" if old is None else "removed" if new is None else "changed"
-    audit.append("grant", {"change": change, "identity": held.identity, "name": held.name, "key": held.key})
+    audit.append("grant", {"change": change, "identity": grant.identity, "name": grant.name, "key": grant.key})
 
 
 async def _serve(options: Options, tls: TlsFiles, handlers: MobilityHandlers) -> None:

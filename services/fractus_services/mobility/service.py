@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, VelocityArgs, Verdict
 
-from fractus_services.grants import Held
+from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.arming import arm
 from fractus_services.mobility.autopilot import Autopilot, Permit
 from fractus_services.mobility.control import Control
@@ -70,71 +70,71 @@ class MobilityService:
         self._rested_at = {True: 0.0, False: 0.0}
         self._came = 0
 
-    def allow(self, call: Call, held: Held) -> Verdict:
+    def allow(self, call: Call, grant: ActiveGrant) -> Verdict:
         """Judge a call that moves nothing.
 
         Raises:
             Refused: by policy.
         """
-        verdict = self._guard.judge(call, held)
+        verdict = self._guard.judge(call, grant)
         if not verdict.permits:
             raise refused(verdict)
         return verdict
 
-    def check(self, call: Call, held: Held) -> Verdict:
+    def check(self, call: Call, grant: ActiveGrant) -> Verdict:
         """The verdict on a call that is not carried out."""
-        if held.spec.class_ != "driver" and call.method in MOVING:
-            return self._not_a_driver(call, held, kind="check")
-        return self._judge(call, held, kind="check")
+        if grant.spec.class_ != "driver" and call.method in MOVING:
+            return self._not_a_driver(call, grant, kind="check")
+        return self._judge(call, grant, kind="check")
 
-    async def turn(self, held: Held) -> None:
+    async def turn(self, grant: ActiveGrant) -> None:
         """Wait until the loop has had time for the flight since a call of this caller, or its like, was judged last."""
-        left_s = self._rested_at[self._drives(held)] - self._autopilot.now
+        left_s = self._rested_at[self._drives(grant)] - self._autopilot.now
         while left_s > 0:
             await asyncio.sleep(left_s)  # others that waited may have been first
-            left_s = self._rested_at[self._drives(held)] - self._autopilot.now
+            left_s = self._rested_at[self._drives(grant)] - self._autopilot.now
 
-    async def turn_to_move(self, held: Held) -> None:
+    async def turn_to_move(self, grant: ActiveGrant) -> None:
         """Wait as `turn` does, before a call that moves the drone: it is void once a later such call has come.
 
         Raises:
             Refused: who has the drone has said since what it shall do.
         """
-        number = self.comes(held)
-        await self.turn(held)
-        if self._drives(held) and number != self._came:
+        number = self.comes(grant)
+        await self.turn(grant)
+        if self._drives(grant) and number != self._came:
             raise aborted("Replaced", "a later call came before this one's turn")
 
-    def comes(self, held: Held) -> int:
+    def comes(self, grant: ActiveGrant) -> int:
         """Number a call on what the drone shall do as it comes; those of who does not have the drone replace none."""
-        self._came += self._drives(held)
+        self._came += self._drives(grant)
         return self._came
 
-    def _drives(self, held: Held) -> bool:
+    def _drives(self, grant: ActiveGrant) -> bool:
         lease = self._control.lease
-        return lease is not None and lease.key == held.key
+        return lease is not None and lease.key == grant.key
 
-    def _judge(self, call: Call, held: Held, *, kind: str = "call", known: Verdict | None = None) -> Verdict:
-        drives, begun = self._drives(held), time.perf_counter()
+    def _judge(self, call: Call, grant: ActiveGrant, *, kind: str = "call", known: Verdict | None = None) -> Verdict:
+        drives, begun = self._drives(grant), time.perf_counter()
         try:
-            return self._guard.judge(call, held, kind=kind, known=known)
+            return self._guard.judge(call, grant, kind=kind, known=known)
         finally:
             rest_s = (time.perf_counter() - begun) * REST[drives]
             self._rested_at[drives] = max(self._rested_at[drives], self._autopilot.now + rest_s)
 
-    def _not_a_driver(self, call: Call, held: Held, *, kind: str = "call") -> Verdict:
+    def _not_a_driver(self, call: Call, grant: ActiveGrant, *, kind: str = "call") -> Verdict:
         verdict = Verdict("deny", None, "NotADriver", f"passengers ride along; only a driver may {call.method}")
-        self._guard.record(call, held.identity, verdict, self._guard.situation(), kind=kind)
+        self._guard.record(call, grant.identity, verdict, self._guard.situation(), kind=kind)
         return verdict
 
-    def _allow_motion(self, call: Call, held: Held, known: Verdict | None = None) -> Verdict:
+    def _allow_motion(self, call: Call, grant: ActiveGrant, known: Verdict | None = None) -> Verdict:
         """Judge a call that moves the drone, of a driver that has it; a takeover happens here."""
-        if held.spec.class_ != "driver":
-            raise refused(self._not_a_driver(call, held))
-        verdict = self._judge(call, held, known=known)
+        if grant.spec.class_ != "driver":
+            raise refused(self._not_a_driver(call, grant))
+        verdict = self._judge(call, grant, known=known)
         if verdict.code == "MethodNotGranted":
             raise refused(verdict)
-        self._control.require(held)
+        self._control.require(grant)
         if verdict.action == "takeover":
             self._control.take_over(verdict)
             raise refused(verdict)
@@ -144,45 +144,45 @@ class MobilityService:
             raise refused(verdict)
         return verdict
 
-    async def arm(self, held: Held) -> Verdict:
+    async def arm(self, grant: ActiveGrant) -> Verdict:
         """Start the motors."""
-        verdict = self._allow_motion(Call("Arm"), held)
+        verdict = self._allow_motion(Call("Arm"), grant)
         if not self._autopilot.vehicle.armed:
-            await arm(self._control, held, driver_permit(self._control, held))
+            await arm(self._control, grant, driver_permit(self._control, grant))
         return verdict
 
-    async def disarm(self, held: Held) -> Verdict:
+    async def disarm(self, grant: ActiveGrant) -> Verdict:
         """Stop the motors on the ground."""
-        self.comes(held)
-        verdict = self._allow_motion(Call("Disarm"), held)
-        await self._autopilot.disarm(driver_permit(self._control, held))
+        self.comes(grant)
+        verdict = self._allow_motion(Call("Disarm"), grant)
+        await self._autopilot.disarm(driver_permit(self._control, grant))
         return verdict
 
-    async def hover(self, held: Held) -> Verdict:
+    async def hover(self, grant: ActiveGrant) -> Verdict:
         """Stop and stay."""
-        self.comes(held)
-        verdict = self._allow_motion(Call("Hover"), held)
+        self.comes(grant)
+        verdict = self._allow_motion(Call("Hover"), grant)
         self._flying("Hover")
         self._control.finish(self._control.begin("Hover"))
-        await self._control.hold(driver_permit(self._control, held))
+        await self._control.hold(driver_permit(self._control, grant))
         return verdict
 
-    async def set_speed(self, held: Held, args: SetSpeedArgs) -> tuple[Verdict, float]:
+    async def set_speed(self, grant: ActiveGrant, args: SetSpeedArgs) -> tuple[Verdict, float]:
         """Change the speed of legs."""
-        verdict = self._allow_motion(Call("SetSpeed", args), held)
+        verdict = self._allow_motion(Call("SetSpeed", args), grant)
         wanted = verdict.args.speed_mps if isinstance(verdict.args, SetSpeedArgs) else args.speed_mps
-        verdict, speed = self._on_leg(held, verdict, wanted)
+        verdict, speed = self._on_leg(grant, verdict, wanted)
         self._control.cruise(wanted, speed)
-        await self._autopilot.set_speed(speed, driver_permit(self._control, held))
+        await self._autopilot.set_speed(speed, driver_permit(self._control, grant))
         return verdict, speed
 
-    def _on_leg(self, held: Held, verdict: Verdict, wanted: float) -> tuple[Verdict, float]:
+    def _on_leg(self, grant: ActiveGrant, verdict: Verdict, wanted: float) -> tuple[Verdict, float]:
         """A change of speed as the rest of the leg under way allows it; a leg that is not legal faster gets no faster."""
         motion = self._control.motion
         if motion is None or motion.leg is None or motion.speed_mps is None or wanted <= motion.speed_mps:
             return verdict, wanted
         leg, speed = replace(motion.leg, speed_mps=wanted), motion.speed_mps
-        rest = self._judge(Call("Goto", leg), held, kind="check")
+        rest = self._judge(Call("Goto", leg), grant, kind="check")
         if rest.permits and not rest.brake_first and isinstance(rest.args, GotoArgs):
             legal_mps = rest.args.speed_mps or wanted
             speed = min(legal_mps, wanted) if replace(rest.args, speed_mps=wanted) == leg else speed
@@ -191,38 +191,38 @@ class MobilityService:
         reason = f"the leg under way is flown with {speed:.1f} m/s: {rest.reason or 'it is not legal faster'}"
         return Verdict("correct", SetSpeedArgs(speed), rest.code or "SpeedAboveLimit", reason, rest.policies), speed
 
-    def take_off(self, held: Held, args: TakeoffArgs) -> AsyncIterator[Progress]:
+    def take_off(self, grant: ActiveGrant, args: TakeoffArgs) -> AsyncIterator[Progress]:
         """Climb from the ground."""
         call = Call("Takeoff", args)
-        self._standing_by(call, held)
-        verdict = self._allow_motion(call, held)
+        self._standing_by(call, grant)
+        verdict = self._allow_motion(call, grant)
         altitude = verdict.args.altitude_m if isinstance(verdict.args, TakeoffArgs) else args.altitude_m
 
         async def steps(motion: Motion) -> AsyncIterator[Progress]:
-            permit = driver_permit(self._control, held, motion)
+            permit = driver_permit(self._control, grant, motion)
             await self._control.helm.change_mode(GUIDED, permit)
             async for step in climb(self._autopilot, motion, altitude, permit):
                 yield Progress(verdict, step)
 
         return self._run("Takeoff", steps)
 
-    def goto(self, held: Held, args: GotoArgs, reached_m: float) -> AsyncIterator[Progress]:
+    def goto(self, grant: ActiveGrant, args: GotoArgs, reached_m: float) -> AsyncIterator[Progress]:
         """Fly straight to a point."""
-        verdict = self._allow_motion(Call("Goto", args), held)
+        verdict = self._allow_motion(Call("Goto", args), grant)
         self._flying("Goto")
         radius = min(max(reached_m, 0.3), MAX_REACHED_M) if reached_m > 0 else REACHED_M
 
         async def steps(motion: Motion) -> AsyncIterator[Progress]:
-            permit = driver_permit(self._control, held, motion)
+            permit = driver_permit(self._control, grant, motion)
             call, final = Call("Goto", args), verdict
             for _ in range(JUDGEMENTS):
-                final = await self._settled(call, held, final, motion, permit)
-                leg, judged = self._leg(final, args), self._judged(call, held, final, permit)
+                final = await self._settled(call, grant, final, motion, permit)
+                leg, judged = self._leg(final, args), self._judged(call, grant, final, permit)
                 try:
                     async with aclosing(fly_to(self._autopilot, motion, leg, radius, permit, judged=judged)) as flying:  # type: ignore[type-var]
                         async for step in flying:
                             if step.complete:
-                                self._control.reached(held, args.lat, args.lon)
+                                self._control.reached(grant, args.lat, args.lon)
                             yield Progress(final, step)
                 except _Outdated as outdated:
                     final = outdated.verdict
@@ -237,7 +237,7 @@ class MobilityService:
         goal = verdict.args if isinstance(verdict.args, GotoArgs) else args
         return replace(goal, speed_mps=goal.speed_mps or self._control.cruise_mps)
 
-    def _judged(self, call: Call, held: Held, verdict: Verdict, permit: Permit) -> Permit:
+    def _judged(self, call: Call, grant: ActiveGrant, verdict: Verdict, permit: Permit) -> Permit:
         """Permits a leg only as it is judged where the drone is when the command is sent, maybe again."""
         judged_at = self._autopilot.now
 
@@ -247,13 +247,15 @@ class MobilityService:
             if self._autopilot.now - judged_at <= JUDGE_AGAIN_S:
                 return
             judged_at = self._autopilot.now
-            again = self._allow_motion(call, self._control.require(held).held, verdict)
+            again = self._allow_motion(call, self._control.require(grant).grant, verdict)
             if again.brake_first or again.args != verdict.args:
                 raise _Outdated(again)
 
         return check
 
-    async def _settled(self, call: Call, held: Held, verdict: Verdict, motion: Motion, permit: Permit) -> Verdict:
+    async def _settled(
+        self, call: Call, grant: ActiveGrant, verdict: Verdict, motion: Motion, permit: Permit
+    ) -> Verdict:
         """The verdict to carry out, given where the drone is once it may be: in GUIDED, and standing if need be.
 
         Raises:
@@ -267,17 +269,17 @@ class MobilityService:
             elif self._autopilot.now - begun <= JUDGE_AGAIN_S:
                 return verdict
             permit()
-            verdict = self._allow_motion(call, self._control.require(held).held, verdict)
+            verdict = self._allow_motion(call, self._control.require(grant).grant, verdict)
         raise aborted("NotStopping", "the drone does not come to rest, and could not begin its leg otherwise")
 
-    async def set_velocity(self, held: Held, args: VelocityArgs) -> tuple[Verdict, VelocityArgs]:
+    async def set_velocity(self, grant: ActiveGrant, args: VelocityArgs) -> tuple[Verdict, VelocityArgs]:
         """Fly with a velocity until the next one, or until its hold is over."""
-        verdict = self._allow_motion(Call("SetVelocity", args), held)
+        verdict = self._allow_motion(Call("SetVelocity", args), grant)
         self._flying("SetVelocity")
         motion = self._control.begin("SetVelocity")
-        permit = driver_permit(self._control, held, motion)
+        permit = driver_permit(self._control, grant, motion)
         try:
-            final = await self._settled(Call("SetVelocity", args), held, verdict, motion, permit)
+            final = await self._settled(Call("SetVelocity", args), grant, verdict, motion, permit)
             setpoint = final.args if isinstance(final.args, VelocityArgs) else args
             self._steering.steer(setpoint, motion, permit)
         except BaseException:
@@ -285,29 +287,29 @@ class MobilityService:
             raise
         return final, setpoint
 
-    def land(self, held: Held) -> AsyncIterator[Progress]:
+    def land(self, grant: ActiveGrant) -> AsyncIterator[Progress]:
         """Come down here."""
-        self.comes(held)
-        verdict = self._allow_motion(Call("Land"), held)
+        self.comes(grant)
+        verdict = self._allow_motion(Call("Land"), grant)
         self._flying("Land")
 
         async def steps(motion: Motion) -> AsyncIterator[Progress]:
-            await self._control.helm.change_mode(LAND, driver_permit(self._control, held, motion))
+            await self._control.helm.change_mode(LAND, driver_permit(self._control, grant, motion))
             async for step in come_down(self._autopilot, motion):
                 yield Progress(verdict, step)
 
         return self._run("Land", steps)
 
-    def return_to_launch(self, held: Held) -> AsyncIterator[Progress]:
+    def return_to_launch(self, grant: ActiveGrant) -> AsyncIterator[Progress]:
         """Fly home, around what is in the way, and land."""
-        self.comes(held)
-        verdict = self._allow_motion(Call("ReturnToLaunch"), held)
+        self.comes(grant)
+        verdict = self._allow_motion(Call("ReturnToLaunch"), grant)
         self._flying("ReturnToLaunch")
 
         async def steps(motion: Motion) -> AsyncIterator[Progress]:
             control = self._control
-            permit = driver_permit(control, held, motion)
-            regime = control.under(control.require(held).held)
+            permit = driver_permit(control, grant, motion)
+            regime = control.under(control.require(grant).grant)
             try:
                 await control.helm.change_mode(GUIDED, permit)
                 trip = Trip(regime, motion.kind, lambda _motion: permit)
@@ -327,11 +329,11 @@ class MobilityService:
 
         return self._run("ReturnToLaunch", steps)
 
-    def _standing_by(self, call: Call, held: Held) -> None:
+    def _standing_by(self, call: Call, grant: ActiveGrant) -> None:
         """Refuse a takeoff that cannot be, before its costly judgement; methods that are not granted are left to that."""
-        if held.spec.class_ != "driver" or call.method not in held.compiled.methods:
+        if grant.spec.class_ != "driver" or call.method not in grant.compiled.methods:
             return
-        self._control.require(held)
+        self._control.require(grant)
         if not self._autopilot.vehicle.armed:
             raise precondition("NotArmed", "the motors are off; arm first")
         if self._autopilot.vehicle.in_air and not self._autopilot.vehicle.standing:

@@ -8,7 +8,7 @@ from contextlib import aclosing
 
 from fractus_core.policy.values import Verdict
 
-from fractus_services.grants import Held
+from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.control import Control
 from fractus_services.mobility.journal import Mission
 from fractus_services.mobility.leases import Lease, News, State
@@ -33,26 +33,26 @@ class Streams:
         self._control = control
         self._bring = bring
 
-    async def follow(self, held: Held) -> AsyncIterator[News]:
+    async def follow(self, grant: ActiveGrant) -> AsyncIterator[News]:
         """The events of a caller's stream.
 
         Raises:
             Refused: this caller gets neither the drone nor a ride.
         """
-        events = self._ride(held) if held.spec.tour else self._drive(held)
+        events = self._ride(grant) if grant.spec.tour else self._drive(grant)
         async with aclosing(events) as running:  # type: ignore[type-var]
             async for news in running:
                 yield news
 
     # Drivers
 
-    async def _drive(self, held: Held) -> AsyncIterator[News]:
+    async def _drive(self, grant: ActiveGrant) -> AsyncIterator[News]:
         """A driver has the drone from GRANTED until this is closed."""
         control = self._control
-        mission = self._admit(held)
+        mission = self._admit(grant)
         if control.lease is not None:
             control.lease.tell(News(State.LOST, reason="another stream of the same instance took over"))
-        lease = control.lease = Lease(held)
+        lease = control.lease = Lease(grant)
         try:
             while control.lease is lease and not lease.granted:
                 async with aclosing(self._until_ready(lease, mission)) as waiting:  # type: ignore[type-var]
@@ -73,16 +73,16 @@ class Streams:
         finally:
             self._left(lease)
 
-    def _admit(self, held: Held) -> Mission:
+    def _admit(self, grant: ActiveGrant) -> Mission:
         control = self._control
-        if held.spec.class_ != "driver":
+        if grant.spec.class_ != "driver":
             raise refused(Verdict("deny", None, "NotADriver", "only a driver gets control; passengers ride along"))
-        mission = control.journal.mission(held)
+        mission = control.journal.mission(grant)
         _open(mission)
         other = control.lease
-        if other is not None and other.key != held.key and not other.granted and control.flies_for(held.key):
+        if other is not None and other.key != grant.key and not other.granted and control.flies_for(grant.key):
             control.lose("another application has the drone")
-        if (control.lease is not None and control.lease.key != held.key) or control.taken(held.key):
+        if (control.lease is not None and control.lease.key != grant.key) or control.taken(grant.key):
             raise precondition("ControlHeld", "another application has the drone; try again when it is back")
         return mission
 
@@ -93,7 +93,7 @@ class Streams:
             if control.taken(lease.key):
                 raise precondition("ControlHeld", "another application has the drone; try again when it is back")
             if reason is None:
-                if lease.held.spec.control != "partial":
+                if lease.grant.spec.control != "partial":
                     return
                 lease.transit = True
                 async with aclosing(self._bring(lease, mission)) as flying:  # type: ignore[type-var]
@@ -115,8 +115,8 @@ class Streams:
         if mission is None or not (lease.granted or lease.transit):
             return
         control.hands = "system"
-        control.note("driver lost", lease.held.identity, "its stream broke")
-        log.warning("driver %s is lost", lease.held.identity)
+        control.note("driver lost", lease.grant.identity, "its stream broke")
+        log.warning("driver %s is lost", lease.grant.identity)
         leaving = control.motion is not None and control.motion.kind in {"Land", "ReturnToLaunch"}
         coming_down = leaving and control.autopilot.vehicle.mode in HOMEWARD
         control.stop_motion(precondition("ControlLost", "the driver's stream broke"))
@@ -126,14 +126,14 @@ class Streams:
 
     # Passengers
 
-    async def _ride(self, held: Held) -> AsyncIterator[News]:
+    async def _ride(self, grant: ActiveGrant) -> AsyncIterator[News]:
         """A passenger whose points of interest the system visits is told how far it is; leaving changes nothing."""
         control = self._control
-        mission = control.journal.mission(held)
+        mission = control.journal.mission(grant)
         _open(mission)
         said: News | None = None
         while True:
-            news = self._ridden(held, mission)
+            news = self._ridden(grant, mission)
             if news != said:
                 said = news
                 yield news
@@ -141,15 +141,15 @@ class Streams:
                 return
             await control.wait(WAIT_S)
 
-    def _ridden(self, held: Held, mission: Mission) -> News:
+    def _ridden(self, grant: ActiveGrant, mission: Mission) -> News:
         done = mission.waypoints
         if mission.outcome == "complete":
             return News(State.COMPLETE, done, "every point of interest was visited", done)
         if mission.outcome:
             return News(State.LOST, done, mission.outcome, done)
-        if self._control.touring == held.key:
+        if self._control.touring == grant.key:
             return News(State.RIDING, done, "the system flies through the points of interest", done)
-        return News(State.WAITING, done, self._control.hindrance(held.key) or "the system is about to take off", done)
+        return News(State.WAITING, done, self._control.hindrance(grant.key) or "the system is about to take off", done)
 
 
 def _open(mission: Mission) -> None:

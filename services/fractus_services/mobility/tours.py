@@ -7,7 +7,7 @@ import logging
 
 import grpc
 
-from fractus_services.grants import GrantFiles, Held
+from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.autopilot import AutopilotError
 from fractus_services.mobility.chauffeur import FAULT, Chauffeur, target_of
 from fractus_services.mobility.control import Control
@@ -45,9 +45,9 @@ class Tours:
         self._since: dict[str, float] = {}
         self._aboard: set[str] = set()
 
-    def heard(self, held: Held) -> None:
+    def heard(self, grant: ActiveGrant) -> None:
         """A component called: the passengers of its application are aboard."""
-        uid = held.spec.application.uid
+        uid = grant.spec.application.uid
         if uid not in self._aboard:
             self._aboard.add(uid)
             self._control.wake()
@@ -56,69 +56,69 @@ class Tours:
         """Look for tours to fly until cancelled."""
         control = self._control
         while True:
-            held = self._due()
-            if held is not None:
+            grant = self._due()
+            if grant is not None:
                 control.stop_system()
-                control.touring = held.key
-                control.system = control.tasks.spawn(self._fly(held))
+                control.touring = grant.key
+                control.system = control.tasks.spawn(self._fly(grant))
             await control.wait(LOOK_S)
 
-    def _due(self) -> Held | None:
+    def _due(self) -> ActiveGrant | None:
         """The grant whose tour is to begin, or to go on."""
         control = self._control
-        touring = [held for held in self._grants.held.values() if held.spec.tour]
-        self._since = {held.key: self._since.get(held.key, control.autopilot.now) for held in touring}
+        touring = [grant for grant in self._grants.active.values() if grant.spec.tour]
+        self._since = {grant.key: self._since.get(grant.key, control.autopilot.now) for grant in touring}
         if control.lease is not None or control.touring is not None:
             return None
-        return next((held for held in sorted(touring, key=lambda h: h.key) if self._may_begin(held)), None)
+        return next((grant for grant in sorted(touring, key=lambda h: h.key) if self._may_begin(grant)), None)
 
-    def _may_begin(self, held: Held) -> bool:
+    def _may_begin(self, grant: ActiveGrant) -> bool:
         control, vehicle = self._control, self._control.autopilot.vehicle
-        mission = control.journal.missions.get(held.key)
+        mission = control.journal.missions.get(grant.key)
         if mission is not None and mission.outcome:
             return False
         other = control.journal.flying
-        if other is not None and other.key != held.key and not other.outcome:
+        if other is not None and other.key != grant.key and not other.outcome:
             return False
-        if control.hindrance(held.key) is not None or (vehicle.armed and not control.flies_for(held.key)):
+        if control.hindrance(grant.key) is not None or (vehicle.armed and not control.flies_for(grant.key)):
             return False
-        aboard = held.spec.application.uid in self._aboard
+        aboard = grant.spec.application.uid in self._aboard
         begun = mission is not None and mission.flown
-        return aboard or begun or control.autopilot.now - self._since[held.key] >= self._boarding_s
+        return aboard or begun or control.autopilot.now - self._since[grant.key] >= self._boarding_s
 
-    async def _fly(self, held: Held) -> None:
+    async def _fly(self, grant: ActiveGrant) -> None:
         control = self._control
-        mission = control.journal.mission(held)
-        control.note("tour", "system", f"{len(held.spec.tour)} points of interest for {held.identity}")
+        mission = control.journal.mission(grant)
+        control.note("tour", "system", f"{len(grant.spec.tour)} points of interest for {grant.identity}")
         try:
-            await self._visit(held, mission)
+            await self._visit(grant, mission)
             self._end(mission, "complete")
         except (Refused, AutopilotError) as error:
-            if mission.outcome or control.hands != "system" or control.touring != held.key:
+            if mission.outcome or control.hands != "system" or control.touring != grant.key:
                 return  # somebody else has taken the drone and has said why
             if _passing(error) and mission.flown:
-                log.warning("the tour of %s waits: %s", held.identity, error)
+                log.warning("the tour of %s waits: %s", grant.identity, error)
                 control.start("hover")
                 control.begin_grace(mission, str(error))
                 return
             self._end(mission, f"failed: {error}")
         except Exception:
-            log.exception("the tour of %s cannot be flown", held.identity)
-            if not mission.outcome and control.hands == "system" and control.touring == held.key:
+            log.exception("the tour of %s cannot be flown", grant.identity)
+            if not mission.outcome and control.hands == "system" and control.touring == grant.key:
                 self._end(mission, f"failed: {FAULT}")
         finally:
-            if control.touring == held.key:
+            if control.touring == grant.key:
                 control.touring = None
             control.wake()
 
-    async def _visit(self, held: Held, mission: Mission) -> None:
+    async def _visit(self, grant: ActiveGrant, mission: Mission) -> None:
         """Fly to each point that was not visited yet."""
         control = self._control
-        regime = control.begin_transit(held, mission)
+        regime = control.begin_transit(grant, mission)
         trip = Trip(regime, "Tour", lambda motion: tour_permit(control, regime, motion))
-        access = held.spec.points_of_interest
+        access = grant.spec.points_of_interest
         stay_s = STAY_S if access is not None and access.service_access == "points" else 0.0
-        places = held.spec.tour
+        places = grant.spec.tour
         try:
             async for doing in self._chauffeur.lift(trip, places[min(mission.waypoints, len(places) - 1)]):
                 log.info("%s", doing)

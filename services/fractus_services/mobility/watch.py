@@ -12,7 +12,7 @@ from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Verdict
 
 from fractus_services.audit import AuditLog
-from fractus_services.grants import Held
+from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.autopilot import AutopilotError, Permit
 from fractus_services.mobility.control import CORRECTION, Control
 from fractus_services.mobility.courses import limited_mps
@@ -50,7 +50,7 @@ class Watch:
         self._supervisor = supervisor
         self._alarm = ""
         self._alarm_at = 0.0
-        self._held: Held | None = None
+        self._grant: ActiveGrant | None = None
         self._changed_at = -math.inf
         self._corrections: set[asyncio.Task[None]] = set()
 
@@ -75,13 +75,15 @@ class Watch:
 
     def look(self) -> None:
         """One check."""
-        control, held = self._control, self._control.mission_grant
-        grant = control.regime.grant if control.regime is not None else held.compiled if held is not None else None
+        control, grant = self._control, self._control.mission_grant
+        compiled = (
+            control.regime.compiled if control.regime is not None else grant.compiled if grant is not None else None
+        )
         coming = control.homeward and control.regime is None
-        if grant is None or control.hands == "pilot" or coming or control.autopilot.vehicle.mode != GUIDED:
+        if compiled is None or control.hands == "pilot" or coming or control.autopilot.vehicle.mode != GUIDED:
             self._alarm = ""
             return
-        verdict, ours = self._judge(grant)
+        verdict, ours = self._judge(compiled)
         if verdict is None:
             self._alarm = ""
             return
@@ -94,25 +96,25 @@ class Watch:
         elif verdict.action in {"takeover", "deny"}:
             self._stop(verdict, fresh)
         elif fresh:
-            self._correct(verdict, grant)
+            self._correct(verdict, compiled)
 
-    def _judge(self, grant: CompiledGrant) -> tuple[Verdict | None, bool]:
+    def _judge(self, compiled: CompiledGrant) -> tuple[Verdict | None, bool]:
         """What is wrong, and whether the system flies the drone already, so that there is nobody to take it from."""
         control, now = self._control, self._guard.situation()
-        changed = self._has_changed(control.regime.held if control.regime is not None else control.mission_grant)
+        changed = self._has_changed(control.regime.grant if control.regime is not None else control.mission_grant)
         if control.homeward:
-            return monitor(now, grant, leaving=True, changed=changed), True
-        verdict = monitor(now, grant, changed=changed)
+            return monitor(now, compiled, leaving=True, changed=changed), True
+        verdict = monitor(now, compiled, changed=changed)
         if verdict is None or verdict.takeover != "hover" or control.hands == "driver":
             return verdict, False
-        return monitor(now, grant, leaving=True, changed=changed), True
+        return monitor(now, compiled, leaving=True, changed=changed), True
 
-    def _has_changed(self, held: Held | None) -> bool:
+    def _has_changed(self, grant: ActiveGrant | None) -> bool:
         """Whether the drone's way may have been judged by another grant than this."""
         control = self._control
         autopilot, motion = control.autopilot, control.motion
-        if held is not self._held:
-            self._held, self._changed_at = held, autopilot.now
+        if grant is not self._grant:
+            self._grant, self._changed_at = grant, autopilot.now
         begins = autopilot.now - control.began_at < BEGINS_S
         if (motion is None or motion.kind == "Takeoff") and not begins and stands(autopilot):
             # Whatever moves it from here is judged by what holds now, or later.
@@ -132,15 +134,15 @@ class Watch:
         else:
             control.autopilot.stop()
 
-    def _correct(self, verdict: Verdict, grant: CompiledGrant) -> None:
+    def _correct(self, verdict: Verdict, compiled: CompiledGrant) -> None:
         self._audit.append(
             "monitor", {"action": verdict.action, "code": verdict.code, "reason": verdict.reason, "policies": list(verdict.policies)}
         )  # fmt: skip
-        task = asyncio.get_running_loop().create_task(self._carry_out(verdict, self._control.motion, grant))
+        task = asyncio.get_running_loop().create_task(self._carry_out(verdict, self._control.motion, compiled))
         self._corrections.add(task)
         task.add_done_callback(self._corrections.discard)
 
-    async def _carry_out(self, verdict: Verdict, seen: Motion | None, grant: CompiledGrant) -> None:
+    async def _carry_out(self, verdict: Verdict, seen: Motion | None, compiled: CompiledGrant) -> None:
         if self._control.motion is not seen:
             self._alarm = ""
             return  # the monitor looks at what flies now first
@@ -148,7 +150,7 @@ class Watch:
             if isinstance(verdict.args, SetSpeedArgs):
                 await self._slow_down(verdict.args.speed_mps)
             elif isinstance(verdict.args, GotoArgs):
-                await self._lead_back(verdict, verdict.args, grant)
+                await self._lead_back(verdict, verdict.args, compiled)
         except (AutopilotError, Refused) as error:
             log.warning("cannot correct the motion: %s", error)
 
@@ -170,12 +172,12 @@ class Watch:
             speed_mps = motion.speed_mps = min(speed_mps, motion.speed_mps)
         await self._control.autopilot.set_speed(speed_mps, self._permit(motion))
 
-    async def _lead_back(self, verdict: Verdict, place: GotoArgs, grant: CompiledGrant) -> None:
+    async def _lead_back(self, verdict: Verdict, place: GotoArgs, compiled: CompiledGrant) -> None:
         """Fly to where the limits hold, as a motion that follows the one that left them."""
         control = self._control
         control.stop_motion(aborted(verdict.code, verdict.reason, verdict.policies))
         motion = control.begin(CORRECTION)
-        speed = limited_mps(control.cruise_mps, place, self._guard.situation(), grant)
+        speed = limited_mps(control.cruise_mps, place, self._guard.situation(), compiled)
         leg = replace(place, speed_mps=speed)
         try:
             async for _ in fly_to(control.autopilot, motion, leg, REACHED_M, self._permit(motion)):

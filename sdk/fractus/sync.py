@@ -1,34 +1,30 @@
-"""The same clients for programs without asyncio: `with fractus.sync.mobility() as drone: drone.arm()`."""
+"""The same clients for programs without asyncio: `with fractus.sync.mobility() as drone: drone.arm()`.
+
+Each method here waits for the method of the same name of the asynchronous client, which runs on an event loop in a
+thread of its own: same arguments, same answers, same errors, same documentation.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import functools
 import threading
-from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator
+from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Concatenate, Generic, ParamSpec, Protocol, Self, TypeVar
 
+from fractus import control as _control
 from fractus import drone as _drone
 from fractus import pictures as _pictures
-from fractus.control import Control as _AsyncControl
+from fractus import questions as _questions
 from fractus.environment import Endpoint
 from fractus.errors import FractusError
-from fractus.questions import CanI as _AsyncCanI
-from fractus.values import (
-    AltitudeReference,
-    Check,
-    ImageInfo,
-    PositionResult,
-    Progress,
-    Result,
-    Ride,
-    SpeedResult,
-    Telemetry,
-    VelocityResult,
-)
 
+JOIN_TIMEOUT_S = 10.0
+"""How long `close` waits for the thread of the event loop to end."""
+
+P = ParamSpec("P")
 T = TypeVar("T")
-OnProgress = Callable[[Progress], None]
 
 
 class _End:
@@ -46,9 +42,13 @@ class _Loop:
         self._thread = threading.Thread(target=self._loop.run_forever, name="fractus", daemon=True)
         self._thread.start()
 
-    def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
-        """Wait for a coroutine; an interrupt here (Ctrl-C, say) cancels it there."""
-        future = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
+    def run(self, work: Callable[[], Awaitable[T]]) -> T:
+        """Wait for some work on the loop; an interrupt here (Ctrl-C, say) cancels it there."""
+
+        async def working() -> T:
+            return await work()
+
+        future = asyncio.run_coroutine_threadsafe(working(), self._loop)
         try:
             return future.result()
         except BaseException:
@@ -57,149 +57,41 @@ class _Loop:
 
     def iterate(self, items: AsyncGenerator[T, None]) -> Iterator[T]:
         """The items, one by one; leaving the iteration ends it there, too."""
-
-        async def following() -> T | _End:
-            return await anext(items, _END)
-
         try:
-            while not isinstance(item := self.run(following()), _End):
+            while not isinstance(item := self.run(lambda: anext(items, _END)), _End):
                 yield item
         finally:
-            self.run(items.aclose())
+            self.run(items.aclose)
 
     def close(self) -> None:
         """Stop the loop and its thread."""
         self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(timeout=10)
+        self._thread.join(timeout=JOIN_TIMEOUT_S)
         if not self._thread.is_alive():
             self._loop.close()
 
 
-class Control:
-    """Control of the drone for one control point; see `fractus.Control`.
+class _Closable(Protocol):
+    async def close(self) -> None: ...
 
-    When it is lost, the motion in progress, or else the next call, raises `ControlLost`.
-    """
 
-    def __init__(self, loop: _Loop, control: _AsyncControl) -> None:
+A = TypeVar("A")
+C = TypeVar("C", bound=_Closable)
+
+
+class _Wrapper(Generic[A]):
+    """An asynchronous object and the loop that it lives on."""
+
+    def __init__(self, loop: _Loop, wrapped: A) -> None:
         self._loop = loop
-        self._control = control
-
-    @property
-    def control_point(self) -> int:
-        """Index of the control point that this is for."""
-        return self._control.control_point
-
-    @property
-    def waypoints_reached(self) -> int:
-        """How many of its waypoints were reached before, by an earlier life of this component."""
-        return self._control.waypoints_reached
-
-    @property
-    def mission_complete(self) -> bool:
-        """After control was returned: whether that was the last control point."""
-        return self._control.mission_complete
-
-    @property
-    def lost(self) -> FractusError | None:
-        """Why control was lost; None while it is ours."""
-        return self._control.lost
-
-    def __enter__(self) -> Self:
-        self._loop.run(self._control.take())
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None and self._control.lost is None:
-            self._loop.run(self._control.give_back())
-            return
-        self._loop.run(self._control.abandon())
-        if kind is None and self._control.lost is not None:
-            raise self._control.lost
+        self._async = wrapped
 
 
-class CanI:
-    """Dry runs of calls; see `fractus.CanI`."""
+class _Client(_Wrapper[C]):
+    """A client with a loop of its own."""
 
-    def __init__(self, loop: _Loop, can_i: _AsyncCanI) -> None:
-        self._loop = loop
-        self._can_i = can_i
-
-    def arm(self) -> Check:
-        """Start the motors?"""
-        return self._loop.run(self._can_i.arm())
-
-    def disarm(self) -> Check:
-        """Stop the motors?"""
-        return self._loop.run(self._can_i.disarm())
-
-    def takeoff(self, altitude_m: float) -> Check:
-        """Climb to an altitude above home?"""
-        return self._loop.run(self._can_i.takeoff(altitude_m))
-
-    def land(self) -> Check:
-        """Land here?"""
-        return self._loop.run(self._can_i.land())
-
-    def return_to_launch(self) -> Check:
-        """Fly home and land there?"""
-        return self._loop.run(self._can_i.return_to_launch())
-
-    def hover(self) -> Check:
-        """Stop and stay?"""
-        return self._loop.run(self._can_i.hover())
-
-    def goto(
-        self,
-        lat: float,
-        lon: float,
-        alt: float,
-        *,
-        reference: AltitudeReference = AltitudeReference.HOME,
-        yaw_deg: float | None = None,
-        speed_mps: float | None = None,
-    ) -> Check:
-        """Fly straight to a position?"""
-        asked = self._can_i.goto(lat, lon, alt, reference=reference, yaw_deg=yaw_deg, speed_mps=speed_mps)
-        return self._loop.run(asked)
-
-    def set_speed(self, speed_mps: float) -> Check:
-        """Fly at this speed?"""
-        return self._loop.run(self._can_i.set_speed(speed_mps))
-
-    def set_velocity(
-        self,
-        north_mps: float,
-        east_mps: float,
-        down_mps: float = 0.0,
-        *,
-        yaw_deg: float | None = None,
-        hold_s: float = 0.0,
-    ) -> Check:
-        """Fly with this velocity?"""
-        asked = self._can_i.set_velocity(north_mps, east_mps, down_mps, yaw_deg=yaw_deg, hold_s=hold_s)
-        return self._loop.run(asked)
-
-    def position(self) -> Check:
-        """Ask where the drone is?"""
-        return self._loop.run(self._can_i.position())
-
-    def speed(self) -> Check:
-        """Ask how fast the drone is?"""
-        return self._loop.run(self._can_i.speed())
-
-
-class Mobility:
-    """The mobility service of this node; see `fractus.Mobility`."""
-
-    def __init__(self, endpoint: Endpoint | None = None, *, strict: bool = False) -> None:
-        drone = _drone.mobility(endpoint, strict=strict)
-        self._loop = _Loop()
-        self._drone = drone
-        self.can_i = CanI(self._loop, drone.can_i)
-        """Dry runs: `drone.can_i.goto(lat, lon, 20)`."""
+    def __init__(self, wrapped: C) -> None:
+        super().__init__(_Loop(), wrapped)
 
     def __enter__(self) -> Self:
         return self
@@ -211,143 +103,126 @@ class Mobility:
 
     def close(self) -> None:
         """Close the connection; control that is still held breaks off."""
-        self._loop.run(self._drone.close())
+        self._loop.run(self._async.close)
         self._loop.close()
 
-    def control(self, *, timeout_s: float | None = None) -> Control:
-        """Control of the drone for the next control point: `with drone.control() as control`."""
-        return Control(self._loop, self._drone.control(timeout_s=timeout_s))
 
-    def arm(self) -> Result:
-        """Start the motors."""
-        return self._loop.run(self._drone.arm())
+def _waiting(method: Callable[Concatenate[A, P], Awaitable[T]]) -> Callable[Concatenate[Any, P], T]:
+    """The method that waits for an asynchronous one."""
 
-    def disarm(self) -> Result:
-        """Stop the motors; refused in the air."""
-        return self._loop.run(self._drone.disarm())
+    def waiting(self: _Wrapper[A], /, *args: P.args, **kwargs: P.kwargs) -> T:
+        return self._loop.run(lambda: method(self._async, *args, **kwargs))
 
-    def hover(self) -> Result:
-        """Stop and stay."""
-        return self._loop.run(self._drone.hover())
-
-    def set_speed(self, speed_mps: float) -> SpeedResult:
-        """Fly at this speed over ground from now on."""
-        return self._loop.run(self._drone.set_speed(speed_mps))
-
-    def set_velocity(
-        self,
-        north_mps: float,
-        east_mps: float,
-        down_mps: float = 0.0,
-        *,
-        yaw_deg: float | None = None,
-        hold_s: float = 0.0,
-    ) -> VelocityResult:
-        """Fly with this velocity until the next one, or until `hold_s` is over; see `fractus.Mobility.set_velocity`."""
-        flying = self._drone.set_velocity(north_mps, east_mps, down_mps, yaw_deg=yaw_deg, hold_s=hold_s)
-        return self._loop.run(flying)
-
-    def telemetry(self, interval_s: float = 0.2) -> Iterator[Telemetry]:
-        """The drone's state, every `interval_s` seconds, until the iteration is left."""
-        return self._loop.iterate(self._drone.telemetry(interval_s))
-
-    def ride(self) -> Iterator[Ride]:
-        """For a passenger of an application without a driver; see `fractus.Mobility.ride`."""
-        return self._loop.iterate(self._drone.ride())
-
-    def speed(self) -> SpeedResult:
-        """The speed over ground, as measured."""
-        return self._loop.run(self._drone.speed())
-
-    def position(self) -> PositionResult:
-        """Where the drone is, above home, and how it moves."""
-        return self._loop.run(self._drone.position())
-
-    def takeoff(
-        self, altitude_m: float, *, progress: OnProgress | None = None, timeout_s: float | None = None
-    ) -> Progress:
-        """Climb from the ground to an altitude above home."""
-        return self._fly(self._drone.takeoff(altitude_m, progress=progress, timeout_s=timeout_s))
-
-    def land(self, *, progress: OnProgress | None = None, timeout_s: float | None = None) -> Progress:
-        """Land here, and disarm."""
-        return self._fly(self._drone.land(progress=progress, timeout_s=timeout_s))
-
-    def return_to_launch(self, *, progress: OnProgress | None = None, timeout_s: float | None = None) -> Progress:
-        """Fly home and land there."""
-        return self._fly(self._drone.return_to_launch(progress=progress, timeout_s=timeout_s))
-
-    def goto(
-        self,
-        lat: float,
-        lon: float,
-        alt: float,
-        *,
-        reference: AltitudeReference = AltitudeReference.HOME,
-        yaw_deg: float | None = None,
-        speed_mps: float | None = None,
-        acceptance_radius_m: float = 0.0,
-        progress: OnProgress | None = None,
-        timeout_s: float | None = None,
-    ) -> Progress:
-        """Fly straight to a position, and return when it is reached; see `fractus.Mobility.goto`."""
-        return self._fly(
-            self._drone.goto(
-                lat,
-                lon,
-                alt,
-                reference=reference,
-                yaw_deg=yaw_deg,
-                speed_mps=speed_mps,
-                acceptance_radius_m=acceptance_radius_m,
-                progress=progress,
-                timeout_s=timeout_s,
-            )
-        )
-
-    def _fly(self, motion: _drone.Motion) -> Progress:
-        async def fly() -> Progress:
-            return await motion
-
-        return self._loop.run(fly())
+    functools.update_wrapper(waiting, method)
+    return waiting
 
 
-class Camera:
-    """The camera service of this node; see `fractus.Camera`."""
+def _iterating(
+    method: Callable[Concatenate[A, P], AsyncGenerator[T, None]],
+) -> Callable[Concatenate[Any, P], Iterator[T]]:
+    """The method that iterates over what an asynchronous one gives."""
 
-    def __init__(self, endpoint: Endpoint | None = None) -> None:
-        camera = _pictures.camera(endpoint)
-        self._loop = _Loop()
-        self._camera = camera
+    def iterating(self: _Wrapper[A], /, *args: P.args, **kwargs: P.kwargs) -> Iterator[T]:
+        return self._loop.iterate(method(self._async, *args, **kwargs))
+
+    functools.update_wrapper(iterating, method)
+    return iterating
+
+
+class Control(_Wrapper[_control.Control]):
+    """Control of the drone for one control point; see `fractus.Control`.
+
+    When it is lost, the motion in progress, or else the next call, raises `ControlLost`.
+    """
+
+    @property
+    def control_point(self) -> int:
+        """Index of the control point that this is for."""
+        return self._async.control_point
+
+    @property
+    def waypoints_reached(self) -> int:
+        """How many of its waypoints were reached before, by an earlier life of this component."""
+        return self._async.waypoints_reached
+
+    @property
+    def mission_complete(self) -> bool:
+        """After control was returned: whether that was the last control point."""
+        return self._async.mission_complete
+
+    @property
+    def lost(self) -> FractusError | None:
+        """Why control was lost; None while it is ours."""
+        return self._async.lost
 
     def __enter__(self) -> Self:
+        self._loop.run(self._async.take)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        if kind is None and self.lost is None:
+            self._loop.run(self._async.give_back)
+            return
+        self._loop.run(self._async.abandon)
+        if kind is None and self.lost is not None:
+            raise self.lost
 
-    def close(self) -> None:
-        """Close the connection."""
-        self._loop.run(self._camera.close())
-        self._loop.close()
 
-    def capture(self, width: int = 0, height: int = 0) -> ImageInfo:
-        """Take a picture; 0 leaves width and height to the camera."""
-        return self._loop.run(self._camera.capture(width, height))
+class CanI(_Wrapper[_questions.CanI]):
+    """Dry runs of calls; see `fractus.CanI`."""
 
-    def retrieve(self, name: str) -> bytes:
-        """Fetch a picture, with what privacy policies demand already done to it."""
-        return self._loop.run(self._camera.retrieve(name))
+    arm = _waiting(_questions.CanI.arm)
+    disarm = _waiting(_questions.CanI.disarm)
+    takeoff = _waiting(_questions.CanI.takeoff)
+    land = _waiting(_questions.CanI.land)
+    return_to_launch = _waiting(_questions.CanI.return_to_launch)
+    hover = _waiting(_questions.CanI.hover)
+    goto = _waiting(_questions.CanI.goto)
+    set_speed = _waiting(_questions.CanI.set_speed)
+    set_velocity = _waiting(_questions.CanI.set_velocity)
+    position = _waiting(_questions.CanI.position)
+    speed = _waiting(_questions.CanI.speed)
 
-    def list(self) -> tuple[ImageInfo, ...]:
-        """The pictures of this component on the node, oldest first."""
-        return self._loop.run(self._camera.list())
 
-    def delete(self, name: str) -> Result:
-        """Delete a picture from the node."""
-        return self._loop.run(self._camera.delete(name))
+class Mobility(_Client[_drone.Mobility]):
+    """The mobility service of this node; see `fractus.Mobility`."""
+
+    def __init__(self, endpoint: Endpoint | None = None, *, strict: bool = False) -> None:
+        super().__init__(_drone.mobility(endpoint, strict=strict))
+        self.can_i = CanI(self._loop, self._async.can_i)
+        """Dry runs: `drone.can_i.goto(lat, lon, 20)`."""
+
+    def control(self, *, timeout_s: float | None = None) -> Control:
+        """Control of the drone for the next control point: `with drone.control() as control`."""
+        return Control(self._loop, self._async.control(timeout_s=timeout_s))
+
+    arm = _waiting(_drone.Mobility.arm)
+    disarm = _waiting(_drone.Mobility.disarm)
+    takeoff = _waiting(_drone.Mobility.takeoff)
+    land = _waiting(_drone.Mobility.land)
+    return_to_launch = _waiting(_drone.Mobility.return_to_launch)
+    goto = _waiting(_drone.Mobility.goto)
+    hover = _waiting(_drone.Mobility.hover)
+    set_speed = _waiting(_drone.Mobility.set_speed)
+    set_velocity = _waiting(_drone.Mobility.set_velocity)
+    position = _waiting(_drone.Mobility.position)
+    speed = _waiting(_drone.Mobility.speed)
+    telemetry = _iterating(_drone.Mobility.telemetry)
+    ride = _iterating(_drone.Mobility.ride)
+
+
+class Camera(_Client[_pictures.Camera]):
+    """The camera service of this node; see `fractus.Camera`."""
+
+    def __init__(self, endpoint: Endpoint | None = None) -> None:
+        super().__init__(_pictures.camera(endpoint))
+
+    capture = _waiting(_pictures.Camera.capture)
+    retrieve = _waiting(_pictures.Camera.retrieve)
+    list = _waiting(_pictures.Camera.list)
+    delete = _waiting(_pictures.Camera.delete)
 
 
 def mobility(endpoint: Endpoint | None = None, *, strict: bool = False) -> Mobility:

@@ -1,0 +1,21 @@
+"""The clients without asyncio have every method of the asynchronous ones, with its arguments and documentation."""
+
+from __future__ import annotations
+
+import inspect
+
+import fractus
+import pytest
+from fractus import sync
+
+PAIRS = [(fractus.Mobility, sync.Mobility), (fractus.Camera, sync.Camera), (fractus.CanI, sync.CanI)]
+
+
+@pytest.mark.parametrize(("theirs", "ours"), PAIRS, ids=lambda kind: kind.__name__)
+def test_every_method_is_there(theirs: type, ours: type) -> None:
+    for name, method in inspect.getmembers(theirs, inspect.isfunction):
+        if not name.startswith("_"):
+            waiting = getattr(ours, name)
+            assert not inspect.iscoroutinefunction(waiting)
+            assert waiting.__doc__
+            assert inspect.signature(waiting).parameters.keys() == inspect.signature(method).parameters.keys()

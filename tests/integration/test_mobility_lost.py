@@ -12,8 +12,8 @@ from typing import Any
 import grpc
 import pytest
 from fractus_proto.v1 import mobility_pb2 as pb
-from fractus_services.mobility.autopilot import Autopilot
-from fractus_services.mobility.dialect import Codec, message
+from fractus_services.mobility.mavlink.dialect import Codec, message
+from fractus_services.mobility.mavlink.link import Autopilot
 from mobility_rig import DRIVER, FRAME, Driver, Rig, denied, fence, flown, grant, xy
 
 LOST = pb.ControlEvent.STATE_LOST

@@ -16,22 +16,22 @@ from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled import compile_grant
 from fractus_core.policy.values import Airframe, GotoArgs, Home, TakeoffArgs
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.autopilot import Autopilot
-from fractus_services.mobility.chauffeur import Chauffeur
-from fractus_services.mobility.control import Control
-from fractus_services.mobility.courses import Courses
-from fractus_services.mobility.dialect import message
-from fractus_services.mobility.failsafes import Checked
-from fractus_services.mobility.guard import Guard
-from fractus_services.mobility.homing import Homing
-from fractus_services.mobility.journal import Journal
-from fractus_services.mobility.leases import News, State
-from fractus_services.mobility.service import MobilityService, Progress
-from fractus_services.mobility.streams import Streams
-from fractus_services.mobility.supervisor import Supervisor
-from fractus_services.mobility.tours import Tours
-from fractus_services.mobility.vehicle import BRAKE, COURSE_S, GUIDED, LAND, RTL, SMART_RTL
-from fractus_services.mobility.watch import Watch
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.journal import Journal
+from fractus_services.mobility.authority.leases import News, State
+from fractus_services.mobility.authority.supervisor import Supervisor
+from fractus_services.mobility.flight.courses import Courses
+from fractus_services.mobility.flight.guard import Guard
+from fractus_services.mobility.flight.homing import Homing
+from fractus_services.mobility.flight.service import MobilityService, Progress
+from fractus_services.mobility.flight.tours import Tours
+from fractus_services.mobility.flight.transit import Chauffeur
+from fractus_services.mobility.flight.watch import Watch
+from fractus_services.mobility.mavlink.dialect import message
+from fractus_services.mobility.mavlink.failsafes import Checked
+from fractus_services.mobility.mavlink.link import Autopilot
+from fractus_services.mobility.mavlink.vehicle import BRAKE, COURSE_S, GUIDED, LAND, RTL, SMART_RTL
+from fractus_services.mobility.rpc.streams import Streams
 from fractus_services.replies import Refused
 
 FRAME = LocalFrame(39.36, 22.95)

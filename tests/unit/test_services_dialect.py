@@ -6,7 +6,7 @@ import importlib
 from typing import Any
 
 import pytest
-from fractus_services.mobility.dialect import MESSAGES, Codec, message
+from fractus_services.mobility.mavlink.dialect import MESSAGES, Codec, message
 
 
 @pytest.fixture(scope="module")

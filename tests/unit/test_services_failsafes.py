@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 from fractus_core.policy.values import Airframe
-from fractus_services.mobility.autopilot import SYSTEM_ID
-from fractus_services.mobility.failsafes import Checked, choose_return, configure, learn_return
+from fractus_services.mobility.mavlink.failsafes import Checked, choose_return, configure, learn_return
+from fractus_services.mobility.mavlink.link import SYSTEM_ID
 
 SOUND = {
     "FS_GCS_ENABLE": 1.0, "FS_GCS_TIMEOUT": 5.0, "BATT_FS_LOW_ACT": 2.0, "BATT_FS_CRT_ACT": 1.0, "FS_EKF_ACTION": 1.0,

@@ -6,9 +6,9 @@ import asyncio
 from typing import Any
 
 import pytest
-from fractus_services.mobility import autopilot as module
-from fractus_services.mobility.autopilot import Autopilot
-from fractus_services.mobility.dialect import message
+from fractus_services.mobility.mavlink import link as module
+from fractus_services.mobility.mavlink.dialect import message
+from fractus_services.mobility.mavlink.link import Autopilot
 
 
 class Overtaken(Exception):

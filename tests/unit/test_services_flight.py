@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, Verdict
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.autopilot import AutopilotError
-from fractus_services.mobility.leases import State
-from fractus_services.mobility.vehicle import GUIDED, LAND, RTL, SMART_RTL
+from fractus_services.mobility.authority.leases import State
+from fractus_services.mobility.mavlink.link import AutopilotError
+from fractus_services.mobility.mavlink.vehicle import GUIDED, LAND, RTL, SMART_RTL
 from fractus_services.replies import Refused
 from mobility_world import World, clear_m, end, fly, goto, partial, refusal, spec, touring, zone
 
@@ -473,7 +473,7 @@ def test_a_planner_that_fails_brings_the_drone_home_straight(tmp_path: Path, mon
             grant = world.grants.put(spec(zone("far", "ignore", 150, 150, 160, 160)))
             await world.up(grant)
             await end(world.service.goto(grant, goto(0, 30), 0))
-            monkeypatch.setattr("fractus_services.mobility.homing.straight_home_blocked", broken)
+            monkeypatch.setattr("fractus_services.mobility.flight.homing.straight_home_blocked", broken)
             await world.control.give_back(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
             assert math.dist(world.plane.xy, (0, 0)) < 1.5

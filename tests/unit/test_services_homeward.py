@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import shapely
 from fractus_core.policy.values import GotoArgs
-from fractus_services.mobility.observer import Observer
-from fractus_services.mobility.vehicle import LAND, RTL, SMART_RTL
+from fractus_services.mobility.authority.observer import Observer
+from fractus_services.mobility.mavlink.vehicle import LAND, RTL, SMART_RTL
 from mobility_world import World, at, end, fly, partial, refusal, spec, touring, zone
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
@@ -224,7 +224,7 @@ def test_a_fault_of_ours_ends_the_mission_once(tmp_path: Path, monkeypatch: pyte
 
     async def flight() -> None:
         async with World(tmp_path) as world:
-            monkeypatch.setattr("fractus_services.mobility.courses.searching", broken)
+            monkeypatch.setattr("fractus_services.mobility.flight.courses.searching", broken)
             grant = world.grants.put(touring(tour=((0.0, 60.0),)) if who == "tour" else partial())
             if who == "driver":
                 why = await refusal(world.drive(grant))

@@ -6,10 +6,10 @@ import asyncio
 from typing import Any
 
 import pytest
-from fractus_services.mobility import itemlists
-from fractus_services.mobility.autopilot import Autopilot, AutopilotError
-from fractus_services.mobility.dialect import message
-from fractus_services.mobility.itemlists import FENCE, Item, NoLists, download, upload
+from fractus_services.mobility.mavlink import itemlists
+from fractus_services.mobility.mavlink.dialect import message
+from fractus_services.mobility.mavlink.itemlists import FENCE, Item, NoLists, download, upload
+from fractus_services.mobility.mavlink.link import Autopilot, AutopilotError
 
 ITEMS = tuple(Item(5001, 3.0, 393600000 + i, 229500000 - i) for i in range(3))
 

@@ -8,7 +8,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from fractus_services.mobility.journal import Journal, Mission
+from fractus_services.mobility.authority.journal import Journal, Mission
 
 
 async def kept(directory: Path) -> Journal:
@@ -51,7 +51,7 @@ async def test_a_disk_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.Mon
         def fail(*_: object) -> None:
             raise OSError(28, "No space left on device")
 
-        broken.setattr("fractus_services.mobility.journal.os.fsync", fail)
+        broken.setattr("fractus_services.mobility.authority.journal.os.fsync", fail)
         await journal.save()
         assert "No space left" in journal.failure
     assert not list(tmp_path.glob("*.new"))  # noqa: ASYNC240 - a temporary directory

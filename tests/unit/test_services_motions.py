@@ -11,9 +11,9 @@ import pytest
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import Call, SetSpeedArgs, VelocityArgs
-from fractus_services.mobility import watch as watching
-from fractus_services.mobility.autopilot import AutopilotError
-from fractus_services.mobility.vehicle import GUIDED
+from fractus_services.mobility.flight import watch as watching
+from fractus_services.mobility.mavlink.link import AutopilotError
+from fractus_services.mobility.mavlink.vehicle import GUIDED
 from fractus_services.replies import Refused
 from mobility_world import World, area, clear_m, end, fly, goto, partial, refusal, spec, zone
 

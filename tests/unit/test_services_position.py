@@ -7,9 +7,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from fractus_services.mobility.dialect import message
-from fractus_services.mobility.telemetry import telemetry_of
-from fractus_services.mobility.vehicle import Vehicle
+from fractus_services.mobility.mavlink.dialect import message
+from fractus_services.mobility.mavlink.vehicle import Vehicle
+from fractus_services.mobility.rpc.telemetry import telemetry_of
 
 
 def place(vehicle: Vehicle, lat: float, now: float) -> None:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_services.mobility import transport
-from fractus_services.mobility.dialect import Codec, message
-from fractus_services.mobility.transport import BadUrl, open_link
+from fractus_services.mobility.mavlink import transport
+from fractus_services.mobility.mavlink.dialect import Codec, message
+from fractus_services.mobility.mavlink.transport import BadUrl, open_link
 
 AUTOPILOT, STRANGER = ("127.0.0.1", 14550), ("127.0.0.1", 40000)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import pytest
-from fractus_services.mobility.vehicle import Vehicle
+from fractus_services.mobility.mavlink.vehicle import Vehicle
 
 
 @pytest.mark.parametrize(

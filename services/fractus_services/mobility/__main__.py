@@ -107,7 +107,7 @@ def serve(verbose: bool, **given: Any) -> None:
 
 
 async def _until_signalled(options: Options) -> None:
-    from fractus_services.mobility.server import run  # noqa: PLC0415 - the command line stays quick
+    from fractus_services.mobility.rpc.server import run  # noqa: PLC0415 - the command line stays quick
 
     loop = asyncio.get_running_loop()
     stop = asyncio.Event()

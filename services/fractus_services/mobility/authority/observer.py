@@ -6,11 +6,11 @@ import asyncio
 import logging
 from dataclasses import replace
 
-from fractus_services.mobility.autopilot import AutopilotError
-from fractus_services.mobility.control import Control
-from fractus_services.mobility.failsafes import BEING_SET, configure
-from fractus_services.mobility.journal import Mission
-from fractus_services.mobility.vehicle import GUIDED, HOMEWARD, LAND, MODE_NAMES
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.journal import Mission
+from fractus_services.mobility.mavlink.failsafes import BEING_SET, configure
+from fractus_services.mobility.mavlink.link import AutopilotError
+from fractus_services.mobility.mavlink.vehicle import GUIDED, HOMEWARD, LAND, MODE_NAMES
 
 log = logging.getLogger(__name__)
 

@@ -15,12 +15,12 @@ from fractus_core.policy.motion import margin_m
 from fractus_core.policy.routes import searching
 from fractus_core.policy.values import Call, GotoArgs, Situation
 
-from fractus_services.mobility.autopilot import Permit
-from fractus_services.mobility.background import in_slices
-from fractus_services.mobility.control import Control
-from fractus_services.mobility.guard import Guard
-from fractus_services.mobility.leases import Motion, Regime
-from fractus_services.mobility.motions import REACHED_M, Step, at_rest, come_to_rest, fly_to
+from fractus_services.mobility.authority.background import in_slices
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.leases import Motion, Regime
+from fractus_services.mobility.flight.guard import Guard
+from fractus_services.mobility.flight.motions import REACHED_M, Step, at_rest, come_to_rest, fly_to
+from fractus_services.mobility.mavlink.link import Permit
 from fractus_services.replies import Refused, aborted, precondition, unavailable
 
 log = logging.getLogger(__name__)

@@ -11,17 +11,17 @@ from dataclasses import dataclass, replace
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, VelocityArgs, Verdict
 
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.arming import arm
-from fractus_services.mobility.autopilot import Autopilot, Permit
-from fractus_services.mobility.control import Control
-from fractus_services.mobility.courses import Trip
-from fractus_services.mobility.guard import Guard
-from fractus_services.mobility.homing import Homing
-from fractus_services.mobility.leases import Motion
-from fractus_services.mobility.motions import REACHED_M, Step, climb, come_down, come_to_rest, fly_to
-from fractus_services.mobility.permits import driver_permit
-from fractus_services.mobility.steering import Steering
-from fractus_services.mobility.vehicle import GUIDED, LAND, RTL, SMART_RTL
+from fractus_services.mobility.authority.arming import arm
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.leases import Motion
+from fractus_services.mobility.authority.permits import driver_permit
+from fractus_services.mobility.flight.courses import Trip
+from fractus_services.mobility.flight.guard import Guard
+from fractus_services.mobility.flight.homing import Homing
+from fractus_services.mobility.flight.motions import REACHED_M, Step, climb, come_down, come_to_rest, fly_to
+from fractus_services.mobility.flight.steering import Steering
+from fractus_services.mobility.mavlink.link import Autopilot, Permit
+from fractus_services.mobility.mavlink.vehicle import GUIDED, LAND, RTL, SMART_RTL
 from fractus_services.replies import Refused, aborted, precondition, refused
 
 MAX_REACHED_M = 50.0

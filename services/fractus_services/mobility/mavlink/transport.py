@@ -13,7 +13,7 @@ import tty
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from fractus_services.mobility.dialect import Codec
+from fractus_services.mobility.mavlink.dialect import Codec
 
 Receive = Callable[[bytes], None]
 Closed = Callable[[Exception | None], None]

@@ -9,10 +9,10 @@ from contextlib import aclosing
 from fractus_core.policy.values import Verdict
 
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.control import Control
-from fractus_services.mobility.journal import Mission
-from fractus_services.mobility.leases import Lease, News, State
-from fractus_services.mobility.vehicle import HOMEWARD
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.journal import Mission
+from fractus_services.mobility.authority.leases import Lease, News, State
+from fractus_services.mobility.mavlink.vehicle import HOMEWARD
 from fractus_services.replies import precondition, refused
 
 log = logging.getLogger(__name__)

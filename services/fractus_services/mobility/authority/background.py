@@ -8,7 +8,7 @@ import time
 from collections.abc import Awaitable, Callable, Coroutine, Generator
 from typing import Any, ParamSpec, TypeVar
 
-from fractus_services.mobility.autopilot import AutopilotError
+from fractus_services.mobility.mavlink.link import AutopilotError
 
 log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from fractus_core.policy.values import Airframe
 
-from fractus_services.mobility.autopilot import ATTEMPTS, SYSTEM_ID, Autopilot
+from fractus_services.mobility.mavlink.link import ATTEMPTS, SYSTEM_ID, Autopilot
 
 log = logging.getLogger(__name__)
 

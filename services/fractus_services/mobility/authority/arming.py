@@ -7,12 +7,12 @@ import asyncio
 from fractus_core.geo import LocalFrame
 
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.autopilot import AutopilotError, Permit
-from fractus_services.mobility.control import Control
-from fractus_services.mobility.failsafes import BEING_SET, Checked, choose_return, learn_return
-from fractus_services.mobility.journal import Mission
-from fractus_services.mobility.motions import distance_m
-from fractus_services.mobility.vehicle import GUIDED
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.journal import Mission
+from fractus_services.mobility.flight.motions import distance_m
+from fractus_services.mobility.mavlink.failsafes import BEING_SET, Checked, choose_return, learn_return
+from fractus_services.mobility.mavlink.link import AutopilotError, Permit
+from fractus_services.mobility.mavlink.vehicle import GUIDED
 from fractus_services.replies import precondition
 
 ARMED_S = 3.0

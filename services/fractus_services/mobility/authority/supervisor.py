@@ -8,7 +8,7 @@ import math
 
 from fractus_core.policy.values import Takeover
 
-from fractus_services.mobility.control import Control
+from fractus_services.mobility.authority.control import Control
 from fractus_services.replies import precondition
 
 log = logging.getLogger(__name__)

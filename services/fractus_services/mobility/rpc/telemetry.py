@@ -7,9 +7,9 @@ from typing import Any
 
 from fractus_proto.v1 import mobility_pb2, types_pb2
 
-from fractus_services.mobility.control import Control
-from fractus_services.mobility.guard import STALE_S
-from fractus_services.mobility.vehicle import Vehicle
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.flight.guard import STALE_S
+from fractus_services.mobility.mavlink.vehicle import Vehicle
 
 
 def position_of(vehicle: Vehicle) -> types_pb2.Position:

@@ -11,16 +11,16 @@ from fractus_core.geo import middle
 from fractus_core.policy.compiled import height_m
 from fractus_core.policy.values import Call, GotoArgs, TakeoffArgs
 
-from fractus_services.mobility.arming import arm
-from fractus_services.mobility.autopilot import AutopilotError
-from fractus_services.mobility.control import Control
-from fractus_services.mobility.courses import Courses, Trip
-from fractus_services.mobility.guard import Guard
-from fractus_services.mobility.journal import Mission
-from fractus_services.mobility.leases import Lease
-from fractus_services.mobility.motions import climb
-from fractus_services.mobility.permits import transit_permit
-from fractus_services.mobility.vehicle import GUIDED
+from fractus_services.mobility.authority.arming import arm
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.journal import Mission
+from fractus_services.mobility.authority.leases import Lease
+from fractus_services.mobility.authority.permits import transit_permit
+from fractus_services.mobility.flight.courses import Courses, Trip
+from fractus_services.mobility.flight.guard import Guard
+from fractus_services.mobility.flight.motions import climb
+from fractus_services.mobility.mavlink.link import AutopilotError
+from fractus_services.mobility.mavlink.vehicle import GUIDED
 from fractus_services.replies import Refused, precondition
 
 CRUISE_M = 10.0

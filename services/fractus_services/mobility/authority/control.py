@@ -17,14 +17,14 @@ from fractus_core.policy.values import Takeover, Verdict
 
 from fractus_services.audit import AuditLog
 from fractus_services.grants import ActiveGrant, GrantFiles
-from fractus_services.mobility.autopilot import Autopilot, AutopilotError, Permit, always
-from fractus_services.mobility.background import Background
-from fractus_services.mobility.backstop import Backstop
-from fractus_services.mobility.failsafes import Checked
-from fractus_services.mobility.helm import Helm
-from fractus_services.mobility.journal import Journal, Mission
-from fractus_services.mobility.leases import Lease, Motion, News, Regime, State
-from fractus_services.mobility.motions import distance_m
+from fractus_services.mobility.authority.background import Background
+from fractus_services.mobility.authority.journal import Journal, Mission
+from fractus_services.mobility.authority.leases import Lease, Motion, News, Regime, State
+from fractus_services.mobility.flight.motions import distance_m
+from fractus_services.mobility.mavlink.failsafes import Checked
+from fractus_services.mobility.mavlink.fence import Backstop
+from fractus_services.mobility.mavlink.link import Autopilot, AutopilotError, Permit, always
+from fractus_services.mobility.mavlink.mode_controller import Helm
 from fractus_services.replies import Refused, aborted, precondition, unavailable
 
 log = logging.getLogger(__name__)

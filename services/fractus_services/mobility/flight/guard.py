@@ -13,8 +13,8 @@ from fractus_core.policy.values import Airframe, Call, Situation, Verdict
 
 from fractus_services.audit import AuditLog
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.control import Control
-from fractus_services.mobility.motions import distance_m
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.flight.motions import distance_m
 
 log = logging.getLogger(__name__)
 

@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from fractus_services.mobility.dialect import Codec, message
-from fractus_services.mobility.transport import BadUrl, Transport, open_link
-from fractus_services.mobility.vehicle import Vehicle
+from fractus_services.mobility.mavlink.dialect import Codec, message
+from fractus_services.mobility.mavlink.transport import BadUrl, Transport, open_link
+from fractus_services.mobility.mavlink.vehicle import Vehicle
 
 log = logging.getLogger(__name__)
 

@@ -13,9 +13,9 @@ from pathlib import Path
 
 from fractus_core.api.plans import GrantSpec
 
-from fractus_services.mobility.autopilot import Autopilot, AutopilotError
-from fractus_services.mobility.bounds import Bounds, bounds_of
-from fractus_services.mobility.itemlists import Item, NoLists, download, upload
+from fractus_services.mobility.mavlink.bounds import Bounds, bounds_of
+from fractus_services.mobility.mavlink.itemlists import Item, NoLists, download, upload
+from fractus_services.mobility.mavlink.link import Autopilot, AutopilotError
 
 log = logging.getLogger(__name__)
 

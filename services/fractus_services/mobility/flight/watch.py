@@ -13,15 +13,15 @@ from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Verdict
 
 from fractus_services.audit import AuditLog
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.autopilot import AutopilotError, Permit
-from fractus_services.mobility.control import CORRECTION, Control
-from fractus_services.mobility.courses import limited_mps
-from fractus_services.mobility.guard import Guard
-from fractus_services.mobility.leases import Motion
-from fractus_services.mobility.motions import REACHED_M, fly_to, stands
-from fractus_services.mobility.supervisor import Supervisor
-from fractus_services.mobility.telemetry import recorded
-from fractus_services.mobility.vehicle import GUIDED
+from fractus_services.mobility.authority.control import CORRECTION, Control
+from fractus_services.mobility.authority.leases import Motion
+from fractus_services.mobility.authority.supervisor import Supervisor
+from fractus_services.mobility.flight.courses import limited_mps
+from fractus_services.mobility.flight.guard import Guard
+from fractus_services.mobility.flight.motions import REACHED_M, fly_to, stands
+from fractus_services.mobility.mavlink.link import AutopilotError, Permit
+from fractus_services.mobility.mavlink.vehicle import GUIDED
+from fractus_services.mobility.rpc.telemetry import recorded
 from fractus_services.replies import Refused, aborted
 
 log = logging.getLogger(__name__)

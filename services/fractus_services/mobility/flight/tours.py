@@ -8,12 +8,12 @@ import logging
 import grpc
 
 from fractus_services.grants import ActiveGrant, GrantFiles
-from fractus_services.mobility.autopilot import AutopilotError
-from fractus_services.mobility.chauffeur import FAULT, Chauffeur, target_of
-from fractus_services.mobility.control import Control
-from fractus_services.mobility.courses import Courses, Trip
-from fractus_services.mobility.journal import Mission
-from fractus_services.mobility.permits import tour_permit
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.journal import Mission
+from fractus_services.mobility.authority.permits import tour_permit
+from fractus_services.mobility.flight.courses import Courses, Trip
+from fractus_services.mobility.flight.transit import FAULT, Chauffeur, target_of
+from fractus_services.mobility.mavlink.link import AutopilotError
 from fractus_services.replies import Refused
 
 log = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ import shapely
 from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame, polygon
 
-from fractus_services.mobility.itemlists import Item
+from fractus_services.mobility.mavlink.itemlists import Item
 
 ROOM_M = 10.0
 """The fence lies so far outside of what is granted: the service's own monitor acts long before it."""

@@ -14,13 +14,13 @@ from fractus_core.policy.returning import straight_home_blocked
 from fractus_core.policy.values import GotoArgs, Situation
 
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.autopilot import AutopilotError
-from fractus_services.mobility.control import Control
-from fractus_services.mobility.courses import MAX_LEGS, REPLANS, Trip, first_leg, limited_mps, stopped_by_monitor
-from fractus_services.mobility.guard import Guard
-from fractus_services.mobility.leases import Motion
-from fractus_services.mobility.motions import REACHED_M, Step, at_rest, come_to_rest, fly_to
-from fractus_services.mobility.vehicle import GUIDED, HOMEWARD, RTL, SMART_RTL
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.leases import Motion
+from fractus_services.mobility.flight.courses import MAX_LEGS, REPLANS, Trip, first_leg, limited_mps, stopped_by_monitor
+from fractus_services.mobility.flight.guard import Guard
+from fractus_services.mobility.flight.motions import REACHED_M, Step, at_rest, come_to_rest, fly_to
+from fractus_services.mobility.mavlink.link import AutopilotError
+from fractus_services.mobility.mavlink.vehicle import GUIDED, HOMEWARD, RTL, SMART_RTL
 from fractus_services.replies import Refused, precondition
 
 log = logging.getLogger(__name__)

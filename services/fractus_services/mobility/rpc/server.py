@@ -17,21 +17,21 @@ from fractus_services.auth import KEEPALIVE, TlsFiles
 from fractus_services.clock import Clock
 from fractus_services.grants import GrantFiles
 from fractus_services.hosting import open_door, read_description
-from fractus_services.mobility.autopilot import Autopilot
-from fractus_services.mobility.backstop import Backstop
-from fractus_services.mobility.chauffeur import Chauffeur
-from fractus_services.mobility.control import Control
-from fractus_services.mobility.courses import Courses
-from fractus_services.mobility.guard import Guard
-from fractus_services.mobility.handlers import MobilityHandlers
-from fractus_services.mobility.homing import Homing
-from fractus_services.mobility.journal import Journal
-from fractus_services.mobility.observer import Observer
-from fractus_services.mobility.service import MobilityService
-from fractus_services.mobility.streams import Streams
-from fractus_services.mobility.supervisor import Supervisor
-from fractus_services.mobility.tours import Tours
-from fractus_services.mobility.watch import Watch
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.journal import Journal
+from fractus_services.mobility.authority.observer import Observer
+from fractus_services.mobility.authority.supervisor import Supervisor
+from fractus_services.mobility.flight.courses import Courses
+from fractus_services.mobility.flight.guard import Guard
+from fractus_services.mobility.flight.homing import Homing
+from fractus_services.mobility.flight.service import MobilityService
+from fractus_services.mobility.flight.tours import Tours
+from fractus_services.mobility.flight.transit import Chauffeur
+from fractus_services.mobility.flight.watch import Watch
+from fractus_services.mobility.mavlink.fence import Backstop
+from fractus_services.mobility.mavlink.link import Autopilot
+from fractus_services.mobility.rpc.handlers import MobilityHandlers
+from fractus_services.mobility.rpc.streams import Streams
 from fractus_services.seals import Seals
 
 if TYPE_CHECKING:

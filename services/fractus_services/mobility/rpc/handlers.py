@@ -16,13 +16,13 @@ from fractus_services.answering import Reception
 from fractus_services.auth import Caller
 from fractus_services.clock import Clock
 from fractus_services.grants import ActiveGrant, GrantFiles
-from fractus_services.mobility.arguments import call_of, checked, goto_args, velocity_args
-from fractus_services.mobility.autopilot import AutopilotError
-from fractus_services.mobility.control import Control
-from fractus_services.mobility.leases import News, State
-from fractus_services.mobility.service import MobilityService, Progress
-from fractus_services.mobility.streams import Streams
-from fractus_services.mobility.telemetry import located, position_of, telemetry_of, velocity_of
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.leases import News, State
+from fractus_services.mobility.flight.service import MobilityService, Progress
+from fractus_services.mobility.mavlink.link import AutopilotError
+from fractus_services.mobility.rpc.arguments import call_of, checked, goto_args, velocity_args
+from fractus_services.mobility.rpc.streams import Streams
+from fractus_services.mobility.rpc.telemetry import located, position_of, telemetry_of, velocity_of
 from fractus_services.replies import Refused, decision, precondition, refused, unavailable
 
 LEAST_INTERVAL_S, USUAL_INTERVAL_S = 0.05, 0.2

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.autopilot import Permit
-from fractus_services.mobility.control import Control
-from fractus_services.mobility.leases import Lease, Motion, Regime
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.leases import Lease, Motion, Regime
+from fractus_services.mobility.mavlink.link import Permit
 from fractus_services.replies import precondition
 
 

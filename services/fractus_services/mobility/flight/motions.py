@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.values import STANDING_MPS, GotoArgs
 
-from fractus_services.mobility.autopilot import Autopilot, AutopilotError, Permit
-from fractus_services.mobility.leases import Motion
-from fractus_services.mobility.vehicle import Vehicle
+from fractus_services.mobility.authority.leases import Motion
+from fractus_services.mobility.mavlink.link import Autopilot, AutopilotError, Permit
+from fractus_services.mobility.mavlink.vehicle import Vehicle
 from fractus_services.replies import aborted, unavailable
 
 REACHED_M = 1.0

@@ -1,0 +1,1 @@
+"""Who may command the vehicle: control, leases, permits, arming, and the journal of missions."""

@@ -1,0 +1,1 @@
+"""Flying: motions, transit, tours, the way home, and the monitor of what is flown."""

@@ -1,0 +1,1 @@
+"""The autopilot: link, dialect, vehicle state, modes, failsafes and fence."""

@@ -36,7 +36,7 @@ RUN mkdir -p /out/usr/bin /out/usr/sbin /out/usr/lib /out/usr/lib64 /out/etc /ou
  && printf 'root:x:0:0:root:/root:/bin/sh\nnobody:x:65534:65534::/nonexistent:/bin/false\nfractus:x:10001:10001::/home/fractus:/bin/sh\n' > /out/etc/passwd \
  && printf 'root:x:0:\nnogroup:x:65534:\nfractus:x:10001:\n' > /out/etc/group \
  && printf 'hosts: files dns\npasswd: files\ngroup: files\nprotocols: files\nservices: files\n' > /out/etc/nsswitch.conf \
- && printf '#!/usr/bin/python3\nimport sys\nfrom fractus.cli import main\nsys.exit(main())\n' > /out/usr/local/bin/fractus \
+ && printf '#!/usr/bin/python3\nimport sys\nfrom fractus_cli.main import main\nsys.exit(main())\n' > /out/usr/local/bin/fractus \
  && chmod 755 /out/usr/local/bin/fractus && chown 10001:10001 /out/home/fractus && mkdir -m 700 /out/root \
  && python3 -m compileall -q --invalidation-mode unchecked-hash -s /out /out/usr/lib/python3.11
 
@@ -89,10 +89,10 @@ RUN uv build --quiet --wheel --no-build-isolation --out-dir /wheel \
  && assemble() { target=$1; shift; mkdir -p /images/$target; \
       for name in fractus_proto "$@"; do cp -a /code/$name /images/$target/; done; \
       cp -a /code/fractus-*.dist-info /images/$target/; } \
- && assemble component fractus \
+ && assemble component fractus fractus_cli \
  && assemble operator fractus_core fractus_operator \
  && assemble agent fractus_core fractus_agent \
- && assemble services fractus fractus_core fractus_services \
+ && assemble services fractus fractus_cli fractus_core fractus_services \
  && assemble sim fractus_vehicle fractus_world
 
 # ---- python: the common start of all images, with what the SDK needs

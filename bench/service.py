@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fractus_cli.standalone import StandalonePki
 from fractus_cluster.ports import free_port
-from fractus_operator.standalone import StandalonePki
 
 NODE = "bench"
 TARGET = 10.0

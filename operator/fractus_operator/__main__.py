@@ -16,19 +16,20 @@ from typing import Any
 
 import kopf
 
-from fractus_operator import handlers, kinds
-from fractus_operator.authority import BrokenAuthority, open_authority
-from fractus_operator.deployments import Deployments
-from fractus_operator.inventory import LiveInventory
-from fractus_operator.kinds import Key, Kind
-from fractus_operator.lease import Lease, LostLease
-from fractus_operator.location import Locations
-from fractus_operator.orphans import Orphans
-from fractus_operator.readiness import Readiness
+from fractus_operator import handlers
+from fractus_operator.cluster import kinds
+from fractus_operator.cluster.kinds import Key, Kind
+from fractus_operator.cluster.lease import Lease, LostLease
+from fractus_operator.cluster.store import Store, StoreError, Unconfigured
+from fractus_operator.identity.authority import BrokenAuthority, open_authority
+from fractus_operator.identity.signing import NodeSigning
+from fractus_operator.inventory.live import LiveInventory
+from fractus_operator.reconcile.deployments import Deployments
+from fractus_operator.reconcile.location import Locations
+from fractus_operator.reconcile.orphans import Orphans
+from fractus_operator.reconcile.readiness import Readiness
+from fractus_operator.reconcile.worklist import Worklist
 from fractus_operator.settings import BadSetting, Settings
-from fractus_operator.signing import NodeSigning
-from fractus_operator.store import Store, StoreError, Unconfigured
-from fractus_operator.worklist import Worklist
 
 logger = logging.getLogger("fractus_operator")
 

@@ -11,11 +11,11 @@ from typing import Any
 
 import kopf
 
-from fractus_operator.deployments import BeingDeleted, Deployments
-from fractus_operator.inventory import LiveInventory
-from fractus_operator.kinds import APPLICATION, Key
-from fractus_operator.labels import FINALIZER
-from fractus_operator.store import StoreError
+from fractus_operator.cluster.kinds import APPLICATION, Key
+from fractus_operator.cluster.labels import FINALIZER
+from fractus_operator.cluster.store import StoreError
+from fractus_operator.inventory.live import LiveInventory
+from fractus_operator.reconcile.deployments import BeingDeleted, Deployments
 
 logger = logging.getLogger(__name__)
 

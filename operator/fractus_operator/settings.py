@@ -9,8 +9,7 @@ from typing import Any
 
 from fractus_core.api import InvalidObject
 from fractus_core.planning.inventory import Settings as PlanningSettings
-
-from fractus_operator.plugins import UnknownPlugin, load_plugin
+from fractus_core.planning.plugins import UnknownPlugin, load_plugin
 
 _PLANNING = {
     "safety_radius_m": "FRACTUS_PLANNING_SAFETY_RADIUS",

@@ -6,9 +6,9 @@ import asyncio
 import sys
 from collections.abc import Sequence
 
-from fractus_operator.kinds import APPLICATION, DRONE, Body, key_of
-from fractus_operator.labels import FINALIZER
-from fractus_operator.store import Store, StoreError, Unconfigured
+from fractus_operator.cluster.kinds import APPLICATION, DRONE, Body, key_of
+from fractus_operator.cluster.labels import FINALIZER
+from fractus_operator.cluster.store import Store, StoreError, Unconfigured
 
 _ON_THE_GROUND = {"inactive", "charging"}
 

@@ -301,7 +301,7 @@ def test_survives_an_interrupted_up(then: str, after_s: float) -> None:
     file.write_text(spec_of(name).to_yaml())
     cluster = Cluster.load(file)
     try:
-        argv = [sys.executable, "-m", "fractus.cli", "cluster", "up", str(file)]
+        argv = [sys.executable, "-m", "fractus_cli", "cluster", "up", str(file)]
         with subprocess.Popen(argv, stderr=subprocess.DEVNULL) as process:
             try:
                 process.wait(timeout=after_s)

@@ -262,7 +262,7 @@ def test_sigterm_stops_the_navigator_and_the_system_brings_the_drone_home(short:
 def test_telemetry_reads_as_json_lines_with_the_node_s_certificate(short: Stage) -> None:
     done = subprocess.run(
         [
-            sys.executable, "-m", "fractus", "telemetry", "--node", "drone-1", "--address", short.address,
+            sys.executable, "-m", "fractus_cli", "telemetry", "--node", "drone-1", "--address", short.address,
             "--tls", str(short.folder / "node-tls"), "--interval", "0.1", "--count", "3", "-o", "json",
         ],
         capture_output=True, text=True, timeout=40, check=False,

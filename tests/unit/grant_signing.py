@@ -6,8 +6,8 @@ from datetime import UTC, datetime
 from typing import Any
 
 from fractus_core.api import Grant
-from fractus_operator.authority import Authority
-from fractus_operator.grantor import Grantor
+from fractus_operator.identity.authority import Authority
+from fractus_operator.identity.grantor import Grantor
 
 AUTHORITY = Authority.generate(datetime.now(UTC))
 CA_PEM = AUTHORITY.certificate_pem

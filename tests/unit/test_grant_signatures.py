@@ -14,6 +14,8 @@ from click.testing import CliRunner
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec
+from fractus_cli.grants import grants
+from fractus_cli.standalone import StandalonePki
 from fractus_core.api import Grant, InvalidObject
 from fractus_core.api.plans import component_identity, node_identity
 from fractus_core.policy.signatures import (
@@ -25,10 +27,8 @@ from fractus_core.policy.signatures import (
     sign,
     verify,
 )
-from fractus_operator.authority import SIGNER_LIFE, Authority
-from fractus_operator.commands.grants import grants
-from fractus_operator.grantor import Grantor
-from fractus_operator.standalone import StandalonePki
+from fractus_operator.identity.authority import SIGNER_LIFE, Authority
+from fractus_operator.identity.grantor import Grantor
 from fractus_services import seals as seals_module
 from fractus_services.seals import Seals
 from policy_world import spec

@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner, Result
-from fractus_operator.standalone import StandalonePki
+from fractus_cli.standalone import StandalonePki
 from fractus_services.camera.__main__ import camera
 from fractus_services.mobility.__main__ import mobility
 

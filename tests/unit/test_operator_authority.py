@@ -10,8 +10,8 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, ExtensionOID
-from fractus_operator.authority import COMPONENT_LIFE, Authority, BrokenAuthority
-from fractus_operator.signing import NODE_NAME_CLAIM, judge
+from fractus_operator.identity.authority import COMPONENT_LIFE, Authority, BrokenAuthority
+from fractus_operator.identity.signing import NODE_NAME_CLAIM, judge
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
 IDENTITY = "spiffe://fractus.dev/ns/a/app/b/component/C/instance/b-c"

@@ -10,9 +10,9 @@ import pytest
 import yaml
 from fractus_core.api import Application, Drone
 from fractus_core.api.plans import DeploymentPlanSpec, GrantApplication, GrantSpec
-from fractus_operator import builders
-from fractus_operator.labels import grant_name, label_value, object_name
-from fractus_operator.pods import PodView
+from fractus_operator.cluster.labels import grant_name, label_value, object_name
+from fractus_operator.cluster.pods import PodView
+from fractus_operator.reconcile import builders
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "operator"
 INPUT = yaml.safe_load((GOLDEN / "input.yaml").read_text())

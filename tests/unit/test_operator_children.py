@@ -13,10 +13,10 @@ import pytest
 import yaml
 from fractus_core.api import Application
 from fractus_core.api.plans import DeploymentPlanSpec
-from fractus_operator import kinds
-from fractus_operator.children import Children, NameTaken
-from fractus_operator.kinds import Body, Key, Kind
-from fractus_operator.store import NotFound, StoreError, Taken
+from fractus_operator.cluster import kinds
+from fractus_operator.cluster.kinds import Body, Key, Kind
+from fractus_operator.cluster.store import NotFound, StoreError, Taken
+from fractus_operator.reconcile.children import Children, NameTaken
 
 INPUT = yaml.safe_load((Path(__file__).parents[1] / "golden" / "operator" / "input.yaml").read_text())
 APPLICATION = Application.from_body(INPUT["application"])

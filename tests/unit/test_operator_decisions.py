@@ -9,10 +9,11 @@ import pytest
 from fractus_core.api import Application, Drone, EdgeNode, Grant
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
 from fractus_core.planning.inventory import Host, Inventory
-from fractus_operator.conditions import Fact, merge
-from fractus_operator.difference import contains, is_current, stamped
-from fractus_operator.location import geohash, location_labels
-from fractus_operator.missions import (
+from fractus_operator.cluster.pods import PodView, amount_of, read_host, read_pod
+from fractus_operator.reconcile.conditions import Fact, merge
+from fractus_operator.reconcile.difference import contains, is_current, stamped
+from fractus_operator.reconcile.location import geohash, location_labels
+from fractus_operator.reconcile.missions import (
     Hindered,
     deployed_standing,
     hindered_standing,
@@ -20,7 +21,6 @@ from fractus_operator.missions import (
     replan_reason,
     stuck_nodes,
 )
-from fractus_operator.pods import PodView, amount_of, read_host, read_pod
 from fractus_operator.settings import BadSetting, Settings
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)

@@ -8,11 +8,11 @@ from typing import Any, cast
 
 import httpx2
 import pytest
-from fractus_operator import lease as lease_module
-from fractus_operator import store as store_module
-from fractus_operator.kinds import LEASE, Body, Kind, key_of
-from fractus_operator.lease import Lease, LostLease
-from fractus_operator.store import NotFound, Store, StoreError, Taken
+from fractus_operator.cluster import lease as lease_module
+from fractus_operator.cluster import store as store_module
+from fractus_operator.cluster.kinds import LEASE, Body, Kind, key_of
+from fractus_operator.cluster.lease import Lease, LostLease
+from fractus_operator.cluster.store import NotFound, Store, StoreError, Taken
 
 DURATION_S = 10.0
 

@@ -8,12 +8,12 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
-from fractus_operator import reflector as reflector_module
-from fractus_operator import worklist as worklist_module
-from fractus_operator.kinds import POLICY, ZONE, Body, Key
-from fractus_operator.reflector import Reflector
-from fractus_operator.store import Expired, Page, StoreError
-from fractus_operator.worklist import Worklist
+from fractus_operator.cluster import reflector as reflector_module
+from fractus_operator.cluster.kinds import POLICY, ZONE, Body, Key
+from fractus_operator.cluster.reflector import Reflector
+from fractus_operator.cluster.store import Expired, Page, StoreError
+from fractus_operator.reconcile import worklist as worklist_module
+from fractus_operator.reconcile.worklist import Worklist
 
 
 def zone(name: str, version: int, value: int = 0) -> Body:

@@ -11,11 +11,11 @@ from fractus_core.api import Drone, Grant
 from fractus_core.api.plans import DeploymentPlanSpec, DroneChoice
 from fractus_core.planning import flight_of, plan
 from fractus_core.planning.flight import Flight
-from fractus_operator.claims import OwnedPlan, claims
-from fractus_operator.hosts import Bookings, corrections
-from fractus_operator.pods import PodView
-from fractus_operator.reading import Makes, read_submitted
-from fractus_operator.rides import Flown, flights, ride_lost, ride_outcome
+from fractus_operator.cluster.pods import PodView
+from fractus_operator.cluster.reading import Makes, read_submitted
+from fractus_operator.inventory.bookings import Bookings, corrections
+from fractus_operator.inventory.claims import Flown, OwnedPlan, claims
+from fractus_operator.reconcile.rides import flights, ride_lost, ride_outcome
 from test_planning import PATH, VIEWER, application, at, drone, inventory, manifest, navigator
 
 HOST = application(navigator(PATH))

@@ -15,11 +15,12 @@ import pytest
 import yaml
 from fractus_core.api import Application
 from fractus_core.api.plans import DeploymentPlanSpec
-from fractus_operator import builders, kinds, rollout
-from fractus_operator.inventory import Subscription
-from fractus_operator.kinds import Body, Key, Kind
-from fractus_operator.rollout import Rollout
-from fractus_operator.store import StoreError
+from fractus_operator.cluster import kinds
+from fractus_operator.cluster.kinds import Body, Key, Kind
+from fractus_operator.cluster.store import StoreError
+from fractus_operator.inventory.live import Subscription
+from fractus_operator.reconcile import builders, rollout
+from fractus_operator.reconcile.rollout import Rollout
 
 INPUT = yaml.safe_load((Path(__file__).parents[1] / "golden" / "operator" / "input.yaml").read_text())
 APPLICATION = Application.from_body(INPUT["application"])

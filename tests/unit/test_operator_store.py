@@ -7,8 +7,8 @@ from typing import Any
 
 import httpx2
 import pytest
-from fractus_operator.kinds import DEPLOYMENT, Body
-from fractus_operator.store import FIELD_MANAGER, Store, StoreError, Taken
+from fractus_operator.cluster.kinds import DEPLOYMENT, Body
+from fractus_operator.cluster.store import FIELD_MANAGER, Store, StoreError, Taken
 
 KEY = ("city", "traffic")
 CREATED = {"manager": FIELD_MANAGER, "operation": "Update", "fieldsV1": {"f:spec": {"f:a": {}, "f:b": {"f:c": {}}}}}

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import httpx2
 import pytest
-from fractus_operator.store import Store
-from fractus_operator.transport import AiohttpTransport
+from fractus_operator.cluster.store import Store
+from fractus_operator.cluster.transport import AiohttpTransport
 
 HEAD = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\n"
 CHUNKED = HEAD + b"Transfer-Encoding: chunked\r\n\r\n"

@@ -7,11 +7,11 @@ import pathlib
 import pytest
 import yaml
 from click.testing import CliRunner
+from fractus_cli import plan as command
+from fractus_cli.manifests import read_manifests
 from fractus_core.api import DeploymentPlan
 from fractus_core.planning import Settings
 from fractus_core.planning import plan as decide
-from fractus_operator.commands import plan as command
-from fractus_operator.commands.manifests import read_manifests
 from test_planning import (
     CHECKER,
     PATH,

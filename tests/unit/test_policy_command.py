@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 from click.testing import CliRunner, Result
-from fractus_operator.commands.policy import policy
+from fractus_cli.policy import policy
 
 FIELD = pathlib.Path(__file__).parents[2] / "examples" / "field"
 DRONE = str(FIELD / "place.yaml")

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import click
 import pytest
-from fractus import cli
+from fractus_cli import main as cli
 
 
 class Infeasible(Exception):

@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from fractus_cli.manifests import BadManifest, Manifests, read_manifests
+from fractus_cli.plan import plan_all
 from fractus_core.api import API_VERSION, Drone
 from fractus_core.api.plans import GrantSpec
 from fractus_core.planning import Settings
 from fractus_core.policy.grants import compile_grants
-from fractus_operator.commands.manifests import BadManifest, Manifests, read_manifests
-from fractus_operator.commands.plan import plan_all
 
 from fractus_sim.experiment.audits import read_audit
 from fractus_sim.experiment.detections import FILE, VARIABLE, TruthWatch, read_detections

@@ -29,9 +29,9 @@ from types import TracebackType
 from typing import Any, Self
 
 import yaml
+from fractus_cli.standalone import StandalonePki
 from fractus_cluster.ports import free_port
 from fractus_core.api import API_VERSION, Drone, Grant
-from fractus_operator.standalone import StandalonePki
 
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.linktap import LinkTap

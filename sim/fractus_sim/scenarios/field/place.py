@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from fractus_cli.manifests import BadManifest, read_manifests
+from fractus_cli.plan import plan_all
 from fractus_core.api import API_VERSION, Application, Drone, Policy, Zone
 from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame, polygon
 from fractus_core.planning import Settings
 from fractus_core.policy.grants import compile_grants
-from fractus_operator.commands.manifests import BadManifest, read_manifests
-from fractus_operator.commands.plan import plan_all
 
 from fractus_sim.experiment.errors import ExperimentError
 

@@ -1,0 +1,75 @@
+"""`fractus grants`: keys, certificates and signed Grants for services that run without Kubernetes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+
+import click
+import yaml
+from fractus_core.api import Grant, InvalidObject
+from fractus_operator.cluster.kinds import Body
+from fractus_operator.identity.authority import BrokenAuthority
+
+from fractus_cli.standalone import StandalonePki
+
+_DIRECTORY = click.Path(file_okay=False, path_type=Path)
+_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+
+
+@click.group()
+def grants() -> None:
+    """Sign Grants, and make the certificates of nodes and components, without Kubernetes."""
+
+
+@grants.command()
+@click.argument("directory", type=_DIRECTORY)
+@click.option("--node", "nodes", multiple=True, required=True, help="A node whose services need a certificate.")
+@click.option("--days", type=click.IntRange(1, 3650), default=365, show_default=True, help="Life of the certificates.")
+def init(directory: Path, nodes: tuple[str, ...], days: int) -> None:
+    """Make a certificate authority in DIRECTORY, once, and the certificates of nodes."""
+    try:
+        pki = StandalonePki.create(directory, life=timedelta(days=days))
+        for node in nodes:
+            click.echo(f"--tls {pki.node(node)}    for the services of {node}")
+    except (BrokenAuthority, InvalidObject) as error:
+        raise click.ClickException(str(error)) from None
+
+
+@grants.command()
+@click.argument("files", type=_FILE, nargs=-1, required=True)
+@click.option("--tls", type=_DIRECTORY, required=True, help="The directory of `fractus grants init`.")
+@click.option("--to", type=_DIRECTORY, required=True, help="Where the signed Grants go: the services' --grants.")
+@click.option("--days", type=click.IntRange(1, 3650), default=365, show_default=True, help="Life of the certificates.")
+def sign(files: tuple[Path, ...], tls: Path, to: Path, days: int) -> None:
+    """Sign the Grants in FILES (YAML or JSON), and make a certificate for the component of each.
+
+    A Grant that replaces another takes effect at once, also in flight. One that was removed counts for nothing any more;
+    sign its manifest again to bring it back.
+    """
+    try:
+        pki = StandalonePki.open(tls, life=timedelta(days=days))
+        for file in files:
+            for manifest in _manifests(file):
+                identity = Grant.from_body(manifest).spec.identity
+                path = pki.grant(manifest, to)
+                click.echo(f"{path}    FRACTUS_TLS_DIR={pki.component(identity)}")
+    except (BrokenAuthority, InvalidObject) as error:
+        raise click.ClickException(str(error)) from None
+
+
+def _manifests(file: Path) -> Iterator[Body]:
+    try:
+        documents = list(yaml.safe_load_all(file.read_text(encoding="utf-8")))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InvalidObject(str(file), f"is neither YAML nor JSON: {error}") from None
+    found = [document for document in documents if document is not None]
+    if not found:
+        raise InvalidObject(str(file), "holds no Grant")
+    for document in found:
+        try:
+            Grant.from_body(document)
+        except InvalidObject as error:
+            raise InvalidObject(str(file), str(error)) from None
+        yield document

@@ -1,0 +1,273 @@
+"""`fractus plan`: what the operator would decide, from manifests alone."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import click
+import yaml
+from fractus_core.api import API_VERSION, Application, DeploymentPlan, InvalidObject
+from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.planning import Flight, Host, Infeasible, Inventory, Settings, flight_of
+from fractus_core.planning import plan as decide
+from fractus_core.planning.candidates import requests
+from fractus_core.planning.plugins import GROUP as PLUGINS
+from fractus_core.planning.plugins import UnknownPlugin, load_plugin
+from fractus_core.policy.grants import compile_grants
+from fractus_core.validation import check_application
+from fractus_operator.cluster.labels import INFEASIBLE_ANNOTATION
+
+from fractus_cli.manifests import BadManifest, Manifests, read_manifests
+from fractus_cli.plan_map import plan_map
+from fractus_cli.plan_table import infeasible_table, plan_table
+
+_DEFAULTS = Settings()
+_INFEASIBLE = 2
+
+
+@dataclass(frozen=True)
+class Decided:
+    """The answer for one application: a plan, or why there is none."""
+
+    application: Application
+    plan: DeploymentPlanSpec | None
+    refusal: Infeasible | None = None
+
+
+@click.command()
+@click.option(
+    "-f",
+    "--filename",
+    "paths",
+    type=click.Path(exists=True, path_type=pathlib.Path),
+    multiple=True,
+    required=True,
+    help="A file of manifests, or a directory of them; may be repeated.",
+)
+@click.argument("more", type=click.Path(exists=True, path_type=pathlib.Path), nargs=-1)
+@click.option("-o", "--output", type=click.Choice(["table", "yaml", "json", "geojson"]), default="table")
+@click.option(
+    "--safety-radius",
+    type=click.FloatRange(min=0, min_open=True),
+    default=_DEFAULTS.safety_radius_m,
+    show_default=True,
+    help="How far paths are dilated, in metres.",
+)
+@click.option(
+    "--depot-radius",
+    type=click.FloatRange(min=0),
+    default=_DEFAULTS.depot_radius_m,
+    show_default=True,
+    help="How far a depot may be from an open or partial start, in metres.",
+)
+@click.option(
+    "--coverage",
+    type=click.FloatRange(0, 1),
+    default=_DEFAULTS.coverage_share,
+    show_default=True,
+    help="Share of the operation area to reach with direct links.",
+)
+@click.option(
+    "--cruise-speed",
+    type=click.FloatRange(min=0, min_open=True),
+    default=_DEFAULTS.cruise_speed_mps,
+    show_default=True,
+    help="Ground speed assumed for flight times, in m/s.",
+)
+@click.option(
+    "--battery-reserve",
+    type=click.FloatRange(0, 1),
+    default=_DEFAULTS.battery_reserve,
+    show_default=True,
+    help="Share of a full charge to be left after landing.",
+)
+@click.option("--ranking", help=f"Name of a plug-in (entry point group {PLUGINS}) that scores drones.")
+@click.option("--covering", help=f"Name of a plug-in (entry point group {PLUGINS}) that chooses nodes along the way.")
+@click.pass_context
+def plan(context: click.Context, /, paths: Sequence[pathlib.Path], more: Sequence[pathlib.Path], output: str, **tuned: Any) -> None:  # fmt: skip
+    """Plan the Applications in some manifests, without a cluster.
+
+    Reads Applications, Drones, EdgeNodes, Depots, Zones, Policies, DeploymentPlans (in force: what still fits stays)
+    and Nodes, in any mix, and passes over all other kinds. Prints the DeploymentPlans that the operator would write.
+
+    Nodes give resources (status.allocatable), readiness and, by the label fractus.dev/class=cloud, the cloud. Without
+    any Node object, every Drone and EdgeNode has a Node of unlimited resources, and there is a cloud. A Drone whose
+    manifest has no Ready condition counts as Ready, and as full if it has no battery status.
+
+    Several Applications are planned one after the other, those with a driver first, then by name; each takes its drone
+    and its resources.
+
+    Exit code: 0 if all are feasible, 2 if one is not, 1 if the input is bad. In yaml and json, what is infeasible has the
+    annotation fractus.dev/infeasible, no placements, and the nodes that were rejected; the operator writes no such plan.
+    """
+    try:
+        manifests = read_manifests([*paths, *more])
+        settings = _settings(tuned)
+        decided = plan_all(manifests, settings)
+    except BadManifest as error:
+        raise click.ClickException(str(error)) from None
+    click.echo(_FORMATS[output](decided, manifests.inventory(), settings), nl=False)
+    for answer in decided:
+        if answer.refusal is not None and output != "table":
+            click.echo(f"{'/'.join(answer.application.key)}: {answer.refusal.reason}: {answer.refusal}", err=True)
+    if any(answer.refusal is not None for answer in decided):
+        context.exit(_INFEASIBLE)
+
+
+def plan_all(manifests: Manifests, settings: Settings) -> list[Decided]:
+    """Plan every application on what those before it leave.
+
+    Raises:
+        BadManifest: there is no application, or one names what does not exist.
+    """
+    stock = manifests.inventory()
+    decided = []
+    standing = {}
+    applications = manifests.applications()
+    if not applications:
+        raise BadManifest("there is no Application in the manifests; name a file that has one")
+    for application in applications:
+        before = manifests.previous(application)
+        if before is not None:
+            standing[application.key] = (application, before.spec)
+    for application in applications:
+        previous = standing.pop(application.key, (application, None))[1]
+        left = stock
+        for other, plan_in_force in standing.values():
+            left = _taken(left, other, plan_in_force)
+        try:
+            check_application(application, stock.depots)
+            found = decide(application, left, settings, previous)
+            compile_grants(application, found, stock, settings)
+        except InvalidObject as error:
+            origin = manifests.origin(application)
+            raise BadManifest(f"{origin}: Application {application.name}: {error}") from None
+        except Infeasible as refusal:
+            decided.append(Decided(application, None, refusal))
+        else:
+            decided.append(Decided(application, found))
+            stock = _taken(stock, application, found)
+    return decided
+
+
+def _taken(stock: Inventory, application: Application, found: DeploymentPlanSpec) -> Inventory:
+    """What is left for the next application: the drone is claimed, resources are booked."""
+    hosts: dict[str, Host] = dict(stock.hosts)
+    components = {component.name: component for component in application.spec.components}
+    for placed in found.placements:
+        if placed.node not in hosts or placed.component not in components:
+            continue
+        host = hosts[placed.node]
+        booked = dict(host.requested)
+        for resource, amount in requests(components[placed.component]).items():
+            booked[resource] = booked.get(resource, 0.0) + amount
+        hosts[placed.node] = replace(host, requested=booked)
+    claimed: dict[str, tuple[str, str]] = dict(stock.claimed)
+    flights: dict[str, Flight] = dict(stock.flights)
+    if found.drone is not None and found.drone.shared_with is None:
+        claimed[found.drone.node] = application.key
+        with contextlib.suppress(InvalidObject):
+            flights[found.drone.node] = flight_of(application, stock.depots)
+    return replace(stock, hosts=hosts, claimed=claimed, flights=flights, whereabouts=stock.located())
+
+
+def _settings(tuned: Mapping[str, Any]) -> Settings:
+    return Settings(
+        safety_radius_m=tuned["safety_radius"],
+        depot_radius_m=tuned["depot_radius"],
+        coverage_share=tuned["coverage"],
+        cruise_speed_mps=tuned["cruise_speed"],
+        battery_reserve=tuned["battery_reserve"],
+        score_drone=_plugin(tuned["ranking"], "--ranking"),
+        cover=_plugin(tuned["covering"], "--covering"),
+    )
+
+
+def _plugin(name: str | None, option: str) -> Any:
+    try:
+        return load_plugin(name)
+    except UnknownPlugin as error:
+        raise click.ClickException(f"{option}: {error}") from None
+
+
+# -- output --
+
+
+def deployment_plan(application: Application, found: DeploymentPlanSpec) -> DeploymentPlan:
+    """The object that the operator would write."""
+    namespace, name = application.key
+    return DeploymentPlan.model_validate(
+        {
+            "apiVersion": API_VERSION,
+            "kind": DeploymentPlan.KIND,
+            "metadata": {"name": name, "namespace": namespace},
+            "spec": found,
+        }
+    )
+
+
+def _bodies(decided: Sequence[Decided]) -> list[dict[str, Any]]:
+    bodies = []
+    for answer in decided:
+        found = answer.plan or _without_placements(answer)
+        body = deployment_plan(answer.application, found).to_dict()
+        body["metadata"] = {"name": body["metadata"]["name"], "namespace": body["metadata"]["namespace"]}
+        if answer.refusal is not None:
+            body["metadata"]["annotations"] = {
+                INFEASIBLE_ANNOTATION: f"{answer.refusal.reason}: {answer.refusal.message}"
+            }
+        bodies.append(body)
+    return bodies
+
+
+def _without_placements(answer: Decided) -> DeploymentPlanSpec:
+    """What programs are told of an application that is infeasible."""
+    rejected = answer.refusal.rejected if answer.refusal is not None else ()
+    omitted = max(len(rejected) - _DEFAULTS.rejections_listed, 0)
+    return DeploymentPlanSpec(
+        application=answer.application.name,
+        rejected=rejected[: _DEFAULTS.rejections_listed],
+        rejected_omitted=omitted or None,
+    )
+
+
+def _as_yaml(decided: Sequence[Decided], stock: Inventory, settings: Settings) -> str:
+    del stock, settings
+    bodies = _bodies(decided)
+    return yaml.safe_dump_all(bodies, sort_keys=False, width=120, explicit_start=len(bodies) > 1)
+
+
+def _as_json(decided: Sequence[Decided], stock: Inventory, settings: Settings) -> str:
+    del stock, settings
+    bodies = _bodies(decided)
+    whole = bodies[0] if len(bodies) == 1 else {"apiVersion": "v1", "kind": "List", "items": bodies}
+    return json.dumps(whole, indent=2) + "\n"
+
+
+def _as_geojson(decided: Sequence[Decided], stock: Inventory, settings: Settings) -> str:
+    features = [f for a in decided if a.plan is not None for f in plan_map(a.application, a.plan, stock, settings)]
+    return json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"
+
+
+def _as_table(decided: Sequence[Decided], stock: Inventory, settings: Settings) -> str:
+    del stock, settings
+    parts = []
+    for answer in decided:
+        if answer.plan is not None:
+            parts.append(plan_table(answer.application, answer.plan))
+        elif answer.refusal is not None:
+            parts.append(infeasible_table(answer.application, answer.refusal))
+    return "\n".join(parts)
+
+
+_FORMATS: dict[str, Callable[[Sequence[Decided], Inventory, Settings], str]] = {
+    "table": _as_table,
+    "yaml": _as_yaml,
+    "json": _as_json,
+    "geojson": _as_geojson,
+}

@@ -1,0 +1,413 @@
+"""`fractus policy`: what the policy engine would say, from manifests alone."""
+
+from __future__ import annotations
+
+import json
+import math
+import pathlib
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from datetime import UTC, datetime
+from typing import Any, TypeVar, get_args
+
+import click
+from fractus_core.api import Application, Drone, Policy, Resource
+from fractus_core.api.methods import METHODS_OF, Method
+from fractus_core.api.model import InvalidObject
+from fractus_core.api.plans import GrantApplication, GrantedLimits, GrantSpec
+from fractus_core.planning import Settings
+from fractus_core.policy.compiled import compile_grant
+from fractus_core.policy.engine import judge
+from fractus_core.policy.footprint import lens_of
+from fractus_core.policy.grants import compile_grants, refresh
+from fractus_core.policy.values import (
+    Airframe,
+    Args,
+    Attitude,
+    Call,
+    CaptureArgs,
+    GotoArgs,
+    Home,
+    SetSpeedArgs,
+    Situation,
+    TakeoffArgs,
+    VelocityArgs,
+    Verdict,
+)
+
+from fractus_cli.manifests import BadManifest, Manifests, read_manifests
+from fractus_cli.plan import plan_all
+
+R = TypeVar("R", bound=Resource)
+
+IN_AIR_M = 0.5
+METHODS: tuple[str, ...] = get_args(Method)
+
+_TAKES: dict[str, type[GotoArgs | TakeoffArgs | SetSpeedArgs | VelocityArgs | CaptureArgs]] = {
+    "Goto": GotoArgs,
+    "Takeoff": TakeoffArgs,
+    "SetSpeed": SetSpeedArgs,
+    "SetVelocity": VelocityArgs,
+    "CaptureImage": CaptureArgs,
+}
+_NEEDED: dict[str, frozenset[str]] = {
+    "Goto": frozenset({"lat", "lon"}),
+    "Takeoff": frozenset({"altitude_m"}),
+    "SetSpeed": frozenset({"speed_mps"}),
+    "SetVelocity": frozenset({"north_mps", "east_mps"}),
+}
+
+
+class Figures(click.ParamType):  # type: ignore[type-arg]
+    """Numbers with commas between them."""
+
+    name = "figures"
+
+    def __init__(self, *names: str) -> None:
+        self._names = names
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        """How help shows it."""
+        del param, ctx
+        return ",".join(self._names)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+        """The numbers, all of them and none too many."""
+        try:
+            found = tuple(float(part) for part in str(value).split(","))
+        except ValueError:
+            found = ()
+        if len(found) != len(self._names) or not all(math.isfinite(figure) for figure in found):
+            self.fail(f"{value!r} is not {','.join(self._names)}: {len(self._names)} numbers with commas", param, ctx)
+        for name, figure in zip(self._names, found, strict=True):
+            lower, upper, unit = _BOUNDS[name]
+            if not lower <= figure <= upper:
+                self.fail(f"{name} must be {lower:g} to {upper:g} {unit}, not {figure:g}", param, ctx)
+        return found
+
+
+_BOUNDS: dict[str, tuple[float, float, str]] = {
+    "lat": (-90.0, 90.0, "degrees"),
+    "lon": (-180.0, 180.0, "degrees"),
+    "alt": (-1000.0, 20_000.0, "m"),
+    "n": (-100.0, 100.0, "m/s"),
+    "e": (-100.0, 100.0, "m/s"),
+    "d": (-100.0, 100.0, "m/s"),
+}
+
+
+class Time(click.ParamType):  # type: ignore[type-arg]
+    """A moment as RFC 3339 spells it, as Unix time."""
+
+    name = "RFC3339"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Seconds since 1970 UTC."""
+        if isinstance(value, float):
+            return value
+        try:
+            moment = datetime.fromisoformat(str(value))
+        except ValueError:
+            moment = None
+        if moment is None or moment.tzinfo is None:
+            self.fail(f"{value!r} is no time with its zone, such as 2026-06-01T12:00:00Z", param, ctx)
+        return moment.timestamp()
+
+
+@click.group()
+def policy() -> None:
+    """Ask the policy engine."""
+
+
+@policy.command()
+@click.option(
+    "--policies", "paths", type=click.Path(exists=True, path_type=pathlib.Path), multiple=True, required=True,
+    help="A file or a directory of Policies and their Zones; may be repeated.",
+)  # fmt: skip
+@click.option(
+    "--drone", "drone_file", type=click.Path(exists=True, path_type=pathlib.Path), required=True, help="The Drone."
+)
+@click.option(
+    "--application", "application_file", type=click.Path(exists=True, path_type=pathlib.Path),
+    help="The Application whose component asks; without it, somebody who may do everything asks.",
+)  # fmt: skip
+@click.option("--component", help="The component that asks; needed with --application.")
+@click.option("--method", required=True, help="Goto, Takeoff, SetSpeed, SetVelocity, Land, Arm, CaptureImage, ...")
+@click.option(
+    "--args", "arguments", default="{}", help='Its arguments, such as {"lat": 39.36, "lon": 22.95, "alt": 10}.'
+)
+@click.option(
+    "--at", "at", type=Figures("lat", "lon", "alt"), required=True, help="The drone: degrees, metres above home."
+)
+@click.option("--velocity", type=Figures("n", "e", "d"), default="0,0,0", help="Its velocity north, east, down in m/s.")
+@click.option(
+    "--home", type=Figures("lat", "lon", "alt"),
+    help="Where it took off: degrees, metres above mean sea level. Else that of its manifest, else below --at at sea level.",
+)  # fmt: skip
+@click.option("--time", "time_s", type=Time(), help="When, with its zone; else now.")
+@click.option(
+    "--way-home", type=click.Choice(["straight", "retraced"]), default="straight", show_default=True,
+    help="How the autopilot's failsafe flies home: straight (RTL), or back as it came (SmartRTL).",
+)  # fmt: skip
+@click.option("--flat-terrain", is_flag=True, help="Take the ground for as high as home everywhere.")
+@click.option("-o", "--output", type=click.Choice(["text", "json"]), default="text", show_default=True)
+def check(paths: Sequence[pathlib.Path], drone_file: pathlib.Path, output: str, **asked: Any) -> None:
+    """What would become of a call, and why: the same engine and the same answer as in flight.
+
+    The drone stands when --at is below half a metre and flies otherwise; its motion is that of ArduCopter's usual
+    parameters, its position errors those that the mobility service assumes, and its camera is level.
+
+    With --application the grant is the one that the operator would write, with its operation area and corridor. Without,
+    every method is granted everywhere, and policies for particular applications do not hold.
+
+    Exit code: 0 with an answer, whatever it is; 1 if the input is bad.
+    """
+    try:
+        question = _question(paths, drone_file, asked)
+    except (BadManifest, InvalidObject) as error:
+        raise click.ClickException(str(error)) from None
+    compiled = compile_grant(question.grant, flat_terrain=bool(asked["flat_terrain"]))
+    click.echo(_FORMATS[output](judge(question.call, question.now, compiled)), nl=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A call, who asks it, and in what situation."""
+
+    call: Call
+    now: Situation
+    grant: GrantSpec
+
+
+def _question(paths: Sequence[pathlib.Path], drone_file: pathlib.Path, asked: Mapping[str, Any]) -> Question:
+    call = _call(asked["method"], asked["arguments"])
+    application, component = asked["application_file"], asked["component"]
+    if (application is None) != (component is None):
+        raise BadManifest("give --application and --component together, or neither")
+    files = {path.resolve(): path for path in (*paths, drone_file, application) if path is not None}.values()
+    manifests = read_manifests(_apart(list(files)))
+    if not manifests.of(Policy):
+        click.echo("note: --policies has no Policy, so nothing but the drone's own limits is judged", err=True)
+    drone = _drone(manifests, drone_file)
+    grant = _anything(manifests, drone) if application is None else _granted(manifests, drone, application, component)
+    return Question(call, _situation(drone, asked), grant)
+
+
+def _apart(paths: list[pathlib.Path]) -> list[pathlib.Path]:
+    """The paths that lie in none of the others, for no object may be read twice."""
+    directories = [path.resolve() for path in paths if path.is_dir()]
+    return [p for p in paths if not any(d in p.resolve().parents for d in directories)]
+
+
+def _from(manifests: Manifests, path: pathlib.Path, kind: type[R]) -> list[R]:
+    """The objects of a kind that were read from a file, or from below a directory."""
+    inside = path.resolve()
+    return [
+        found.resource
+        for found in manifests.found.values()
+        if isinstance(found.resource, kind) and pathlib.Path(found.origin).resolve().is_relative_to(inside)
+    ]
+
+
+def _drone(manifests: Manifests, file: pathlib.Path) -> Drone:
+    drones = _from(manifests, file, Drone)
+    if len(drones) != 1:
+        names = ", ".join(sorted(drone.name for drone in drones)) or "none"
+        raise BadManifest(f"{file}: --drone takes a manifest of one Drone, not of {len(drones)} ({names})")
+    return drones[0]
+
+
+def _granted(manifests: Manifests, drone: Drone, file: pathlib.Path, component: str) -> GrantSpec:
+    """The grant that the operator would write for a component.
+
+    Raises:
+        BadManifest: there is no such component, or no plan puts it on the drone.
+    """
+    applications = _from(manifests, file, Application)
+    if len(applications) != 1:
+        raise BadManifest(f"{file}: --application takes a manifest of one Application, not of {len(applications)}")
+    application = applications[0]
+    # Nobody else is to be planned, and on no other drone.
+    for key, found in list(manifests.found.items()):
+        if isinstance(found.resource, Application | Drone) and found.resource not in (application, drone):
+            del manifests.found[key]
+    known = [c.name for c in application.spec.components]
+    if component not in known:
+        raise BadManifest(f"Application {application.name} has no component {component} (it has {', '.join(known)})")
+    settings = Settings()
+    answer = plan_all(manifests, settings)[0]
+    if answer.plan is None:
+        raise BadManifest(f"Application {application.name} cannot be planned: {answer.refusal}")
+    inventory = manifests.inventory()
+    for grant in compile_grants(application, answer.plan, inventory, settings):
+        if grant.component == component and grant.node == drone.name:
+            return grant
+    raise BadManifest(
+        f"component {component} is not granted anything on {drone.name}: give it services, and a placement on the drone"
+    )
+
+
+def _anything(manifests: Manifests, drone: Drone) -> GrantSpec:
+    """A grant of everything, under the policies that hold for whoever flies the drone."""
+    features = drone.spec.services.mobility
+    depots = manifests.inventory().depots
+    depot = depots.get(drone.spec.depot or "")
+    grant = GrantSpec.model_validate(
+        {
+            "node": drone.name,
+            "application": GrantApplication(namespace="", name="", uid=""),
+            "component": "",
+            "instance": "",
+            "class": "driver",
+            "control": "full",
+            "services": [{"service": service, "methods": sorted(methods)} for service, methods in METHODS_OF.items()],
+            "depot": depot.spec.location if depot is not None else None,
+            "home": drone.spec.home,
+            "limits": GrantedLimits(max_altitude=features.max_altitude, max_speed=features.max_speed)
+            if features
+            else None,
+        }
+    )
+    return refresh(grant, manifests.inventory())
+
+
+def _situation(drone: Drone, asked: Mapping[str, Any]) -> Situation:
+    lat, lon, alt = asked["at"]
+    north, east, down = asked["velocity"]
+    time_s = asked["time_s"] if asked["time_s"] is not None else datetime.now(tz=UTC).timestamp()
+    flying = alt > IN_AIR_M
+    return Situation(
+        time_s=time_s,
+        lat=lat,
+        lon=lon,
+        altitude_m=alt,
+        north_mps=north,
+        east_mps=east,
+        down_mps=down,
+        home=_home(drone, asked),
+        armed=flying,
+        in_air=flying,
+        airframe=Airframe(retraces=asked["way_home"] == "retraced"),
+        attitude=Attitude(0.0, 0.0, math.degrees(math.atan2(east, north))),
+        lens=lens_of(drone.spec.services.camera),
+    )
+
+
+def _home(drone: Drone, asked: Mapping[str, Any]) -> Home:
+    if asked["home"] is not None:
+        return Home(*asked["home"])
+    stated = drone.spec.home
+    if stated is None:
+        return Home(asked["at"][0], asked["at"][1], 0.0)
+    known = stated.alt is not None and stated.altitude_reference == "amsl"
+    return Home(stated.lat, stated.lon, stated.alt if known and stated.alt is not None else 0.0)
+
+
+def _call(method: str, text: str) -> Call:
+    """The call with its arguments.
+
+    Raises:
+        BadManifest: there is no such method, or an argument is missing, unknown or no number.
+    """
+    if method not in METHODS:
+        raise BadManifest(f"--method: there is no method {method} (there are {', '.join(sorted(METHODS))})")
+    try:
+        given = json.loads(text, parse_int=float)  # an integer of any length is a number out of range
+    except json.JSONDecodeError as error:
+        raise BadManifest(f"--args: this is no JSON: {error.msg} at character {error.pos + 1}") from None
+    except RecursionError:
+        raise BadManifest("--args: this JSON is nested too deeply; give an object of numbers") from None
+    if not isinstance(given, dict):
+        raise BadManifest('--args: give a JSON object, such as {"lat": 39.36, "lon": 22.95, "alt": 10}')
+    takes = _TAKES.get(method)
+    if takes is None:
+        if given:
+            raise BadManifest(f"--args: {method} takes no arguments")
+        return Call(method)
+    spelled = {_plain(f.name): f.name for f in fields(takes)} | {f.name: f.name for f in fields(takes)}
+    if takes is GotoArgs:
+        spelled |= {"altitude": "alt", "altitudeReference": "reference"}
+    found: dict[str, Any] = {}
+    for name, value in given.items():
+        field = spelled.get(name)
+        if field is None:
+            raise BadManifest(f"--args: {method} has no {name} (it takes {', '.join(f.name for f in fields(takes))})")
+        if field in found:
+            raise BadManifest(f"--args: {name} is there twice under two names; give it once")
+        if value is not None:
+            found[field] = _value(name, field, value)
+    missing = sorted(_NEEDED.get(method, frozenset()) - set(found))
+    if missing:
+        raise BadManifest(f"--args: {method} needs {' and '.join(missing)}")
+    args: Args = takes(**found)
+    return Call(method, args)
+
+
+def _plain(name: str) -> str:
+    """An argument's name without its unit: speed for speed_mps."""
+    return re.sub(r"_(mps|m|deg|s)$", "", name)
+
+
+def _value(name: str, field: str, value: Any) -> Any:
+    if field == "reference":
+        if value not in ("home", "amsl", "terrain"):
+            raise BadManifest(f"--args: {name} must be home, amsl or terrain, not {value!r}")
+        return value
+    if not isinstance(value, float):
+        raise BadManifest(f"--args: {name} must be a number, not {value!r}")
+    if field not in {"width", "height"}:
+        return value
+    if not value.is_integer():
+        raise BadManifest(f"--args: {name} must be a whole number of pixels, not {value!r}")
+    return int(value)
+
+
+# -- output --
+
+
+def _spelled(verdict: Verdict) -> dict[str, Any] | None:
+    if verdict.args is None or not verdict.permits:
+        return None
+    return {name: value for name, value in asdict(verdict.args).items() if value is not None}
+
+
+def _as_json(verdict: Verdict) -> str:
+    whole = {
+        "action": verdict.action,
+        "takeover": verdict.takeover,
+        "args": _spelled(verdict),
+        "reason": verdict.reason,
+        "policies": list(verdict.policies),
+        "code": verdict.code,
+        "brakeFirst": verdict.brake_first,
+        "filters": [f.action for f in verdict.filters],
+    }
+    return json.dumps(whole, indent=2) + "\n"
+
+
+def _as_text(verdict: Verdict) -> str:
+    args = _spelled(verdict)
+    lines = [f"action:   {verdict.action}"]
+    if verdict.takeover is not None:
+        lines.append(f"takeover: {verdict.takeover}")
+    if args:
+        lines.append(
+            "args:     "
+            + ", ".join(
+                f"{k}={v:g}" if isinstance(v, float) and k not in {"lat", "lon"} else f"{k}={v}"
+                for k, v in args.items()
+            )
+        )
+    if verdict.reason:
+        lines.append(f"reason:   {verdict.reason}" + (f" ({verdict.code})" if verdict.code else ""))
+    if verdict.policies:
+        lines.append(f"policies: {', '.join(verdict.policies)}")
+    if verdict.filters:
+        lines.append(f"filters:  {', '.join(f.action for f in verdict.filters)}")
+    if verdict.brake_first:
+        lines.append("first:    the drone is brought to a stop")
+    return "\n".join(lines) + "\n"
+
+
+_FORMATS: dict[str, Callable[[Verdict], str]] = {"text": _as_text, "json": _as_json}

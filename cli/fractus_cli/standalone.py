@@ -1,0 +1,165 @@
+"""Keys, certificates and signed Grants in a directory, for services that run without Kubernetes.
+
+DIR/authority/                  tls.crt, tls.key    keep the key off the drone
+DIR/nodes/NODE/                 tls.crt, tls.key, ca.crt    --tls of the node's services
+DIR/components/INSTANCE/        tls.crt, tls.key, ca.crt    FRACTUS_TLS_DIR of the component
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import re
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Self
+
+from fractus_core.api import Grant, InvalidObject
+from fractus_core.api.plans import component_identity
+from fractus_operator.cluster.kinds import Body
+from fractus_operator.identity.authority import Authority, BrokenAuthority, Data
+from fractus_operator.identity.grantor import Grantor
+
+LIFE = timedelta(days=365)
+
+_NAME = re.compile(r"[a-z0-9]([-a-z0-9.]{0,251}[a-z0-9])?")
+"""A DNS subdomain (RFC 1123), as Kubernetes names nodes; it becomes a directory here."""
+
+
+_PARTS = component_identity("", "", "", "").count("/") + 1
+
+
+def _now() -> datetime:
+    return datetime.now(UTC)
+
+
+class StandalonePki:
+    """A certificate authority in a directory, and what it issues.
+
+    Args:
+        directory: The directory, as above.
+        authority: Its authority.
+        clock: The present time.
+        life: How long the certificates of nodes and components are valid.
+    """
+
+    def __init__(
+        self, directory: Path, authority: Authority, clock: Callable[[], datetime] = _now, life: timedelta = LIFE
+    ) -> None:
+        self._directory = directory
+        self._authority = authority
+        self._clock = clock
+        self._life = life
+        self._grantor = Grantor(authority, clock)
+
+    @classmethod
+    def create(cls, directory: Path, clock: Callable[[], datetime] = _now, life: timedelta = LIFE) -> Self:
+        """Make the authority of a directory, once; later calls open it.
+
+        Raises:
+            BrokenAuthority: its files are damaged.
+        """
+        if not (directory / "authority").is_dir():
+            _write(directory / "authority", Authority.generate(clock()).to_data())
+        return cls.open(directory, clock, life)
+
+    @classmethod
+    def open(cls, directory: Path, clock: Callable[[], datetime] = _now, life: timedelta = LIFE) -> Self:
+        """Open the directory.
+
+        Raises:
+            BrokenAuthority: it has no authority, or a damaged one.
+        """
+        folder = directory / "authority"
+        data = _read(folder)
+        if not data:
+            raise BrokenAuthority(f"{folder}: there is no authority; make one with: fractus grants init {directory}")
+        try:
+            return cls(directory, Authority.from_data(data), clock, life)
+        except BrokenAuthority:
+            raise BrokenAuthority(f"{folder}: tls.key and tls.crt are damaged or do not belong together") from None
+
+    def node(self, name: str) -> Path:
+        """The directory with the certificate of a node's services, made anew.
+
+        Raises:
+            InvalidObject: the name is none that a node can have.
+        """
+        if not _NAME.fullmatch(name):
+            raise InvalidObject("node", f"{name!r} is no name of a node; use lower-case letters, digits, - and .")
+        return _write(self._directory / "nodes" / name, self._authority.issue_node(name, self._clock(), self._life))
+
+    def component(self, identity: str) -> Path:
+        """The directory with the certificate of a component instance; made anew when it is due for renewal.
+
+        Args:
+            identity: Its SPIFFE id; `GrantSpec.identity` of its grant.
+
+        Raises:
+            InvalidObject: its parts are no names.
+        """
+        part = identity.split("/")
+        if len(part) != _PARTS or not _NAME.fullmatch(part[4]) or not _NAME.fullmatch(part[-1]):
+            raise InvalidObject("spec.instance", f"{part[-1]!r}, in {identity}, is no name of an instance")
+        folder = self._directory / "components" / f"{part[4]}.{part[-1]}"
+        now = self._clock()
+        if self._authority.still_good(_read(folder), identity, now):
+            return folder
+        return _write(folder, self._authority.issue_component(identity, now, self._life))
+
+    def sign(self, manifest: Body, replaces: Grant | None = None) -> Body:
+        """The manifest of a Grant, signed.
+
+        Args:
+            manifest: The Grant.
+            replaces: One that this one is to count before.
+
+        Raises:
+            InvalidObject: the manifest is no Grant.
+        """
+        return self._grantor.signed(manifest, replaces or Grant.from_body(manifest))
+
+    def grant(self, manifest: Body, grants: Path) -> Path:
+        """Sign a Grant and put it, in one step, where the services of its node look for it.
+
+        Args:
+            manifest: The Grant.
+            grants: The services' --grants.
+
+        Raises:
+            InvalidObject: the manifest is no Grant.
+        """
+        name = Grant.from_body(manifest).name
+        if "/" in name or name.startswith("."):
+            raise InvalidObject("metadata.name", f"{name!r} is no name of a file")
+        path = grants / f"{name}.json"
+        signed = self.sign(manifest, _present(path))
+        grants.mkdir(parents=True, exist_ok=True)
+        return _replace(path, json.dumps(signed, indent=1).encode() + b"\n", 0o640)
+
+
+def _present(path: Path) -> Grant | None:
+    try:
+        return Grant.from_body(json.loads(path.read_bytes()))
+    except (OSError, ValueError):
+        return None
+
+
+def _read(folder: Path) -> Data:
+    return {path.name: base64.b64encode(path.read_bytes()).decode() for path in folder.glob("[!.]*")}
+
+
+def _write(folder: Path, data: Data) -> Path:
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    for name, content in data.items():
+        _replace(folder / name, base64.b64decode(content), 0o600 if name == "tls.key" else 0o644)
+    return folder
+
+
+def _replace(path: Path, content: bytes, mode: int) -> Path:
+    fresh = path.with_name(f".{path.name}.new")
+    with open(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "wb") as file:  # noqa: PTH123
+        file.write(content)
+    return fresh.replace(path)

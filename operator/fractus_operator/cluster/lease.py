@@ -1,0 +1,161 @@
+"""Which operator acts: the one that holds the Lease, so that two that overlap for a moment never both do."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+
+from fractus_operator.cluster.kinds import LEASE, Body
+from fractus_operator.cluster.store import NotFound, Store, StoreError, Taken
+
+logger = logging.getLogger(__name__)
+
+NAME = "fractus-operator"
+_RENEWALS = 5
+_HELD_SHARE = 0.7
+_RETRY_S = 1.0
+_RETRIES = 20
+_ANSWER_SHARE = _HELD_SHARE / 2
+"""How much of the duration an answer may take: one that stalls leaves time to ask again before the Lease is lost."""
+
+
+class LostLease(Exception):
+    """Another operator has acted since this one last did: what this one remembers may be wrong, it must begin anew."""
+
+
+class Lease:
+    """A Lease of coordination.k8s.io, held by one operator at a time.
+
+    Another operator takes it only after it has seen it unchanged for its whole duration, by its own clock; the holder counts
+    as such for a part of that, from before it asked. So clocks need not agree, and a holder that was frozen knows better.
+
+    Args:
+        store: The API server.
+        namespace: Where the Lease is.
+        identity: Who asks; a process that is started again under the same identity goes on where it was.
+        duration_s: How long nobody else may act after the holder was last heard of.
+        time: Monotonic seconds, which go on while the process is frozen.
+    """
+
+    def __init__(
+        self, store: Store, namespace: str, identity: str, duration_s: float, time: Callable[[], float]
+    ) -> None:
+        self._store = store
+        self._namespace = namespace
+        self._identity = identity
+        self._duration_s = duration_s
+        self._time = time
+        self._until = float("-inf")
+        self._seen: tuple[object, ...] = ()
+        self._seen_at = 0.0
+        self._transitions: int | None = None
+        self._acquired = asyncio.Event()
+
+    @property
+    def left_s(self) -> float:
+        """Seconds for which this operator may still act; none where it does not hold the Lease."""
+        return max(self._until - self._time(), 0.0)
+
+    async def held(self) -> None:
+        """Wait until this operator may act."""
+        while not self.left_s:
+            self._acquired.clear()
+            await self._acquired.wait()
+
+    async def run(self) -> None:
+        """Take the Lease and keep it, until cancelled; it is given back then.
+
+        Raises:
+            LostLease: another operator has held it since.
+        """
+        try:
+            while True:
+                asked = self._time()
+                # After a renewal that came to nothing, whether it stalled or was refused, there is time for one more.
+                pause_s = min(_RETRY_S, self._duration_s / _RETRIES)
+                try:
+                    async with asyncio.timeout(_ANSWER_SHARE * self._duration_s):
+                        taken = await self._ask()
+                    if taken:
+                        self._hold(asked)
+                    pause_s = self._duration_s / _RENEWALS if taken else min(_RETRY_S, self._duration_s / _RENEWALS)
+                except StoreError as error:
+                    logger.info("the lease: %s", error)
+                except TimeoutError:
+                    logger.info("the lease: no answer in %.1f s", _ANSWER_SHARE * self._duration_s)
+                await asyncio.sleep(pause_s)
+        finally:
+            await self._give_back()
+
+    def _hold(self, asked: float) -> None:
+        if not self.left_s:
+            logger.info("%s acts now", self._identity)
+        self._until = asked + _HELD_SHARE * self._duration_s
+        self._acquired.set()
+
+    async def _ask(self) -> bool:
+        """Take or renew the Lease, if it is ours or free.
+
+        Raises:
+            StoreError: the API server did not take it.
+        """
+        try:
+            body = await self._store.get(LEASE, NAME, self._namespace)
+        except NotFound:
+            body = LEASE.header(NAME, self._namespace)
+        spec = body.get("spec") or {}
+        if self._transitions is not None and spec.get("leaseTransitions") != self._transitions:
+            raise LostLease(
+                f"{spec.get('holderIdentity') or 'another operator'} has acted since {self._identity} last did"
+            )
+        if (spec.get("holderIdentity") or "") not in ("", self._identity) and not self._expired(body):
+            return False
+        wanted = self._wanted(body)
+        write = self._store.replace if spec else self._store.create
+        try:
+            await write(LEASE, wanted, guarded=False)
+        except Taken:
+            return False
+        self._transitions = int(wanted["spec"]["leaseTransitions"])
+        return True
+
+    def _expired(self, body: Body) -> bool:
+        """Whether a Lease of somebody else has not changed for its duration, as far as this process has seen."""
+        spec = body.get("spec") or {}
+        now, state = self._time(), (spec.get("holderIdentity"), spec.get("renewTime"))
+        if state != self._seen:
+            if self._seen[:1] != state[:1]:
+                logger.info("%s acts; waiting for it to end", spec.get("holderIdentity"))
+            self._seen, self._seen_at = state, now
+        return now - self._seen_at > max(self._duration_s, float(spec.get("leaseDurationSeconds") or 0))
+
+    def _wanted(self, body: Body, *, free: bool = False) -> Body:
+        now = datetime.now(UTC)
+        spec = body.get("spec") or {}
+        ours = spec.get("holderIdentity") == self._identity
+        wanted = {
+            **spec,
+            "holderIdentity": "" if free else self._identity,
+            "leaseDurationSeconds": max(1, round(timedelta(seconds=self._duration_s).total_seconds())),
+            "renewTime": now.strftime("%Y-%m-%dT%H:%M:%S.%fZ"),
+        }
+        if not ours and not free:
+            wanted["acquireTime"] = wanted["renewTime"]
+            wanted["leaseTransitions"] = int(spec.get("leaseTransitions") or 0) + 1
+        return {**body, "spec": wanted}
+
+    async def _give_back(self) -> None:
+        """Let the next one begin at once, once nothing of ours is under way any more.
+
+        Whose Lease it is the API server tells: it may have taken a renewal whose answer never came.
+        """
+        self._until = float("-inf")
+        try:
+            async with asyncio.timeout(2.0):
+                body = await self._store.get(LEASE, NAME, self._namespace)
+                if (body.get("spec") or {}).get("holderIdentity") == self._identity:
+                    await self._store.replace(LEASE, self._wanted(body, free=True), guarded=False)
+        except (StoreError, TimeoutError) as error:
+            logger.info("the lease was not given back: %s", error)

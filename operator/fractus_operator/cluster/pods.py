@@ -1,0 +1,148 @@
+"""What the operator remembers of Pods and Nodes: a small part of large objects, so that thousands fit."""
+
+from __future__ import annotations
+
+import functools
+import sys
+import types
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+
+from fractus_core.api.model import quantity
+from fractus_core.planning.inventory import Host
+
+from fractus_operator.cluster.kinds import Body
+from fractus_operator.cluster.labels import APPLICATION_LABEL, COMPONENT_LABEL, INSTANCE_LABEL, MANAGED_LABEL
+
+_KEPT_LABELS = (APPLICATION_LABEL, COMPONENT_LABEL, INSTANCE_LABEL, MANAGED_LABEL)
+
+
+@dataclass(frozen=True, slots=True)
+class PodView:
+    """A Pod, as far as it matters here.
+
+    Attributes:
+        requests: what it asks of its node, in base units.
+        deployment: name of the Deployment that made it, through a ReplicaSet; None for a pod of other making.
+        unschedulable_since: since when the scheduler has found no node for it, if so.
+        unschedulable_message: what the scheduler said.
+    """
+
+    namespace: str
+    name: str
+    node: str | None
+    labels: Mapping[str, str]
+    requests: Mapping[str, float]
+    ready: bool
+    finished: bool
+    terminating: bool
+    ip: str | None
+    deployment: str | None = None
+    unschedulable_since: datetime | None = None
+    unschedulable_message: str = ""
+
+    @property
+    def instance(self) -> str | None:
+        """The planned instance that the pod is."""
+        return self.labels.get(INSTANCE_LABEL)
+
+    @property
+    def application(self) -> str | None:
+        """The application that the pod belongs to, as its label says."""
+        return self.labels.get(APPLICATION_LABEL)
+
+    @property
+    def component(self) -> str | None:
+        """The component that the pod runs."""
+        return self.labels.get(COMPONENT_LABEL)
+
+
+_RARE_SCALE = {"n": 1e-9, "u": 1e-6, "E": 1e18, "Ei": 2.0**60}
+
+
+def amount_of(text: str | float) -> float:
+    """Value of any quantity that the API server may hold, also those that manifests of ours may not use.
+
+    Raises:
+        ValueError: it is no quantity.
+    """
+    try:
+        return quantity(text)
+    except ValueError:
+        digits = str(text)
+        for suffix, scale in _RARE_SCALE.items():
+            if digits.endswith(suffix):
+                return float(digits.removesuffix(suffix)) * scale
+        return float(digits)
+
+
+def read_pod(body: Body) -> PodView:
+    """The view of a Pod."""
+    metadata, spec, status = body["metadata"], body["spec"], body.get("status") or {}
+    labels = metadata.get("labels") or {}
+    conditions = {c["type"]: c for c in status.get("conditions") or ()}
+    ready = conditions.get("Ready", {}).get("status") == "True"
+    scheduled = conditions.get("PodScheduled", {})
+    unschedulable = scheduled.get("status") == "False" and scheduled.get("reason") == "Unschedulable"
+    since = scheduled.get("lastTransitionTime") if unschedulable else None
+    return PodView(
+        namespace=metadata["namespace"],
+        name=metadata["name"],
+        node=spec.get("nodeName"),
+        labels={key: labels[key] for key in _KEPT_LABELS if key in labels},
+        requests=_requests(spec),
+        ready=ready,
+        finished=status.get("phase") in {"Succeeded", "Failed"},
+        terminating="deletionTimestamp" in metadata,
+        ip=status.get("podIP"),
+        deployment=_deployment(metadata),
+        unschedulable_since=datetime.fromisoformat(since) if since else None,
+        unschedulable_message=scheduled.get("message", "") if unschedulable else "",
+    )
+
+
+def _deployment(metadata: Body) -> str | None:
+    """ReplicaSets are named after their Deployment: NAME-HASH."""
+    for owner in metadata.get("ownerReferences") or ():
+        if owner.get("controller") and (owner.get("apiVersion"), owner.get("kind")) == ("apps/v1", "ReplicaSet"):
+            return str(owner["name"]).rpartition("-")[0]
+    return None
+
+
+def _requests(spec: Body) -> dict[str, float]:
+    """Effective requests of a Pod: the sum of its containers, or its largest init container, plus overhead."""
+    total: dict[str, float] = {"pods": 1.0}
+    for container in spec.get("containers") or ():
+        for resource, amount in _asked(container).items():
+            total[resource] = total.get(resource, 0.0) + amount
+    for container in spec.get("initContainers") or ():
+        for resource, amount in _asked(container).items():
+            total[resource] = max(total.get(resource, 0.0), amount)
+    for resource, amount in (spec.get("overhead") or {}).items():
+        total[resource] = total.get(resource, 0.0) + amount_of(amount)
+    return total
+
+
+def _asked(container: Body) -> dict[str, float]:
+    resources = container.get("resources") or {}
+    return {name: amount_of(q) for name, q in (resources.get("requests") or {}).items()}
+
+
+def read_host(body: Body) -> Host:
+    """The view of a Node; its heartbeats change nothing here."""
+    metadata, spec, status = body["metadata"], body.get("spec") or {}, body.get("status") or {}
+    ready = any(c["type"] == "Ready" and c["status"] == "True" for c in status.get("conditions") or ())
+    return Host(
+        name=metadata["name"],
+        labels={sys.intern(name): value for name, value in (metadata.get("labels") or {}).items()},
+        allocatable=_allocatable(tuple((status.get("allocatable") or {}).items())),
+        ready=ready,
+        schedulable=not spec.get("unschedulable", False),
+    )
+
+
+@functools.lru_cache(maxsize=256)
+def _allocatable(quantities: tuple[tuple[str, str], ...]) -> Mapping[str, float]:
+    """What a node offers, in base units: one mapping for all nodes of a make."""
+    return types.MappingProxyType({name: amount_of(quantity) for name, quantity in quantities})

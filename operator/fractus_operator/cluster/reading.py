@@ -1,0 +1,174 @@
+"""Reads objects so that one which cannot be read is known as such, and never stops the others."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from fractus_core.api import Application, Condition, Drone, EdgeNode, Grant, InvalidObject, Metadata, Resource
+from pydantic import ValidationError
+
+from fractus_operator.cluster.kinds import Body
+
+logger = logging.getLogger(__name__)
+
+R = TypeVar("R", bound=Resource)
+N = TypeVar("N", Drone, EdgeNode)
+P = TypeVar("P", bound=Hashable)
+
+_MAKES = 10_000
+
+SETTLED = frozenset({"Completed", "Failed"})
+"""Phases of an application whose mission is over."""
+
+
+@dataclass(frozen=True)
+class Submitted:
+    """An Application as it was submitted: parsed, or with the reason why it cannot be."""
+
+    body: Body
+    application: Application | None
+    error: InvalidObject | None
+
+    @property
+    def metadata(self) -> Metadata:
+        """Its metadata."""
+        return Metadata.model_validate(self.body["metadata"])
+
+    @property
+    def uid(self) -> str:
+        """metadata.uid."""
+        return str(self.body["metadata"].get("uid", ""))
+
+    @property
+    def phase(self) -> str:
+        """Where it stands, as its status says; empty before it has one."""
+        return str((self.body.get("status") or {}).get("phase") or "")
+
+    @property
+    def settled_generation(self) -> int | None:
+        """The generation whose mission is over; None while a mission goes on, or before the first."""
+        status = self.body.get("status") or {}
+        return int(status.get("observedGeneration") or 0) if status.get("phase") in SETTLED else None
+
+
+@dataclass(frozen=True)
+class Broken:
+    """An object that the API server took and that cannot be read."""
+
+    body: Body
+    problem: str
+
+    @property
+    def metadata(self) -> Metadata:
+        """Its metadata."""
+        return Metadata.model_validate(self.body["metadata"])
+
+    @property
+    def name(self) -> str:
+        """metadata.name."""
+        return str(self.body["metadata"]["name"])
+
+    @property
+    def spec(self) -> Any:
+        """As the API server has it."""
+        return self.body.get("spec")
+
+    @property
+    def conditions(self) -> tuple[Condition, ...]:
+        """Its conditions, as far as they can be read."""
+        try:
+            return tuple(Condition.model_validate(c) for c in (self.body.get("status") or {}).get("conditions") or ())
+        except ValidationError:
+            return ()
+
+
+def read(model: type[R], body: Body) -> R:
+    """Parse an object.
+
+    Raises:
+        InvalidObject: it cannot be parsed, for whatever reason.
+    """
+    try:
+        # As it is: what was decoded from JSON needs no conversion, and large parts are shared with it.
+        return model.model_validate(body)
+    except ValidationError as error:
+        raise InvalidObject.from_pydantic(error) from None
+    except Exception as error:
+        raise InvalidObject("", f"the object cannot be read: {type(error).__name__}: {error}") from error
+
+
+def read_submitted(body: Body) -> Submitted:
+    """Parse an Application, keeping what cannot be parsed with the reason."""
+    try:
+        return Submitted(body, read(Application, body), None)
+    except InvalidObject as error:
+        return Submitted(body, None, error)
+
+
+def reader(model: type[R]) -> Callable[[Body], R | None]:
+    """A parser for objects that can be left out where they cannot be read."""
+
+    def parse(body: Body) -> R | None:
+        try:
+            return read(model, body)
+        except InvalidObject as error:
+            logger.warning("%s %s is left out: %s", model.KIND, body["metadata"]["name"], error)
+            return None
+
+    return parse
+
+
+class Makes:
+    """What objects of one make have in common, such as the services of thousands of nodes, or the areas of grants.
+
+    Args:
+        parts: How many parts are remembered to be shared.
+    """
+
+    def __init__(self, parts: int = _MAKES) -> None:
+        self._known: dict[Hashable, Any] = {}
+        self._parts = parts
+
+    def sharing(self, parse: Callable[[Body], N | None]) -> Callable[[Body], N | None]:
+        """A parser whose results share equal parts."""
+
+        def shared(body: Body) -> N | None:
+            node = parse(body)
+            if node is None:
+                return None
+            spec = node.spec
+            parts = {"services": self._one(spec.services), "interfaces": tuple(map(self._one, spec.interfaces))}
+            parts["interfaces"] = self._one(parts["interfaces"])
+            return node.model_copy(update={"spec": spec.model_copy(update=parts)})
+
+        return shared
+
+    def grant(self, body: Body) -> Grant | None:
+        """Parse a Grant so that it shares equal areas, which have many points, with others."""
+        grant = reader(Grant)(body)
+        if grant is None:
+            return None
+        spec = grant.spec
+        parts = {"operation_area": self._one(spec.operation_area), "corridor": self._one(spec.corridor)}
+        return grant.model_copy(update={"spec": spec.model_copy(update=parts)})
+
+    def _one(self, part: P) -> P:
+        if len(self._known) >= self._parts:
+            self._known.clear()
+        found: P = self._known.setdefault(part, part)
+        return found
+
+
+def keeping_broken(model: type[R]) -> Callable[[Body], R | Broken]:
+    """A parser for objects that count also where they cannot be read."""
+
+    def parse(body: Body) -> R | Broken:
+        try:
+            return read(model, body)
+        except InvalidObject as error:
+            return Broken(body, str(error))
+
+    return parse

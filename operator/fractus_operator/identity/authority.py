@@ -1,0 +1,271 @@
+"""The certificate authority of the system: its key, and the short-lived certificates it issues."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Self
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from fractus_core.api import GROUP, node_identity, node_server_name
+from fractus_core.api.plans import OPERATOR_IDENTITY
+from fractus_core.policy.signatures import DOCUMENT_SIGNING
+
+from fractus_operator.cluster.kinds import CONFIG_MAP, SECRET, Body
+from fractus_operator.cluster.labels import MANAGED_BY, MANAGED_LABEL
+from fractus_operator.cluster.store import NotFound, Store, Taken
+
+logger = logging.getLogger(__name__)
+
+NAME = "fractus-ca"
+"""Name of the Secret with the authority's key, and of the ConfigMap with its certificate."""
+
+CA_LIFE = timedelta(days=3650)
+COMPONENT_LIFE = timedelta(hours=24)
+NODE_LIFE = timedelta(days=30)
+SIGNER_LIFE = timedelta(days=30)
+_CLOCK_SKEW = timedelta(minutes=5)
+_RENEW_AFTER = 2 / 3
+
+Data = dict[str, str]
+"""The data of a TLS Secret: base64 of tls.crt, tls.key and ca.crt."""
+
+
+class BrokenAuthority(Exception):
+    """The Secret of the authority exists, but does not hold a usable key and certificate."""
+
+
+@dataclass(frozen=True, slots=True)
+class Authority:
+    """A CA certificate and its P-256 key."""
+
+    key: ec.EllipticCurvePrivateKey
+    certificate: x509.Certificate
+
+    @classmethod
+    def generate(cls, now: datetime) -> Self:
+        """Make a new authority, valid for ten years."""
+        key = ec.generate_private_key(ec.SECP256R1())
+        name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"{GROUP} authority")])
+        certificate = (
+            x509.CertificateBuilder()
+            .subject_name(name)
+            .issuer_name(name)
+            .public_key(key.public_key())
+            .serial_number(x509.random_serial_number())
+            .not_valid_before(now - _CLOCK_SKEW)
+            .not_valid_after(now + CA_LIFE)
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(_key_usage(signs_certificates=True), critical=True)
+            .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+            .sign(key, hashes.SHA256())
+        )
+        return cls(key, certificate)
+
+    @classmethod
+    def from_data(cls, data: Data) -> Self:
+        """Read an authority from the data of its Secret.
+
+        Raises:
+            BrokenAuthority: the data is not a matching P-256 key and certificate.
+        """
+        try:
+            key = serialization.load_pem_private_key(base64.b64decode(data["tls.key"]), password=None)
+            certificate = x509.load_pem_x509_certificate(base64.b64decode(data["tls.crt"]))
+        except (KeyError, ValueError) as error:
+            raise BrokenAuthority(f"Secret {NAME}: {error}; restore it, or delete it to begin anew") from error
+        if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
+            raise BrokenAuthority(f"Secret {NAME}: tls.key does not belong to tls.crt; restore it, or delete it")
+        return cls(key, certificate)
+
+    def to_data(self) -> Data:
+        """The data of the authority's Secret."""
+        return {"tls.crt": _encoded(self.certificate_pem), "tls.key": _encoded(_key_pem(self.key))}
+
+    @property
+    def certificate_pem(self) -> bytes:
+        """The CA certificate, which everyone trusts."""
+        return self.certificate.public_bytes(serialization.Encoding.PEM)
+
+    def issue_component(self, identity: str, now: datetime, life: timedelta = COMPONENT_LIFE) -> Data:
+        """Make a key and a client certificate for a component instance.
+
+        Args:
+            identity: Its SPIFFE id, the only subject alternative name.
+            now: The time it is valid from.
+            life: How long it is valid.
+        """
+        key = ec.generate_private_key(ec.SECP256R1())
+        certificate = self._issue(
+            key.public_key(),
+            common_name=_short(identity),
+            names=[x509.UniformResourceIdentifier(identity)],
+            usages=[ExtendedKeyUsageOID.CLIENT_AUTH],
+            life=life,
+            now=now,
+        )
+        return self._data(key, certificate)
+
+    def issue_node(self, node: str, now: datetime, life: timedelta = NODE_LIFE) -> Data:
+        """Make a key and the certificate of a node's services, for nodes without an agent that keeps its own key.
+
+        Args:
+            node: Its name.
+            now: The time it is valid from.
+            life: How long it is valid.
+        """
+        key = ec.generate_private_key(ec.SECP256R1())
+        return self._data(key, self._node_certificate(key.public_key(), node, now, life))
+
+    def issue_signer(self, now: datetime) -> tuple[ec.EllipticCurvePrivateKey, x509.Certificate]:
+        """Make a key and a certificate that is good for signing Grants and for nothing else."""
+        key = ec.generate_private_key(ec.SECP256R1())
+        pem = self._issue(
+            key.public_key(),
+            common_name=f"{GROUP} operator",
+            names=[x509.UniformResourceIdentifier(OPERATOR_IDENTITY)],
+            usages=[DOCUMENT_SIGNING],
+            life=SIGNER_LIFE,
+            now=now,
+            signs_grants=True,
+        )
+        return key, x509.load_pem_x509_certificate(pem)
+
+    def _data(self, key: ec.EllipticCurvePrivateKey, certificate: bytes) -> Data:
+        return {
+            "tls.crt": _encoded(certificate),
+            "tls.key": _encoded(_key_pem(key)),
+            "ca.crt": _encoded(self.certificate_pem),
+        }
+
+    def still_good(self, data: Data, identity: str, now: datetime) -> bool:
+        """Whether a component's certificate is ours, for this identity, and not due for renewal."""
+        try:
+            certificate = x509.load_pem_x509_certificate(base64.b64decode(data["tls.crt"]))
+            certificate.verify_directly_issued_by(self.certificate)
+            names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+            same_ca = base64.b64decode(data["ca.crt"]) == self.certificate_pem
+        except (KeyError, ValueError, TypeError, InvalidSignature, x509.ExtensionNotFound):
+            return False
+        if not same_ca or names.get_values_for_type(x509.UniformResourceIdentifier) != [identity]:
+            return False
+        return now < renewal_time(certificate)
+
+    def sign_node(self, request: x509.CertificateSigningRequest, node: str, now: datetime) -> bytes:
+        """Issue the certificate of a node's services and agent for the key of a request; PEM.
+
+        Only the key is taken from the request: the names are made here.
+        """
+        key = request.public_key()
+        if not isinstance(key, ec.EllipticCurvePublicKey):
+            raise TypeError(f"the request of {node} has no elliptic curve key")
+        return self._node_certificate(key, node, now, NODE_LIFE)
+
+    def _node_certificate(self, key: ec.EllipticCurvePublicKey, node: str, now: datetime, life: timedelta) -> bytes:
+        names: list[x509.GeneralName] = [
+            x509.UniformResourceIdentifier(node_identity(node)),
+            x509.DNSName(node_server_name(node)),
+        ]
+        usages = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
+        return self._issue(
+            key, common_name=_short(node_server_name(node)), names=names, usages=usages, life=life, now=now
+        )
+
+    def _issue(
+        self,
+        key: ec.EllipticCurvePublicKey,
+        *,
+        common_name: str,
+        names: Sequence[x509.GeneralName],
+        usages: list[x509.ObjectIdentifier],
+        life: timedelta,
+        now: datetime,
+        signs_grants: bool = False,
+    ) -> bytes:
+        issuer_key = self.certificate.extensions.get_extension_for_class(x509.SubjectKeyIdentifier).value
+        return (
+            x509.CertificateBuilder()
+            .subject_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)]))
+            .issuer_name(self.certificate.subject)
+            .public_key(key)
+            .serial_number(x509.random_serial_number())
+            .not_valid_before(now - _CLOCK_SKEW)
+            .not_valid_after(min(now + life, self.certificate.not_valid_after_utc))
+            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(_key_usage(signs_grants=signs_grants), critical=True)
+            .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
+            .add_extension(x509.SubjectAlternativeName(names), critical=False)
+            .add_extension(x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(issuer_key), critical=False)
+            .sign(self.key, hashes.SHA256())
+            .public_bytes(serialization.Encoding.PEM)
+        )
+
+
+def renewal_time(certificate: x509.Certificate) -> datetime:
+    """When a certificate is due for renewal: after two thirds of its life."""
+    start, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+    return start + (end - start) * _RENEW_AFTER
+
+
+async def open_authority(store: Store, namespace: str) -> Authority:
+    """Read the system's authority, or make it once; two operators that start at once end with the same one.
+
+    Raises:
+        BrokenAuthority: its Secret is damaged.
+    """
+    try:
+        secret = await store.get(SECRET, NAME, namespace)
+    except NotFound:
+        authority = Authority.generate(datetime.now(UTC))
+        body = {**_owned(SECRET.header(NAME, namespace)), "type": "kubernetes.io/tls", "data": authority.to_data()}
+        try:
+            secret = await store.create(SECRET, body)
+            logger.info("made the certificate authority (Secret %s/%s)", namespace, NAME)
+        except Taken:
+            secret = await store.get(SECRET, NAME, namespace)
+    authority = Authority.from_data(secret.get("data") or {})
+    public = {**_owned(CONFIG_MAP.header(NAME, namespace)), "data": {"ca.crt": authority.certificate_pem.decode()}}
+    await store.apply(CONFIG_MAP, public)
+    return authority
+
+
+def _owned(header: Body) -> Body:
+    header["metadata"]["labels"] = {MANAGED_LABEL: MANAGED_BY}
+    return header
+
+
+def _key_usage(*, signs_certificates: bool = False, signs_grants: bool = False) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not (signs_certificates or signs_grants),
+        key_cert_sign=signs_certificates,
+        crl_sign=signs_certificates,
+        content_commitment=signs_grants,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _short(text: str) -> str:
+    """A common name has 64 characters at most; who checks identities reads the alternative names."""
+    return text if len(text) <= 64 else text[:47] + "-" + hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+
+
+def _encoded(content: bytes) -> str:
+    return base64.b64encode(content).decode()

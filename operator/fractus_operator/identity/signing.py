@@ -1,0 +1,170 @@
+"""Signs the certificates of nodes: a request is granted only to the agent that runs on the node it names."""
+
+from __future__ import annotations
+
+import base64
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+
+from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric import ec
+from fractus_core.api import node_identity, node_server_name
+
+from fractus_operator.cluster.kinds import SIGNING_REQUEST, Body, Key
+from fractus_operator.cluster.store import NotFound, Store, Taken
+from fractus_operator.identity.authority import Authority
+
+logger = logging.getLogger(__name__)
+
+NODE_NAME_CLAIM = "authentication.kubernetes.io/node-name"
+"""The API server puts it into the user info of a token that is bound to a pod."""
+
+_USAGES = frozenset({"server auth", "client auth"})
+_TOLERATED_USAGES = frozenset({"digital signature"})
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """Whether a request may be signed, for which node, and why not.
+
+    Attributes:
+        node: set when it may be signed.
+        request: the parsed request, when it may be signed.
+    """
+
+    reason: str
+    message: str
+    node: str | None = None
+    request: x509.CertificateSigningRequest | None = None
+
+
+class Refused(Exception):
+    """A request is not of the kind that this signer signs."""
+
+    def __init__(self, reason: str, message: str) -> None:
+        self.reason = reason
+        super().__init__(message)
+
+
+def judge(body: Body, agent: str) -> Judgement:
+    """Judge a CertificateSigningRequest of the signer fractus.dev/node.
+
+    Args:
+        body: The request, with what the API server says of who made it.
+        agent: User name of the agents' service account.
+    """
+    spec = body["spec"]
+    if spec.get("username") != agent:
+        return Judgement("WrongRequester", f"{spec.get('username')} is not the agent ({agent})")
+    nodes = (spec.get("extra") or {}).get(NODE_NAME_CLAIM) or []
+    if len(nodes) != 1:
+        return Judgement("NotNodeBound", "the requester's token is not bound to a pod on a node")
+    node = nodes[0]
+    usages = set(spec.get("usages") or ())
+    if not usages >= _USAGES or usages - _USAGES - _TOLERATED_USAGES:
+        return Judgement("WrongUsages", f"usages must be server auth and client auth, not {', '.join(sorted(usages))}")
+    try:
+        request, asked = _read(spec["request"])
+    except Refused as refused:
+        return Judgement(refused.reason, str(refused))
+    wanted = {(x509.UniformResourceIdentifier, node_identity(node)), (x509.DNSName, node_server_name(node))}
+    if asked != wanted:
+        listed = ", ".join(sorted(str(value) for _, value in asked))
+        return Judgement("WrongNames", f"the agent of {node} may ask for the names of {node} only, not for {listed}")
+    return Judgement("NodeAgent", f"the agent on {node} asks for its own certificate", node, request)
+
+
+def _read(encoded: str) -> tuple[x509.CertificateSigningRequest, frozenset[tuple[type[x509.GeneralName], object]]]:
+    """Parse a request that proves possession of a P-256 key and has alternative names; the request and the names.
+
+    Raises:
+        Refused: it is not of that kind.
+    """
+    try:
+        request = x509.load_pem_x509_csr(base64.b64decode(encoded, validate=True))
+        key = request.public_key()
+        names = request.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        asked = frozenset((type(name), name.value) for name in names)
+        genuine = request.is_signature_valid
+    except x509.ExtensionNotFound:
+        raise Refused("WrongNames", "the request has no subject alternative names") from None
+    except Exception as error:
+        raise Refused("Malformed", f"the request cannot be read: {error or type(error).__name__}") from error
+    if not genuine:
+        raise Refused("Malformed", "the request is not signed with its own key")
+    if not isinstance(key, ec.EllipticCurvePublicKey) or not isinstance(key.curve, ec.SECP256R1):
+        raise Refused("WrongKey", "the key must be P-256")
+    return request, asked
+
+
+class NodeSigning:
+    """Approves, denies and signs requests of the signer fractus.dev/node."""
+
+    def __init__(
+        self,
+        store: Store,
+        read: Callable[[Key], Body | None],
+        authority: Authority,
+        agent: str,
+        clock: Callable[[], datetime],
+    ) -> None:
+        self._store = store
+        self._read = read
+        self._authority = authority
+        self._agent = agent
+        self._clock = clock
+
+    async def reconcile(self, key: Key) -> None:
+        """Bring one request to its end: denied with the reason, or approved and signed.
+
+        Also an approved request is judged, whoever approved it.
+        """
+        body = self._read(key)
+        if body is None:
+            return
+        status = body.get("status") or {}
+        conditions = {c["type"] for c in status.get("conditions") or ()}
+        if status.get("certificate") or conditions & {"Denied", "Failed"}:
+            return
+        judgement = judge(body, self._agent)
+        try:
+            if "Approved" not in conditions:
+                body = await self._decide(body, judgement)
+            if judgement.node is not None and judgement.request is not None:
+                certificate = self._authority.sign_node(judgement.request, judgement.node, self._clock())
+                status = {**(body.get("status") or {}), "certificate": base64.b64encode(certificate).decode()}
+                await self._store.replace(SIGNING_REQUEST, {**body, "status": status}, subresource="status")
+                logger.info("signed the certificate of node %s (%s)", judgement.node, key[1])
+            elif "Approved" in conditions:
+                await self._fail(body, judgement)
+        except (Taken, NotFound):
+            # It changed or went meanwhile: the watch brings the newer one.
+            return
+
+    async def _decide(self, body: Body, judgement: Judgement) -> Body:
+        verdict = "Approved" if judgement.node is not None else "Denied"
+        logger.info("%s request %s: %s", verdict.lower(), body["metadata"]["name"], judgement.message)
+        return await self._store.replace(
+            SIGNING_REQUEST, self._with_condition(body, verdict, judgement), subresource="approval"
+        )
+
+    async def _fail(self, body: Body, judgement: Judgement) -> None:
+        logger.warning("request %s was approved but is not signed: %s", body["metadata"]["name"], judgement.message)
+        await self._store.replace(
+            SIGNING_REQUEST, self._with_condition(body, "Failed", judgement), subresource="status"
+        )
+
+    def _with_condition(self, body: Body, type_: str, judgement: Judgement) -> Body:
+        stamp = self._clock().strftime("%Y-%m-%dT%H:%M:%SZ")
+        condition = {
+            "type": type_,
+            "status": "True",
+            "reason": judgement.reason,
+            "message": judgement.message,
+            "lastUpdateTime": stamp,
+            "lastTransitionTime": stamp,
+        }
+        status = body.get("status") or {}
+        return {**body, "status": {**status, "conditions": [*(status.get("conditions") or ()), condition]}}

@@ -1,0 +1,326 @@
+"""From a plan to Kubernetes objects: pure functions, one for each kind of child."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from fractus_core.api import API_VERSION, Application, Component, Drone
+from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec, PlannedInstance
+
+from fractus_operator.cluster.kinds import (
+    APPLICATION,
+    DEPLOYMENT,
+    DEPLOYMENT_PLAN,
+    ENDPOINT_SLICE,
+    GRANT,
+    SECRET,
+    SERVICE,
+    Body,
+    Kind,
+)
+from fractus_operator.cluster.labels import (
+    APPLICATION_LABEL,
+    CAUSE_ANNOTATION,
+    CLASS_LABEL,
+    COMPONENT_LABEL,
+    INSTANCE_LABEL,
+    MANAGED_BY,
+    MANAGED_LABEL,
+    NAMESPACE_LABEL,
+    PLACEMENT_LABEL,
+    grant_name,
+    label_value,
+    service_name,
+)
+from fractus_operator.cluster.pods import PodView
+
+COMPONENT_USER = 10001
+TLS_DIR = "/var/run/fractus/tls"
+MOBILITY_PORT = 50051
+CAMERA_PORT = 50052
+
+
+def deployment_plan(application: Application, plan: DeploymentPlanSpec) -> Body:
+    """The DeploymentPlan of an application; it carries the application's name."""
+    return _child(DEPLOYMENT_PLAN, application, application.name, {}, spec=plan.to_dict())
+
+
+def grant(application: Application, spec: GrantSpec) -> Body:
+    """The Grant of an instance. It is cluster-scoped, so labels and not an owner say whose it is."""
+    namespace, _ = application.key
+    body = GRANT.header(grant_name(namespace, spec.instance))
+    body["metadata"]["labels"] = {
+        **_labels(application),
+        NAMESPACE_LABEL: namespace,
+        COMPONENT_LABEL: spec.component,
+        INSTANCE_LABEL: spec.instance,
+    }
+    body["spec"] = _unsigned(spec)
+    return body
+
+
+def granted_again(observed: Body, spec: GrantSpec) -> Body:
+    """A Grant that exists, with another spec, made without its application: as `grant` makes it."""
+    body = GRANT.header(observed["metadata"]["name"])
+    ours = (APPLICATION_LABEL, MANAGED_LABEL, NAMESPACE_LABEL, COMPONENT_LABEL, INSTANCE_LABEL)
+    labels = observed["metadata"].get("labels") or {}
+    body["metadata"]["labels"] = {label: labels[label] for label in ours if label in labels}
+    body["spec"] = _unsigned(spec)
+    return body
+
+
+def _unsigned(spec: GrantSpec) -> Body:
+    """The spec without what is added when it is signed, so that what was signed before compares with it."""
+    unsigned = spec.model_copy(update={"issued_at": None})
+    # Without defaults: a field that a later release adds changes no Grant that does not use it, and services of the
+    # release before can still read those.
+    return unsigned.model_dump(mode="json", by_alias=True, exclude_defaults=True)
+
+
+def tls_secret(application: Application, placed: PlannedInstance, data: dict[str, str]) -> Body:
+    """The Secret with an instance's client certificate."""
+    labels = {COMPONENT_LABEL: placed.component, INSTANCE_LABEL: placed.instance}
+    return _child(SECRET, application, secret_name(placed.instance), labels, type="kubernetes.io/tls", data=data)
+
+
+def secret_name(instance: str) -> str:
+    """Name of the Secret of an instance."""
+    return f"{instance}-tls"
+
+
+def service(application: Application, component: Component) -> Body:
+    """The Service that callers of a component use.
+
+    A hybrid component's has no selector: the operator says by an EndpointSlice which instance answers.
+    """
+    spec: Body = {
+        "type": "ClusterIP",
+        "ports": [
+            {"name": _port_name(component, i), "port": p.port, "targetPort": p.port, "protocol": p.protocol}
+            for i, p in enumerate(component.container.ports)
+        ],
+    }
+    if component.placement != "hybrid":
+        spec["selector"] = {APPLICATION_LABEL: label_value(application.name), COMPONENT_LABEL: component.name}
+    name = service_name(application.name, component)
+    return _child(SERVICE, application, name, {COMPONENT_LABEL: component.name}, spec=spec)
+
+
+def endpoint_slice(application: Application, component: Component, pods: Iterable[PodView]) -> Body:
+    """Where a hybrid component's Service leads: to the ready pods of its base instance."""
+    name = service_name(application.name, component)
+    ready = sorted((pod for pod in pods if pod.ready and not pod.terminating and pod.ip), key=lambda pod: pod.name)
+    labels = {
+        COMPONENT_LABEL: component.name,
+        "kubernetes.io/service-name": name,
+        "endpointslice.kubernetes.io/managed-by": "operator.fractus.dev",
+    }
+    return _child(
+        ENDPOINT_SLICE,
+        application,
+        name,
+        labels,
+        addressType="IPv6" if any(":" in (pod.ip or "") for pod in ready) else "IPv4",
+        endpoints=[
+            {
+                "addresses": [pod.ip],
+                "conditions": {"ready": True, "serving": True, "terminating": False},
+                "nodeName": pod.node,
+                "targetRef": {"kind": "Pod", "namespace": pod.namespace, "name": pod.name},
+            }
+            for pod in ready
+        ],
+        ports=[
+            {"name": _port_name(component, i), "port": p.port, "protocol": p.protocol}
+            for i, p in enumerate(component.container.ports)
+        ],
+    )
+
+
+def deployment(application: Application, placed: PlannedInstance, drone: Drone | None = None) -> Body:
+    """The Deployment of a planned instance, bound to its node by required affinity.
+
+    Args:
+        application: Whose component it is.
+        placed: The instance.
+        drone: The Drone behind its node, if it is one: its autonomy bounds how long pods outlive a lost link.
+    """
+    component = application.spec.component(placed.component)
+    identity = {APPLICATION_LABEL: label_value(application.name), INSTANCE_LABEL: placed.instance}
+    labels = {**_labels(application), **_location_labels(component, placed)}
+    spec: Body = {
+        "replicas": placed.replicas,
+        "revisionHistoryLimit": 1,
+        "selector": {"matchLabels": identity},
+        "strategy": {"type": "Recreate" if placed.node is not None else "RollingUpdate"},
+        "template": {
+            "metadata": {"labels": labels, "annotations": {"kubectl.kubernetes.io/default-container": component.slug}},
+            "spec": _pod_spec(application, component, placed, drone),
+        },
+    }
+    body = _child(DEPLOYMENT, application, placed.instance, _location_labels(component, placed), spec=spec)
+    body["metadata"]["annotations"] = {CAUSE_ANNOTATION: f"{_wish(application, component)}@{placed.node or 'cloud'}"}
+    return body
+
+
+def _wish(application: Application, component: Component) -> str:
+    """A digest of what the manifest says that concerns a component's pods."""
+    called = [application.spec.component(name).container.ports for name in component.egress]
+    # Defaults are left out: a new version of the kinds adds some.
+    said = [
+        component.model_dump(mode="json", by_alias=True, exclude_defaults=True),
+        [[port.port for port in ports] for ports in called],
+    ]
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def application_status(application: Body, status: Body) -> Body:
+    """The status part of an Application, for server-side apply to that one object and no later one of its name."""
+    metadata = application["metadata"]
+    body = APPLICATION.header(metadata["name"], metadata["namespace"], uid=metadata["uid"])
+    body["status"] = status
+    return body
+
+
+def _pod_spec(application: Application, component: Component, placed: PlannedInstance, drone: Drone | None) -> Body:
+    container = component.container
+    spec: Body = {
+        "automountServiceAccountToken": False,
+        "enableServiceLinks": False,
+        "terminationGracePeriodSeconds": 10,
+        "securityContext": {
+            "runAsNonRoot": True,
+            "runAsUser": COMPONENT_USER,
+            "runAsGroup": COMPONENT_USER,
+            "fsGroup": COMPONENT_USER,
+            "seccompProfile": {"type": "RuntimeDefault"},
+        },
+        "affinity": {"nodeAffinity": _affinity(placed)},
+        "tolerations": _tolerations(placed, drone),
+        "volumes": [
+            {"name": "tls", "secret": {"secretName": secret_name(placed.instance), "defaultMode": 0o440}},
+            {"name": "tmp", "emptyDir": {"sizeLimit": "64Mi"}},
+            *(volume.pod_volume() for volume in container.volumes),
+        ],
+        "containers": [
+            {
+                "name": component.slug,
+                "image": container.image,
+                "env": _environment(application, component, placed),
+                "resources": container.resources.to_dict(),
+                "securityContext": {
+                    "allowPrivilegeEscalation": False,
+                    "capabilities": {"drop": ["ALL"]},
+                    "readOnlyRootFilesystem": True,
+                },
+                "volumeMounts": [
+                    {"name": "tls", "mountPath": TLS_DIR, "readOnly": True},
+                    {"name": "tmp", "mountPath": "/tmp"},  # noqa: S108  (the pod's own)
+                    *(volume.mount() for volume in container.volumes),
+                ],
+            }
+        ],
+    }
+    main = spec["containers"][0]
+    if container.command:
+        main["command"] = list(container.command)
+    if container.args:
+        main["args"] = list(container.args)
+    if container.ports:
+        main["ports"] = [
+            {"name": _port_name(component, i), "containerPort": p.port, "protocol": p.protocol}
+            for i, p in enumerate(container.ports)
+        ]
+    return spec
+
+
+def _environment(application: Application, component: Component, placed: PlannedInstance) -> list[Body]:
+    namespace, name = application.key
+    env: list[Body] = [
+        {"name": "FRACTUS_NODE", "valueFrom": {"fieldRef": {"apiVersion": "v1", "fieldPath": "spec.nodeName"}}},
+        {"name": "FRACTUS_HOST_IP", "valueFrom": {"fieldRef": {"apiVersion": "v1", "fieldPath": "status.hostIP"}}},
+        {"name": "FRACTUS_NAMESPACE", "value": namespace},
+        {"name": "FRACTUS_APPLICATION", "value": name},
+        {"name": "FRACTUS_COMPONENT", "value": component.name},
+        {"name": "FRACTUS_INSTANCE", "value": placed.instance},
+        {"name": "FRACTUS_TLS_DIR", "value": TLS_DIR},
+    ]
+    if placed.placement == "drone":
+        env.append({"name": "FRACTUS_MOBILITY_ADDRESS", "value": f"$(FRACTUS_HOST_IP):{MOBILITY_PORT}"})
+    if placed.placement in {"drone", "edge"}:
+        env.append({"name": "FRACTUS_CAMERA_ADDRESS", "value": f"$(FRACTUS_HOST_IP):{CAMERA_PORT}"})
+    if component.control_points:
+        points = [point.to_dict() for point in component.control_points]
+        env.append({"name": "FRACTUS_CONTROL_POINTS", "value": json.dumps(points, separators=(",", ":"))})
+    for called in component.egress:
+        other = application.spec.component(called)
+        if other.container.ports:
+            address = f"{service_name(name, other)}.{namespace}.svc:{other.container.ports[0].port}"
+            env.append({"name": f"FRACTUS_SERVICE_{other.slug.upper().replace('-', '_')}", "value": address})
+    ours = {variable["name"] for variable in env}
+    env += [v.to_dict() for v in component.container.env if v.name not in ours]
+    return env
+
+
+def _affinity(placed: PlannedInstance) -> Body:
+    if placed.node is not None:
+        term = {"matchFields": [{"key": "metadata.name", "operator": "In", "values": [placed.node]}]}
+    else:
+        term = {"matchExpressions": [{"key": CLASS_LABEL, "operator": "In", "values": ["cloud"]}]}
+    return {"requiredDuringSchedulingIgnoredDuringExecution": {"nodeSelectorTerms": [term]}}
+
+
+def _tolerations(placed: PlannedInstance, drone: Drone | None) -> list[Body]:
+    """Pods of a drone or edge node stay when the node cannot be reached; those of the cloud go elsewhere."""
+    if placed.node is None:
+        return []
+    autonomy = drone.spec.autonomy if drone is not None else None
+    bound: Body = {} if autonomy is None else {"tolerationSeconds": autonomy}
+    return [
+        {"key": CLASS_LABEL, "operator": "Exists"},
+        {"key": "node.kubernetes.io/not-ready", "operator": "Exists", "effect": "NoExecute", **bound},
+        {"key": "node.kubernetes.io/unreachable", "operator": "Exists", "effect": "NoExecute", **bound},
+    ]
+
+
+def _port_name(component: Component, index: int) -> str:
+    port = component.container.ports[index]
+    return port.name or f"port-{port.port}"
+
+
+def _labels(application: Application) -> dict[str, str]:
+    return {APPLICATION_LABEL: label_value(application.name), MANAGED_LABEL: MANAGED_BY}
+
+
+def _location_labels(component: Component, placed: PlannedInstance) -> dict[str, str]:
+    return {
+        "app.kubernetes.io/name": component.slug,
+        COMPONENT_LABEL: component.name,
+        INSTANCE_LABEL: placed.instance,
+        PLACEMENT_LABEL: placed.placement,
+    }
+
+
+def _child(kind: Kind, application: Application, name: str, labels: dict[str, str], **content: Any) -> Body:
+    namespace, _ = application.key
+    body = kind.header(name, namespace)
+    body["metadata"]["labels"] = {**_labels(application), **labels}
+    body["metadata"]["ownerReferences"] = [
+        {
+            "apiVersion": API_VERSION,
+            "kind": Application.KIND,
+            "name": application.name,
+            "uid": application.metadata.uid or "",
+            "controller": True,
+            "blockOwnerDeletion": True,
+        }
+    ]
+    return {**body, **content}
+
+
+def base_instances(plan: DeploymentPlanSpec, component: Component) -> Sequence[str]:
+    """The instances of a hybrid component that answer where no nearer one does: those in the cloud."""
+    return [p.instance for p in plan.placements if p.component == component.name and p.role == "cloud"]

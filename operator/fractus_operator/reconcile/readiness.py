@@ -1,0 +1,99 @@
+"""Says of every Zone and Policy whether it can be enforced, in its Ready condition."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from datetime import datetime
+from typing import Any
+
+from fractus_core.api import Condition, InvalidObject, Policy, Zone
+from fractus_core.validation import check_policy, check_zone
+
+from fractus_operator.cluster.kinds import POLICY, ZONE, Key, Kind
+from fractus_operator.cluster.reading import Broken
+from fractus_operator.cluster.store import NotFound, Store, Taken
+from fractus_operator.inventory.live import LiveInventory
+from fractus_operator.reconcile.conditions import Fact, merge
+
+
+class Readiness:
+    """Writes the Ready condition of Zones and Policies."""
+
+    def __init__(self, store: Store, live: LiveInventory, clock: Callable[[], datetime]) -> None:
+        self._store = store
+        self._live = live
+        self._clock = clock
+
+    async def reconcile_zone(self, key: Key) -> None:
+        """Check one Zone beyond its schema."""
+        zone = self._live.zones.get(key)
+        if zone is not None:
+            await self._report(ZONE, zone, self._judge_zone(zone))
+
+    async def reconcile_policy(self, key: Key) -> None:
+        """Check one Policy beyond its schema; a policy is ready when all of its zones are."""
+        policy = self._live.policies.get(key)
+        if policy is not None:
+            await self._report(POLICY, policy, self._judge_policy(policy))
+
+    def policies_of(self, zone: str) -> Sequence[Key]:
+        """The policies that select a zone."""
+        return [
+            key
+            for key, policy in self._live.policies.items()
+            if isinstance(policy, Policy) and zone in policy.spec.selector.zones
+        ]
+
+    def _judge_zone(self, zone: Zone | Broken) -> Fact:
+        if isinstance(zone, Broken):
+            return Fact("Ready", "False", "Invalid", zone.problem)
+        try:
+            check_zone(zone)
+        except InvalidObject as error:
+            return Fact("Ready", "False", "Invalid", str(error))
+        return Fact("Ready", "True", "Valid", "the zone can be enforced")
+
+    def _judge_policy(self, policy: Policy | Broken) -> Fact:
+        if isinstance(policy, Broken):
+            return Fact("Ready", "False", "Invalid", policy.problem)
+        zones = {zone.name: zone for zone in self._live.zones.values()}
+        try:
+            check_policy(policy, zones.keys())
+        except InvalidObject as error:
+            return Fact("Ready", "False", "ZoneMissing", str(error))
+        for i, name in enumerate(policy.spec.selector.zones):
+            fact = self._judge_zone(zones[name])
+            if fact.status != "True":
+                message = f"spec.selector.zones[{i}]: Zone {name}: {fact.message}"
+                return Fact("Ready", "False", "ZoneInvalid", message)
+        return Fact("Ready", "True", "Valid", "the policy can be enforced")
+
+    async def _report(self, kind: Kind, resource: Zone | Policy | Broken, fact: Fact) -> None:
+        now = self._clock()
+        generation = resource.metadata.generation
+        before = _conditions(resource)
+        conditions, news = merge(before, [fact], generation, now)
+        if conditions == before:
+            return
+        body = kind.header(resource.name, uid=resource.metadata.uid)
+        body["status"] = {"observedGeneration": generation, "conditions": [c.to_dict() for c in conditions]}
+        try:
+            await self._store.apply(kind, body, subresource="status")
+        except (Taken, NotFound):
+            return
+        for item in news:
+            if item.warning:
+                await self._warn(kind, resource, item, now)
+
+    async def _warn(self, kind: Kind, resource: Zone | Policy | Broken, fact: Fact, now: datetime) -> None:
+        regarding: dict[str, Any] = kind.header(resource.name, uid=resource.metadata.uid)
+        name = f"{resource.name}.{int(now.timestamp() * 1000):x}"
+        await self._store.record_event(
+            regarding, reason=fact.reason, message=fact.message, warning=True, name=name, now=now
+        )
+
+
+def _conditions(resource: Zone | Policy | Broken) -> tuple[Condition, ...]:
+    if isinstance(resource, Broken):
+        return resource.conditions
+    return resource.status.conditions if resource.status is not None else ()

@@ -1,0 +1,161 @@
+"""How a plan becomes objects: the order in which an application's children are made, and what of them is left alone."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import Counter
+from collections.abc import Callable, Sequence
+from datetime import datetime
+
+from fractus_core.api import Application, component_identity
+from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec, PlannedInstance
+
+from fractus_operator.cluster import kinds
+from fractus_operator.cluster.kinds import Body, Key, Kind, key_of
+from fractus_operator.cluster.labels import CAUSE_ANNOTATION
+from fractus_operator.cluster.pods import PodView
+from fractus_operator.identity.authority import Authority
+from fractus_operator.inventory.live import LiveInventory
+from fractus_operator.reconcile import builders
+from fractus_operator.reconcile.children import Children
+
+_HEAD_START_S = 0.5
+"""How long what makes pods goes first at most, where there are new ones: neither a webhook that holds Deployments up nor pods
+that no node takes delay a Grant for longer."""
+
+
+class Rollout:
+    """Makes an application's children what its plan says.
+
+    What makes pods goes first: until these have their nodes nothing else that is new takes the API server from the scheduler.
+    A pod starts without it, which takes longer, but can call nothing before it has its Grant.
+    """
+
+    def __init__(
+        self, children: Children, live: LiveInventory, authority: Authority, clock: Callable[[], datetime]
+    ) -> None:
+        self._children = children
+        self._live = live
+        self._authority = authority
+        self._clock = clock
+
+    async def carry_out(
+        self,
+        application: Application,
+        decided: DeploymentPlanSpec,
+        grants: Sequence[GrantSpec],
+        pods: Sequence[PodView],
+        rules: int,
+    ) -> bool:
+        """Write the plan, remove what is stale, then make the Deployments and the rest.
+
+        Args:
+            application: Whose plan it is.
+            decided: The plan.
+            grants: What its instances may do.
+            pods: Its pods as they are.
+            rules: The revision of the rules that the grants are made of; no new one is made once there is a later one.
+
+        Returns:
+            Whether that is all; else some grants are left to the next look.
+
+        Raises:
+            NameTaken: somebody else's object has the name of a child.
+            StoreError: the API server refuses one, or cannot be reached.
+        """
+        wanted = self._wanted(application, decided, grants, pods)
+        secrets = {builders.secret_name(placed.instance): placed for placed in decided.placements}
+        # The plan before all else: it tells, also after a crash, who flies the drone and who comes along.
+        await self._children.apply(application, {kinds.DEPLOYMENT_PLAN: wanted[kinds.DEPLOYMENT_PLAN]})
+        await self._children.prune(application, wanted, keep_secrets=secrets.keys())
+        running = [body for body in wanted[kinds.DEPLOYMENT] if not self._in_the_air(body, decided)]
+        starts = not all(self._is_there(kinds.DEPLOYMENT, body) for body in running)
+        granted = [body for body in wanted[kinds.GRANT] if self._is_there(kinds.GRANT, body)]
+        # What is granted already may have to shrink: it waits for nothing.
+        first = {kinds.GRANT: granted, kinds.DEPLOYMENT: running}
+        made = asyncio.ensure_future(self._children.apply(application, first))
+
+        async def beside() -> None:
+            await asyncio.wait({made}, timeout=_HEAD_START_S)
+            certificates = [self._certificate(application, placed) for placed in secrets.values()]
+            await self._children.apply(application, {kinds.SECRET: certificates})
+
+        async def after() -> bool:
+            if starts:
+                await self._scheduled(application.key, decided, made, rules)
+            last = {kind: wanted[kind] for kind in (kinds.SERVICE, kinds.ENDPOINT_SLICE)}
+            # Rules that changed meanwhile are in no Grant that was compiled before.
+            valid = rules == self._live.rules_revision
+            if valid:
+                last = {kinds.GRANT: [body for body in wanted[kinds.GRANT] if body not in granted], **last}
+            await self._children.apply(application, last)
+            return valid
+
+        # Nothing is written any more when the next look begins; and an object in the way of one stops no other.
+        results = await asyncio.gather(made, beside(), after(), return_exceptions=True)
+        for result in results:
+            if isinstance(result, BaseException):
+                raise result
+        return results[2] is True
+
+    def _wanted(
+        self,
+        application: Application,
+        decided: DeploymentPlanSpec,
+        grants: Sequence[GrantSpec],
+        pods: Sequence[PodView],
+    ) -> dict[Kind, list[Body]]:
+        """The children that a plan asks for, but Secrets: those hold keys, which are made when they are needed."""
+        wanted: dict[Kind, list[Body]] = {kind: [] for kind in kinds.CHILDREN}
+        wanted[kinds.DEPLOYMENT_PLAN] = [builders.deployment_plan(application, decided)]
+        wanted[kinds.GRANT] = [builders.grant(application, spec) for spec in grants]
+        for component in (c for c in application.spec.components if c.container.ports):
+            wanted[kinds.SERVICE].append(builders.service(application, component))
+            if component.placement == "hybrid":
+                instances = builders.base_instances(decided, component)
+                bases = [pod for pod in pods if pod.instance in instances]
+                wanted[kinds.ENDPOINT_SLICE].append(builders.endpoint_slice(application, component, bases))
+        for placed in decided.placements:
+            drone = self._live.drones.get(("", placed.node)) if placed.node is not None else None
+            wanted[kinds.DEPLOYMENT].append(builders.deployment(application, placed, drone))
+        return wanted
+
+    def _is_there(self, kind: Kind, body: Body) -> bool:
+        return self._live.children[kind].get(key_of(body)) is not None
+
+    async def _scheduled(self, key: Key, decided: DeploymentPlanSpec, made: asyncio.Future[None], rules: int) -> None:
+        """Wait until every pod of a plan has its node, or will get none: the head start at most, and never when rules change."""
+        with self._live.subscription(key) as inputs, contextlib.suppress(TimeoutError):
+            made.add_done_callback(lambda _: inputs.wake())
+            async with asyncio.timeout(_HEAD_START_S):
+                while rules == self._live.rules_revision and not (made.done() and made.exception()):
+                    nodes = Counter(pod.instance for pod in self._live.pods_of(key) if pod.node is not None)
+                    if all(nodes[placed.instance] >= placed.replicas for placed in decided.placements):
+                        return
+                    await inputs.changed(_HEAD_START_S)
+
+    def _in_the_air(self, desired: Body, decided: DeploymentPlanSpec) -> bool:
+        """Whether a Deployment is left alone: its drone flies, and its owner has asked for no change.
+
+        So no upgrade of the operator, which may build pods in another way, restarts a driver in flight.
+        """
+        drone = self._live.aloft(decided)
+        observed = self._live.children[kinds.DEPLOYMENT].get(key_of(desired))
+        if drone is None or observed is None:
+            return False
+        cause = str(desired["metadata"]["annotations"][CAUSE_ANNOTATION])
+        present = (observed["metadata"].get("annotations") or {}).get(CAUSE_ANNOTATION)
+        return cause == present and cause.rpartition("@")[2] == drone
+
+    def _certificate(self, application: Application, placed: PlannedInstance) -> Body:
+        """The Secret of an instance: the present certificate while it is good, so that a restart renews nothing."""
+        namespace, name = application.key
+        identity = component_identity(namespace, name, placed.component, placed.instance)
+        place = (namespace, builders.secret_name(placed.instance))
+        observed = self._live.children[kinds.SECRET].get(place)
+        data = dict((observed or {}).get("data") or {})
+        now = self._clock()
+        if not self._authority.still_good(data, identity, now):
+            data = self._authority.issue_component(identity, now)
+        return builders.tls_secret(application, placed, data)

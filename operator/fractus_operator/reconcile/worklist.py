@@ -1,0 +1,74 @@
+"""A queue of keys to reconcile: each key once, one at a time, failures again later."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+from collections.abc import Awaitable, Callable
+
+from fractus_operator.cluster.kinds import Key
+from fractus_operator.cluster.store import StoreError
+
+logger = logging.getLogger(__name__)
+
+_BACKOFF_S = (0.5, 60.0)
+
+
+class Worklist:
+    """Calls `reconcile(key)` for each key that was added since it was last reconciled.
+
+    A failing key is tried again with growing, jittered pauses, up to a minute apart: what is
+    reconciled is a level, so a later try can only find a newer one.
+    """
+
+    def __init__(
+        self, name: str, reconcile: Callable[[Key], Awaitable[None]], *, rng: random.Random | None = None
+    ) -> None:
+        self.name = name
+        self.failures: dict[Key, int] = {}
+        self._reconcile = reconcile
+        self._rng = rng or random.Random()  # noqa: S311  (jitter)
+        self._waiting: dict[Key, None] = {}
+        self._added = asyncio.Event()
+        self._later: dict[Key, asyncio.TimerHandle] = {}
+
+    def add(self, key: Key) -> None:
+        """Reconcile the key soon."""
+        handle = self._later.pop(key, None)
+        if handle is not None:
+            handle.cancel()
+        self._waiting[key] = None
+        self._added.set()
+
+    async def run(self) -> None:
+        """Reconcile until cancelled."""
+        while True:
+            await self._added.wait()
+            self._added.clear()
+            while self._waiting:
+                key = next(iter(self._waiting))
+                del self._waiting[key]
+                await self._attempt(key)
+
+    async def _attempt(self, key: Key) -> None:
+        try:
+            await self._reconcile(key)
+        except Exception as error:
+            failures = self.failures[key] = self.failures.get(key, 0) + 1
+            low, high = _BACKOFF_S
+            pause_s = min(high, low * 2.0 ** min(failures, 8)) * self._rng.uniform(0.5, 1.0)
+            expected = isinstance(error, StoreError)
+            logger.log(
+                logging.INFO if expected and failures <= 2 else logging.WARNING,
+                "%s %s: %s; again in %.1f s",
+                self.name,
+                "/".join(filter(None, key)),
+                error if expected else repr(error),
+                pause_s,
+                exc_info=None if expected else error,
+            )
+            if key not in self._waiting:
+                self._later[key] = asyncio.get_running_loop().call_later(pause_s, self.add, key)
+        else:
+            self.failures.pop(key, None)

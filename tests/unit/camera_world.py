@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from fractus_core.policy.values import Attitude, CaptureArgs, Lens, Situation
 from fractus_services.audit import AuditLog
-from fractus_services.camera import service as camera
-from fractus_services.camera.album import Album
-from fractus_services.camera.drivers import Wanted
-from fractus_services.camera.faces import Box
-from fractus_services.camera.imaging import Pixels, decoded
-from fractus_services.camera.service import Body, CameraService
-from fractus_services.camera.shots import Shot
-from fractus_services.camera.shutter import Shutter
+from fractus_services.camera.album.album import Album
+from fractus_services.camera.album.shots import Shot
+from fractus_services.camera.capture.driver import Wanted
+from fractus_services.camera.capture.shutter import Shutter
+from fractus_services.camera.imaging.faces import Box
+from fractus_services.camera.imaging.pixels import Pixels, decoded
+from fractus_services.camera.pictures import service as camera
+from fractus_services.camera.pictures.service import Body, CameraService
 from fractus_services.grants import ActiveGrant
 from fractus_services.replies import Refused
 from policy_world import NOW, at, box, compiled, policy, spec, zone

@@ -11,8 +11,8 @@ from fractus_core.policy.footprint import footprint, seen_from
 from fractus_core.policy.values import Lens, Situation
 from fractus_proto.v1 import mobility_pb2
 from fractus_services.auth import TlsFiles
-from fractus_services.camera import whereabouts
-from fractus_services.camera.whereabouts import Airborne
+from fractus_services.camera.pose import provider as whereabouts
+from fractus_services.camera.pose.provider import Airborne
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from policy_world import FRAME, HOME

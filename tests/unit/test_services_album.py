@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 from camera_world import World, active_grant, private, refusal
-from fractus_services.camera import service as camera
-from fractus_services.camera.album import Album, AlbumFull, NoSuchImage
+from fractus_services.camera.album.album import Album, AlbumFull, NoSuchImage
+from fractus_services.camera.pictures import service as camera
 
 
 @pytest.fixture
@@ -88,7 +88,7 @@ async def test_a_full_disk_is_said_and_leaves_nothing_behind(world: World, monke
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as broken:
-        broken.setattr("fractus_services.camera.album.os.fsync", full)
+        broken.setattr("fractus_services.camera.album.album.os.fsync", full)
         with pytest.raises(OSError, match="No space left") as caught:
             await world.capture(active_grant())
     refused = camera.known(caught.value)

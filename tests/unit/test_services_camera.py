@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from camera_world import Scene, World, active_grant, grain, private, refusal
 from fractus_core.policy.values import CaptureArgs, Lens
-from fractus_services.camera import service as camera
-from fractus_services.camera.drivers import CameraFailed, Wanted
-from fractus_services.camera.service import MAX_OF_ONE
-from fractus_services.camera.shutter import Shutter
+from fractus_services.camera.capture.driver import CameraFailed, Wanted
+from fractus_services.camera.capture.shutter import Shutter
+from fractus_services.camera.pictures import service as camera
+from fractus_services.camera.pictures.service import MAX_OF_ONE
 from fractus_services.grants import ActiveGrant
 from fractus_services.replies import Refused
 from policy_world import FRAME, NOW, at, box, policy, zone

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import skimage.data
 from fractus_core.policy.values import Attitude, Filter, Home, Lens
-from fractus_services.camera.darkroom import NotHidden, is_upright, recipe
-from fractus_services.camera.drivers import BadConnection, CameraFailed, Wanted, driver_for
-from fractus_services.camera.faces import BadModel, CascadeDetector, ModelDetector, smallest_face_px
-from fractus_services.camera.filters import (
+from fractus_services.camera.album.shots import Pose, Shot, facts
+from fractus_services.camera.capture.driver import BadConnection, CameraFailed, Wanted, driver_for
+from fractus_services.camera.imaging.faces import BadModel, CascadeDetector, ModelDetector, smallest_face_px
+from fractus_services.camera.imaging.filters import (
     black,
     blur_average,
     blur_median,
@@ -25,9 +25,9 @@ from fractus_services.camera.filters import (
     moving,
     remove_background,
 )
-from fractus_services.camera.imaging import NotAPicture, Pixels, decoded, encoded, fitted, source_size
-from fractus_services.camera.metadata import tagged
-from fractus_services.camera.shots import Pose, Shot, facts
+from fractus_services.camera.imaging.metadata import tagged
+from fractus_services.camera.imaging.pipeline import NotHidden, is_upright, recipe
+from fractus_services.camera.imaging.pixels import NotAPicture, Pixels, decoded, encoded, fitted, source_size
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image

@@ -118,9 +118,9 @@ def serve(**given: object) -> None:
 
 
 async def _until_signalled(options: Options) -> None:
-    from fractus_services.camera.drivers import BadConnection  # noqa: PLC0415 - the command line stays quick
-    from fractus_services.camera.faces import BadModel  # noqa: PLC0415
-    from fractus_services.camera.server import run  # noqa: PLC0415
+    from fractus_services.camera.capture.driver import BadConnection  # noqa: PLC0415 - the command line stays quick
+    from fractus_services.camera.imaging.faces import BadModel  # noqa: PLC0415
+    from fractus_services.camera.rpc.server import run  # noqa: PLC0415
 
     loop = asyncio.get_running_loop()
     stop = asyncio.Event()

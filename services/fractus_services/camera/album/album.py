@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from fractus_services.camera.shots import Shot
+from fractus_services.camera.album.shots import Shot
 
 log = logging.getLogger(__name__)
 

@@ -16,13 +16,13 @@ from fractus_proto.v1 import camera_pb2_grpc
 from fractus_services.answering import Reception
 from fractus_services.audit import AuditLog
 from fractus_services.auth import KEEPALIVE, TlsFiles
-from fractus_services.camera.album import Album
-from fractus_services.camera.drivers import driver_for
-from fractus_services.camera.faces import CascadeDetector, Detector, ModelDetector
-from fractus_services.camera.handlers import CameraHandlers
-from fractus_services.camera.service import Body, CameraService, Whereabouts, known, owner_of
-from fractus_services.camera.shutter import Shutter
-from fractus_services.camera.whereabouts import Airborne, Fixed
+from fractus_services.camera.album.album import Album
+from fractus_services.camera.capture.driver import driver_for
+from fractus_services.camera.capture.shutter import Shutter
+from fractus_services.camera.imaging.faces import CascadeDetector, Detector, ModelDetector
+from fractus_services.camera.pictures.service import Body, CameraService, Whereabouts, known, owner_of
+from fractus_services.camera.pose.provider import Airborne, Fixed
+from fractus_services.camera.rpc.handlers import CameraHandlers
 from fractus_services.clock import Clock
 from fractus_services.grants import GrantFiles
 from fractus_services.hosting import open_door, read_description

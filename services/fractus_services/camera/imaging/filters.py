@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from fractus_core.policy.values import FaceMethod
 
-from fractus_services.camera.faces import Box
-from fractus_services.camera.imaging import Pixels, opencv, reduced
+from fractus_services.camera.imaging.faces import Box
+from fractus_services.camera.imaging.pixels import Pixels, opencv, reduced
 
 Mask = npt.NDArray[np.bool_]
 

@@ -11,9 +11,9 @@ from fractus_core.policy.values import CaptureArgs
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
 
 from fractus_services.answering import Reception
-from fractus_services.camera.album import NoSuchImage
-from fractus_services.camera.service import CameraService
-from fractus_services.camera.shots import Shot
+from fractus_services.camera.album.album import NoSuchImage
+from fractus_services.camera.album.shots import Shot
+from fractus_services.camera.pictures.service import CameraService
 from fractus_services.replies import decision
 
 CHUNK_BYTES = 256 * 1024

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from fractus_services.camera.drivers import CameraFailed, Wanted, as_described
-from fractus_services.camera.imaging import Pixels
+from fractus_services.camera.capture.driver import CameraFailed, Wanted, as_described
+from fractus_services.camera.imaging.pixels import Pixels
 
 
 class RaspberryCamera:

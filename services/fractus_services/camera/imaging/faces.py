@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from fractus_core.policy.values import Lens
 
-from fractus_services.camera.imaging import Pixels, opencv
+from fractus_services.camera.imaging.pixels import Pixels, opencv
 
 Box = tuple[int, int, int, int]
 """Left, top, width and height in pixels."""

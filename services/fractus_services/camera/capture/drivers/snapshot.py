@@ -8,8 +8,8 @@ import urllib.error
 import urllib.parse
 import urllib.request
 
-from fractus_services.camera.drivers import TIMEOUT_S, BadConnection, CameraFailed, Wanted
-from fractus_services.camera.imaging import MOST_BYTES, NotAPicture, Pixels, decoded
+from fractus_services.camera.capture.driver import TIMEOUT_S, BadConnection, CameraFailed, Wanted
+from fractus_services.camera.imaging.pixels import MOST_BYTES, NotAPicture, Pixels, decoded
 
 _PIECE_BYTES = 256 * 1024
 

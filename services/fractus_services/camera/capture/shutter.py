@@ -8,9 +8,9 @@ import threading
 import time
 from collections.abc import Callable
 
-from fractus_services.camera.drivers import TIMEOUT_S, CameraFailed, Driver, Wanted
-from fractus_services.camera.filters import MOTION_PX
-from fractus_services.camera.imaging import Pixels, reduced
+from fractus_services.camera.capture.driver import TIMEOUT_S, CameraFailed, Driver, Wanted
+from fractus_services.camera.imaging.filters import MOTION_PX
+from fractus_services.camera.imaging.pixels import Pixels, reduced
 
 _Answer = asyncio.Future[list[Pixels]]
 

@@ -6,8 +6,8 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from fractus_services.camera.drivers import Wanted
-from fractus_services.camera.imaging import Pixels, opencv
+from fractus_services.camera.capture.driver import Wanted
+from fractus_services.camera.imaging.pixels import Pixels, opencv
 
 GRID_PX = 80
 

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from fractus_core.geo import LocalFrame
 
-from fractus_services.camera.drivers import CameraFailed, Wanted
-from fractus_services.camera.imaging import NotAPicture, Pixels, decoded
+from fractus_services.camera.capture.driver import CameraFailed, Wanted
+from fractus_services.camera.imaging.pixels import NotAPicture, Pixels, decoded
 
 log = logging.getLogger(__name__)
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from fractus_core.policy.privacy import compose
 from fractus_core.policy.values import Filter
 
-from fractus_services.camera import filters as do
-from fractus_services.camera.faces import Detector
-from fractus_services.camera.imaging import Pixels
-from fractus_services.camera.shots import Pose, directions
+from fractus_services.camera.album.shots import Pose, directions
+from fractus_services.camera.imaging import filters as do
+from fractus_services.camera.imaging.faces import Detector
+from fractus_services.camera.imaging.pixels import Pixels
 
 _UPRIGHT_PITCH_DEG = -45.0
 _UPRIGHT_ROLL_DEG = 15.0

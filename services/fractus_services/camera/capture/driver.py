@@ -8,7 +8,7 @@ from typing import Literal, Protocol
 
 from fractus_core.policy.values import Situation
 
-from fractus_services.camera.imaging import Pixels
+from fractus_services.camera.imaging.pixels import Pixels
 
 TIMEOUT_S = 5.0
 """A camera that takes longer for a picture is broken."""
@@ -88,23 +88,23 @@ def driver_for(connection: str) -> Driver:
     """
     kind, _, rest = connection.partition(":")
     if kind in {"http", "https"}:
-        from fractus_services.camera.drivers.snapshot import Snapshot  # noqa: PLC0415 - only the one that is used
+        from fractus_services.camera.capture.drivers.snapshot import Snapshot  # noqa: PLC0415 - only the one that is used
 
         return Snapshot(connection)
     if kind == "v4l2" and rest:
-        from fractus_services.camera.drivers.v4l2 import VideoDevice  # noqa: PLC0415
+        from fractus_services.camera.capture.drivers.v4l2 import VideoDevice  # noqa: PLC0415
 
         return VideoDevice(rest)
     if kind == "picamera2" and rest.isdigit():
-        from fractus_services.camera.drivers.raspberry import RaspberryCamera  # noqa: PLC0415
+        from fractus_services.camera.capture.drivers.raspberry import RaspberryCamera  # noqa: PLC0415
 
         return RaspberryCamera(int(rest))
     if kind == "directory" and rest:
-        from fractus_services.camera.drivers.directory import GeotaggedDirectory  # noqa: PLC0415
+        from fractus_services.camera.capture.drivers.directory import GeotaggedDirectory  # noqa: PLC0415
 
         return GeotaggedDirectory(Path(rest))
     if connection == "test:":
-        from fractus_services.camera.drivers.rendered import Rendered  # noqa: PLC0415
+        from fractus_services.camera.capture.drivers.rendered import Rendered  # noqa: PLC0415
 
         return Rendered()
     raise BadConnection(

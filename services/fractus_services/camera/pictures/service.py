@@ -20,16 +20,16 @@ from fractus_core.policy.privacy import compose, judge_privacy, remaining
 from fractus_core.policy.values import Call, CaptureArgs, Filter, Moment, Situation, Verdict, earliest
 
 from fractus_services.audit import AuditLog
-from fractus_services.camera.album import Album, AlbumFull, NoSuchImage
-from fractus_services.camera.darkroom import NotHidden, Recipe, developed, is_upright, recipe
-from fractus_services.camera.drivers import CameraFailed, Wanted
-from fractus_services.camera.faces import BadModel, Detector, smallest_face_px
-from fractus_services.camera.filters import MOTION_PX
-from fractus_services.camera.imaging import NotAPicture, Pixels, cropped, decoded, encoded, fitted, source_size
-from fractus_services.camera.metadata import tagged
-from fractus_services.camera.shots import Pose, Shot, facts
-from fractus_services.camera.shutter import Shutter
-from fractus_services.camera.turns import QueueFull, Turns
+from fractus_services.camera.album.album import Album, AlbumFull, NoSuchImage
+from fractus_services.camera.album.shots import Pose, Shot, facts
+from fractus_services.camera.capture.driver import CameraFailed, Wanted
+from fractus_services.camera.capture.shutter import Shutter
+from fractus_services.camera.imaging.faces import BadModel, Detector, smallest_face_px
+from fractus_services.camera.imaging.filters import MOTION_PX
+from fractus_services.camera.imaging.metadata import tagged
+from fractus_services.camera.imaging.pipeline import NotHidden, Recipe, developed, is_upright, recipe
+from fractus_services.camera.imaging.pixels import NotAPicture, Pixels, cropped, decoded, encoded, fitted, source_size
+from fractus_services.camera.pictures.fair_queue import QueueFull, Turns
 from fractus_services.grants import ActiveGrant
 from fractus_services.replies import Refused, refused
 

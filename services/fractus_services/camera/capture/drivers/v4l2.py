@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from fractus_services.camera.drivers import CameraFailed, Wanted, as_described
-from fractus_services.camera.imaging import Pixels, opencv
+from fractus_services.camera.capture.driver import CameraFailed, Wanted, as_described
+from fractus_services.camera.imaging.pixels import Pixels, opencv
 
 _STALE_FRAMES = 4
 """Pictures that the driver's buffers hold from before."""

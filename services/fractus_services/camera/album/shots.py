@@ -9,7 +9,7 @@ from typing import Any
 from fractus_core.policy.footprint import camera_axes
 from fractus_core.policy.values import Attitude, Filter, Home, Lens, Situation
 
-from fractus_services.camera.metadata import Facts
+from fractus_services.camera.imaging.metadata import Facts
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,1 @@
+"""Pictures on disk with the records by which they are judged again."""

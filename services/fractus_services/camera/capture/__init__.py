@@ -1,0 +1,1 @@
+"""Cameras: drivers, and the shutter that calls them on a thread."""

@@ -1,0 +1,1 @@
+"""Judges a call, takes a picture, filters it, stores it, returns it."""

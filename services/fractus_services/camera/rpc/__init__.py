@@ -1,0 +1,1 @@
+"""gRPC of the camera service: handlers, the server, and the telemetry client."""

@@ -15,7 +15,8 @@ import pytest
 import skimage.data
 from fractus_core.policy.values import Attitude, Filter, Home, Lens
 from fractus_services.camera.album.shots import Pose, Shot, facts
-from fractus_services.camera.capture.driver import BadConnection, CameraFailed, Wanted, driver_for
+from fractus_services.camera.capture.connection import driver_for
+from fractus_services.camera.capture.driver import BadConnection, CameraFailed, Wanted
 from fractus_services.camera.imaging.faces import BadModel, CascadeDetector, ModelDetector, smallest_face_px
 from fractus_services.camera.imaging.filters import (
     black,

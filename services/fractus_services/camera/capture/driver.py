@@ -1,9 +1,8 @@
-"""Where pictures come from: one module for each kind of camera."""
+"""What every camera driver does, and what is asked of it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal, Protocol
 
 from fractus_core.policy.values import Situation
@@ -78,36 +77,3 @@ class Driver(Protocol):
 
     def close(self) -> None:
         """Let go of the camera."""
-
-
-def driver_for(connection: str) -> Driver:
-    """The driver of a connection as manifests spell it.
-
-    Raises:
-        BadConnection: it names no kind of camera.
-    """
-    kind, _, rest = connection.partition(":")
-    if kind in {"http", "https"}:
-        from fractus_services.camera.capture.drivers.snapshot import Snapshot  # noqa: PLC0415 - only the one that is used
-
-        return Snapshot(connection)
-    if kind == "v4l2" and rest:
-        from fractus_services.camera.capture.drivers.v4l2 import VideoDevice  # noqa: PLC0415
-
-        return VideoDevice(rest)
-    if kind == "picamera2" and rest.isdigit():
-        from fractus_services.camera.capture.drivers.raspberry import RaspberryCamera  # noqa: PLC0415
-
-        return RaspberryCamera(int(rest))
-    if kind == "directory" and rest:
-        from fractus_services.camera.capture.drivers.directory import GeotaggedDirectory  # noqa: PLC0415
-
-        return GeotaggedDirectory(Path(rest))
-    if connection == "test:":
-        from fractus_services.camera.capture.drivers.rendered import Rendered  # noqa: PLC0415
-
-        return Rendered()
-    raise BadConnection(
-        f"{connection!r} names no camera; give http://HOST/snapshot.jpg, v4l2:/dev/video0, picamera2:0,"
-        " directory:/PATH or test:"
-    )

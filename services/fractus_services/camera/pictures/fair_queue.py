@@ -12,7 +12,7 @@ class QueueFull(Exception):
     """A caller has as many requests waiting as it may have."""
 
 
-class Turns:
+class FairQueue:
     """A lock that is handed from caller to caller in rounds.
 
     Args:

@@ -29,7 +29,7 @@ from fractus_services.camera.imaging.filters import MOTION_PX
 from fractus_services.camera.imaging.metadata import tagged
 from fractus_services.camera.imaging.pipeline import NotHidden, Recipe, developed, is_upright, recipe
 from fractus_services.camera.imaging.pixels import NotAPicture, Pixels, cropped, decoded, encoded, fitted, source_size
-from fractus_services.camera.pictures.fair_queue import QueueFull, Turns
+from fractus_services.camera.pictures.fair_queue import FairQueue, QueueFull
 from fractus_services.grants import ActiveGrant
 from fractus_services.replies import Refused, refused
 
@@ -138,8 +138,8 @@ class CameraService:
         self._audit = audit
         self._clock = clock
         self._numbers = itertools.count()
-        self._exposing = Turns(MAX_OF_ONE, MAX_WAITING)
-        self._developing = Turns(MAX_OF_ONE, MAX_DEVELOPING)
+        self._exposing = FairQueue(MAX_OF_ONE, MAX_WAITING)
+        self._developing = FairQueue(MAX_OF_ONE, MAX_DEVELOPING)
         self._tasks: set[asyncio.Task[Any]] = set()
 
     async def capture(

@@ -17,7 +17,7 @@ from fractus_services.answering import Reception
 from fractus_services.audit import AuditLog
 from fractus_services.auth import KEEPALIVE, TlsFiles
 from fractus_services.camera.album.album import Album
-from fractus_services.camera.capture.driver import driver_for
+from fractus_services.camera.capture.connection import driver_for
 from fractus_services.camera.capture.shutter import Shutter
 from fractus_services.camera.imaging.faces import CascadeDetector, Detector, ModelDetector
 from fractus_services.camera.pictures.service import Body, CameraService, Whereabouts, known, owner_of

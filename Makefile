@@ -17,7 +17,7 @@ UV := $(shell uv --version 2> /dev/null | grep -q '^uv ' && command -v uv || ech
 RUN := $(UV) run --frozen --all-extras
 GO_PATH := $(PATH):/usr/local/go/bin
 export PATH := $(GO_PATH)
-# Tests start hundreds of Python processes: each would compile all its modules anew.
+# Tests start hundreds of Python processes: each would compile all its modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help

@@ -9,6 +9,7 @@ import ast
 import re
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -31,6 +32,7 @@ FIELDS = frozenset(
 """Fields of MAVLink messages whose values are members of an enumeration or a bit mask."""
 
 
+@cache
 def rules() -> list[tuple[re.Pattern[str], str]]:
     """The word list: what is looked for, and what to say instead."""
     found = []
@@ -40,6 +42,12 @@ def rules() -> list[tuple[re.Pattern[str], str]]:
             flags = re.IGNORECASE if word == word.lower() else 0
             found.append((re.compile(rf"(?<![A-Za-z])(?:{word})(?![A-Za-z])", flags), instead))
     return found
+
+
+@cache
+def any_rule() -> re.Pattern[str]:
+    """Finds out at once whether a line has any of the words."""
+    return re.compile("|".join(f"(?{'i' if p.flags & re.IGNORECASE else ''}:{p.pattern})" for p, _ in rules()))
 
 
 def files(paths: list[Path]) -> Iterator[Path]:
@@ -53,11 +61,12 @@ def files(paths: list[Path]) -> Iterator[Path]:
 
 def words(text: str) -> Iterator[tuple[int, str, str]]:
     """Line, word and remedy of each word that the field does not use."""
-    everything = rules()
     for number, line in enumerate(text.splitlines(), 1):
-        for pattern, instead in everything:
-            for match in pattern.finditer(line):
-                yield number, match.group(), instead
+        if any_rule().search(line):
+            found = [(match, instead) for pattern, instead in rules() for match in pattern.finditer(line)]
+            yield from (
+                (number, match.group(), instead) for match, instead in sorted(found, key=lambda f: f[0].start())
+            )
 
 
 def numbers(text: str) -> Iterator[tuple[int, str, str]]:

@@ -46,6 +46,10 @@ test: packages env lint ## Everything: lint, types, unit, integration and end-to
 test-fast: env lint ## The inner loop: lint, types and unit tests
 	$(RUN) pytest -q -n 2 --dist loadfile tests/unit
 
+.PHONY: test-deep
+test-deep: env ## Unit tests with all examples of the property-based ones
+	FRACTUS_DEEP=1 $(RUN) pytest -q -n 2 --dist loadfile tests/unit
+
 .PHONY: test-e2e
 test-e2e: packages env ## End-to-end tests only, on the embedded cluster or on FRACTUS_E2E_CLUSTER=current
 	[ "$${FRACTUS_E2E_CLUSTER:-embedded}" = current ] || $(RUN) fractus cluster binaries

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from depth import examples
 from fractus_core.policy.footprint import footprint, seen_from
 from fractus_core.policy.values import Lens, Situation
 from fractus_proto.v1 import mobility_pb2
@@ -111,7 +112,7 @@ def test_where_a_part_of_the_exposure_was_not_told_it_is_unknown(drone: Drone) -
     assert drone.way(101.3)[0].lat is None, "longer ago than anybody remembers"
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=examples(150), deadline=None, derandomize=True)
 @given(
     gaps=st.lists(st.floats(0.02, 0.5), min_size=2, max_size=5),
     rates=st.tuples(st.floats(-25, 25), st.floats(-25, 25), st.floats(-150, 150)),

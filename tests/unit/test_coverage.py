@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import shapely
+from depth import examples
 from fractus_core.planning.coverage import CoverScene, Samples, greedy_cover
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,7 +17,7 @@ def corridor(path, width=7):
 
 
 @given(paths, spots, st.floats(20, 400))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_samples_lie_inside_and_measure_area(path, centre, radius):
     shape = corridor(path)
     samples = Samples(shape)
@@ -72,7 +73,7 @@ discs = st.lists(
 
 
 @given(paths, discs, st.sets(st.integers(0, 13), max_size=4), st.sampled_from([0.3, 0.95, 1.0]))
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=examples(80), deadline=None)
 def test_lazy_greedy_equals_plain_greedy(path, found, unfit, share):
     samples = Samples(corridor(path, width=25))
     named = {f"n{i:02d}": disc for i, disc in enumerate(found)}

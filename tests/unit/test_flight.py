@@ -4,6 +4,7 @@ import itertools
 import math
 
 import pytest
+from depth import examples
 from fractus_core.api.geometry import Position
 from fractus_core.planning import Flight, Settings, flight_of, operation_area
 from fractus_core.planning.flight import Mission, chauffeur_legs, first_missed
@@ -49,7 +50,7 @@ def visits(leg, points, radius, ordered):
     st.lists(st.tuples(st.floats(0, 1), st.floats(-12, 12), st.floats(-12, 12)), min_size=1, max_size=4),
     st.booleans(),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 def test_points_are_visited_in_order_along_the_path(leg, offsets, ordered):
     steps = list(walked(leg))
     assume(len(steps) > 10)
@@ -100,7 +101,7 @@ def test_flight_of_a_driver_breaks_at_regions():
 
 
 @given(st.lists(spots, min_size=1, max_size=7))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_short_tours_are_shortest(points):
     def length(order):
         return sum(math.dist(points[a], points[b]) for a, b in itertools.pairwise(order))
@@ -113,7 +114,7 @@ def test_short_tours_are_shortest(points):
 
 
 @given(st.lists(spots, min_size=10, max_size=30))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 def test_longer_tours_visit_all_and_beat_the_order_given(points):
     tour = short_tour(points)
     assert sorted(tour) == list(range(len(points)))

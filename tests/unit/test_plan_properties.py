@@ -5,6 +5,7 @@ import itertools
 import random
 
 import pytest
+from depth import examples
 from fractus_core.api import Drone
 from fractus_core.api.nodes import Interface
 from fractus_core.geo import geodesic_m
@@ -94,7 +95,7 @@ def scene(seed, count=14):
 
 
 @given(st.integers(0, 10_000), st.randoms(use_true_random=False))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 def test_plans_do_not_depend_on_order(seed, shuffler):
     fleet, edges, hosts = scene(seed)
     first = plan(TRAFFIC, inventory(fleet, edges, hosts))
@@ -104,7 +105,7 @@ def test_plans_do_not_depend_on_order(seed, shuffler):
 
 
 @given(st.integers(0, 10_000))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 def test_static_instances_are_the_nearest_that_suit(seed):
     fleet, edges, hosts = scene(seed)
     stock = inventory(fleet, edges, hosts)
@@ -126,7 +127,7 @@ def test_static_instances_are_the_nearest_that_suit(seed):
 
 
 @given(st.integers(0, 10_000))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 def test_every_candidate_by_place_is_placed_passed_over_or_rejected_for_a_true_reason(seed):
     fleet, edges, hosts = scene(seed)
     stock = inventory(fleet, edges, hosts)
@@ -145,7 +146,7 @@ def test_every_candidate_by_place_is_placed_passed_over_or_rejected_for_a_true_r
 
 
 @given(st.integers(0, 10_000), st.data())
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 def test_replanning_keeps_all_that_still_fits(seed, data):
     fleet, edges, hosts = scene(seed)
     before = plan(TRAFFIC, inventory(fleet, edges, hosts))
@@ -181,7 +182,7 @@ def test_a_cheaper_cover_does_not_move_what_covers():
 
 
 @given(st.integers(0, 10_000))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 def test_whereabouts_that_followed_every_change_plan_the_same(seed):
     fleet, edges, hosts = scene(seed)
     stock = inventory(fleet, edges, hosts)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import shapely
+from depth import examples
 from fractus_core.api.nodes import CameraFeatures
 from fractus_core.policy.footprint import SIGHT_M, Footprint, footprint, lens_of
 from fractus_core.policy.privacy import compose, judge_privacy, remaining
@@ -16,7 +17,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from policy_world import FRAME, NOW, ask, at, box, compiled, policy, zone
 
-_cases = settings(max_examples=400, deadline=None, derandomize=True)
+_cases = settings(max_examples=examples(400), deadline=None, derandomize=True)
 
 
 def rotation(axis: int, degrees: float) -> np.ndarray:

@@ -11,6 +11,7 @@ import random
 
 import numpy as np
 import pytest
+from depth import examples
 from fractus_core.policy import legs, velocities
 from fractus_core.policy.limits import LEAST_LEG_M
 from fractus_core.policy.values import Call, GotoArgs, TakeoffArgs
@@ -23,7 +24,7 @@ EARTH_M = 6_371_000.0
 STEP_S = 0.05
 ACCEL_MPS2 = 2.5
 JUST = 0.02  # sphere against ellipsoid, at these distances
-_cases = settings(max_examples=600, deadline=None, derandomize=True)
+_cases = settings(max_examples=examples(600), deadline=None, derandomize=True)
 
 
 def flat(lat: float, lon: float) -> tuple[float, float]:

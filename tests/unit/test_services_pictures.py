@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import skimage.data
+from depth import examples
 from fractus_core.policy.values import Attitude, Filter, Home, Lens
 from fractus_services.camera.album.shots import Pose, Shot, facts
 from fractus_services.camera.capture.connection import driver_for
@@ -184,7 +185,7 @@ def test_a_model_that_is_none_is_refused_with_a_sentence(tmp_path: Path) -> None
 
 
 @given(st.integers(16, 400), st.integers(16, 400), st.sampled_from([(640, 480), (1280, 720), (100, 100), (480, 640)]))
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=examples(100), deadline=None, derandomize=True)
 def test_cropping_keeps_proportions_and_shows_no_more(width: int, height: int, native: tuple[int, int]) -> None:
     source = source_size(width, height, native)
     assert source[0] >= width

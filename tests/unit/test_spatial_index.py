@@ -5,6 +5,7 @@ import time
 
 import pytest
 import shapely
+from depth import examples
 from fractus_core.api.geometry import Point
 from fractus_core.geo import LocalFrame, distance_m, geodesic_m
 from fractus_core.planning import SpatialIndex
@@ -44,7 +45,7 @@ def test_within_is_exact_anywhere_on_earth(centre, radius, spread):
 
 
 @given(places, st.lists(places, max_size=12), st.floats(300_000, 2e7))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_within_is_exact_for_huge_radii(centre, others, radius):
     points = {f"n{i}": p for i, p in enumerate(others)}
     found, wanted = index_of(points).within(centre, radius), brute(points, centre, radius)
@@ -134,7 +135,7 @@ def test_fast_distance_is_the_geodesic(a, bearing, length):
 
 
 @given(places, places)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 def test_fast_distance_is_the_geodesic_around_the_globe(a, b):
     assert distance_m(a, b) == pytest.approx(geodesic_m(a, b), abs=1e-4)
 

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from depth import examples
 from fractus_core.geo import LocalFrame
 from fractus_world.optics import Intrinsics, Mount, Pose, View
 from hypothesis import given, settings
@@ -82,7 +83,7 @@ def test_places_land_where_they_should(pose: Pose, mount: Mount, lat: float, lon
             assert found[0] == pytest.approx((u, v), abs=1e-6)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 @given(
     st.floats(-84, 84),
     st.floats(-180, 180),

@@ -12,9 +12,10 @@ from typing import Any
 import grpc
 from fractus_core.policy.values import Verdict
 
-from fractus_services.auth import Caller, NotAuthenticated, caller_of
+from fractus_services.auth import Caller, caller_of
+from fractus_services.errors import InternalError, InvalidRequest, PolicyDenied, Refused, ResourceExhausted
 from fractus_services.grants import ActiveGrant, GrantFiles
-from fractus_services.replies import Refused, abort, refused
+from fractus_services.replies import abort
 
 log = logging.getLogger(__name__)
 
@@ -96,11 +97,8 @@ class Reception:
             self._open[admitted] += 1
             if not (urgent or lasting) and context.time_remaining() is None:
                 reason = "the call has no deadline; set a timeout, as the SDK does"
-                raise Refused(grpc.StatusCode.INVALID_ARGUMENT, Verdict("deny", None, "DeadlineMissing", reason))
+                raise InvalidRequest("DeadlineMissing", reason)
             yield caller
-        except NotAuthenticated as error:
-            verdict = Verdict("deny", None, "NotAuthenticated", str(error))
-            await abort(context, Refused(grpc.StatusCode.UNAUTHENTICATED, verdict))
         except Refused as refusal:
             await abort(context, refusal)
         except grpc.aio.AbortError:
@@ -110,9 +108,9 @@ class Reception:
             if known is not None:
                 await abort(context, known)
             log.exception("a call failed inside the service; refused")
-            verdict = Verdict("deny", None, "InternalError", "the service failed; nothing was done", (), "hover")
-            self._failed(verdict)
-            await abort(context, Refused(grpc.StatusCode.INTERNAL, verdict))
+            reason = "the service failed; nothing was done"
+            self._failed(Verdict("deny", None, "InternalError", reason, (), "hover"))
+            await abort(context, InternalError("InternalError", reason))
         finally:
             if admitted:
                 self._open[admitted] -= 1
@@ -130,8 +128,7 @@ class Reception:
         if not again_s and not urgent and self._open[identity] >= OPEN_CALLS:
             again_s, reason = 1.0, f"{OPEN_CALLS} calls are under way; end one before the next"
         if again_s:
-            verdict = Verdict("deny", None, "TooManyCalls", reason)
-            raise Refused(grpc.StatusCode.RESOURCE_EXHAUSTED, verdict, again_s)
+            raise ResourceExhausted("TooManyCalls", reason, retry_after_s=again_s)
 
     def grant_of(self, caller: Caller) -> ActiveGrant:
         """The grant of a caller.
@@ -141,5 +138,5 @@ class Reception:
         """
         grant = self._grants.of(caller.identity)
         if grant is None:
-            raise refused(Verdict("deny", None, "NoGrant", f"{caller.identity} has no grant on this node"))
+            raise PolicyDenied("NoGrant", f"{caller.identity} has no grant on this node")
         return grant

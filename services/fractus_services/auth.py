@@ -13,14 +13,12 @@ from typing import Any
 import grpc
 from cryptography import x509
 
+from fractus_services.errors import NotAuthenticated
+
 log = logging.getLogger(__name__)
 
 FILES = ("tls.key", "tls.crt", "ca.crt")
 _SCHEME = "spiffe://"
-
-
-class NotAuthenticated(Exception):
-    """The caller's certificate proves nothing (any more)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +68,7 @@ def caller_of(auth_context: Mapping[str, Any], time_s: float) -> Caller:
         time_s: Unix time.
 
     Raises:
-        NotAuthenticated: there is no certificate, or it names nobody, or it is not valid now.
+        NotAuthenticated: there is no certificate, or it names no one, or it is not valid now.
     """
     chain = auth_context.get("x509_pem_cert") or ()
     if not chain:

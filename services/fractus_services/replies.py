@@ -1,4 +1,4 @@
-"""Verdicts and failures as gRPC speaks of them."""
+"""Verdicts and errors as gRPC replies: the one place where domain errors become status codes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,19 @@ from google.protobuf import any_pb2
 from google.rpc import code_pb2, error_details_pb2, status_pb2  # type: ignore[import-untyped]
 from grpc_status import rpc_status  # type: ignore[import-untyped]
 
+from fractus_services.errors import (
+    Aborted,
+    InternalError,
+    InvalidRequest,
+    NotAuthenticated,
+    NotFound,
+    PolicyDenied,
+    PreconditionFailed,
+    Refused,
+    ResourceExhausted,
+    Unavailable,
+)
+
 DOMAIN = "fractus.dev"
 
 _ACTIONS = {
@@ -21,41 +34,18 @@ _ACTIONS = {
 }
 
 
-class Refused(Exception):
-    """A call that ends without being carried out.
-
-    Attributes:
-        status: the gRPC status code.
-        verdict: what clients find in the status details.
-        again_s: in how many seconds the caller may try again; 0: trying again as such does not help.
-    """
-
-    def __init__(self, status: grpc.StatusCode, verdict: Verdict, again_s: float = 0.0) -> None:
-        super().__init__(verdict.reason)
-        self.status = status
-        self.verdict = verdict
-        self.again_s = again_s
-
-
-def refused(verdict: Verdict) -> Refused:
-    """A refusal by policy."""
-    invalid = verdict.code == "InvalidArgument"
-    return Refused(grpc.StatusCode.INVALID_ARGUMENT if invalid else grpc.StatusCode.PERMISSION_DENIED, verdict)
-
-
-def precondition(code: str, reason: str) -> Refused:
-    """A call that the drone's present state forbids."""
-    return Refused(grpc.StatusCode.FAILED_PRECONDITION, Verdict("deny", None, code, reason))
-
-
-def aborted(code: str, reason: str, policies: tuple[str, ...] = ()) -> Refused:
-    """A call that was carried out in part and then stopped."""
-    return Refused(grpc.StatusCode.ABORTED, Verdict("deny", None, code, reason, policies))
-
-
-def unavailable(reason: str) -> Refused:
-    """A call that cannot be served now and may be tried again."""
-    return Refused(grpc.StatusCode.UNAVAILABLE, Verdict("deny", None, "AutopilotUnavailable", reason))
+STATUS: dict[type[Refused], grpc.StatusCode] = {
+    PolicyDenied: grpc.StatusCode.PERMISSION_DENIED,
+    InvalidRequest: grpc.StatusCode.INVALID_ARGUMENT,
+    NotAuthenticated: grpc.StatusCode.UNAUTHENTICATED,
+    PreconditionFailed: grpc.StatusCode.FAILED_PRECONDITION,
+    Aborted: grpc.StatusCode.ABORTED,
+    Unavailable: grpc.StatusCode.UNAVAILABLE,
+    ResourceExhausted: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    NotFound: grpc.StatusCode.NOT_FOUND,
+    InternalError: grpc.StatusCode.INTERNAL,
+    Refused: grpc.StatusCode.UNKNOWN,
+}
 
 
 def decision(verdict: Verdict) -> types_pb2.Decision:
@@ -68,13 +58,15 @@ def decision(verdict: Verdict) -> types_pb2.Decision:
 async def abort(context: Any, refusal: Refused) -> NoReturn:
     """End a call with the structured details of a refusal."""
     details = [decision(refusal.verdict), _error_info(refusal.verdict)]
-    if refusal.again_s:
+    if refusal.retry_after_s:
         again = error_details_pb2.RetryInfo()
-        again.retry_delay.FromNanoseconds(int(refusal.again_s * 1e9))
+        again.retry_delay.FromNanoseconds(int(refusal.retry_after_s * 1e9))
         details.append(again)
-    number = code_pb2.Code.Value(refusal.status.name)
-    status = status_pb2.Status(code=number, message=refusal.verdict.reason, details=map(_packed, details))
-    rich = rpc_status.to_status(status)
+    status = next(STATUS[kind] for kind in type(refusal).__mro__ if kind in STATUS)
+    number = code_pb2.Code.Value(status.name)
+    rich = rpc_status.to_status(
+        status_pb2.Status(code=number, message=refusal.verdict.reason, details=map(_packed, details))
+    )
     await context.abort(rich.code, rich.details, rich.trailing_metadata)
     raise AssertionError("abort always raises")
 

@@ -21,8 +21,8 @@ from fractus_services.camera.imaging.faces import Box
 from fractus_services.camera.imaging.pixels import Pixels, decoded
 from fractus_services.camera.pictures import service as camera
 from fractus_services.camera.pictures.service import Body, CameraService
+from fractus_services.errors import Refused
 from fractus_services.grants import ActiveGrant
-from fractus_services.replies import Refused
 from policy_world import NOW, at, box, compiled, policy, spec, zone
 
 SEEING = Lens(60.0, 60.0, stabilised=True, error_deg=0.0)

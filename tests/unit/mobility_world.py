@@ -15,6 +15,7 @@ from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled import compile_grant
 from fractus_core.policy.values import Airframe, GotoArgs, Home, TakeoffArgs
+from fractus_services.errors import Refused
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Journal
@@ -32,7 +33,6 @@ from fractus_services.mobility.mavlink.failsafes import Checked
 from fractus_services.mobility.mavlink.link import Autopilot
 from fractus_services.mobility.mavlink.vehicle import BRAKE, COURSE_S, GUIDED, LAND, RTL, SMART_RTL
 from fractus_services.mobility.rpc.streams import Streams
-from fractus_services.replies import Refused
 
 FRAME = LocalFrame(39.36, 22.95)
 STEP_S = 0.05

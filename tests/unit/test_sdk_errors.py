@@ -7,7 +7,9 @@ import pytest
 from fractus import Busy, InvalidRequest, PolicyDenied
 from fractus.errors import translate
 from fractus_core.policy.values import Verdict
-from fractus_services.replies import Refused, abort
+from fractus_services import errors
+from fractus_services.errors import Refused, ResourceExhausted, denied
+from fractus_services.replies import abort
 
 
 async def failed(refusal: Refused) -> grpc.aio.AioRpcError:
@@ -26,8 +28,8 @@ async def failed(refusal: Refused) -> grpc.aio.AioRpcError:
 
 @pytest.mark.parametrize("again_s", [0.25, 0.0])
 async def test_who_asks_too_much_learns_when_to_ask_again(again_s: float) -> None:
-    verdict = Verdict("deny", None, "TooManyCalls", "more than 50 calls a second; slow down")
-    error = await failed(Refused(grpc.StatusCode.RESOURCE_EXHAUSTED, verdict, again_s))
+    reason = "more than 50 calls a second; slow down"
+    error = await failed(ResourceExhausted("TooManyCalls", reason, retry_after_s=again_s))
     found = translate(error, "GetSpeed", "there")
     assert isinstance(found, Busy)
     assert str(found) == "GetSpeed: more than 50 calls a second; slow down"
@@ -36,10 +38,10 @@ async def test_who_asks_too_much_learns_when_to_ask_again(again_s: float) -> Non
 
 async def test_a_refusal_carries_who_decided() -> None:
     verdict = Verdict("deny", None, "InsideExclusionZone", "the target is inside", ("no-fly",))
-    found = translate(await failed(Refused(grpc.StatusCode.PERMISSION_DENIED, verdict)), "Goto", "there")
+    found = translate(await failed(denied(verdict)), "Goto", "there")
     assert isinstance(found, PolicyDenied)
     assert (found.decision.code, found.decision.policies) == ("InsideExclusionZone", ("no-fly",))
-    missing = Verdict("deny", None, "DeadlineMissing", "the call has no deadline; set a timeout, as the SDK does")
-    found = translate(await failed(Refused(grpc.StatusCode.INVALID_ARGUMENT, missing)), "GetSpeed", "there")
+    missing = errors.InvalidRequest("DeadlineMissing", "the call has no deadline; set a timeout, as the SDK does")
+    found = translate(await failed(missing), "GetSpeed", "there")
     assert isinstance(found, InvalidRequest)
     assert "set a timeout" in str(found)

@@ -12,6 +12,7 @@ import pytest
 from camera_world import World, active_grant, private, refusal
 from fractus_services.camera.album.album import Album, AlbumFull, NoSuchImage
 from fractus_services.camera.pictures import service as camera
+from fractus_services.errors import ResourceExhausted
 
 
 @pytest.fixture
@@ -92,8 +93,8 @@ async def test_a_full_disk_is_said_and_leaves_nothing_behind(world: World, monke
         with pytest.raises(OSError, match="No space left") as caught:
             await world.capture(active_grant())
     refused = camera.known(caught.value)
-    assert refused is not None
-    assert (refused.status.name, refused.verdict.code) == ("RESOURCE_EXHAUSTED", "StorageFailed")
+    assert isinstance(refused, ResourceExhausted)
+    assert refused.verdict.code == "StorageFailed"
     assert "make room on the node" in refused.verdict.reason
     assert [path for path in world.directory.rglob("*") if path.is_file()] == []
     await world.capture(active_grant())
@@ -106,7 +107,6 @@ async def test_a_full_album_says_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(AlbumFull, match="DeleteImage") as caught:
         await world.capture(active_grant())
     refused = camera.known(caught.value)
-    assert refused is not None
-    assert refused.status.name == "RESOURCE_EXHAUSTED"
+    assert isinstance(refused, ResourceExhausted)
     await world.capture(active_grant(instance="other"))
     world.shutter.close()

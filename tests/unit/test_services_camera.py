@@ -17,8 +17,8 @@ from fractus_services.camera.capture.driver import CameraFailed, Wanted
 from fractus_services.camera.capture.shutter import Shutter
 from fractus_services.camera.pictures import service as camera
 from fractus_services.camera.pictures.service import MAX_OF_ONE
+from fractus_services.errors import Refused
 from fractus_services.grants import ActiveGrant
-from fractus_services.replies import Refused
 from policy_world import FRAME, NOW, at, box, policy, zone
 
 

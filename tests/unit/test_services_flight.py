@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, Verdict
+from fractus_services.errors import Refused
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.leases import State
 from fractus_services.mobility.mavlink.link import AutopilotError
 from fractus_services.mobility.mavlink.vehicle import GUIDED, LAND, RTL, SMART_RTL
-from fractus_services.replies import Refused
 from mobility_world import World, clear_m, end, fly, goto, partial, refusal, spec, touring, zone
 
 WALL = (-40.0, 25.0, 40.0, 40.0)

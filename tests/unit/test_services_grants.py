@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 from fractus_core.policy.values import Moment, earliest
 from fractus_services.answering import Allowance
-from fractus_services.auth import Caller, NotAuthenticated, caller_of
+from fractus_services.auth import Caller, caller_of
 from fractus_services.clock import TRUST_S, Clock
+from fractus_services.errors import NotAuthenticated
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.seals import Seals
 from grant_signing import CA_PEM, signed

@@ -11,10 +11,10 @@ import pytest
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import Call, SetSpeedArgs, VelocityArgs
+from fractus_services.errors import Refused
 from fractus_services.mobility.flight import watch as watching
 from fractus_services.mobility.mavlink.link import AutopilotError
 from fractus_services.mobility.mavlink.vehicle import GUIDED
-from fractus_services.replies import Refused
 from mobility_world import World, area, clear_m, end, fly, goto, partial, refusal, spec, zone
 
 WALL = (-40.0, 25.0, 40.0, 40.0)

@@ -13,7 +13,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar
 
-import grpc
 from fractus_core.policy.engine import judge
 from fractus_core.policy.footprint import seen_from
 from fractus_core.policy.privacy import compose, judge_privacy, remaining
@@ -30,8 +29,16 @@ from fractus_services.camera.imaging.metadata import tagged
 from fractus_services.camera.imaging.pipeline import NotHidden, Recipe, developed, is_upright, recipe
 from fractus_services.camera.imaging.pixels import NotAPicture, Pixels, cropped, decoded, encoded, fitted, source_size
 from fractus_services.camera.pictures.fair_queue import FairQueue, QueueFull
+from fractus_services.errors import (
+    InvalidRequest,
+    NotFound,
+    PreconditionFailed,
+    Refused,
+    ResourceExhausted,
+    Unavailable,
+    denied,
+)
 from fractus_services.grants import ActiveGrant
-from fractus_services.replies import Refused, refused
 
 log = logging.getLogger(__name__)
 
@@ -169,7 +176,7 @@ class CameraService:
             reason = (
                 f"{width}x{height} pixels is not between {MIN_PX}x{MIN_PX} and {MAX_PX}x{MAX_PX}; ask for another size"
             )
-            raise refused(Verdict("deny", None, "InvalidArgument", reason))
+            raise InvalidRequest("InvalidArgument", reason)
         whole = source_size(width, height, native)
         most = max(native[0] * native[1], MOST_PIXELS)
         if whole[0] * whole[1] > most * 1.01:
@@ -177,7 +184,7 @@ class CameraService:
                 f"{width}x{height} pixels would be cut from {whole[0]}x{whole[1]}, more than {most / 1e6:.1f} megapixels;"
                 f" ask for less, or for the proportions of {native[0]}x{native[1]}"
             )
-            raise refused(Verdict("deny", None, "InvalidArgument", reason))
+            raise InvalidRequest("InvalidArgument", reason)
 
     async def _finished(self, work: Coroutine[Any, Any, _T]) -> _T:
         task = asyncio.get_running_loop().create_task(work)
@@ -361,7 +368,7 @@ class CameraService:
                 },
             )  # fmt: skip
         if not verdict.permits:
-            raise refused(verdict)
+            raise denied(verdict)
         return verdict
 
 
@@ -385,23 +392,22 @@ def _noted(verdict: Verdict, chosen: Recipe) -> Verdict:
     return replace(verdict, reason=f"{verdict.reason}; {chosen.note}") if chosen.note else verdict
 
 
-_EXHAUSTED = grpc.StatusCode.RESOURCE_EXHAUSTED
-_KNOWN: dict[type[Exception], tuple[grpc.StatusCode, str]] = {
-    AlbumFull: (_EXHAUSTED, "AlbumFull"),
-    QueueFull: (_EXHAUSTED, "ShutterBusy"),
-    NoSuchImage: (grpc.StatusCode.NOT_FOUND, "NoSuchImage"),
-    CameraFailed: (grpc.StatusCode.UNAVAILABLE, "CameraFailed"),
-    BadModel: (grpc.StatusCode.FAILED_PRECONDITION, "FilterUnavailable"),
-    NotAPicture: (grpc.StatusCode.FAILED_PRECONDITION, "FilterUnavailable"),
+_KNOWN: dict[type[Exception], tuple[type[Refused], str]] = {
+    AlbumFull: (ResourceExhausted, "AlbumFull"),
+    QueueFull: (ResourceExhausted, "ShutterBusy"),
+    NoSuchImage: (NotFound, "NoSuchImage"),
+    CameraFailed: (Unavailable, "CameraFailed"),
+    BadModel: (PreconditionFailed, "FilterUnavailable"),
+    NotAPicture: (PreconditionFailed, "FilterUnavailable"),
 }
 
 
 def known(error: Exception) -> Refused | None:
     """Failures of album and camera as refusals."""
-    for kind, (status, code) in _KNOWN.items():
+    for kind, (refusal, code) in _KNOWN.items():
         if isinstance(error, kind):
-            return Refused(status, Verdict("deny", None, code, str(error)))
+            return refusal(code, str(error))
     if isinstance(error, OSError):
         reason = f"the picture cannot be stored: {error.strerror or error}; delete pictures, or make room on the node"
-        return Refused(_EXHAUSTED, Verdict("deny", None, "StorageFailed", reason))
+        return ResourceExhausted("StorageFailed", reason)
     return None

@@ -6,6 +6,7 @@ import asyncio
 
 from fractus_core.geo import LocalFrame
 
+from fractus_services.errors import PreconditionFailed
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Mission
@@ -13,7 +14,6 @@ from fractus_services.mobility.flight.motions import distance_m
 from fractus_services.mobility.mavlink.failsafes import BEING_SET, Checked, choose_return, learn_return
 from fractus_services.mobility.mavlink.link import AutopilotError, Permit
 from fractus_services.mobility.mavlink.vehicle import GUIDED
-from fractus_services.replies import precondition
 
 ARMED_S = 3.0
 WAIT_S = 0.5
@@ -56,7 +56,7 @@ async def _arm(control: Control, grant: ActiveGrant, permit: Permit) -> None:
     control.journal.active = mission.key
     await control.journal.save(timeout_s=ARMED_S)
     if control.journal.failure:
-        raise precondition("JournalUnavailable", control.journal.failure)
+        raise PreconditionFailed("JournalUnavailable", control.journal.failure)
     permit()
     helm.preparing += 1
     try:
@@ -114,7 +114,7 @@ async def _prepare_ways_home(control: Control, grant: ActiveGrant, home: tuple[f
     except (AutopilotError, OSError) as error:
         said = str(error) or f"it takes longer than {FENCE_S:.0f} s"
         why = f"the vehicle's own fence cannot be raised around the operation area: {said}"
-        raise precondition("FenceNotRaised", why) from error
+        raise PreconditionFailed("FenceNotRaised", why) from error
     _check(control, checked)
     if not control.backstop.missing:
         checked = _learnt(control, checked, await learn_return(autopilot, checked))
@@ -133,9 +133,9 @@ def _check(control: Control, chosen: Checked | None = None) -> Checked:
     checked = control.checked
     if checked is None or checked.problem or (chosen is not None and checked is not chosen):
         why = (checked.problem if checked is not None else "") or BEING_SET
-        raise precondition("FailsafesNotVerified", f"the autopilot's failsafes are not verified: {why}")
+        raise PreconditionFailed("FailsafesNotVerified", f"the autopilot's failsafes are not verified: {why}")
     if control.audit.failure:
-        raise precondition("AuditUnavailable", control.audit.failure)
+        raise PreconditionFailed("AuditUnavailable", control.audit.failure)
     return checked
 
 
@@ -143,13 +143,13 @@ def _home_of(control: Control, grant: ActiveGrant, mission: Mission) -> tuple[fl
     """Home is where the mission armed first: landing on the way and arming again does not move it."""
     vehicle = control.autopilot.vehicle
     if vehicle.lat is None or vehicle.lon is None:
-        raise precondition("PositionUnknown", "the position is not known yet")
+        raise PreconditionFailed("PositionUnknown", "the position is not known yet")
     lat, lon, amsl_m = mission.home or (vehicle.lat, vehicle.lon, vehicle.amsl_m)
     base = grant.spec.home or grant.spec.depot
     if base is not None:
         away = distance_m(LocalFrame(base.lat, base.lon), lat, lon)
         if away > STRAY_M:
-            raise precondition(
+            raise PreconditionFailed(
                 "NotAtHome", f"the drone would return to a place {away:.0f} m away from the home of its grant"
             )
     return lat, lon, amsl_m

@@ -16,6 +16,7 @@ from fractus_core.policy.compiled import CompiledGrant, for_transit
 from fractus_core.policy.values import Takeover, Verdict
 
 from fractus_services.audit import AuditLog
+from fractus_services.errors import Aborted, PreconditionFailed, Refused, Unavailable
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.background import Background
 from fractus_services.mobility.authority.journal import Journal, Mission
@@ -25,7 +26,6 @@ from fractus_services.mobility.mavlink.failsafes import Checked
 from fractus_services.mobility.mavlink.fence import Backstop
 from fractus_services.mobility.mavlink.link import Autopilot, AutopilotError, Permit, always
 from fractus_services.mobility.mavlink.mode_controller import Helm
-from fractus_services.replies import Refused, aborted, precondition, unavailable
 
 log = logging.getLogger(__name__)
 
@@ -190,9 +190,11 @@ class Control:
         """
         lease = self.lease
         if lease is None or lease.key != grant.key or not self.drives(lease):
-            raise precondition("NotInControl", f"the drone is not yours: {self.controller} has it; use GetControl")
+            raise PreconditionFailed(
+                "NotInControl", f"the drone is not yours: {self.controller} has it; use GetControl"
+            )
         if not self.autopilot.connected:
-            raise unavailable("the autopilot is not connected")
+            raise Unavailable("AutopilotUnavailable", "the autopilot is not connected")
         return lease
 
     def drives(self, lease: Lease) -> bool:
@@ -207,7 +209,7 @@ class Control:
         last = mission.points_done >= len(grant.spec.control_points)
         self.lease = None
         self.hands = "system"
-        self.stop_motion(aborted("ControlReturned", "control was returned"))
+        self.stop_motion(Aborted("ControlReturned", "control was returned"))
         self.note("returned", grant.identity, "the mission is complete" if last else "")
         if last:
             mission.outcome = "complete"
@@ -279,7 +281,7 @@ class Control:
 
     def begin(self, kind: str) -> Motion:
         """Start a motion; the one under way is replaced."""
-        self.stop_motion(aborted("Replaced", f"{kind} replaced it"))
+        self.stop_motion(Aborted("Replaced", f"{kind} replaced it"))
         self.motion, self.began_at = Motion(kind), self.autopilot.now
         return self.motion
 
@@ -298,7 +300,7 @@ class Control:
             await asyncio.sleep(0.3)
         if self.motion is motion and self.hands == "driver":
             self.motion = None
-            motion.stop(aborted("Cancelled", "the call was cancelled"))
+            motion.stop(Aborted("Cancelled", "the call was cancelled"))
             await self.tasks.attempt(self.hold, self.still)
 
     def failed(self, motion: Motion) -> None:
@@ -336,7 +338,9 @@ class Control:
         # A position that is not known now may be known in a moment.
         passing = verdict.code == "PositionUnknown"
         self.stop_motion(
-            unavailable(verdict.reason) if passing else aborted(verdict.code, verdict.reason, verdict.policies)
+            Unavailable("AutopilotUnavailable", verdict.reason)
+            if passing
+            else Aborted(verdict.code, verdict.reason, verdict.policies)
         )
         self.autopilot.stop()
         self.tasks.spawn(self.helm.settle())
@@ -363,7 +367,7 @@ class Control:
     def lose(self, reason: str) -> None:
         """Take the lease from the driver and tell it why."""
         lease, self.lease = self.lease, None
-        self.stop_motion(precondition("ControlLost", reason))
+        self.stop_motion(PreconditionFailed("ControlLost", reason))
         self.tasks.drop(self._grace)
         if lease is not None:
             lease.tell(News(State.LOST, reason=reason))

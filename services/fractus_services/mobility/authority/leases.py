@@ -9,8 +9,8 @@ from enum import Enum
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.values import GotoArgs
 
+from fractus_services.errors import Refused
 from fractus_services.grants import ActiveGrant
-from fractus_services.replies import Refused
 
 
 class State(Enum):

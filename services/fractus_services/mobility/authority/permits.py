@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from fractus_services.errors import PreconditionFailed
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import Lease, Motion, Regime
 from fractus_services.mobility.mavlink.link import Permit
-from fractus_services.replies import precondition
 
 
 def driver_permit(control: Control, grant: ActiveGrant, motion: Motion | None = None) -> Permit:
@@ -23,7 +23,7 @@ def driver_permit(control: Control, grant: ActiveGrant, motion: Motion | None = 
         if motion is not None:
             motion.check()
         if control.require(grant) is not lease or not control.valid(grant):
-            raise precondition("ControlLost", "the drone is not yours any more")
+            raise PreconditionFailed("ControlLost", "the drone is not yours any more")
 
     return check
 
@@ -34,7 +34,7 @@ def transit_permit(control: Control, lease: Lease, motion: Motion) -> Permit:
     def check() -> None:
         motion.check()
         if control.lease is not lease or control.hands != "system" or not control.valid(lease.grant):
-            raise precondition("ControlLost", "the driver is gone")
+            raise PreconditionFailed("ControlLost", "the driver is gone")
 
     return check
 
@@ -45,6 +45,6 @@ def tour_permit(control: Control, regime: Regime, motion: Motion) -> Permit:
     def check() -> None:
         motion.check()
         if control.regime is not regime or control.hands != "system" or not control.valid(regime.grant):
-            raise precondition("ControlLost", "the system does not fly this mission any more")
+            raise PreconditionFailed("ControlLost", "the system does not fly this mission any more")
 
     return check

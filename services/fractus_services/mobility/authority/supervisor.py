@@ -8,8 +8,8 @@ import math
 
 from fractus_core.policy.values import Takeover
 
+from fractus_services.errors import PreconditionFailed
 from fractus_services.mobility.authority.control import Control
-from fractus_services.replies import precondition
 
 log = logging.getLogger(__name__)
 
@@ -86,7 +86,7 @@ class Supervisor:
     def _adopt(self) -> None:
         control, mission = self._control, self._control.journal.flying
         control.hands = "system"
-        control.stop_motion(precondition("ControlLost", "the system took the drone"))
+        control.stop_motion(PreconditionFailed("ControlLost", "the system took the drone"))
         alive = mission is not None and not mission.outcome and control.mission_grant is not None
         action: Takeover = "hover" if alive and control.autopilot.vehicle.in_air else "returnToLaunch"
         control.note(action, "system", "nobody had the drone", "Orphaned", kind="takeover")

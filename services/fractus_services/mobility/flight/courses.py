@@ -7,7 +7,6 @@ from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import aclosing
 from dataclasses import dataclass, replace
 
-import grpc
 import shapely
 from fractus_core.policy.compiled import Air, CompiledGrant, height_m
 from fractus_core.policy.limits import speed_bounds
@@ -15,13 +14,13 @@ from fractus_core.policy.motion import margin_m
 from fractus_core.policy.routes import searching
 from fractus_core.policy.values import Call, GotoArgs, Situation
 
+from fractus_services.errors import Aborted, PreconditionFailed, Refused, Unavailable
 from fractus_services.mobility.authority.background import in_slices
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import Motion, Regime
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import REACHED_M, Step, at_rest, come_to_rest, fly_to
 from fractus_services.mobility.mavlink.link import Permit
-from fractus_services.replies import Refused, aborted, precondition, unavailable
 
 log = logging.getLogger(__name__)
 
@@ -56,7 +55,7 @@ class Trip:
 
 def stopped_by_monitor(refusal: Refused) -> bool:
     """Whether a leg ended because it had become illegal, so that another way may exist."""
-    return refusal.status is grpc.StatusCode.ABORTED and refusal.verdict.code in STOPPED
+    return isinstance(refusal, Aborted) and refusal.verdict.code in STOPPED
 
 
 async def first_leg(
@@ -84,7 +83,7 @@ async def first_leg(
         found = await _first_leg(goal, heights, now, grant)
         if trip.regime.compiled is grant:
             return found
-    raise aborted("FencesChanged", "the fences change faster than a way is found")
+    raise Aborted("FencesChanged", "the fences change faster than a way is found")
 
 
 async def _first_leg(
@@ -160,17 +159,17 @@ class Courses:
                 yield Step(step.distance_m, step.complete and last)
             if last:
                 return
-        raise aborted("NotFollowing", f"the drone did not arrive within {MAX_LEGS} legs")
+        raise Aborted("NotFollowing", f"the drone did not arrive within {MAX_LEGS} legs")
 
     async def _next(self, trip: Trip, target: GotoArgs) -> tuple[GotoArgs, bool]:
         now, grant = self._guard.situation(), trip.regime.compiled
         if now.lat is None or now.lon is None:
-            raise unavailable("the drone's position is not known")
+            raise Unavailable("AutopilotUnavailable", "the drone's position is not known")
         wanted = now.altitude_m
         if target.alt is not None:
             known = height_m(target.alt, target.reference, now.home, grant.flat_terrain)
             if known is None:
-                raise precondition(
+                raise PreconditionFailed(
                     "TerrainUnknown", "the altitude is given above terrain, and no terrain model is loaded"
                 )
             wanted = known
@@ -192,11 +191,11 @@ class Courses:
         """No way is found: what the policies say of the straight one tells why."""
         verdict = self._guard.judge(Call("Goto", target), trip.regime.grant, trip.regime.compiled)
         why = verdict.reason or "no way around the zones is found"
-        return precondition("NoLegalWay", f"the system cannot fly to {target.lat:.6f}, {target.lon:.6f}: {why}")
+        return PreconditionFailed("NoLegalWay", f"the system cannot fly to {target.lat:.6f}, {target.lon:.6f}: {why}")
 
     def _allowed(self, trip: Trip, leg: GotoArgs) -> GotoArgs:
         """A leg as the policies allow it."""
         verdict = self._guard.judge(Call("Goto", leg), trip.regime.grant, trip.regime.compiled)
         if not verdict.permits or not isinstance(verdict.args, GotoArgs):
-            raise precondition("NoLegalWay", f"the system cannot fly there: {verdict.reason}")
+            raise PreconditionFailed("NoLegalWay", f"the system cannot fly there: {verdict.reason}")
         return replace(verdict.args, speed_mps=verdict.args.speed_mps or self._control.cruise_mps)

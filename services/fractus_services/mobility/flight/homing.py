@@ -7,12 +7,12 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import aclosing
 from dataclasses import replace
 
-import grpc
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.motion import height_margin_m, margin_m
 from fractus_core.policy.returning import straight_home_blocked
 from fractus_core.policy.values import GotoArgs, Situation
 
+from fractus_services.errors import PreconditionFailed, Refused, Unavailable
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import Motion
@@ -21,7 +21,6 @@ from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import REACHED_M, Step, at_rest, come_to_rest, fly_to
 from fractus_services.mobility.mavlink.link import AutopilotError
 from fractus_services.mobility.mavlink.vehicle import GUIDED, HOMEWARD, RTL, SMART_RTL
-from fractus_services.replies import Refused, precondition
 
 log = logging.getLogger(__name__)
 
@@ -110,7 +109,7 @@ class Homing:
                 if refusal.verdict.code == "NoLegalWay":
                     return why
                 if not stopped_by_monitor(refusal):
-                    raise AutopilotError(why, link=refusal.status is grpc.StatusCode.UNAVAILABLE) from refusal
+                    raise AutopilotError(why, link=isinstance(refusal, Unavailable)) from refusal
             else:
                 return ""
             finally:
@@ -141,7 +140,7 @@ class Homing:
             async with aclosing(fly_to(autopilot, motion, leg, REACHED_M, permit)) as steps:  # type: ignore[type-var]
                 async for step in steps:
                     yield Step(step.distance_m, complete=False)
-        raise precondition("NoLegalWay", f"the drone is not home after {MAX_LEGS} legs")
+        raise PreconditionFailed("NoLegalWay", f"the drone is not home after {MAX_LEGS} legs")
 
     def _clear(self, grant: CompiledGrant) -> bool:
         now = self._guard.situation()
@@ -158,7 +157,7 @@ class Homing:
         home = (now.home.lat, now.home.lon)
         found = await first_leg(home, (now.altitude_m, now.airframe.return_altitude_m), free, trip)
         if found is None:
-            raise precondition("NoLegalWay", "zones are all around the drone or its home")
+            raise PreconditionFailed("NoLegalWay", "zones are all around the drone or its home")
         leg, last, _ = found
         if last and self._guard.distance_m(leg.lat, leg.lon) <= HOME_M:
             return None

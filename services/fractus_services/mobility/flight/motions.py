@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.values import STANDING_MPS, GotoArgs
 
+from fractus_services.errors import Aborted, Unavailable
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.mavlink.link import Autopilot, AutopilotError, Permit
 from fractus_services.mobility.mavlink.vehicle import Vehicle
-from fractus_services.replies import aborted, unavailable
 
 REACHED_M = 1.0
 HEIGHT_REACHED_M = 0.8
@@ -52,9 +52,9 @@ async def climb(autopilot: Autopilot, motion: Motion, altitude_m: float, permit:
         if vehicle.altitude_m > best + 0.2:
             best, begun = vehicle.altitude_m, autopilot.now
         if autopilot.now - begun > 20.0:
-            raise aborted("NotFollowing", f"the drone does not climb above {vehicle.altitude_m:.1f} m")
+            raise Aborted("NotFollowing", f"the drone does not climb above {vehicle.altitude_m:.1f} m")
         if not vehicle.armed:
-            raise aborted("Disarmed", "the autopilot disarmed before the drone took off")
+            raise Aborted("Disarmed", "the autopilot disarmed before the drone took off")
         await _tick(autopilot, motion)
 
 
@@ -110,7 +110,7 @@ async def fly_to(
             best, sent = math.hypot(away, rise), autopilot.now
         if autopilot.now - sent > STUCK_S:
             if resends == RESENDS:
-                raise aborted("NotFollowing", f"the drone stays {math.hypot(away, rise):.1f} m away from the target")
+                raise Aborted("NotFollowing", f"the drone stays {math.hypot(away, rise):.1f} m away from the target")
             resends, sent = resends + 1, autopilot.now
             await begin()
         await _tick(autopilot, motion)
@@ -149,7 +149,7 @@ async def come_to_rest(autopilot: Autopilot, motion: Motion, permit: Permit) -> 
         while not at_rest(autopilot):
             if autopilot.now > deadline:
                 speed = autopilot.vehicle.speed_mps
-                raise aborted("NotStopping", f"the drone does not stop; it still flies {speed:.1f} m/s")
+                raise Aborted("NotStopping", f"the drone does not stop; it still flies {speed:.1f} m/s")
             if autopilot.now - sent >= REST_AGAIN_S:
                 permit()
                 autopilot.stop()
@@ -193,4 +193,4 @@ async def _tick(autopilot: Autopilot, motion: Motion) -> None:
 
 async def _news(autopilot: Autopilot) -> None:
     if not await autopilot.update(REPORT_S) and not autopilot.connected:
-        raise unavailable("the autopilot is no longer heard; it flies home by its own failsafe")
+        raise Unavailable("AutopilotUnavailable", "the autopilot is no longer heard; it flies home by its own failsafe")

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, VelocityArgs, Verdict
 
+from fractus_services.errors import Aborted, PreconditionFailed, Refused, denied
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.arming import arm
 from fractus_services.mobility.authority.control import Control
@@ -22,7 +23,6 @@ from fractus_services.mobility.flight.motions import REACHED_M, Step, climb, com
 from fractus_services.mobility.flight.steering import Steering
 from fractus_services.mobility.mavlink.link import Autopilot, Permit
 from fractus_services.mobility.mavlink.vehicle import GUIDED, LAND, RTL, SMART_RTL
-from fractus_services.replies import Refused, aborted, precondition, refused
 
 MAX_REACHED_M = 50.0
 JUDGE_AGAIN_S = 0.05
@@ -78,7 +78,7 @@ class MobilityService:
         """
         verdict = self._guard.judge(call, grant)
         if not verdict.permits:
-            raise refused(verdict)
+            raise denied(verdict)
         return verdict
 
     def check(self, call: Call, grant: ActiveGrant) -> Verdict:
@@ -103,7 +103,7 @@ class MobilityService:
         number = self.comes(grant)
         await self.turn(grant)
         if self._drives(grant) and number != self._came:
-            raise aborted("Replaced", "a later call came before this one's turn")
+            raise Aborted("Replaced", "a later call came before this one's turn")
 
     def comes(self, grant: ActiveGrant) -> int:
         """Number a call on what the drone shall do as it comes; those of who does not have the drone replace none."""
@@ -130,18 +130,18 @@ class MobilityService:
     def _allow_motion(self, call: Call, grant: ActiveGrant, known: Verdict | None = None) -> Verdict:
         """Judge a call that moves the drone, of a driver that has it; a takeover happens here."""
         if grant.spec.class_ != "driver":
-            raise refused(self._not_a_driver(call, grant))
+            raise denied(self._not_a_driver(call, grant))
         verdict = self._judge(call, grant, known=known)
         if verdict.code == "MethodNotGranted":
-            raise refused(verdict)
+            raise denied(verdict)
         self._control.require(grant)
         if verdict.action == "takeover":
             self._control.take_over(verdict)
-            raise refused(verdict)
+            raise denied(verdict)
         if not verdict.permits:
             if verdict.takeover is not None:
                 self._control.brake(verdict)
-            raise refused(verdict)
+            raise denied(verdict)
         return verdict
 
     async def arm(self, grant: ActiveGrant) -> Verdict:
@@ -228,7 +228,7 @@ class MobilityService:
                     final = outdated.verdict
                 else:
                     return
-            raise aborted("NotFollowing", f"the autopilot was told {JUDGEMENTS} times where to fly, and does not")
+            raise Aborted("NotFollowing", f"the autopilot was told {JUDGEMENTS} times where to fly, and does not")
 
         return self._run("Goto", steps)
 
@@ -270,7 +270,7 @@ class MobilityService:
                 return verdict
             permit()
             verdict = self._allow_motion(call, self._control.require(grant).grant, verdict)
-        raise aborted("NotStopping", "the drone does not come to rest, and could not begin its leg otherwise")
+        raise Aborted("NotStopping", "the drone does not come to rest, and could not begin its leg otherwise")
 
     async def set_velocity(self, grant: ActiveGrant, args: VelocityArgs) -> tuple[Verdict, VelocityArgs]:
         """Fly with a velocity until the next one, or until its hold is over."""
@@ -335,13 +335,13 @@ class MobilityService:
             return
         self._control.require(grant)
         if not self._autopilot.vehicle.armed:
-            raise precondition("NotArmed", "the motors are off; arm first")
+            raise PreconditionFailed("NotArmed", "the motors are off; arm first")
         if self._autopilot.vehicle.in_air and not self._autopilot.vehicle.standing:
-            raise precondition("AlreadyFlying", "the drone is in the air; use goto to climb")
+            raise PreconditionFailed("AlreadyFlying", "the drone is in the air; use goto to climb")
 
     def _flying(self, method: str) -> None:
         if not self._autopilot.vehicle.in_air:
-            raise precondition("NotFlying", f"{method} needs a drone in the air; take off first")
+            raise PreconditionFailed("NotFlying", f"{method} needs a drone in the air; take off first")
 
     async def _run(self, kind: str, steps: Callable[[Motion], AsyncIterator[Progress]]) -> AsyncIterator[Progress]:
         motion = self._control.begin(kind)

@@ -7,10 +7,10 @@ import logging
 
 from fractus_core.policy.values import VelocityArgs
 
+from fractus_services.errors import Refused
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.mavlink.link import Permit
-from fractus_services.replies import Refused
 
 log = logging.getLogger(__name__)
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 
-import grpc
-
+from fractus_services.errors import Refused, Unavailable
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Mission
@@ -14,7 +13,6 @@ from fractus_services.mobility.authority.permits import tour_permit
 from fractus_services.mobility.flight.courses import Courses, Trip
 from fractus_services.mobility.flight.transit import FAULT, Chauffeur, target_of
 from fractus_services.mobility.mavlink.link import AutopilotError
-from fractus_services.replies import Refused
 
 log = logging.getLogger(__name__)
 
@@ -145,4 +143,4 @@ def _passing(error: Refused | AutopilotError) -> bool:
     """Whether what ended a leg may be over in a moment: the autopilot was not heard."""
     if isinstance(error, AutopilotError):
         return error.link
-    return error.status is grpc.StatusCode.UNAVAILABLE
+    return isinstance(error, Unavailable)

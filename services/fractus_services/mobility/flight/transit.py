@@ -11,6 +11,7 @@ from fractus_core.geo import middle
 from fractus_core.policy.compiled import height_m
 from fractus_core.policy.values import Call, GotoArgs, TakeoffArgs
 
+from fractus_services.errors import PreconditionFailed, Refused
 from fractus_services.mobility.authority.arming import arm
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Mission
@@ -21,7 +22,6 @@ from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import climb
 from fractus_services.mobility.mavlink.link import AutopilotError
 from fractus_services.mobility.mavlink.vehicle import GUIDED
-from fractus_services.replies import Refused, precondition
 
 CRUISE_M = 10.0
 FAULT = "the mobility service has a fault, see its log"
@@ -38,7 +38,7 @@ def start_of(point: ControlPoint) -> Position:
     if point.region is not None:
         centre = middle(point.region)
         return Position(lat=centre.lat, lon=centre.lon)
-    raise precondition("NoStart", "the control point has neither position, path nor region")
+    raise PreconditionFailed("NoStart", "the control point has neither position, path nor region")
 
 
 def target_of(place: Position) -> GotoArgs:
@@ -91,7 +91,7 @@ class Chauffeur:
             control.journal.save_soon()
             control.lose(FAULT)
             control.start("returnToLaunch")
-        return precondition("ControlLost", FAULT)
+        return PreconditionFailed("ControlLost", FAULT)
 
     async def lift(self, trip: Trip, place: Position) -> AsyncIterator[str]:
         """Arm and take off, unless the drone is in the air, to the altitude of a place.
@@ -129,11 +129,15 @@ class Chauffeur:
         home, flat = self._control.autopilot.vehicle.home, trip.regime.compiled.flat_terrain
         height = height_m(place.alt, place.altitude_reference, home, flat)
         if height is None:
-            raise precondition("TerrainUnknown", "the altitude is given above terrain, and no terrain model is loaded")
+            raise PreconditionFailed(
+                "TerrainUnknown", "the altitude is given above terrain, and no terrain model is loaded"
+            )
         return height
 
     def _allow(self, call: Call, trip: Trip) -> object:
         verdict = self._guard.judge(call, trip.regime.grant, trip.regime.compiled)
         if not verdict.permits:
-            raise precondition("ControlPointUnreachable", f"the system cannot bring the drone there: {verdict.reason}")
+            raise PreconditionFailed(
+                "ControlPointUnreachable", f"the system cannot bring the drone there: {verdict.reason}"
+            )
         return verdict.args

@@ -12,6 +12,7 @@ from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Verdict
 
 from fractus_services.audit import AuditLog
+from fractus_services.errors import Aborted, Refused
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import CORRECTION, Control
 from fractus_services.mobility.authority.leases import Motion
@@ -22,7 +23,6 @@ from fractus_services.mobility.flight.motions import REACHED_M, fly_to, stands
 from fractus_services.mobility.mavlink.link import AutopilotError, Permit
 from fractus_services.mobility.mavlink.vehicle import GUIDED
 from fractus_services.mobility.rpc.telemetry import recorded
-from fractus_services.replies import Refused, aborted
 
 log = logging.getLogger(__name__)
 
@@ -161,7 +161,7 @@ class Watch:
 
         def check() -> None:
             if control.lease is not lease or control.hands != hands or control.motion is not motion:
-                raise aborted("Replaced", "something else flies by now")
+                raise Aborted("Replaced", "something else flies by now")
 
         return check
 
@@ -175,7 +175,7 @@ class Watch:
     async def _lead_back(self, verdict: Verdict, place: GotoArgs, compiled: CompiledGrant) -> None:
         """Fly to where the limits hold, as a motion that follows the one that left them."""
         control = self._control
-        control.stop_motion(aborted(verdict.code, verdict.reason, verdict.policies))
+        control.stop_motion(Aborted(verdict.code, verdict.reason, verdict.policies))
         motion = control.begin(CORRECTION)
         speed = limited_mps(control.cruise_mps, place, self._guard.situation(), compiled)
         leg = replace(place, speed_mps=speed)

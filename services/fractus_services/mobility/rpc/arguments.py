@@ -9,7 +9,8 @@ from fractus_core.api.geometry import Reference
 from fractus_core.policy.values import Args, Call, GotoArgs, SetSpeedArgs, TakeoffArgs, VelocityArgs, Verdict
 from fractus_proto.v1 import mobility_pb2, types_pb2
 
-from fractus_services.replies import Refused, decision, refused
+from fractus_services.errors import InvalidRequest, Refused
+from fractus_services.replies import decision
 
 HOLD_S = 0.5
 """How long a velocity holds when the caller does not say."""
@@ -105,7 +106,7 @@ def _write_velocity(message: mobility_pb2.SetVelocityRequest, args: VelocityArgs
 
 
 def _invalid(reason: str) -> Refused:
-    return refused(Verdict("deny", None, "InvalidArgument", reason))
+    return InvalidRequest("InvalidArgument", reason)
 
 
 _ARGUMENTS: dict[str, Callable[[Any], Args]] = {

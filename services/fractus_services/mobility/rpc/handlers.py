@@ -15,6 +15,7 @@ from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 from fractus_services.answering import Reception
 from fractus_services.auth import Caller
 from fractus_services.clock import Clock
+from fractus_services.errors import InvalidRequest, PreconditionFailed, Refused, Unavailable
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import News, State
@@ -23,7 +24,7 @@ from fractus_services.mobility.mavlink.link import AutopilotError
 from fractus_services.mobility.rpc.arguments import call_of, checked, goto_args, velocity_args
 from fractus_services.mobility.rpc.streams import Streams
 from fractus_services.mobility.rpc.telemetry import located, position_of, telemetry_of, velocity_of
-from fractus_services.replies import Refused, decision, precondition, refused, unavailable
+from fractus_services.replies import decision
 
 LEAST_INTERVAL_S, USUAL_INTERVAL_S = 0.05, 0.2
 JUDGED_S = 0.5
@@ -162,7 +163,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
             verdict = self._service.allow(Call("GetPosition"), self._grant_of(caller))
             vehicle = self._control.autopilot.vehicle
             if not located(self._control):
-                raise unavailable("the drone's position is not known yet")
+                raise Unavailable("AutopilotUnavailable", "the drone's position is not known yet")
             return mobility_pb2.GetPositionResponse(
                 decision=decision(verdict), position=position_of(vehicle), velocity=velocity_of(vehicle)
             )
@@ -235,7 +236,11 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 def _known(error: Exception) -> Refused | None:
     if not isinstance(error, AutopilotError):
         return None
-    return unavailable(str(error)) if error.link else precondition("AutopilotRefused", str(error))
+    return (
+        Unavailable("AutopilotUnavailable", str(error))
+        if error.link
+        else PreconditionFailed("AutopilotRefused", str(error))
+    )
 
 
 def _event(news: News) -> Any:
@@ -249,9 +254,7 @@ def _event(news: News) -> Any:
 
 def _finite(value: float) -> float:
     if not math.isfinite(value) or value < 0:
-        raise refused(
-            Verdict("deny", None, "InvalidArgument", f"the acceptance radius must be 0 m or more, not {value:g}")
-        )
+        raise InvalidRequest("InvalidArgument", f"the acceptance radius must be 0 m or more, not {value:g}")
     return value
 
 

@@ -6,14 +6,12 @@ import logging
 from collections.abc import AsyncIterator, Callable
 from contextlib import aclosing
 
-from fractus_core.policy.values import Verdict
-
+from fractus_services.errors import PolicyDenied, PreconditionFailed
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Mission
 from fractus_services.mobility.authority.leases import Lease, News, State
 from fractus_services.mobility.mavlink.vehicle import HOMEWARD
-from fractus_services.replies import precondition, refused
 
 log = logging.getLogger(__name__)
 
@@ -76,14 +74,14 @@ class Streams:
     def _admit(self, grant: ActiveGrant) -> Mission:
         control = self._control
         if grant.spec.class_ != "driver":
-            raise refused(Verdict("deny", None, "NotADriver", "only a driver gets control; passengers ride along"))
+            raise PolicyDenied("NotADriver", "only a driver gets control; passengers ride along")
         mission = control.journal.mission(grant)
         _open(mission)
         other = control.lease
         if other is not None and other.key != grant.key and not other.granted and control.flies_for(grant.key):
             control.lose("another application has the drone")
         if (control.lease is not None and control.lease.key != grant.key) or control.taken(grant.key):
-            raise precondition("ControlHeld", "another application has the drone; try again when it is back")
+            raise PreconditionFailed("ControlHeld", "another application has the drone; try again when it is back")
         return mission
 
     async def _until_ready(self, lease: Lease, mission: Mission) -> AsyncIterator[str]:
@@ -91,7 +89,7 @@ class Streams:
         while control.lease is lease:
             reason = control.hindrance(lease.key)
             if control.taken(lease.key):
-                raise precondition("ControlHeld", "another application has the drone; try again when it is back")
+                raise PreconditionFailed("ControlHeld", "another application has the drone; try again when it is back")
             if reason is None:
                 if lease.grant.spec.control != "partial":
                     return
@@ -119,7 +117,7 @@ class Streams:
         log.warning("driver %s is lost", lease.grant.identity)
         leaving = control.motion is not None and control.motion.kind in {"Land", "ReturnToLaunch"}
         coming_down = leaving and control.autopilot.vehicle.mode in HOMEWARD
-        control.stop_motion(precondition("ControlLost", "the driver's stream broke"))
+        control.stop_motion(PreconditionFailed("ControlLost", "the driver's stream broke"))
         if control.autopilot.vehicle.armed and not coming_down:
             control.start("hover")
         control.begin_grace(mission, "driver lost")
@@ -159,6 +157,6 @@ def _open(mission: Mission) -> None:
         Refused: it is.
     """
     if mission.outcome == "complete":
-        raise precondition("MissionComplete", "the mission is complete")
+        raise PreconditionFailed("MissionComplete", "the mission is complete")
     if mission.outcome:
-        raise precondition("ControlLost", f"the mission has ended ({mission.outcome})")
+        raise PreconditionFailed("ControlLost", f"the mission has ended ({mission.outcome})")

@@ -13,10 +13,10 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
+from fractus_agent.grant_verifier import GrantVerifier
 from fractus_agent.grants import GrantDirectory, GrantKeeper
 from fractus_agent.identity import Identity
 from fractus_agent.registration import Registration
-from fractus_agent.seals import Seals
 from fractus_agent.settings import MissingSetting, Settings
 from fractus_agent.status import Observed, StatusReporter
 from fractus_agent.store import Object, Store, Unavailable, connect
@@ -39,7 +39,7 @@ class Agent:
             store,
             GrantDirectory(settings.grants),
             node,
-            Seals(settings.tls).check,
+            GrantVerifier(settings.tls).verify,
             ask=self.identity.doubt_authority,
         )
         self._certificates = 0

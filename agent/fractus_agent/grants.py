@@ -12,10 +12,10 @@ from typing import Any, Literal, Protocol
 
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.plans import Grant
+from fractus_core.policy.trust import BadSignature, UnknownAuthority
 
 from fractus_agent.backoff import Backoff
 from fractus_agent.durable import remove_file, write_file
-from fractus_agent.seals import Undecided, Unsigned
 from fractus_agent.store import Changed, Conflict, Deleted, GrantEvent, Listed, Object, Rejected, Unavailable
 
 LOG = logging.getLogger(__name__)
@@ -121,7 +121,7 @@ class GrantKeeper:
         store: the API server.
         directory: the disk.
         node: whose grants.
-        check: raises Unsigned or Undecided for a Grant that is not to be stored.
+        check: raises BadSignature or UnknownAuthority for a Grant that is not to be stored.
         ask: called when the authority that the node trusts may be out of date.
         monotonic: seconds that never jump.
     """
@@ -236,12 +236,12 @@ class GrantKeeper:
             return
         try:
             self._check(grant)
-        except Undecided as doubt:
+        except UnknownAuthority as doubt:
             # One that was stored once was verified then, whatever became of its authority since.
             if not self._stored(grant):
                 self._doubt(body, str(doubt))
                 return
-        except Unsigned as problem:
+        except BadSignature as problem:
             LOG.error("grant %s is not stored: %s", name, problem)  # noqa: TRY400
             self._remove(name)
             self._wait(body, str(problem))

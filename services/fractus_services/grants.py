@@ -12,9 +12,9 @@ from pathlib import Path
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.plans import Grant, GrantSpec
 from fractus_core.policy.compiled import CompiledGrant, compile_grant
-from fractus_core.policy.signatures import BadSignature
+from fractus_core.policy.trust import BadSignature
 
-from fractus_services.seals import Seals
+from fractus_services.grant_verifier import GrantVerifier
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ class GrantFiles:
     Args:
         directory: where the agent stores the grants; it may not exist yet.
         node: the node that grants must be for.
-        seals: tells which are the operator's.
+        verifier: tells which are the operator's.
         flat_terrain: see `compile_grant`.
         refused: told of files that grant nothing.
     """
@@ -68,13 +68,13 @@ class GrantFiles:
         self,
         directory: Path,
         node: str,
-        seals: Seals,
+        verifier: GrantVerifier,
         flat_terrain: bool = False,
         refused: Complaint = lambda _name, _why: None,
     ) -> None:
         self._directory = directory
         self._node = node
-        self._seals = seals
+        self._verifier = verifier
         self._flat_terrain = flat_terrain
         self._refused = refused
         self._saving: asyncio.Task[None] | None = None
@@ -117,14 +117,14 @@ class GrantFiles:
     def _remember(self) -> None:
         """Store what was seen, beside the loop: a disk that hangs must hold up no news."""
         if self._saving is None or self._saving.done():
-            content = self._seals.unsaved()
+            content = self._verifier.unsaved()
             if content is not None:
-                self._saving = asyncio.create_task(asyncio.to_thread(self._seals.store, content))
+                self._saving = asyncio.create_task(asyncio.to_thread(self._verifier.store, content))
 
     def scan(self) -> None:
         """Read what changed."""
         found, whole = self._look()
-        trusted = self._seals.renewed()
+        trusted = self._verifier.reload_authorities()
         if found == self._stamps and not trusted:
             return
         before = dict(self._loaded)
@@ -186,20 +186,20 @@ class GrantFiles:
         if grant.spec.node != self._node:
             log.error("%s is a grant for node %s, not for %s; ignored", path, grant.spec.node, self._node)
             return None
-        digest = self._seals.check(grant)
+        digest = self._verifier.verify(grant)
         compiled = compile_grant(grant.spec, flat_terrain=self._flat_terrain)
         return ActiveGrant(grant.metadata.uid or grant.spec.identity, grant.name, grant.spec, compiled, digest)
 
     def _revoke(self, grant: ActiveGrant | None) -> None:
         if grant is not None:
-            self._seals.revoke(grant.identity, grant.digest)
+            self._verifier.revoke(grant.identity, grant.digest)
 
     def _replace(self) -> None:
         fresh: dict[str, ActiveGrant] = {}
         for path, grant in sorted(self._loaded.items()):
             if grant is None:
                 continue
-            if not self._seals.holds(grant.identity, grant.digest):
+            if not self._verifier.is_latest(grant.identity, grant.digest):
                 log.error("%s was replaced by a later grant of %s; ignored", path, grant.identity)
                 continue
             if grant.identity in fresh:

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from fractus_agent.backoff import Backoff
 from fractus_agent.grants import HOLD_S, GrantDirectory, GrantKeeper, outcome_of, status_of, stored_form
-from fractus_agent.seals import Undecided, Unsigned
 from fractus_agent.store import Changed, Deleted, GrantEvent, Listed, Unavailable
 from fractus_core.api.plans import Grant
+from fractus_core.policy.trust import BadSignature, UnknownAuthority
 
 
 def manifest(name: str = "g1", uid: str = "u1", version: str = "1", **more: Any) -> dict[str, Any]:
@@ -198,7 +198,7 @@ async def test_a_grant_that_is_not_signed_is_not_stored_and_takes_away_the_one_b
     doubting: GrantKeeper, doubter: Doubter, store: FakeStore, tmp_path: Path
 ) -> None:
     doubting.take(Listed((manifest(),)))
-    doubter.error = Unsigned("it was changed after it was signed")
+    doubter.error = BadSignature("it was changed after it was signed")
     doubting.take(Changed(manifest(spec={"control": "full"})))
     assert on_disk(tmp_path) == set()
     await doubting.report_once()
@@ -217,7 +217,7 @@ async def test_a_change_of_authorities_takes_no_grant_away(
 ) -> None:
     doubting.take(Listed((manifest(),)))
     await doubting.report_once()
-    doubter.error = Undecided("it is of an authority that is not in ca.crt")
+    doubter.error = UnknownAuthority("it is of an authority that is not in ca.crt")
     doubting.take(Changed(manifest(spec={"control": "full"})))
     await doubting.report_once()
     assert "control" not in json.loads((tmp_path / "g1.json").read_text())["spec"]
@@ -232,7 +232,7 @@ def test_an_authority_that_stays_unknown_ends_the_grant(
     doubting: GrantKeeper, doubter: Doubter, tmp_path: Path
 ) -> None:
     doubting.take(Listed((manifest(),)))
-    doubter.error = Undecided("it is of an authority that is not in ca.crt")
+    doubter.error = UnknownAuthority("it is of an authority that is not in ca.crt")
     doubting.take(Changed(manifest(spec={"control": "full"})))
     doubter.now_s = HOLD_S
     doubting._give_up_undecided()
@@ -250,7 +250,7 @@ async def test_a_stored_grant_outlives_its_authority_and_the_agent(
     doubting: GrantKeeper, doubter: Doubter, store: FakeStore, tmp_path: Path
 ) -> None:
     doubting.take(Listed((manifest(),)))
-    doubter.error = Undecided("it is of an authority that is not in ca.crt")
+    doubter.error = UnknownAuthority("it is of an authority that is not in ca.crt")
     again = GrantKeeper(store, GrantDirectory(tmp_path), "drone-1", doubter.check, monotonic=lambda: doubter.now_s)
     again.take(Listed((manifest(),)))
     doubter.now_s = HOLD_S * 2
@@ -265,7 +265,7 @@ async def test_an_api_server_that_is_gone_for_a_month_takes_no_grant_away(
 ) -> None:
     doubting.take(Listed((manifest("g1"), manifest("g2"))))
     store.down = True
-    doubter.error = Undecided("there is no ca.crt any more")
+    doubter.error = UnknownAuthority("there is no ca.crt any more")
     for _ in range(30):
         doubter.now_s += 86_400
         doubting.missions_changed({"u1": f"failed: {doubter.now_s}"})

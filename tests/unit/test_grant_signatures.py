@@ -21,16 +21,15 @@ from fractus_core.api.plans import component_identity, node_identity
 from fractus_core.policy.signatures import (
     SIGNATURE_ANNOTATION,
     SIGNER_ANNOTATION,
-    BadSignature,
-    UnknownAuthority,
     read_authorities,
     sign,
     verify,
 )
+from fractus_core.policy.trust import BadSignature, UnknownAuthority
 from fractus_operator.identity.authority import SIGNER_LIFE, Authority
 from fractus_operator.identity.grantor import Grantor
-from fractus_services import seals as seals_module
-from fractus_services.seals import Seals
+from fractus_services import grant_verifier
+from fractus_services.grant_verifier import GrantVerifier
 from policy_world import spec
 
 NOW = datetime(2026, 6, 1, 12, 0, 0, 123456, tzinfo=UTC)
@@ -199,21 +198,21 @@ class Node:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.trust(CA)
-        self.seals = Seals(path, path / "seen.json")
-        self.seals.renewed()
+        self.verifier = GrantVerifier(path, path / "seen.json")
+        self.verifier.reload_authorities()
 
     def trust(self, *authorities: Authority) -> None:
         (self.path / "ca.crt").write_bytes(b"".join(a.certificate_pem for a in authorities))
 
     def restart(self) -> None:
-        content = self.seals.unsaved()
+        content = self.verifier.unsaved()
         if content is not None:
-            self.seals.store(content)
-        self.seals = Seals(self.path, self.path / "seen.json")
-        self.seals.renewed()
+            self.verifier.store(content)
+        self.verifier = GrantVerifier(self.path, self.path / "seen.json")
+        self.verifier.reload_authorities()
 
     def take(self, body: dict[str, Any]) -> str:
-        return self.seals.check(grant(body))
+        return self.verifier.verify(grant(body))
 
 
 @pytest.fixture
@@ -236,13 +235,13 @@ def test_an_older_grant_does_not_come_back(node: Node, restarts: bool) -> None:
     with pytest.raises(BadSignature, match=r"not after the one of 2026-06-01T12:00:01\.123456"):
         node.take(old)
     assert node.take(new) == digest
-    assert node.seals.holds(IDENTITY, digest)
-    assert not node.seals.holds(IDENTITY, first)
+    assert node.verifier.is_latest(IDENTITY, digest)
+    assert not node.verifier.is_latest(IDENTITY, first)
 
 
 @pytest.mark.parametrize("restarts", [False, True])
 def test_a_revoked_grant_does_not_come_back_and_a_later_one_does(node: Node, restarts: bool) -> None:
-    node.seals.revoke(IDENTITY, node.take(signed()))
+    node.verifier.revoke(IDENTITY, node.take(signed()))
     if restarts:
         node.restart()
     with pytest.raises(BadSignature, match=r"that was revoked here; sign it again"):
@@ -261,7 +260,7 @@ def test_what_was_verified_once_outlives_its_authority(node: Node) -> None:
     body = signed()
     digest = node.take(body)
     node.trust(OTHER_CA)
-    assert node.seals.renewed()
+    assert node.verifier.reload_authorities()
     assert node.take(body) == digest
     node.restart()
     assert node.take(body) == digest
@@ -276,14 +275,14 @@ def test_without_an_authority_nothing_is_granted(node: Node) -> None:
     with pytest.raises(UnknownAuthority, match=r"there is no .*ca\.crt"):
         node.take(signed())
     node.trust(CA)
-    assert node.seals.renewed()
-    assert not node.seals.renewed()
+    assert node.verifier.reload_authorities()
+    assert not node.verifier.reload_authorities()
     assert node.take(signed())
 
 
 def test_a_broken_ca_file_keeps_the_one_before(node: Node) -> None:
     (node.path / "ca.crt").write_text("nonsense")
-    assert not node.seals.renewed()
+    assert not node.verifier.reload_authorities()
     assert node.take(signed())
 
 
@@ -304,15 +303,15 @@ def test_a_full_disk_grants_on_and_remembers_when_there_is_room(
 
     body = signed()
     node.take(body)
-    content = node.seals.unsaved()
+    content = node.verifier.unsaved()
     assert content is not None
-    assert node.seals.unsaved() is None
+    assert node.verifier.unsaved() is None
     with monkeypatch.context() as patch:
-        patch.setattr("fractus_services.seals.os.fsync", full)
-        node.seals.store(content)
+        patch.setattr("fractus_services.grant_verifier.os.fsync", full)
+        node.verifier.store(content)
     assert "No space left" in caplog.text
     node.restart()
-    node.seals.revoke(IDENTITY, node.take(body))
+    node.verifier.revoke(IDENTITY, node.take(body))
     node.restart()
     with pytest.raises(BadSignature, match="revoked"):
         node.take(body)
@@ -326,7 +325,7 @@ def test_a_signature_that_is_taken_off_takes_the_grant_away(node: Node) -> None:
 
 
 def test_the_memory_has_an_end_and_forgets_nothing_that_matters(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(seals_module, "MOST_KNOWN", 3)
+    monkeypatch.setattr(grant_verifier, "MAX_REMEMBERED", 3)
     for n in range(6):
         node.take(signed(later(n), instance=f"i{n}"))
     node.restart()

@@ -12,8 +12,8 @@ from fractus_services.answering import Allowance
 from fractus_services.auth import Caller, caller_of
 from fractus_services.clock import TRUST_S, Clock
 from fractus_services.errors import NotAuthenticated
+from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import ActiveGrant, GrantFiles
-from fractus_services.seals import Seals
 from grant_signing import CA_PEM, signed
 from policy_world import spec
 
@@ -35,7 +35,7 @@ def grant_files(directory: Path, refused: Any = lambda _name, _why: None) -> Gra
     tls = directory.parent / f"{directory.name}-tls"
     tls.mkdir(exist_ok=True)
     (tls / "ca.crt").write_bytes(CA_PEM)
-    return GrantFiles(directory, "drone-1", Seals(tls, tls / "seen.json"), refused=refused)
+    return GrantFiles(directory, "drone-1", GrantVerifier(tls, tls / "seen.json"), refused=refused)
 
 
 def test_files_come_change_and_go(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from cryptography.x509.oid import ExtensionOID, ObjectIdentifier
 
 from fractus_core.api.model import GROUP
 from fractus_core.api.plans import OPERATOR_IDENTITY, Grant
+from fractus_core.policy.trust import BadSignature, UnknownAuthority
 
 SIGNATURE_ANNOTATION = f"{GROUP}/signature"
 SIGNER_ANNOTATION = f"{GROUP}/signed-by"
@@ -32,14 +33,6 @@ SKEW = timedelta(minutes=5)
 """How far the clocks of who signs and who issues the certificate may be apart."""
 
 _CONTEXT = b"fractus.dev grant 1\n"
-
-
-class BadSignature(Exception):
-    """A Grant that the operator did not sign as it stands; the message says why."""
-
-
-class UnknownAuthority(BadSignature):
-    """The signer's certificate is of no authority that is known here (yet)."""
 
 
 def canonical(grant: Grant) -> bytes:

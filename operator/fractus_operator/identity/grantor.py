@@ -11,7 +11,8 @@ from datetime import datetime, timedelta
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
 from fractus_core.api import Grant, InvalidObject
-from fractus_core.policy.signatures import SIGNATURE_ANNOTATION, SIGNER_ANNOTATION, BadSignature, sign, verify
+from fractus_core.policy.signatures import SIGNATURE_ANNOTATION, SIGNER_ANNOTATION, sign, verify
+from fractus_core.policy.trust import BadSignature
 
 from fractus_operator.cluster.kinds import Body
 from fractus_operator.cluster.reading import read

@@ -24,9 +24,9 @@ from fractus_services.camera.pictures.service import Body, CameraService, Wherea
 from fractus_services.camera.pose.provider import Airborne, Fixed
 from fractus_services.camera.rpc.handlers import CameraHandlers
 from fractus_services.clock import Clock
+from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import GrantFiles
 from fractus_services.hosting import open_door, read_description
-from fractus_services.seals import Seals
 
 if TYPE_CHECKING:
     from fractus_services.camera.__main__ import Options
@@ -75,7 +75,10 @@ async def run(options: Options, stop: asyncio.Event) -> None:
     tls = TlsFiles(options.tls)
     audit = AuditLog(options.audit, clock)
     grants = GrantFiles(
-        options.grants, node, Seals(options.tls, options.state / "grants-seen.json"), refused=audit.refused_grant
+        options.grants,
+        node,
+        GrantVerifier(options.tls, options.state / "grants-seen.json"),
+        refused=audit.refused_grant,
     )
     grants.scan()
     camera = description.spec.services.camera if description is not None else None

@@ -15,6 +15,7 @@ from fractus_proto.v1 import mobility_pb2_grpc
 from fractus_services.audit import AuditLog
 from fractus_services.auth import KEEPALIVE, TlsFiles
 from fractus_services.clock import Clock
+from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import GrantFiles
 from fractus_services.hosting import open_door, read_description
 from fractus_services.mobility.authority.control import Control
@@ -32,7 +33,6 @@ from fractus_services.mobility.mavlink.fence import Backstop
 from fractus_services.mobility.mavlink.link import Autopilot
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from fractus_services.mobility.rpc.streams import Streams
-from fractus_services.seals import Seals
 
 if TYPE_CHECKING:
     from fractus_services.mobility.__main__ import Options
@@ -67,8 +67,8 @@ async def run(options: Options, stop: asyncio.Event) -> None:
     node, url = options.node or name, options.autopilot or link
     tls = TlsFiles(options.tls)
     audit = AuditLog(options.audit, clock)
-    seals = Seals(options.tls, options.state / "grants-seen.json")
-    grants = GrantFiles(options.grants, node, seals, options.flat_terrain, audit.refused_grant)
+    verifier = GrantVerifier(options.tls, options.state / "grants-seen.json")
+    grants = GrantFiles(options.grants, node, verifier, options.flat_terrain, audit.refused_grant)
     journal = Journal(options.state)
     autopilot = Autopilot(url)
     backstop = Backstop(autopilot, options.state)

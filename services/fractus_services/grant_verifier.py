@@ -1,4 +1,4 @@
-"""Whether a Grant is the operator's word, and its last one: signatures, and a memory against replays."""
+"""Whether a Grant is the operator's, and the latest one: its signature, and a memory against replays."""
 
 from __future__ import annotations
 
@@ -15,29 +15,28 @@ from fractus_core.api.plans import Grant
 from fractus_core.policy.signatures import (
     SIGNATURE_ANNOTATION,
     SIGNER_ANNOTATION,
-    BadSignature,
-    UnknownAuthority,
     canonical,
     read_authorities,
     verify,
 )
+from fractus_core.policy.trust import BadSignature, UnknownAuthority
 
 log = logging.getLogger(__name__)
 
-MOST_KNOWN = 5_000
-"""So many instances are remembered; for older ones there is one date before which nothing counts."""
+MAX_REMEMBERED = 5_000
+"""Instances that are remembered one by one; older ones share one date, and no grant issued before it counts."""
 
 _EPOCH = datetime.fromtimestamp(0, UTC)
 
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """The last grant of an instance.
+    """The latest grant of an instance.
 
     Attributes:
         issued_at: when it was signed, ISO 8601 in UTC.
         digest: of the grant with its signature.
-        revoked: it was taken away on this node, and counts no more.
+        revoked: it was removed on this node and no longer counts.
     """
 
     issued_at: str
@@ -45,15 +44,16 @@ class _Seen:
     revoked: bool = False
 
 
-class Seals:
-    """Judges where grants come from.
+class GrantVerifier:
+    """Verifies grants and remembers the latest one of each instance.
 
-    A grant is verified once. It goes on to hold, over a restart too, when certificates expire or the authority changes
-    meanwhile; it ends when its file goes, or when a later one takes its place.
+    A grant is verified once. It stays in force, also over a restart, when certificates expire or the authority changes
+    meanwhile: a drone in flight must not lose its grant to a date. It ends when its file goes, or when a later one takes
+    its place. The memory is what stops a replay: an old grant has a valid signature too.
 
     Args:
         directory: where ca.crt is.
-        memory: file of what was seen here, so that no older grant comes back.
+        memory: file that remembers the grants seen on this node.
     """
 
     def __init__(self, directory: Path, memory: Path) -> None:
@@ -62,11 +62,11 @@ class Seals:
         self._stamp: tuple[int, int, int] | None = None
         self._authorities: tuple[x509.Certificate, ...] = ()
         self._seen: dict[str, _Seen] = {}
-        self._floor = _iso(_EPOCH)
+        self._oldest = _iso(_EPOCH)
         self._unsaved = self._failing = False
-        self._recall()
+        self._restore()
 
-    def renewed(self) -> bool:
+    def reload_authorities(self) -> bool:
         """Read ca.crt if it changed; True if it did."""
         try:
             stat = self._path.stat()
@@ -78,15 +78,15 @@ class Seals:
         except FileNotFoundError:
             return False
         except (OSError, ValueError) as error:
-            log.critical("cannot read %s, keeping to the authority known before: %s", self._path, error)
+            log.critical("grants: cannot read the authority, keeping the previous one (file=%s): %s", self._path, error)
             return False
         return True
 
-    def check(self, grant: Grant) -> str:
-        """Take a grant as the last one of its instance; the digest of it with its signature.
+    def verify(self, grant: Grant) -> str:
+        """Accept a grant as the latest of its instance; returns the digest of it with its signature.
 
         Raises:
-            BadSignature: the operator did not sign it, or there was a later one here, or it was revoked here.
+            BadSignature: the operator did not sign it, a later one was seen here, or it was revoked here.
         """
         identity, digest = grant.spec.identity, _digest(grant)
         seen = self._seen.get(identity)
@@ -95,39 +95,39 @@ class Seals:
         if not self._authorities:
             raise UnknownAuthority(f"there is no {self._path} to check its signature by")
         issued_at = _iso(verify(grant, self._authorities))
-        last = seen.issued_at if seen is not None else self._floor
-        if issued_at <= last:
+        latest = seen.issued_at if seen is not None else self._oldest
+        if issued_at <= latest:
             raise BadSignature(
-                f"it was issued at {issued_at}, and not after the one of {last} that was "
+                f"it was issued at {issued_at}, and not after the one of {latest} that was "
                 f"{'revoked' if seen is not None and seen.revoked else 'granted'} here; sign it again"
             )
         self._seen[identity] = _Seen(issued_at, digest)
         self._unsaved = True
         return digest
 
-    def holds(self, identity: str, digest: str) -> bool:
-        """Whether a grant is still the last one of its instance."""
+    def is_latest(self, identity: str, digest: str) -> bool:
+        """Whether a grant is still the latest one of its instance."""
         seen = self._seen.get(identity)
         return seen is not None and seen.digest == digest and not seen.revoked
 
     def revoke(self, identity: str, digest: str) -> None:
-        """A grant was taken away: only a later one of its instance counts from now on."""
+        """A grant was removed: from now on only a later one of its instance counts."""
         seen = self._seen.get(identity)
         if seen is not None and seen.digest == digest and not seen.revoked:
             self._seen[identity] = replace(seen, revoked=True)
             self._unsaved = True
 
     def unsaved(self) -> bytes | None:
-        """What is to be stored, for `store`; None when it is stored already."""
+        """Content for `store`; None when it is stored already."""
         if not self._unsaved:
             return None
-        self._forget()
+        self._limit()
         self._unsaved = False
-        body = {"floor": self._floor, "seen": {name: asdict(seen) for name, seen in self._seen.items()}}
+        body = {"floor": self._oldest, "seen": {name: asdict(seen) for name, seen in self._seen.items()}}
         return json.dumps(body).encode()
 
     def store(self, content: bytes) -> None:
-        """Have it on disk; may be called from another thread. What cannot be written is unsaved again."""
+        """Write the memory; may be called from another thread. What cannot be written is unsaved again."""
         fresh = self._memory.with_name(f".{self._memory.name}.new")
         try:
             self._memory.parent.mkdir(parents=True, exist_ok=True)
@@ -138,29 +138,35 @@ class Seals:
             fresh.replace(self._memory)
         except OSError as error:
             if not self._failing:
-                log.critical("cannot write %s: a restart would forget which grants were replaced: %s", fresh, error)
+                log.critical(
+                    "grants: cannot write the memory, a restart would forget replaced grants (file=%s): %s",
+                    fresh,
+                    error,
+                )
             self._failing = self._unsaved = True
         else:
             self._failing = False
 
-    def _forget(self) -> None:
+    def _limit(self) -> None:
         """Keep the instances that were granted last."""
-        surplus = len(self._seen) - MOST_KNOWN
+        surplus = len(self._seen) - MAX_REMEMBERED
         if surplus > 0:
             for identity in sorted(self._seen, key=lambda name: self._seen[name].issued_at)[:surplus]:
-                self._floor = max(self._floor, self._seen.pop(identity).issued_at)
+                self._oldest = max(self._oldest, self._seen.pop(identity).issued_at)
 
-    def _recall(self) -> None:
+    def _restore(self) -> None:
         try:
             body = json.loads(self._memory.read_bytes())
             self._seen = {str(name): _Seen(**seen) for name, seen in body["seen"].items()}
-            self._floor = str(body["floor"])
+            self._oldest = str(body["floor"])
         except FileNotFoundError:
             return
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-            # To refuse every grant from now on would strand the drone; their signatures are checked all the same.
-            self._seen, self._floor = {}, _iso(_EPOCH)
-            log.critical("%s cannot be read, so it is forgotten which grants were replaced: %s", self._memory, error)
+            # Refusing every grant from now on would strand the drone; signatures are still verified.
+            self._seen, self._oldest = {}, _iso(_EPOCH)
+            log.critical(
+                "grants: the memory cannot be read, replaced grants are forgotten (file=%s): %s", self._memory, error
+            )
 
 
 def _iso(moment: datetime) -> str:
@@ -169,8 +175,8 @@ def _iso(moment: datetime) -> str:
 
 
 def _digest(grant: Grant) -> str:
-    said = [
+    signed = [
         grant.metadata.uid,
         *(grant.metadata.annotations.get(key) for key in (SIGNATURE_ANNOTATION, SIGNER_ANNOTATION)),
     ]
-    return hashlib.sha256(json.dumps(said).encode() + canonical(grant)).hexdigest()
+    return hashlib.sha256(json.dumps(signed).encode() + canonical(grant)).hexdigest()

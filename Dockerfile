@@ -92,7 +92,7 @@ RUN uv build --quiet --wheel --no-build-isolation --out-dir /wheel \
  && assemble component fractus fractus_cli \
  && assemble operator fractus_core fractus_operator \
  && assemble agent fractus_core fractus_agent \
- && assemble services fractus fractus_cli fractus_core fractus_services \
+ && assemble services fractus fractus_cli fractus_core fractus_mavlink fractus_services \
  && assemble sim fractus_vehicle fractus_world
 
 # ---- python: the common start of all images, with what the SDK needs

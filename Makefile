@@ -68,8 +68,9 @@ format: env ## Format the code
 	$(RUN) ruff format
 
 .PHONY: generate
-generate: env ## Generate the CRDs from the models and the stubs from the .proto files
+generate: env ## Generate the CRDs, the stubs of the .proto files and the MAVLink codec's tables
 	$(RUN) python -m fractus_core.api.crd crds
+	$(RUN) python -m fractus_mavlink.generate
 	$(RUN) python -m grpc_tools.protoc -Iproto --python_out=proto --pyi_out=proto --grpc_python_out=proto \
 		proto/fractus_proto/v1/*.proto
 

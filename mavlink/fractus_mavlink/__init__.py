@@ -1,6 +1,7 @@
 """MAVLink 2 for services and simulation: one codec, generated from the dialect that is checked in.
 
-    link = Endpoint(system=255, component=190)
+Example:
+    link = Endpoint(system=255, component=MAV_COMPONENT.MISSIONPLANNER)
     frame = link.encode("COMMAND_LONG", {"command": MAV_CMD.NAV_LAND, "target_system": 1})
     for message in link.decode(received):
         if message.name == "ATTITUDE":

@@ -6,8 +6,8 @@ checksums of definitions. Its generated Python is not used: docs/decisions/0011-
 
 from __future__ import annotations
 
-import os
 import sys
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +58,8 @@ def _enums(xml: Any) -> str:
 
 def _prefix(names: list[str]) -> str:
     """What the names begin with, up to an underscore."""
-    return os.path.commonprefix(names).rpartition("_")[0] + "_"
+    same = takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
+    return "".join(letters[0] for letters in same).rpartition("_")[0] + "_"
 
 
 def _member(name: str, prefix: str) -> str:

@@ -84,7 +84,7 @@ def partial(*policies: dict[str, Any], at: tuple[float, float]) -> dict[str, Any
     return grant(*policies, control="partial", controlPoints=points, services=services)
 
 
-async def test_the_chauffeur_flies_around_zones_to_the_control_point_and_home(rig: Rig) -> None:
+async def test_the_transit_flies_around_zones_to_the_control_point_and_home(rig: Rig) -> None:
     rig.write_grant(partial(fence("wall", "exclusion", "ignore", *WALL), at=(0, 70)))
     rig.start_service()
     rig.start_vehicle(3.0)

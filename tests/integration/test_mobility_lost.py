@@ -232,7 +232,7 @@ async def test_a_stopped_driver_process_is_noticed(rig: Rig) -> None:
     rig.tell("driver", signal.SIGCONT)
 
 
-async def test_partial_control_begins_where_the_chauffeur_brings_it(rig: Rig) -> None:
+async def test_partial_control_begins_where_the_transit_brings_it(rig: Rig) -> None:
     path = [dict(zip(("lat", "lon", "alt"), (*FRAME.latlon(x, y), 12.0), strict=True)) for x, y in ((30, 40), (60, 40))]
     rig.write_grant(
         grant(
@@ -265,14 +265,14 @@ def partial(**changes: Any) -> dict[str, Any]:
 
 
 async def told(driver: Driver, reason: str) -> None:
-    """Wait until the chauffeur says it is that far."""
+    """Wait until the transit says it is that far."""
     driver._stream = driver.stub.GetControl(pb.GetControlRequest(), wait_for_ready=True)
     async with asyncio.timeout(30):
         while (await driver._stream.read()).reason != reason:
             pass
 
 
-async def test_a_driver_lost_during_the_chauffeurs_takeoff_strands_nobody(rig: Rig) -> None:
+async def test_a_driver_lost_during_the_transits_takeoff_strands_nobody(rig: Rig) -> None:
     rig.write_grant(partial())
     rig.start_service()
     rig.start_vehicle()

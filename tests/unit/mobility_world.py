@@ -19,14 +19,14 @@ from fractus_services.errors import Refused
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Journal
-from fractus_services.mobility.authority.leases import News, State
+from fractus_services.mobility.authority.leases import ControlEvent, ControlState
 from fractus_services.mobility.authority.supervisor import Supervisor
 from fractus_services.mobility.flight.courses import Courses
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.homing import Homing
 from fractus_services.mobility.flight.service import MobilityService, Progress
 from fractus_services.mobility.flight.tours import Tours
-from fractus_services.mobility.flight.transit import Chauffeur
+from fractus_services.mobility.flight.transit import TransitFlight
 from fractus_services.mobility.flight.watch import Watch
 from fractus_services.mobility.mavlink.dialect import message
 from fractus_services.mobility.mavlink.failsafes import Checked
@@ -303,23 +303,23 @@ class World:
         self.journal._write = lambda _data: None  # type: ignore[method-assign]
         self.fence = Fence()
         self.control = Control(
-            self.plane, self.journal, self.grants, self.audit, backstop=self.fence, grace_s=grace_s,  # type: ignore[arg-type]
+            self.plane, self.journal, self.grants, self.audit, fence=self.fence, grace_s=grace_s,  # type: ignore[arg-type]
         )  # fmt: skip
         control = self.control
         control.checked = Checked("", (), Airframe(retraces=retraces), 8.0, retraces)
-        control.decided, control.was_armed, control.helm.expected = True, self.plane.vehicle.armed, GUIDED
+        control.decided, control.was_armed, control.modes.expected = True, self.plane.vehicle.armed, GUIDED
         self.guard = Guard(control, self.audit, lambda: 1_790_000_000.0 + self.plane.now)  # type: ignore[arg-type]
         homing = Homing(control, self.guard)
-        control.helm.approach = homing.approach
+        control.modes.approach = homing.approach
         courses = Courses(control, self.guard)
-        chauffeur = Chauffeur(control, self.guard, courses)
-        self.tours = Tours(control, self.grants, chauffeur, courses, boarding_s)  # type: ignore[arg-type]
+        transit = TransitFlight(control, self.guard, courses)
+        self.tours = Tours(control, self.grants, transit, courses, boarding_s)  # type: ignore[arg-type]
         self.service = MobilityService(control, self.guard, homing)
-        self.streams = Streams(control, chauffeur.bring)
+        self.streams = Streams(control, transit.bring)
         self.supervisor = Supervisor(control)
         self.watch = Watch(control, self.guard, self.audit, self.supervisor)  # type: ignore[arg-type]
         self._tasks = [asyncio.ensure_future(part) for part in (self.plane.run(), self.watch.run(), self.tours.run())]
-        self.news: list[News] = []
+        self.events: list[ControlEvent] = []
 
     async def __aenter__(self) -> World:
         await asyncio.sleep(0.2)
@@ -336,9 +336,9 @@ class World:
         granted = asyncio.Event()
 
         async def follow() -> None:
-            async for news in self.streams.follow(grant):
-                self.news.append(news)
-                if news.state is State.GRANTED:
+            async for event in self.streams.follow(grant):
+                self.events.append(event)
+                if event.state is ControlState.GRANTED:
                     granted.set()
 
         stream = asyncio.ensure_future(follow())

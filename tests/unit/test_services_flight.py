@@ -11,7 +11,7 @@ import pytest
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, Verdict
 from fractus_services.errors import Refused
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.authority.leases import State
+from fractus_services.mobility.authority.leases import ControlState
 from fractus_services.mobility.mavlink.link import AutopilotError
 from fractus_services.mobility.mavlink.vehicle import GUIDED, LAND, RTL, SMART_RTL
 from mobility_world import World, clear_m, end, fly, goto, partial, refusal, spec, touring, zone
@@ -22,13 +22,13 @@ WALL = (-40.0, 25.0, 40.0, 40.0)
 # The system's ways
 
 
-def test_the_chauffeur_flies_around_a_wall_there_and_home(tmp_path: Path) -> None:
+def test_the_transit_flies_around_a_wall_there_and_home(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             grant = world.grants.put(partial(zone("wall", "ignore", *WALL), corridor=[]))
             stream = await world.drive(grant)
             assert math.dist(world.plane.xy, (0, 70)) < 1.5
-            assert [n.reason for n in world.news if n.state is State.WAITING][
+            assert [n.reason for n in world.events if n.state is ControlState.WAITING][
                 -1
             ] == "the system flies to the control point"
             assert await world.control.give_back(grant)
@@ -89,7 +89,7 @@ def test_a_drone_that_speeds_up_toward_a_new_zone_is_stopped_before_anybody_know
             why = await going
             assert (why.verdict.code, why.verdict.action) == ("ExclusionZoneAhead", "deny")
             await asyncio.sleep(20)
-            assert world.control.hands == "driver", "nothing was in the zone, nor was it going to be"
+            assert world.control.authority == "driver", "nothing was in the zone, nor was it going to be"
             assert clear_m(world, *WALL) > 5
 
     fly(flight)
@@ -102,7 +102,7 @@ def test_no_way_to_the_control_point_is_told(tmp_path: Path) -> None:
             why = await refusal(world.drive(grant))
             assert why.verdict.code == "NoLegalWay"
             assert "around" in str(why)
-            assert world.control.hands == "system"
+            assert world.control.authority == "system"
 
     fly(flight)
 
@@ -235,14 +235,14 @@ def test_a_pilot_ends_a_tour_and_a_mission_that_ended_is_not_flown_again(tmp_pat
         async with World(tmp_path) as world:
             world.grants.put(touring(tour=((0, 100),)))
             await world.until(lambda: world.plane.xy[1] > 20)
-            world.control.hands = "pilot"
+            world.control.authority = "pilot"
             world.control.lose("a human pilot took it")
             world.control.tasks.drop(world.control.system)
             world.plane.set_to(LAND)
             await world.until(lambda: not world.plane.vehicle.armed)
             assert world.control.touring is None
             world.journal.missions["m1"].outcome = "failed: pilot"
-            world.control.hands = "system"
+            world.control.authority = "system"
             world.plane.vehicle.mode = GUIDED
             await asyncio.sleep(20)
             assert not world.plane.vehicle.armed
@@ -455,7 +455,7 @@ def test_an_orphan_is_adopted(tmp_path: Path) -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
             await world.up(grant)
-            world.control.lease, world.control.hands = None, "system"  # a fault of ours
+            world.control.lease, world.control.authority = None, "system"  # a fault of ours
             await world.until(lambda: world.kinds("takeover"))
             assert world.kinds("takeover")[0]["code"] == "Orphaned"
             await world.until(lambda: not world.plane.vehicle.armed)

@@ -209,7 +209,7 @@ def test_a_driver_that_comes_back_has_its_speed_again(tmp_path: Path) -> None:
             stream = await world.up(grant)
             await world.service.set_speed(grant, SetSpeedArgs(2.0))
             stream.cancel()
-            await world.until(lambda: world.control.hands == "system", 10)
+            await world.until(lambda: world.control.authority == "system", 10)
             assert world.guard.situation().speed_setpoint_mps == 8.0
             await world.drive(grant)
             assert world.guard.situation().speed_setpoint_mps == 2.0

@@ -146,7 +146,7 @@ def test_a_setpoint_that_fails_ends_the_one_before(tmp_path: Path, monkeypatch: 
                 raise AutopilotError("not now")
 
             with monkeypatch.context() as broken:
-                broken.setattr(world.control.helm, "change_mode", refuses)
+                broken.setattr(world.control.modes, "change_mode", refuses)
                 with pytest.raises(AutopilotError, match="not now"):
                     await world.service.set_velocity(grant, VelocityArgs(5.0, 0.0, hold_s=2.0))
                 await asyncio.sleep(0.05)
@@ -163,14 +163,14 @@ def test_a_setpoint_that_waited_is_watched_as_well(tmp_path: Path, monkeypatch: 
             grant = world.grants.put(spec())
             await world.up(grant)
             await world.service.set_velocity(grant, VelocityArgs(4.0, 0.0, hold_s=0.5))
-            change_mode = world.control.helm.change_mode
+            change_mode = world.control.modes.change_mode
 
             async def slow(*args: Any) -> None:
-                monkeypatch.setattr(world.control.helm, "change_mode", change_mode)
+                monkeypatch.setattr(world.control.modes, "change_mode", change_mode)
                 await asyncio.sleep(1.0)
                 await change_mode(*args)
 
-            monkeypatch.setattr(world.control.helm, "change_mode", slow)
+            monkeypatch.setattr(world.control.modes, "change_mode", slow)
             await world.service.set_velocity(grant, VelocityArgs(0.0, 3.0, hold_s=0.5))
             assert world.plane.wanted == (3.0, 0.0, 0.0)
             await asyncio.sleep(0.7)

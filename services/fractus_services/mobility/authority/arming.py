@@ -49,7 +49,7 @@ async def _in_turn(control: Control, grant: ActiveGrant, permit: Permit) -> None
 
 
 async def _arm(control: Control, grant: ActiveGrant, permit: Permit) -> None:
-    helm = control.helm
+    modes = control.modes
     _check(control)
     mission = control.journal.mission(grant)
     home = mission.home = _home_of(control, grant, mission)
@@ -58,7 +58,7 @@ async def _arm(control: Control, grant: ActiveGrant, permit: Permit) -> None:
     if control.journal.failure:
         raise PreconditionFailed("JournalUnavailable", control.journal.failure)
     permit()
-    helm.preparing += 1
+    modes.preparing += 1
     try:
         checked = await _prepare_ways_home(control, grant, home)
 
@@ -69,15 +69,15 @@ async def _arm(control: Control, grant: ActiveGrant, permit: Permit) -> None:
         still()
         await _start(control, home, still)
     finally:
-        helm.preparing -= 1
+        modes.preparing -= 1
 
 
 async def _start(control: Control, home: tuple[float, float, float], permit: Permit) -> None:
     """Start the motors; stop them again when anything fails before the drone flies."""
-    autopilot, helm = control.autopilot, control.helm
-    helm.arming = True
+    autopilot, modes = control.autopilot, control.modes
+    modes.arming = True
     try:
-        await helm.change_mode(GUIDED, permit)
+        await modes.change_mode(GUIDED, permit)
         try:
             await autopilot.arm(permit)
             deadline = autopilot.now + ARMED_S
@@ -93,7 +93,7 @@ async def _start(control: Control, home: tuple[float, float, float], permit: Per
                 await control.tasks.attempt(autopilot.disarm)
             raise
     finally:
-        helm.arming = False
+        modes.arming = False
 
 
 async def _prepare_ways_home(control: Control, grant: ActiveGrant, home: tuple[float, float, float]) -> Checked:
@@ -110,13 +110,13 @@ async def _prepare_ways_home(control: Control, grant: ActiveGrant, home: tuple[f
     checked = _learnt(control, checked, await choose_return(autopilot, checked, retrace=at_home))
     try:
         async with asyncio.timeout(FENCE_S):
-            await control.backstop.raise_around(grant.spec, retraces=control.retraces)
+            await control.fence.raise_around(grant.spec, retraces=control.retraces)
     except (AutopilotError, OSError) as error:
         said = str(error) or f"it takes longer than {FENCE_S:.0f} s"
         why = f"the vehicle's own fence cannot be raised around the operation area: {said}"
         raise PreconditionFailed("FenceNotRaised", why) from error
     _check(control, checked)
-    if not control.backstop.missing:
+    if not control.fence.missing:
         checked = _learnt(control, checked, await learn_return(autopilot, checked))
     return checked
 

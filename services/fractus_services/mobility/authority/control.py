@@ -20,16 +20,16 @@ from fractus_services.errors import Aborted, PreconditionFailed, Refused, Unavai
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.background import Background
 from fractus_services.mobility.authority.journal import Journal, Mission
-from fractus_services.mobility.authority.leases import Lease, Motion, News, Regime, State
+from fractus_services.mobility.authority.leases import ControlEvent, ControlState, FlightConstraints, Lease, Motion
 from fractus_services.mobility.flight.motions import distance_m
 from fractus_services.mobility.mavlink.failsafes import Checked
-from fractus_services.mobility.mavlink.fence import Backstop
+from fractus_services.mobility.mavlink.fence import MissionFence
 from fractus_services.mobility.mavlink.link import Autopilot, AutopilotError, Permit, always
-from fractus_services.mobility.mavlink.mode_controller import Helm
+from fractus_services.mobility.mavlink.mode_controller import ModeController
 
 log = logging.getLogger(__name__)
 
-Hands = Literal["driver", "system", "pilot"]
+Authority = Literal["driver", "system", "pilot"]
 
 CORRECTION = "Correction"
 """What the motions are called with which the monitor leads a driver's drone back."""
@@ -47,13 +47,13 @@ class Control:
         journal: what survives a restart.
         grants: grants of this node.
         audit: where takeovers are written.
-        backstop: the vehicle's own fence.
+        fence: the vehicle's own fence.
         grace_s: how long a lost driver may take to come back.
 
     Attributes:
         decided: whether it is settled who has the vehicle, since its link came up last.
         began_at: when the last motion began, by the autopilot's clock.
-        regime: the fences under which the system flies an application's drone; None while it does not.
+        constraints: the fences under which the system flies an application's drone; None while it does not.
         touring: key of the mission without a driver that the system is flying.
     """
 
@@ -64,25 +64,25 @@ class Control:
         grants: GrantFiles,
         audit: AuditLog,
         *,
-        backstop: Backstop,
+        fence: MissionFence,
         grace_s: float,
     ) -> None:
         self.autopilot = autopilot
-        self.backstop = backstop
+        self.fence = fence
         self.journal = journal
-        self.hands: Hands = "system"
+        self.authority: Authority = "system"
         self.lease: Lease | None = None
         self.motion: Motion | None = None
         self.began_at = -math.inf
         self.checked: Checked | None = None
         self.speed_mps: float | None = None
         self.homeward = False
-        self.regime: Regime | None = None
+        self.constraints: FlightConstraints | None = None
         self.touring: str | None = None
         self._grants = grants
         self.audit = audit
         self._grace_s = grace_s
-        self.helm = Helm(autopilot, lambda: self.motion is not None)
+        self.modes = ModeController(autopilot, lambda: self.motion is not None)
         self.decided = False
         self.was_armed: bool | None = None
         self.system: asyncio.Task[None] | None = None
@@ -96,9 +96,9 @@ class Control:
     @property
     def controller(self) -> str:
         """Who flies, as telemetry tells it."""
-        if self.hands == "driver" and self.lease is not None:
+        if self.authority == "driver" and self.lease is not None:
             return self.lease.grant.identity
-        return "pilot" if self.hands == "pilot" else "system"
+        return "pilot" if self.authority == "pilot" else "system"
 
     @property
     def mission_grant(self) -> ActiveGrant | None:
@@ -131,7 +131,7 @@ class Control:
         flying = self.journal.flying
         return flying is not None and flying.key != key and self.autopilot.vehicle.armed
 
-    def hindrance(self, key: str) -> str | None:
+    def blocked_by(self, key: str) -> str | None:
         """Why the drone cannot fly for a mission now; None when it can."""
         vehicle = self.autopilot.vehicle
         why = next((t for t in reversed(vehicle.texts) if t.startswith("PreArm")), "")
@@ -140,7 +140,7 @@ class Control:
             (not self.decided, "it is not known yet what the drone does"),
             (self.taken(key), "another application has the drone"),
             (self.checked is None, "the autopilot's failsafes are being set"),
-            (self.hands == "pilot", f"a human pilot has the drone ({vehicle.mode_name})"),
+            (self.authority == "pilot", f"a human pilot has the drone ({vehicle.mode_name})"),
             (self.homeward, "the system brings the drone home"),
             (not vehicle.armed and not vehicle.ready, f"the autopilot is not ready to arm{': ' if why else ''}{why}"),
             (vehicle.lat is None or vehicle.home is None, "position and home are not known yet"),
@@ -160,14 +160,14 @@ class Control:
         self._changed.set()
         self._changed = asyncio.Event()
 
-    def hand_over(self, lease: Lease, mission: Mission) -> News:
+    def hand_over(self, lease: Lease, mission: Mission) -> ControlEvent:
         """The driver has the drone from now on."""
         self.stop_system()
-        self.hands = "driver"
+        self.authority = "driver"
         lease.granted = True
         self.adopt(mission)
         self.note("granted", lease.grant.identity, f"control point {mission.points_done}")
-        return News(State.GRANTED, mission.points_done, "", mission.waypoints)
+        return ControlEvent(ControlState.GRANTED, mission.points_done, "", mission.waypoints)
 
     def adopt(self, mission: Mission) -> None:
         """The drone flies for this mission."""
@@ -199,7 +199,7 @@ class Control:
 
     def drives(self, lease: Lease) -> bool:
         """Whether the driver of a lease has the drone."""
-        return lease.granted and self.hands == "driver"
+        return lease.granted and self.authority == "driver"
 
     async def give_back(self, grant: ActiveGrant) -> bool:
         """A driver returns control at the end of a control point; True when that was the last one."""
@@ -208,12 +208,12 @@ class Control:
         mission.points_done, mission.waypoints = mission.points_done + 1, 0
         last = mission.points_done >= len(grant.spec.control_points)
         self.lease = None
-        self.hands = "system"
+        self.authority = "system"
         self.stop_motion(Aborted("ControlReturned", "control was returned"))
         self.note("returned", grant.identity, "the mission is complete" if last else "")
         if last:
             mission.outcome = "complete"
-            lease.tell(News(State.COMPLETE, mission.points_done - 1, "every control point is done"))
+            lease.tell(ControlEvent(ControlState.COMPLETE, mission.points_done - 1, "every control point is done"))
             self.start("returnToLaunch")
         else:
             lease.tell(None)
@@ -241,22 +241,22 @@ class Control:
         self.tasks.drop(self._grace)
         self.tasks.drop(self.system)
 
-    def begin_transit(self, grant: ActiveGrant, mission: Mission) -> Regime:
+    def begin_transit(self, grant: ActiveGrant, mission: Mission) -> FlightConstraints:
         """The system flies for an application, under its fences."""
         self.stop_system()
-        self.hands = "system"
+        self.authority = "system"
         self.adopt(mission)
-        return self.under(grant)
+        return self.begin_system_flight(grant)
 
-    def under(self, grant: ActiveGrant) -> Regime:
+    def begin_system_flight(self, grant: ActiveGrant) -> FlightConstraints:
         """What the system flies from now on keeps to the fences of a grant, as they are at each moment."""
-        self.regime = Regime(grant, self._for_transit(grant))
-        return self.regime
+        self.constraints = FlightConstraints(grant, self._for_transit(grant))
+        return self.constraints
 
-    def relieve(self, regime: Regime) -> None:
-        """The system has stopped flying under a regime."""
-        if self.regime is regime:
-            self.regime = None
+    def end_system_flight(self, constraints: FlightConstraints) -> None:
+        """The system has stopped flying under these constraints."""
+        if self.constraints is constraints:
+            self.constraints = None
 
     def _for_transit(self, grant: ActiveGrant) -> CompiledGrant:
         if self._transit is None or self._transit[0] is not grant:
@@ -269,7 +269,7 @@ class Control:
     def cruise_mps(self) -> float:
         """The speed of legs that name none: the driver's on what the driver flies, else the vehicle's own."""
         corrects = self.motion is not None and self.motion.kind == CORRECTION
-        if self.speed_mps is not None and self.hands == "driver" and not corrects:
+        if self.speed_mps is not None and self.authority == "driver" and not corrects:
             return self.speed_mps
         return self.checked.speed_mps if self.checked is not None else DEFAULT_SPEED_MPS
 
@@ -298,7 +298,7 @@ class Control:
     async def _hover_after(self, motion: Motion) -> None:
         if motion.kind in {"Land", "ReturnToLaunch"}:
             await asyncio.sleep(0.3)
-        if self.motion is motion and self.hands == "driver":
+        if self.motion is motion and self.authority == "driver":
             self.motion = None
             motion.stop(Aborted("Cancelled", "the call was cancelled"))
             await self.tasks.attempt(self.hold, self.still)
@@ -307,7 +307,7 @@ class Control:
         """A motion ended with an error, and the autopilot may fly on for it: hover."""
         if self.motion is motion:
             self.motion = None
-            if self.hands == "driver" and self.autopilot.vehicle.in_air:
+            if self.authority == "driver" and self.autopilot.vehicle.in_air:
                 self.tasks.spawn(self.tasks.attempt(self.hold, self.still))
 
     def still(self) -> None:
@@ -316,7 +316,7 @@ class Control:
         Raises:
             AutopilotError: somebody else flies by now.
         """
-        if self.motion is not None or self.hands != "driver":
+        if self.motion is not None or self.authority != "driver":
             raise AutopilotError("somebody else flies by now")
 
     def stop_motion(self, why: Refused) -> None:
@@ -327,8 +327,8 @@ class Control:
 
     async def hold(self, permit: Permit = always) -> None:
         """Brake and hover."""
-        await self.helm.hold(permit)
-        self.tasks.spawn(self.helm.settle())
+        await self.modes.hold(permit)
+        self.tasks.spawn(self.modes.settle())
 
     # The system
 
@@ -343,7 +343,7 @@ class Control:
             else Aborted(verdict.code, verdict.reason, verdict.policies)
         )
         self.autopilot.stop()
-        self.tasks.spawn(self.helm.settle())
+        self.tasks.spawn(self.modes.settle())
 
     def take_over(self, verdict: Verdict) -> None:
         """The system takes the drone from its driver, as a policy or the monitor says."""
@@ -356,7 +356,7 @@ class Control:
         log.warning("the system takes the drone (%s): %s", action, verdict.reason)
         self.note(action, "system", verdict.reason, verdict.code, policies=verdict.policies, kind="takeover")
         self.lose(verdict.reason)
-        self.hands = "system"
+        self.authority = "system"
         if mission is not None and outcome and not mission.outcome:
             mission.outcome = f"{outcome}: {verdict.reason}"
             self.journal.save_soon()
@@ -370,7 +370,7 @@ class Control:
         self.stop_motion(PreconditionFailed("ControlLost", reason))
         self.tasks.drop(self._grace)
         if lease is not None:
-            lease.tell(News(State.LOST, reason=reason))
+            lease.tell(ControlEvent(ControlState.LOST, reason=reason))
         self.wake()
 
     def start(self, action: Takeover) -> None:
@@ -382,7 +382,7 @@ class Control:
 
     async def act(self, action: Takeover) -> None:
         """Carry out what the system wants, as long as it has the drone."""
-        await self.helm.carry_out(action, lambda: self.hands == "system")
+        await self.modes.carry_out(action, lambda: self.authority == "system")
         if action != "hover":
             self.homeward = False
             self.wake()
@@ -405,16 +405,16 @@ class Control:
         mission.outcome = f"failed: {why}"
         log.warning("mission of %s failed: %s", mission.identity, why)
         self.note("returnToLaunch", "system", why, "DriverLost", kind="takeover")
-        if self.hands == "system" and not self.homeward:
+        if self.authority == "system" and not self.homeward:
             self.start("returnToLaunch")
         self.journal.save_soon()
 
-    # News
+    # ControlEvent
 
     def in_air(self) -> None:
         """Remember that the mission flies."""
         mission = self.journal.flying
-        if mission is not None and not mission.flown and self.hands != "pilot":
+        if mission is not None and not mission.flown and self.authority != "pilot":
             mission.flown = True
             self.journal.save_soon()
 
@@ -422,8 +422,8 @@ class Control:
         if old is not None and new is not None and old.key == new.key:
             if self.lease is not None and self.lease.key == new.key:
                 self.lease.grant = new
-            if self.regime is not None and self.regime.grant.key == new.key:
-                self.regime.grant, self.regime.compiled = new, self._for_transit(new)
+            if self.constraints is not None and self.constraints.grant.key == new.key:
+                self.constraints.grant, self.constraints.compiled = new, self._for_transit(new)
             return
         self.wake()
         if old is None or not (old.spec.class_ == "driver" or old.spec.tour):
@@ -434,7 +434,7 @@ class Control:
             return
         verdict = Verdict("takeover", None, "GrantRevoked", "the grant was removed", (), "revoke")
         self.journal.active, self._removed = self.journal.active or old.key, old
-        if self.hands == "pilot":
+        if self.authority == "pilot":
             mission.outcome = "revoked: the grant was removed"
             self.journal.save_soon()
         else:

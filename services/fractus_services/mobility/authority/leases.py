@@ -13,7 +13,7 @@ from fractus_services.errors import Refused
 from fractus_services.grants import ActiveGrant
 
 
-class State(Enum):
+class ControlState(Enum):
     """States of a driver's stream."""
 
     WAITING = "waiting"
@@ -24,10 +24,10 @@ class State(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class News:
+class ControlEvent:
     """One event on a driver's stream."""
 
-    state: State
+    state: ControlState
     control_point: int = 0
     reason: str = ""
     waypoints_reached: int = 0
@@ -35,7 +35,7 @@ class News:
     @property
     def final(self) -> bool:
         """Whether the stream ends after it."""
-        return self.state in {State.LOST, State.COMPLETE}
+        return self.state in {ControlState.LOST, ControlState.COMPLETE}
 
 
 class Lease:
@@ -51,29 +51,29 @@ class Lease:
         self.grant = grant
         self.granted = False
         self.transit = False
-        self._news: asyncio.Queue[News | None] = asyncio.Queue()
+        self._events: asyncio.Queue[ControlEvent | None] = asyncio.Queue()
 
     @property
     def key(self) -> str:
         """The mission."""
         return self.grant.key
 
-    def tell(self, news: News | None) -> None:
+    def tell(self, event: ControlEvent | None) -> None:
         """Send an event to the driver; None ends the stream without one."""
-        self._news.put_nowait(news)
+        self._events.put_nowait(event)
 
-    async def next(self, timeout_s: float) -> News | None:
+    async def next(self, timeout_s: float) -> ControlEvent | None:
         """The next event, or None when the stream ends.
 
         Raises:
             TimeoutError: nothing happened.
         """
         async with asyncio.timeout(timeout_s):
-            return await self._news.get()
+            return await self._events.get()
 
 
 @dataclass(eq=False, slots=True)
-class Regime:
+class FlightConstraints:
     """The fences under which the system flies an application's drone; they follow the grant when it changes."""
 
     grant: ActiveGrant

@@ -68,7 +68,7 @@ class Observer:
         checked, idle = self._control.checked, not self._control.autopilot.vehicle.armed
         if checked is None or checked.problem == BEING_SET:
             return True
-        return bool(checked.problem) and idle and not self._control.helm.preparing
+        return bool(checked.problem) and idle and not self._control.modes.preparing
 
     def _resume(self) -> None:
         """Decide who has a vehicle that was there before us, or comes back from a broken link."""
@@ -77,10 +77,10 @@ class Observer:
         if self._control.was_armed is None:
             self._control.was_armed = vehicle.armed
         lease = self._control.lease
-        if lease is not None and (lease.granted or self._control.regime is not None):
+        if lease is not None and (lease.granted or self._control.constraints is not None):
             return
-        self._control.helm.expected = vehicle.mode
-        if vehicle.armed and self._control.hands == "pilot":
+        self._control.modes.expected = vehicle.mode
+        if vehicle.armed and self._control.authority == "pilot":
             return
         if not vehicle.armed:
             if mission is not None and mission.flown and not mission.outcome:
@@ -89,11 +89,11 @@ class Observer:
         if vehicle.mode not in HOMEWARD | {GUIDED} or (mission is None and vehicle.mode != GUIDED):
             self._pilot(f"is flying in {vehicle.mode_name}")
         elif mission is None:
-            self._control.hands = "system"
+            self._control.authority = "system"
             self._control.note("returnToLaunch", "system", "found the drone armed, and no mission", kind="takeover")
             self._control.start("returnToLaunch")
         elif vehicle.mode in HOMEWARD:
-            self._control.hands, self._control.homeward = "system", True
+            self._control.authority, self._control.homeward = "system", True
             if not mission.outcome:
                 mission.outcome = "failed: the autopilot flew home by itself while the mobility service was away"
                 self._control.journal.save_soon()
@@ -102,7 +102,7 @@ class Observer:
                 self._control.act("returnToLaunch" if vehicle.mode != LAND else "land")
             )
         else:
-            self._control.hands = "system"
+            self._control.authority = "system"
             self._control.note("hover", "system", "found the drone in the air", kind="takeover")
             self._take_back(mission)
 
@@ -130,16 +130,16 @@ class Observer:
             self._armed() if vehicle.armed else self._landed()
         if (
             vehicle.armed
-            and not self._control.helm.changing
-            and self._control.helm.expected is not None
-            and vehicle.mode != self._control.helm.expected
+            and not self._control.modes.changing
+            and self._control.modes.expected is not None
+            and vehicle.mode != self._control.modes.expected
         ):
             self._foreign_mode(vehicle.mode)
-        if not vehicle.armed and not self._control.helm.changing:
-            self._control.helm.expected = vehicle.mode
+        if not vehicle.armed and not self._control.modes.changing:
+            self._control.modes.expected = vehicle.mode
 
     def _armed(self) -> None:
-        if self._control.hands != "driver" and not self._control.helm.arming:
+        if self._control.authority != "driver" and not self._control.modes.arming:
             self._pilot("armed the drone")
         self._control.tasks.spawn(self._control.tasks.attempt(self._control.autopilot.set_rates, flying=True))
 
@@ -148,10 +148,10 @@ class Observer:
         mission = self._control.journal.flying
         self._control.tasks.drop(self._control.system)
         self._control.homeward = False
-        if self._control.hands == "pilot" and mission is not None and mission.flown and not mission.outcome:
+        if self._control.authority == "pilot" and mission is not None and mission.flown and not mission.outcome:
             mission.outcome = "failed: a human pilot took the drone and landed it"
         if self._control.lease is None or not self._control.lease.granted:
-            self._control.hands = "system"
+            self._control.authority = "system"
             if mission is None or mission.outcome:
                 self._control.journal.active = None
         self._control.note("landed", self._control.controller, "the motors are stopped")
@@ -163,10 +163,10 @@ class Observer:
         """Somebody else changed the mode: the autopilot's own failsafe, or a human pilot."""
         vehicle = self._control.autopilot.vehicle
         name = MODE_NAMES.get(mode, str(mode))
-        self._control.helm.expected = mode
+        self._control.modes.expected = mode
         recent = self._control.autopilot.now - vehicle.failsafe_text_at < SAID_S
         said = vehicle.failsafe_text if recent else ""
-        if (vehicle.failsafe or said) and mode in HOMEWARD and self._control.hands != "pilot":
+        if (vehicle.failsafe or said) and mode in HOMEWARD and self._control.authority != "pilot":
             reason = f"the autopilot's own failsafe took the drone ({said or name})"
             self._control.note(name, "system", reason, "AutopilotFailsafe", kind="takeover")
             mission = self._control.journal.flying
@@ -174,14 +174,14 @@ class Observer:
                 mission.outcome = f"failed: {reason}"
                 self._control.journal.save_soon()
             self._control.lose(reason)
-            self._control.hands, self._control.homeward = "system", True
+            self._control.authority, self._control.homeward = "system", True
             self._control.tasks.drop(self._control.system)
             self._control.system = self._control.tasks.spawn(
                 self._control.act("land" if mode == LAND else "returnToLaunch")
             )
-        elif self._control.hands == "pilot" and mode == GUIDED and self._control.journal.flying is not None:
+        elif self._control.authority == "pilot" and mode == GUIDED and self._control.journal.flying is not None:
             self._control.note("hover", "system", "the pilot handed the drone back", kind="takeover")
-            self._control.hands = "system"
+            self._control.authority = "system"
             self._take_back(self._control.journal.flying)
         else:
             self._pilot(f"changed the mode to {name}")
@@ -190,9 +190,9 @@ class Observer:
         """A human pilot has the drone: applications lose it at once, and we keep our hands off."""
         reason = f"a human pilot {what}"
         log.warning("%s", reason)
-        if self._control.hands != "pilot":
+        if self._control.authority != "pilot":
             self._control.note("pilot", "pilot", reason, "PilotTookOver", kind="takeover")
         self._control.tasks.drop(self._control.system)
         self._control.homeward = False
         self._control.lose(reason)
-        self._control.hands = "pilot"
+        self._control.authority = "pilot"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fractus_services.errors import PreconditionFailed
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.authority.leases import Lease, Motion, Regime
+from fractus_services.mobility.authority.leases import FlightConstraints, Lease, Motion
 from fractus_services.mobility.mavlink.link import Permit
 
 
@@ -33,18 +33,22 @@ def transit_permit(control: Control, lease: Lease, motion: Motion) -> Permit:
 
     def check() -> None:
         motion.check()
-        if control.lease is not lease or control.hands != "system" or not control.valid(lease.grant):
+        if control.lease is not lease or control.authority != "system" or not control.valid(lease.grant):
             raise PreconditionFailed("ControlLost", "the driver is gone")
 
     return check
 
 
-def tour_permit(control: Control, regime: Regime, motion: Motion) -> Permit:
+def tour_permit(control: Control, constraints: FlightConstraints, motion: Motion) -> Permit:
     """What the system flies for passengers goes only while nobody else has the drone."""
 
     def check() -> None:
         motion.check()
-        if control.regime is not regime or control.hands != "system" or not control.valid(regime.grant):
+        if (
+            control.constraints is not constraints
+            or control.authority != "system"
+            or not control.valid(constraints.grant)
+        ):
             raise PreconditionFailed("ControlLost", "the system does not fly this mission any more")
 
     return check

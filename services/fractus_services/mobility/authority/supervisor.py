@@ -46,7 +46,7 @@ class Supervisor:
         self._ticked_at = now
         if mute and self.alive():
             control.autopilot.beat()
-        if now >= self._lower_at and self._idle() and control.backstop.raised:
+        if now >= self._lower_at and self._idle() and control.fence.raised:
             self._lower_at = now + LOWER_AGAIN_S
             if self._lowering is None or self._lowering.done():
                 self._lowering = control.tasks.spawn(self._lower())
@@ -68,24 +68,29 @@ class Supervisor:
         if not (control.decided and control.autopilot.connected) or control.autopilot.vehicle.armed:
             return False
         over = mission is None or bool(mission.outcome) or not mission.flown
-        return over and not control.helm.preparing
+        return over and not control.modes.preparing
 
     async def _lower(self) -> None:
-        await self._control.tasks.attempt(self._control.backstop.lower, self._idle)
+        await self._control.tasks.attempt(self._control.fence.lower, self._idle)
 
     def _orphaned(self) -> bool:
-        """Whether the motors run for nobody: no pilot, no driver, no chauffeur, no tour, no grace, no way home."""
+        """Whether the motors run for nobody: no pilot, no driver, no transit, no tour, no grace, no way home."""
         control, lease = self._control, self._control.lease
-        if not control.autopilot.vehicle.armed or control.helm.arming or control.hands == "pilot" or control.graced:
+        if (
+            not control.autopilot.vehicle.armed
+            or control.modes.arming
+            or control.authority == "pilot"
+            or control.graced
+        ):
             return False
-        if lease is not None and (control.drives(lease) or control.regime is not None):
+        if lease is not None and (control.drives(lease) or control.constraints is not None):
             return False
         at_work = control.system is not None and not control.system.done()
         return not (at_work and (control.homeward or control.touring is not None))
 
     def _adopt(self) -> None:
         control, mission = self._control, self._control.journal.flying
-        control.hands = "system"
+        control.authority = "system"
         control.stop_motion(PreconditionFailed("ControlLost", "the system took the drone"))
         alive = mission is not None and not mission.outcome and control.mission_grant is not None
         action: Takeover = "hover" if alive and control.autopilot.vehicle.in_air else "returnToLaunch"

@@ -17,7 +17,7 @@ from fractus_core.policy.values import Call, GotoArgs, Situation
 from fractus_services.errors import Aborted, PreconditionFailed, Refused, Unavailable
 from fractus_services.mobility.authority.background import in_slices
 from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.authority.leases import Motion, Regime
+from fractus_services.mobility.authority.leases import FlightConstraints, Motion
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import REACHED_M, Step, at_rest, come_to_rest, fly_to
 from fractus_services.mobility.mavlink.link import Permit
@@ -43,12 +43,12 @@ class Trip:
     """A flight by the system.
 
     Attributes:
-        regime: the fences it keeps to.
+        constraints: the fences it keeps to.
         kind: what its motions are called.
         permit: for each motion, what its commands are asked for before they are sent.
     """
 
-    regime: Regime
+    constraints: FlightConstraints
     kind: str
     permit: Callable[[Motion], Permit]
 
@@ -79,9 +79,9 @@ async def first_leg(
     """
     heights = tuple(dict.fromkeys(heights_m))
     for _ in range(REPLANS + 1):
-        grant = trip.regime.compiled
+        grant = trip.constraints.compiled
         found = await _first_leg(goal, heights, now, grant)
-        if trip.regime.compiled is grant:
+        if trip.constraints.compiled is grant:
             return found
     raise Aborted("FencesChanged", "the fences change faster than a way is found")
 
@@ -162,7 +162,7 @@ class Courses:
         raise Aborted("NotFollowing", f"the drone did not arrive within {MAX_LEGS} legs")
 
     async def _next(self, trip: Trip, target: GotoArgs) -> tuple[GotoArgs, bool]:
-        now, grant = self._guard.situation(), trip.regime.compiled
+        now, grant = self._guard.situation(), trip.constraints.compiled
         if now.lat is None or now.lon is None:
             raise Unavailable("AutopilotUnavailable", "the drone's position is not known")
         wanted = now.altitude_m
@@ -189,13 +189,13 @@ class Courses:
 
     def _unreachable(self, trip: Trip, target: GotoArgs) -> Refused:
         """No way is found: what the policies say of the straight one tells why."""
-        verdict = self._guard.judge(Call("Goto", target), trip.regime.grant, trip.regime.compiled)
+        verdict = self._guard.judge(Call("Goto", target), trip.constraints.grant, trip.constraints.compiled)
         why = verdict.reason or "no way around the zones is found"
         return PreconditionFailed("NoLegalWay", f"the system cannot fly to {target.lat:.6f}, {target.lon:.6f}: {why}")
 
     def _allowed(self, trip: Trip, leg: GotoArgs) -> GotoArgs:
         """A leg as the policies allow it."""
-        verdict = self._guard.judge(Call("Goto", leg), trip.regime.grant, trip.regime.compiled)
+        verdict = self._guard.judge(Call("Goto", leg), trip.constraints.grant, trip.constraints.compiled)
         if not verdict.permits or not isinstance(verdict.args, GotoArgs):
             raise PreconditionFailed("NoLegalWay", f"the system cannot fly there: {verdict.reason}")
         return replace(verdict.args, speed_mps=verdict.args.speed_mps or self._control.cruise_mps)

@@ -80,17 +80,17 @@ class Homing:
         control = self._control
         if self._clear(grant.compiled):
             return ""
-        regime = control.under(grant)
+        constraints = control.begin_system_flight(grant)
 
         def permit() -> None:
-            if not wanted() or control.regime is not regime:
+            if not wanted() or control.constraints is not constraints:
                 raise AutopilotError("the system does not have the drone any more")
 
         try:
-            await control.helm.change_mode(GUIDED, permit)
-            return await self._round(Trip(regime, "Homeward", lambda motion: _both(permit, motion)))
+            await control.modes.change_mode(GUIDED, permit)
+            return await self._round(Trip(constraints, "Homeward", lambda motion: _both(permit, motion)))
         finally:
-            control.relieve(regime)
+            control.end_system_flight(constraints)
 
     async def _round(self, trip: Trip) -> str:
         """Fly around what is in the way; why there is no way, or nothing.
@@ -131,7 +131,7 @@ class Homing:
                 try:
                     await come_to_rest(autopilot, motion, permit)
                 except Refused as refusal:
-                    if refusal.verdict.code == "NotStopping" and self._clear(trip.regime.compiled):
+                    if refusal.verdict.code == "NotStopping" and self._clear(trip.constraints.compiled):
                         return  # in a wind that gives it no rest the drone flies home all the same
                     raise
             leg = await self._leg(trip)
@@ -149,7 +149,7 @@ class Homing:
         return _straight(now, grant)
 
     async def _leg(self, trip: Trip) -> GotoArgs | None:
-        now, grant = self._guard.situation(), trip.regime.compiled
+        now, grant = self._guard.situation(), trip.constraints.compiled
         if now.lat is None or now.lon is None or now.home is None or _straight(now, grant):
             return None
         # The whole way is flown by us, so the autopilot's own straight one need not be legal from its waypoints.

@@ -155,7 +155,7 @@ async def come_to_rest(autopilot: Autopilot, motion: Motion, permit: Permit) -> 
                 autopilot.stop()
                 sent = autopilot.now
             motion.check()
-            await _news(autopilot)
+            await _next_message(autopilot)
     finally:
         motion.braking = False
     motion.check()
@@ -187,10 +187,10 @@ async def _tick(autopilot: Autopilot, motion: Motion) -> None:
     deadline = autopilot.now + REPORT_S
     while autopilot.now < deadline:
         motion.check()
-        await _news(autopilot)
+        await _next_message(autopilot)
     motion.check()
 
 
-async def _news(autopilot: Autopilot) -> None:
+async def _next_message(autopilot: Autopilot) -> None:
     if not await autopilot.update(REPORT_S) and not autopilot.connected:
         raise Unavailable("AutopilotUnavailable", "the autopilot is no longer heard; it flies home by its own failsafe")

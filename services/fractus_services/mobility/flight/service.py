@@ -200,7 +200,7 @@ class MobilityService:
 
         async def steps(motion: Motion) -> AsyncIterator[Progress]:
             permit = driver_permit(self._control, grant, motion)
-            await self._control.helm.change_mode(GUIDED, permit)
+            await self._control.modes.change_mode(GUIDED, permit)
             async for step in climb(self._autopilot, motion, altitude, permit):
                 yield Progress(verdict, step)
 
@@ -263,7 +263,7 @@ class MobilityService:
         """
         for _ in range(JUDGEMENTS):
             begun = self._autopilot.now
-            await self._control.helm.change_mode(GUIDED, permit)
+            await self._control.modes.change_mode(GUIDED, permit)
             if verdict.brake_first:
                 await come_to_rest(self._autopilot, motion, permit)
             elif self._autopilot.now - begun <= JUDGE_AGAIN_S:
@@ -294,7 +294,7 @@ class MobilityService:
         self._flying("Land")
 
         async def steps(motion: Motion) -> AsyncIterator[Progress]:
-            await self._control.helm.change_mode(LAND, driver_permit(self._control, grant, motion))
+            await self._control.modes.change_mode(LAND, driver_permit(self._control, grant, motion))
             async for step in come_down(self._autopilot, motion):
                 yield Progress(verdict, step)
 
@@ -309,10 +309,10 @@ class MobilityService:
         async def steps(motion: Motion) -> AsyncIterator[Progress]:
             control = self._control
             permit = driver_permit(control, grant, motion)
-            regime = control.under(control.require(grant).grant)
+            constraints = control.begin_system_flight(control.require(grant).grant)
             try:
-                await control.helm.change_mode(GUIDED, permit)
-                trip = Trip(regime, motion.kind, lambda _motion: permit)
+                await control.modes.change_mode(GUIDED, permit)
+                trip = Trip(constraints, motion.kind, lambda _motion: permit)
                 async with aclosing(self._homing.around(trip, motion)) as legs:  # type: ignore[type-var]
                     async for step in legs:
                         yield Progress(verdict, step)
@@ -322,8 +322,8 @@ class MobilityService:
                     raise
                 mode = SMART_RTL
             finally:
-                control.relieve(regime)
-            await control.helm.change_mode(mode, permit)
+                control.end_system_flight(constraints)
+            await control.modes.change_mode(mode, permit)
             async for step in come_down(self._autopilot, motion):
                 yield Progress(verdict, step)
 

@@ -11,7 +11,7 @@ from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Mission
 from fractus_services.mobility.authority.permits import tour_permit
 from fractus_services.mobility.flight.courses import Courses, Trip
-from fractus_services.mobility.flight.transit import FAULT, Chauffeur, target_of
+from fractus_services.mobility.flight.transit import FAULT, TransitFlight, target_of
 from fractus_services.mobility.mavlink.link import AutopilotError
 
 log = logging.getLogger(__name__)
@@ -27,17 +27,17 @@ class Tours:
     Args:
         control: the state machine of the drone.
         grants: grants of this node.
-        chauffeur: arms and takes off.
+        transit: arms and takes off.
         courses: flies the legs.
         boarding_s: a passenger that never calls the mobility service is flown this long after its grant came.
     """
 
     def __init__(
-        self, control: Control, grants: GrantFiles, chauffeur: Chauffeur, courses: Courses, boarding_s: float
+        self, control: Control, grants: GrantFiles, transit: TransitFlight, courses: Courses, boarding_s: float
     ) -> None:
         self._control = control
         self._grants = grants
-        self._chauffeur = chauffeur
+        self._transit = transit
         self._courses = courses
         self._boarding_s = boarding_s
         self._since: dict[str, float] = {}
@@ -78,7 +78,7 @@ class Tours:
         other = control.journal.flying
         if other is not None and other.key != grant.key and not other.outcome:
             return False
-        if control.hindrance(grant.key) is not None or (vehicle.armed and not control.flies_for(grant.key)):
+        if control.blocked_by(grant.key) is not None or (vehicle.armed and not control.flies_for(grant.key)):
             return False
         aboard = grant.spec.application.uid in self._aboard
         begun = mission is not None and mission.flown
@@ -92,7 +92,7 @@ class Tours:
             await self._visit(grant, mission)
             self._end(mission, "complete")
         except (Refused, AutopilotError) as error:
-            if mission.outcome or control.hands != "system" or control.touring != grant.key:
+            if mission.outcome or control.authority != "system" or control.touring != grant.key:
                 return  # somebody else has taken the drone and has said why
             if _passing(error) and mission.flown:
                 log.warning("the tour of %s waits: %s", grant.identity, error)
@@ -102,7 +102,7 @@ class Tours:
             self._end(mission, f"failed: {error}")
         except Exception:
             log.exception("the tour of %s cannot be flown", grant.identity)
-            if not mission.outcome and control.hands == "system" and control.touring == grant.key:
+            if not mission.outcome and control.authority == "system" and control.touring == grant.key:
                 self._end(mission, f"failed: {FAULT}")
         finally:
             if control.touring == grant.key:
@@ -112,13 +112,13 @@ class Tours:
     async def _visit(self, grant: ActiveGrant, mission: Mission) -> None:
         """Fly to each point that was not visited yet."""
         control = self._control
-        regime = control.begin_transit(grant, mission)
-        trip = Trip(regime, "Tour", lambda motion: tour_permit(control, regime, motion))
+        constraints = control.begin_transit(grant, mission)
+        trip = Trip(constraints, "Tour", lambda motion: tour_permit(control, constraints, motion))
         access = grant.spec.points_of_interest
         stay_s = STAY_S if access is not None and access.service_access == "points" else 0.0
         places = grant.spec.tour
         try:
-            async for doing in self._chauffeur.lift(trip, places[min(mission.waypoints, len(places) - 1)]):
+            async for doing in self._transit.lift(trip, places[min(mission.waypoints, len(places) - 1)]):
                 log.info("%s", doing)
             for number in range(mission.waypoints, len(places)):
                 async for _ in self._courses.fly(trip, target_of(places[number])):
@@ -128,7 +128,7 @@ class Tours:
                 control.wake()
                 await asyncio.sleep(stay_s)
         finally:
-            control.relieve(regime)
+            control.end_system_flight(constraints)
 
     def _end(self, mission: Mission, outcome: str) -> None:
         control = self._control

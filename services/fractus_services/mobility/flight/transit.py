@@ -46,7 +46,7 @@ def target_of(place: Position) -> GotoArgs:
     return GotoArgs(place.lat, place.lon, place.alt, place.altitude_reference)
 
 
-class Chauffeur:
+class TransitFlight:
     """Arms, takes off and flies to where the driver takes over; judged like anybody else."""
 
     def __init__(self, control: Control, guard: Guard, courses: Courses) -> None:
@@ -66,11 +66,11 @@ class Chauffeur:
         """
         control = self._control
         start = start_of(lease.grant.spec.control_points[mission.points_done])
-        regime = control.begin_transit(lease.grant, mission)
-        trip = Trip(regime, "Transit", lambda motion: transit_permit(control, lease, motion))
+        constraints = control.begin_transit(lease.grant, mission)
+        trip = Trip(constraints, "Transit", lambda motion: transit_permit(control, lease, motion))
         try:
-            async for news in self.lift(trip, start):
-                yield news
+            async for event in self.lift(trip, start):
+                yield event
             yield "the system flies to the control point"
             async for _ in self._courses.fly(trip, target_of(start)):
                 pass
@@ -80,12 +80,12 @@ class Chauffeur:
             log.exception("the drone cannot be brought to %s", lease.grant.identity)
             raise self._give_up(lease, mission) from error
         finally:
-            control.relieve(regime)
+            control.end_system_flight(constraints)
 
     def _give_up(self, lease: Lease, mission: Mission) -> Refused:
         """End a mission that a fault of ours would end again and again, and bring the drone home."""
         control = self._control
-        if control.lease is lease and control.hands == "system" and not mission.outcome:
+        if control.lease is lease and control.authority == "system" and not mission.outcome:
             mission.outcome = f"failed: {FAULT}"
             control.note("returnToLaunch", "system", FAULT, "InternalError", kind="takeover")
             control.journal.save_soon()
@@ -112,21 +112,21 @@ class Chauffeur:
                 yield "the system arms the drone"
                 self._allow(Call("Arm"), trip)
                 if not vehicle.armed:
-                    await arm(control, trip.regime.grant, permit)
+                    await arm(control, trip.constraints.grant, permit)
                 climbed = self._allow(Call("Takeoff", TakeoffArgs(self._height_m(place, trip))), trip)
                 yield "the system takes off"
-                await control.helm.change_mode(GUIDED, permit)
+                await control.modes.change_mode(GUIDED, permit)
                 height = climbed.altitude_m if isinstance(climbed, TakeoffArgs) else CRUISE_M
                 async for _ in climb(autopilot, motion, height, permit):
                     pass
-            await control.helm.change_mode(GUIDED, permit)
+            await control.modes.change_mode(GUIDED, permit)
         finally:
             control.finish(motion)
 
     def _height_m(self, place: Position, trip: Trip) -> float:
         if place.alt is None:
             return CRUISE_M
-        home, flat = self._control.autopilot.vehicle.home, trip.regime.compiled.flat_terrain
+        home, flat = self._control.autopilot.vehicle.home, trip.constraints.compiled.flat_terrain
         height = height_m(place.alt, place.altitude_reference, home, flat)
         if height is None:
             raise PreconditionFailed(
@@ -135,7 +135,7 @@ class Chauffeur:
         return height
 
     def _allow(self, call: Call, trip: Trip) -> object:
-        verdict = self._guard.judge(call, trip.regime.grant, trip.regime.compiled)
+        verdict = self._guard.judge(call, trip.constraints.grant, trip.constraints.compiled)
         if not verdict.permits:
             raise PreconditionFailed(
                 "ControlPointUnreachable", f"the system cannot bring the drone there: {verdict.reason}"

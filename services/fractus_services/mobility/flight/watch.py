@@ -77,10 +77,14 @@ class Watch:
         """One check."""
         control, grant = self._control, self._control.mission_grant
         compiled = (
-            control.regime.compiled if control.regime is not None else grant.compiled if grant is not None else None
+            control.constraints.compiled
+            if control.constraints is not None
+            else grant.compiled
+            if grant is not None
+            else None
         )
-        coming = control.homeward and control.regime is None
-        if compiled is None or control.hands == "pilot" or coming or control.autopilot.vehicle.mode != GUIDED:
+        coming = control.homeward and control.constraints is None
+        if compiled is None or control.authority == "pilot" or coming or control.autopilot.vehicle.mode != GUIDED:
             self._alarm = ""
             return
         verdict, ours = self._judge(compiled)
@@ -101,11 +105,13 @@ class Watch:
     def _judge(self, compiled: CompiledGrant) -> tuple[Verdict | None, bool]:
         """What is wrong, and whether the system flies the drone already, so that there is nobody to take it from."""
         control, now = self._control, self._guard.situation()
-        changed = self._has_changed(control.regime.grant if control.regime is not None else control.mission_grant)
+        changed = self._has_changed(
+            control.constraints.grant if control.constraints is not None else control.mission_grant
+        )
         if control.homeward:
             return monitor(now, compiled, leaving=True, changed=changed), True
         verdict = monitor(now, compiled, changed=changed)
-        if verdict is None or verdict.takeover != "hover" or control.hands == "driver":
+        if verdict is None or verdict.takeover != "hover" or control.authority == "driver":
             return verdict, False
         return monitor(now, compiled, leaving=True, changed=changed), True
 
@@ -155,12 +161,12 @@ class Watch:
             log.warning("cannot correct the motion: %s", error)
 
     def _permit(self, motion: Motion | None) -> Permit:
-        """What corrects a motion is sent only while nobody else flies."""
+        """What corrects a motion is sent only while no one else flies."""
         control = self._control
-        lease, hands = control.lease, control.hands
+        lease, authority = control.lease, control.authority
 
         def check() -> None:
-            if control.lease is not lease or control.hands != hands or control.motion is not motion:
+            if control.lease is not lease or control.authority != authority or control.motion is not motion:
                 raise Aborted("Replaced", "something else flies by now")
 
         return check

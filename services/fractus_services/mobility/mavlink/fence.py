@@ -49,7 +49,7 @@ class Owned:
         return self.parameters.get(ENABLE, 0.0) != 0.0
 
 
-class Backstop:
+class MissionFence:
     """Raises and lowers the vehicle's fence. What the owner had is on disk before anything is changed.
 
     Where the owner's own fence is in force, it stays so: the mission's is added, and the lower ceiling counts.

@@ -206,7 +206,7 @@ class Autopilot:
             self._updated = asyncio.Event()
 
     async def update(self, timeout_s: float) -> bool:
-        """Wait for news of the vehicle; False when there were none in time."""
+        """Wait for a message of the vehicle; False when none came in time."""
         event = self._updated
         try:
             async with asyncio.timeout(timeout_s):

@@ -22,7 +22,7 @@ BRAKE_S, BRAKE_AGAIN_S = 8.0, 0.1
 STANDING_MPS = 0.2
 
 
-class Helm:
+class ModeController:
     """Changes modes and brakes.
 
     Args:

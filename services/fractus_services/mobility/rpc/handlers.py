@@ -18,7 +18,7 @@ from fractus_services.clock import Clock
 from fractus_services.errors import InvalidRequest, PreconditionFailed, Refused, Unavailable
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.authority.leases import News, State
+from fractus_services.mobility.authority.leases import ControlEvent, ControlState
 from fractus_services.mobility.flight.service import MobilityService, Progress
 from fractus_services.mobility.mavlink.link import AutopilotError
 from fractus_services.mobility.rpc.arguments import call_of, checked, goto_args, velocity_args
@@ -31,11 +31,11 @@ JUDGED_S = 0.5
 """A stream is judged again so often: what was revoked ends it within a second."""
 
 _STATES = {
-    State.WAITING: mobility_pb2.ControlEvent.STATE_WAITING,
-    State.RIDING: mobility_pb2.ControlEvent.STATE_RIDING,
-    State.GRANTED: mobility_pb2.ControlEvent.STATE_GRANTED,
-    State.LOST: mobility_pb2.ControlEvent.STATE_LOST,
-    State.COMPLETE: mobility_pb2.ControlEvent.STATE_COMPLETE,
+    ControlState.WAITING: mobility_pb2.ControlEvent.STATE_WAITING,
+    ControlState.RIDING: mobility_pb2.ControlEvent.STATE_RIDING,
+    ControlState.GRANTED: mobility_pb2.ControlEvent.STATE_GRANTED,
+    ControlState.LOST: mobility_pb2.ControlEvent.STATE_LOST,
+    ControlState.COMPLETE: mobility_pb2.ControlEvent.STATE_COMPLETE,
 }
 
 
@@ -79,7 +79,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     def _failed(self, verdict: Verdict) -> None:
         """Something in here broke: hold the drone of a driver where it is."""
-        if self._control.hands == "driver" and self._control.autopilot.vehicle.in_air:
+        if self._control.authority == "driver" and self._control.autopilot.vehicle.in_air:
             self._control.brake(verdict)
 
     # Control
@@ -94,8 +94,8 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
                     asyncio.timeout(max(caller.valid_until_s - self._clock(), 0.0)),
                     aclosing(self._streams.follow(grant)) as events,  # type: ignore[type-var]
                 ):
-                    async for news in events:
-                        await context.write(_event(news))
+                    async for event in events:
+                        await context.write(_event(event))
             except TimeoutError:
                 caller.check(self._clock())
 
@@ -243,12 +243,12 @@ def _known(error: Exception) -> Refused | None:
     )
 
 
-def _event(news: News) -> Any:
+def _event(event: ControlEvent) -> Any:
     return mobility_pb2.ControlEvent(
-        state=_STATES[news.state],
-        control_point=news.control_point,
-        reason=news.reason,
-        waypoints_reached=news.waypoints_reached,
+        state=_STATES[event.state],
+        control_point=event.control_point,
+        reason=event.reason,
+        waypoints_reached=event.waypoints_reached,
     )
 
 

@@ -27,9 +27,9 @@ from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.homing import Homing
 from fractus_services.mobility.flight.service import MobilityService
 from fractus_services.mobility.flight.tours import Tours
-from fractus_services.mobility.flight.transit import Chauffeur
+from fractus_services.mobility.flight.transit import TransitFlight
 from fractus_services.mobility.flight.watch import Watch
-from fractus_services.mobility.mavlink.fence import Backstop
+from fractus_services.mobility.mavlink.fence import MissionFence
 from fractus_services.mobility.mavlink.link import Autopilot
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from fractus_services.mobility.rpc.streams import Streams
@@ -71,14 +71,14 @@ async def run(options: Options, stop: asyncio.Event) -> None:
     grants = GrantFiles(options.grants, node, verifier, options.flat_terrain, audit.refused_grant)
     journal = Journal(options.state)
     autopilot = Autopilot(url)
-    backstop = Backstop(autopilot, options.state)
-    control = Control(autopilot, journal, grants, audit, backstop=backstop, grace_s=options.driver_grace)
+    fence = MissionFence(autopilot, options.state)
+    control = Control(autopilot, journal, grants, audit, fence=fence, grace_s=options.driver_grace)
     guard = Guard(control, audit, clock)
     homing = Homing(control, guard)
-    control.helm.approach = homing.approach
+    control.modes.approach = homing.approach
     courses = Courses(control, guard)
-    chauffeur = Chauffeur(control, guard, courses)
-    tours = Tours(control, grants, chauffeur, courses, options.boarding)
+    transit = TransitFlight(control, guard, courses)
+    tours = Tours(control, grants, transit, courses, options.boarding)
     supervisor = Supervisor(control)
     autopilot.alive = supervisor.alive
     watch = Watch(control, guard, audit, supervisor)
@@ -89,7 +89,7 @@ async def run(options: Options, stop: asyncio.Event) -> None:
     grants.listen(lambda old, new: _record_grant(audit, old, new))
     grants.scan()
     service = MobilityService(control, guard, homing)
-    streams = Streams(control, chauffeur.bring)
+    streams = Streams(control, transit.bring)
     handlers = MobilityHandlers(service, control, streams, grants=grants, node=node, clock=clock, heard=tours.heard)
     async with asyncio.TaskGroup() as tasks:
         running = [

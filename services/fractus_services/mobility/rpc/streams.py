@@ -10,7 +10,7 @@ from fractus_services.errors import PolicyDenied, PreconditionFailed
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Mission
-from fractus_services.mobility.authority.leases import Lease, News, State
+from fractus_services.mobility.authority.leases import ControlEvent, ControlState, Lease
 from fractus_services.mobility.mavlink.vehicle import HOMEWARD
 
 log = logging.getLogger(__name__)
@@ -31,7 +31,7 @@ class Streams:
         self._control = control
         self._bring = bring
 
-    async def follow(self, grant: ActiveGrant) -> AsyncIterator[News]:
+    async def follow(self, grant: ActiveGrant) -> AsyncIterator[ControlEvent]:
         """The events of a caller's stream.
 
         Raises:
@@ -39,34 +39,34 @@ class Streams:
         """
         events = self._ride(grant) if grant.spec.tour else self._drive(grant)
         async with aclosing(events) as running:  # type: ignore[type-var]
-            async for news in running:
-                yield news
+            async for event in running:
+                yield event
 
     # Drivers
 
-    async def _drive(self, grant: ActiveGrant) -> AsyncIterator[News]:
+    async def _drive(self, grant: ActiveGrant) -> AsyncIterator[ControlEvent]:
         """A driver has the drone from GRANTED until this is closed."""
         control = self._control
         mission = self._admit(grant)
         if control.lease is not None:
-            control.lease.tell(News(State.LOST, reason="another stream of the same instance took over"))
+            control.lease.tell(ControlEvent(ControlState.LOST, reason="another stream of the same instance took over"))
         lease = control.lease = Lease(grant)
         try:
             while control.lease is lease and not lease.granted:
                 async with aclosing(self._until_ready(lease, mission)) as waiting:  # type: ignore[type-var]
                     async for reason in waiting:
-                        yield News(State.WAITING, mission.points_done, reason)
-                if control.lease is lease and control.hindrance(lease.key) is None:
+                        yield ControlEvent(ControlState.WAITING, mission.points_done, reason)
+                if control.lease is lease and control.blocked_by(lease.key) is None:
                     yield control.hand_over(lease, mission)
             while True:
                 try:
-                    news = await lease.next(TOLD_S)
+                    event = await lease.next(TOLD_S)
                 except TimeoutError:
                     continue
-                if news is None:
+                if event is None:
                     return
-                yield news
-                if news.final:
+                yield event
+                if event.final:
                     return
         finally:
             self._left(lease)
@@ -87,7 +87,7 @@ class Streams:
     async def _until_ready(self, lease: Lease, mission: Mission) -> AsyncIterator[str]:
         control, said = self._control, ""
         while control.lease is lease:
-            reason = control.hindrance(lease.key)
+            reason = control.blocked_by(lease.key)
             if control.taken(lease.key):
                 raise PreconditionFailed("ControlHeld", "another application has the drone; try again when it is back")
             if reason is None:
@@ -95,8 +95,8 @@ class Streams:
                     return
                 lease.transit = True
                 async with aclosing(self._bring(lease, mission)) as flying:  # type: ignore[type-var]
-                    async for news in flying:
-                        yield news
+                    async for event in flying:
+                        yield event
                 return
             if reason != said:
                 said = reason
@@ -112,7 +112,7 @@ class Streams:
         mission = control.journal.missions.get(lease.key)
         if mission is None or not (lease.granted or lease.transit):
             return
-        control.hands = "system"
+        control.authority = "system"
         control.note("driver lost", lease.grant.identity, "its stream broke")
         log.warning("driver %s is lost", lease.grant.identity)
         leaving = control.motion is not None and control.motion.kind in {"Land", "ReturnToLaunch"}
@@ -124,30 +124,32 @@ class Streams:
 
     # Passengers
 
-    async def _ride(self, grant: ActiveGrant) -> AsyncIterator[News]:
+    async def _ride(self, grant: ActiveGrant) -> AsyncIterator[ControlEvent]:
         """A passenger whose points of interest the system visits is told how far it is; leaving changes nothing."""
         control = self._control
         mission = control.journal.mission(grant)
         _open(mission)
-        said: News | None = None
+        said: ControlEvent | None = None
         while True:
-            news = self._ridden(grant, mission)
-            if news != said:
-                said = news
-                yield news
-            if news.final:
+            event = self._ridden(grant, mission)
+            if event != said:
+                said = event
+                yield event
+            if event.final:
                 return
             await control.wait(WAIT_S)
 
-    def _ridden(self, grant: ActiveGrant, mission: Mission) -> News:
+    def _ridden(self, grant: ActiveGrant, mission: Mission) -> ControlEvent:
         done = mission.waypoints
         if mission.outcome == "complete":
-            return News(State.COMPLETE, done, "every point of interest was visited", done)
+            return ControlEvent(ControlState.COMPLETE, done, "every point of interest was visited", done)
         if mission.outcome:
-            return News(State.LOST, done, mission.outcome, done)
+            return ControlEvent(ControlState.LOST, done, mission.outcome, done)
         if self._control.touring == grant.key:
-            return News(State.RIDING, done, "the system flies through the points of interest", done)
-        return News(State.WAITING, done, self._control.hindrance(grant.key) or "the system is about to take off", done)
+            return ControlEvent(ControlState.RIDING, done, "the system flies through the points of interest", done)
+        return ControlEvent(
+            ControlState.WAITING, done, self._control.blocked_by(grant.key) or "the system is about to take off", done
+        )
 
 
 def _open(mission: Mission) -> None:

@@ -14,7 +14,7 @@ from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame
 from fractus_services.mobility.mavlink import fence as module
 from fractus_services.mobility.mavlink.bounds import ROOM_M, bounds_of
-from fractus_services.mobility.mavlink.fence import Backstop
+from fractus_services.mobility.mavlink.fence import MissionFence
 from fractus_services.mobility.mavlink.itemlists import Item, NoLists
 from fractus_services.mobility.mavlink.link import AutopilotError
 
@@ -112,8 +112,8 @@ def test_nothing_bounded_nothing_loaded() -> None:
 async def test_a_fence_is_raised_and_put_back(vehicle: Vehicle, tmp_path: Path) -> None:
     before = dict(vehicle.values)
     vehicle.items = (Item(5003, 30.0, 1, 2),)
-    backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
-    await backstop.raise_around(spec(area(-50, -50, 50, 50), **LIMITS), retraces=True)
+    fence = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
+    await fence.raise_around(spec(area(-50, -50, 50, 50), **LIMITS), retraces=True)
     assert vehicle.written[-1] == "FENCE_ENABLE", "it is switched on when all else stands"
     assert vehicle.values["FENCE_TYPE"] == 5.0
     assert vehicle.values["FENCE_ACTION"] == 3.0
@@ -121,7 +121,7 @@ async def test_a_fence_is_raised_and_put_back(vehicle: Vehicle, tmp_path: Path) 
     assert {i.command for i in vehicle.items} == {5001}, (
         "what the owner had stored and not enabled stays out of the way"
     )
-    again = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
+    again = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
     assert again.raised, "a service that was restarted knows"
     await again.raise_around(spec(area(-10, -10, 10, 10)), retraces=False)
     await again.lower(lambda: True)
@@ -133,8 +133,8 @@ async def test_a_fence_is_raised_and_put_back(vehicle: Vehicle, tmp_path: Path) 
 async def test_the_owners_own_fence_stays_in_force(vehicle: Vehicle, tmp_path: Path) -> None:
     vehicle.values |= {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 3.0, "FENCE_ALT_MAX": 40.0, "FENCE_OPTIONS": 3.0}
     vehicle.items = (Item(5003, 30.0, 1, 2),)
-    backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
-    await backstop.raise_around(spec(area(-50, -50, 50, 50), **LIMITS), retraces=True)
+    fence = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
+    await fence.raise_around(spec(area(-50, -50, 50, 50), **LIMITS), retraces=True)
     assert [n for n in vehicle.written if n == "FENCE_ENABLE"] == ["FENCE_ENABLE"] * 2, (
         "off, and on with all that is new"
     )
@@ -150,13 +150,13 @@ async def test_the_owners_own_fence_stays_in_force(vehicle: Vehicle, tmp_path: P
 
 async def test_a_vehicle_without_fences_is_left_alone(vehicle: Vehicle, tmp_path: Path) -> None:
     del vehicle.values["FENCE_ENABLE"]
-    backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
-    await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
-    assert "FENCE_ENABLE" in backstop.missing
+    fence = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
+    await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+    assert "FENCE_ENABLE" in fence.missing
     assert not vehicle.written
     vehicle.values.clear()
     with pytest.raises(AutopilotError, match="stopped answering"):
-        await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+        await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
 
 
 async def test_a_vehicle_without_item_lists_is_left_alone(
@@ -166,10 +166,10 @@ async def test_a_vehicle_without_item_lists_is_left_alone(
         raise NoLists("the autopilot keeps no fence items")
 
     monkeypatch.setattr(module, "download", unsupported)
-    backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
-    await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
-    assert backstop.missing
-    assert not backstop.raised
+    fence = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
+    await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+    assert fence.missing
+    assert not fence.raised
 
 
 async def test_what_is_read_back_must_be_what_was_sent(
@@ -179,9 +179,9 @@ async def test_what_is_read_back_must_be_what_was_sent(
         vehicle.items = tuple(items)[:-1]
 
     monkeypatch.setattr(module, "upload", forgetful)
-    backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
+    fence = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
     with pytest.raises(AutopilotError, match="stores 3 fence items"):
-        await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+        await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
 
 
 async def test_a_parameter_that_stays_as_it_is_is_told(vehicle: Vehicle, tmp_path: Path) -> None:
@@ -190,20 +190,20 @@ async def test_a_parameter_that_stays_as_it_is_is_told(vehicle: Vehicle, tmp_pat
 
     vehicle.write_parameter = stubborn  # type: ignore[method-assign]
     with pytest.raises(AutopilotError, match="FENCE_TYPE cannot be set to 4"):
-        await Backstop(vehicle, tmp_path).raise_around(spec(area(-50, -50, 50, 50)), retraces=False)  # type: ignore[arg-type]
+        await MissionFence(vehicle, tmp_path).raise_around(spec(area(-50, -50, 50, 50)), retraces=False)  # type: ignore[arg-type]
 
 
 async def test_nothing_is_changed_before_the_owners_fence_is_stored(vehicle: Vehicle, tmp_path: Path) -> None:
-    backstop = Backstop(vehicle, tmp_path / "gone")  # type: ignore[arg-type]
+    fence = MissionFence(vehicle, tmp_path / "gone")  # type: ignore[arg-type]
     with pytest.raises(OSError, match="gone"):
-        await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+        await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     assert not vehicle.written
     assert not vehicle.items
 
 
 async def test_a_damaged_memory_of_the_owners_fence_is_no_memory(vehicle: Vehicle, tmp_path: Path) -> None:
     await asyncio.to_thread((tmp_path / "fence.json").write_text, json.dumps({"items": 3}))
-    await Backstop(vehicle, tmp_path).lower(lambda: True)  # type: ignore[arg-type]
+    await MissionFence(vehicle, tmp_path).lower(lambda: True)  # type: ignore[arg-type]
     assert not vehicle.written
 
 
@@ -213,18 +213,18 @@ OWNED = {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 3.0, "FENCE_ALT_MAX": 40.0}
 async def test_no_fence_is_changed_while_the_motors_run(vehicle: Vehicle, tmp_path: Path) -> None:
     vehicle.values |= OWNED
     vehicle.vehicle.armed = True
-    backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
+    fence = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
     with pytest.raises(AutopilotError, match="the motors run"):
-        await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+        await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     assert not vehicle.written
     vehicle.vehicle.armed = False
-    await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+    await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     vehicle.vehicle.armed = True
     vehicle.written.clear()
     with pytest.raises(AutopilotError, match="the motors run"):
-        await backstop.lower(lambda: True)
+        await fence.lower(lambda: True)
     assert not vehicle.written
-    assert backstop.raised
+    assert fence.raised
 
 
 async def test_motors_that_start_while_the_fence_is_asked_for_keep_it_on(vehicle: Vehicle, tmp_path: Path) -> None:
@@ -238,9 +238,9 @@ async def test_motors_that_start_while_the_fence_is_asked_for_keep_it_on(vehicle
         return await read(name, attempts)
 
     vehicle.read_parameter = slow  # type: ignore[method-assign]
-    backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
+    fence = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
     with pytest.raises(AutopilotError, match="not switched off"):
-        await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+        await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     assert not vehicle.written
 
 
@@ -259,12 +259,12 @@ async def test_a_fence_that_cannot_be_raised_leaves_the_owners(
             raise AutopilotError("no space") if how == "refused" else asyncio.CancelledError
 
     monkeypatch.setattr(module, "upload", full)
-    backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
+    fence = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
     with pytest.raises((AutopilotError, asyncio.CancelledError)):
-        await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+        await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     assert vehicle.values == before
     assert vehicle.items == (Item(5003, 30.0, 1, 2),)
-    assert not backstop.raised
+    assert not fence.raised
 
 
 async def test_an_owners_fence_that_cannot_be_put_back_at_once_is_remembered(
@@ -276,7 +276,7 @@ async def test_an_owners_fence_that_cannot_be_put_back_at_once_is_remembered(
         raise AutopilotError("the autopilot stopped answering", link=True)
 
     monkeypatch.setattr(module, "upload", silent)
-    backstop = Backstop(vehicle, tmp_path)  # type: ignore[arg-type]
+    fence = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
     with pytest.raises(AutopilotError, match="stopped answering"):
-        await backstop.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
-    assert backstop.raised, "the supervisor puts it back later"
+        await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+    assert fence.raised, "the supervisor puts it back later"

@@ -1,88 +1,110 @@
-"""The `fractus` command: finds its subcommands in whatever parts of Fractus are installed."""
+"""The `fractus` command: lists its subcommands without importing them, and imports the one that is called."""
 
 from __future__ import annotations
 
 import difflib
-import importlib.metadata
+import importlib
+import importlib.util
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import click
 
-GROUP = "fractus.commands"
 EXIT_OK = 0
 EXIT_BAD_INPUT = 1
 EXIT_INFEASIBLE = 2
 EXIT_INTERRUPTED = 130
 
-_EXTRA_OF = {
-    "fractus_cluster": "sim",
-    "fractus_sim": "sim",
-    "fractus_vehicle": "sim",
-    "fractus_world": "sim",
-    "fractus_services": "services",
-    "fractus_agent": "agent",
-    "fractus_cli": "core",
-}
+_MARKERS = {"core": "shapely", "operator": "cryptography", "services": "cv2", "sim": "matplotlib"}
+"""A module that tells whether an extra is installed: looking for it takes a millisecond, importing a command a second."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """Where a command is, and what the list of commands says of it.
+
+    Named by strings, because an import of every command would take seconds, and fail where an extra is missing.
+
+    Attributes:
+        place: MODULE:ATTRIBUTE.
+        summary: its line in `fractus --help`.
+        extra: what has to be installed for it; empty for the base.
+    """
+
+    place: str
+    summary: str
+    extra: str = ""
+
+    @property
+    def installed(self) -> bool:
+        """Whether the command can probably be imported."""
+        modules = [self.place.partition(":")[0].partition(".")[0], *filter(None, [_MARKERS.get(self.extra)])]
+        return all(importlib.util.find_spec(module) for module in modules)
+
+
+COMMANDS: dict[str, Entry] = {
+    "audit": Entry("fractus_cli.audit:audit", "Check audit logs of node services.", "services"),
+    "camera": Entry("fractus_services.camera.__main__:camera", "The camera service of a node.", "services"),
+    "camera-world": Entry("fractus_world.__main__:camera_world", "Serve what a camera above a simulated world sees.", "sim"),
+    "cluster": Entry("fractus_cluster.cli:cluster", "Run a real Kubernetes of several nodes on this machine.", "sim"),
+    "experiment": Entry("fractus_sim.experiment.cli:experiment", "Run experiments with faults, checks and a report.", "sim"),
+    "grants": Entry("fractus_cli.grants:grants", "Sign Grants and make certificates, without Kubernetes.", "operator"),
+    "images": Entry("fractus_cluster.images.cli:images", "Build the container images of Fractus with buildah.", "sim"),
+    "mobility": Entry("fractus_services.mobility.__main__:mobility", "The mobility service of a drone.", "services"),
+    "plan": Entry("fractus_cli.plan:plan", "Plan the Applications in some manifests, without a cluster.", "core"),
+    "policy": Entry("fractus_cli.policy:policy", "Ask the policy engine, without a cluster.", "core"),
+    "telemetry": Entry("fractus_cli.telemetry:telemetry", "Print the state of a drone until interrupted."),
+    "vehicle": Entry("fractus_vehicle.__main__:vehicle", "Simulate ArduCopter-compatible vehicles.", "sim"),
+    "zones": Entry("fractus_cli.zones:zones", "Read and write Zones in other formats.", "core"),
+}  # fmt: skip
 
 
 class LazyGroup(click.Group):
-    """A group whose commands are entry points, imported only when they are asked for.
-
-    A command whose extra is not installed stays out of the help; calling it says what to install.
-    """
+    """A group that imports a command when it is called, and lists those whose extra is installed."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Names of the commands that there could be."""
-        return sorted({*super().list_commands(ctx), *(e.name for e in _entry_points())})
+        """Names of all commands."""
+        return sorted(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import one command; None when there is none of that name."""
-        own = super().get_command(ctx, cmd_name)
-        if own is not None:
-            return own
-        for entry in _entry_points():
-            if entry.name == cmd_name:
-                return _load(entry)
-        return None
+        entry = COMMANDS.get(cmd_name)
+        if entry is None:
+            return None
+        module, _, attribute = entry.place.partition(":")
+        try:
+            command: click.Command = getattr(importlib.import_module(module), attribute)
+        except ImportError as error:
+            return _missing(cmd_name, entry, error)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the commands without importing them."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, entry.summary) for name, entry in COMMANDS.items() if entry.installed])
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command meant; a mistyped one is answered with the nearest."""
+        """Find the command; the error for a mistyped one names the nearest."""
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError:
-            near = difflib.get_close_matches(args[0], self.list_commands(ctx), n=1)
+            near = difflib.get_close_matches(args[0], COMMANDS, n=1)
             hint = f"did you mean {near[0]}?" if near else "see `fractus --help`"
             raise click.UsageError(f"there is no command {args[0]}; {hint}") from None
 
 
-def _entry_points() -> Sequence[importlib.metadata.EntryPoint]:
-    return tuple(importlib.metadata.entry_points(group=GROUP))
-
-
-def _load(entry: importlib.metadata.EntryPoint) -> click.Command:
-    try:
-        command = entry.load()
-    except ImportError as error:
-        return _missing(entry, error)
-    if not isinstance(command, click.Command):
-        raise click.ClickException(f"{entry.value} is not a command; reinstall the package that brings it")
-    return command
-
-
-def _missing(entry: importlib.metadata.EntryPoint, error: ImportError) -> click.Command:
-    extra = _EXTRA_OF.get(entry.module.split(".", maxsplit=1)[0], "sim")
+def _missing(name: str, entry: Entry, error: ImportError) -> click.Command:
     lacking = error.name or str(error)
 
-    @click.command(entry.name, hidden=True, add_help_option=False, context_settings={"ignore_unknown_options": True})
+    @click.command(name, hidden=True, add_help_option=False, context_settings={"ignore_unknown_options": True})
     @click.argument("rest", nargs=-1, type=click.UNPROCESSED)
     def hint(rest: tuple[str, ...]) -> None:
         del rest
-        raise click.ClickException(
-            f"`fractus {entry.name}` needs {lacking}; install it with: pip install 'fractus[{extra}]'"
-        )
+        wanted = f"fractus[{entry.extra}]" if entry.extra else "fractus"
+        raise click.ClickException(f"`fractus {name}` needs {lacking}; install it with: pip install '{wanted}'")
 
     return hint
 
@@ -112,7 +134,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 def _explain(error: Exception) -> int:
     while isinstance(error, ExceptionGroup):
-        error = error.exceptions[0]  # what failed first; what it took along says less
+        error = error.exceptions[0]  # what failed first is the cause; the others were cancelled by it
     match error:
         case click.exceptions.NoArgsIsHelpError():
             click.echo(error.format_message())
@@ -134,8 +156,7 @@ def _explain(error: Exception) -> int:
 def _sentence(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    text = " ".join(str(error).split())
-    return text or type(error).__name__
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def _complain(message: str, code: int) -> int:

@@ -19,7 +19,7 @@ import pytest
 import yaml
 from fractus_cluster.ports import free_port
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
-from fractus_services.audit import verify
+from fractus_services.chain import verify
 from mobility_rig import (
     DRIVER,
     FRAME,

@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from fractus_services.audit import AuditLog, audit, verify
-from fractus_services.chain import digest, segments
+from fractus_cli.audit import audit
+from fractus_services.audit import AuditLog
+from fractus_services.chain import digest, segments, verify
 
 
 async def written(path: Path, count: int, begin: int = 0) -> list[bytes]:

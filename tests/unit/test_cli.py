@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.metadata
+import subprocess
+import sys
 from collections.abc import Callable
 
 import click
@@ -33,17 +35,17 @@ def probe(how: str) -> None:
     click.echo(how)
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def commands(monkeypatch: pytest.MonkeyPatch) -> None:
-    entries = (
-        importlib.metadata.EntryPoint("probe", f"{__name__}:probe", cli.GROUP),
-        importlib.metadata.EntryPoint("cluster", "fractus_sim.no_such_module:cluster", cli.GROUP),
-    )
-    monkeypatch.setattr(cli, "_entry_points", lambda: entries)
+    entries = {
+        "probe": cli.Entry(f"{__name__}:probe", "Do what the test says."),
+        "cluster": cli.Entry("no_such_package.cli:cluster", "A cluster.", "sim"),
+    }
+    monkeypatch.setattr(cli, "COMMANDS", entries)
 
 
 @pytest.fixture
-def fractus(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+def fractus(commands: None, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
     def call(*arguments: str) -> tuple[int, str, str]:
         code = cli.run(arguments)
         said = capsys.readouterr()
@@ -94,3 +96,23 @@ def test_version_and_bare_command(fractus: Callable[..., tuple[int, str, str]]) 
     code, out, _ = fractus()
     assert code == 0
     assert out.startswith("Usage: fractus")
+
+
+@pytest.mark.parametrize("name", sorted(cli.COMMANDS))
+def test_the_list_names_commands_that_are_there(name: str) -> None:
+    entry = cli.COMMANDS[name]
+    assert entry.installed
+    command = cli.fractus.get_command(click.Context(cli.fractus), name)
+    assert command is not None
+    assert command.name == name
+    assert not command.hidden
+
+
+def test_help_imports_no_command() -> None:
+    program = "import sys; from fractus_cli.main import run; run(['--help']); print(*sys.modules, file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    for name in cli.COMMANDS:
+        assert f"\n  {name} " in done.stdout
+    imported = {module.partition(".")[0] for module in done.stderr.split()}
+    assert {module for module in imported if module.startswith("fractus")} == {"fractus_cli"}
+    assert not imported & {"grpc", "numpy", "shapely", "pydantic", "yaml"}

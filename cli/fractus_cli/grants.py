@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import click
 import yaml
 from fractus_core.api import Grant, InvalidObject
-from fractus_operator.cluster.kinds import Body
-from fractus_operator.identity.authority import BrokenAuthority
+from fractus_core.identity.authority import BrokenAuthority
 
 from fractus_cli.standalone import StandalonePki
 
@@ -59,7 +59,7 @@ def sign(files: tuple[Path, ...], tls: Path, to: Path, days: int) -> None:
         raise click.ClickException(str(error)) from None
 
 
-def _manifests(file: Path) -> Iterator[Body]:
+def _manifests(file: Path) -> Iterator[dict[str, Any]]:
     try:
         documents = list(yaml.safe_load_all(file.read_text(encoding="utf-8")))
     except (yaml.YAMLError, UnicodeDecodeError) as error:

@@ -27,8 +27,8 @@ from fractus_core.api import (
 )
 from fractus_core.api.nodes import DroneStatus
 from fractus_core.planning import CLASS_LABEL, Host, Inventory
+from fractus_core.planning.quantities import amount_of
 from fractus_core.validation import check_policy, check_zone
-from fractus_operator.cluster.pods import amount_of
 
 R = TypeVar("R", bound=Resource)
 

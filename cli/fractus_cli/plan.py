@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 import yaml
-from fractus_core.api import API_VERSION, Application, DeploymentPlan, InvalidObject
+from fractus_core.api import API_VERSION, GROUP, Application, DeploymentPlan, InvalidObject
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning import Flight, Host, Infeasible, Inventory, Settings, flight_of
 from fractus_core.planning import plan as decide
@@ -20,14 +20,16 @@ from fractus_core.planning.plugins import GROUP as PLUGINS
 from fractus_core.planning.plugins import UnknownPlugin, load_plugin
 from fractus_core.policy.grants import compile_grants
 from fractus_core.validation import check_application
-from fractus_operator.cluster.labels import INFEASIBLE_ANNOTATION
 
+from fractus_cli.main import EXIT_INFEASIBLE
 from fractus_cli.manifests import BadManifest, Manifests, read_manifests
 from fractus_cli.plan_map import plan_map
 from fractus_cli.plan_table import infeasible_table, plan_table
 
 _DEFAULTS = Settings()
-_INFEASIBLE = 2
+
+INFEASIBLE_ANNOTATION = f"{GROUP}/infeasible"
+"""On what is printed of an application that no plan fits: REASON: MESSAGE."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,7 @@ def plan(context: click.Context, /, paths: Sequence[pathlib.Path], more: Sequenc
         if answer.refusal is not None and output != "table":
             click.echo(f"{'/'.join(answer.application.key)}: {answer.refusal.reason}: {answer.refusal}", err=True)
     if any(answer.refusal is not None for answer in decided):
-        context.exit(_INFEASIBLE)
+        context.exit(EXIT_INFEASIBLE)
 
 
 def plan_all(manifests: Manifests, settings: Settings) -> list[Decided]:

@@ -14,13 +14,12 @@ import re
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from fractus_core.api import Grant, InvalidObject
 from fractus_core.api.plans import component_identity
-from fractus_operator.cluster.kinds import Body
-from fractus_operator.identity.authority import Authority, BrokenAuthority, Data
-from fractus_operator.identity.grantor import Grantor
+from fractus_core.identity.authority import Authority, BrokenAuthority, Data
+from fractus_core.identity.grant_signer import GrantSigner
 
 LIFE = timedelta(days=365)
 
@@ -52,7 +51,7 @@ class StandalonePki:
         self._authority = authority
         self._clock = clock
         self._life = life
-        self._grantor = Grantor(authority, clock)
+        self._signer = GrantSigner(authority, clock)
 
     @classmethod
     def create(cls, directory: Path, clock: Callable[[], datetime] = _now, life: timedelta = LIFE) -> Self:
@@ -105,11 +104,11 @@ class StandalonePki:
             raise InvalidObject("spec.instance", f"{part[-1]!r}, in {identity}, is no name of an instance")
         folder = self._directory / "components" / f"{part[4]}.{part[-1]}"
         now = self._clock()
-        if self._authority.still_good(_read(folder), identity, now):
+        if self._authority.is_current(_read(folder), identity, now):
             return folder
         return _write(folder, self._authority.issue_component(identity, now, self._life))
 
-    def sign(self, manifest: Body, replaces: Grant | None = None) -> Body:
+    def sign(self, manifest: dict[str, Any], replaces: Grant | None = None) -> dict[str, Any]:
         """The manifest of a Grant, signed.
 
         Args:
@@ -119,9 +118,9 @@ class StandalonePki:
         Raises:
             InvalidObject: the manifest is no Grant.
         """
-        return self._grantor.signed(manifest, replaces or Grant.from_body(manifest))
+        return self._signer.sign(manifest, replaces or Grant.from_body(manifest))
 
-    def grant(self, manifest: Body, grants: Path) -> Path:
+    def grant(self, manifest: dict[str, Any], grants: Path) -> Path:
         """Sign a Grant and put it, in one step, where the services of its node look for it.
 
         Args:

@@ -15,14 +15,15 @@ from datetime import UTC, datetime
 from typing import Any
 
 import kopf
+from fractus_core.identity.authority import BrokenAuthority
 
 from fractus_operator import handlers
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Key, Kind
 from fractus_operator.cluster.lease import Lease, LostLease
 from fractus_operator.cluster.store import Store, StoreError, Unconfigured
-from fractus_operator.identity.authority import BrokenAuthority, open_authority
-from fractus_operator.identity.signing import NodeSigning
+from fractus_operator.identity.ca_secret import open_authority
+from fractus_operator.identity.node_requests import NodeSigning
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile.deployments import Deployments
 from fractus_operator.reconcile.location import Locations

@@ -18,6 +18,8 @@ from fractus_cli.grants import grants
 from fractus_cli.standalone import StandalonePki
 from fractus_core.api import Grant, InvalidObject
 from fractus_core.api.plans import component_identity, node_identity
+from fractus_core.identity.authority import SIGNER_LIFE, Authority
+from fractus_core.identity.grant_signer import GrantSigner
 from fractus_core.policy.signatures import (
     SIGNATURE_ANNOTATION,
     SIGNER_ANNOTATION,
@@ -26,8 +28,6 @@ from fractus_core.policy.signatures import (
     verify,
 )
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
-from fractus_operator.identity.authority import SIGNER_LIFE, Authority
-from fractus_operator.identity.grantor import Grantor
 from fractus_services import grant_verifier
 from fractus_services.grant_verifier import GrantVerifier
 from policy_world import spec
@@ -154,23 +154,23 @@ def test_several_authorities_while_one_takes_over() -> None:
 
 def test_each_grant_is_issued_later_whatever_the_clock_does() -> None:
     clock = [NOW]
-    grantor = Grantor(CA, lambda: clock[0])
-    first = grant(grantor.signed(manifest()))
-    second = grant(grantor.signed(manifest()))
+    signer = GrantSigner(CA, lambda: clock[0])
+    first = grant(signer.sign(manifest()))
+    second = grant(signer.sign(manifest()))
     clock[0] = NOW - timedelta(hours=1)
-    third = grant(grantor.signed(manifest(), second))
-    restarted = Grantor(CA, lambda: clock[0])
-    fourth = grant(restarted.signed(manifest(), third))
+    third = grant(signer.sign(manifest(), second))
+    restarted = GrantSigner(CA, lambda: clock[0])
+    fourth = grant(restarted.sign(manifest(), third))
     times = [g.spec.issued_at for g in (first, second, third, fourth)]
     assert times == sorted(set(times), key=str)
 
 
 def test_the_signing_certificate_is_renewed_in_time() -> None:
     clock = [NOW]
-    grantor = Grantor(CA, lambda: clock[0])
+    signer = GrantSigner(CA, lambda: clock[0])
     signers = set()
     for _ in range(6):
-        body = grantor.signed(manifest())
+        body = signer.sign(manifest())
         signers.add(body["metadata"]["annotations"][SIGNER_ANNOTATION])
         assert verify(grant(body), CAS)
         clock[0] += SIGNER_LIFE / 2
@@ -179,14 +179,13 @@ def test_the_signing_certificate_is_renewed_in_time() -> None:
 
 
 def test_the_operator_knows_its_own() -> None:
-    grantor = Grantor(CA, lambda: NOW)
-    body = grantor.signed(manifest())
-    assert grantor.vouches(grant(body))
+    signer = GrantSigner(CA, lambda: NOW)
+    body = signer.sign(manifest())
+    assert signer.problem(grant(body)) is None
     body["metadata"]["annotations"][SIGNATURE_ANNOTATION] = "bm9uc2Vuc2U="
-    assert not grantor.vouches(grant(body))
-    assert not grantor.vouches(grant(manifest()))
-    assert not Grantor(OTHER_CA, lambda: NOW).vouches(grant(signed()))
-    assert not grantor.vouches_for({"kind": "Grant", "metadata": {"name": "g"}, "spec": {"odd": 1}})
+    assert signer.problem(grant(body)) is not None
+    assert signer.problem(grant(manifest())) is not None
+    assert GrantSigner(OTHER_CA, lambda: NOW).problem(grant(signed())) is not None
 
 
 # The node

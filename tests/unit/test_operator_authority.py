@@ -10,8 +10,8 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, ExtensionOID
-from fractus_operator.identity.authority import COMPONENT_LIFE, Authority, BrokenAuthority
-from fractus_operator.identity.signing import NODE_NAME_CLAIM, judge
+from fractus_core.identity.authority import COMPONENT_LIFE, Authority, BrokenAuthority
+from fractus_operator.identity.node_requests import NODE_NAME_CLAIM, judge
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
 IDENTITY = "spiffe://fractus.dev/ns/a/app/b/component/C/instance/b-c"
@@ -38,23 +38,23 @@ def test_a_component_gets_a_short_lived_client_certificate() -> None:
 
 def test_a_certificate_is_kept_for_two_thirds_of_its_life() -> None:
     data = AUTHORITY.issue_component(IDENTITY, NOW)
-    assert AUTHORITY.still_good(data, IDENTITY, NOW + timedelta(hours=15))
-    assert not AUTHORITY.still_good(data, IDENTITY, NOW + timedelta(hours=17))
+    assert AUTHORITY.is_current(data, IDENTITY, NOW + timedelta(hours=15))
+    assert not AUTHORITY.is_current(data, IDENTITY, NOW + timedelta(hours=17))
 
 
 def test_a_certificate_of_another_identity_or_authority_is_not_good() -> None:
     data = AUTHORITY.issue_component(IDENTITY, NOW)
-    assert not AUTHORITY.still_good(data, IDENTITY + "2", NOW)
-    assert not Authority.generate(NOW).still_good(data, IDENTITY, NOW)
-    assert not AUTHORITY.still_good({}, IDENTITY, NOW)
-    assert not AUTHORITY.still_good({**data, "tls.crt": "bm9uc2Vuc2U="}, IDENTITY, NOW)
-    assert not AUTHORITY.still_good({**data, "ca.crt": ""}, IDENTITY, NOW)
+    assert not AUTHORITY.is_current(data, IDENTITY + "2", NOW)
+    assert not Authority.generate(NOW).is_current(data, IDENTITY, NOW)
+    assert not AUTHORITY.is_current({}, IDENTITY, NOW)
+    assert not AUTHORITY.is_current({**data, "tls.crt": "bm9uc2Vuc2U="}, IDENTITY, NOW)
+    assert not AUTHORITY.is_current({**data, "ca.crt": ""}, IDENTITY, NOW)
 
 
 def test_the_authority_survives_its_secret() -> None:
     again = Authority.from_data(AUTHORITY.to_data())
     assert again.certificate == AUTHORITY.certificate
-    assert again.still_good(AUTHORITY.issue_component(IDENTITY, NOW), IDENTITY, NOW)
+    assert again.is_current(AUTHORITY.issue_component(IDENTITY, NOW), IDENTITY, NOW)
 
 
 def test_a_damaged_authority_is_not_replaced_in_silence() -> None:

@@ -90,8 +90,8 @@ class Webhooks:
 
 
 def made_on(store: Webhooks) -> Children:
-    grantor = SimpleNamespace(signed=lambda body, _=None: body, vouches_for=lambda _body: False)
-    return Children(cast(Any, store), live(), cast(Any, grantor))
+    signer = SimpleNamespace(sign=lambda body, _=None: body, problem=lambda _grant: "unsigned")
+    return Children(cast(Any, store), live(), cast(Any, signer))
 
 
 @pytest.mark.parametrize(("hanging", "full"), [(kinds.SECRET, 2), (kinds.DEPLOYMENT, 8)])

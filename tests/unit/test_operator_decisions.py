@@ -9,7 +9,8 @@ import pytest
 from fractus_core.api import Application, Drone, EdgeNode, Grant
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
 from fractus_core.planning.inventory import Host, Inventory
-from fractus_operator.cluster.pods import PodView, amount_of, read_host, read_pod
+from fractus_core.planning.quantities import amount_of
+from fractus_operator.cluster.pods import PodView, read_host, read_pod
 from fractus_operator.reconcile.conditions import Fact, merge
 from fractus_operator.reconcile.difference import contains, is_current, stamped
 from fractus_operator.reconcile.location import geohash, location_labels

@@ -129,7 +129,7 @@ def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
     inventory = live()
     inventory.children[kinds.GRANT]["", "there"] = kinds.GRANT.header("there")
     authority = SimpleNamespace(
-        certificate=SimpleNamespace(not_valid_before_utc=NOW), still_good=lambda *_: True, issue_component=None
+        certificate=SimpleNamespace(not_valid_before_utc=NOW), is_current=lambda *_: True, issue_component=None
     )
     recorder = Recorder()
     one = Rollout(cast(Any, recorder), inventory, cast(Any, authority), lambda: NOW)

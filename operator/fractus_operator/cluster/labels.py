@@ -23,9 +23,6 @@ DIGEST_ANNOTATION = f"{GROUP}/applied"
 CAUSE_ANNOTATION = f"{GROUP}/cause"
 """On Deployments: DIGEST@NODE, of what the manifest says of the component, and the node that it is made for."""
 
-INFEASIBLE_ANNOTATION = f"{GROUP}/infeasible"
-"""On what `fractus plan` prints of an application that no plan fits: REASON: MESSAGE."""
-
 FINALIZER = f"{GROUP}/teardown"
 CLASS_LABEL = f"{GROUP}/class"
 DEPOT_LABEL = f"{GROUP}/depot"

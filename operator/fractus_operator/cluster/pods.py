@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 
-from fractus_core.api.model import quantity
 from fractus_core.planning.inventory import Host
+from fractus_core.planning.quantities import amount_of
 
 from fractus_operator.cluster.kinds import Body
 from fractus_operator.cluster.labels import APPLICATION_LABEL, COMPONENT_LABEL, INSTANCE_LABEL, MANAGED_LABEL
@@ -56,25 +56,6 @@ class PodView:
     def component(self) -> str | None:
         """The component that the pod runs."""
         return self.labels.get(COMPONENT_LABEL)
-
-
-_RARE_SCALE = {"n": 1e-9, "u": 1e-6, "E": 1e18, "Ei": 2.0**60}
-
-
-def amount_of(text: str | float) -> float:
-    """Value of any quantity that the API server may hold, also those that manifests of ours may not use.
-
-    Raises:
-        ValueError: it is no quantity.
-    """
-    try:
-        return quantity(text)
-    except ValueError:
-        digits = str(text)
-        for suffix, scale in _RARE_SCALE.items():
-            if digits.endswith(suffix):
-                return float(digits.removesuffix(suffix)) * scale
-        return float(digits)
 
 
 def read_pod(body: Body) -> PodView:

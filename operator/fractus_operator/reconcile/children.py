@@ -8,13 +8,13 @@ from collections.abc import Collection, Mapping, Sequence
 
 from fractus_core.api import Application, Grant, InvalidObject
 from fractus_core.api.plans import GrantSpec
+from fractus_core.identity.grant_signer import GrantSigner
 
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind, key_of
 from fractus_operator.cluster.labels import APPLICATION_LABEL, MANAGED_SELECTOR, NAMESPACE_LABEL, label_value
 from fractus_operator.cluster.reading import read
 from fractus_operator.cluster.store import NotFound, Store, StoreError, Taken
-from fractus_operator.identity.grantor import Grantor
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile import builders
 from fractus_operator.reconcile.difference import contains, digest, is_current, stamped
@@ -38,10 +38,10 @@ class NameTaken(Exception):
 class Children:
     """The children of Applications."""
 
-    def __init__(self, store: Store, live: LiveInventory, grantor: Grantor) -> None:
+    def __init__(self, store: Store, live: LiveInventory, signer: GrantSigner) -> None:
         self._store = store
         self._live = live
-        self._grantor = grantor
+        self._signer = signer
         self._parallel = asyncio.Semaphore(_PARALLEL)
         self._scheduling = asyncio.Semaphore(_PARALLEL)
         self._beside = asyncio.Semaphore(_BESIDE)
@@ -74,7 +74,7 @@ class Children:
         observed = self._live.children[kinds.GRANT].get(key)
         if observed is None or "deletionTimestamp" in observed["metadata"]:
             return
-        body = self._grantor.signed(stamped(builders.granted_again(observed, spec)), grant)
+        body = self._signer.sign(stamped(builders.granted_again(observed, spec)), grant)
         async with self._parallel:
             self._live.children[kinds.GRANT].note(key, await self._store.rewrite(kinds.GRANT, observed, body))
 
@@ -95,14 +95,18 @@ class Children:
         kind, key = kinds.GRANT, key_of(desired)
         observed = self._live.children[kind].get(key)
         if observed is None:
-            observed = await self._create(kind, desired, self._grantor.signed(desired))
+            observed = await self._create(kind, desired, self._signer.sign(desired))
         if observed is None:
             return
         said = self._is_as_desired(kind, desired, observed) or _says_the_same(observed, body)
-        if said and self._grantor.vouches_for(observed):
+        present = _readable(observed)
+        problem = self._signer.problem(present) if present is not None else "the object cannot be read"
+        if said and problem is None:
             return
+        if problem is not None:
+            logger.warning("children: Grant is not valid and is signed again (grant=%s problem=%s)", key[1], problem)
         _check_own(application, kind, observed)
-        signed = self._grantor.signed(desired, _readable(observed))
+        signed = self._signer.sign(desired, present)
         if _moved(observed, body):
             # A Grant belongs to one node for its whole life: its status tells what happened there.
             await self._store.delete(kind, key, observed["metadata"]["uid"])

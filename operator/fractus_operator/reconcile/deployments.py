@@ -10,6 +10,8 @@ from datetime import datetime, timedelta
 
 from fractus_core.api import Application, Condition, Grant, InvalidObject
 from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec
+from fractus_core.identity.authority import Authority
+from fractus_core.identity.grant_signer import GrantSigner
 from fractus_core.planning.growth import room_to_grow
 from fractus_core.planning.inventory import Flight, Inventory, Settings
 from fractus_core.planning.plan import Infeasible, plan
@@ -21,8 +23,6 @@ from fractus_operator.cluster.kinds import Body, Key, key_of
 from fractus_operator.cluster.labels import FINALIZER
 from fractus_operator.cluster.reading import SETTLED, Submitted
 from fractus_operator.cluster.store import NotFound, Store, StoreError, Taken
-from fractus_operator.identity.authority import Authority
-from fractus_operator.identity.grantor import Grantor
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile import builders
 from fractus_operator.reconcile.children import Children, NameTaken
@@ -87,8 +87,8 @@ class Deployments:
         self._live = live
         self._clock = clock
         self._settings = settings or Settings()
-        self._grantor = Grantor(authority, clock)
-        self._children = Children(store, live, self._grantor)
+        self._signer = GrantSigner(authority, clock)
+        self._children = Children(store, live, self._signer)
         self._rollout = Rollout(self._children, live, authority, clock)
         self._memories: dict[Key, _Memory] = {}
         self._torn_down: set[str] = set()
@@ -191,7 +191,7 @@ class Deployments:
 
     def _vouched(self, key: Key, uid: str) -> list[Grant]:
         """The grants of an application that are as they were signed: nothing of another one is ever signed again."""
-        return [grant for grant in self._live.grants_of(key, uid) if self._grantor.vouches(grant)]
+        return [grant for grant in self._live.grants_of(key, uid) if self._signer.problem(grant) is None]
 
     def _basis(self, grants: Sequence[Grant], *more: object) -> tuple[object, ...]:
         """What tells that nothing changed of which grants are made, nor they themselves."""

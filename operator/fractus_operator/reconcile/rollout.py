@@ -10,12 +10,12 @@ from datetime import datetime
 
 from fractus_core.api import Application, component_identity
 from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec, PlannedInstance
+from fractus_core.identity.authority import Authority
 
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind, key_of
 from fractus_operator.cluster.labels import CAUSE_ANNOTATION
 from fractus_operator.cluster.pods import PodView
-from fractus_operator.identity.authority import Authority
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile import builders
 from fractus_operator.reconcile.children import Children
@@ -156,6 +156,6 @@ class Rollout:
         observed = self._live.children[kinds.SECRET].get(place)
         data = dict((observed or {}).get("data") or {})
         now = self._clock()
-        if not self._authority.still_good(data, identity, now):
+        if not self._authority.is_current(data, identity, now):
             data = self._authority.issue_component(identity, now)
         return builders.tls_secret(application, placed, data)

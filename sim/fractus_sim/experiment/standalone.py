@@ -10,7 +10,7 @@ A program gets the environment that its pod would have (FRACTUS_*), so programs 
 end with the block, whatever happens in it.
 
 The directory that is left:
-    pki/           keys and certificates (fractus_operator.standalone)
+    pki/           keys and certificates (fractus_cli.standalone)
     logs/          NAME.log of each process, DRONE.tlog of each autopilot link, both directions
     DRONE/         grants/, state/, pictures/, node.yaml, mobility.jsonl and camera.jsonl (audit logs)
 """

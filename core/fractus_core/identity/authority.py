@@ -1,13 +1,12 @@
-"""The certificate authority of the system: its key, and the short-lived certificates it issues."""
+"""The certificate authority of the system: its key, and the short-lived certificates that it issues."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 from typing import Self
 
 from cryptography import x509
@@ -15,18 +14,10 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
 from fractus_core.api import GROUP, node_identity, node_server_name
 from fractus_core.api.plans import OPERATOR_IDENTITY
 from fractus_core.policy.signatures import DOCUMENT_SIGNING
-
-from fractus_operator.cluster.kinds import CONFIG_MAP, SECRET, Body
-from fractus_operator.cluster.labels import MANAGED_BY, MANAGED_LABEL
-from fractus_operator.cluster.store import NotFound, Store, Taken
-
-logger = logging.getLogger(__name__)
-
-NAME = "fractus-ca"
-"""Name of the Secret with the authority's key, and of the ConfigMap with its certificate."""
 
 CA_LIFE = timedelta(days=3650)
 COMPONENT_LIFE = timedelta(hours=24)
@@ -40,7 +31,7 @@ Data = dict[str, str]
 
 
 class BrokenAuthority(Exception):
-    """The Secret of the authority exists, but does not hold a usable key and certificate."""
+    """What is stored of an authority is no usable key and certificate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,9 +72,9 @@ class Authority:
             key = serialization.load_pem_private_key(base64.b64decode(data["tls.key"]), password=None)
             certificate = x509.load_pem_x509_certificate(base64.b64decode(data["tls.crt"]))
         except (KeyError, ValueError) as error:
-            raise BrokenAuthority(f"Secret {NAME}: {error}; restore it, or delete it to begin anew") from error
+            raise BrokenAuthority(f"the key or the certificate cannot be read: {error}") from error
         if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
-            raise BrokenAuthority(f"Secret {NAME}: tls.key does not belong to tls.crt; restore it, or delete it")
+            raise BrokenAuthority("tls.key does not belong to tls.crt")
         return cls(key, certificate)
 
     def to_data(self) -> Data:
@@ -92,7 +83,7 @@ class Authority:
 
     @property
     def certificate_pem(self) -> bytes:
-        """The CA certificate, which everyone trusts."""
+        """The CA certificate."""
         return self.certificate.public_bytes(serialization.Encoding.PEM)
 
     def issue_component(self, identity: str, now: datetime, life: timedelta = COMPONENT_LIFE) -> Data:
@@ -146,7 +137,7 @@ class Authority:
             "ca.crt": _encoded(self.certificate_pem),
         }
 
-    def still_good(self, data: Data, identity: str, now: datetime) -> bool:
+    def is_current(self, data: Data, identity: str, now: datetime) -> bool:
         """Whether a component's certificate is ours, for this identity, and not due for renewal."""
         try:
             certificate = x509.load_pem_x509_certificate(base64.b64decode(data["tls.crt"]))
@@ -215,33 +206,6 @@ def renewal_time(certificate: x509.Certificate) -> datetime:
     return start + (end - start) * _RENEW_AFTER
 
 
-async def open_authority(store: Store, namespace: str) -> Authority:
-    """Read the system's authority, or make it once; two operators that start at once end with the same one.
-
-    Raises:
-        BrokenAuthority: its Secret is damaged.
-    """
-    try:
-        secret = await store.get(SECRET, NAME, namespace)
-    except NotFound:
-        authority = Authority.generate(datetime.now(UTC))
-        body = {**_owned(SECRET.header(NAME, namespace)), "type": "kubernetes.io/tls", "data": authority.to_data()}
-        try:
-            secret = await store.create(SECRET, body)
-            logger.info("made the certificate authority (Secret %s/%s)", namespace, NAME)
-        except Taken:
-            secret = await store.get(SECRET, NAME, namespace)
-    authority = Authority.from_data(secret.get("data") or {})
-    public = {**_owned(CONFIG_MAP.header(NAME, namespace)), "data": {"ca.crt": authority.certificate_pem.decode()}}
-    await store.apply(CONFIG_MAP, public)
-    return authority
-
-
-def _owned(header: Body) -> Body:
-    header["metadata"]["labels"] = {MANAGED_LABEL: MANAGED_BY}
-    return header
-
-
 def _key_usage(*, signs_certificates: bool = False, signs_grants: bool = False) -> x509.KeyUsage:
     return x509.KeyUsage(
         digital_signature=not (signs_certificates or signs_grants),
@@ -257,7 +221,7 @@ def _key_usage(*, signs_certificates: bool = False, signs_grants: bool = False) 
 
 
 def _short(text: str) -> str:
-    """A common name has 64 characters at most; who checks identities reads the alternative names."""
+    """A common name has 64 characters at most (X.520); identities are read from the alternative names."""
     return text if len(text) <= 64 else text[:47] + "-" + hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

@@ -11,10 +11,10 @@ from datetime import datetime
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
 from fractus_core.api import node_identity, node_server_name
+from fractus_core.identity.authority import Authority
 
 from fractus_operator.cluster.kinds import SIGNING_REQUEST, Body, Key
 from fractus_operator.cluster.store import NotFound, Store, Taken
-from fractus_operator.identity.authority import Authority
 
 logger = logging.getLogger(__name__)
 

@@ -1,7 +1,7 @@
 """MAVLink 2 for services and simulation: one codec, generated from the dialect that is checked in.
 
 Example:
-    link = Endpoint(system=255, component=MAV_COMPONENT.MISSIONPLANNER)
+    link = Endpoint(sysid=255, compid=MAV_COMPONENT.MISSIONPLANNER)
     frame = link.encode("COMMAND_LONG", {"command": MAV_CMD.NAV_LAND, "target_system": 1})
     for message in link.decode(received):
         if message.name == "ATTITUDE":
@@ -9,7 +9,7 @@ Example:
 """
 
 from fractus_mavlink.endpoint import Endpoint
-from fractus_mavlink.framing import Parser, encode
+from fractus_mavlink.framing import Parser, encode, frame_length
 from fractus_mavlink.messages import (
     Message,
     Scalar,
@@ -30,6 +30,7 @@ __all__ = [
     "UnknownMessageError",
     "Value",
     "encode",
+    "frame_length",
     "layout_named",
     "layout_of",
     "message",

@@ -13,8 +13,8 @@ class Endpoint:
     """A system's end of one link.
 
     Args:
-        system: the sender's system id.
-        component: the sender's component id, see MAV_COMPONENT.
+        sysid: the sender's system id.
+        compid: the sender's component id, see MAV_COMPONENT.
         saturate: send the nearest value for a number that does not fit its field, instead of raising an error.
 
     Attributes:
@@ -22,9 +22,9 @@ class Endpoint:
         parser: counts what is lost and damaged.
     """
 
-    def __init__(self, system: int, component: int, *, saturate: bool = False) -> None:
-        self.system = system
-        self.component = component
+    def __init__(self, sysid: int, compid: int, *, saturate: bool = False) -> None:
+        self.sysid = sysid
+        self.compid = compid
         self.signing: Signing | None = None
         self.parser = Parser(lambda: self.signing)
         self._saturate = saturate
@@ -41,8 +41,8 @@ class Endpoint:
             layout_named(name),
             values,
             sequence=self._sequence,
-            sysid=self.system,
-            compid=self.component,
+            sysid=self.sysid,
+            compid=self.compid,
             signing=self.signing,
             saturate=self._saturate,
         )

@@ -15,6 +15,7 @@ MAGIC_V1 = 0xFE
 MAGIC_V2 = 0xFD
 HEADER_V1 = 6
 HEADER_V2 = 10
+CHECKSUM_LENGTH = 2
 MAVLINK_IFLAG_SIGNED = 0x01
 MAX_STREAMS = 256
 
@@ -44,6 +45,14 @@ def encode(
     )
     frame = body + _checksum.pack(mcrf4xx(body[1:] + bytes((layout.crc_extra,))))
     return frame if signing is None else signing.sign(frame)
+
+
+def frame_length(data: bytes | bytearray, at: int = 0) -> int:
+    """How long the frame is whose first three bytes are at a position."""
+    if data[at] == MAGIC_V1:
+        return data[at + 1] + HEADER_V1 + CHECKSUM_LENGTH
+    signature = SIGNATURE_LENGTH if data[at + 2] & MAVLINK_IFLAG_SIGNED else 0
+    return data[at + 1] + HEADER_V2 + CHECKSUM_LENGTH + signature
 
 
 class _Refusal(Enum):
@@ -85,18 +94,14 @@ class Parser:
         at = 0
         end = len(buffer)
         while at < end:
-            magic = buffer[at]
-            if magic not in _MAGICS:
+            if buffer[at] not in _MAGICS:
                 at += 1
                 continue
             if end - at < 3:
                 break
-            length = buffer[at + 1] + (HEADER_V1 if magic == MAGIC_V1 else HEADER_V2) + 2
-            if magic == MAGIC_V2 and buffer[at + 2] & MAVLINK_IFLAG_SIGNED:
-                length += SIGNATURE_LENGTH
-            if end - at < length:
+            after = at + frame_length(buffer, at)
+            if after > end:
                 break
-            after = at + length
             verdict = self._decode(bytes(buffer[at:after]))
             if isinstance(verdict, Message):
                 messages.append(verdict)

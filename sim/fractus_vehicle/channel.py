@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from fractus_vehicle.wire import Message, Parser, Signing, Value, encode, layout_named
+from fractus_mavlink import Endpoint, Message, Value
 
 # A client that does not read costs at most this much memory; what does not fit is dropped, as on a radio.
 OUTBOX_LIMIT = 256 * 1024
@@ -24,7 +24,7 @@ class Stream:
     due_s: float
 
 
-class Channel:
+class Channel(Endpoint):
     """The vehicle's end of one link."""
 
     def __init__(
@@ -37,18 +37,15 @@ class Channel:
         discard: bool = False,
         port: int | None = None,
     ) -> None:
-        self.sysid = sysid
-        self.compid = compid
+        # A simulated quantity may run out of its field; a real autopilot's driver saturates as well.
+        super().__init__(sysid, compid, saturate=True)
         self.name = name
         self.port = port  # the autopilot's own number of this link, which selects its SRn_ parameters
-        self.signing: Signing | None = None
-        self.parser = Parser(lambda: self.signing)
         self.streams: dict[str, Stream] = {}
         self.next_due_s = 0.0
         self.peers: set[tuple[int, int]] = set()
         self.parameters: deque[int] = deque()
         self.dropped = 0
-        self._sequence = 0
         self._outbox: deque[bytes] = deque()
         self._waiting = 0
         self._tap = tap
@@ -56,7 +53,7 @@ class Channel:
 
     def receive(self, data: bytes) -> list[Message]:
         """Bytes from the wire to messages; remembers who speaks here."""
-        messages = self.parser.feed(data)
+        messages = self.decode(data)
         for message in messages:
             if message.sysid and len(self.peers) < 64:
                 self.peers.add((message.sysid, message.compid))
@@ -64,15 +61,7 @@ class Channel:
 
     def send(self, name: str, values: Mapping[str, Value]) -> None:
         """Queue a message of our own."""
-        frame = encode(
-            layout_named(name),
-            values,
-            sequence=self._sequence,
-            sysid=self.sysid,
-            compid=self.compid,
-            signing=self.signing,
-        )
-        self._sequence = (self._sequence + 1) & 0xFF
+        frame = self.encode(name, values)
         if self._tap is not None:
             self._tap(frame)
         if not self._discard:

@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from fractus_mavlink import Message, layout_of
+
 from fractus_vehicle.auto import AutoFlight
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.earth import valid_coordinates
@@ -26,7 +28,6 @@ from fractus_vehicle.mission import Item
 from fractus_vehicle.streams import BUILDERS
 from fractus_vehicle.todo import item_target, switch_fence
 from fractus_vehicle.vehicle import Vehicle
-from fractus_vehicle.wire import Message, layout_of
 
 NOT_ARMABLE = frozenset({Mode.RTL, Mode.SMART_RTL, Mode.LAND, Mode.BRAKE, Mode.AUTO})
 

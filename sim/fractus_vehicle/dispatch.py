@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from fractus_mavlink import Message, Signing
+
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.commands import handle_command, outside_fence, set_current, set_mode_number
 from fractus_vehicle.earth import Place, valid_coordinates
@@ -23,7 +25,6 @@ from fractus_vehicle.mission import item_from
 from fractus_vehicle.shaping import clamp, wrap_pi
 from fractus_vehicle.streams import ALL_GROUPS, GROUPS
 from fractus_vehicle.vehicle import Vehicle
-from fractus_vehicle.wire import Message, Signing
 
 _FTP_NAK = 129
 _FTP_UNKNOWN = 7

@@ -11,8 +11,9 @@ from fractus_vehicle.earth import valid_coordinates
 from fractus_vehicle.mav import GLOBAL_FRAMES, Command, Frame, MissionKind, MissionResult
 
 if TYPE_CHECKING:
+    from fractus_mavlink import Message
+
     from fractus_vehicle.channel import Channel
-    from fractus_vehicle.wire import Message
 
 MAX_ITEMS = 724
 UPLOAD_TIMEOUT_S = 8.0

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from fractus_mavlink import Endpoint, Message, Value
+
 from fractus_vehicle.mav import Command, Mode, ModeFlag, Result
 from fractus_vehicle.simulation import Craft, Simulation
-from fractus_vehicle.wire import Message, Parser, Value, encode, layout_named
 
 HEARTBEAT_INTERVAL_S = 1.0
 
@@ -21,24 +22,20 @@ class Pilot:
     def __init__(self, simulation: Simulation, craft: Craft, sysid: int = 255, compid: int = 190) -> None:
         self.simulation = simulation
         self.craft = craft
-        self.sysid, self.compid = sysid, compid
         self.channel = craft.open("pilot")
-        self.parser = Parser()
+        self.endpoint = Endpoint(sysid, compid, saturate=True)
         self.last: dict[str, Message] = {}
         self.texts: list[str] = []
         self.heartbeats = True
-        self._sequence = 0
         self._next_heartbeat_s = 0.0
 
     def send(self, name: str, values: Mapping[str, Value]) -> None:
         """Send a message to the vehicle."""
-        frame = encode(layout_named(name), values, sequence=self._sequence, sysid=self.sysid, compid=self.compid)
-        self._sequence = (self._sequence + 1) & 0xFF
-        self.craft.receive(self.channel, frame)
+        self.craft.receive(self.channel, self.endpoint.encode(name, values))
 
     def read(self) -> list[Message]:
         """Take what the vehicle has sent since."""
-        messages = self.parser.feed(self.channel.take())
+        messages = self.endpoint.decode(self.channel.take())
         for message in messages:
             self.last[message.name] = message
             if message.name == "STATUSTEXT":

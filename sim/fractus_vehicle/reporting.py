@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 from fractus_vehicle.shaping import clamp
 
 if TYPE_CHECKING:
+    from fractus_mavlink import Value
+
     from fractus_vehicle.vehicle import Vehicle
-    from fractus_vehicle.wire import Value
 
 Values = Mapping[str, "Value"]
 Builder = Callable[["Vehicle"], "Values | None"]

@@ -11,8 +11,9 @@ from fractus_vehicle.reporting import UNKNOWN_U16, Values, boot_ms, boot_us, cen
 from fractus_vehicle.shaping import clamp
 
 if TYPE_CHECKING:
+    from fractus_mavlink import Value
+
     from fractus_vehicle.vehicle import Vehicle
-    from fractus_vehicle.wire import Value
 
 _BARO_AXIS = 16
 

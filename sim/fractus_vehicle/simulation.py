@@ -7,11 +7,12 @@ import struct
 from dataclasses import replace
 from typing import BinaryIO
 
+from fractus_mavlink import Message, Signing
+
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.dispatch import dispatch
 from fractus_vehicle.streams import ALL_GROUPS, GROUPS
 from fractus_vehicle.vehicle import CONTROL_STEP_S, Vehicle, VehicleConfig
-from fractus_vehicle.wire import Message, Signing
 
 # Never passed on from one link to another: they speak about the link itself.
 _LINK_LOCAL = frozenset({"RADIO_STATUS", "RADIO", "SETUP_SIGNING"})

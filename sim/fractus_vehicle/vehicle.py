@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from fractus_mavlink import Message, Value
+
 from fractus_vehicle.body import Airframe, Body, Wind
 from fractus_vehicle.breadcrumbs import Breadcrumbs
 from fractus_vehicle.channel import Channel
@@ -29,7 +31,6 @@ from fractus_vehicle.sensors import Battery, Gps
 from fractus_vehicle.settings import LIMIT_PREFIXES, set_battery, set_fence, set_limits, set_wind
 from fractus_vehicle.shaping import clamp, wrap_pi
 from fractus_vehicle.voice import Voice
-from fractus_vehicle.wire import Message, Value
 
 CONTROL_STEP_S = 0.01
 PHYSICS_PER_CONTROL = 2

@@ -10,8 +10,9 @@ from fractus_vehicle.mav import VERSION_TEXT, Severity
 from fractus_vehicle.streams import ALL_GROUPS, BUILDERS, GROUPS
 
 if TYPE_CHECKING:
+    from fractus_mavlink import Value
+
     from fractus_vehicle.vehicle import Vehicle
-    from fractus_vehicle.wire import Value
 
 TEXT_CHUNK = 50
 HIGHEST_RATE_HZ = 100.0

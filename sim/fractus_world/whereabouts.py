@@ -11,7 +11,8 @@ import time
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from fractus_vehicle.wire import Message, Parser, encode, layout_named
+from fractus_mavlink import Endpoint, Message, layout_named
+from fractus_mavlink.enums import GIMBAL_DEVICE_FLAGS, MAV_AUTOPILOT, MAV_CMD, MAV_COMPONENT
 
 from fractus_world.optics import Mount, Pose
 
@@ -24,14 +25,9 @@ SILENCE_S = 5.0
 """A link that brings nothing for so long is opened again."""
 RETRY_S = (0.2, 3.0)
 ASK_EVERY_S = 5.0
-SYSTEM, COMPONENT = 242, 100
+SYSTEM, COMPONENT = 242, MAV_COMPONENT.CAMERA
 """MAVLink ids of a camera; no heartbeats are sent, so that none can hold off an autopilot's failsafe."""
 _STREAMS = {"GLOBAL_POSITION_INT": 20.0, "ATTITUDE": 20.0, "GIMBAL_DEVICE_ATTITUDE_STATUS": 10.0}
-_SET_MESSAGE_INTERVAL = 511
-_NO_AUTOPILOT = 8
-_YAW_IN_EARTH_FRAME = 64
-_YAW_LOCK = 16
-_YAW_IN_VEHICLE_FRAME = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +89,6 @@ class Vehicle:
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="vehicle", daemon=True)
-        self._sequence = 0
 
     def start(self) -> None:
         """Begin to follow."""
@@ -135,7 +130,7 @@ class Vehicle:
     def _follow(self, link: socket.socket) -> bool:
         """Listen until the link breaks; returns whether anything was heard."""
         link.settimeout(READ_TIMEOUT_S)
-        parser = Parser()
+        endpoint = Endpoint(SYSTEM, COMPONENT)
         autopilot: tuple[int, int] | None = None
         asked_s = -math.inf
         heard_s = opened_s = time.monotonic()
@@ -146,28 +141,20 @@ class Vehicle:
             now_s = time.monotonic()
             if data == b"" or now_s - heard_s > SILENCE_S:
                 break
-            for message in parser.feed(data or b""):
+            for message in endpoint.decode(data or b""):
                 heard_s = now_s
-                if message.name == "HEARTBEAT" and message.integer("autopilot") != _NO_AUTOPILOT and autopilot is None:
+                if (
+                    message.name == "HEARTBEAT"
+                    and message.integer("autopilot") != MAV_AUTOPILOT.INVALID
+                    and autopilot is None
+                ):
                     autopilot = (message.sysid, message.compid)
                 if autopilot is not None and message.sysid == autopilot[0]:
                     self._take(message, now_s)
             if autopilot is not None and now_s - asked_s > ASK_EVERY_S:
                 asked_s = now_s
-                self._ask(link, autopilot)
+                _ask(link, endpoint, autopilot)
         return heard_s > opened_s
-
-    def _ask(self, link: socket.socket, autopilot: tuple[int, int]) -> None:
-        """Ask for the streams; a restarted autopilot has forgotten them, so this is done again and again."""
-        for name, rate_hz in _STREAMS.items():
-            values: dict[str, float] = {f"param{k}": 0.0 for k in range(3, 8)}
-            values |= {"target_system": autopilot[0], "target_component": autopilot[1], "confirmation": 0}
-            values |= {"command": _SET_MESSAGE_INTERVAL, "param1": layout_named(name).msgid, "param2": 1e6 / rate_hz}
-            frame = encode(
-                layout_named("COMMAND_LONG"), values, sequence=self._sequence, sysid=SYSTEM, compid=COMPONENT
-            )
-            self._sequence += 1
-            link.sendall(frame)
 
     def _take(self, message: Message, now_s: float) -> None:
         with self._lock:
@@ -179,6 +166,19 @@ class Vehicle:
                 self._heard.attitude, self._heard.attitude_s = message, now_s
             elif message.name == "GIMBAL_DEVICE_ATTITUDE_STATUS":
                 self._heard.mount, self._heard.mount_s = _gimbal(message, self._heard.attitude), now_s
+
+
+def _ask(link: socket.socket, endpoint: Endpoint, autopilot: tuple[int, int]) -> None:
+    """Ask for the streams; a restarted autopilot has forgotten them, so this is repeated."""
+    for name, rate_hz in _STREAMS.items():
+        values = {
+            "target_system": autopilot[0],
+            "target_component": autopilot[1],
+            "command": MAV_CMD.SET_MESSAGE_INTERVAL,
+            "param1": layout_named(name).msgid,
+            "param2": 1e6 / rate_hz,
+        }
+        link.sendall(endpoint.encode("COMMAND_LONG", values))
 
 
 def _pose(position: Message, attitude: Message, age_s: float, ground_amsl_m: float) -> Pose:
@@ -206,7 +206,8 @@ def _gimbal(message: Message, attitude: Message | None) -> Mount | None:
     pitch = math.degrees(math.asin(min(max(2 * (w * y - z * x) / norm**2, -1.0), 1.0)))
     yaw = math.degrees(math.atan2(2 * (w * z + x * y), norm**2 - 2 * (y * y + z * z)))
     flags = message.integer("flags")
-    earth = flags & _YAW_IN_EARTH_FRAME or (flags & _YAW_LOCK and not flags & _YAW_IN_VEHICLE_FRAME)
+    lock, vehicle = flags & GIMBAL_DEVICE_FLAGS.YAW_LOCK, flags & GIMBAL_DEVICE_FLAGS.YAW_IN_VEHICLE_FRAME
+    earth = flags & GIMBAL_DEVICE_FLAGS.YAW_IN_EARTH_FRAME or (lock and not vehicle)
     if earth and attitude is not None:
         yaw -= math.degrees(attitude.real("yaw"))
     return Mount(pitch, (yaw + 180.0) % 360.0 - 180.0, stabilised=True)

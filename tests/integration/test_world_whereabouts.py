@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from fractus_vehicle.wire import Parser, encode, layout_named
+from fractus_mavlink import Parser, encode, layout_named
 from fractus_world import whereabouts
 from fractus_world.whereabouts import Sighting, Vehicle, parse_address
 

@@ -7,7 +7,7 @@ import random
 import struct
 
 import pytest
-from fractus_vehicle import wire
+from fractus_mavlink import encode, layout_named
 from fractus_vehicle.dispatch import HANDLERS
 from fractus_vehicle.mav import Command, Mode
 from fractus_vehicle.pilot import Pilot
@@ -19,7 +19,7 @@ COMMANDS = [int(command) for command in Command if command is not Command.PREFLI
 
 
 def _wild_frame(rng: random.Random, name: str) -> bytes:
-    layout = wire.layout_named(name)
+    layout = layout_named(name)
     payload = bytearray(rng.randbytes(layout.packer.size))
     values = dict(layout.unpack(bytes(payload)))
     for field, value in values.items():
@@ -41,7 +41,7 @@ def _wild_frame(rng: random.Random, name: str) -> bytes:
             values[field] = rng.choice(
                 (b"WPNAV_SPEED", b"PSC_JERK_XY", b"FENCE_TYPE", b"BATT_CAPACITY", rng.randbytes(16))
             )
-    return wire.encode(layout, values, sequence=rng.randrange(256), sysid=255, compid=190)
+    return encode(layout, values, sequence=rng.randrange(256), sysid=255, compid=190)
 
 
 def _sane(vehicle: Vehicle) -> bool:

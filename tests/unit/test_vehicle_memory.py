@@ -7,9 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from fractus_mavlink import Parser, Signing, encode, layout_named
 from fractus_vehicle.mav import Command, Result
 from fractus_vehicle.params import Parameters, UnknownParameterError, table
-from fractus_vehicle.wire import Parser, Signing, encode, layout_named
 from vehicle_world import CONFIG, START, airborne, alone, upload
 
 FENCE = {"command": 5003, "param1": 80.0, "frame": 0, "x": START.lat_e7, "y": START.lon_e7}

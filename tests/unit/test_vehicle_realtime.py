@@ -7,11 +7,11 @@ import math
 import socket
 
 import pytest
+from fractus_mavlink import Parser, encode, layout_named
 from fractus_vehicle import __main__ as realtime
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.links import Hub
 from fractus_vehicle.simulation import Craft, Simulation
-from fractus_vehicle.wire import Parser, encode, layout_named
 from vehicle_world import CONFIG
 
 STEP_S = 0.01

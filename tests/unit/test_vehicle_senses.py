@@ -9,11 +9,11 @@ import struct
 from dataclasses import replace
 
 import pytest
+from fractus_mavlink import Message, Parser
 from fractus_vehicle.mav import Command, Mode, Result
 from fractus_vehicle.noise import gaussian
 from fractus_vehicle.pilot import Pilot
 from fractus_vehicle.vehicle import Vehicle
-from fractus_vehicle.wire import Message, Parser
 from vehicle_world import CONFIG, START, airborne, alone, distance_m, upload
 
 

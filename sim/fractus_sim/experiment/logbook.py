@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fractus_vehicle.wire import Message
+from fractus_mavlink import Message
 from mcap.writer import Writer
 
 from fractus_sim.experiment.station import Station

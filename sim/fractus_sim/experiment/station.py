@@ -9,10 +9,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from fractus_mavlink import Endpoint, Message, Value, layout_named
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.mav import Command, Mode, ModeFlag
 from fractus_vehicle.simulation import Craft
-from fractus_vehicle.wire import Message, Parser, Value, encode, layout_named
 
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.tlog import TlogWriter
@@ -177,9 +177,8 @@ class Station:
         self.parameters: dict[str, float] = {}
         self.inbox: list[Message] = []
         self._link, self._system_id, self._log = link, system_id, log
-        self._own_id, self._beats = own_id, beats
-        self._parser = Parser()
-        self._sequence = 0
+        self._beats = beats
+        self._endpoint = Endpoint(own_id, STATION_COMPONENT, saturate=True)
         self._unix_us = 0
         self._next_beat_s = -1e9
         self._asked = False
@@ -192,7 +191,7 @@ class Station:
         """
         self.now_s, self._unix_us = now_s, unix_us
         data = self._link.receive()
-        messages = [] if self.cut else self._parser.feed(data)
+        messages = [] if self.cut else self._endpoint.decode(data)
         self.inbox = [m for m in messages if m.sysid == self._system_id and m.compid == 1]
         for message in messages:
             if self._log is not None:
@@ -211,10 +210,7 @@ class Station:
 
     def send(self, name: str, values: Mapping[str, Value]) -> None:
         """Send a message, unless the link is cut."""
-        frame = encode(
-            layout_named(name), values, sequence=self._sequence, sysid=self._own_id, compid=STATION_COMPONENT
-        )
-        self._sequence = (self._sequence + 1) & 0xFF
+        frame = self._endpoint.encode(name, values)
         if self.cut:
             return
         if self._log is not None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from fractus_vehicle.wire import Parser
+from fractus_mavlink import Parser
 
 _STAMP = struct.Struct(">Q")
 

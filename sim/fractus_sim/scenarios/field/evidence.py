@@ -11,8 +11,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from fractus_mavlink import Message, Parser, frame_length
 from fractus_vehicle.mav import Mode, ModeFlag
-from fractus_vehicle.wire import INCOMPAT_SIGNED, MAGIC_V1, SIGNATURE_LENGTH, Message, Parser
 
 from fractus_sim.report.track import Place, Sample, Track
 
@@ -124,13 +124,9 @@ def _frames(path: Path) -> Iterator[tuple[float, Message]]:
     while at + _STAMP.size + 3 <= len(data):
         (stamp_us,) = _STAMP.unpack_from(data, at)
         begin = at + _STAMP.size
-        old = data[begin] == MAGIC_V1
-        length = data[begin + 1] + (8 if old else 12)
-        if not old and data[begin + 2] & INCOMPAT_SIGNED:
-            length += SIGNATURE_LENGTH
-        for message in parser.feed(data[begin : begin + length]):
+        at = begin + frame_length(data, begin)
+        for message in parser.feed(data[begin:at]):
             yield stamp_us / 1e6, message
-        at = begin + length
 
 
 def _flight(path: Path) -> tuple[tuple[Sample, ...], _Clock, list[str]]:

@@ -6,8 +6,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from fractus_mavlink import Endpoint, Message, Value, layout_named
 from fractus_vehicle.mav import AUTOPILOT_ARDUPILOTMEGA, Command, ModeFlag
-from fractus_vehicle.wire import Message, Parser, Value, encode, layout_named
 
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.station import OBSERVER_ID, STATION_COMPONENT, TcpLink
@@ -74,18 +74,13 @@ class _Visitor:
     def __init__(self, link: TcpLink) -> None:
         self.system_id = 0
         self._link = link
-        self._parser = Parser()
-        self._sequence = 0
+        self._endpoint = Endpoint(OBSERVER_ID, STATION_COMPONENT)
 
     def ask(self, name: str) -> None:
         """Ask for one message of a kind."""
         values: dict[str, Value] = {"command": int(Command.REQUEST_MESSAGE), "param1": float(layout_named(name).msgid)}
         values |= {"target_system": self.system_id, "target_component": 1}
-        frame = encode(
-            layout_named("COMMAND_LONG"), values, sequence=self._sequence, sysid=OBSERVER_ID, compid=STATION_COMPONENT
-        )
-        self._sequence = (self._sequence + 1) & 0xFF
-        self._link.send(frame)
+        self._link.send(self._endpoint.encode("COMMAND_LONG", values))
 
     def wait(self, wanted: Callable[[Message], bool], timeout_s: float, missing: str, asking: str = "") -> Message:
         """The first message that is wanted; `asking` repeats the request each second.
@@ -99,7 +94,7 @@ class _Visitor:
             if asking and time.monotonic() >= next_ask:
                 next_ask += ASK_S
                 self.ask(asking)
-            for message in self._parser.feed(self._link.receive()):
+            for message in self._endpoint.decode(self._link.receive()):
                 if wanted(message):
                     return message
             time.sleep(POLL_S)

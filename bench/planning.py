@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 from fractus_core.api import Application, Depot, Drone, EdgeNode
-from fractus_core.api.applications import Component
+from fractus_core.api.components import Component
 from fractus_core.api.geometry import Position
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.geo import LocalFrame, distance_m

@@ -29,7 +29,7 @@ import numpy as np
 from fractus_cli.standalone import StandalonePki
 from fractus_cluster.ports import free_port
 from fractus_core.api import Grant
-from fractus_core.api.plans import node_server_name
+from fractus_core.api.names import node_server_name
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
 from fractus_services import answering
 from fractus_services.auth import Caller

@@ -11,7 +11,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from fractus_core.api.plans import node_identity, node_server_name
+from fractus_core.api.names import node_identity, node_server_name
 
 _IGNORE_DATES = 0x200000
 """OpenSSL's X509_V_FLAG_NO_CHECK_TIME: dates are judged by the clock that is passed in."""

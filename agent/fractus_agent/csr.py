@@ -12,7 +12,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
-from fractus_core.api.plans import node_identity, node_server_name
+from fractus_core.api.names import node_identity, node_server_name
 
 
 def make_request(node: str) -> tuple[bytes, bytes]:

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 import grpc
-from fractus_core.api.plans import node_server_name
+from fractus_core.api.names import node_server_name
 from fractus_proto.v1.mobility_pb2 import SubscribeTelemetryRequest, Telemetry
 from fractus_proto.v1.mobility_pb2_grpc import MobilityServiceStub
 from fractus_proto.v1.types_pb2 import AltitudeReference

@@ -10,24 +10,17 @@ from __future__ import annotations
 import base64
 import json
 import os
-import re
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Self
 
 from fractus_core.api import Grant, InvalidObject
-from fractus_core.api.plans import component_identity
+from fractus_core.api.names import ComponentIdentity, is_subdomain
 from fractus_core.identity.authority import Authority, BrokenAuthority, Data
 from fractus_core.identity.grant_signer import GrantSigner
 
 LIFE = timedelta(days=365)
-
-_NAME = re.compile(r"[a-z0-9]([-a-z0-9.]{0,251}[a-z0-9])?")
-"""A DNS subdomain (RFC 1123), as Kubernetes names nodes; it becomes a directory here."""
-
-
-_PARTS = component_identity("", "", "", "").count("/") + 1
 
 
 def _now() -> datetime:
@@ -86,7 +79,7 @@ class StandalonePki:
         Raises:
             InvalidObject: the name is none that a node can have.
         """
-        if not _NAME.fullmatch(name):
+        if not is_subdomain(name):
             raise InvalidObject("node", f"{name!r} is no name of a node; use lower-case letters, digits, - and .")
         return _write(self._directory / "nodes" / name, self._authority.issue_node(name, self._clock(), self._life))
 
@@ -99,10 +92,10 @@ class StandalonePki:
         Raises:
             InvalidObject: its parts are no names.
         """
-        part = identity.split("/")
-        if len(part) != _PARTS or not _NAME.fullmatch(part[4]) or not _NAME.fullmatch(part[-1]):
-            raise InvalidObject("spec.instance", f"{part[-1]!r}, in {identity}, is no name of an instance")
-        folder = self._directory / "components" / f"{part[4]}.{part[-1]}"
+        found = ComponentIdentity.parse(identity)
+        if found is None or not is_subdomain(found.namespace) or not is_subdomain(found.instance):
+            raise InvalidObject("spec.instance", f"{identity} does not name an instance of a component")
+        folder = self._directory / "components" / f"{found.namespace}.{found.instance}"
         now = self._clock()
         if self._authority.is_current(_read(folder), identity, now):
             return folder

@@ -12,13 +12,13 @@ from typing import Any
 
 import grpc
 from cryptography import x509
+from fractus_core.api.names import SPIFFE_SCHEME
 
 from fractus_services.errors import NotAuthenticated
 
 log = logging.getLogger(__name__)
 
 FILES = ("tls.key", "tls.crt", "ca.crt")
-_SCHEME = "spiffe://"
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ def _read(pem: bytes) -> Caller:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
         raise NotAuthenticated("the client certificate names no identity") from None
-    uris = [uri for uri in names.get_values_for_type(x509.UniformResourceIdentifier) if uri.startswith(_SCHEME)]
+    uris = [uri for uri in names.get_values_for_type(x509.UniformResourceIdentifier) if uri.startswith(SPIFFE_SCHEME)]
     if len(uris) != 1:
         raise NotAuthenticated(f"the client certificate must name one SPIFFE id, not {len(uris)}")
     return Caller(uris[0], certificate.not_valid_before_utc.timestamp(), certificate.not_valid_after_utc.timestamp())

@@ -10,13 +10,13 @@ from urllib.parse import urlsplit
 
 import yaml
 from fractus_core.api import API_VERSION, Drone, EdgeNode, InvalidObject, Resource
+from fractus_core.api.names import DNS_LABEL
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from fractus_cluster.errors import ClusterError
 
 NodeClass = Literal["drone", "edge", "cloud"]
 
-_NAME = r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$"
 _SUFFIXES: dict[str, Decimal | int] = {
     "": 1,
     "m": Decimal("0.001"),
@@ -121,7 +121,7 @@ class NodeSpec(_Value):
         hardware: What stands beside the node.
     """
 
-    name: Annotated[str, Field(pattern=_NAME, max_length=40)]
+    name: Annotated[str, Field(pattern=DNS_LABEL, max_length=40)]
     node_class: Annotated[NodeClass, Field(alias="class")]
     resources: dict[str, str] = Field(default_factory=dict)
     labels: dict[str, str] = Field(default_factory=dict)
@@ -235,7 +235,7 @@ class NodeSpec(_Value):
 class ClusterSpec(_Value):
     """A cluster: its name and its nodes."""
 
-    name: Annotated[str, Field(pattern=_NAME, max_length=30)]
+    name: Annotated[str, Field(pattern=DNS_LABEL, max_length=30)]
     nodes: Annotated[tuple[NodeSpec, ...], Field(min_length=1, max_length=100)]
 
     @model_validator(mode="after")

@@ -17,7 +17,7 @@ from typing import Any
 import grpc
 import pytest
 from cryptography.hazmat.primitives import serialization
-from fractus_core.api.plans import OPERATOR_IDENTITY, node_identity, node_server_name
+from fractus_core.api.names import OPERATOR_IDENTITY, node_identity, node_server_name
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, mobility_pb2_grpc, types_pb2
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_services.answering import BURST, CALLS_PER_S

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from control_plane import ControlPlane, Refused
 from fractus_core.api import KINDS, InvalidObject
+from fractus_core.api.crd import crd
 
 Body = dict[str, Any]
 API = "/apis/fractus.dev/v1alpha1"
@@ -80,7 +82,7 @@ BAD: list[tuple[str, Body, str]] = [
     ("latitude of 95", driver(path=[HERE | {"lat": 95}]), "should be less than or equal to 90"),
     ("edge component without locations", app({k: v for k, v in EDGE.items() if k != "locations"}), "locations are needed for placement edge, and only there"),
     ("radius of 0", app(EDGE | {"locations": [{"center": HERE, "radius": 0}]}), "radius: Invalid value: 0: spec.components[0].locations[0].radius in body should be greater than 0"),
-    ("no instances", app(EDGE | {"locations": [{"center": HERE, "radius": 5, "instances": 0}]}), 'instances is a whole number of at least 1, or "*" for as many as possible'),
+    ("no instances", app(EDGE | {"locations": [{"center": HERE, "radius": 5, "instances": 0}]}), 'instances is a whole number of 1 to 10000, or "*" for as many as possible'),
     ("hybrid to nothing", app({k: v for k, v in HYBRID.items() if k != "hybridTo"}), "hybridTo is needed for placement hybrid, and only there"),
     ("hybrid to the cloud", app(CLOUD, HYBRID | {"hybridTo": ["Store"]}), "hybridTo takes components placed on a drone or at the edge"),
     ("heuristic in the cloud", app(CLOUD | {"heuristic": {"kind": "preferDirect"}}), "heuristic is for placement hybrid"),
@@ -93,9 +95,18 @@ BAD: list[tuple[str, Body, str]] = [
     ("egress to a stranger", app(CLOUD | {"egress": ["Nobody"]}), "egress names a component that the application does not have"),
     ("egress to itself", app(CLOUD | {"egress": ["Store"]}), "egress names the component itself; remove it"),
     ("egress to one without ports", app(CLOUD | {"egress": ["Mute"]}, MUTE), "egress names a component without container.ports; give it the port it listens on"),
+    ("ingress from a stranger", app(CLOUD | {"ingress": ["Nobody"]}), "ingress names a component that the application does not have"),
+    ("ingress from itself", app(CLOUD | {"ingress": ["Store"]}), "ingress names the component itself; remove it"),
+    ("hybrid to a stranger", app(HYBRID | {"hybridTo": ["Nobody"]}), "hybridTo names a component that the application does not have"),
+    ("hybrid to itself", app(EDGE, HYBRID | {"hybridTo": ["Checker"]}), "hybridTo names the component itself; remove it"),
+    ("control points of a passenger", app(GUIDED | {"controlPoints": [PATH]}), "controlPoints are for a component of class driver"),
+    ("points of interest at the edge", app(EDGE | {"pointsOfInterest": {"points": [HERE]}}), "pointsOfInterest are for a component of class passenger"),
+    ("path without path", app(DRIVER | {"controlPoints": [{"navigation": "pathBased"}]}), "pathBased navigation needs path"),
+    ("method of the camera", app(DRIVER | {"services": [MOBILITY | {"methods": ["CaptureImage"]}]}), "the mobility service has Arm, Disarm"),
     ("two components of one name", app(CLOUD, CLOUD), "duplicate entries for key"),
     ("volume from nowhere", volume(), "give exactly one of emptyDir, configMap, secret and claim"),
     ("volume from two sources", volume(claim="c", secret="s"), "give exactly one of emptyDir, configMap, secret and claim"),
+    ("certificate as a volume", volume(secret="viewer-tls"), "Secrets whose names end in -tls are certificates of components"),
     ("zone of two shapes", zone(area=DISC | {"polygon": RING}), "give either polygon or circle, and only one of them"),
     ("zone upside down", zone(altitude={"lower": 50, "upper": 10}), "lower must be below upper"),
     ("half a time of day", zone(schedule=[{"start": "08:00"}]), "give start and end together, or neither"),
@@ -107,6 +118,7 @@ BAD: list[tuple[str, Body, str]] = [
     ("limits crossed", policy("LimitControl", "speed", upperLimit=1, lowerLimit=2), "lowerLimit must not be above upperLimit"),
     ("limit that lands", policy("LimitControl", "speed", upperLimit=1, action="land"), "LimitControl takes action enforce or refuse"),
     ("geofence nowhere", policy("GeofenceControl", "exclusion"), "GeofenceControl takes kind inclusion or exclusion, and selector.zones"),
+    ("geofence that filters", policy("GeofenceControl", "exclusion", selector={"zones": ["z"]}, action="black"), "GeofenceControl takes action ignore, adjust, hover"),
     ("privacy without filter", policy("PrivacyControl", "camera"), "PrivacyControl takes kind camera, and action refuse"),
     (
         "fallback without faces",
@@ -134,10 +146,32 @@ def test_bad_manifest_is_refused_at_apply_with_its_sentence(
     assert sentence.lower() in str(refused.value).lower()
 
 
-@pytest.mark.parametrize("manifest", [case[1] for case in BAD], ids=[case[0] for case in BAD])
-def test_what_the_schema_refuses_the_models_refuse_too(manifest: Body) -> None:
-    with pytest.raises(InvalidObject):
+def rules(schema: Body) -> Iterator[str]:
+    """The sentences of all CEL rules of a schema, at any depth."""
+    yield from (rule["message"] for rule in schema.get("x-kubernetes-validations", ()))
+    for inner in (*schema.get("properties", {}).values(), schema.get("items")):
+        if isinstance(inner, dict):
+            yield from rules(inner)
+
+
+RULES = {
+    sentence
+    for kind in KINDS
+    if not kind.WRITTEN_BY_OPERATOR
+    for sentence in rules(crd(kind)["spec"]["versions"][0]["schema"]["openAPIV3Schema"])
+}
+
+
+@pytest.mark.parametrize(("manifest", "sentence"), [case[1:] for case in BAD], ids=[case[0] for case in BAD])
+def test_what_the_schema_refuses_the_models_refuse_with_the_same_sentence(manifest: Body, sentence: str) -> None:
+    with pytest.raises(InvalidObject) as refused:
         MODELS[manifest["kind"]].from_body(manifest)
+    if any(rule.startswith(sentence) for rule in RULES):
+        assert sentence in refused.value.problem
+
+
+def test_every_rule_has_a_manifest_that_breaks_it() -> None:
+    assert [rule for rule in RULES if not any(rule.startswith(sentence) for _, _, sentence in BAD)] == []
 
 
 def test_unknown_fields_are_refused(control_plane: ControlPlane) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import grpc
 import pytest
-from fractus_core.api.plans import node_identity
+from fractus_core.api.names import node_identity
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_proto.v1 import types_pb2
 from fractus_services.chain import verify

@@ -12,7 +12,7 @@ import grpc
 import pytest
 import shapely
 from fractus_cluster.ports import free_port
-from fractus_core.api.plans import node_identity
+from fractus_core.api.names import node_identity
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_proto.v1 import types_pb2
 from fractus_services.mobility.mavlink.itemlists import download

@@ -14,7 +14,7 @@ from fractus import sync
 from fractus.drone import Mobility
 from fractus.environment import Endpoint
 from fractus.errors import ControlLost, InvalidRequest, MissionComplete, PolicyDenied
-from fractus_core.api.plans import node_server_name
+from fractus_core.api.names import node_server_name
 from mobility_rig import DRIVER, FRAME, NODE, PASSENGER, Rig, altitude_limit, fence, grant, passenger_grant
 
 

@@ -56,12 +56,12 @@ def test_sentences_of_bad_applications():
         ([navigator([plain | {"lat": 95}])], "spec.components[0].controlPoints[0].path[0].lat: input should be less than or equal to 90, not 95"),
         ([STORE | {"replicas": 0}], "spec.components[0].replicas: input should be greater than or equal to 1, not 0"),
         ([edge_component(locations=[{"center": plain, "radius": -1}])], "spec.components[0].locations[0].radius: input should be greater than 0, not -1"),
-        ([edge_component(locations=[{"center": plain, "radius": 1, "instances": 0}])], "spec.components[0].locations[0].instances: must be 1 to 10000 or '*', not 0"),
-        ([edge_component(locations=[])], "spec.components[0].locations: is needed for placement edge"),
-        ([STORE | {"egress": ["Nobody"]}], "spec.components[0].egress[0]: there is no component Nobody"),
-        ([STORE | {"egress": ["DataStore"]}], "spec.components[0].egress[0]: a component does not refer to itself"),
+        ([edge_component(locations=[{"center": plain, "radius": 1, "instances": 0}])], "spec.components[0].locations[0].instances: instances is a whole number of 1 to 10000, or"),
+        ([edge_component(locations=[])], "spec.components[0].locations: locations are needed for placement edge"),
+        ([STORE | {"egress": ["Nobody"]}], "spec.components[0].egress[0]: egress names a component that the application does not have (Nobody)"),
+        ([STORE | {"egress": ["DataStore"]}], "spec.components[0].egress[0]: egress names the component itself; remove it (DataStore)"),
         ([edge_component(services=[{"service": "camera", "methods": ["Fly"]}])], "spec.components[0].services[0].methods[0]: input should be 'Arm'"),
-        ([edge_component(services=[{"service": "camera", "methods": ["Goto"]}])], "spec.components[0].services[0].methods[0]: the camera service has no Goto"),
+        ([edge_component(services=[{"service": "camera", "methods": ["Goto"]}])], "spec.components[0].services[0].methods[0]: the camera service has CaptureImage, DeleteImage"),
         ([edge_component(services=[{"service": "mobility", "methods": ["Goto"]}])], "spec.components[0].services: the mobility service is on drones only"),
         ([STORE, STORE | {"name": "data-store"}], "spec.components[1].name: data-store and DataStore get the same object name"),
         ([STORE | {"replica": 2}], "spec.components[0].replica: extra inputs are not permitted, not 2"),
@@ -112,25 +112,37 @@ def test_area_of_continental_size_is_refused():
 @pytest.mark.parametrize(
     ("spec", "sentence"),
     [
-        ({"type": "AccessControl", "kind": "speed"}, "spec.kind: AccessControl takes grant or denial"),
-        ({"type": "AccessControl", "kind": "denial"}, "spec.methods: AccessControl needs at least one method"),
-        ({"type": "LimitControl", "kind": "speed"}, "spec.upperLimit: LimitControl needs upperLimit or lowerLimit"),
+        (
+            {"type": "AccessControl", "kind": "speed"},
+            "spec.kind: AccessControl takes kind grant or denial, and methods",
+        ),
+        (
+            {"type": "AccessControl", "kind": "denial"},
+            "spec.methods: AccessControl takes kind grant or denial, and methods",
+        ),
+        (
+            {"type": "LimitControl", "kind": "speed"},
+            "spec.upperLimit: LimitControl takes kind speed or altitude, and upperLimit or lowerLimit",
+        ),
         (
             {"type": "LimitControl", "kind": "altitude", "lowerLimit": 9, "upperLimit": 5},
-            "spec.lowerLimit: must not be above upperLimit",
+            "spec.lowerLimit: lowerLimit must not be above upperLimit",
         ),
         (
             {"type": "GeofenceControl", "kind": "exclusion"},
-            "spec.selector.zones: GeofenceControl needs at least one zone",
+            "spec.selector.zones: GeofenceControl takes kind inclusion or exclusion, and selector.zones",
         ),
-        ({"type": "PrivacyControl", "kind": "camera"}, "spec.action: PrivacyControl needs an image filter"),
+        (
+            {"type": "PrivacyControl", "kind": "camera"},
+            "spec.action: PrivacyControl takes kind camera, and action refuse, black",
+        ),
         (
             {"type": "PrivacyControl", "kind": "camera", "action": "black", "fallback": "refuse"},
-            "spec.fallback: goes with PrivacyControl and action blurFaces",
+            "spec.fallback: faces and fallback go with PrivacyControl and action blurFaces",
         ),
         (
             {"type": "LimitControl", "kind": "speed", "upperLimit": 3, "faces": "gaussian"},
-            "spec.faces: goes with PrivacyControl and action blurFaces",
+            "spec.faces: faces and fallback go with PrivacyControl and action blurFaces",
         ),
     ],
 )
@@ -203,7 +215,7 @@ def test_schedules(time, moment, active):
         ({"start": "24:00", "end": "25:00"}, "spec.schedule[0].start: "),
         (
             {"validFrom": "2026-06-02T00:00:00Z", "validUntil": "2026-06-01T00:00:00Z"},
-            "spec.schedule[0].validUntil: must be after",
+            "spec.schedule[0].validUntil: validUntil must be after",
         ),
     ],
 )

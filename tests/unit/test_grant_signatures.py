@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from fractus_cli.grants import grants
 from fractus_cli.standalone import StandalonePki
 from fractus_core.api import Grant, InvalidObject
-from fractus_core.api.plans import component_identity, node_identity
+from fractus_core.api.names import component_identity, node_identity
 from fractus_core.identity.authority import SIGNER_LIFE, Authority
 from fractus_core.identity.grant_signer import GrantSigner
 from fractus_core.policy.signatures import (

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Any, Literal, Self
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from fractus_core.api.model import InvalidObject, Model, Name, Quantity, rules
+from fractus_core.api.model import InvalidObject, Model, Quantity
+from fractus_core.api.names import Name
+from fractus_core.api.rules import Broken, rule
 
 
 class ContainerPort(Model):
@@ -41,19 +43,6 @@ class EmptyDirectory(Model):
 class Volume(Model):
     """Files that the component sees: an empty directory, a ConfigMap, a Secret or a claim of storage."""
 
-    model_config = ConfigDict(
-        json_schema_extra=rules(
-            (
-                "[has(self.emptyDir), has(self.configMap), has(self.secret), has(self.claim)].filter(x, x).size() == 1",
-                "give exactly one of emptyDir, configMap, secret and claim",
-            ),
-            (
-                "!has(self.secret) || !self.secret.endsWith('-tls')",
-                "Secrets whose names end in -tls are certificates of components; give yours another name",
-            ),
-        )
-    )
-
     name: Name
     mount_path: str = Field(
         pattern=r"^/[^:]*$", max_length=512, description="Where the component finds it; an absolute path."
@@ -64,16 +53,20 @@ class Volume(Model):
     secret: Name | None = Field(default=None, description="A Secret of the application's namespace.")
     claim: Name | None = Field(default=None, description="A PersistentVolumeClaim of the application's namespace.")
 
-    @model_validator(mode="after")
-    def _one_source(self) -> Self:
+    @rule(
+        "[has(self.emptyDir), has(self.configMap), has(self.secret), has(self.claim)].filter(x, x).size() == 1",
+        "give exactly one of emptyDir, configMap, secret and claim",
+    )
+    def _one_source(self) -> Broken:
         given = [s for s in (self.empty_dir, self.config_map, self.secret, self.claim) if s is not None]
-        if len(given) != 1:
-            raise InvalidObject("", "give exactly one of emptyDir, configMap, secret and claim")
-        if self.secret is not None and self.secret.endswith("-tls"):
-            raise InvalidObject(
-                "secret", "Secrets whose names end in -tls are certificates of components; give yours another name"
-            )
-        return self
+        return "" if len(given) != 1 else None
+
+    @rule(
+        "!has(self.secret) || !self.secret.endsWith('-tls')",
+        "Secrets whose names end in -tls are certificates of components; give yours another name",
+    )
+    def _own_secret(self) -> Broken:
+        return "secret" if self.secret is not None and self.secret.endswith("-tls") else None
 
     def pod_volume(self) -> dict[str, Any]:
         """The entry for volumes of a pod."""

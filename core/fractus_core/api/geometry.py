@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field
 
-from fractus_core.api.model import InvalidObject, Model, rules
+from fractus_core.api.model import Model
+from fractus_core.api.rules import Broken, rule
 
 Latitude = Annotated[float, Field(ge=-90, le=90, description="Degrees north, WGS 84, -90 to 90.")]
 Longitude = Annotated[float, Field(ge=-180, le=180, description="Degrees east, WGS 84, -180 to 180.")]
@@ -63,37 +64,21 @@ class Polygon(Model):
 class Area(Model):
     """A piece of ground: either a polygon or a circle."""
 
-    model_config = ConfigDict(
-        json_schema_extra=rules(
-            ("has(self.polygon) != has(self.circle)", "give either polygon or circle, and only one of them")
-        )
-    )
-
     polygon: Polygon | None = None
     circle: Circle | None = None
 
-    @model_validator(mode="after")
-    def _one_shape(self) -> Self:
-        if (self.polygon is None) == (self.circle is None):
-            raise InvalidObject("", "give either polygon or circle, and only one of them")
-        return self
+    @rule("has(self.polygon) != has(self.circle)", "give either polygon or circle, and only one of them")
+    def _one_shape(self) -> Broken:
+        return "" if (self.polygon is None) == (self.circle is None) else None
 
 
 class AltitudeBand(Model):
     """A slab of air between two altitudes."""
 
-    model_config = ConfigDict(
-        json_schema_extra=rules(
-            ("!has(self.lower) || !has(self.upper) || self.lower < self.upper", "lower must be below upper")
-        )
-    )
-
     lower: float | None = Field(default=None, ge=-1000, le=20000, description="Metres; unset reaches to the ground.")
     upper: float | None = Field(default=None, ge=-1000, le=20000, description="Metres; unset has no ceiling.")
     reference: Reference = Field(default="home", description="What lower and upper are measured from.")
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.lower is not None and self.upper is not None and self.lower >= self.upper:
-            raise InvalidObject("lower", f"must be below upper ({self.lower} is not below {self.upper})")
-        return self
+    @rule("!has(self.lower) || !has(self.upper) || self.lower < self.upper", "lower must be below upper")
+    def _ordered(self) -> Broken:
+        return "lower" if self.lower is not None and self.upper is not None and self.lower >= self.upper else None

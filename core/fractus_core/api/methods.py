@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 MobilityMethod = Literal[
     "Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "Goto", "SetVelocity", "Hover", "GetPosition",
@@ -10,16 +10,13 @@ MobilityMethod = Literal[
 ]  # fmt: skip
 CameraMethod = Literal["CaptureImage", "RetrieveImage", "ListImages", "DeleteImage"]
 ControlMethod = Literal["GetControl", "ReturnControl"]
-Method = Literal[
-    "Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "Goto", "SetVelocity", "Hover", "GetPosition",
-    "ReturnToLaunch", "CaptureImage", "RetrieveImage", "ListImages", "DeleteImage", "GetControl", "ReturnControl",
-]  # fmt: skip
+Method = Literal[MobilityMethod, CameraMethod, ControlMethod]
 
 Service = Literal["mobility", "camera"]
 
-MOBILITY_METHODS: tuple[MobilityMethod, ...] = MobilityMethod.__args__  # type: ignore[attr-defined]
-CAMERA_METHODS: tuple[CameraMethod, ...] = CameraMethod.__args__  # type: ignore[attr-defined]
-CONTROL_METHODS: tuple[ControlMethod, ...] = ControlMethod.__args__  # type: ignore[attr-defined]
+MOBILITY_METHODS: tuple[MobilityMethod, ...] = get_args(MobilityMethod)
+CAMERA_METHODS: tuple[CameraMethod, ...] = get_args(CameraMethod)
+CONTROL_METHODS: tuple[ControlMethod, ...] = get_args(ControlMethod)
 
 METHODS_OF: dict[Service, frozenset[str]] = {
     "mobility": frozenset(MOBILITY_METHODS) | frozenset(CONTROL_METHODS),

@@ -15,13 +15,6 @@ GROUP = "fractus.dev"
 VERSION = "v1alpha1"
 API_VERSION = f"{GROUP}/{VERSION}"
 
-DNS_LABEL = r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$"
-Name = Annotated[str, Field(min_length=1, max_length=63, pattern=DNS_LABEL)]
-"""A DNS label (RFC 1123), as Kubernetes names objects."""
-
-ComponentName = Annotated[str, Field(min_length=1, max_length=40, pattern=r"^[A-Za-z]([-A-Za-z0-9]*[A-Za-z0-9])?$")]
-"""A component's name; CamelCase is welcome, objects get its kebab-case form."""
-
 _QUANTITY = re.compile(r"^(\d+(?:\.\d+)?)(m|k|Ki|M|Mi|G|Gi|T|Ti|P|Pi)?$")
 _SCALE = {
     None: 1.0, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 1e9, "T": 1e12, "P": 1e15,
@@ -50,11 +43,27 @@ Quantity = Annotated[str, Field(max_length=32, coerce_numbers_to_str=True), Afte
 """A Kubernetes quantity, such as 250m, 1.5 or 512Mi."""
 
 
+VALIDATIONS = "x-kubernetes-validations"
+
+
+def _add_rules(schema: dict[str, Any], model: type[Any]) -> None:
+    """Put the CEL of a model's rules (see `api.rules`) into its schema, in the order of their declaration."""
+    declared = (decorator.func for decorator in model.__pydantic_decorators__.model_validators.values())
+    rules = [found for check in declared if (found := getattr(check, VALIDATIONS, None)) is not None]
+    if rules:
+        schema[VALIDATIONS] = rules
+
+
 class Model(BaseModel):
     """A frozen value of the API; camelCase outside, snake_case inside, unknown fields refused."""
 
     model_config = ConfigDict(
-        alias_generator=to_camel, populate_by_name=True, extra="forbid", frozen=True, allow_inf_nan=False
+        alias_generator=to_camel,
+        populate_by_name=True,
+        extra="forbid",
+        frozen=True,
+        allow_inf_nan=False,
+        json_schema_extra=_add_rules,
     )
 
     def to_dict(self) -> dict[str, Any]:
@@ -192,8 +201,3 @@ def _problem(finding: ErrorDetails) -> str:
         case "too_short" if limits.get("field_type") == "Tuple":
             return f"must have at least {limits['min_length']} entries, not {limits['actual_length']}"
     return finding["msg"]
-
-
-def rules(*pairs: tuple[str, str]) -> dict[str, Any]:
-    """CEL rules for a model's schema: (rule, message) pairs become x-kubernetes-validations."""
-    return {"x-kubernetes-validations": [{"rule": rule, "message": message} for rule, message in pairs]}

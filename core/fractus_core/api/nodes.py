@@ -9,7 +9,8 @@ from pydantic import Field
 
 from fractus_core.api.geometry import Point, Position
 from fractus_core.api.methods import CameraMethod, MobilityMethod
-from fractus_core.api.model import Condition, Model, Name, OpenModel, Resource
+from fractus_core.api.model import Condition, Model, OpenModel, Resource
+from fractus_core.api.names import Name
 
 Technology = Literal["Ethernet", "4G", "5G", "WiFi", "BLE"]
 FlightState = Literal["inactive", "charging", "takingOff", "flying", "landing"]

@@ -7,9 +7,17 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, WithJsonSchema
 
-from fractus_core.api.applications import ControlPoint, Placement, PointsOfInterest, ServiceRequest
+from fractus_core.api.components import (
+    ComponentClass,
+    ControlPoint,
+    ControlScope,
+    Placement,
+    PointsOfInterest,
+    ServiceRequest,
+)
 from fractus_core.api.geometry import AltitudeBand, Area, Point, Position
 from fractus_core.api.model import Condition, Model, OpenModel, Resource
+from fractus_core.api.names import component_identity
 from fractus_core.api.policies import ActiveTime, PolicySpec
 
 Role = Literal["drone", "static", "hybrid-edge", "hybrid-drone", "cloud"]
@@ -154,8 +162,8 @@ class GrantSpec(Model):
     application: GrantApplication
     component: str
     instance: str
-    class_: Literal["driver", "passenger"] | None = Field(default=None, alias="class")
-    control: Literal["full", "partial"] | None = None
+    class_: ComponentClass | None = Field(default=None, alias="class")
+    control: ControlScope | None = None
     control_points: tuple[ControlPoint, ...] = ()
     points_of_interest: PointsOfInterest | None = None
     tour: tuple[Position, ...] = Field(
@@ -189,27 +197,6 @@ class GrantSpec(Model):
         if service == "mobility" and self.class_ == "driver":
             granted |= {"GetControl", "ReturnControl"}
         return frozenset(granted)
-
-
-TRUST_DOMAIN = "fractus.dev"
-
-OPERATOR_IDENTITY = f"spiffe://{TRUST_DOMAIN}/operator"
-"""SPIFFE id of who signs Grants."""
-
-
-def component_identity(namespace: str, application: str, component: str, instance: str) -> str:
-    """SPIFFE id of a component instance."""
-    return f"spiffe://{TRUST_DOMAIN}/ns/{namespace}/app/{application}/component/{component}/instance/{instance}"
-
-
-def node_identity(node: str) -> str:
-    """SPIFFE id of a node's agent and system services."""
-    return f"spiffe://{TRUST_DOMAIN}/node/{node}"
-
-
-def node_server_name(node: str) -> str:
-    """DNS name in the certificate of a node's services; clients check it whatever address they dial."""
-    return f"{node}.node.{TRUST_DOMAIN}"
 
 
 class GrantStatus(OpenModel):

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, get_args
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field
 
-from fractus_core.api.geometry import AltitudeBand, Area
+from fractus_core.api.geometry import AltitudeBand, Area, Reference
 from fractus_core.api.methods import Method
-from fractus_core.api.model import Condition, InvalidObject, Model, Name, OpenModel, Resource, rules
+from fractus_core.api.model import Condition, Model, OpenModel, Resource
+from fractus_core.api.names import Name
+from fractus_core.api.rules import Broken, rule
 
 
 class ReadyStatus(OpenModel):
@@ -23,49 +27,49 @@ class ReadyStatus(OpenModel):
 Day = Literal["Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun"]
 ClockTime = Annotated[str, Field(pattern=r"^([01][0-9]|2[0-3]):[0-5][0-9]$", max_length=5)]
 
-_DAYS: tuple[Day, ...] = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")
+_DAYS: tuple[Day, ...] = get_args(Day)
 _DAY_S = 86_400.0
 _THURSDAY = 3
 """1970-01-01 was one."""
 
 
-_VALIDITY = (
-    "!has(self.validFrom) || !has(self.validUntil) || self.validFrom < self.validUntil",
-    "validUntil must be after validFrom",
-)
+class Validity(Model):
+    """A window of time, open at the end that is not given."""
 
+    valid_from: datetime | None = Field(default=None, description="RFC 3339; unset: always valid before validUntil.")
+    valid_until: datetime | None = Field(default=None, description="RFC 3339; unset: valid indefinitely.")
 
-class ActiveTime(Model):
-    """When a zone is active; what is given must hold together. Times are UTC, as in ED-269."""
-
-    model_config = ConfigDict(
-        json_schema_extra=rules(
-            ("has(self.start) == has(self.end)", "give start and end together, or neither"),
-            _VALIDITY,
-        )
+    @rule(
+        "!has(self.validFrom) || !has(self.validUntil) || self.validFrom < self.validUntil",
+        "validUntil must be after validFrom",
     )
+    def _ordered(self) -> Broken:
+        return "validUntil" if self.window_s[0] >= self.window_s[1] else None
+
+    @property
+    def window_s(self) -> tuple[float, float]:
+        """Begin and end in seconds since 1970 UTC, infinite where they are not given; the end is not part of it."""
+        begin = -math.inf if self.valid_from is None else _unix(self.valid_from)
+        return begin, math.inf if self.valid_until is None else _unix(self.valid_until)
+
+
+class ActiveTime(Validity):
+    """When a zone is active; what is given must hold together. Times are UTC, as in ED-269."""
 
     days: tuple[Day, ...] = Field(default=(), max_length=7, description="Days of the week in UTC; empty: every day.")
     start: ClockTime | None = Field(default=None, description="HH:MM, UTC; unset: midnight.")
     end: ClockTime | None = Field(
         default=None, description="HH:MM, UTC; not later than start: on the day after. Unset: midnight."
     )
-    valid_from: datetime | None = Field(default=None, description="RFC 3339; unset: always active before validUntil.")
-    valid_until: datetime | None = Field(default=None, description="RFC 3339; unset: active for ever.")
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if (self.start is None) != (self.end is None):
-            raise InvalidObject("start", "give start and end together, or neither")
-        if self.valid_from and self.valid_until and self.valid_from >= self.valid_until:
-            raise InvalidObject("validUntil", "must be after validFrom")
-        return self
+    @rule("has(self.start) == has(self.end)", "give start and end together, or neither")
+    def _start_and_end(self) -> Broken:
+        return "start" if (self.start is None) != (self.end is None) else None
 
     def active(self, time_s: float) -> bool:
         """Whether a moment, in seconds since 1970 UTC, is in this time."""
-        if self.valid_from is not None and time_s < _unix(self.valid_from):
-            return False
-        if self.valid_until is not None and time_s >= _unix(self.valid_until):
+        begin_s, end_s = self.window_s
+        if not begin_s <= time_s < end_s:
             return False
         start, end = _clock_s(self.start or "00:00"), _clock_s(self.end or "00:00")
         length = end - start if end > start else _DAY_S + end - start
@@ -122,27 +126,11 @@ class Zone(Resource):
     status: ReadyStatus | None = None
 
 
+_NUMBER = r"^[-+]?([0-9]+[.]?[0-9]*|[.][0-9]+)$"
+
+
 class NodeExpression(Model):
     """A condition on one attribute of a node."""
-
-    model_config = ConfigDict(
-        json_schema_extra=rules(
-            (
-                "self.operator == 'Exists' ? !has(self.values) || size(self.values) == 0 :"
-                " has(self.values) && size(self.values) > 0",
-                "values must be given for In, NotIn, Gt and Lt, and left out for Exists",
-            ),
-            (
-                "!(self.operator in ['Gt', 'Lt']) || !has(self.values) || size(self.values) == 1",
-                "Gt and Lt take exactly one value",
-            ),
-            (
-                "!(self.operator in ['Gt', 'Lt']) || !has(self.values) ||"
-                " self.values.all(v, v.matches('^[-+]?([0-9]+[.]?[0-9]*|[.][0-9]+)$'))",
-                "Gt and Lt compare numbers",
-            ),
-        )
-    )
 
     key: str = Field(
         min_length=1,
@@ -152,18 +140,30 @@ class NodeExpression(Model):
     operator: Literal["In", "NotIn", "Exists", "Gt", "Lt"]
     values: tuple[Annotated[str, Field(max_length=256)], ...] = Field(default=(), max_length=100)
 
-    @model_validator(mode="after")
-    def _values_fit(self) -> Self:
-        if (self.operator == "Exists") == bool(self.values):
-            raise InvalidObject("values", "must be given for In, NotIn, Gt and Lt, and left out for Exists")
-        if self.operator in {"Gt", "Lt"}:
-            if len(self.values) != 1:
-                raise InvalidObject("values", f"{self.operator} takes exactly one value")
-            try:
-                float(self.values[0])
-            except ValueError:
-                raise InvalidObject("values[0]", f"{self.operator} compares numbers, not {self.values[0]!r}") from None
-        return self
+    @rule(
+        "self.operator == 'Exists' ? !has(self.values) || size(self.values) == 0 :"
+        " has(self.values) && size(self.values) > 0",
+        "values must be given for In, NotIn, Gt and Lt, and left out for Exists",
+    )
+    def _values_fit(self) -> Broken:
+        return "values" if (self.operator == "Exists") == bool(self.values) else None
+
+    @rule(
+        "!(self.operator in ['Gt', 'Lt']) || !has(self.values) || size(self.values) == 1",
+        "Gt and Lt take exactly one value",
+    )
+    def _one_bound(self) -> Broken:
+        return "values" if self.operator in {"Gt", "Lt"} and len(self.values) != 1 else None
+
+    @rule(
+        f"!(self.operator in ['Gt', 'Lt']) || !has(self.values) || self.values.all(v, v.matches('{_NUMBER}'))",
+        "Gt and Lt compare numbers",
+    )
+    def _numeric_bound(self) -> Broken:
+        compared = self.values if self.operator in {"Gt", "Lt"} else ()
+        return next(
+            ((f"values[{i}]", f"not {v!r}") for i, v in enumerate(compared) if not re.fullmatch(_NUMBER, v)), None
+        )
 
 
 class ApplicationSelector(Model):
@@ -184,53 +184,38 @@ class PolicySelector(Model):
     applications: ApplicationSelector | None = Field(default=None, description="Unset: every application.")
 
 
-class PolicySpec(Model):
+PolicyType = Literal["AccessControl", "LimitControl", "GeofenceControl", "PrivacyControl"]
+AccessKind = Literal["grant", "denial"]
+LimitKind = Literal["speed", "altitude"]
+GeofenceKind = Literal["inclusion", "exclusion"]
+LimitAction = Literal["enforce", "refuse"]
+GeofenceAction = Literal["ignore", "adjust", "hover", "land", "returnToLaunch", "revoke"]
+FilterAction = Literal["black", "blurAverage", "blurMedian", "blurFaces", "removeBackground"]
+PrivacyAction = Literal["refuse", FilterAction]
+FaceMethod = Literal["pixelate", "gaussian"]
+Fallback = Literal["blurAverage", "black", "refuse"]
+
+
+def _for(type_: PolicyType, then: str) -> str:
+    """A CEL rule that holds for one type of policy."""
+    return f"self.type != '{type_}' || {then}"
+
+
+def _among(field: str, choices: object) -> str:
+    """CEL: whether a field has one of the values of a closed set."""
+    return f"self.{field} in {list(get_args(choices))}"
+
+
+def _listed(choices: object) -> str:
+    *most, last = get_args(choices)
+    return f"{', '.join(most)} or {last}"
+
+
+class PolicySpec(Validity):
     """One rule of an authority or a provider."""
 
-    model_config = ConfigDict(
-        json_schema_extra=rules(
-            (
-                "self.type != 'AccessControl' || (self.kind in ['grant', 'denial'] && has(self.methods) && size(self.methods) > 0)",
-                "AccessControl takes kind grant or denial, and methods",
-            ),
-            (
-                "self.type != 'LimitControl' || (self.kind in ['speed', 'altitude'] && (has(self.upperLimit) || has(self.lowerLimit)))",
-                "LimitControl takes kind speed or altitude, and upperLimit or lowerLimit",
-            ),
-            (
-                "self.type != 'LimitControl' || !has(self.action) || self.action in ['enforce', 'refuse']",
-                "LimitControl takes action enforce or refuse",
-            ),
-            (
-                "!has(self.upperLimit) || !has(self.lowerLimit) || self.lowerLimit <= self.upperLimit",
-                "lowerLimit must not be above upperLimit",
-            ),
-            (
-                "self.type != 'GeofenceControl' || (self.kind in ['inclusion', 'exclusion'] && has(self.selector)"
-                " && has(self.selector.zones) && size(self.selector.zones) > 0)",
-                "GeofenceControl takes kind inclusion or exclusion, and selector.zones",
-            ),
-            (
-                "self.type != 'GeofenceControl' || !has(self.action) ||"
-                " self.action in ['ignore', 'adjust', 'hover', 'land', 'returnToLaunch', 'revoke']",
-                "GeofenceControl takes action ignore, adjust, hover, land, returnToLaunch or revoke",
-            ),
-            (
-                "self.type != 'PrivacyControl' || (self.kind == 'camera' && has(self.action) && self.action in"
-                " ['refuse', 'black', 'blurAverage', 'blurMedian', 'blurFaces', 'removeBackground'])",
-                "PrivacyControl takes kind camera, and action refuse, black, blurAverage, blurMedian, blurFaces or removeBackground",
-            ),
-            (
-                "!(has(self.faces) || has(self.fallback)) || (self.type == 'PrivacyControl' && has(self.action)"
-                " && self.action == 'blurFaces')",
-                "faces and fallback go with PrivacyControl and action blurFaces",
-            ),
-            _VALIDITY,
-        )
-    )
-
-    type: Literal["AccessControl", "LimitControl", "GeofenceControl", "PrivacyControl"]
-    kind: Literal["grant", "denial", "speed", "altitude", "inclusion", "exclusion", "camera"]
+    type: PolicyType
+    kind: Literal[AccessKind, LimitKind, GeofenceKind, "camera"]
     methods: tuple[Method, ...] = Field(default=(), max_length=64, description="For AccessControl: the methods meant.")
     lower_limit: float | None = Field(
         default=None,
@@ -244,86 +229,99 @@ class PolicySpec(Model):
         le=20000,
         description="For LimitControl: m/s, or metres in the datum of altitudeReference.",
     )
-    altitude_reference: Literal["home", "amsl", "terrain"] = Field(
+    altitude_reference: Reference = Field(
         default="home", description="For LimitControl altitude: what the limits are measured from."
     )
-    action: (
-        Literal[
-            "enforce", "refuse", "ignore", "adjust", "hover", "land", "returnToLaunch", "revoke",
-            "black", "blurAverage", "blurMedian", "blurFaces", "removeBackground",
-        ]
-        | None
-    ) = Field(
+    action: Literal[LimitAction, GeofenceAction, FilterAction] | None = Field(
         default=None,
         description="What happens on a violation; unset: enforce for limits, ignore (the request is discarded) for geofences.",
-    )  # fmt: skip
-    faces: Literal["pixelate", "gaussian"] | None = Field(
-        default=None, description="For blurFaces: how faces are hidden; unset: pixelate."
     )
-    fallback: Literal["blurAverage", "black", "refuse"] | None = Field(
+    faces: FaceMethod | None = Field(default=None, description="For blurFaces: how faces are hidden; unset: pixelate.")
+    fallback: Fallback | None = Field(
         default=None,
         description="For blurFaces: what is done where faces would be too small or too far to be found reliably;"
         " unset: blurAverage, of the whole picture.",
     )
     selector: PolicySelector = Field(default_factory=PolicySelector)
-    valid_from: datetime | None = Field(default=None, description="RFC 3339; unset: always valid before validUntil.")
-    valid_until: datetime | None = Field(default=None, description="RFC 3339; unset: valid for ever.")
     priority: int = Field(default=0, ge=-1000, le=1000, description="Decides between equally restrictive policies.")
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        _KIND_CHECKS[self.type](self)
-        for name, value in (("faces", self.faces), ("fallback", self.fallback)):
-            if value is not None and self.action != "blurFaces":
-                raise InvalidObject(name, "goes with PrivacyControl and action blurFaces; leave it out here")
-        if self.valid_from and self.valid_until and self.valid_from >= self.valid_until:
-            raise InvalidObject("validUntil", "must be after validFrom")
-        return self
+    @rule(
+        _for("AccessControl", f"({_among('kind', AccessKind)} && has(self.methods) && size(self.methods) > 0)"),
+        "AccessControl takes kind grant or denial, and methods",
+    )
+    def _access(self) -> Broken:
+        if self.type != "AccessControl":
+            return None
+        return "kind" if self.kind not in get_args(AccessKind) else "methods" if not self.methods else None
 
+    @rule(
+        _for("LimitControl", f"({_among('kind', LimitKind)} && (has(self.upperLimit) || has(self.lowerLimit)))"),
+        "LimitControl takes kind speed or altitude, and upperLimit or lowerLimit",
+    )
+    def _limit(self) -> Broken:
+        if self.type != "LimitControl":
+            return None
+        unlimited = self.lower_limit is None and self.upper_limit is None
+        return "kind" if self.kind not in get_args(LimitKind) else "upperLimit" if unlimited else None
 
-def _check_access(spec: PolicySpec) -> None:
-    if spec.kind not in {"grant", "denial"}:
-        raise InvalidObject("kind", "AccessControl takes grant or denial")
-    if not spec.methods:
-        raise InvalidObject("methods", "AccessControl needs at least one method")
+    @rule(
+        _for("LimitControl", f"!has(self.action) || {_among('action', LimitAction)}"),
+        f"LimitControl takes action {_listed(LimitAction)}",
+    )
+    def _limit_action(self) -> Broken:
+        return "action" if self.type == "LimitControl" and not self._acts(LimitAction) else None
 
+    @rule(
+        "!has(self.upperLimit) || !has(self.lowerLimit) || self.lowerLimit <= self.upperLimit",
+        "lowerLimit must not be above upperLimit",
+    )
+    def _limits_ordered(self) -> Broken:
+        lower, upper = self.lower_limit, self.upper_limit
+        return "lowerLimit" if lower is not None and upper is not None and lower > upper else None
 
-def _check_limit(spec: PolicySpec) -> None:
-    if spec.kind not in {"speed", "altitude"}:
-        raise InvalidObject("kind", "LimitControl takes speed or altitude")
-    if spec.lower_limit is None and spec.upper_limit is None:
-        raise InvalidObject("upperLimit", "LimitControl needs upperLimit or lowerLimit")
-    if spec.lower_limit is not None and spec.upper_limit is not None and spec.lower_limit > spec.upper_limit:
-        raise InvalidObject("lowerLimit", "must not be above upperLimit")
-    if spec.action not in {None, "enforce", "refuse"}:
-        raise InvalidObject("action", "LimitControl takes enforce or refuse")
-
-
-def _check_geofence(spec: PolicySpec) -> None:
-    if spec.kind not in {"inclusion", "exclusion"}:
-        raise InvalidObject("kind", "GeofenceControl takes inclusion or exclusion")
-    if not spec.selector.zones:
-        raise InvalidObject("selector.zones", "GeofenceControl needs at least one zone")
-    if spec.action not in {None, "ignore", "adjust", "hover", "land", "returnToLaunch", "revoke"}:
-        raise InvalidObject("action", "GeofenceControl takes ignore, adjust, hover, land, returnToLaunch or revoke")
-
-
-def _check_privacy(spec: PolicySpec) -> None:
-    if spec.kind != "camera":
-        raise InvalidObject("kind", "PrivacyControl takes camera")
-    if spec.action not in {"refuse", "black", "blurAverage", "blurMedian", "blurFaces", "removeBackground"}:
-        raise InvalidObject(
-            "action",
-            "PrivacyControl needs an image filter (black, blurAverage, blurMedian, blurFaces, removeBackground), or refuse",
+    @rule(
+        _for(
+            "GeofenceControl",
+            f"({_among('kind', GeofenceKind)} && has(self.selector)"
+            " && has(self.selector.zones) && size(self.selector.zones) > 0)",
+        ),
+        "GeofenceControl takes kind inclusion or exclusion, and selector.zones",
+    )
+    def _geofence(self) -> Broken:
+        if self.type != "GeofenceControl":
+            return None
+        return (
+            "kind" if self.kind not in get_args(GeofenceKind) else "selector.zones" if not self.selector.zones else None
         )
 
+    @rule(
+        _for("GeofenceControl", f"!has(self.action) || {_among('action', GeofenceAction)}"),
+        f"GeofenceControl takes action {_listed(GeofenceAction)}",
+    )
+    def _geofence_action(self) -> Broken:
+        return "action" if self.type == "GeofenceControl" and not self._acts(GeofenceAction) else None
 
-_KIND_CHECKS = {
-    "AccessControl": _check_access,
-    "LimitControl": _check_limit,
-    "GeofenceControl": _check_geofence,
-    "PrivacyControl": _check_privacy,
-}
+    @rule(
+        _for("PrivacyControl", f"(self.kind == 'camera' && has(self.action) && {_among('action', PrivacyAction)})"),
+        f"PrivacyControl takes kind camera, and action {_listed(PrivacyAction)}",
+    )
+    def _privacy(self) -> Broken:
+        if self.type != "PrivacyControl":
+            return None
+        return "kind" if self.kind != "camera" else "action" if self.action not in get_args(PrivacyAction) else None
+
+    @rule(
+        "!(has(self.faces) || has(self.fallback)) || (self.type == 'PrivacyControl' && has(self.action)"
+        " && self.action == 'blurFaces')",
+        "faces and fallback go with PrivacyControl and action blurFaces",
+    )
+    def _faces(self) -> Broken:
+        if self.type == "PrivacyControl" and self.action == "blurFaces":
+            return None
+        return "faces" if self.faces is not None else "fallback" if self.fallback is not None else None
+
+    def _acts(self, actions: object) -> bool:
+        return self.action is None or self.action in get_args(actions)
 
 
 class Policy(Resource):

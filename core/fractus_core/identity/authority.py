@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from fractus_core.api import GROUP, node_identity, node_server_name
-from fractus_core.api.plans import OPERATOR_IDENTITY
+from fractus_core.api.names import OPERATOR_IDENTITY
 from fractus_core.policy.signatures import DOCUMENT_SIGNING
 
 CA_LIFE = timedelta(days=3650)

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from fractus_core.api.applications import ApplicationSpec, ControlPoint
+from fractus_core.api.applications import ApplicationSpec
+from fractus_core.api.components import ControlPoint
 from fractus_core.api.geometry import Area, Circle, Point, Position
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.nodes import Depot

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from fractus_core.api.applications import Component
+from fractus_core.api.components import Component
 from fractus_core.api.model import quantity
 from fractus_core.api.nodes import Interface, NodeServices
 from fractus_core.api.plans import Rejection

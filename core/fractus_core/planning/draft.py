@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator
 
-from fractus_core.api.applications import Application, Component
+from fractus_core.api.applications import Application
+from fractus_core.api.components import Component
 from fractus_core.api.nodes import EdgeNode
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance, Rejection, Role, Serves
 from fractus_core.planning.candidates import Check, Ledger, check_host, check_resources, check_services

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from fractus_core.api.applications import Component
+from fractus_core.api.components import Component
 from fractus_core.api.geometry import Point, Position
 from fractus_core.api.nodes import Drone
 from fractus_core.api.plans import Alternative, DroneChoice

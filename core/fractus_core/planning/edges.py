@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fractus_core.api.applications import Component, EdgeLocation
+from fractus_core.api.components import Component, EdgeLocation
 from fractus_core.api.geometry import Point
 from fractus_core.api.nodes import Drone, EdgeNode, Interface
 from fractus_core.api.plans import PlannedInstance, Serves

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Generator
 
-from fractus_core.api.applications import Application, Component
+from fractus_core.api.applications import Application
+from fractus_core.api.components import Component
 from fractus_core.api.plans import DeploymentPlanSpec, DroneChoice
 from fractus_core.geo import geojson
 from fractus_core.planning.area import OperationArea, operation_area

@@ -10,7 +10,7 @@ from typing import Literal
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from fractus_core.api.applications import ServiceRequest
+from fractus_core.api.components import ServiceRequest
 from fractus_core.api.geometry import AltitudeBand, Area, Point, Reference
 from fractus_core.api.methods import METHODS_OF, MOBILITY_METHODS
 from fractus_core.api.plans import GrantedPolicy, GrantSpec

@@ -20,7 +20,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtensionOID, ObjectIdentifier
 
 from fractus_core.api.model import GROUP
-from fractus_core.api.plans import OPERATOR_IDENTITY, Grant
+from fractus_core.api.names import OPERATOR_IDENTITY
+from fractus_core.api.plans import Grant
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
 
 SIGNATURE_ANNOTATION = f"{GROUP}/signature"

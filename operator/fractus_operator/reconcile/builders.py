@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from fractus_core.api import API_VERSION, Application, Component, Drone
+from fractus_core.api.names import address_variable
 from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec, PlannedInstance
 
 from fractus_operator.cluster.kinds import (
@@ -259,7 +260,7 @@ def _environment(application: Application, component: Component, placed: Planned
         other = application.spec.component(called)
         if other.container.ports:
             address = f"{service_name(name, other)}.{namespace}.svc:{other.container.ports[0].port}"
-            env.append({"name": f"FRACTUS_SERVICE_{other.slug.upper().replace('-', '_')}", "value": address})
+            env.append({"name": address_variable(other.name), "value": address})
     ours = {variable["name"] for variable in env}
     env += [v.to_dict() for v in component.container.env if v.name not in ours]
     return env

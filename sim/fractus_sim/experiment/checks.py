@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from typing import Annotated, Literal
 
-from fractus_core.api.model import InvalidObject, Model, Name
+from fractus_core.api.model import InvalidObject, Model
+from fractus_core.api.names import Name
 from pydantic import AfterValidator, Field
 
 from fractus_sim.experiment.tasks import Altitude, ModeName, Place

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from fractus_core.api.model import Model, Name
+from fractus_core.api.model import Model
+from fractus_core.api.names import Name
 from pydantic import Field
 
 Share = Annotated[float, Field(ge=0, le=1)]

@@ -11,7 +11,8 @@ from typing import Annotated, Literal, Self
 
 import yaml
 from fractus_core.api.geometry import AltitudeBand, Area, Latitude, Longitude
-from fractus_core.api.model import InvalidObject, Model, Name
+from fractus_core.api.model import InvalidObject, Model
+from fractus_core.api.names import Name
 from fractus_vehicle.earth import Place
 from pydantic import Field, ValidationError, model_validator
 

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -32,6 +31,7 @@ import yaml
 from fractus_cli.standalone import StandalonePki
 from fractus_cluster.ports import free_port
 from fractus_core.api import API_VERSION, Drone, Grant
+from fractus_core.api.names import address_variable
 
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.linktap import LinkTap
@@ -359,7 +359,7 @@ class Standalone:
             points = [point.to_dict() for point in spec.control_points]
             variables["FRACTUS_CONTROL_POINTS"] = json.dumps(points, separators=(",", ":"))
         for component, address in (services or {}).items():
-            variables[f"FRACTUS_SERVICE_{_variable(component)}"] = address
+            variables[address_variable(component)] = address
         return {**_environment(), **variables}
 
     def run(
@@ -411,7 +411,7 @@ class Standalone:
         Raises:
             ExperimentError: it cannot be started.
         """
-        variables = {f"FRACTUS_SERVICE_{_variable(c)}": address for c, address in (services or {}).items()}
+        variables = {address_variable(c): address for c, address in (services or {}).items()}
         variables |= {"FRACTUS_HOST_IP": LOOPBACK, "FRACTUS_INSTANCE": name}
         program = _Program("", tuple(command), {**_environment(), **variables, **(environment or {})}, folder)
         self.processes.start(name, program.command, program.environment, program.folder)
@@ -491,8 +491,3 @@ def _module(name: str) -> list[str]:
 def _environment() -> dict[str, str]:
     kept = {name: value for name, value in os.environ.items() if not name.startswith("FRACTUS_")}
     return {**kept, "PYTHONUNBUFFERED": "1", "MALLOC_ARENA_MAX": "2"}
-
-
-def _variable(component: str) -> str:
-    """A component's name as part of an environment variable, as the operator writes it."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", component).upper().replace("-", "_")

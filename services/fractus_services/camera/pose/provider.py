@@ -10,8 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import grpc
+from fractus_core.api.names import node_server_name
 from fractus_core.api.nodes import EdgeNodeSpec
-from fractus_core.api.plans import node_server_name
 from fractus_core.policy.footprint import lens_of
 from fractus_core.policy.values import Attitude, Home, Lens, Situation
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import AsyncIterator
 
-from fractus_core.api.applications import ControlPoint
+from fractus_core.api.components import ControlPoint
 from fractus_core.api.geometry import Position
 from fractus_core.geo import middle
 from fractus_core.policy.compiled import height_m

@@ -1,0 +1,48 @@
+"""Rules across fields, each stated once: in CEL for the API server, and as a check of the model for everyone else.
+
+The API server evaluates CEL at `kubectl apply`. The models are also read where no API server is: by `fractus plan`, by
+agents from disk, in tests. One decorator declares both forms side by side, with the one sentence that both give:
+
+    class Area(Model):
+        @rule("has(self.polygon) != has(self.circle)", "give either polygon or circle, and only one of them")
+        def _one_shape(self) -> Broken:
+            return "" if (self.polygon is None) == (self.circle is None) else None
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from pydantic import model_validator
+
+from fractus_core.api.model import VALIDATIONS, InvalidObject
+
+M = TypeVar("M")
+
+Broken = str | tuple[str, str] | None
+"""The field that breaks a rule ("" for the object as a whole), or that and what is wrong with it; None: the rule holds."""
+
+
+def rule(cel: str, message: str) -> Callable[[Callable[[M], Broken]], Any]:
+    """Declare a rule of a model by its CEL expression, its sentence, and a method that finds the field that breaks it.
+
+    Args:
+        cel: true for an object that keeps the rule; `self` is the object as manifests spell it, without defaults.
+        message: what is asked for, and the remedy.
+    """
+
+    def declare(broken: Callable[[M], Broken]) -> Any:
+        @functools.wraps(broken)
+        def check(model: M) -> M:
+            found = broken(model)
+            if found is not None:
+                field, detail = found if isinstance(found, tuple) else (found, "")
+                raise InvalidObject(field, f"{message} ({detail})" if detail else message)
+            return model
+
+        check.__dict__[VALIDATIONS] = {"rule": cel, "message": message}
+        return model_validator(mode="after")(check)
+
+    return declare

@@ -1,0 +1,154 @@
+"""Flights in which anything may happen at any time, decided by a seed alone."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import Callable
+from typing import Any
+
+from control_courses import GUIDED, LAND, LOITER, POINTS, RTL, Course
+from control_flights import Flight
+from fractus_core.policy.values import GotoArgs, TakeoffArgs, VelocityArgs
+from mobility_world import partial, spec, touring, zone
+
+WEIGHTS = {
+    "stream": 12, "leave": 4, "arm": 8, "takeoff": 8, "goto": 8, "land": 2, "home": 2, "hover": 2, "velocity": 2,
+    "cancel": 3, "give_back": 5, "grant": 3, "remove": 1, "zone": 2, "pilot": 1, "hand_back": 3, "failsafe": 1,
+    "lose_link": 1, "find_link": 3, "refuse": 1, "obey": 3, "restart": 1, "motors": 1,
+}  # fmt: skip
+CALLS = frozenset({"arm", "takeoff", "goto", "land", "home", "hover", "velocity"})
+
+
+def wandering(seed: int) -> Course:
+    """The flight of a seed."""
+
+    async def course(f: Flight) -> None:
+        wanderer = Wanderer(f, random.Random(seed))
+        for _ in range(wanderer.dice.randint(8, 30)):
+            await wanderer.step()
+            await f.sleep(wanderer.dice.choice((0.0, 0.05, 0.3, 1.0, 2.5, 5.0, 8.0)))
+        f.world.plane.refuses.clear()
+        if f.world.plane.deaf:
+            f.find_link()
+        await f.sleep(60)
+
+    return course
+
+
+class Wanderer:
+    """Does one thing after another; what cannot be done at the moment is left out."""
+
+    def __init__(self, flight: Flight, dice: random.Random) -> None:
+        self.dice = dice
+        self._flight = flight
+        self._specs = {
+            "m1": spec(controlPoints=POINTS),
+            "m2": partial(instance="other"),
+            "m3": touring(tour=((0, 30), (30, 30))),
+        }
+        keys = dice.sample(sorted(self._specs), dice.randint(1, 3))
+        self._grants = {key: flight.put(self._specs[key], key) for key in keys}
+        self._streams: list[asyncio.Task[None]] = []
+        self._calls: list[asyncio.Task[None]] = []
+        self._key = ""
+        self._place = (0.0, 0.0)
+
+    async def step(self) -> None:
+        """Whatever the dice say."""
+        dice = self.dice
+        self._key = dice.choice(sorted(self._specs))
+        self._place = dice.uniform(-60, 60), dice.uniform(-60, 60)
+        what = dice.choices(tuple(WEIGHTS), tuple(WEIGHTS.values()))[0]
+        if what in CALLS:
+            self._call(what)
+        elif what in {"give_back", "restart"}:
+            await getattr(self, what)()
+        else:
+            getattr(self, what)()
+
+    def _call(self, what: str) -> None:
+        mine, (x, y), service = self._grants.get(self._key), self._place, self._flight.world.service
+        if mine is None:
+            return
+        work: dict[str, Callable[[], Any]] = {
+            "arm": lambda: service.arm(mine),
+            "takeoff": lambda: service.take_off(mine, TakeoffArgs(10.0)),
+            "goto": lambda: service.goto(mine, GotoArgs(39.36 + y / 111_000, 22.95 + x / 86_000, 12.0), 0),
+            "land": lambda: service.land(mine),
+            "home": lambda: service.return_to_launch(mine),
+            "hover": lambda: service.hover(mine),
+            "velocity": lambda: service.set_velocity(mine, VelocityArgs(x / 20, y / 20, hold_s=2.0)),
+        }
+        self._calls.append(self._flight.call(what, work[what]))
+
+    # Drivers
+
+    def stream(self) -> None:
+        mine = self._grants.get(self._key)
+        if mine is not None:
+            self._streams.append(self._flight.follow(mine, self._key))
+
+    def leave(self) -> None:
+        if self._streams:
+            self.dice.choice(self._streams).cancel()
+
+    def cancel(self) -> None:
+        if self._calls:
+            self.dice.choice(self._calls).cancel()
+
+    async def give_back(self) -> None:
+        mine = self._grants.get(self._key)
+        if mine is not None:
+            await self._flight.give_back(mine)
+
+    # Grants
+
+    def grant(self) -> None:
+        self._grants[self._key] = self._flight.put(self._specs[self._key], self._key)
+
+    def remove(self) -> None:
+        grants, mine = self._flight.world.grants, self._grants.get(self._key)
+        if mine is not None and grants.of(mine.identity) is mine:
+            grants.remove(self._grants.pop(self._key))
+
+    def zone(self) -> None:
+        if self._key in self._grants:
+            x, y = self._place
+            action = self.dice.choice(("hover", "land", "returnToLaunch", "revoke", "ignore"))
+            policies = spec(zone("new", action, x, y, x + 25, y + 25)).policies
+            changed = self._specs[self._key].model_copy(update={"policies": policies})
+            self._grants[self._key] = self._flight.put(changed, self._key)
+
+    # The vehicle, and who else commands it
+
+    def pilot(self) -> None:
+        self._flight.world.plane.set_to(self.dice.choice((LOITER, LAND, RTL)))
+
+    def hand_back(self) -> None:
+        self._flight.world.plane.set_to(GUIDED)
+
+    def failsafe(self) -> None:
+        self._flight.failsafe(self.dice.choice((RTL, LAND)))
+
+    def lose_link(self) -> None:
+        self._flight.lose_link()
+
+    def find_link(self) -> None:
+        self._flight.find_link()
+
+    def refuse(self) -> None:
+        self._flight.world.plane.refuses.add(self.dice.choice((176, 192, 400, 22)))
+
+    def obey(self) -> None:
+        self._flight.world.plane.refuses.clear()
+
+    def motors(self) -> None:
+        plane = self._flight.world.plane
+        if plane.height <= 0.0:
+            plane.vehicle.armed = not plane.vehicle.armed
+
+    async def restart(self) -> None:
+        self._streams.clear()
+        self._calls.clear()
+        await self._flight.restart()

@@ -69,3 +69,15 @@ def denied(verdict: Verdict) -> Refused:
     refusal = kind(verdict.code, verdict.reason, verdict.policies)
     refusal.verdict = verdict
     return refusal
+
+
+class AutopilotError(Exception):
+    """The autopilot did not do what was asked; the text says what and why.
+
+    Attributes:
+        link: whether it was not heard, so that trying again may help; otherwise it refused.
+    """
+
+    def __init__(self, reason: str, *, link: bool = False) -> None:
+        super().__init__(reason)
+        self.link = link

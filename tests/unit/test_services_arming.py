@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from fractus_core.api.plans import GrantSpec
 from fractus_core.policy.values import Airframe, TakeoffArgs
+from fractus_services.errors import AutopilotError
 from fractus_services.mobility.authority.observer import Observer
 from fractus_services.mobility.mavlink.failsafes import Checked
-from fractus_services.mobility.mavlink.link import AutopilotError
 from fractus_services.mobility.mavlink.vehicle import BRAKE
 from mobility_world import World, end, fly, refusal, spec
 

@@ -7,8 +7,8 @@ import gc
 import warnings
 
 import pytest
-from fractus_services.mobility.authority.background import Background
-from fractus_services.mobility.mavlink.link import AutopilotError
+from fractus_services.background import Background
+from fractus_services.errors import AutopilotError
 
 
 def test_what_is_cancelled_before_it_begins_was_never_made() -> None:

@@ -9,10 +9,9 @@ from pathlib import Path
 
 import pytest
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, Verdict
-from fractus_services.errors import Refused
+from fractus_services.errors import AutopilotError, Refused
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.leases import ControlState
-from fractus_services.mobility.mavlink.link import AutopilotError
 from fractus_services.mobility.mavlink.vehicle import GUIDED, LAND, RTL, SMART_RTL
 from mobility_world import World, clear_m, end, fly, goto, partial, refusal, spec, touring, zone
 

@@ -6,10 +6,11 @@ import asyncio
 from typing import Any
 
 import pytest
+from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink import itemlists
 from fractus_services.mobility.mavlink.dialect import message
 from fractus_services.mobility.mavlink.itemlists import FENCE, Item, NoLists, download, upload
-from fractus_services.mobility.mavlink.link import Autopilot, AutopilotError
+from fractus_services.mobility.mavlink.link import Autopilot
 
 ITEMS = tuple(Item(5001, 3.0, 393600000 + i, 229500000 - i) for i in range(3))
 

@@ -11,9 +11,8 @@ import pytest
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import Call, SetSpeedArgs, VelocityArgs
-from fractus_services.errors import Refused
+from fractus_services.errors import AutopilotError, Refused
 from fractus_services.mobility.flight import watch as watching
-from fractus_services.mobility.mavlink.link import AutopilotError
 from fractus_services.mobility.mavlink.vehicle import GUIDED
 from mobility_world import World, area, clear_m, end, fly, goto, partial, refusal, spec, zone
 

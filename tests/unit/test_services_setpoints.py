@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from fractus_core.policy.values import VelocityArgs
-from fractus_services.mobility.mavlink.link import AutopilotError
+from fractus_services.errors import AutopilotError
 from mobility_world import World, clear_m, end, fly, goto, refusal, spec, zone
 
 WALL = (-40.0, 25.0, 40.0, 40.0)

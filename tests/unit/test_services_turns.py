@@ -13,11 +13,10 @@ import grpc
 import pytest
 from fractus_core.policy.values import Call, TakeoffArgs, Verdict
 from fractus_proto.v1 import mobility_pb2
-from fractus_services import answering
+from fractus_services import answering, background
 from fractus_services.auth import Caller
+from fractus_services.background import in_slices
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.authority import background
-from fractus_services.mobility.authority.background import in_slices
 from fractus_services.mobility.flight import courses, service
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from google.rpc import error_details_pb2, status_pb2

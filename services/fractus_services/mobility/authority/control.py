@@ -16,15 +16,15 @@ from fractus_core.policy.compiled import CompiledGrant, for_transit
 from fractus_core.policy.values import Takeover, Verdict
 
 from fractus_services.audit import AuditLog
-from fractus_services.errors import Aborted, PreconditionFailed, Refused, Unavailable
+from fractus_services.background import Background
+from fractus_services.errors import Aborted, AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.grants import ActiveGrant, GrantFiles
-from fractus_services.mobility.authority.background import Background
 from fractus_services.mobility.authority.journal import Journal, Mission
 from fractus_services.mobility.authority.leases import ControlEvent, ControlState, FlightConstraints, Lease, Motion
 from fractus_services.mobility.flight.motions import distance_m
 from fractus_services.mobility.mavlink.failsafes import Checked
 from fractus_services.mobility.mavlink.fence import MissionFence
-from fractus_services.mobility.mavlink.link import Autopilot, AutopilotError, Permit, always
+from fractus_services.mobility.mavlink.link import Autopilot, Permit, always
 from fractus_services.mobility.mavlink.mode_controller import ModeController
 
 log = logging.getLogger(__name__)

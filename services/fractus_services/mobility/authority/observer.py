@@ -6,10 +6,10 @@ import asyncio
 import logging
 from dataclasses import replace
 
+from fractus_services.errors import AutopilotError
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Mission
 from fractus_services.mobility.mavlink.failsafes import BEING_SET, configure
-from fractus_services.mobility.mavlink.link import AutopilotError
 from fractus_services.mobility.mavlink.vehicle import GUIDED, HOMEWARD, LAND, MODE_NAMES
 
 log = logging.getLogger(__name__)

@@ -14,8 +14,8 @@ from fractus_core.policy.motion import margin_m
 from fractus_core.policy.routes import searching
 from fractus_core.policy.values import Call, GotoArgs, Situation
 
+from fractus_services.background import in_slices
 from fractus_services.errors import Aborted, PreconditionFailed, Refused, Unavailable
-from fractus_services.mobility.authority.background import in_slices
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import FlightConstraints, Motion
 from fractus_services.mobility.flight.guard import Guard

@@ -12,14 +12,13 @@ from fractus_core.policy.motion import height_margin_m, margin_m
 from fractus_core.policy.returning import straight_home_blocked
 from fractus_core.policy.values import GotoArgs, Situation
 
-from fractus_services.errors import PreconditionFailed, Refused, Unavailable
+from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.flight.courses import MAX_LEGS, REPLANS, Trip, first_leg, limited_mps, stopped_by_monitor
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import REACHED_M, Step, at_rest, come_to_rest, fly_to
-from fractus_services.mobility.mavlink.link import AutopilotError
 from fractus_services.mobility.mavlink.vehicle import GUIDED, HOMEWARD, RTL, SMART_RTL
 
 log = logging.getLogger(__name__)

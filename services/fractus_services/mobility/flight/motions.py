@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.values import STANDING_MPS, GotoArgs
 
-from fractus_services.errors import Aborted, Unavailable
+from fractus_services.errors import Aborted, AutopilotError, Unavailable
 from fractus_services.mobility.authority.leases import Motion
-from fractus_services.mobility.mavlink.link import Autopilot, AutopilotError, Permit
+from fractus_services.mobility.mavlink.link import Autopilot, Permit
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 
 REACHED_M = 1.0

@@ -5,14 +5,13 @@ from __future__ import annotations
 import asyncio
 import logging
 
-from fractus_services.errors import Refused, Unavailable
+from fractus_services.errors import AutopilotError, Refused, Unavailable
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Mission
 from fractus_services.mobility.authority.permits import tour_permit
 from fractus_services.mobility.flight.courses import Courses, Trip
 from fractus_services.mobility.flight.transit import FAULT, TransitFlight, target_of
-from fractus_services.mobility.mavlink.link import AutopilotError
 
 log = logging.getLogger(__name__)
 

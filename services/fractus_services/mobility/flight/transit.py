@@ -11,7 +11,7 @@ from fractus_core.geo import middle
 from fractus_core.policy.compiled import height_m
 from fractus_core.policy.values import Call, GotoArgs, TakeoffArgs
 
-from fractus_services.errors import PreconditionFailed, Refused
+from fractus_services.errors import AutopilotError, PreconditionFailed, Refused
 from fractus_services.mobility.authority.arming import arm
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Mission
@@ -20,7 +20,6 @@ from fractus_services.mobility.authority.permits import transit_permit
 from fractus_services.mobility.flight.courses import Courses, Trip
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import climb
-from fractus_services.mobility.mavlink.link import AutopilotError
 from fractus_services.mobility.mavlink.vehicle import GUIDED
 
 CRUISE_M = 10.0

@@ -12,7 +12,7 @@ from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Verdict
 
 from fractus_services.audit import AuditLog
-from fractus_services.errors import Aborted, Refused
+from fractus_services.errors import Aborted, AutopilotError, Refused
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import CORRECTION, Control
 from fractus_services.mobility.authority.leases import Motion
@@ -20,7 +20,7 @@ from fractus_services.mobility.authority.supervisor import Supervisor
 from fractus_services.mobility.flight.courses import limited_mps
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import REACHED_M, fly_to, stands
-from fractus_services.mobility.mavlink.link import AutopilotError, Permit
+from fractus_services.mobility.mavlink.link import Permit
 from fractus_services.mobility.mavlink.vehicle import GUIDED
 from fractus_services.mobility.rpc.telemetry import recorded
 

@@ -13,9 +13,10 @@ from pathlib import Path
 
 from fractus_core.api.plans import GrantSpec
 
+from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.bounds import Bounds, bounds_of
 from fractus_services.mobility.mavlink.itemlists import Item, NoLists, download, upload
-from fractus_services.mobility.mavlink.link import Autopilot, AutopilotError
+from fractus_services.mobility.mavlink.link import Autopilot
 
 log = logging.getLogger(__name__)
 

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.dialect import message
-from fractus_services.mobility.mavlink.link import Autopilot, AutopilotError
+from fractus_services.mobility.mavlink.link import Autopilot
 
 FENCE = 1
 ANSWER_S = 1.0

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.dialect import Codec, message
 from fractus_services.mobility.mavlink.transport import BadUrl, Transport, open_link
 from fractus_services.mobility.mavlink.vehicle import Vehicle
@@ -46,14 +47,6 @@ Permit = Callable[[], None]
 
 def always() -> None:
     """The permit of what may be sent at any time."""
-
-
-class AutopilotError(Exception):
-    """The autopilot did not do what was asked; the text says what and why."""
-
-    def __init__(self, reason: str, *, link: bool = False) -> None:
-        super().__init__(reason)
-        self.link = link
 
 
 class Autopilot:

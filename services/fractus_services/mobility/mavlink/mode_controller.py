@@ -8,8 +8,9 @@ from collections.abc import Awaitable, Callable
 
 from fractus_core.policy.values import Takeover
 
+from fractus_services.errors import AutopilotError
 from fractus_services.mobility.flight.motions import FRESH_S, at_rest
-from fractus_services.mobility.mavlink.link import Autopilot, AutopilotError, Permit, always
+from fractus_services.mobility.mavlink.link import Autopilot, Permit, always
 from fractus_services.mobility.mavlink.vehicle import GUIDED, HOMEWARD, LAND, RTL
 
 log = logging.getLogger(__name__)

@@ -15,12 +15,11 @@ from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 from fractus_services.answering import Reception
 from fractus_services.auth import Caller
 from fractus_services.clock import Clock
-from fractus_services.errors import InvalidRequest, PreconditionFailed, Refused, Unavailable
+from fractus_services.errors import AutopilotError, InvalidRequest, PreconditionFailed, Refused, Unavailable
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import ControlEvent, ControlState
 from fractus_services.mobility.flight.service import MobilityService, Progress
-from fractus_services.mobility.mavlink.link import AutopilotError
 from fractus_services.mobility.rpc.arguments import call_of, checked, goto_args, velocity_args
 from fractus_services.mobility.rpc.streams import Streams
 from fractus_services.mobility.rpc.telemetry import located, position_of, telemetry_of, velocity_of

@@ -1,4 +1,4 @@
-"""Work that goes on beside the calls: kept until it ends, and its failures told."""
+"""Tasks beside the calls: kept until they end, failures logged, and long computations cut into slices."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import time
 from collections.abc import Awaitable, Callable, Coroutine, Generator
 from typing import Any, ParamSpec, TypeVar
 
-from fractus_services.mobility.mavlink.link import AutopilotError
+from fractus_services.errors import AutopilotError
 
 log = logging.getLogger(__name__)
 
 SLICE_S = 0.004
-"""Long computations let everything else in the loop have its turn so often: monitor, watchdog, heartbeats."""
+"""How long a computation may hold the event loop: monitor (20 Hz), watchdogs and heartbeats run in between."""
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -33,7 +33,7 @@ async def in_slices(work: Generator[None, None, T]) -> T:
 
 
 class Background:
-    """Tasks of the drone's control."""
+    """Tasks of one service, which keeps a reference to each: the event loop itself holds them only weakly."""
 
     def __init__(self) -> None:
         self._tasks: set[asyncio.Task[None]] = set()
@@ -58,13 +58,13 @@ class Background:
             task.cancel()
 
     async def attempt(self, work: Callable[P, Awaitable[None]], *args: P.args, **kwargs: P.kwargs) -> None:
-        """Do something with the autopilot that may fail without harm."""
+        """Do something with the autopilot whose failure is harmless: it is logged."""
         try:
             await work(*args, **kwargs)
         except AutopilotError as error:
-            log.warning("%s", error)
+            log.warning("background: the autopilot did not follow (error=%s)", error)
 
     def _ended(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
         if not task.cancelled() and task.exception() is not None:
-            log.error("a task of the drone's control failed", exc_info=task.exception())
+            log.error("background: a task failed", exc_info=task.exception())

@@ -20,14 +20,15 @@ from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.authority.leases import ControlEvent, ControlState
+from fractus_services.mobility.authority.situation import situation_of
 from fractus_services.mobility.authority.supervisor import Supervisor
 from fractus_services.mobility.flight.courses import Courses
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.homing import Homing
+from fractus_services.mobility.flight.monitor import MotionMonitor
 from fractus_services.mobility.flight.service import MobilityService, Progress
 from fractus_services.mobility.flight.tours import Tours
 from fractus_services.mobility.flight.transit import TransitFlight
-from fractus_services.mobility.flight.watch import Watch
 from fractus_services.mobility.mavlink.dialect import message
 from fractus_services.mobility.mavlink.failsafes import Checked
 from fractus_services.mobility.mavlink.link import Autopilot
@@ -308,7 +309,7 @@ class World:
         control = self.control
         control.checked = Checked("", (), Airframe(retraces=retraces), 8.0, retraces)
         control.decided, control.was_armed, control.modes.expected = True, self.plane.vehicle.armed, GUIDED
-        self.guard = Guard(control, self.audit, lambda: 1_790_000_000.0 + self.plane.now)  # type: ignore[arg-type]
+        self.guard = Guard(lambda: situation_of(control, 1_790_000_000.0 + self.plane.now), self.audit)  # type: ignore[arg-type]
         homing = Homing(control, self.guard)
         control.modes.approach = homing.approach
         courses = Courses(control, self.guard)
@@ -317,8 +318,8 @@ class World:
         self.service = MobilityService(control, self.guard, homing)
         self.streams = Streams(control, transit.bring)
         self.supervisor = Supervisor(control)
-        self.watch = Watch(control, self.guard, self.audit, self.supervisor)  # type: ignore[arg-type]
-        self._tasks = [asyncio.ensure_future(part) for part in (self.plane.run(), self.watch.run(), self.tours.run())]
+        self.monitor = MotionMonitor(control, self.guard, self.audit, self.supervisor)  # type: ignore[arg-type]
+        self._tasks = [asyncio.ensure_future(part) for part in (self.plane.run(), self.monitor.run(), self.tours.run())]
         self.events: list[ControlEvent] = []
 
     async def __aenter__(self) -> World:

@@ -12,7 +12,7 @@ from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import Call, SetSpeedArgs, VelocityArgs
 from fractus_services.errors import AutopilotError, Refused
-from fractus_services.mobility.flight import watch as watching
+from fractus_services.mobility.flight import monitor as monitoring
 from fractus_services.mobility.mavlink.vehicle import GUIDED
 from mobility_world import World, area, clear_m, end, fly, goto, partial, refusal, spec, zone
 
@@ -241,7 +241,7 @@ def test_a_correction_that_came_too_late_for_its_motion_is_made_for_the_next(tmp
             flying = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 150), 0)))
             await world.until(lambda: world.plane.velocity[1] > 7)
             world.grants.put(spec(limit("speed", 3.0)))
-            world.watch.look()
+            world.monitor.look()
             world.control.begin("Goto").speed_mps = 8.0  # before the correction has begun
             begun = world.plane.now
             await world.until(lambda: world.plane.speed_mps == 3.0, 5)
@@ -442,7 +442,7 @@ def changed(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
         told.append(changed)
         return monitor(*args, changed=changed, **more)
 
-    monkeypatch.setattr(watching, "monitor", look)
+    monkeypatch.setattr(monitoring, "monitor", look)
     return told
 
 

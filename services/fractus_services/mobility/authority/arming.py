@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 
 from fractus_core.geo import LocalFrame
 
@@ -10,7 +11,6 @@ from fractus_services.errors import AutopilotError, PreconditionFailed
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Mission
-from fractus_services.mobility.flight.motions import distance_m
 from fractus_services.mobility.mavlink.failsafes import BEING_SET, Checked, choose_return, learn_return
 from fractus_services.mobility.mavlink.link import Permit
 from fractus_services.mobility.mavlink.vehicle import GUIDED
@@ -105,7 +105,7 @@ async def _prepare_ways_home(control: Control, grant: ActiveGrant, home: tuple[f
         The failsafes to arm with; others that are set meanwhile were not chosen for this flight.
     """
     autopilot, vehicle = control.autopilot, control.autopilot.vehicle
-    at_home = distance_m(LocalFrame(home[0], home[1]), vehicle.lat, vehicle.lon) <= HOME_M
+    at_home = vehicle.distance_m(home[0], home[1]) <= HOME_M
     checked = _check(control)
     checked = _learnt(control, checked, await choose_return(autopilot, checked, retrace=at_home))
     try:
@@ -147,7 +147,7 @@ def _home_of(control: Control, grant: ActiveGrant, mission: Mission) -> tuple[fl
     lat, lon, amsl_m = mission.home or (vehicle.lat, vehicle.lon, vehicle.amsl_m)
     base = grant.spec.home or grant.spec.depot
     if base is not None:
-        away = distance_m(LocalFrame(base.lat, base.lon), lat, lon)
+        away = math.hypot(*LocalFrame(base.lat, base.lon).xy(lat, lon))
         if away > STRAY_M:
             raise PreconditionFailed(
                 "NotAtHome", f"the drone would return to a place {away:.0f} m away from the home of its grant"

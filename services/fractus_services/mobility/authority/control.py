@@ -21,7 +21,6 @@ from fractus_services.errors import Aborted, AutopilotError, PreconditionFailed,
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.journal import Journal, Mission
 from fractus_services.mobility.authority.leases import ControlEvent, ControlState, FlightConstraints, Lease, Motion
-from fractus_services.mobility.flight.motions import distance_m
 from fractus_services.mobility.mavlink.failsafes import Checked
 from fractus_services.mobility.mavlink.fence import MissionFence
 from fractus_services.mobility.mavlink.link import Autopilot, Permit, always
@@ -230,7 +229,7 @@ class Control:
         path = points[mission.points_done].path if mission.points_done < len(points) else None
         if path and mission.waypoints < len(path):
             ahead = path[mission.waypoints]
-            if distance_m(LocalFrame(ahead.lat, ahead.lon), lat, lon) <= WAYPOINT_M:
+            if math.hypot(*LocalFrame(ahead.lat, ahead.lon).xy(lat, lon)) <= WAYPOINT_M:
                 mission.waypoints += 1
                 self.journal.save_soon()
 

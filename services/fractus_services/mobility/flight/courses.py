@@ -19,7 +19,7 @@ from fractus_services.errors import Aborted, PreconditionFailed, Refused, Unavai
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import FlightConstraints, Motion
 from fractus_services.mobility.flight.guard import Guard
-from fractus_services.mobility.flight.motions import REACHED_M, Step, at_rest, come_to_rest, fly_to
+from fractus_services.mobility.flight.motions import REACHED_M, Step, come_to_rest, fly_to
 from fractus_services.mobility.mavlink.link import Permit
 
 log = logging.getLogger(__name__)
@@ -149,7 +149,7 @@ class Courses:
     async def _along(self, trip: Trip, motion: Motion, target: GotoArgs) -> AsyncIterator[Step]:
         autopilot, permit = self._control.autopilot, trip.permit(motion)
         for _ in range(MAX_LEGS):
-            if not at_rest(autopilot):
+            if not autopilot.vehicle.at_rest(autopilot.now):
                 await come_to_rest(autopilot, motion, permit)
             leg, last = await self._next(trip, target)
             leg = self._allowed(trip, leg)
@@ -185,7 +185,7 @@ class Courses:
 
     def _arrived(self, leg: GotoArgs) -> bool:
         """Whether the drone is at the end of a leg already, so that flying it changes nothing."""
-        return self._guard.distance_m(leg.lat, leg.lon) <= 2 * REACHED_M
+        return self._control.autopilot.vehicle.distance_m(leg.lat, leg.lon) <= 2 * REACHED_M
 
     def _unreachable(self, trip: Trip, target: GotoArgs) -> Refused:
         """No way is found: what the policies say of the straight one tells why."""

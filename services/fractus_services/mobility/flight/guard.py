@@ -4,62 +4,32 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 
-from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.engine import judge
-from fractus_core.policy.values import Airframe, Call, Situation, Verdict
+from fractus_core.policy.values import Call, Situation, Verdict
 
 from fractus_services.audit import AuditLog
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.flight.motions import distance_m
 
 log = logging.getLogger(__name__)
-
-STALE_S = 1.0
-"""A position older than this is no position."""
 
 QUIET = frozenset({"GetPosition", "GetSpeed"})
 """Methods that are asked often and change nothing: only their refusals are written down."""
 
 
 class Guard:
-    """Judges calls against the streamed state."""
+    """Judges calls against the streamed state.
 
-    def __init__(self, control: Control, audit: AuditLog, clock: Callable[[], float]) -> None:
-        self._control = control
+    Args:
+        situation: the state of the drone at this moment.
+        audit: where verdicts are written.
+    """
+
+    def __init__(self, situation: Callable[[], Situation], audit: AuditLog) -> None:
+        self.situation = situation
         self._audit = audit
-        self._clock = clock
-
-    def situation(self) -> Situation:
-        """The state of the drone at this moment; a stale position counts as unknown."""
-        autopilot = self._control.autopilot
-        checked = self._control.checked
-        airframe = checked.airframe if checked is not None else Airframe()
-        if airframe.retraces and not self._control.retraces:
-            airframe = replace(airframe, retraces=False)
-        speed = self._control.cruise_mps
-        motion = self._control.motion
-        vertical = motion is not None and motion.kind in {"Takeoff", "Land", "ReturnToLaunch"}
-        now = autopilot.vehicle.situation(self._clock(), airframe, speed, vertical)
-        if autopilot.now - autopilot.vehicle.position_at <= STALE_S:
-            return now
-        return Situation(
-            time_s=now.time_s,
-            home=now.home,
-            armed=now.armed,
-            in_air=now.in_air,
-            airframe=airframe,
-            altitude_m=now.altitude_m,
-            speed_setpoint_mps=speed,
-        )
-
-    def distance_m(self, lat: float, lon: float) -> float:
-        """How far away a place is over ground; infinite while the drone's position is unknown."""
-        vehicle = self._control.autopilot.vehicle
-        return distance_m(LocalFrame(lat, lon), vehicle.lat, vehicle.lon)
 
     def judge(
         self,

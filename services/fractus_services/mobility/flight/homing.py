@@ -18,7 +18,7 @@ from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.flight.courses import MAX_LEGS, REPLANS, Trip, first_leg, limited_mps, stopped_by_monitor
 from fractus_services.mobility.flight.guard import Guard
-from fractus_services.mobility.flight.motions import REACHED_M, Step, at_rest, come_to_rest, fly_to
+from fractus_services.mobility.flight.motions import REACHED_M, Step, come_to_rest, fly_to
 from fractus_services.mobility.mavlink.vehicle import GUIDED, HOMEWARD, RTL, SMART_RTL
 
 log = logging.getLogger(__name__)
@@ -126,7 +126,7 @@ class Homing:
         """
         autopilot, permit = self._control.autopilot, trip.permit(motion)
         for _ in range(MAX_LEGS):
-            if self._guard.situation().lat is not None and not at_rest(autopilot):
+            if self._guard.situation().lat is not None and not autopilot.vehicle.at_rest(autopilot.now):
                 try:
                     await come_to_rest(autopilot, motion, permit)
                 except Refused as refusal:
@@ -158,7 +158,7 @@ class Homing:
         if found is None:
             raise PreconditionFailed("NoLegalWay", "zones are all around the drone or its home")
         leg, last, _ = found
-        if last and self._guard.distance_m(leg.lat, leg.lon) <= HOME_M:
+        if last and self._control.autopilot.vehicle.distance_m(leg.lat, leg.lon) <= HOME_M:
             return None
         return replace(leg, speed_mps=limited_mps(self._control.cruise_mps, leg, now, grant))
 

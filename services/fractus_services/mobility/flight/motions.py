@@ -7,8 +7,7 @@ import math
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 
-from fractus_core.geo import LocalFrame
-from fractus_core.policy.values import STANDING_MPS, GotoArgs
+from fractus_core.policy.values import GotoArgs
 
 from fractus_services.errors import Aborted, AutopilotError, Unavailable
 from fractus_services.mobility.authority.leases import Motion
@@ -27,7 +26,6 @@ SPEED_S = 1.3
 """A leg whose speed is not acknowledged for so long, in which it is sent twice, is stopped and begun once more."""
 
 REST_S, REST_AGAIN_S = 12.0, 0.4
-FRESH_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +76,6 @@ async def fly_to(
         judged: asked instead each time before the leg is begun, for the drone moves while commands are lost.
     """
     altitude = args.alt if args.alt is not None else autopilot.vehicle.altitude_m
-    frame = LocalFrame(args.lat, args.lon)
     motion.leg, motion.speed_mps = args, args.speed_mps
 
     async def begin() -> None:
@@ -96,7 +93,7 @@ async def fly_to(
     there: float | None = None
     while True:
         vehicle = autopilot.vehicle
-        away = distance_m(frame, vehicle.lat, vehicle.lon)
+        away = vehicle.distance_m(args.lat, args.lon)
         rise = abs(altitude - vehicle.altitude_m)
         done = away <= reached_m and rise <= HEIGHT_REACHED_M
         if done and args.yaw_deg is not None:
@@ -146,7 +143,7 @@ async def come_to_rest(autopilot: Autopilot, motion: Motion, permit: Permit) -> 
     deadline, sent = autopilot.now + REST_S, -math.inf
     motion.braking = True
     try:
-        while not at_rest(autopilot):
+        while not autopilot.vehicle.at_rest(autopilot.now):
             if autopilot.now > deadline:
                 speed = autopilot.vehicle.speed_mps
                 raise Aborted("NotStopping", f"the drone does not stop; it still flies {speed:.1f} m/s")
@@ -161,26 +158,8 @@ async def come_to_rest(autopilot: Autopilot, motion: Motion, permit: Permit) -> 
     motion.check()
 
 
-def at_rest(autopilot: Autopilot) -> bool:
-    """Whether the drone surely stands, in the sense of the policy engine."""
-    return stands(autopilot) and abs(autopilot.vehicle.down_mps) < STANDING_MPS
-
-
-def stands(autopilot: Autopilot) -> bool:
-    """Whether the drone surely stays above one place."""
-    vehicle = autopilot.vehicle
-    return autopilot.now - vehicle.position_at <= FRESH_S and vehicle.speed_mps < STANDING_MPS
-
-
 def _turned(vehicle: Vehicle, yaw_deg: float) -> bool:
     return abs((vehicle.yaw_deg - yaw_deg + 180.0) % 360.0 - 180.0) <= TURNED_DEG
-
-
-def distance_m(frame: LocalFrame, lat: float | None, lon: float | None) -> float:
-    """Horizontal distance of a position from a frame's origin."""
-    if lat is None or lon is None:
-        return math.inf
-    return math.hypot(*frame.xy(lat, lon))
 
 
 async def _tick(autopilot: Autopilot, motion: Motion) -> None:

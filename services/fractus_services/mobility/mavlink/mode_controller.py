@@ -9,7 +9,6 @@ from collections.abc import Awaitable, Callable
 from fractus_core.policy.values import Takeover
 
 from fractus_services.errors import AutopilotError
-from fractus_services.mobility.flight.motions import FRESH_S, at_rest
 from fractus_services.mobility.mavlink.link import Autopilot, Permit, always
 from fractus_services.mobility.mavlink.vehicle import GUIDED, HOMEWARD, LAND, RTL
 
@@ -84,7 +83,7 @@ class ModeController:
         autopilot = self._autopilot
         deadline = autopilot.now + SETTLE_S
         while not self._moving() and autopilot.vehicle.mode == GUIDED and autopilot.now < deadline:
-            known = autopilot.now - autopilot.vehicle.position_at < FRESH_S
+            known = autopilot.vehicle.position_fresh(autopilot.now)
             if known and autopilot.vehicle.speed_mps < STANDING_MPS and abs(autopilot.vehicle.down_mps) < STANDING_MPS:
                 return
             autopilot.stop()
@@ -144,7 +143,7 @@ class ModeController:
         deadline = autopilot.now + BRAKE_S
         autopilot.stop()
         while wanted() and vehicle.in_air and vehicle.mode == GUIDED and autopilot.now < deadline:
-            if at_rest(autopilot) or autopilot.now - vehicle.position_at > FRESH_S:
+            if vehicle.at_rest(autopilot.now) or not vehicle.position_fresh(autopilot.now):
                 return
             autopilot.stop()
             await autopilot.update(BRAKE_AGAIN_S)

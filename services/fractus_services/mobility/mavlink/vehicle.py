@@ -7,7 +7,8 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
-from fractus_core.policy.values import Airframe, Home, Situation
+from fractus_core.geo import LocalFrame
+from fractus_core.policy.values import STANDING_MPS, Airframe, Home, Situation
 
 GUIDED, RTL, LAND, SMART_RTL, BRAKE = 4, 6, 9, 21, 17
 MODE_NAMES = {
@@ -29,6 +30,9 @@ SURELY_M, UNTOLD_M = 1.5, 0.5
 _IN_AIR = frozenset({2, 3, 4})
 _FIX_3D = 3
 _LEAST_ERROR_M, _UNTOLD_ERROR_M, _WORST_ERROR_M = 0.5, 1.5, 10.0
+
+MAX_POSITION_AGE_S = 1.0
+"""A position older than this is no position: at 20 Hz in flight, twenty in a row were lost."""
 
 COURSE_S = 0.3
 """Velocities this far back tell how the drone speeds up."""
@@ -110,6 +114,24 @@ class Vehicle:
     def speed_mps(self) -> float:
         """Horizontal speed over ground."""
         return math.hypot(self.north_mps, self.east_mps)
+
+    def position_fresh(self, now: float) -> bool:
+        """Whether the position is recent enough to judge and to fly by; `now` is monotonic, as `position_at` is."""
+        return now - self.position_at <= MAX_POSITION_AGE_S
+
+    def keeps_place(self, now: float) -> bool:
+        """Whether it surely stays above one place."""
+        return self.position_fresh(now) and self.speed_mps < STANDING_MPS
+
+    def at_rest(self, now: float) -> bool:
+        """Whether it surely stands, in the sense of the policy engine."""
+        return self.keeps_place(now) and abs(self.down_mps) < STANDING_MPS
+
+    def distance_m(self, lat: float, lon: float) -> float:
+        """How far away a place is over ground; infinite while the position is unknown."""
+        if self.lat is None or self.lon is None:
+            return math.inf
+        return math.hypot(*LocalFrame(lat, lon).xy(self.lat, self.lon))
 
     @property
     def forward_mps2(self) -> float | None:

@@ -21,14 +21,15 @@ from fractus_services.hosting import open_door, read_description
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.authority.observer import Observer
+from fractus_services.mobility.authority.situation import situation_of
 from fractus_services.mobility.authority.supervisor import Supervisor
 from fractus_services.mobility.flight.courses import Courses
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.homing import Homing
+from fractus_services.mobility.flight.monitor import MotionMonitor
 from fractus_services.mobility.flight.service import MobilityService
 from fractus_services.mobility.flight.tours import Tours
 from fractus_services.mobility.flight.transit import TransitFlight
-from fractus_services.mobility.flight.watch import Watch
 from fractus_services.mobility.mavlink.fence import MissionFence
 from fractus_services.mobility.mavlink.link import Autopilot
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
@@ -73,7 +74,7 @@ async def run(options: Options, stop: asyncio.Event) -> None:
     autopilot = Autopilot(url)
     fence = MissionFence(autopilot, options.state)
     control = Control(autopilot, journal, grants, audit, fence=fence, grace_s=options.driver_grace)
-    guard = Guard(control, audit, clock)
+    guard = Guard(lambda: situation_of(control, clock()), audit)
     homing = Homing(control, guard)
     control.modes.approach = homing.approach
     courses = Courses(control, guard)
@@ -81,7 +82,7 @@ async def run(options: Options, stop: asyncio.Event) -> None:
     tours = Tours(control, grants, transit, courses, options.boarding)
     supervisor = Supervisor(control)
     autopilot.alive = supervisor.alive
-    watch = Watch(control, guard, audit, supervisor)
+    monitor = MotionMonitor(control, guard, audit, supervisor)
     observer = Observer(control)
     autopilot.on_found = observer.found
     autopilot.on_message = lambda m: observer.heartbeat() if m.get_type() == "HEARTBEAT" else None
@@ -97,8 +98,8 @@ async def run(options: Options, stop: asyncio.Event) -> None:
             for part in (
                 autopilot.run(),
                 grants.run(),
-                watch.run(),
-                watch.record(),
+                monitor.run(),
+                monitor.record(),
                 tours.run(),
                 _serve(options, tls, handlers),
             )

@@ -1,4 +1,4 @@
-"""The vehicle's state as subscribers and the flight recorder see it."""
+"""The vehicle's state as subscribers see it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import Any
 from fractus_proto.v1 import mobility_pb2, types_pb2
 
 from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.flight.guard import STALE_S
-from fractus_services.mobility.mavlink.vehicle import Vehicle
+from fractus_services.mobility.mavlink.vehicle import MAX_POSITION_AGE_S, Vehicle
 
 
 def position_of(vehicle: Vehicle) -> types_pb2.Position:
@@ -31,7 +30,8 @@ def position_age_s(control: Control) -> float:
 
 def located(control: Control) -> bool:
     """Whether the position is known and fresh."""
-    return control.autopilot.vehicle.lat is not None and position_age_s(control) <= STALE_S
+    vehicle = control.autopilot.vehicle
+    return vehicle.lat is not None and vehicle.position_fresh(control.autopilot.now)
 
 
 def telemetry_of(control: Control, time_s: float, missions: bool) -> Any:
@@ -40,7 +40,7 @@ def telemetry_of(control: Control, time_s: float, missions: bool) -> Any:
     Args:
         control: who flies, and what.
         time_s: Unix time.
-        missions: whether the subscriber may know of everybody's missions.
+        missions: whether the subscriber may know of the missions of all applications.
     """
     vehicle = control.autopilot.vehicle
     message = mobility_pb2.Telemetry(
@@ -65,7 +65,7 @@ def telemetry_of(control: Control, time_s: float, missions: bool) -> Any:
         message.position_age_s = max(position_age_s(control), 0.0)
         message.position_error_m = vehicle.position_error_m + vehicle.speed_mps * message.position_age_s
     attitude_age_s = control.autopilot.now - vehicle.attitude_at
-    if attitude_age_s <= STALE_S:
+    if attitude_age_s <= MAX_POSITION_AGE_S:
         message.attitude_age_s = max(attitude_age_s, 0.0)
         message.attitude.roll_deg, message.attitude.pitch_deg = vehicle.roll_deg, vehicle.pitch_deg
         message.attitude.yaw_deg = vehicle.heading_deg
@@ -78,19 +78,3 @@ def telemetry_of(control: Control, time_s: float, missions: bool) -> Any:
 
 def _known(value: float) -> float:
     return value if math.isfinite(value) else 0.0
-
-
-def recorded(control: Control) -> dict[str, Any]:
-    """One entry of the flight recorder."""
-    vehicle = control.autopilot.vehicle
-    return {
-        "lat": vehicle.lat,
-        "lon": vehicle.lon,
-        "alt": round(vehicle.altitude_m, 2),
-        "amsl": round(vehicle.amsl_m, 2),
-        "speed": round(vehicle.speed_mps, 2),
-        "mode": vehicle.mode_name,
-        "battery": round(_known(vehicle.battery_remaining), 3),
-        "controller": control.controller,
-        "in_air": vehicle.in_air,
-    }

@@ -6,6 +6,7 @@ import asyncio
 import logging
 import math
 from dataclasses import replace
+from typing import Any
 
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.monitoring import monitor
@@ -19,10 +20,9 @@ from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.authority.supervisor import Supervisor
 from fractus_services.mobility.flight.courses import limited_mps
 from fractus_services.mobility.flight.guard import Guard
-from fractus_services.mobility.flight.motions import REACHED_M, fly_to, stands
+from fractus_services.mobility.flight.motions import REACHED_M, fly_to
 from fractus_services.mobility.mavlink.link import Permit
 from fractus_services.mobility.mavlink.vehicle import GUIDED
-from fractus_services.mobility.rpc.telemetry import recorded
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ BEGINS_S = 2.0
 """So long a drone may stand that has been told to fly."""
 
 
-class Watch:
+class MotionMonitor:
     """Judges the flying drone's present state, and acts on what it finds."""
 
     def __init__(self, control: Control, guard: Guard, audit: AuditLog, supervisor: Supervisor) -> None:
@@ -122,7 +122,7 @@ class Watch:
         if grant is not self._grant:
             self._grant, self._changed_at = grant, autopilot.now
         begins = autopilot.now - control.began_at < BEGINS_S
-        if (motion is None or motion.kind == "Takeoff") and not begins and stands(autopilot):
+        if (motion is None or motion.kind == "Takeoff") and not begins and autopilot.vehicle.keeps_place(autopilot.now):
             # Whatever moves it from here is judged by what holds now, or later.
             self._changed_at = -math.inf
         return autopilot.now - self._changed_at < CHANGED_S
@@ -199,3 +199,19 @@ class Watch:
             await asyncio.sleep(RECORD_S)
             if self._control.autopilot.vehicle.armed:
                 self._audit.append("state", recorded(self._control), now=False)
+
+
+def recorded(control: Control) -> dict[str, Any]:
+    """One entry of the flight recorder."""
+    vehicle = control.autopilot.vehicle
+    return {
+        "lat": vehicle.lat,
+        "lon": vehicle.lon,
+        "alt": round(vehicle.altitude_m, 2),
+        "amsl": round(vehicle.amsl_m, 2),
+        "speed": round(vehicle.speed_mps, 2),
+        "mode": vehicle.mode_name,
+        "battery": round(vehicle.battery_remaining, 3) if math.isfinite(vehicle.battery_remaining) else 0.0,
+        "controller": control.controller,
+        "in_air": vehicle.in_air,
+    }

@@ -33,7 +33,7 @@ from fractus_core.api.names import node_server_name
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
 from fractus_services import answering
 from fractus_services.auth import Caller
-from fractus_services.camera.__main__ import camera
+from fractus_services.commands import camera
 from skimage.data import astronaut
 
 NODE = "bench"

@@ -45,13 +45,13 @@ class Entry:
 
 COMMANDS: dict[str, Entry] = {
     "audit": Entry("fractus_cli.audit:audit", "Check audit logs of node services.", "services"),
-    "camera": Entry("fractus_services.camera.__main__:camera", "The camera service of a node.", "services"),
+    "camera": Entry("fractus_services.commands:camera", "The camera service of a node.", "services"),
     "camera-world": Entry("fractus_world.__main__:camera_world", "Serve what a camera above a simulated world sees.", "sim"),
     "cluster": Entry("fractus_cluster.cli:cluster", "Run a real Kubernetes of several nodes on this machine.", "sim"),
     "experiment": Entry("fractus_sim.experiment.cli:experiment", "Run experiments with faults, checks and a report.", "sim"),
     "grants": Entry("fractus_cli.grants:grants", "Sign Grants and make certificates, without Kubernetes.", "operator"),
     "images": Entry("fractus_cluster.images.cli:images", "Build the container images of Fractus with buildah.", "sim"),
-    "mobility": Entry("fractus_services.mobility.__main__:mobility", "The mobility service of a drone.", "services"),
+    "mobility": Entry("fractus_services.commands:mobility", "The mobility service of a drone.", "services"),
     "plan": Entry("fractus_cli.plan:plan", "Plan the Applications in some manifests, without a cluster.", "core"),
     "policy": Entry("fractus_cli.policy:policy", "Ask the policy engine, without a cluster.", "core"),
     "telemetry": Entry("fractus_cli.telemetry:telemetry", "Print the state of a drone until interrupted."),

@@ -1,10 +1,13 @@
-"""What both services do when they start: read the node's description, open the door, say why they cannot."""
+"""What both services do when they start: read the node's description, bind their port, say why they cannot."""
 
 from __future__ import annotations
 
+import asyncio
 import logging
+import signal
+from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 from fractus_core.api.model import InvalidObject
@@ -16,6 +19,8 @@ if TYPE_CHECKING:
     from fractus_services.auth import TlsFiles
 
 log = logging.getLogger(__name__)
+
+_Options = TypeVar("_Options")
 
 _LAST_PORT = 65535
 _SOCKET_FILES = ("unix:", "unix-abstract:")
@@ -57,7 +62,7 @@ def read_description(path: Path, *kinds: type[Drone | EdgeNode]) -> Drone | Edge
     except yaml.YAMLError as error:
         raise CannotServe(f"--description {path}: is not YAML: {' '.join(str(error).split())}") from None
     if body is None:
-        log.warning("there is no description of this node at %s", path)
+        log.warning("hosting: this node has no description (path=%s)", path)
         return None
     said = body.get("kind") if isinstance(body, dict) else None
     kind = next((kind for kind in kinds if said == kind.KIND), None)
@@ -70,11 +75,11 @@ def read_description(path: Path, *kinds: type[Drone | EdgeNode]) -> Drone | Edge
         raise CannotServe(f"--description {path}: {error}") from None
 
 
-async def open_door(server: grpc.aio.Server, listen: str, tls: TlsFiles) -> None:
+async def bind(server: grpc.aio.Server, listen: str, tls: TlsFiles) -> None:
     """Wait for certificates, then take calls.
 
     Raises:
-        CannotServe: the address cannot be listened at.
+        CannotServe: the address cannot be bound.
     """
     await tls.wait()
     try:
@@ -87,7 +92,42 @@ async def open_door(server: grpc.aio.Server, listen: str, tls: TlsFiles) -> None
     await server.start()
 
 
-def one_sentence(failures: ExceptionGroup[Exception]) -> click.ClickException:
+def until_signalled(
+    run: Callable[[_Options, asyncio.Event], Coroutine[Any, Any, None]],
+    options: _Options,
+    level: int,
+    *known: type[Exception],
+) -> None:
+    """Run a service until SIGTERM or SIGINT.
+
+    Args:
+        run: serves until the event is set.
+        options: of the command line.
+        level: of the log.
+        known: errors of the service whose message tells the user enough.
+
+    Raises:
+        click.ClickException: the service cannot run as it is told to.
+    """
+    logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+
+    expected: tuple[type[Exception], ...] = (CannotServe, *known)
+
+    async def main() -> None:
+        stop = asyncio.Event()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            asyncio.get_running_loop().add_signal_handler(number, stop.set)
+        await run(options, stop)
+
+    try:
+        asyncio.run(main())
+    except expected as error:
+        raise click.ClickException(str(error)) from None
+    except ExceptionGroup as failures:
+        raise _one_sentence(failures) from None
+
+
+def _one_sentence(failures: ExceptionGroup[Exception]) -> click.ClickException:
     """What to tell the user of a service whose parts failed so.
 
     Raises:

@@ -7,8 +7,7 @@ import click
 import pytest
 from click.testing import CliRunner, Result
 from fractus_cli.standalone import StandalonePki
-from fractus_services.camera.__main__ import camera
-from fractus_services.mobility.__main__ import mobility
+from fractus_services.commands import camera, mobility
 
 SERVICES = pytest.mark.parametrize("service", [mobility, camera], ids=["mobility", "camera"])
 

@@ -6,7 +6,6 @@ import asyncio
 import logging
 import socket
 import time
-from typing import TYPE_CHECKING
 
 import grpc
 from fractus_core.api.nodes import Drone, EdgeNode
@@ -26,10 +25,8 @@ from fractus_services.camera.rpc.handlers import CameraHandlers
 from fractus_services.clock import Clock
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import GrantFiles
-from fractus_services.hosting import open_door, read_description
-
-if TYPE_CHECKING:
-    from fractus_services.camera.__main__ import Options
+from fractus_services.hosting import bind, read_description
+from fractus_services.options import CameraOptions
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +40,7 @@ def body_of(description: Drone | EdgeNode | None) -> Body:
     return Body(camera.pixels, camera.model, camera.sensor_type, fixed) if camera is not None else Body(fixed=fixed)
 
 
-def detector_of(options: Options) -> Detector:
+def detector_of(options: CameraOptions) -> Detector:
     """What finds faces.
 
     Raises:
@@ -54,14 +51,14 @@ def detector_of(options: Options) -> Detector:
     return CascadeDetector(options.face_px)
 
 
-def _whereabouts(options: Options, description: Drone | EdgeNode | None, node: str, tls: TlsFiles) -> Whereabouts:
+def _whereabouts(options: CameraOptions, description: Drone | EdgeNode | None, node: str, tls: TlsFiles) -> Whereabouts:
     if isinstance(description, EdgeNode):
         return Fixed.of(description.spec, options.relief)
     lens = lens_of(description.spec.services.camera) if description is not None else None
     return Airborne(options.mobility, node, tls, time.monotonic, lens=lens, relief_m=options.relief)
 
 
-async def run(options: Options, stop: asyncio.Event) -> None:
+async def run(options: CameraOptions, stop: asyncio.Event) -> None:
     """Serve until `stop` is set, or a part of the service fails.
 
     Raises:
@@ -110,7 +107,7 @@ async def run(options: Options, stop: asyncio.Event) -> None:
 async def _serve(listen: str, tls: TlsFiles, handlers: CameraHandlers, whereabouts: Whereabouts) -> None:
     server = grpc.aio.server(options=KEEPALIVE)
     camera_pb2_grpc.add_CameraServiceServicer_to_server(handlers, server)  # type: ignore[no-untyped-call]
-    await open_door(server, listen, tls)
+    await bind(server, listen, tls)
     log.info("camera service on %s", listen)
     try:
         await whereabouts.run()

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import socket
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import grpc
 from fractus_core.api.nodes import Drone
@@ -17,7 +17,7 @@ from fractus_services.auth import KEEPALIVE, TlsFiles
 from fractus_services.clock import Clock
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import GrantFiles
-from fractus_services.hosting import open_door, read_description
+from fractus_services.hosting import bind, read_description
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.authority.observer import Observer
@@ -34,9 +34,7 @@ from fractus_services.mobility.mavlink.fence import MissionFence
 from fractus_services.mobility.mavlink.link import Autopilot
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from fractus_services.mobility.rpc.streams import Streams
-
-if TYPE_CHECKING:
-    from fractus_services.mobility.__main__ import Options
+from fractus_services.options import MobilityOptions
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +55,7 @@ def describe(path: Path) -> tuple[str, str]:
     return drone.name, features.connection if features is not None else DEFAULT_LINK
 
 
-async def run(options: Options, stop: asyncio.Event) -> None:
+async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     """Serve until `stop` is set, or a part of the service fails.
 
     Raises:
@@ -117,10 +115,10 @@ def _record_grant(audit: AuditLog, old: Any, new: Any) -> None:
     audit.append("grant", {"change": change, "identity": grant.identity, "name": grant.name, "key": grant.key})
 
 
-async def _serve(options: Options, tls: TlsFiles, handlers: MobilityHandlers) -> None:
+async def _serve(options: MobilityOptions, tls: TlsFiles, handlers: MobilityHandlers) -> None:
     server = grpc.aio.server(options=KEEPALIVE)
     mobility_pb2_grpc.add_MobilityServiceServicer_to_server(handlers, server)  # type: ignore[no-untyped-call]
-    await open_door(server, options.listen, tls)
+    await bind(server, options.listen, tls)
     log.info("mobility service on %s", options.listen)
     try:
         await asyncio.Event().wait()

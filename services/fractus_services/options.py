@@ -1,0 +1,43 @@
+"""What the command lines of the services say; node, autopilot and camera default to the node's description."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServiceOptions:
+    """Options of both services."""
+
+    grants: Path
+    tls: Path
+    state: Path
+    audit: Path
+    node: str | None
+    description: Path
+    listen: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MobilityOptions(ServiceOptions):
+    """Options of `fractus mobility serve`."""
+
+    autopilot: str | None
+    driver_grace: float
+    boarding: float
+    flat_terrain: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraOptions(ServiceOptions):
+    """Options of `fractus camera serve`."""
+
+    mobility: str
+    keep: int
+    keep_mb: int
+    keep_total_mb: int
+    camera: str | None
+    face_model: Path | None
+    face_px: float
+    relief: float

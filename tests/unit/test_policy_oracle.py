@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from depth import examples
 from fractus_core.policy import legs, velocities
-from fractus_core.policy.limits import LEAST_LEG_M
+from fractus_core.policy.limits import MIN_LEG_ALTITUDE_M
 from fractus_core.policy.values import Call, GotoArgs, TakeoffArgs
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -182,8 +182,8 @@ def test_altitudes_against_a_plain_reading_of_the_rules(
     want = max(min(asked, 120.0, upper if upper is not None else math.inf), lower if lower is not None else -math.inf)
     for call in (goto(10, 10, asked), Call("Takeoff", TakeoffArgs(asked))):
         verdict = ask(grant, call, at(alt=0.0) if call.method == "Takeoff" else at())
-        low = min(max(asked, lower or 0.0), upper or 120.0) < LEAST_LEG_M and not any(
-            edge is not None and edge < LEAST_LEG_M for edge in (lower, upper)
+        low = min(max(asked, lower or 0.0), upper or 120.0) < MIN_LEG_ALTITUDE_M and not any(
+            edge is not None and edge < MIN_LEG_ALTITUDE_M for edge in (lower, upper)
         )
         if breaks and refuse:
             assert verdict.action == "deny"

@@ -195,6 +195,10 @@ PrivacyAction = Literal["refuse", FilterAction]
 FaceMethod = Literal["pixelate", "gaussian"]
 Fallback = Literal["blurAverage", "black", "refuse"]
 
+_LIMIT_ACTIONS: dict[str | None, LimitAction] = {action: action for action in get_args(LimitAction)}
+_GEOFENCE_ACTIONS: dict[str | None, GeofenceAction] = {action: action for action in get_args(GeofenceAction)}
+_FILTER_ACTIONS: dict[str | None, FilterAction] = {action: action for action in get_args(FilterAction)}
+
 
 def _for(type_: PolicyType, then: str) -> str:
     """A CEL rule that holds for one type of policy."""
@@ -244,6 +248,21 @@ class PolicySpec(Validity):
     )
     selector: PolicySelector = Field(default_factory=PolicySelector)
     priority: int = Field(default=0, ge=-1000, le=1000, description="Decides between equally restrictive policies.")
+
+    @property
+    def limit_action(self) -> LimitAction:
+        """What a limit does with a value beyond it."""
+        return _LIMIT_ACTIONS.get(self.action, "enforce")
+
+    @property
+    def geofence_action(self) -> GeofenceAction:
+        """What a geofence does on a breach."""
+        return _GEOFENCE_ACTIONS.get(self.action, "ignore")
+
+    @property
+    def filter_action(self) -> FilterAction | None:
+        """What a privacy policy has done to pictures; None where it refuses them."""
+        return _FILTER_ACTIONS.get(self.action)
 
     @rule(
         _for("AccessControl", f"({_among('kind', AccessKind)} && has(self.methods) && size(self.methods) > 0)"),

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fractus_core.api.applications import Application, ApplicationSpec
-from fractus_core.api.geometry import Point, Position
+from fractus_core.api.geometry import Point, Position, Reference
 from fractus_core.api.nodes import Depot, Drone
 from fractus_core.api.plans import Leg
+from fractus_core.exhaustive import exhaustive
 from fractus_core.geo import LocalFrame, distance_m, middle_of
 from fractus_core.planning.area import OperationArea, control_routes
 from fractus_core.planning.inventory import Flight, Settings
@@ -208,7 +209,7 @@ def first_missed(points: Sequence[Position], flight: Flight, radius_m: float, *,
 
 
 _Spots = NDArray[np.float64]
-_DATUMS = {"home": 0.0, "terrain": 1.0, "amsl": 2.0}
+_DATUMS: dict[Reference, float] = exhaustive(Reference, {"home": 0.0, "terrain": 1.0, "amsl": 2.0})
 
 
 def _spot(frame: LocalFrame, place: Position, alt: float | None) -> list[float]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
-from typing import Literal
+from typing import Literal, assert_never
 
 import shapely
 from shapely.geometry.base import BaseGeometry
@@ -18,11 +18,10 @@ from fractus_core.api.policies import ActiveTime, PolicySpec, active_at
 from fractus_core.geo import LocalFrame, middle, polygon
 from fractus_core.policy.values import Home, Moment, Situation, earliest
 
-FOREVER = float("inf")
 REACH_M = 500_000.0
 """Ground further than this from the origin is left out of the frame: no drone of ours gets there."""
-FEW = 4
-"""So many zones are looked at one by one faster than through an index."""
+MAX_UNINDEXED = 4
+"""Up to this many zones are faster to test one by one than through an index."""
 OPERATION_AREA = "operation-area"
 """Name under which verdicts list the fence that every grant implies."""
 
@@ -62,11 +61,15 @@ class Patch:
 
 def height_m(value: float, reference: Reference, home: Home | None, flat_terrain: bool) -> float | None:
     """An altitude as metres above home; None where nothing tells how high that datum lies."""
-    if reference == "home":
-        return value
-    if reference == "amsl":
-        return None if home is None else value - home.amsl_m
-    return value if flat_terrain else None
+    match reference:
+        case "home":
+            return value
+        case "amsl":
+            return None if home is None else value - home.amsl_m
+        case "terrain":
+            return value if flat_terrain else None
+        case _:
+            assert_never(reference)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +90,7 @@ class Patches:
     def __init__(self, patches: Iterable[Patch] = (), everywhere: Iterable[Rule] = ()) -> None:
         self.patches = tuple(patches)
         self.everywhere = tuple(everywhere)
-        many = len(self.patches) > FEW
+        many = len(self.patches) > MAX_UNINDEXED
         self._tree = shapely.STRtree([p.shape for p in self.patches]) if many else None
 
     def __bool__(self) -> bool:
@@ -126,8 +129,8 @@ def band_holds(band: AltitudeBand | None, lower_m: float, upper_m: float, home: 
     """Whether altitudes from lower to upper (above home) surely lie inside a band; unknown datums do not."""
     if band is None:
         return True
-    floor = -FOREVER if band.lower is None else height_m(band.lower, band.reference, home, flat)
-    ceiling = FOREVER if band.upper is None else height_m(band.upper, band.reference, home, flat)
+    floor = -math.inf if band.lower is None else height_m(band.lower, band.reference, home, flat)
+    ceiling = math.inf if band.upper is None else height_m(band.upper, band.reference, home, flat)
     return floor is not None and ceiling is not None and floor <= lower_m and upper_m <= ceiling
 
 
@@ -191,7 +194,7 @@ class CompiledGrant:
     flat_terrain: bool
 
     def locate(self, now: Situation) -> tuple[float, float] | None:
-        """Where the drone is, in metres of the frame; None while nobody knows."""
+        """Where the drone is, in metres of the frame; None while it is unknown."""
         return None if now.lat is None or now.lon is None else self.frame.xy(now.lat, now.lon)
 
 
@@ -262,14 +265,7 @@ def _origin(spec: GrantSpec) -> Point:
 
 
 def _rule(policy: GrantedPolicy) -> Rule:
-    spec = policy.spec
-    return Rule(policy.name, spec, _unix(spec.valid_from, -FOREVER), _unix(spec.valid_until, FOREVER))
-
-
-def _unix(moment: datetime | None, default: float) -> float:
-    if moment is None:
-        return default
-    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+    return Rule(policy.name, policy.spec, *policy.spec.window_s)
 
 
 def _prepared(shape: BaseGeometry) -> BaseGeometry:

@@ -9,6 +9,8 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
+from fractus_core.api.methods import CONTROL_METHODS, Method
+from fractus_core.exhaustive import exhaustive
 from fractus_core.policy.access import judge_access
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.legs import judge_goto
@@ -30,10 +32,10 @@ from fractus_core.policy.velocities import judge_speed, judge_velocity
 from fractus_core.policy.vertical import judge_arm, judge_disarm, judge_land, judge_takeoff
 
 MAX_ALTITUDE_M = 20_000.0
-LEAST_SPEED_MPS = 0.1
+MIN_SPEED_MPS = 0.1
 MAX_SPEED_MPS = 100.0
 MAX_PIXELS = 20_000
-LEAST_ALTITUDE_M = 0.5
+MIN_TAKEOFF_ALTITUDE_M = 0.5
 """A takeoff goes at least this high."""
 MAX_CLIMB_MPS = 20.0
 HOLD_S = (0.1, 2.0)
@@ -56,13 +58,10 @@ def judge(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     problem = _check_arguments(call) or judge_access(call, now, grant)
     if problem is not None:
         return problem
-    rule = _RULES.get(call.method)
-    if rule is not None:
-        verdict = rule(call, now, grant)
-        return replace(verdict, brake_first=True) if _must_brake(call, verdict, now, grant) else verdict
-    if call.method in _ACCESS_ONLY:
-        return Verdict("allow", call.args)
-    return deny("MethodUnknown", f"the policy engine has no rule for {call.method}")
+    if call.method not in _RULES:
+        return deny("MethodUnknown", f"the policy engine has no rule for {call.method}")
+    verdict = _RULES[call.method](call, now, grant)
+    return replace(verdict, brake_first=True) if _must_brake(call, verdict, now, grant) else verdict
 
 
 def _must_brake(call: Call, verdict: Verdict, now: Situation, grant: CompiledGrant) -> bool:
@@ -105,16 +104,16 @@ def _figures(call: Call) -> tuple[_Figure, ...]:
     """The figures among the arguments, each with its bounds and unit."""
     match call.args:
         case TakeoffArgs(altitude_m):
-            return (("altitude", altitude_m, LEAST_ALTITUDE_M, MAX_ALTITUDE_M, "m above home"),)
+            return (("altitude", altitude_m, MIN_TAKEOFF_ALTITUDE_M, MAX_ALTITUDE_M, "m above home"),)
         case SetSpeedArgs(speed_mps):
-            return (("speed", speed_mps, LEAST_SPEED_MPS, MAX_SPEED_MPS, "m/s"),)
+            return (("speed", speed_mps, MIN_SPEED_MPS, MAX_SPEED_MPS, "m/s"),)
         case GotoArgs(lat, lon, alt, _, yaw_deg, speed_mps):
             return (
                 ("latitude", lat, -90, 90, "degrees"),
                 ("longitude", lon, -180, 180, "degrees"),
                 ("altitude", alt, -1000, MAX_ALTITUDE_M, "m"),
                 ("yaw", yaw_deg, -360, 360, "degrees"),
-                ("speed", speed_mps, LEAST_SPEED_MPS, MAX_SPEED_MPS, "m/s"),
+                ("speed", speed_mps, MIN_SPEED_MPS, MAX_SPEED_MPS, "m/s"),
             )
         case VelocityArgs(north_mps, east_mps, down_mps, yaw_deg, hold_s):
             return (
@@ -146,26 +145,31 @@ _ARGS: dict[str, type] = {
 
 def _judge_picture(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     if call.method == "CaptureImage" and (now.lat is None or now.lon is None):
-        return deny(
-            "PositionUnknown", "nobody knows what the camera sees while its position is unknown; wait for a fix"
-        )
+        return deny("PositionUnknown", "what the camera sees is unknown while its position is unknown; wait for a fix")
     verdict = judge_privacy(now, grant)
     return verdict if verdict.action == "deny" else replace(verdict, args=call.args)
 
 
-_ACCESS_ONLY = frozenset(
-    {"Hover", "GetSpeed", "GetPosition", "ReturnToLaunch", "ListImages", "DeleteImage", "GetControl", "ReturnControl"}
-)
-"""Methods that may be used by who has access: they stop the drone, bring it home, or move nothing."""
+def _judge_access_only(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
+    """A method that stops the drone, brings it home, or moves nothing: access to it is enough."""
+    return Verdict("allow", call.args)
 
-_RULES: dict[str, Callable[[Call, Situation, CompiledGrant], Verdict]] = {
-    "Arm": judge_arm,
-    "Disarm": judge_disarm,
-    "Takeoff": judge_takeoff,
-    "Land": judge_land,
-    "Goto": judge_goto,
-    "SetSpeed": judge_speed,
-    "SetVelocity": judge_velocity,
-    "CaptureImage": _judge_picture,
-    "RetrieveImage": _judge_picture,
-}
+
+_RULES: dict[str, Callable[[Call, Situation, CompiledGrant], Verdict]] = exhaustive(
+    Method,
+    {
+        "Arm": judge_arm,
+        "Disarm": judge_disarm,
+        "Takeoff": judge_takeoff,
+        "Land": judge_land,
+        "Goto": judge_goto,
+        "SetSpeed": judge_speed,
+        "SetVelocity": judge_velocity,
+        "CaptureImage": _judge_picture,
+        "RetrieveImage": _judge_picture,
+        **dict.fromkeys(
+            ("Hover", "GetSpeed", "GetPosition", "ReturnToLaunch", "ListImages", "DeleteImage", *CONTROL_METHODS),
+            _judge_access_only,
+        ),
+    },
+)

@@ -5,18 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from fractus_core.api.policies import GeofenceAction
+from fractus_core.exhaustive import exhaustive
 from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Inclusion, Patch, band_meets
 from fractus_core.policy.motion import XY, Leg, stop_altitude_m, stop_point
 from fractus_core.policy.values import Situation, Takeover, Verdict, deny
 
-FenceAction = Literal["ignore", "adjust", "hover", "returnToLaunch", "land", "revoke"]
-
-SEVERITY: dict[str, int] = {"adjust": 0, "ignore": 1, "hover": 2, "returnToLaunch": 3, "land": 4, "revoke": 5}
+SEVERITY: dict[GeofenceAction, int] = exhaustive(
+    GeofenceAction, {"adjust": 0, "ignore": 1, "hover": 2, "returnToLaunch": 3, "land": 4, "revoke": 5}
+)
 """The more a reaction takes from the application, the more restrictive it is."""
 
 HOME_RADIUS_M = 5.0
@@ -40,7 +41,7 @@ class Breach:
 
     policy: str
     priority: int
-    action: FenceAction
+    action: GeofenceAction
     code: str
     reason: str
     enters: bool
@@ -67,26 +68,34 @@ def broken(found: list[Breach]) -> Verdict:
     """What becomes of a request that breaks fences, most restrictive first."""
     worst = found[0]
     names = tuple(dict.fromkeys(b.policy for b in found))
-    takeover = TAKEOVERS.get(worst.action) if worst.enters else None
+    takeover = TAKEOVERS[worst.action] if worst.enters else None
     if takeover is None:
         return deny(worst.code, worst.reason, names)
-    return Verdict("takeover", None, worst.code, f"{worst.reason}; {_DOES[takeover]}", names, takeover)
+    return Verdict("takeover", None, worst.code, f"{worst.reason}; {_EFFECTS[takeover]}", names, takeover)
 
 
-TAKEOVERS: dict[str, Takeover] = {
-    "hover": "hover",
-    "land": "land",
-    "returnToLaunch": "returnToLaunch",
-    "revoke": "revoke",
-}
-"""Actions of policies that take the drone from the application."""
+TAKEOVERS: dict[GeofenceAction, Takeover | None] = exhaustive(
+    GeofenceAction,
+    {
+        "ignore": None,
+        "adjust": None,
+        "hover": "hover",
+        "land": "land",
+        "returnToLaunch": "returnToLaunch",
+        "revoke": "revoke",
+    },
+)
+"""How actions of policies take the drone from the application; None: they do not."""
 
-_DOES: dict[Takeover, str] = {
-    "hover": "the system takes the drone and hovers",
-    "land": "the system takes the drone and lands it",
-    "returnToLaunch": "the system takes the drone and flies it home",
-    "revoke": "access is revoked and the system flies the drone home",
-}
+_EFFECTS: dict[Takeover, str] = exhaustive(
+    Takeover,
+    {
+        "hover": "the system takes the drone and hovers",
+        "land": "the system takes the drone and lands it",
+        "returnToLaunch": "the system takes the drone and flies it home",
+        "revoke": "access is revoked and the system flies the drone home",
+    },
+)
 
 
 def _operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float) -> Iterator[Breach]:
@@ -144,7 +153,7 @@ def _exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Ite
         clearance_m = _clearance_outside(shape, leg.unavoidable)
         level = _is_level_with(patch, now, grant)
         if (
-            shape.dwithin(_least_way(leg, now), margin_m)
+            shape.dwithin(_certain_way(leg, now), margin_m)
             and (level or not _comes_level(patch, leg, now, grant))
             and _leads_out(shape, leg, margin_m, clearance_m)
         ):
@@ -154,10 +163,10 @@ def _exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Ite
         yield _exclusion_breach(patch, leg, margin_m, enters)
 
 
-def _least_way(leg: Leg, now: Situation) -> BaseGeometry:
-    """The part of a leg that the drone flies for all that is known, even if it brakes by now as hard as it can.
+def _certain_way(leg: Leg, now: Situation) -> BaseGeometry:
+    """The part of a leg that the drone certainly flies, even if it brakes already, as hard as it can.
 
-    Where nobody knows whether it does, its way to rest is taken for long, which must not open ways past a fence.
+    Where its acceleration is unknown, its way to rest is overestimated, which must not open ways past a fence.
     """
     if now.forward_mps2 is not None or leg.start == leg.stop:
         return leg.unavoidable
@@ -193,19 +202,12 @@ def _exclusion_breach(patch: Patch, leg: Leg, margin_m: float, enters: bool) -> 
     return Breach(
         name,
         patch.rule.spec.priority,
-        _action(patch.rule.spec.action),
+        patch.rule.spec.geofence_action,
         code,
         f"{reason} of policy {name}",
         enters,
         lambda: leg.line.difference(shape.buffer(margin_m + INSIDE_M)),
     )
-
-
-def _action(action: str | None) -> FenceAction:
-    for known in ("ignore", "adjust", "hover", "returnToLaunch", "land", "revoke"):
-        if action == known:
-            return known
-    return "ignore"
 
 
 def _inclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Iterator[Breach]:
@@ -249,7 +251,7 @@ def _inclusion_breach(fence: Inclusion, shape: BaseGeometry, border: BaseGeometr
     return Breach(
         name,
         fence.rule.spec.priority,
-        _action(fence.rule.spec.action),
+        fence.rule.spec.geofence_action,
         code,
         f"{reason} (policy {name})",
         enters,
@@ -266,13 +268,13 @@ def _stays_inside(shape: BaseGeometry, border: BaseGeometry, leg: Leg, now: Situ
     ground = leg.ground
     if shape.covers(ground) and not border.dwithin(ground, margin_m):
         return True
-    least = _least_way(leg, now)
+    least = _certain_way(leg, now)
     if shape.covers(least) and not border.dwithin(least, margin_m):
         return False
     if shape.covers(leg.unavoidable) and not shape.covers(ground):
         return False
     inner = shape.buffer(-margin_m)
-    return _returns(leg, inner, lambda point: _signed(shape, border, point))
+    return _returns(leg, inner, lambda point: signed_depth_m(shape, border, point))
 
 
 def _leads_out(shape: BaseGeometry, leg: Leg, margin_m: float, clearance_m: float) -> bool:
@@ -285,7 +287,7 @@ def _leads_out(shape: BaseGeometry, leg: Leg, margin_m: float, clearance_m: floa
     target = shapely.points(leg.target)
     if outer.intersects(target):
         return False
-    return _monotone(line.intersection(outer), leg.stop, lambda point: -_signed(shape, border, point))
+    return _monotone(line.intersection(outer), leg.stop, lambda point: -signed_depth_m(shape, border, point))
 
 
 def _returns(leg: Leg, inner: BaseGeometry, clearance: Callable[[BaseGeometry], float]) -> bool:
@@ -303,7 +305,7 @@ def _monotone(part: BaseGeometry, begin: XY, clearance: Callable[[BaseGeometry],
         return False
     if shapely.points(begin).distance(part) > 1e-6:
         return False
-    last = float("-inf")
+    last = -math.inf
     for i in range(_SAMPLES + 1):
         point = part.interpolate(i / _SAMPLES, normalized=True) if isinstance(part, shapely.LineString) else part
         now = clearance(point)
@@ -313,9 +315,9 @@ def _monotone(part: BaseGeometry, begin: XY, clearance: Callable[[BaseGeometry],
     return True
 
 
-def _signed(shape: BaseGeometry, border: BaseGeometry, point: BaseGeometry) -> float:
+def signed_depth_m(shape: BaseGeometry, border: BaseGeometry, point: BaseGeometry) -> float:
     """Distance to the border: positive inside the shape, negative outside."""
-    distance = float(border.distance(point)) if not border.is_empty else float("inf")
+    distance = float(border.distance(point)) if not border.is_empty else math.inf
     return distance if shape.covers(point) else -distance
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, assert_never
 
 import shapely
 from shapely.geometry.base import BaseGeometry
@@ -90,7 +90,7 @@ def compile_grants(
 
 
 def check_policies(inventory: Inventory) -> None:
-    """Refuse new grants while there is a policy that cannot be read: nobody knows for whom it holds.
+    """Refuse new grants while there is a policy that cannot be read: for whom it holds is unknown.
 
     Raises:
         InvalidObject: naming the policy.
@@ -229,7 +229,7 @@ def _policies(
     bounds = _bounds(grant, node, inventory)
     granted = {name: policy for name, policy in kept.items() if name in inventory.unreadable_policies}
     for name, policy in inventory.policies.items():
-        # Of a node without a description nobody knows what it has: what held for it goes on.
+        # The attributes of a node without a description are unknown: what held for it goes on.
         known = node is not None or name not in kept or not policy.spec.selector.nodes
         if known and not _holds(policy.spec, grant.application, grant.component, attributes):
             continue
@@ -342,14 +342,20 @@ def matches(expression: NodeExpression, attributes: Mapping[str, object], *, unk
         return value is not None
     if value is None:
         return unknown
-    if expression.operator in {"In", "NotIn"}:
-        return (str(value) in expression.values) == (expression.operator == "In")
-    try:
-        figure = float(str(value))
-    except ValueError:
-        return unknown
-    bound = float(expression.values[0])
-    return figure > bound if expression.operator == "Gt" else figure < bound
+    match expression.operator:
+        case "In":
+            return str(value) in expression.values
+        case "NotIn":
+            return str(value) not in expression.values
+        case "Gt" | "Lt":
+            try:
+                figure = float(str(value))
+            except ValueError:
+                return unknown
+            bound = float(expression.values[0])
+            return figure > bound if expression.operator == "Gt" else figure < bound
+        case _:
+            assert_never(expression.operator)
 
 
 def node_attributes(node: Drone | EdgeNode) -> dict[str, object]:

@@ -10,7 +10,7 @@ import shapely
 from fractus_core.policy.compiled import Air, CompiledGrant, height_m
 from fractus_core.policy.fences import breaches, broken, last_legal
 from fractus_core.policy.limits import (
-    LEAST_LEG_M,
+    MIN_LEG_ALTITUDE_M,
     SLACK,
     Clamped,
     altitude_bounds,
@@ -160,10 +160,10 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Clamped])
     height = clamp("Altitude", "m above home", aim.altitude_m, bounds)
     if isinstance(height, Verdict):
         return height
-    if height.value < LEAST_LEG_M - SLACK and not lower_is_fine(bounds):
+    if height.value < MIN_LEG_ALTITUDE_M - SLACK and not lower_is_fine(bounds):
         return deny(
             "AltitudeTooLow",
-            f"a leg ends at least {LEAST_LEG_M:.0f} m above home, not at {height.value:.1f} m; use land to come down",
+            f"a leg ends at least {MIN_LEG_ALTITUDE_M:.0f} m above home, not at {height.value:.1f} m; use land to come down",
         )
     asked = request.args.speed_mps if aim.speed_mps is None else aim.speed_mps
     speed = clamp("Speed", "m/s", now.speed_setpoint_mps if asked is None else asked, speed_bounds(grant, now, air))

@@ -7,12 +7,17 @@ from dataclasses import dataclass
 
 from shapely.geometry.base import BaseGeometry
 
+from fractus_core.api.policies import LimitAction
+from fractus_core.exhaustive import exhaustive
 from fractus_core.policy.compiled import Air, CompiledGrant, Patch, Patches, Rule, height_m
 from fractus_core.policy.values import Situation, Verdict, deny
 
 SLACK = 1e-6
-LEAST_LEG_M = 2.0
+MIN_LEG_ALTITUDE_M = 2.0
 """A motion other than landing ends at least this high above home, where no altitude limit says that lower is fine."""
+
+
+_REFUSES: dict[LimitAction, bool] = exhaustive(LimitAction, {"enforce": False, "refuse": True})
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,14 +56,21 @@ def altitude_bounds(grant: CompiledGrant, now: Situation, air: Air) -> list[Boun
                 return _datum_unknown(rule)
             edges.append(height)
         bounds.append(
-            Bound(rule.name, spec.priority, edges[0], edges[1], spec.action == "refuse", patch.shape if patch else None)
+            Bound(
+                rule.name,
+                spec.priority,
+                edges[0],
+                edges[1],
+                _REFUSES[spec.limit_action],
+                patch.shape if patch else None,
+            )
         )
     return bounds
 
 
 def _datum_unknown(rule: Rule) -> Verdict:
-    what = "no terrain model is loaded" if rule.spec.altitude_reference == "terrain" else "home is unknown"
-    code = "TerrainUnknown" if rule.spec.altitude_reference == "terrain" else "HomeUnknown"
+    terrain = rule.spec.altitude_reference == "terrain"
+    what, code = ("no terrain model is loaded", "TerrainUnknown") if terrain else ("home is unknown", "HomeUnknown")
     return deny(
         code,
         f"policy {rule.name} limits altitude above {rule.spec.altitude_reference} level, and {what}",
@@ -84,7 +96,7 @@ def speed_bounds(grant: CompiledGrant, now: Situation, air: Air) -> list[Bound]:
         bounds.append(Bound("", 0, None, grant.max_speed_mps, refuses=False))
     for rule, _ in _in_force(grant.speed_limits, grant, now, air):
         spec = rule.spec
-        bounds.append(Bound(rule.name, spec.priority, spec.lower_limit, spec.upper_limit, spec.action == "refuse"))
+        bounds.append(Bound(rule.name, spec.priority, spec.lower_limit, spec.upper_limit, _REFUSES[spec.limit_action]))
     return bounds
 
 
@@ -169,8 +181,10 @@ def strictest(bounds: list[Bound], *, above: bool) -> Bound | None:
 
 
 def lower_is_fine(bounds: list[Bound]) -> bool:
-    """Whether an altitude limit in force speaks of heights below the least that a motion ends at otherwise."""
-    return any(edge is not None and edge < LEAST_LEG_M for bound in bounds for edge in (bound.lower, bound.upper))
+    """Whether an altitude limit in force allows heights below `MIN_LEG_ALTITUDE_M`."""
+    return any(
+        edge is not None and edge < MIN_LEG_ALTITUDE_M for bound in bounds for edge in (bound.lower, bound.upper)
+    )
 
 
 def height_on_entry(here: BaseGeometry, now: Situation, bounds: list[Bound], slack_m: float) -> Verdict | None:

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from fractus_core.api.policies import GeofenceAction
 from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Patch
-from fractus_core.policy.fences import TAKEOVERS, breaches
+from fractus_core.policy.fences import SEVERITY, TAKEOVERS, breaches, signed_depth_m
 from fractus_core.policy.limits import Bound, altitude_bounds, speed_bounds, strictest
 from fractus_core.policy.motion import XY, margin_m, moving, standing, stop_altitude_m, stop_point
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Situation, Verdict
@@ -21,8 +22,6 @@ SINKS_MPS = 0.5
 
 DEEPER_M = 0.6
 """A drone on the wrong side of a fence is stopped again only when it moves this much further in."""
-
-_RANK = {None: 0, "hover": 1, "returnToLaunch": 2, "land": 3, "revoke": 4}
 
 
 def monitor(now: Situation, grant: CompiledGrant, *, leaving: bool = False, changed: bool = False) -> Verdict | None:
@@ -37,7 +36,7 @@ def monitor(now: Situation, grant: CompiledGrant, *, leaving: bool = False, chan
         leaving: whether the system flies the drone already, so that only what gets worse counts: where it is on the wrong
             side of a fence, the system's way leads back.
         changed: whether other fences may have been in force when the drone's way was judged. A drone that speeds up is
-            faster before it hears of a stop, and nobody has judged whether there is room for that: it is stopped in time.
+            faster before it hears of a stop, and whether there is room for that has not been judged: it is stopped in time.
 
     Returns:
         None when all is well; a takeover; a denial with `hover`, when the motion is to be stopped and the application
@@ -70,7 +69,8 @@ def monitor(now: Situation, grant: CompiledGrant, *, leaving: bool = False, chan
 def _worst(found: list[tuple[int, Verdict]]) -> Verdict | None:
     """What takes most from the application; of equals what has the highest priority."""
     ranked = [
-        (-_RANK[v.takeover if v.action == "takeover" else None], -priority, i) for i, (priority, v) in enumerate(found)
+        (-SEVERITY[v.takeover] if v.action == "takeover" and v.takeover is not None else 0, -priority, i)
+        for i, (priority, v) in enumerate(found)
     ]
     return found[min(ranked)[2]][1] if ranked else None
 
@@ -110,7 +110,7 @@ class _Fence:
     """What a fence is called, what its policy does, and how its breach is called once it is there and before."""
 
     policy: str
-    action: str | None
+    action: GeofenceAction
     name: str
     broken: str
     ahead: str
@@ -143,7 +143,7 @@ def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead, *, leaving: boo
             zones = ", ".join(dict.fromkeys(p.zone for p in inclusion.patches)) or "its zones"
             rule = inclusion.rule
             name = f"{zones} of policy {rule.name}"
-            fence = _Fence(rule.name, rule.spec.action, name, "OutsideInclusionZone", "InclusionBorderAhead")
+            fence = _Fence(rule.name, rule.spec.geofence_action, name, "OutsideInclusionZone", "InclusionBorderAhead")
             found.append((rule.spec.priority, _kept_in(shape, border, ahead, fence)))
     reactions = [(priority, _reaction(f, leaving=leaving)) for priority, f in found if f is not None]
     return [(priority, verdict) for priority, verdict in reactions if verdict is not None]
@@ -151,10 +151,12 @@ def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead, *, leaving: boo
 
 def _kept_out(patch: Patch, ahead: _Ahead) -> _Finding:
     inside = bool(patch.shape.intersects(ahead.here))
-    worse = _depth(patch.shape, ahead.rest) > _depth(patch.shape, ahead.here) + DEEPER_M
+    border = patch.shape.boundary
+    rest_m, here_m = (signed_depth_m(patch.shape, border, point) for point in (ahead.rest, ahead.here))
+    worse = rest_m > here_m + DEEPER_M
     entering = not inside and bool(patch.shape.intersects(ahead.air.ground))
     name = f"zone {patch.zone} of policy {patch.rule.name}"
-    fence = _Fence(patch.rule.name, patch.rule.spec.action, name, "InsideExclusionZone", "ExclusionZoneAhead")
+    fence = _Fence(patch.rule.name, patch.rule.spec.geofence_action, name, "InsideExclusionZone", "ExclusionZoneAhead")
     return _Finding(fence, inside, worse or entering, "is inside" if inside else "is about to enter")
 
 
@@ -165,7 +167,7 @@ def _kept_in(shape: BaseGeometry, border: BaseGeometry, ahead: _Ahead, fence: _F
     outside = not shape.covers(ahead.here)
     worse = False
     if not shape.is_empty:
-        worse = _signed_depth(shape, border, ahead.rest) < _signed_depth(shape, border, ahead.here) - DEEPER_M
+        worse = signed_depth_m(shape, border, ahead.rest) < signed_depth_m(shape, border, ahead.here) - DEEPER_M
     worse = worse or (not outside and not shape.covers(way))
     return _Finding(fence, outside, worse, "is outside" if outside else "is about to leave")
 
@@ -177,7 +179,7 @@ def _reaction(found: _Finding, *, leaving: bool) -> Verdict | None:
     things worse.
     """
     fence = found.fence
-    takeover = TAKEOVERS.get(fence.action or "ignore")
+    takeover = TAKEOVERS[fence.action]
     code = fence.broken if found.broken else fence.ahead
     reason = f"the drone {found.what} {fence.name}"
     if takeover is not None and (found.worse or (found.broken and not leaving)):
@@ -185,15 +187,6 @@ def _reaction(found: _Finding, *, leaving: bool) -> Verdict | None:
     if found.worse:
         return Verdict("deny", None, code, f"{reason}; the motion is stopped", (fence.policy,), "hover")
     return None
-
-
-def _depth(shape: BaseGeometry, point: BaseGeometry) -> float:
-    return _signed_depth(shape, shape.boundary, point)
-
-
-def _signed_depth(shape: BaseGeometry, border: BaseGeometry, point: BaseGeometry) -> float:
-    distance = float(border.distance(point))
-    return distance if shape.covers(point) else -distance
 
 
 def _heights(now: Situation, grant: CompiledGrant, start: XY, stop: XY, rest_m: float) -> Verdict | None:

@@ -7,13 +7,17 @@ from collections.abc import Iterable, Sequence
 
 import shapely
 
+from fractus_core.api.policies import FaceMethod, Fallback, FilterAction
+from fractus_core.exhaustive import exhaustive
 from fractus_core.policy.compiled import Air, CompiledGrant, Patch, Patches, Rule, height_m
 from fractus_core.policy.footprint import seen_from
-from fractus_core.policy.values import FaceMethod, Fallback, Filter, FilterAction, Situation, Verdict, deny
+from fractus_core.policy.values import Filter, Situation, Verdict, deny
 
-_IN_ORDER: tuple[FilterAction, ...] = ("blurFaces", "removeBackground", "blurMedian", "blurAverage", "black")
+_IN_ORDER: tuple[FilterAction, ...] = exhaustive(
+    FilterAction, ("blurFaces", "removeBackground", "blurMedian", "blurAverage", "black")
+)
 """Filters from the mildest to the strictest, which is also the order in which they are applied."""
-_FALLBACKS: tuple[Fallback, ...] = ("blurAverage", "black", "refuse")
+_FALLBACKS: tuple[Fallback, ...] = exhaustive(Fallback, ("blurAverage", "black", "refuse"))
 _WHOLE: frozenset[FilterAction] = frozenset({"blurMedian", "blurAverage", "black"})
 """Filters of the whole picture, which leave no face to find."""
 
@@ -39,8 +43,7 @@ def judge_privacy(now: Situation, grant: CompiledGrant) -> Verdict:
 def filter_of(rule: Rule) -> Filter:
     """What a rule asks for; one that names no filter blacks the picture out."""
     spec = rule.spec
-    action: FilterAction = next((known for known in _IN_ORDER if known == spec.action), "black")
-    return Filter(action, spec.faces or "pixelate", spec.fallback or "blurAverage")
+    return Filter(spec.filter_action or "black", spec.faces or "pixelate", spec.fallback or "blurAverage")
 
 
 def compose(filters: Iterable[Filter]) -> tuple[Filter, ...]:

@@ -7,6 +7,8 @@ from operator import attrgetter
 from typing import Literal
 
 from fractus_core.api.geometry import Reference
+from fractus_core.api.methods import METHODS_OF, Service
+from fractus_core.api.policies import FaceMethod, Fallback, FilterAction
 
 STANDING_MPS = 0.5
 """A drone slower than this, on the ground and vertically, stands: it turns on the spot, within its tracking margin."""
@@ -75,7 +77,7 @@ class VelocityArgs:
 
 @dataclass(frozen=True, slots=True)
 class CaptureArgs:
-    """Take a picture of so many pixels; 0 means the camera's default."""
+    """Take a picture of this size in pixels; 0 means the camera's default."""
 
     width: int = 0
     height: int = 0
@@ -112,12 +114,9 @@ class Call:
     args: Args = None
 
     @property
-    def service(self) -> Literal["mobility", "camera"]:
+    def service(self) -> Service:
         """The system service that the method belongs to."""
-        return "camera" if self.method in _CAMERA else "mobility"
-
-
-_CAMERA = frozenset({"CaptureImage", "RetrieveImage", "ListImages", "DeleteImage"})
+        return "camera" if self.method in METHODS_OF["camera"] else "mobility"
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +211,7 @@ class Situation:
         speed_setpoint_mps: horizontal speed that the autopilot flies legs with, or that of the velocity it was told to
             hold, when that is higher: the speed that the present motion tends to.
         forward_mps2: how much the drone speeds up along its course (negative: slows down), from the last velocities; None
-            while nobody knows.
+            while it is unknown.
         vertical: whether the drone is taking off or landing, when lower altitude limits do not hold.
         attitude: None while it is unknown; the camera may look anywhere then, unless a gimbal keeps it level.
         lens: None on a node whose camera is not described: it may see everything around it.
@@ -270,14 +269,9 @@ _TURNS = attrgetter(*(f.name for f in fields(Attitude)))
 _VIEW = attrgetter(*(f.name for f in fields(Lens)))
 
 
-FilterAction = Literal["black", "removeBackground", "blurMedian", "blurAverage", "blurFaces"]
-FaceMethod = Literal["pixelate", "gaussian"]
-Fallback = Literal["blurAverage", "black", "refuse"]
-
-
 @dataclass(frozen=True, slots=True)
 class Filter:
-    """What is done to a picture before anybody gets it.
+    """What is done to a picture before it is handed out.
 
     Attributes:
         action: black it out, blur all of it, hide faces, or keep only what moves.

@@ -11,7 +11,7 @@ from fractus_core.policy.compiled import Air, CompiledGrant
 from fractus_core.policy.fences import Breach, breaches, broken
 from fractus_core.policy.legs import way_home_blocked
 from fractus_core.policy.limits import (
-    LEAST_LEG_M,
+    MIN_LEG_ALTITUDE_M,
     SLACK,
     Bound,
     Clamped,
@@ -139,7 +139,7 @@ def _within_heights(setpoint: _Setpoint) -> Verdict | None:
     )
     if problem is not None:
         return problem
-    floor = -math.inf if lower_is_fine(bounds) else min(LEAST_LEG_M, now.altitude_m)
+    floor = -math.inf if lower_is_fine(bounds) else min(MIN_LEG_ALTITUDE_M, now.altitude_m)
     ground = Bound("", 0, floor, None, refuses=False)
     for above in (True, False):
         every = bounds if above else [*bounds, ground]

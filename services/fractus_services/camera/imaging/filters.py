@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from fractus_core.policy.values import FaceMethod
+from fractus_core.api.policies import FaceMethod
 
 from fractus_services.camera.imaging.faces import Box
 from fractus_services.camera.imaging.pixels import Pixels, opencv, reduced

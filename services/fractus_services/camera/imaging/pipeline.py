@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import assert_never
 
 from fractus_core.policy.privacy import compose
 from fractus_core.policy.values import Filter
@@ -89,16 +90,19 @@ def developed(
     middle = pictures[len(pictures) // 2]
     picture = middle
     for one in chosen.filters:
-        if one.action == "black":
-            picture = do.black(picture)
-        elif one.action == "blurAverage":
-            picture = do.blur_average(picture)
-        elif one.action == "blurMedian":
-            picture = do.blur_median(picture)
-        elif one.action == "blurFaces":
-            picture = do.hide_faces(picture, detector.find(picture, face_px, upright=upright), one.faces)
-        else:
-            still = len(pictures) < 3
-            mask = None if still else do.moving(pictures[0], middle, pictures[2], fixed=fixed)
-            picture = do.remove_background(picture, mask)
+        match one.action:
+            case "black":
+                picture = do.black(picture)
+            case "blurAverage":
+                picture = do.blur_average(picture)
+            case "blurMedian":
+                picture = do.blur_median(picture)
+            case "blurFaces":
+                picture = do.hide_faces(picture, detector.find(picture, face_px, upright=upright), one.faces)
+            case "removeBackground":
+                still = len(pictures) < 3
+                mask = None if still else do.moving(pictures[0], middle, pictures[2], fixed=fixed)
+                picture = do.remove_background(picture, mask)
+            case _:
+                assert_never(one.action)
     return picture

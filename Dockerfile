@@ -56,6 +56,8 @@ RUN --mount=type=cache,target=/root/.cache/uv \
       rm -rf bin .lock numpy/_core/_simd.* numpy/_core/include numpy/_core/lib numpy/f2py numpy/distutils cv2/gapi \
         lxml lxml-* pymavlink/dialects/v09 pymavlink/dialects/v10 pymavlink/dfindexer pymavlink/tools; \
       find . -path '*/tests' -prune -exec rm -rf {} +; \
+      find . -path './kubernetes/*' \( -path '*/client/models/*' -o -path '*/client/api/*' \) ! -name __init__.py -delete; \
+      find . -path './kubernetes/*_test.py' -delete; \
       find . -path './pymavlink/generator/*' -type d -prune -exec rm -rf {} +; \
       find pymavlink/dialects/v20 -type f 2>/dev/null \
         | grep -Ev '/(__init__|minimal|common|standard|ardupilotmega)\.py$' | xargs -r rm -f; \
@@ -90,8 +92,8 @@ RUN uv build --quiet --wheel --no-build-isolation --out-dir /wheel \
       for name in fractus_proto "$@"; do cp -a /code/$name /images/$target/; done; \
       cp -a /code/fractus-*.dist-info /images/$target/; } \
  && assemble component fractus fractus_cli \
- && assemble operator fractus_core fractus_operator \
- && assemble agent fractus_core fractus_agent \
+ && assemble operator fractus_core fractus_kube fractus_operator \
+ && assemble agent fractus_core fractus_kube fractus_agent \
  && assemble services fractus fractus_cli fractus_core fractus_mavlink fractus_services \
  && assemble sim fractus_vehicle fractus_world
 

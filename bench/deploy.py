@@ -16,6 +16,7 @@ Takes about a quarter of an hour; --quick, with 100 and 1,000 nodes, about four 
 from __future__ import annotations
 
 import argparse
+import asyncio
 import contextlib
 import json
 import math
@@ -34,12 +35,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
-import httpx2
 import yaml
 from fractus_cluster.loopback import LoopbackCluster, simulated_node, wait_until
 from fractus_cluster.ports import free_port
 from fractus_core.api import KINDS
 from fractus_core.api.crd import crd
+from fractus_kube import BlockingClient, Client, Kind, KubeError, with_certificate
 
 EXAMPLE = pathlib.Path(__file__).parents[1] / "examples" / "traffic-monitoring"
 API = "/apis/fractus.dev/v1alpha1"
@@ -51,45 +52,15 @@ SEED = 5000
 NODE = {"cpu": "64", "memory": "64Gi", "pods": "500", "fractus.dev/gpu": "500"}
 
 Body = dict[str, Any]
+PODS = Kind("v1", "Pod", "pods", namespaced=True)
 
 
-class Api:
+class Api(BlockingClient):
     """The API server, for many threads."""
 
     def __init__(self, cluster: LoopbackCluster) -> None:
-        import ssl  # noqa: PLC0415
-
-        context = ssl.create_default_context(cafile=str(cluster.ca))
-        context.load_cert_chain(*map(str, cluster.credential))
-        limits = httpx2.Limits(max_connections=16)
-        self._http = httpx2.Client(
-            base_url=cluster.server, verify=context, timeout=60.0, limits=limits, trust_env=False
-        )
-
-    def call(self, method: str, path: str, body: Body | None = None, kind: str = "application/json", **q: str) -> Body:
-        """Send a request; the object in the answer, empty for one that is not found."""
-        content = None if body is None else json.dumps(body)
-        answer = self._http.request(method, path, params=q, content=content, headers={"Content-Type": kind})
-        if answer.status_code == httpx2.codes.NOT_FOUND:
-            return {}
-        if answer.status_code >= httpx2.codes.BAD_REQUEST:
-            raise RuntimeError(f"{method} {path}: {answer.text[:300]}")
-        return answer.json()
-
-    def apply(self, path: str, body: Body) -> None:
-        """Server-side apply."""
-        self.call("PATCH", path, body, "application/apply-patch+yaml", fieldManager="bench", force="true")
-
-    def items(self, path: str, **q: str) -> list[Body]:
-        """A whole collection."""
-        return self.call("GET", path, **q)["items"]
-
-    def watch(self, path: str, version: str) -> Iterator[Body]:
-        """Events of a collection."""
-        q = {"watch": "true", "resourceVersion": version}
-        with self._http.stream("GET", path, params=q, timeout=httpx2.Timeout(10.0, read=600.0)) as answer:
-            for line in answer.iter_lines():
-                yield json.loads(line)
+        self.access = with_certificate(cluster.server, cluster.ca, cluster.credential)
+        super().__init__(self.access, "bench")
 
 
 # -- the scene --
@@ -161,7 +132,7 @@ class Scene:
     def _ready(self) -> set[str]:
         return {
             n["metadata"]["name"]
-            for n in self._api.items("/api/v1/nodes", resourceVersion="0")
+            for n in self._api.list("/api/v1/nodes", resourceVersion="0")
             if any(c["type"] == "Ready" and c["status"] == "True" for c in n["status"].get("conditions", ()))
         }
 
@@ -175,7 +146,7 @@ class Scene:
         self._api.apply(path_of(body), body)
         if kind == "Drone":
             status = {"flightState": "inactive", "battery": {"remaining": 1.0}, "conditions": [READY]}
-            self._api.call("PATCH", path_of(body) + "/status", {"status": status}, "application/merge-patch+json")
+            self._api.merge(path_of(body) + "/status", {"status": status})
 
 
 # -- the operator --
@@ -225,18 +196,18 @@ class Bound:
     """When each pod was seen to be bound, by namespace; follows the API server in a thread of its own."""
 
     def __init__(self, api: Api) -> None:
-        self._api = api
+        self._access = api.access
         self.at: dict[str, dict[str, float]] = {}
-        version = api.call("GET", "/api/v1/pods", limit="1")["metadata"]["resourceVersion"]
-        threading.Thread(target=self._follow, args=(version,), daemon=True).start()
+        version = api.call("GET", "/api/v1/pods?limit=1")["metadata"]["resourceVersion"]
+        threading.Thread(target=lambda: asyncio.run(self._follow(version)), daemon=True).start()
 
-    def _follow(self, version: str) -> None:
-        with contextlib.suppress(httpx2.HTTPError):
-            for event in self._api.watch("/api/v1/pods", version):
-                pod = event["object"]
-                if event["type"] != "DELETED" and pod.get("spec", {}).get("nodeName"):
-                    seen = self.at.setdefault(pod["metadata"]["namespace"], {})
-                    seen.setdefault(pod["metadata"]["name"], time.monotonic())
+    async def _follow(self, version: str) -> None:
+        async with contextlib.aclosing(Client(self._access, "bench")) as client:
+            with contextlib.suppress(KubeError):
+                async for type_, pod in client.watch(PODS, resource_version=version, timeout_s=3600, silence_s=600.0):
+                    if type_ not in ("BOOKMARK", "DELETED") and pod.get("spec", {}).get("nodeName"):
+                        seen = self.at.setdefault(pod["metadata"]["namespace"], {})
+                        seen.setdefault(pod["metadata"]["name"], time.monotonic())
 
 
 # -- measuring --
@@ -284,7 +255,7 @@ class Bench:
 
     def _kinds_served(self) -> bool:
         try:
-            return all("items" in self._api.call("GET", f"{API}/{kind.PLURAL}", limit="1") for kind in KINDS)
+            return all(self._api.get(f"{API}/{kind.PLURAL}?limit=1") is not None for kind in KINDS)
         except RuntimeError:
             return False
 
@@ -316,7 +287,7 @@ class Bench:
 
     def _labelled(self) -> None:
         def all_labelled() -> bool:
-            nodes = self._api.items("/api/v1/nodes", resourceVersion="0")
+            nodes = self._api.list("/api/v1/nodes", resourceVersion="0")
             return all(
                 "fractus.dev/geohash" in n["metadata"]["labels"]
                 for n in nodes
@@ -331,7 +302,7 @@ class Bench:
         self._api.apply(path_of(application("first", namespace), namespace), application("first", namespace))
         plan = f"{API}/namespaces/{namespace}/deploymentplans/first"
         self.operator.start()
-        wait_until(lambda: bool(self._api.call("GET", plan)), "the first plan", timeout_s=120, pause_s=0.02)
+        wait_until(lambda: self._api.get(plan) is not None, "the first plan", timeout_s=120, pause_s=0.02)
         taken = time.monotonic() - self.operator.started
         self._gone(namespace, ["first"])
         return taken
@@ -369,7 +340,7 @@ class Bench:
         namespace = self._namespace()
         self._api.apply(path_of(application("traffic", namespace), namespace), application("traffic", namespace))
         self._phase(namespace, {"traffic"}, {"Running"})
-        made = self._api.items(f"/apis/apps/v1/namespaces/{namespace}/deployments")
+        made = self._api.list(f"/apis/apps/v1/namespaces/{namespace}/deployments")
         self._gone(namespace, ["traffic"])
         return made
 
@@ -415,12 +386,12 @@ class Bench:
     def _audit(self, namespace: str, names: list[str], found: Measured) -> list[str]:
         faults = []
         applications = {
-            a["metadata"]["name"]: a["status"] for a in self._api.items(f"{API}/namespaces/{namespace}/applications")
+            a["metadata"]["name"]: a["status"] for a in self._api.list(f"{API}/namespaces/{namespace}/applications")
         }
         plans = {
-            p["metadata"]["name"]: p["spec"] for p in self._api.items(f"{API}/namespaces/{namespace}/deploymentplans")
+            p["metadata"]["name"]: p["spec"] for p in self._api.list(f"{API}/namespaces/{namespace}/deploymentplans")
         }
-        pods = self._api.items(f"/api/v1/namespaces/{namespace}/pods")
+        pods = self._api.list(f"/api/v1/namespaces/{namespace}/pods")
         phases = [status["phase"] for status in applications.values()]
         found.at_once = {phase: phases.count(phase) for phase in sorted(set(phases))}
         if set(applications) != set(names):
@@ -456,13 +427,13 @@ class Bench:
         )
         # Without it no pod is made.
         account = f"/api/v1/namespaces/{name}/serviceaccounts/default"
-        wait_until(lambda: bool(self._api.call("GET", account)), "the service account", timeout_s=60)
+        wait_until(lambda: self._api.get(account) is not None, "the service account", timeout_s=60)
         time.sleep(0.5)
         return name
 
     def _phase(self, namespace: str, names: set[str], phases: set[str], pause_s: float = 0.1) -> None:
         def reached() -> bool:
-            items = self._api.items(f"{API}/namespaces/{namespace}/applications", resourceVersion="0")
+            items = self._api.list(f"{API}/namespaces/{namespace}/applications", resourceVersion="0")
             there = {a["metadata"]["name"] for a in items if a.get("status", {}).get("phase") in phases}
             return there == names
 
@@ -471,16 +442,16 @@ class Bench:
     def _gone(self, namespace: str, names: Iterable[str]) -> None:
         """Delete applications, and wait until nothing is left of them."""
         for name in names:
-            self._api.call("DELETE", f"{API}/namespaces/{namespace}/applications/{name}")
+            self._api.delete(f"{API}/namespaces/{namespace}/applications/{name}")
         collections = (f"{API}/namespaces/{namespace}/applications", f"/api/v1/namespaces/{namespace}/pods")
-        wait_until(lambda: not any(self._api.items(c) for c in collections), "deletion", timeout_s=180, pause_s=0.2)
+        wait_until(lambda: not any(self._api.list(c) for c in collections), "deletion", timeout_s=180, pause_s=0.2)
         self._remove(namespace)
 
     def _remove(self, namespace: str) -> None:
         """Delete a namespace, and let the control plane come to rest: what one run leaves is no load on the next."""
         path = f"/api/v1/namespaces/{namespace}"
-        self._api.call("DELETE", path)
-        wait_until(lambda: not self._api.call("GET", path), "the namespace to go", timeout_s=180, pause_s=0.2)
+        self._api.delete(path)
+        wait_until(lambda: self._api.get(path) is None, "the namespace to go", timeout_s=180, pause_s=0.2)
         time.sleep(1.0)
 
 

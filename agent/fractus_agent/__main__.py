@@ -19,7 +19,7 @@ from fractus_agent.identity import Identity
 from fractus_agent.registration import Registration
 from fractus_agent.settings import MissingSetting, Settings
 from fractus_agent.status import Observed, StatusReporter
-from fractus_agent.store import Object, Store, Unavailable, connect
+from fractus_agent.store import Object, Store, Unconfigured, connect
 from fractus_agent.watchdog import guard
 
 if TYPE_CHECKING:
@@ -123,9 +123,9 @@ async def serve(settings: Settings) -> None:
     """Run the agent until SIGTERM or SIGINT.
 
     Raises:
-        Unavailable: there is no service account and no KUBECONFIG.
+        Unconfigured: there is no service account and no KUBECONFIG.
     """
-    store = Store(connect(), settings.node)
+    store = Store(await connect(), settings.node)
     task = asyncio.create_task(Agent(settings, store).run())
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -145,11 +145,10 @@ def main(environment: Mapping[str, str] = os.environ) -> int:
         print(error, file=sys.stderr)
         return 2
     logging.basicConfig(level=settings.log_level, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    logging.getLogger("httpx2").setLevel(logging.WARNING)
     LOG.info("agent of node %s", settings.node)
     try:
         asyncio.run(serve(settings))
-    except Unavailable as error:
+    except Unconfigured as error:
         LOG.error("%s", error)  # noqa: TRY400 (one line is enough)
         return 1
     return 0

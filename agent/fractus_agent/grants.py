@@ -14,9 +14,8 @@ from fractus_core.api.model import InvalidObject
 from fractus_core.api.plans import Grant
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
 
-from fractus_agent.backoff import Backoff
 from fractus_agent.durable import remove_file, write_file
-from fractus_agent.store import Changed, Conflict, Deleted, GrantEvent, Listed, Object, Rejected, Unavailable
+from fractus_agent.store import Backoff, Changed, Deleted, GrantEvent, KubeError, Listed, Object
 
 LOG = logging.getLogger(__name__)
 
@@ -195,7 +194,7 @@ class GrantKeeper:
             try:
                 await self.report_once()
                 backoff.succeeded()
-            except (Unavailable, Conflict, Rejected) as error:
+            except KubeError as error:
                 LOG.log(logging.DEBUG if backoff.attempts else logging.WARNING, "phases wait: %s", error)
                 delay_s = backoff.delay_s()
                 await asyncio.sleep(delay_s)

@@ -17,11 +17,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Protocol
 
-from fractus_agent.backoff import Backoff
 from fractus_agent.certificates import Unusable, Validity, inspect
 from fractus_agent.durable import read_set, write_set
 from fractus_agent.findings import Finding
-from fractus_agent.store import Conflict, Object, Rejected, Unavailable
+from fractus_agent.store import Backoff, KubeError, Object
 
 LOG = logging.getLogger(__name__)
 
@@ -52,6 +51,10 @@ class Authority(Protocol):
         """Delete this node's signing requests."""
 
 
+class NotYet(Exception):
+    """A step did not succeed this time: try again later."""
+
+
 class Refused(Exception):
     """The signer denied the request, or failed."""
 
@@ -64,7 +67,7 @@ async def make_request_apart(node: str) -> tuple[bytes, bytes]:
     """A key and a signing request, made by a process of its own.
 
     Raises:
-        Unavailable: the process failed or took longer than a minute.
+        NotYet: the process failed or took longer than a minute.
     """
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "fractus_agent.csr", node,
@@ -73,11 +76,11 @@ async def make_request_apart(node: str) -> tuple[bytes, bytes]:
     try:
         output, complaint = await asyncio.wait_for(process.communicate(), 60.0)
         if process.returncode != 0:
-            raise Unavailable(f"the key could not be made: {complaint.decode(errors='replace')[-500:]}")
+            raise NotYet(f"the key could not be made: {complaint.decode(errors='replace')[-500:]}")
         made = json.loads(output)
         return made["key"].encode(), made["request"].encode()
     except TimeoutError as error:
-        raise Unavailable("making the key took longer than a minute") from error
+        raise NotYet("making the key took longer than a minute") from error
     finally:
         if process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
@@ -133,7 +136,7 @@ class Identity:
                 # A new installation's operator is about to publish its authority; a refusal wants patience.
                 pause_s = self._backoff.delay_s()
                 delay_s = min(5.0, pause_s) if refusal.reason == "NoAuthority" else max(30.0, pause_s)
-            except (Unavailable, Rejected, Conflict, OSError) as error:
+            except (KubeError, NotYet, OSError) as error:
                 if self._wanting():
                     self._find("False", "Requested", f"The node has no usable certificate yet: {error}")
                     delay_s = min(15.0, self._backoff.delay_s())
@@ -143,7 +146,7 @@ class Identity:
             await asyncio.sleep(delay_s)
 
     def doubt_authority(self) -> None:
-        """Look at the published authority soon: somebody met another one."""
+        """Look at the published authority soon: a certificate of another one was presented."""
         self._doubted = True
 
     async def step(self, ask: bool = True) -> None:
@@ -154,7 +157,7 @@ class Identity:
 
         Raises:
             Refused: the signer denied the request, or failed.
-            Unavailable: something is due and the API server is out of reach.
+            KubeError: something is due and the API server is out of reach.
         """
         validity, now = self._validity(), self._clock()
         authority = await self._store.authority() if ask else None
@@ -222,7 +225,7 @@ class Identity:
         except Unusable as problem:
             raise Refused("Failed", f"The signed certificate is of no use: {problem}.") from problem
         self._install(files)
-        with contextlib.suppress(Unavailable):
+        with contextlib.suppress(KubeError):
             await self._store.drop_certificate_requests()
         now = self._clock()
         if not validity.begun(now) or now >= validity.not_after:
@@ -237,7 +240,7 @@ class Identity:
         while loop.time() < until_s:
             found = await self._store.certificate_request(name)
             if found is None:
-                raise Unavailable(f"signing request {name} was deleted")
+                raise NotYet(f"signing request {name} was deleted")
             status = found.get("status") or {}
             for condition in status.get("conditions") or ():
                 if condition["type"] in ("Denied", "Failed"):
@@ -251,7 +254,7 @@ class Identity:
             if self._wanting():
                 self._find("False", "Requested", f"Signing request {name} waits for the operator.")
             await asyncio.sleep(backoff.delay_s())
-        raise Unavailable(f"nobody signed {name} in {SIGNING_TIMEOUT_S:.0f} s")
+        raise NotYet(f"no one signed {name} in {SIGNING_TIMEOUT_S:.0f} s")
 
     def _inspect_apart(self, files: dict[str, bytes]) -> Validity:
         trial = self._directory / f"..{uuid.uuid4().hex}"

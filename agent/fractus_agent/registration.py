@@ -14,9 +14,8 @@ import yaml
 from fractus_core.api.model import GROUP, InvalidObject
 from fractus_core.api.nodes import Drone, EdgeNode
 
-from fractus_agent.backoff import Backoff
 from fractus_agent.findings import Finding
-from fractus_agent.store import Conflict, Object, Rejected, Unavailable
+from fractus_agent.store import Backoff, Invalid, KubeError, Object
 
 LOG = logging.getLogger(__name__)
 
@@ -108,7 +107,7 @@ class Registration:
                     await self.step()
                     resync_s = loop.time() + RESYNC_S
                     backoff.succeeded()
-            except (Unavailable, Conflict, Rejected) as error:
+            except KubeError as error:
                 LOG.log(logging.DEBUG if backoff.attempts else logging.WARNING, "registration waits: %s", error)
                 self._stamp = None
                 await asyncio.sleep(backoff.delay_s())
@@ -133,9 +132,9 @@ class Registration:
         """Bring the object in step with the description once.
 
         Raises:
-            Unavailable: the API server is out of reach.
-            Conflict: somebody wrote in between.
-            Rejected: the API server refuses the object.
+            Conflict: the object was written in between.
+            Invalid: the API server refuses the object.
+            KubeError: the API server is out of reach.
         """
         described = self._description()
         labels = await self._store.node_labels()
@@ -177,7 +176,7 @@ class Registration:
                 changed["spec"] = described.to_dict()["spec"]
                 LOG.info("took over the changed description of %s %s", described.kind, self._node)
             return await self._store.replace(changed)
-        except Rejected as error:
+        except Invalid as error:
             self._undescribed(f"the API server refuses it: {error}")
             self._take(body)
             raise

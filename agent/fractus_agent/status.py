@@ -12,10 +12,9 @@ from typing import Any, Protocol, get_args
 
 from fractus_core.api.nodes import FlightState
 
-from fractus_agent.backoff import Backoff
 from fractus_agent.findings import Finding, conditions, timestamp
 from fractus_agent.flight import Snapshot
-from fractus_agent.store import Conflict, Object, Rejected, Unavailable
+from fractus_agent.store import Backoff, KubeError, Object
 
 LOG = logging.getLogger(__name__)
 
@@ -200,7 +199,7 @@ class StatusReporter:
             try:
                 wait_s = await self.step()
                 backoff.succeeded()
-            except (Unavailable, Conflict, Rejected) as error:
+            except KubeError as error:
                 LOG.log(logging.DEBUG if backoff.attempts else logging.WARNING, "the status waits: %s", error)
                 await asyncio.sleep(backoff.delay_s())
                 continue

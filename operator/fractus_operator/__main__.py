@@ -20,8 +20,7 @@ from fractus_core.identity.authority import BrokenAuthority
 from fractus_operator import handlers
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Key, Kind
-from fractus_operator.cluster.lease import Lease, LostLease
-from fractus_operator.cluster.store import Store, StoreError, Unconfigured
+from fractus_operator.cluster.store import KubeError, Lease, LostLease, Store, Unconfigured
 from fractus_operator.identity.ca_secret import open_authority
 from fractus_operator.identity.node_requests import NodeSigning
 from fractus_operator.inventory.live import LiveInventory
@@ -34,6 +33,7 @@ from fractus_operator.settings import BadSetting, Settings
 
 logger = logging.getLogger("fractus_operator")
 
+LEASE_NAME = "fractus-operator"
 _ALLOCATIONS = 20_000
 """Of so many containers that are not freed at once, the garbage collector looks for cycles: a deployment makes a few thousand."""
 
@@ -50,10 +50,10 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         stop: Set it to end the operator; signals do so as well.
     """
     # The Lease has a connection of its own: no burst of other requests keeps a renewal waiting.
-    store, beside = Store.connect(), Store.connect()
+    beside = await Store.connect()
     identity = settings.identity or f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
-    lease = Lease(beside, settings.namespace, identity, settings.lease_s, time.monotonic)
-    store.may_write_s = lambda: lease.left_s
+    lease = Lease(beside, (settings.namespace, LEASE_NAME), identity, settings.lease_s, time.monotonic)
+    store = await Store.connect(may_write_s=lambda: lease.left_s)
     keeping = asyncio.create_task(lease.run())
     try:
         await _acting(lease, keeping)
@@ -81,8 +81,8 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         # Last of all: until here something of ours may still be written.
         keeping.cancel()
         await asyncio.gather(keeping, return_exceptions=True)
-        await store.close()
-        await beside.close()
+        await store.aclose()
+        await beside.aclose()
 
 
 async def _acting(lease: Lease, keeping: asyncio.Task[None]) -> None:
@@ -177,11 +177,10 @@ def main() -> int:
     logging.basicConfig(
         level=settings.log_level, format="%(asctime)s %(levelname)-7s %(name)s: %(message)s", stream=sys.stderr
     )
-    logging.getLogger("httpx2").setLevel(logging.WARNING)
     logging.getLogger("kopf").setLevel(max(settings.log_level, logging.WARNING))
     try:
         asyncio.run(run(settings))
-    except (Unconfigured, BrokenAuthority, StoreError, LostLease) as error:
+    except (Unconfigured, BrokenAuthority, KubeError, LostLease) as error:
         logger.critical("%s", error)
         return 1
     return 0

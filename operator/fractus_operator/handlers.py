@@ -13,7 +13,7 @@ import kopf
 
 from fractus_operator.cluster.kinds import APPLICATION, Key
 from fractus_operator.cluster.labels import FINALIZER
-from fractus_operator.cluster.store import StoreError
+from fractus_operator.cluster.store import KubeError
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile.deployments import BeingDeleted, Deployments
 
@@ -55,7 +55,7 @@ def register(registry: kopf.OperatorRegistry, live: LiveInventory, deployments: 
         await live.synced()
         try:
             await deployments.teardown((namespace or "", name), uid)
-        except StoreError as error:
+        except KubeError as error:
             raise kopf.TemporaryError(str(error), delay=_RETRY_S) from error
 
 
@@ -80,7 +80,7 @@ async def follow(live: LiveInventory, deployments: Deployments, key: Key, stoppe
                 failures = 0
             except BeingDeleted:
                 return
-            except StoreError as error:
+            except KubeError as error:
                 failures += 1
                 low, high = _BACKOFF_S
                 again_s = min(high, low * 2.0 ** min(failures, 8)) * random.uniform(0.5, 1.0)  # noqa: S311  (jitter)

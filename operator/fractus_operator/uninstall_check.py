@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from fractus_operator.cluster.kinds import APPLICATION, DRONE, Body, key_of
 from fractus_operator.cluster.labels import FINALIZER
-from fractus_operator.cluster.store import Store, StoreError, Unconfigured
+from fractus_operator.cluster.store import KubeError, Store, Unconfigured
 
 _ON_THE_GROUND = {"inactive", "charging"}
 
@@ -46,20 +46,20 @@ async def check() -> str:
 
     Raises:
         Unconfigured: there are no credentials.
-        StoreError: the API server refused, or could not be reached.
+        KubeError: the API server refused, or could not be reached.
     """
-    store = Store.connect()
+    store = await Store.connect()
     try:
         return objection(await store.list(APPLICATION), await store.list(DRONE))
     finally:
-        await store.close()
+        await store.aclose()
 
 
 def main() -> int:
     """Run the check as a program; returns its exit code."""
     try:
         found = asyncio.run(check())
-    except (Unconfigured, StoreError) as error:
+    except (Unconfigured, KubeError) as error:
         found = f"whether drones fly could not be found out: {error}"
     if found:
         print(found, file=sys.stderr)

@@ -13,17 +13,17 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from http import HTTPStatus
 from pathlib import Path
+
+from fractus_kube import BlockingClient, Conflict, KubeError
 
 from fractus_cluster import machine, manifests, network
 from fractus_cluster.addressing import Addressing
-from fractus_cluster.apiclient import ApiClient, ApiError, answers_ready
+from fractus_cluster.apiclient import administrating, answers_ready, wait_ready
 from fractus_cluster.binaries import Binaries, ensure_binaries
 from fractus_cluster.cgroups import Branch, cluster_branch
 from fractus_cluster.commands import run
 from fractus_cluster.controlplane import (
-    API_PORT,
     CONTROL_PLANE_PROGRAMS,
     DNS_READY_PORT,
     ControlPlaneFiles,
@@ -219,7 +219,7 @@ class Cluster:
             wanted = store.fetch(images)
             self._place_nodes(nodes, binaries, authority, store, wanted)
             with self._api(authority, memory) as api:
-                api.wait_ready(timeout_s=_API_TIMEOUT_S)
+                wait_ready(api, _API_TIMEOUT_S)
                 self._apply_objects(api, nodes, memory)
                 let_dns_start(self._wiring(memory).addressing, self._files())
                 since = datetime.now(UTC).replace(microsecond=0)
@@ -399,21 +399,17 @@ class Cluster:
             with ThreadPoolExecutor(max_workers=2) as pool:
                 list(pool.map(template.furnish, fresh))
 
-    def _api(self, authority: Authority, memory: Memory) -> ApiClient:
-        return ApiClient(
-            str(Addressing(memory.block).control_plane),
-            API_PORT,
-            ca=authority.credential.certificate,
-            credential=administrator(authority),
-        )
+    def _api(self, authority: Authority, memory: Memory) -> AbstractContextManager[BlockingClient]:
+        server = server_url(Addressing(memory.block))
+        return administrating(server, authority.credential.certificate, administrator(authority))
 
-    def _apply_objects(self, api: ApiClient, nodes: list[Node], memory: Memory) -> None:
+    def _apply_objects(self, api: BlockingClient, nodes: list[Node], memory: Memory) -> None:
         place = Addressing(memory.block)
         names = {node.name for node in nodes}
-        for present in api.request("GET", "/api/v1/nodes")["items"]:
+        for present in api.list("/api/v1/nodes"):
             name = present["metadata"]["name"]
             if name not in names and "fractus-sim" in str(present["metadata"].get("managedFields")):
-                api.request("DELETE", f"/api/v1/nodes/{name}")
+                api.call("DELETE", f"/api/v1/nodes/{name}")
         for node in nodes:
             # Before its kubelet starts, so that no pod is there before labels and taints are.
             _apply_node(api, node, place)
@@ -427,17 +423,17 @@ class Cluster:
         if not self.kubeconfig.exists() or self.kubeconfig.read_text() != text:
             write_private(self.kubeconfig, text)
 
-    def _wait_nodes(self, api: ApiClient, nodes: Sequence[tuple[Node, datetime | None]]) -> None:
+    def _wait_nodes(self, api: BlockingClient, nodes: Sequence[tuple[Node, datetime | None]]) -> None:
         """Wait until every node is Ready, by its word since the given time, and offers its extended resources."""
         deadline = time.monotonic() + _READY_TIMEOUT_S
         waiting = {node.name: (node, since) for node, since in nodes}
         while True:
-            for item in api.request("GET", "/api/v1/nodes")["items"]:
+            for item in api.list("/api/v1/nodes"):
                 name = item["metadata"]["name"]
                 if name in waiting and manifests.is_ready(item, since=waiting[name][1]):
                     patch = manifests.extended_resources_patch(waiting[name][0].spec, item)
                     if patch:
-                        api.patch(*patch)
+                        api.merge(*patch)
                     else:
                         del waiting[name]
             if not waiting:
@@ -470,27 +466,27 @@ class Cluster:
     def _ready_nodes(self, memory: Memory) -> dict[str, bool] | None:
         if not self.running:
             return None
-        try:
-            with self._api(Authority(self._state.pki), memory) as api:
-                items = api.request("GET", "/api/v1/nodes")["items"]
-        except ApiError:
-            raise
-        except ClusterError:
-            return None
+        with self._api(Authority(self._state.pki), memory) as api:
+            try:
+                items = api.list("/api/v1/nodes")
+            except KubeError as error:
+                if error.status:
+                    raise
+                return None
         return {item["metadata"]["name"]: manifests.is_ready(item) for item in items}
 
 
-def _apply_node(api: ApiClient, node: Node, place: Addressing) -> None:
+def _apply_node(api: BlockingClient, node: Node, place: Addressing) -> None:
     for tries_left in reversed(range(_CONFLICTS)):
         present = api.apply(*manifests.node_object(node.spec, node.index, place))
         patch = manifests.taints_patch(node.spec, present)
         if patch is None:
             return
         try:
-            api.patch(*patch)
-        except ApiError as error:
+            api.merge(*patch)
+        except Conflict:
             # The node controller has set a taint of its own meanwhile.
-            if error.status != HTTPStatus.CONFLICT or not tries_left:
+            if not tries_left:
                 raise
 
 

@@ -16,10 +16,10 @@ from typing import Any
 
 import yaml
 
-from fractus_cluster.apiclient import ApiClient
+from fractus_cluster.apiclient import administrating, wait_ready
 from fractus_cluster.binaries import Binaries, ensure_binaries
 from fractus_cluster.errors import ClusterError
-from fractus_cluster.pki import Authority, write_private
+from fractus_cluster.pki import Authority, Credential, write_private
 from fractus_cluster.ports import free_port
 
 PROGRAMS = ("etcd", "kube-apiserver", "kube-controller-manager", "kube-scheduler", "kwok")
@@ -76,8 +76,8 @@ class LoopbackCluster:
         """
         self._run("etcd", *self._etcd())
         self._run("kube-apiserver", *self._api_server())
-        with self.client() as api:
-            api.wait_ready(timeout_s=_START_TIMEOUT_S)
+        with administrating(self.server, self.ca, Credential(*self.credential)) as api:
+            wait_ready(api, _START_TIMEOUT_S)
         config = f"--kubeconfig={self.kubeconfig}"
         accounts = self._authority.service_account_key()
         self._run(
@@ -116,11 +116,6 @@ class LoopbackCluster:
                 process.kill()
                 process.wait(_STOP_TIMEOUT_S)
         self._processes.clear()
-
-    def client(self) -> ApiClient:
-        """A connection as administrator."""
-        credential = self._authority.issue("admin", common_name="admin", organizations=("system:masters",))
-        return ApiClient("127.0.0.1", self._port, ca=self.ca, credential=credential)
 
     def check(self) -> None:
         """Check that every process still runs.

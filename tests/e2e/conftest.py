@@ -18,7 +18,7 @@ import yaml
 from fractus_cluster import Cluster
 from fractus_cluster.binaries import ensure_binaries
 from fractus_cluster.images.build import build_images
-from kube import Kube, Object, condition
+from kubectl import Kube, Object, condition
 
 ROOT = pathlib.Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "traffic-monitoring"

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import pytest
 import yaml
 from conftest import DRONE
-from kube import Kube, Object
+from kubectl import Kube, Object
 
 NAMESPACE = "isolation"
 ALICE = "alice"

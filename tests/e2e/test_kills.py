@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 from conftest import DRONE, SYSTEM, flight_state, short_flight
-from kube import Kube, Object
+from kubectl import Kube, Object
 from test_mission import audit_log, phase
 
 PARTS: dict[str, tuple[str, str, str | None]] = {

@@ -8,7 +8,7 @@ import time
 
 from conftest import DRONE, SYSTEM, example, flight_state, short_flight
 from fractus_services.chain import verify
-from kube import Kube, Object, condition
+from kubectl import Kube, Object, condition
 
 MOBILITY = "app.kubernetes.io/component=mobility"
 

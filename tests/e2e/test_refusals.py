@@ -6,7 +6,7 @@ import copy
 
 import pytest
 from conftest import example
-from kube import Kube, Object, condition
+from kubectl import Kube, Object, condition
 from test_mission import children
 
 

@@ -8,7 +8,7 @@ import shutil
 import subprocess
 
 from conftest import SYSTEM, short_flight
-from kube import Kube
+from kubectl import Kube
 
 
 def helm(kube: Kube, *args: str) -> subprocess.CompletedProcess[str]:

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import json
 import os
 import signal
 import subprocess
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx2
 from agent_pki import TestAuthority
-from control_plane import ControlPlane, Refused, programs, wait_for
+from control_plane import ControlPlane, programs, wait_for
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
+from fractus_kube import KubeError
 
 FRACTUS = "/apis/fractus.dev/v1alpha1"
 REQUESTS = "/apis/certificates.k8s.io/v1/certificatesigningrequests"
@@ -87,7 +89,7 @@ class ApiServer(ControlPlane):
         return self.admin.call("POST", path, body)
 
     def delete(self, path: str) -> None:
-        with contextlib.suppress(Refused):
+        with contextlib.suppress(KubeError):
             self.admin.call("DELETE", path)
 
     @property
@@ -128,7 +130,9 @@ class ApiServer(ControlPlane):
 
 
 def _post(url: str, body: dict[str, Any]) -> dict[str, Any]:
-    return dict(httpx2.post(url, json=body, timeout=5.0, trust_env=False).json())
+    request = urllib.request.Request(url, json.dumps(body).encode(), {"Content-Type": "application/json"})
+    with urllib.request.build_opener(urllib.request.ProxyHandler({})).open(request, timeout=5.0) as answer:
+        return dict(json.load(answer))
 
 
 @contextlib.contextmanager

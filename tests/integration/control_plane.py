@@ -5,8 +5,6 @@ No kubelets: objects are real, nothing runs. Tests say of pods what kubelets wou
 
 from __future__ import annotations
 
-import json
-import ssl
 import subprocess
 import time
 from collections.abc import Callable
@@ -14,12 +12,12 @@ from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any, TypeVar
 
-import httpx2
 from fractus_cluster.binaries import ensure_binaries
 from fractus_cluster.pki import Authority
 from fractus_cluster.ports import free_port
 from fractus_core.api import KINDS
 from fractus_core.api.crd import crd
+from fractus_kube import BlockingClient, KubeError, with_certificate
 
 T = TypeVar("T")
 Body = dict[str, Any]
@@ -60,77 +58,6 @@ def select_pause(seconds: float) -> None:
     select.select([], [], [], seconds)
 
 
-class Refused(Exception):
-    """The API server refused a request."""
-
-    def __init__(self, code: int, message: str) -> None:
-        self.code = code
-        super().__init__(message)
-
-
-class Api:
-    """A synchronous client with a certificate or a token."""
-
-    def __init__(self, server: str, ca: Path, *, certificate: tuple[Path, Path] | None = None, token: str = "") -> None:
-        context = ssl.create_default_context(cafile=str(ca))
-        if certificate is not None:
-            context.load_cert_chain(*map(str, certificate))
-        headers = {"Authorization": f"Bearer {token}"} if token else {}
-        self._client = httpx2.Client(base_url=server, verify=context, headers=headers, timeout=20.0, trust_env=False)
-
-    def close(self) -> None:
-        self._client.close()
-
-    def call(
-        self, method: str, path: str, body: Body | None = None, *, content: str = "application/json", **params: str
-    ) -> Body:
-        response = self._client.request(
-            method,
-            path,
-            params=params,
-            content=None if body is None else json.dumps(body),
-            headers={"Content-Type": content},
-        )
-        if response.status_code >= 400:
-            raise Refused(response.status_code, response.json().get("message", response.text))
-        return response.json()
-
-    def get(self, path: str) -> Body | None:
-        try:
-            return self.call("GET", path)
-        except Refused as error:
-            if error.code == 404:
-                return None
-            raise
-
-    def list(self, path: str, **params: str) -> list[Body]:
-        return self.call("GET", path, **params)["items"]
-
-    def apply(self, path: str, body: Body, manager: str = "kubectl") -> Body:
-        return self.call(
-            "PATCH", path, body, content="application/apply-patch+yaml", fieldManager=manager, force="true"
-        )
-
-    def merge(self, path: str, body: Body) -> Body:
-        return self.call("PATCH", path, body, content="application/merge-patch+json")
-
-    def delete(self, path: str, grace_s: int | None = None) -> None:
-        options: Body = {"propagationPolicy": "Background"}
-        if grace_s is not None:
-            options["gracePeriodSeconds"] = grace_s
-        try:
-            self.call("DELETE", path, options)
-        except Refused as error:
-            if error.code != 404:
-                raise
-
-    def ready(self) -> bool:
-        try:
-            return self._client.get("/readyz").status_code == 200
-        except httpx2.HTTPError:
-            return False
-
-
 class ControlPlane:
     """etcd, kube-apiserver and kube-controller-manager of one test session."""
 
@@ -145,9 +72,10 @@ class ControlPlane:
         self.admin = self._admin()
         self.kubeconfig = self.write_kubeconfig("admin", "admin", ("system:masters",))
 
-    def _admin(self) -> Api:
+    def _admin(self) -> BlockingClient:
         credential = self.authority.issue("admin", common_name="admin", organizations=("system:masters",))
-        return Api(self.server, self.ca, certificate=(credential.certificate, credential.key))
+        access = with_certificate(self.server, self.ca, (credential.certificate, credential.key))
+        return BlockingClient(access, "kubectl")
 
     def write_kubeconfig(self, name: str, user: str, groups: tuple[str, ...] = ()) -> Path:
         credential = self.authority.issue(name, common_name=user, organizations=groups)
@@ -155,8 +83,8 @@ class ControlPlane:
         path.write_text(self.authority.kubeconfig(credential, server=self.server, cluster="test"))
         return path
 
-    def with_token(self, token: str) -> Api:
-        return Api(self.server, self.ca, token=token)
+    def with_token(self, token: str) -> BlockingClient:
+        return BlockingClient(with_certificate(self.server, self.ca, token=token), "kubectl")
 
     def start(self) -> None:
         client, peer = free_port(), free_port()
@@ -239,7 +167,7 @@ class ControlPlane:
             return False
         try:
             self.admin.list(f"/apis/fractus.dev/v1alpha1/{body['spec']['names']['plural']}")
-        except Refused:
+        except KubeError:
             # "storage is (re)initializing"
             return False
         return True

@@ -11,8 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from control_plane import Api, ControlPlane, Refused, wait_for
+from control_plane import ControlPlane, wait_for
 from fractus_cluster.ports import free_port
+from fractus_kube import BlockingClient, KubeError
 
 Body = dict[str, Any]
 FRACTUS = "/apis/fractus.dev/v1alpha1"
@@ -87,7 +88,7 @@ class World:
 
     def __init__(self, plane: ControlPlane) -> None:
         self.plane = plane
-        self.api: Api = plane.admin
+        self.api: BlockingClient = plane.admin
 
     def furnish(self, drones: int = 1, edges: int = 3) -> None:
         self.clear()
@@ -272,7 +273,7 @@ def fresh_namespace(world: World, name: str) -> Iterator[str]:
             world.api.delete(path)
             try:
                 world.api.merge(path, {"metadata": {"finalizers": None}})
-            except Refused as error:
-                if error.code != 404:
+            except KubeError as error:
+                if error.status != 404:
                     raise
         world.api.delete(f"/api/v1/namespaces/{name}")

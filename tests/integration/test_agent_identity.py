@@ -13,7 +13,7 @@ from fractus_agent.certificates import Unusable, inspect
 from fractus_agent.csr import make_request
 from fractus_agent.durable import read_set, write_set
 from fractus_agent.identity import FILES, Identity, Refused, make_request_apart
-from fractus_agent.store import Unavailable
+from fractus_agent.store import KubeError
 
 NODE = "drone-1"
 
@@ -102,8 +102,8 @@ async def test_a_renewal_that_fails_leaves_the_certificate_in_use(bench: Bench) 
     await bench.identity.step()
     before = bench.files()
     bench.clock.now += timedelta(days=22)
-    bench.signer.error = Unavailable("no API server")
-    with pytest.raises(Unavailable):
+    bench.signer.error = KubeError(0, "Unreachable", "no API server")
+    with pytest.raises(KubeError):
         await bench.identity.step()
     assert bench.files() == before
     assert bench.identity.finding.holds

@@ -12,11 +12,12 @@ from typing import Any
 
 import pytest
 import yaml
-from control_plane import Api, ControlPlane, Refused, wait_for
+from control_plane import ControlPlane, wait_for
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.x509.oid import NameOID
+from fractus_kube import BlockingClient, KubeError
 from operator_world import FRACTUS, SYSTEM, OperatorProcess, World, at, component, navigator, ours, traffic
 
 Body = dict[str, Any]
@@ -91,9 +92,9 @@ def test_a_bad_application_is_refused_and_nothing_is_made(
     spoil(manifest["spec"])
     try:
         world.put(manifest)
-    except Refused as refusal:
+    except KubeError as refusal:
         assert field in str(refusal)
-        assert refusal.code in (400, 422)
+        assert refusal.status in (400, 422)
     else:
         wait_for(lambda: world.condition(namespace, "Ready").get("status") == "False", "Ready=False")
         condition = world.condition(namespace, "Ready")
@@ -173,7 +174,7 @@ def _path(body: Body) -> str:
 
 
 @pytest.fixture
-def agents(control_plane: ControlPlane, world: World, chart: None) -> Iterator[dict[str, Api]]:
+def agents(control_plane: ControlPlane, world: World, chart: None) -> Iterator[dict[str, BlockingClient]]:
     """Clients with tokens as the agents of drone-1 and edge-1 have them, bound to pods on these nodes."""
     clients = {}
     pods = f"/api/v1/namespaces/{SYSTEM}/pods"
@@ -195,22 +196,22 @@ def agents(control_plane: ControlPlane, world: World, chart: None) -> Iterator[d
         client.close()
 
 
-def _denied(client: Api) -> bool:
+def _denied(client: BlockingClient) -> bool:
     try:
         client.merge(f"{FRACTUS}/drones/drone-1/status?dryRun=All", {"status": {"flightState": "flying"}})
-    except Refused as error:
-        return error.code == 403 and "may write the Drone" in str(error)
+    except KubeError as error:
+        return error.status == 403 and "may write the Drone" in str(error)
     return False
 
 
 def denied(attempt: Callable[[], object], words: str) -> None:
-    with pytest.raises(Refused) as refusal:
+    with pytest.raises(KubeError) as refusal:
         attempt()
-    assert refusal.value.code == 403, refusal.value
+    assert refusal.value.status == 403, refusal.value
     assert words in str(refusal.value)
 
 
-def test_an_agent_reports_its_own_drone_only(world: World, agents: dict[str, Api]) -> None:
+def test_an_agent_reports_its_own_drone_only(world: World, agents: dict[str, BlockingClient]) -> None:
     state = {"status": {"flightState": "flying"}}
     agents["drone-1"].merge(f"{FRACTUS}/drones/drone-1/status", state)
     denied(lambda: agents["edge-1"].merge(f"{FRACTUS}/drones/drone-1/status", state), "edge-1 only")
@@ -218,7 +219,7 @@ def test_an_agent_reports_its_own_drone_only(world: World, agents: dict[str, Api
     denied(lambda: agents["drone-1"].merge(f"{FRACTUS}/drones/drone-2/status", state), "drone-1 only")
 
 
-def test_an_agent_registers_its_own_node_only(world: World, agents: dict[str, Api]) -> None:
+def test_an_agent_registers_its_own_node_only(world: World, agents: dict[str, BlockingClient]) -> None:
     body = copy.deepcopy(world.api.get(f"{FRACTUS}/edgenodes/edge-1"))
     assert body is not None
     fresh = ours("EdgeNode", "edge-1", body["spec"])
@@ -230,13 +231,15 @@ def test_an_agent_registers_its_own_node_only(world: World, agents: dict[str, Ap
     denied(lambda: agents["edge-1"].delete(f"{FRACTUS}/edgenodes/edge-1"), "cannot delete")
 
 
-def test_an_agent_makes_its_node_nothing_else_than_its_label_says(world: World, agents: dict[str, Api]) -> None:
+def test_an_agent_makes_its_node_nothing_else_than_its_label_says(
+    world: World, agents: dict[str, BlockingClient]
+) -> None:
     def refused(node: str, kind: Body, label: str) -> bool:
         path = f"{FRACTUS}/{kind['kind'].lower()}s?dryRun=All"
         try:
             agents[node].call("POST", path, kind)
-        except Refused as error:
-            return error.code == 403 and f"has the label fractus.dev/class={label}; its agent" in str(error)
+        except KubeError as error:
+            return error.status == 403 and f"has the label fractus.dev/class={label}; its agent" in str(error)
         return False
 
     drone, edge = ours("Drone", "edge-1", {"services": {}}), ours("EdgeNode", "drone-1", {"location": at(0, 0)})
@@ -252,7 +255,7 @@ def _grant(world: World, node: str) -> str:
     return f"{FRACTUS}/grants/{name}"
 
 
-def test_an_agent_reports_on_grants_of_its_node_only(world: World, agents: dict[str, Api]) -> None:
+def test_an_agent_reports_on_grants_of_its_node_only(world: World, agents: dict[str, BlockingClient]) -> None:
     mine, other = _grant(world, "drone-1"), _grant(world, "edge-1")
     status = {"status": {"phase": "Active"}}
     agents["drone-1"].merge(f"{mine}/status", status)
@@ -262,7 +265,7 @@ def test_an_agent_reports_on_grants_of_its_node_only(world: World, agents: dict[
 
 
 def test_a_token_that_is_bound_to_no_node_writes_nothing(
-    control_plane: ControlPlane, world: World, agents: dict[str, Api]
+    control_plane: ControlPlane, world: World, agents: dict[str, BlockingClient]
 ) -> None:
     path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-agent/token"
     request = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest", "spec": {"expirationSeconds": 600}}
@@ -310,7 +313,7 @@ def settled(world: World, body: Body) -> Body:
 
 
 def test_an_agent_gets_the_certificate_of_its_node(
-    world: World, operator: OperatorProcess, agents: dict[str, Api]
+    world: World, operator: OperatorProcess, agents: dict[str, BlockingClient]
 ) -> None:
     body = signing_request("drone-1")
     agents["drone-1"].call("POST", REQUESTS, body)
@@ -341,7 +344,7 @@ FOREIGN = [
 
 @pytest.mark.parametrize(("change", "reason"), FOREIGN)
 def test_an_agent_gets_no_other_certificate(
-    world: World, operator: OperatorProcess, agents: dict[str, Api], change: Body, reason: str
+    world: World, operator: OperatorProcess, agents: dict[str, BlockingClient], change: Body, reason: str
 ) -> None:
     body = signing_request("drone-1", **change)
     agents["drone-1"].call("POST", REQUESTS, body)
@@ -351,7 +354,7 @@ def test_an_agent_gets_no_other_certificate(
 
 
 def test_nobody_else_gets_a_certificate_of_a_node(
-    world: World, operator: OperatorProcess, agents: dict[str, Api]
+    world: World, operator: OperatorProcess, agents: dict[str, BlockingClient]
 ) -> None:
     body = signing_request("drone-1")
     world.api.call("POST", REQUESTS, body)
@@ -404,11 +407,11 @@ def test_the_operator_writes_nothing_that_it_has_not_made(
         client.close()
 
 
-def _probe_refused(client: Api) -> bool:
+def _probe_refused(client: BlockingClient) -> bool:
     try:
         client.merge("/api/v1/nodes/cloud-1", {"metadata": {"labels": {"probe": uuid.uuid4().hex}}})
-    except Refused as error:
-        return error.code == 403 and "location labels" in str(error)
+    except KubeError as error:
+        return error.status == 403 and "location labels" in str(error)
     return False
 
 

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_agent.backoff import Backoff
 from fractus_agent.grants import HOLD_S, GrantDirectory, GrantKeeper, outcome_of, status_of, stored_form
-from fractus_agent.store import Changed, Deleted, GrantEvent, Listed, Unavailable
+from fractus_agent.store import Backoff, Changed, Deleted, GrantEvent, KubeError, Listed
 from fractus_core.api.plans import Grant
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
 
@@ -36,7 +35,7 @@ class FakeStore:
 
     async def apply_status(self, kind: str, name: str, status: dict[str, Any]) -> dict[str, Any] | None:
         if self.down:
-            raise Unavailable("down")
+            raise KubeError(0, "Unreachable", "down")
         self.statuses.append((name, status))
         return {}
 
@@ -121,7 +120,7 @@ async def test_an_unreadable_grant_grants_nothing_and_says_so(
 async def test_phases_are_reported_once_and_survive_outages(keeper: GrantKeeper, store: FakeStore) -> None:
     keeper.take(Listed((manifest(),)))
     store.down = True
-    with pytest.raises(Unavailable):
+    with pytest.raises(KubeError):
         await keeper.report_once()
     store.down = False
     await keeper.report_once()
@@ -272,7 +271,7 @@ async def test_an_api_server_that_is_gone_for_a_month_takes_no_grant_away(
         doubting._give_up_undecided()
         doubting._retry_disk()
         doubting.authority_changed()
-        with pytest.raises(Unavailable):
+        with pytest.raises(KubeError):
             await doubting.report_once()
     assert on_disk(tmp_path) == {"g1.json", "g2.json"}
 

@@ -13,7 +13,7 @@ from fractus_agent.registration import (
     description_hash,
     parse_description,
 )
-from fractus_agent.store import Rejected
+from fractus_agent.store import Invalid
 
 MANIFEST: dict[str, Any] = {
     "apiVersion": "fractus.dev/v1alpha1",
@@ -47,7 +47,7 @@ class FakeStore:
     async def create(self, body: dict[str, Any]) -> dict[str, Any]:
         assert self.object is None
         if self.refuse:
-            raise Rejected("spec.depot: no")
+            raise Invalid(422, "Invalid", "spec.depot: no")
         return self._store(body, 1)
 
     async def replace(self, body: dict[str, Any]) -> dict[str, Any]:
@@ -175,7 +175,7 @@ async def test_a_refused_object_is_said(path: Path) -> None:
     store = FakeStore()
     store.refuse = True
     registration = Registration(store, path, "drone-1")
-    with pytest.raises(Rejected):
+    with pytest.raises(Invalid):
         await registration.step()
     assert registration.described is not None
     assert "spec.depot: no" in registration.described.message

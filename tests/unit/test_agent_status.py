@@ -7,7 +7,7 @@ import pytest
 from fractus_agent.findings import Finding
 from fractus_agent.flight import Snapshot
 from fractus_agent.status import DRONE_PACE, EDGE_PACE, Observed, StatusReporter, due_s, node_status, readiness
-from fractus_agent.store import Unavailable
+from fractus_agent.store import KubeError
 from fractus_agent.telemetry import snapshot
 from fractus_core.api.nodes import DroneStatus, EdgeNodeStatus
 from fractus_proto.v1.mobility_pb2 import Telemetry
@@ -145,7 +145,7 @@ class FakeStore:
 
     async def apply_status(self, kind: str, name: str, status: dict[str, Any]) -> dict[str, Any] | None:
         if self.down:
-            raise Unavailable("down")
+            raise KubeError(0, "Unreachable", "down")
         if self.absent:
             return None
         self.writes.append(status)
@@ -202,7 +202,7 @@ async def test_no_change_is_lost_over_an_outage() -> None:
     bench = Bench()
     await bench.second(seen(flight_state="flying"))
     bench.store.down = True
-    with pytest.raises(Unavailable):
+    with pytest.raises(KubeError):
         await bench.second(seen(flight_state="landing"))
     bench.store.down = False
     await bench.second(seen(flight_state="landing"))

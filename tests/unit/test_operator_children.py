@@ -15,7 +15,7 @@ from fractus_core.api import Application
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind
-from fractus_operator.cluster.store import NotFound, StoreError, Taken
+from fractus_operator.cluster.store import Conflict, KubeError, NotFound
 from fractus_operator.reconcile.children import Children, NameTaken
 
 INPUT = yaml.safe_load((Path(__file__).parents[1] / "golden" / "operator" / "input.yaml").read_text())
@@ -60,7 +60,7 @@ class Webhooks:
     async def create(self, kind: Kind, body: Body) -> Body:
         if (kind, body["metadata"]["name"]) in self.there:
             self.said.append(f"create {kind.name} in vain")
-            raise Taken(409, "AlreadyExists", "it is there")
+            raise Conflict(409, "AlreadyExists", "it is there")
         return await self.written("create", kind, body)
 
     async def apply(self, kind: Kind, body: Body) -> Body:
@@ -77,7 +77,7 @@ class Webhooks:
     async def count_as_applied(self, kind: Kind, _key: Key) -> None:
         self.said.append(f"count {kind.name}")
         if self.frozen:
-            raise StoreError(422, "Invalid", "its image may not be used any more")
+            raise KubeError(422, "Invalid", "its image may not be used any more")
 
     async def written(self, how: str, kind: Kind, body: Body) -> Body:
         if kind is self.hanging:

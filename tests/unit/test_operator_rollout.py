@@ -17,7 +17,7 @@ from fractus_core.api import Application
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind
-from fractus_operator.cluster.store import StoreError
+from fractus_operator.cluster.store import KubeError
 from fractus_operator.inventory.live import Subscription
 from fractus_operator.reconcile import builders, rollout
 from fractus_operator.reconcile.rollout import Rollout
@@ -102,7 +102,7 @@ class Recorder:
         if kinds.GRANT in wanted:
             self.granted.set()
         if self.refused in wanted:
-            raise StoreError(422, "Invalid", "no")
+            raise KubeError(422, "Invalid", "no")
 
     async def prune(self, *_: object, **_more: object) -> None:
         self.said.append("prune")
@@ -195,7 +195,7 @@ async def test_a_refused_deployment_stops_no_grant_but_a_refused_plan_all(
     scene.recorder.refused = refused
     if refused is kinds.SERVICE:
         scene.live.pods.bound(*(p.instance for p in PLACED.placements for _ in range(p.replicas)))
-    with pytest.raises(StoreError, match="no"):
+    with pytest.raises(KubeError, match="no"):
         await scene.deploy()
     assert scene.recorder.said.count("apply Grant") == grants
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from typing import Any
 
-import httpx2
 import pytest
 from fractus_operator.cluster.kinds import DEPLOYMENT, Body
-from fractus_operator.cluster.store import FIELD_MANAGER, Store, StoreError, Taken
+from fractus_operator.cluster.store import FIELD_MANAGER, Conflict, Invalid, KubeError, Store
+from kube_server import Request, answer, listening
+from kube_server import Server as HttpServer
 
 KEY = ("city", "traffic")
 CREATED = {"manager": FIELD_MANAGER, "operation": "Update", "fieldsV1": {"f:spec": {"f:a": {}, "f:b": {"f:c": {}}}}}
@@ -23,29 +25,26 @@ class Server:
     def __init__(self, *entries: Body, there: bool = True, refusals: int = 0) -> None:
         self.metadata: Body = {"name": KEY[1], "namespace": KEY[0], "uid": "u1", "resourceVersion": "7"}
         self.metadata["managedFields"] = list(entries)
-        self.refusal = httpx2.Response(409, json={"reason": "Conflict"})
+        self.refusal = answer({"reason": "Conflict"}, 409)
         self.there = there
         self.refusals = refusals
         self.patches: list[dict[str, Any]] = []
 
-    def __call__(self, request: httpx2.Request) -> httpx2.Response:
+    def __call__(self, request: Request) -> bytes:
         if not self.there:
-            return httpx2.Response(404, json={"reason": "NotFound"})
+            return answer({"reason": "NotFound"}, 404)
         if request.method == "PATCH":
-            assert request.headers["Content-Type"] == "application/json-patch+json"
+            assert request.header("content-type") == "application/json-patch+json"
             if self.refusals:
                 self.refusals -= 1
                 return self.refusal
-            self.patches.append({step["path"]: step["value"] for step in json.loads(request.content)})
-        return httpx2.Response(200, json={"metadata": self.metadata})
+            self.patches.append({step["path"]: step["value"] for step in json.loads(request.body)})
+        return answer({"metadata": self.metadata})
 
 
 async def asked(server: Server) -> None:
-    store = Store(httpx2.AsyncClient(base_url="https://nowhere.test", transport=httpx2.MockTransport(server)))
-    try:
+    async with listening(HttpServer(server)) as access, contextlib.aclosing(Store(access)) as store:
         await store.count_as_applied(DEPLOYMENT, KEY)
-    finally:
-        await store.close()
 
 
 async def test_what_was_created_counts_as_applied_and_others_keep_theirs() -> None:
@@ -78,7 +77,7 @@ async def test_a_change_meanwhile_is_looked_at_again() -> None:
     server = Server(CREATED, refusals=2)
     await asked(server)
     assert len(server.patches) == 1
-    with pytest.raises(Taken):
+    with pytest.raises(Conflict):
         await asked(Server(CREATED, refusals=3))
 
 
@@ -92,11 +91,8 @@ WANTED: Body = {
 
 
 async def rewritten(server: Server) -> None:
-    store = Store(httpx2.AsyncClient(base_url="https://nowhere.test", transport=httpx2.MockTransport(server)))
-    try:
+    async with listening(HttpServer(server)) as access, contextlib.aclosing(Store(access)) as store:
         await store.rewrite(DEPLOYMENT, OBSERVED, WANTED)
-    finally:
-        await store.close()
 
 
 async def test_a_rewrite_is_of_this_object_and_leaves_labels_of_others() -> None:
@@ -112,13 +108,13 @@ async def test_a_rewrite_is_of_this_object_and_leaves_labels_of_others() -> None
     ]
 
 
-@pytest.mark.parametrize(("uid", "error"), [("u1", StoreError), ("u2", Taken)])
+@pytest.mark.parametrize(("uid", "error"), [("u1", Invalid), ("u2", Conflict)])
 async def test_a_rewrite_that_is_refused_tells_whether_the_object_is_another_one(
-    uid: str, error: type[StoreError]
+    uid: str, error: type[KubeError]
 ) -> None:
     server = Server(refusals=1)
-    server.refusal = httpx2.Response(422, json={"reason": "Invalid"})
+    server.refusal = answer({"reason": "Invalid"}, 422)
     server.metadata["uid"] = uid
-    with pytest.raises(StoreError) as raised:
+    with pytest.raises(KubeError) as raised:
         await rewritten(server)
     assert type(raised.value) is error

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 from fractus_core.api import (
     API_VERSION,
     Application,
@@ -17,38 +14,9 @@ from fractus_core.api import (
     Resource,
     Zone,
 )
+from fractus_kube import Body, Key, Kind, key_of
 
-Body = dict[str, Any]
-"""An object as the API server gives and takes it."""
-
-Key = tuple[str, str]
-"""(namespace, name); the namespace is empty for cluster-scoped objects."""
-
-
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """A kind of object and its place in the REST API."""
-
-    api_version: str
-    name: str
-    plural: str
-    namespaced: bool
-
-    def path(self, namespace: str = "", name: str = "", subresource: str = "") -> str:
-        """Path of a collection (no name), an object, or one of its subresources."""
-        root = "/apis/" if "/" in self.api_version else "/api/"
-        parts = [root + self.api_version]
-        if self.namespaced and namespace:
-            parts += ["namespaces", namespace]
-        parts += [part for part in (self.plural, name, subresource) if part]
-        return "/".join(parts)
-
-    def header(self, name: str, namespace: str = "", **metadata: Any) -> Body:
-        """The beginning of an object of this kind."""
-        meta: Body = {"name": name, **metadata}
-        if self.namespaced:
-            meta["namespace"] = namespace
-        return {"apiVersion": self.api_version, "kind": self.name, "metadata": meta}
+__all__ = ["Body", "Key", "Kind", "key_of"]
 
 
 def _ours(model: type[Resource]) -> Kind:
@@ -69,7 +37,6 @@ POD = Kind("v1", "Pod", "pods", namespaced=True)
 SERVICE = Kind("v1", "Service", "services", namespaced=True)
 SECRET = Kind("v1", "Secret", "secrets", namespaced=True)
 CONFIG_MAP = Kind("v1", "ConfigMap", "configmaps", namespaced=True)
-LEASE = Kind("coordination.k8s.io/v1", "Lease", "leases", namespaced=True)
 EVENT = Kind("v1", "Event", "events", namespaced=True)
 DEPLOYMENT = Kind("apps/v1", "Deployment", "deployments", namespaced=True)
 ENDPOINT_SLICE = Kind("discovery.k8s.io/v1", "EndpointSlice", "endpointslices", namespaced=True)
@@ -77,9 +44,3 @@ SIGNING_REQUEST = Kind("certificates.k8s.io/v1", "CertificateSigningRequest", "c
 
 CHILDREN: tuple[Kind, ...] = (GRANT, DEPLOYMENT_PLAN, SECRET, SERVICE, ENDPOINT_SLICE, DEPLOYMENT)
 """What the operator makes for an Application, in the order in which it is applied."""
-
-
-def key_of(body: Body) -> Key:
-    """The key of an object."""
-    metadata = body["metadata"]
-    return (metadata.get("namespace", ""), metadata["name"])

@@ -9,7 +9,7 @@ from fractus_core.identity.authority import Authority, BrokenAuthority
 
 from fractus_operator.cluster.kinds import CONFIG_MAP, SECRET, Body
 from fractus_operator.cluster.labels import MANAGED_BY, MANAGED_LABEL
-from fractus_operator.cluster.store import NotFound, Store, Taken
+from fractus_operator.cluster.store import Conflict, NotFound, Store
 
 logger = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ async def open_authority(store: Store, namespace: str) -> Authority:
         try:
             secret = await store.create(SECRET, body)
             logger.info("identity: certificate authority created (secret=%s/%s)", namespace, NAME)
-        except Taken:
+        except Conflict:
             secret = await store.get(SECRET, NAME, namespace)
     try:
         authority = Authority.from_data(secret.get("data") or {})

@@ -14,7 +14,7 @@ from fractus_core.api import node_identity, node_server_name
 from fractus_core.identity.authority import Authority
 
 from fractus_operator.cluster.kinds import SIGNING_REQUEST, Body, Key
-from fractus_operator.cluster.store import NotFound, Store, Taken
+from fractus_operator.cluster.store import Conflict, NotFound, Store
 
 logger = logging.getLogger(__name__)
 
@@ -139,7 +139,7 @@ class NodeSigning:
                 logger.info("signed the certificate of node %s (%s)", judgement.node, key[1])
             elif "Approved" in conditions:
                 await self._fail(body, judgement)
-        except (Taken, NotFound):
+        except (Conflict, NotFound):
             # It changed or went meanwhile: the watch brings the newer one.
             return
 

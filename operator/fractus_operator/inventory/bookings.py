@@ -9,7 +9,7 @@ from fractus_core.planning.inventory import Host
 
 from fractus_operator.cluster.kinds import Key
 from fractus_operator.cluster.pods import PodView
-from fractus_operator.cluster.reflector import Reflector
+from fractus_operator.cluster.store import Reflector
 
 T = TypeVar("T")
 

@@ -29,8 +29,7 @@ from fractus_operator.cluster.kinds import Body, Key, Kind
 from fractus_operator.cluster.labels import APPLICATION_LABEL, MANAGED_SELECTOR, NAMESPACE_LABEL, label_value
 from fractus_operator.cluster.pods import PodView, read_host, read_pod
 from fractus_operator.cluster.reading import Broken, Makes, Submitted, keeping_broken, read_submitted, reader
-from fractus_operator.cluster.reflector import Reflector
-from fractus_operator.cluster.store import Store
+from fractus_operator.cluster.store import Reflector, Store
 from fractus_operator.inventory.bookings import Asked, BookedHosts, Bookings, ByName, corrections
 from fractus_operator.inventory.claims import Claim, Flown, OwnedPlan, claims, host_key
 

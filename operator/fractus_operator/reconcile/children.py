@@ -14,7 +14,7 @@ from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind, key_of
 from fractus_operator.cluster.labels import APPLICATION_LABEL, MANAGED_SELECTOR, NAMESPACE_LABEL, label_value
 from fractus_operator.cluster.reading import read
-from fractus_operator.cluster.store import NotFound, Store, StoreError, Taken
+from fractus_operator.cluster.store import Conflict, KubeError, NotFound, Store
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile import builders
 from fractus_operator.reconcile.difference import contains, digest, is_current, stamped
@@ -125,7 +125,7 @@ class Children:
         _check_own(application, kind, observed)
         try:
             await self._store.count_as_applied(kind, key)
-        except StoreError as error:
+        except KubeError as error:
             if error.status not in _INADMISSIBLE:
                 raise
             # What it says so far may not be said any more, not even by its fields' change of hands.
@@ -145,7 +145,7 @@ class Children:
                 return there
         try:
             self._note(kind, desired, await self._store.create(kind, body))
-        except Taken as taken:
+        except Conflict as taken:
             if taken.reason != _EXISTS:
                 raise
             self._met.add((kind, key))

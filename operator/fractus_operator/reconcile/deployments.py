@@ -22,7 +22,7 @@ from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, key_of
 from fractus_operator.cluster.labels import FINALIZER
 from fractus_operator.cluster.reading import SETTLED, Submitted
-from fractus_operator.cluster.store import NotFound, Store, StoreError, Taken
+from fractus_operator.cluster.store import Conflict, KubeError, NotFound, Store
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile import builders
 from fractus_operator.reconcile.children import Children, NameTaken
@@ -183,10 +183,10 @@ class Deployments:
         memory.refreshed = None if stale else basis
         try:
             await self._children.refresh(stale)
-        except StoreError as error:
+        except KubeError as error:
             # The watch of grants brings a newer one, or the next look finds it refused still.
             logger.warning("%s/%s: grants are not up to date: %s", *key, error)
-            if error.status not in _REFUSALS and not isinstance(error, Taken | NotFound):
+            if error.status not in _REFUSALS and not isinstance(error, Conflict | NotFound):
                 raise
 
     def _vouched(self, key: Key, uid: str) -> list[Grant]:
@@ -277,7 +277,7 @@ class Deployments:
             complete = await self._rollout.carry_out(application, decided, grants, pods, rules)
         except NameTaken as error:
             raise Hindered("Pending", "Deployed", "NameTaken", str(error), again_s=2.0) from error
-        except StoreError as error:
+        except KubeError as error:
             if error.status not in _REFUSALS:
                 raise
             raise Hindered("Pending", "Deployed", error.reason, str(error), again_s=10.0) from error
@@ -371,7 +371,7 @@ class Deployments:
         try:
             body = builders.application_status(submitted.body, status)
             applied = await self._store.apply(kinds.APPLICATION, body, subresource="status")
-        except Taken:
+        except Conflict:
             return
         self._live.applications.note(key_of(applied), applied)
         memory.status = (submitted.metadata.uid or "", status)
@@ -389,7 +389,7 @@ class Deployments:
                     name=name,
                     now=now,
                 )
-            except StoreError as error:
+            except KubeError as error:
                 logger.warning("Event %s of %s: %s", fact.reason, submitted.metadata.name, error)
 
 

@@ -11,7 +11,7 @@ from fractus_core.validation import check_policy, check_zone
 
 from fractus_operator.cluster.kinds import POLICY, ZONE, Key, Kind
 from fractus_operator.cluster.reading import Broken
-from fractus_operator.cluster.store import NotFound, Store, Taken
+from fractus_operator.cluster.store import Conflict, NotFound, Store
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile.conditions import Fact, merge
 
@@ -79,7 +79,7 @@ class Readiness:
         body["status"] = {"observedGeneration": generation, "conditions": [c.to_dict() for c in conditions]}
         try:
             await self._store.apply(kind, body, subresource="status")
-        except (Taken, NotFound):
+        except (Conflict, NotFound):
             return
         for item in news:
             if item.warning:

@@ -62,7 +62,7 @@ class Rollout:
 
         Raises:
             NameTaken: somebody else's object has the name of a child.
-            StoreError: the API server refuses one, or cannot be reached.
+            KubeError: the API server refuses one, or cannot be reached.
         """
         wanted = self._wanted(application, decided, grants, pods)
         secrets = {builders.secret_name(placed.instance): placed for placed in decided.placements}

@@ -8,7 +8,7 @@ import random
 from collections.abc import Awaitable, Callable
 
 from fractus_operator.cluster.kinds import Key
-from fractus_operator.cluster.store import StoreError
+from fractus_operator.cluster.store import KubeError
 
 logger = logging.getLogger(__name__)
 
@@ -58,7 +58,7 @@ class Worklist:
             failures = self.failures[key] = self.failures.get(key, 0) + 1
             low, high = _BACKOFF_S
             pause_s = min(high, low * 2.0 ** min(failures, 8)) * self._rng.uniform(0.5, 1.0)
-            expected = isinstance(error, StoreError)
+            expected = isinstance(error, KubeError)
             logger.log(
                 logging.INFO if expected and failures <= 2 else logging.WARNING,
                 "%s %s: %s; again in %.1f s",

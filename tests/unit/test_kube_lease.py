@@ -6,13 +6,9 @@ import asyncio
 import copy
 from typing import Any, cast
 
-import httpx2
 import pytest
-from fractus_operator.cluster import lease as lease_module
-from fractus_operator.cluster import store as store_module
-from fractus_operator.cluster.kinds import LEASE, Body, Kind, key_of
-from fractus_operator.cluster.lease import Lease, LostLease
-from fractus_operator.cluster.store import NotFound, Store, StoreError, Taken
+from fractus_kube import Body, Client, Conflict, Kind, KubeError, Lease, LostLease, NotFound, key_of
+from fractus_kube import lease as lease_module
 
 DURATION_S = 10.0
 
@@ -35,21 +31,21 @@ class Shelf:
             raise NotFound(404, "NotFound", name)
         return copy.deepcopy(self.body)
 
-    async def create(self, kind: Kind, body: Body, *, guarded: bool) -> Body:
+    async def create(self, kind: Kind, body: Body) -> Body:
         self._reach()
         if self.body is not None:
-            raise Taken(409, "AlreadyExists", "")
+            raise Conflict(409, "AlreadyExists", "")
         return self._put(body)
 
-    async def replace(self, kind: Kind, body: Body, *, guarded: bool) -> Body:
+    async def replace(self, kind: Kind, body: Body) -> Body:
         self._reach()
         if self.body is None or body["metadata"].get("resourceVersion") != self.body["metadata"]["resourceVersion"]:
-            raise Taken(409, "Conflict", "")
+            raise Conflict(409, "Conflict", "")
         return self._put(body)
 
     def _reach(self) -> None:
         if not self.reachable:
-            raise StoreError(0, "Unreachable", "nobody answers")
+            raise KubeError(0, "Unreachable", "nobody answers")
 
     def _put(self, body: Body) -> Body:
         assert key_of(body) == ("system", "fractus-operator")
@@ -68,7 +64,7 @@ class Clock:
 
 
 def lease(shelf: Shelf, clock: Clock, identity: str) -> Lease:
-    return Lease(cast(Store, shelf), "system", identity, DURATION_S, clock)
+    return Lease(cast(Client, shelf), ("system", "fractus-operator"), identity, DURATION_S, clock)
 
 
 async def step(*leases: Lease) -> None:
@@ -177,7 +173,7 @@ async def test_of_two_that_ask_at_once_one_gets_it() -> None:
 async def test_an_answer_that_stalls_is_given_up_in_time_to_ask_again() -> None:
     shelf = Shelf()
     shelf.stalls = 2
-    short = Lease(cast(Store, shelf), "system", "short", 0.1, asyncio.get_running_loop().time)
+    short = Lease(cast(Client, shelf), ("system", "fractus-operator"), "short", 0.1, asyncio.get_running_loop().time)
     task = asyncio.create_task(short.run())
     await asyncio.wait_for(short.held(), 10.0)
     assert shelf.stalls == 0
@@ -185,7 +181,7 @@ async def test_an_answer_that_stalls_is_given_up_in_time_to_ask_again() -> None:
     await asyncio.gather(task, return_exceptions=True)
 
 
-@pytest.mark.parametrize("failure", [StoreError(500, "InternalError", "not now"), TimeoutError()])
+@pytest.mark.parametrize("failure", [KubeError(500, "InternalError", "not now"), TimeoutError()])
 async def test_after_a_failed_renewal_there_is_time_for_another(
     monkeypatch: pytest.MonkeyPatch, failure: Exception
 ) -> None:
@@ -232,37 +228,3 @@ async def test_a_renewal_whose_answer_never_came_is_given_back() -> None:
     writes = shelf.writes
     await first._give_back()
     assert shelf.writes == writes, "what another holds is not given back"
-
-
-async def test_a_list_that_makes_progress_has_more_time_than_an_object(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(store_module, "_REQUEST_TIMEOUT_S", 0.02)
-    parts: list[dict[str, float]] = []
-
-    async def slow(request: httpx2.Request) -> httpx2.Response:
-        parts.append(request.extensions["timeout"])
-        await asyncio.sleep(0.2)
-        return httpx2.Response(200, json={"metadata": {"name": "any", "resourceVersion": "7"}, "items": []})
-
-    store = Store(httpx2.AsyncClient(base_url="https://nowhere.test", transport=httpx2.MockTransport(slow)))
-    assert (await store.list_page(LEASE)).resource_version == "7"
-    assert [part["read"] for part in parts] == [0.02]
-    with pytest.raises(StoreError, match="no answer"):
-        await store.get(LEASE, "any", "system")
-    await store.close()
-
-
-async def test_a_write_to_an_api_server_that_stalls_ends_before_another_may_act() -> None:
-    async def stalled(_: httpx2.Request) -> httpx2.Response:
-        await asyncio.Event().wait()
-        raise AssertionError
-
-    client = httpx2.AsyncClient(base_url="https://nowhere.test", transport=httpx2.MockTransport(stalled))
-    store = Store(client)
-    store.may_write_s = lambda: 0.02
-    async with asyncio.timeout(10.0):
-        with pytest.raises(StoreError, match=r"no answer in 0\.0 s"):
-            await store.create(LEASE, LEASE.header("any", "system"))
-    store.may_write_s = lambda: 0.0
-    with pytest.raises(StoreError, match="another operator may act"):
-        await store.create(LEASE, LEASE.header("any", "system"))
-    await store.close()

@@ -1,4 +1,8 @@
-"""Which operator acts: the one that holds the Lease, so that two that overlap for a moment never both do."""
+"""Leader election: only the process that holds a Lease acts, so that two that overlap for a moment never both do.
+
+The official client's election goes by the wall clock, gives a request five minutes, and ends with the first refused connection;
+this one never lets two act at once.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +11,13 @@ import logging
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 
-from fractus_operator.cluster.kinds import LEASE, Body
-from fractus_operator.cluster.store import NotFound, Store, StoreError, Taken
+from fractus_kube.client import Client
+from fractus_kube.errors import Conflict, KubeError, NotFound
+from fractus_kube.objects import Body, Key, Kind
 
 logger = logging.getLogger(__name__)
 
-NAME = "fractus-operator"
+LEASE = Kind("coordination.k8s.io/v1", "Lease", "leases", namespaced=True)
 _RENEWALS = 5
 _HELD_SHARE = 0.7
 _RETRY_S = 1.0
@@ -22,7 +27,7 @@ _ANSWER_SHARE = _HELD_SHARE / 2
 
 
 class LostLease(Exception):
-    """Another operator has acted since this one last did: what this one remembers may be wrong, it must begin anew."""
+    """Another operator has acted since this one last did: what this one remembers may be wrong, it must start again."""
 
 
 class Lease:
@@ -32,18 +37,16 @@ class Lease:
     as such for a part of that, from before it asked. So clocks need not agree, and a holder that was frozen knows better.
 
     Args:
-        store: The API server.
-        namespace: Where the Lease is.
+        client: The API server, through connections of its own: no burst of other requests keeps a renewal waiting.
+        key: Namespace and name of the Lease.
         identity: Who asks; a process that is started again under the same identity goes on where it was.
-        duration_s: How long nobody else may act after the holder was last heard of.
+        duration_s: How long no other process may act after the holder was last heard of.
         time: Monotonic seconds, which go on while the process is frozen.
     """
 
-    def __init__(
-        self, store: Store, namespace: str, identity: str, duration_s: float, time: Callable[[], float]
-    ) -> None:
-        self._store = store
-        self._namespace = namespace
+    def __init__(self, client: Client, key: Key, identity: str, duration_s: float, time: Callable[[], float]) -> None:
+        self._client = client
+        self._namespace, self._name = key
         self._identity = identity
         self._duration_s = duration_s
         self._time = time
@@ -81,17 +84,17 @@ class Lease:
                     if taken:
                         self._hold(asked)
                     pause_s = self._duration_s / _RENEWALS if taken else min(_RETRY_S, self._duration_s / _RENEWALS)
-                except StoreError as error:
-                    logger.info("the lease: %s", error)
+                except KubeError as error:
+                    logger.info("lease: not renewed: %s", error)
                 except TimeoutError:
-                    logger.info("the lease: no answer in %.1f s", _ANSWER_SHARE * self._duration_s)
+                    logger.info("lease: not renewed: no answer in %.1f s", _ANSWER_SHARE * self._duration_s)
                 await asyncio.sleep(pause_s)
         finally:
             await self._give_back()
 
     def _hold(self, asked: float) -> None:
         if not self.left_s:
-            logger.info("%s acts now", self._identity)
+            logger.info("lease: became leader (identity=%s)", self._identity)
         self._until = asked + _HELD_SHARE * self._duration_s
         self._acquired.set()
 
@@ -99,12 +102,12 @@ class Lease:
         """Take or renew the Lease, if it is ours or free.
 
         Raises:
-            StoreError: the API server did not take it.
+            KubeError: the API server did not take it.
         """
         try:
-            body = await self._store.get(LEASE, NAME, self._namespace)
+            body = await self._client.get(LEASE, self._name, self._namespace)
         except NotFound:
-            body = LEASE.header(NAME, self._namespace)
+            body = LEASE.header(self._name, self._namespace)
         spec = body.get("spec") or {}
         if self._transitions is not None and spec.get("leaseTransitions") != self._transitions:
             raise LostLease(
@@ -113,21 +116,21 @@ class Lease:
         if (spec.get("holderIdentity") or "") not in ("", self._identity) and not self._expired(body):
             return False
         wanted = self._wanted(body)
-        write = self._store.replace if spec else self._store.create
+        write = self._client.replace if spec else self._client.create
         try:
-            await write(LEASE, wanted, guarded=False)
-        except Taken:
+            await write(LEASE, wanted)
+        except Conflict:
             return False
         self._transitions = int(wanted["spec"]["leaseTransitions"])
         return True
 
     def _expired(self, body: Body) -> bool:
-        """Whether a Lease of somebody else has not changed for its duration, as far as this process has seen."""
+        """Whether a Lease of another process has not changed for its duration, as far as this process has seen."""
         spec = body.get("spec") or {}
         now, state = self._time(), (spec.get("holderIdentity"), spec.get("renewTime"))
         if state != self._seen:
             if self._seen[:1] != state[:1]:
-                logger.info("%s acts; waiting for it to end", spec.get("holderIdentity"))
+                logger.info("lease: waiting for the leader to end (leader=%s)", spec.get("holderIdentity"))
             self._seen, self._seen_at = state, now
         return now - self._seen_at > max(self._duration_s, float(spec.get("leaseDurationSeconds") or 0))
 
@@ -147,15 +150,15 @@ class Lease:
         return {**body, "spec": wanted}
 
     async def _give_back(self) -> None:
-        """Let the next one begin at once, once nothing of ours is under way any more.
+        """Let the next one begin at once; called when nothing of ours is under way any more.
 
         Whose Lease it is the API server tells: it may have taken a renewal whose answer never came.
         """
         self._until = float("-inf")
         try:
             async with asyncio.timeout(2.0):
-                body = await self._store.get(LEASE, NAME, self._namespace)
+                body = await self._client.get(LEASE, self._name, self._namespace)
                 if (body.get("spec") or {}).get("holderIdentity") == self._identity:
-                    await self._store.replace(LEASE, self._wanted(body, free=True), guarded=False)
-        except (StoreError, TimeoutError) as error:
-            logger.info("the lease was not given back: %s", error)
+                    await self._client.replace(LEASE, self._wanted(body, free=True))
+        except (KubeError, TimeoutError) as error:
+            logger.info("lease: not released: %s", error)

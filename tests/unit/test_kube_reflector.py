@@ -8,10 +8,9 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
-from fractus_operator.cluster import reflector as reflector_module
+from fractus_kube import Expired, KubeError, Page, Reflector
+from fractus_kube import reflector as reflector_module
 from fractus_operator.cluster.kinds import POLICY, ZONE, Body, Key
-from fractus_operator.cluster.reflector import Reflector
-from fractus_operator.cluster.store import Expired, Page, StoreError
 from fractus_operator.reconcile import worklist as worklist_module
 from fractus_operator.reconcile.worklist import Worklist
 
@@ -104,7 +103,7 @@ async def test_an_expired_watch_lists_again_and_reports_the_difference(monkeypat
 
 
 async def test_a_broken_connection_is_taken_up_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    broken = StoreError(0, "Unreachable", "reset")
+    broken = KubeError(0, "Unreachable", "reset")
     script = Script(broken, page(5), [("ADDED", zone("a", 6, 1)), broken], [("MODIFIED", zone("a", 7, 2))])
     held, _ = await follow(script, monkeypatch)
     assert held == {("", "a"): 2}
@@ -268,7 +267,7 @@ async def test_a_failure_is_tried_again_and_holds_up_nobody(monkeypatch: pytest.
     async def reconcile(key: Key) -> None:
         attempts[key] = attempts.get(key, 0) + 1
         if key == ("", "bad") and attempts[key] < 4:
-            raise StoreError(500, "InternalError", "not now")
+            raise KubeError(500, "InternalError", "not now")
         if key == ("", "bad"):
             done.set()
 

@@ -8,8 +8,10 @@ import random
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from typing import Generic, TypeVar
 
-from fractus_operator.cluster.kinds import Body, Key, Kind, key_of
-from fractus_operator.cluster.store import Expired, Store, StoreError
+from fractus_kube.client import Client
+from fractus_kube.errors import Expired, KubeError
+from fractus_kube.objects import Body, Key, Kind, key_of
+from fractus_kube.pace import Backoff
 
 logger = logging.getLogger(__name__)
 
@@ -17,7 +19,7 @@ T = TypeVar("T")
 
 _WATCH_TIMEOUT_S = (240, 300)
 _SILENCE_S = 100.0
-_BACKOFF_S = (0.2, 30.0)
+_BACKOFF_S = (0.4, 30.0)
 
 
 class Reflector(Generic[T]):
@@ -29,7 +31,7 @@ class Reflector(Generic[T]):
 
     def __init__(
         self,
-        store: Store,
+        client: Client,
         kind: Kind,
         parse: Callable[[Body], T],
         on_change: Callable[[Key, T | None, T | None], None],
@@ -40,13 +42,14 @@ class Reflector(Generic[T]):
         self.kind = kind
         self.synced = asyncio.Event()
         self.restarts = 0
-        self._store = store
+        self._client = client
         self._parse = parse
         self._on_change = on_change
         self._selectors = dict(selectors or {})
         self._rng = rng or random.Random()  # noqa: S311  (jitter)
         self._objects: dict[Key, T] = {}
         self._noted: dict[Key, int] = {}
+        self._backoff = Backoff(*_BACKOFF_S, self._rng)
         self._reached = 0
         self._last_contact = float("-inf")
 
@@ -84,30 +87,24 @@ class Reflector(Generic[T]):
     async def run(self) -> None:
         """List and watch until cancelled; failures are retried with growing, jittered pauses."""
         version = ""
-        failures = 0
         while True:
             try:
                 if not version:
                     version = await self._list()
-                    failures = 0
+                    self._backoff.succeeded()
                 async for seen in self._watch(version):
                     version = seen
-                    failures = 0
+                    self._backoff.succeeded()
             except Expired:
-                logger.info("%s: the watch is too old to go on; listing again", self.kind.plural)
+                logger.info("reflector of %s: the watch expired; listing again", self.kind.plural)
                 version = ""
-            except StoreError as error:
-                failures += 1
+            except KubeError as error:
                 if error.status not in (0, 429) and error.status < 500:
                     version = ""
-                log = logger.warning if failures > 1 else logger.info
-                log("%s: %s", self.kind.plural, error)
-                await asyncio.sleep(self._pause_s(failures))
+                log = logger.warning if self._backoff.attempts else logger.info
+                log("reflector of %s: %s", self.kind.plural, error)
+                await asyncio.sleep(self._backoff.delay_s())
             self.restarts += 1
-
-    def _pause_s(self, failures: int) -> float:
-        low, high = _BACKOFF_S
-        return min(high, low * 2.0 ** min(failures, 10)) * self._rng.uniform(0.5, 1.0)
 
     def _heard(self) -> None:
         self._last_contact = asyncio.get_running_loop().time()
@@ -116,7 +113,7 @@ class Reflector(Generic[T]):
         listed: set[Key] = set()
         continue_ = ""
         while True:
-            page = await self._store.list_page(self.kind, selectors=self._selectors, continue_=continue_)
+            page = await self._client.list_page(self.kind, selectors=self._selectors, continue_=continue_)
             self._heard()
             # All pages show the same moment: what a later one brings is no older than an answer that comes meanwhile.
             self._reach(page.resource_version)
@@ -136,7 +133,7 @@ class Reflector(Generic[T]):
 
     async def _watch(self, version: str) -> AsyncIterator[str]:
         timeout_s = self._rng.randint(*_WATCH_TIMEOUT_S)
-        async for type_, body in self._store.watch(
+        async for type_, body in self._client.watch(
             self.kind,
             resource_version=version,
             selectors=self._selectors,
@@ -168,8 +165,8 @@ class Reflector(Generic[T]):
         try:
             new = self._parse(self._typed(body))
         except Exception:
-            # One object that nobody foresaw must not hide all others: its last readable version stays.
-            logger.exception("%s %s cannot be read", self.kind.name, "/".join(filter(None, key)))
+            # One object of an unforeseen shape must not hide all others: its last readable version stays.
+            logger.exception("reflector of %s: %s cannot be read", self.kind.plural, "/".join(filter(None, key)))
             return
         old = self._objects.get(key)
         self._objects[key] = new
@@ -185,7 +182,9 @@ class Reflector(Generic[T]):
         try:
             self._on_change(key, old, new)
         except Exception:
-            logger.exception("a change of %s %s was not followed", self.kind.name, "/".join(filter(None, key)))
+            logger.exception(
+                "reflector of %s: a change of %s was not handled", self.kind.plural, "/".join(filter(None, key))
+            )
 
     def _typed(self, item: Body) -> Body:
         """Items of a list come without their kind: give it to them. Who manages which field, half of an object, goes."""

@@ -1,0 +1,104 @@
+"""Where the API server is, and who asks: from a kubeconfig, a pod's service account, or a certificate."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+from kubernetes.aio.client import Configuration
+from kubernetes.aio.config import ConfigException, load_kube_config
+from kubernetes.aio.config.incluster_config import InClusterConfigLoader
+
+SERVICE_ACCOUNT = Path("/var/run/secrets/kubernetes.io/serviceaccount")
+_KUBECONFIG = "~/.kube/config"
+
+
+class Unconfigured(Exception):
+    """No usable credentials for an API server were found."""
+
+
+@dataclass(frozen=True, slots=True)
+class Access:
+    """How to reach an API server.
+
+    Attributes:
+        configuration: What the official client asks with.
+        renew: Reads the credentials again into the configuration, for when the API server no longer takes them:
+            a token file was rotated, or a credential plugin has a fresh token.
+    """
+
+    configuration: Configuration
+    renew: Callable[[], Awaitable[None]]
+
+
+async def kubeconfig(path: str | Path) -> Access:
+    """Access by the current context of a kubeconfig; several are separated as in KUBECONFIG.
+
+    Raises:
+        Unconfigured: there is none, or it has no current context that is whole.
+    """
+    configuration = Configuration()
+
+    async def load() -> None:
+        try:
+            await load_kube_config(str(path), client_configuration=configuration, persist_config=False)
+        # The loader does not check types: a kubeconfig of other shapes ends in whatever Python says of them.
+        except (ConfigException, OSError, yaml.YAMLError, AttributeError, TypeError, ValueError) as error:
+            raise Unconfigured(f"the kubeconfig {path} cannot be used: {error}") from error
+
+    await load()
+    return Access(configuration, load)
+
+
+async def in_cluster(directory: Path = SERVICE_ACCOUNT) -> Access:
+    """Access by the service account of this pod; its token is read again every minute, and when it is refused.
+
+    Raises:
+        Unconfigured: this is no pod, or it has no service account.
+    """
+    loader = InClusterConfigLoader(str(directory / "token"), str(directory / "ca.crt"))
+    configuration = Configuration()
+
+    async def load() -> None:
+        try:
+            loader.load_and_set(configuration)
+        except (ConfigException, OSError) as error:
+            raise Unconfigured(f"the service account cannot be used: {error}") from error
+
+    await load()
+    return Access(configuration, load)
+
+
+async def from_environment() -> Access:
+    """Access by the service account of this pod or, outside of one, by KUBECONFIG or kubectl's own kubeconfig.
+
+    Raises:
+        Unconfigured: there is none of them.
+    """
+    try:
+        return await in_cluster()
+    except Unconfigured:
+        pass
+    try:
+        return await kubeconfig(os.environ.get("KUBECONFIG") or _KUBECONFIG)
+    except Unconfigured as error:
+        raise Unconfigured(f"no cluster: set KUBECONFIG, or run in a pod ({error})") from error
+
+
+def with_certificate(
+    server: str, ca: Path | None = None, certificate: tuple[Path, Path] | None = None, token: str = ""
+) -> Access:
+    """Access by a client certificate (certificate and key) or a token."""
+    configuration = Configuration(host=server, ssl_ca_cert=None if ca is None else str(ca))
+    if certificate is not None:
+        configuration.cert_file, configuration.key_file = map(str, certificate)
+    if token:
+        configuration.api_key["BearerToken"] = f"Bearer {token}"
+
+    async def nothing() -> None:
+        """Neither changes."""
+
+    return Access(configuration, nothing)

@@ -1,0 +1,111 @@
+"""An API server of the tests' own: HTTP on a loopback port, answering with the bytes it is told to."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import ssl
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fractus_kube import Access, Client, with_certificate
+
+HEAD = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\n"
+CHUNKED = HEAD + b"Transfer-Encoding: chunked\r\n\r\n"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a client sent."""
+
+    head: str
+    body: bytes
+
+    @property
+    def line(self) -> str:
+        return self.head.splitlines()[0].rsplit(" ", 1)[0]
+
+    @property
+    def method(self) -> str:
+        return self.line.split(" ")[0]
+
+    def header(self, name: str) -> str:
+        found = [value for key, _, value in (h.partition(": ") for h in self.head.splitlines()) if key.lower() == name]
+        assert len(found) <= 1, found
+        return found[0] if found else ""
+
+
+def answer(body: Any, status: int = 200) -> bytes:
+    """A whole answer with a JSON body."""
+    data = body if isinstance(body, bytes) else json.dumps(body).encode()
+    return b"HTTP/1.1 %d X\r\nContent-Type: application/json\r\nContent-Length: %d\r\n\r\n" % (status, len(data)) + data
+
+
+def chunk(data: bytes) -> bytes:
+    """A part of a chunked answer."""
+    return b"%x\r\n%s\r\n" % (len(data), data)
+
+
+class Server:
+    """Answers each request, and then keeps the connection or closes it."""
+
+    def __init__(
+        self, answers: bytes | Callable[[Request], bytes], *, closes: bool = False, delay_s: float = 0.0
+    ) -> None:
+        self._answers, self._closes, self._delay_s = answers, closes, delay_s
+        self.requests: list[Request] = []
+        self.connections = 0
+        self.url = ""
+        self.heard, self.gone = asyncio.Event(), asyncio.Event()
+
+    async def __call__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.connections += 1
+        with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
+            while True:
+                head = (await reader.readuntil(b"\r\n\r\n")).decode()
+                length = Request(head, b"").header("content-length")
+                request = Request(head, await reader.readexactly(int(length or 0)))
+                self.requests.append(request)
+                self.heard.set()
+                await asyncio.sleep(self._delay_s)
+                writer.write(self._answers if isinstance(self._answers, bytes) else self._answers(request))
+                if self._closes:
+                    break
+        self.gone.set()
+        writer.close()
+
+
+@contextlib.asynccontextmanager
+async def listening(server: Server, context: ssl.SSLContext | None = None) -> AsyncIterator[Access]:
+    """The server on a port, and the way to it."""
+    listener = await asyncio.start_server(server, "127.0.0.1", 0, ssl=context)
+    scheme = "https" if context else "http"
+    server.url = f"{scheme}://127.0.0.1:{listener.sockets[0].getsockname()[1]}"
+    try:
+        async with asyncio.timeout(30.0):
+            yield with_certificate(server.url)
+    finally:
+        listener.close()
+
+
+@contextlib.asynccontextmanager
+async def client_of(server: Server, **options: Any) -> AsyncIterator[Client]:
+    """A client of the server; its options are those of Client."""
+    async with listening(server) as access, contextlib.aclosing(Client(access, "tests", **options)) as client:
+        yield client
+
+
+def kubeconfig_for(directory: Path, server: str, user: dict[str, Any], **cluster: Any) -> Path:
+    """A kubeconfig of one cluster and one user."""
+    config = {
+        "apiVersion": "v1", "kind": "Config", "current-context": "c",
+        "clusters": [{"name": "c", "cluster": {"server": server, **cluster}}],
+        "users": [{"name": "u", "user": user}],
+        "contexts": [{"name": "c", "context": {"cluster": "c", "user": "u"}}],
+    }  # fmt: skip
+    path = directory / "config"
+    path.write_text(json.dumps(config))
+    return path

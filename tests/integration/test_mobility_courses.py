@@ -15,8 +15,8 @@ from fractus_cluster.ports import free_port
 from fractus_core.api.names import node_identity
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_proto.v1 import types_pb2
+from fractus_services.mobility.mavlink.autopilot import Autopilot
 from fractus_services.mobility.mavlink.itemlists import download
-from fractus_services.mobility.mavlink.link import Autopilot
 from mobility_rig import (
     FRAME,
     NODE,

@@ -11,9 +11,10 @@ from typing import Any
 
 import grpc
 import pytest
+from fractus_mavlink import Endpoint
+from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_COMPONENT, MAV_TYPE
 from fractus_proto.v1 import mobility_pb2 as pb
-from fractus_services.mobility.mavlink.dialect import Codec, message
-from fractus_services.mobility.mavlink.link import Autopilot
+from fractus_services.mobility.mavlink.autopilot import Autopilot
 from mobility_rig import DRIVER, FRAME, Driver, Rig, denied, fence, flown, grant, xy
 
 LOST = pb.ControlEvent.STATE_LOST
@@ -108,11 +109,13 @@ async def test_a_service_that_stays_dead_leaves_it_to_the_autopilot(rig: Rig) ->
 
 async def until_mode(link: str, mode: int) -> None:
     """Listen to the vehicle as a ground station: its heartbeats, of system 255, must not stand for the companion's."""
-    watcher, station = Autopilot(link), Codec(255, 190)
+    watcher, station = Autopilot(link), Endpoint(255, MAV_COMPONENT.MISSIONPLANNER)
 
     def heartbeat() -> None:
         if watcher._transport is not None:
-            watcher._transport.write(station.encode(message("HEARTBEAT", type=6, autopilot=8, mavlink_version=3)))
+            watcher._transport.write(
+                station.encode("HEARTBEAT", {"type": MAV_TYPE.GCS, "autopilot": MAV_AUTOPILOT.INVALID})
+            )
 
     watcher._heartbeat = heartbeat  # type: ignore[method-assign]
     task = asyncio.create_task(watcher.run())

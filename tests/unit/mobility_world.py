@@ -15,6 +15,8 @@ from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled import compile_grant
 from fractus_core.policy.values import Airframe, GotoArgs, Home, TakeoffArgs
+from fractus_mavlink import Message, message
+from fractus_mavlink.enums import MAV_CMD, MAV_RESULT
 from fractus_services.errors import Refused
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
@@ -29,9 +31,8 @@ from fractus_services.mobility.flight.monitor import MotionMonitor
 from fractus_services.mobility.flight.service import MobilityService, Progress
 from fractus_services.mobility.flight.tours import Tours
 from fractus_services.mobility.flight.transit import TransitFlight
-from fractus_services.mobility.mavlink.dialect import message
+from fractus_services.mobility.mavlink.autopilot import Autopilot
 from fractus_services.mobility.mavlink.failsafes import Checked
-from fractus_services.mobility.mavlink.link import Autopilot
 from fractus_services.mobility.mavlink.vehicle import BRAKE, COURSE_S, GUIDED, LAND, RTL, SMART_RTL
 from fractus_services.mobility.rpc.streams import Streams
 
@@ -132,39 +133,44 @@ class Plane(Autopilot):
         self.parameters[name] = value
         return value
 
-    def send(self, outgoing: Any) -> None:
+    def send(self, outgoing: Message) -> None:
         if self.deaf:
             return
-        kind = outgoing.get_type()
+        kind, command = outgoing.name, outgoing.values.get("command", 0)
         if kind in {"COMMAND_LONG", "COMMAND_INT"}:
-            self.commands.append(outgoing.command)
-            refused = outgoing.command in self.refuses
+            self.commands.append(command)
+            refused = command in self.refuses
             if not refused:
                 self._obey(outgoing)
-            self._take(message("COMMAND_ACK", command=outgoing.command, result=4 if refused else 0))
+            self._take(
+                message("COMMAND_ACK", command=command, result=MAV_RESULT.FAILED if refused else MAV_RESULT.ACCEPTED)
+            )
         elif kind == "SET_POSITION_TARGET_LOCAL_NED" and self.vehicle.mode == GUIDED and self.height > 0.2:
             self.commands.append(84)
             self.positions = False
-            self.wanted, self.wanted_until = (outgoing.vy, outgoing.vx, -outgoing.vz), self.now + 3.0
+            self.wanted, self.wanted_until = (
+                (outgoing.real("vy"), outgoing.real("vx"), -outgoing.real("vz")),
+                self.now + 3.0,
+            )
             self.goal = None
 
-    def _obey(self, outgoing: Any) -> None:
-        number = outgoing.command
-        if number == 176:
-            self.set_to(int(outgoing.param2))
-        elif number == 400:
-            self.vehicle.armed = outgoing.param1 == 1
-        elif number == 22:
-            self.goal, self.goal_height, self.wanted = (self.xy[0], self.xy[1]), outgoing.param7, None
-        elif number == 178:
-            self.speed_mps = outgoing.param2
-        elif number == 192:
+    def _obey(self, outgoing: Message) -> None:
+        number = outgoing.integer("command")
+        if number == MAV_CMD.DO_SET_MODE:
+            self.set_to(int(outgoing.real("param2")))
+        elif number == MAV_CMD.COMPONENT_ARM_DISARM:
+            self.vehicle.armed = outgoing.real("param1") == 1
+        elif number == MAV_CMD.NAV_TAKEOFF:
+            self.goal, self.goal_height, self.wanted = (self.xy[0], self.xy[1]), outgoing.real("param7"), None
+        elif number == MAV_CMD.DO_CHANGE_SPEED:
+            self.speed_mps = outgoing.real("param2")
+        elif number == MAV_CMD.DO_REPOSITION:
             if not self.positions:
                 self.positions, self.speed_mps = True, DEFAULT_MPS  # its position controller begins anew
-            self.goal = FRAME.xy(outgoing.x / 1e7, outgoing.y / 1e7)
-            self.goal_height, self.wanted = outgoing.z, None
-        elif number == 115:
-            self.heading = outgoing.param1
+            self.goal = FRAME.xy(outgoing.integer("x") / 1e7, outgoing.integer("y") / 1e7)
+            self.goal_height, self.wanted = outgoing.real("z"), None
+        elif number == MAV_CMD.CONDITION_YAW:
+            self.heading = outgoing.real("param1")
 
     def set_to(self, mode: int) -> None:
         """Change the mode, as a pilot or a failsafe does."""

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from fractus_core.api.plans import GrantSpec
 from fractus_core.policy.values import Airframe, TakeoffArgs
+from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.authority.observer import Observer
 from fractus_services.mobility.mavlink.failsafes import Checked
@@ -103,8 +104,8 @@ def test_failsafes_that_are_set_anew_meanwhile_forbid_arming(
             obey, motors = plane._obey, list[float]()
 
             def noted(outgoing: Any) -> None:
-                if outgoing.command == 400:
-                    motors.append(outgoing.param1)
+                if outgoing.integer("command") == MAV_CMD.COMPONENT_ARM_DISARM:
+                    motors.append(outgoing.real("param1"))
                 obey(outgoing)
 
             plane._obey = noted  # type: ignore[method-assign]

@@ -6,9 +6,9 @@ import asyncio
 from typing import Any
 
 import pytest
-from fractus_services.mobility.mavlink import link as module
-from fractus_services.mobility.mavlink.dialect import message
-from fractus_services.mobility.mavlink.link import Autopilot
+from fractus_mavlink import message
+from fractus_services.mobility.mavlink import autopilot as module
+from fractus_services.mobility.mavlink.autopilot import Autopilot
 
 
 class Overtaken(Exception):
@@ -41,13 +41,13 @@ async def test_no_duty_no_heartbeat(link: tuple[Autopilot, list[Any]]) -> None:
     autopilot, sent = link
     autopilot.alive = lambda: False
     autopilot.beat()
-    assert [m.get_type() for m in sent] == ["PARAM_REQUEST_READ"], "it knocks, so that it is answered"
+    assert [m.name for m in sent] == ["PARAM_REQUEST_READ"], "it knocks, so that it is answered"
     autopilot._target = (1, 1)
     autopilot.beat()
     assert len(sent) == 1
     autopilot.alive = lambda: True
     autopilot.beat()
-    assert sent[-1].get_type() == "HEARTBEAT"
+    assert sent[-1].name == "HEARTBEAT"
 
 
 async def test_two_that_read_one_parameter_both_hear_it(
@@ -60,10 +60,10 @@ async def test_two_that_read_one_parameter_both_hear_it(
 
     def answered(outgoing: Any) -> None:
         sent.append(outgoing)
-        told = message("PARAM_VALUE", param_id=b"FENCE_TYPE", param_value=values.pop(0), param_type=9)
+        told = message("PARAM_VALUE", param_id=b"FENCE_TYPE", param_value=values.pop(0))
         asyncio.get_running_loop().call_soon(autopilot._take, told)
 
     monkeypatch.setattr(autopilot, "send", answered)
     both = await asyncio.gather(autopilot.read_parameter("FENCE_TYPE"), autopilot.write_parameter("FENCE_TYPE", 2.0))
     assert both == [1.0, 2.0]
-    assert [m.get_type() for m in sent] == ["PARAM_REQUEST_READ", "PARAM_SET"]
+    assert [m.name for m in sent] == ["PARAM_REQUEST_READ", "PARAM_SET"]

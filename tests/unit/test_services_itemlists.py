@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
 
 import pytest
+from fractus_mavlink import Message, message
+from fractus_mavlink.enums import MAV_MISSION_TYPE
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink import itemlists
-from fractus_services.mobility.mavlink.dialect import message
-from fractus_services.mobility.mavlink.itemlists import FENCE, Item, NoLists, download, upload
-from fractus_services.mobility.mavlink.link import Autopilot
+from fractus_services.mobility.mavlink.autopilot import Autopilot
+from fractus_services.mobility.mavlink.itemlists import Item, NoLists, download, upload
 
 ITEMS = tuple(Item(5001, 3.0, 393600000 + i, 229500000 - i) for i in range(3))
 
@@ -22,7 +22,7 @@ class Keeper(Autopilot):
         super().__init__("tcp:nowhere:1")
         self._target = (1, 1)
         self.vehicle.heartbeat_at = asyncio.get_running_loop().time()
-        self.items: list[Any] = []
+        self.items: list[Message] = []
         self.wanted = 0
         self.result = result
         self._lost = set(lost)
@@ -32,30 +32,30 @@ class Keeper(Autopilot):
         self._count += 1
         return self._count not in self._lost
 
-    def send(self, outgoing: Any) -> None:
+    def send(self, outgoing: Message) -> None:
         if self._passes():
             answer = self._answer(outgoing)
             if answer is not None and self._passes():
-                self._take(message("MISSION_ACK", mission_type=0))  # of another list: not ours
+                self._take(message("MISSION_ACK", mission_type=MAV_MISSION_TYPE.MISSION))  # of another list: not ours
                 self._take(answer)
 
-    def _answer(self, outgoing: Any) -> Any:
-        kind = outgoing.get_type()
+    def _answer(self, outgoing: Message) -> Message | None:
+        kind = outgoing.name
         if self.result:
-            return message("MISSION_ACK", type=self.result, mission_type=FENCE)
+            return message("MISSION_ACK", type=self.result, mission_type=MAV_MISSION_TYPE.FENCE)
         if kind == "MISSION_COUNT":
-            self.items, self.wanted = [], outgoing.count
-        elif kind == "MISSION_ITEM_INT" and outgoing.seq == len(self.items):
+            self.items, self.wanted = [], outgoing.integer("count")
+        elif kind == "MISSION_ITEM_INT" and outgoing.integer("seq") == len(self.items):
             self.items.append(outgoing)
         elif kind == "MISSION_REQUEST_LIST":
-            return message("MISSION_COUNT", count=len(self.items), mission_type=FENCE)
+            return message("MISSION_COUNT", count=len(self.items), mission_type=MAV_MISSION_TYPE.FENCE)
         elif kind == "MISSION_REQUEST_INT":
-            return self.items[outgoing.seq]
+            return self.items[outgoing.integer("seq")]
         elif kind == "MISSION_ACK":
             return None
         if len(self.items) < self.wanted:
-            return message("MISSION_REQUEST", seq=len(self.items), mission_type=FENCE)
-        return message("MISSION_ACK", mission_type=FENCE)
+            return message("MISSION_REQUEST", seq=len(self.items), mission_type=MAV_MISSION_TYPE.FENCE)
+        return message("MISSION_ACK", mission_type=MAV_MISSION_TYPE.FENCE)
 
 
 @pytest.fixture(autouse=True)

@@ -11,6 +11,7 @@ import pytest
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import Call, SetSpeedArgs, VelocityArgs
+from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError, Refused
 from fractus_services.mobility.flight import monitor as monitoring
 from fractus_services.mobility.mavlink.vehicle import GUIDED
@@ -284,7 +285,7 @@ def test_a_goto_whose_command_was_lost_is_judged_where_the_drone_is_by_then(tmp_
             send, lost = plane.send, []
 
             def lossy(outgoing: Any) -> None:
-                if outgoing.get_type() == "COMMAND_INT" and len(lost) < 3:
+                if outgoing.name == "COMMAND_INT" and len(lost) < 3:
                     lost.append(math.hypot(*plane.velocity))
                 else:
                     send(outgoing)
@@ -313,7 +314,11 @@ def test_a_leg_whose_speed_is_lost_is_stopped_and_begun_once_more(tmp_path: Path
             def lossy(outgoing: Any) -> None:
                 nonlocal left, top
                 top = max(top, math.hypot(*plane.velocity))
-                if outgoing.get_type() == "COMMAND_LONG" and outgoing.command == 178 and left > 0:
+                if (
+                    outgoing.name == "COMMAND_LONG"
+                    and outgoing.integer("command") == MAV_CMD.DO_CHANGE_SPEED
+                    and left > 0
+                ):
                     left -= 1
                 else:
                     send(outgoing)

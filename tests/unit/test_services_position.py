@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from fractus_services.mobility.mavlink.dialect import message
+from fractus_mavlink import message
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 from fractus_services.mobility.rpc.telemetry import telemetry_of
 

@@ -8,15 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fractus_mavlink import Endpoint
+from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_STATE, MAV_TYPE
 from fractus_services.mobility.mavlink import transport
-from fractus_services.mobility.mavlink.dialect import Codec, message
 from fractus_services.mobility.mavlink.transport import BadUrl, open_link
 
 AUTOPILOT, STRANGER = ("127.0.0.1", 14550), ("127.0.0.1", 40000)
 
 
-def heartbeat(autopilot: int = 3) -> bytes:
-    return Codec(1, 1).encode(message("HEARTBEAT", type=2, autopilot=autopilot, system_status=3, mavlink_version=3))
+def heartbeat(autopilot: MAV_AUTOPILOT = MAV_AUTOPILOT.ARDUPILOTMEGA) -> bytes:
+    values = {"type": MAV_TYPE.QUADROTOR, "autopilot": autopilot, "system_status": MAV_STATE.STANDBY}
+    return Endpoint(1, 1).encode("HEARTBEAT", values)
 
 
 class Socket:
@@ -47,7 +49,7 @@ def test_a_listening_link_belongs_to_the_first_autopilot(monkeypatch: pytest.Mon
     monkeypatch.setattr(transport.time, "monotonic", lambda: now[0])
     made, socket, heard = link(connected=False)
     made.datagram_received(b"x", STRANGER)
-    made.datagram_received(heartbeat(autopilot=8), STRANGER)
+    made.datagram_received(heartbeat(MAV_AUTOPILOT.INVALID), STRANGER)
     made.write(b"nobody")
     assert not heard
     assert not socket.sent

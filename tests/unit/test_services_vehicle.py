@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
+from fractus_mavlink import message
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 
 
@@ -32,8 +31,7 @@ def test_it_tells_how_it_speeds_up(vx: tuple[int, int], forward_mps2: float) -> 
     vehicle = Vehicle(located=True)
     assert vehicle.forward_mps2 is None
     for i in range(12):
-        told = SimpleNamespace(lat=1, lon=1, relative_alt=0, alt=0, vx=vx[0] + i * vx[1], vy=0, vz=0, hdg=0)
-        told.get_type = lambda: "GLOBAL_POSITION_INT"
+        told = message("GLOBAL_POSITION_INT", lat=1, lon=1, vx=vx[0] + i * vx[1])
         vehicle.take(told, i * 0.05)
     assert vehicle.forward_mps2 == pytest.approx(forward_mps2, abs=0.01)
     assert len(vehicle.courses) < 10, "old ones are forgotten"

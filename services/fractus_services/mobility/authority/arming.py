@@ -11,8 +11,8 @@ from fractus_services.errors import AutopilotError, PreconditionFailed
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Mission
+from fractus_services.mobility.mavlink.autopilot import Permit
 from fractus_services.mobility.mavlink.failsafes import BEING_SET, Checked, choose_return, learn_return
-from fractus_services.mobility.mavlink.link import Permit
 from fractus_services.mobility.mavlink.vehicle import GUIDED
 
 ARMED_S = 3.0

@@ -21,9 +21,9 @@ from fractus_services.errors import Aborted, AutopilotError, PreconditionFailed,
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.journal import Journal, Mission
 from fractus_services.mobility.authority.leases import ControlEvent, ControlState, FlightConstraints, Lease, Motion
+from fractus_services.mobility.mavlink.autopilot import Autopilot, Permit, always
 from fractus_services.mobility.mavlink.failsafes import Checked
 from fractus_services.mobility.mavlink.fence import MissionFence
-from fractus_services.mobility.mavlink.link import Autopilot, Permit, always
 from fractus_services.mobility.mavlink.mode_controller import ModeController
 
 log = logging.getLogger(__name__)

@@ -20,7 +20,7 @@ from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import FlightConstraints, Motion
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import REACHED_M, Step, come_to_rest, fly_to
-from fractus_services.mobility.mavlink.link import Permit
+from fractus_services.mobility.mavlink.autopilot import Permit
 
 log = logging.getLogger(__name__)
 

@@ -21,7 +21,7 @@ from fractus_services.mobility.authority.supervisor import Supervisor
 from fractus_services.mobility.flight.courses import limited_mps
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import REACHED_M, fly_to
-from fractus_services.mobility.mavlink.link import Permit
+from fractus_services.mobility.mavlink.autopilot import Permit
 from fractus_services.mobility.mavlink.vehicle import GUIDED
 
 log = logging.getLogger(__name__)

@@ -11,7 +11,7 @@ from fractus_core.policy.values import GotoArgs
 
 from fractus_services.errors import Aborted, AutopilotError, Unavailable
 from fractus_services.mobility.authority.leases import Motion
-from fractus_services.mobility.mavlink.link import Autopilot, Permit
+from fractus_services.mobility.mavlink.autopilot import Autopilot, Permit
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 
 REACHED_M = 1.0

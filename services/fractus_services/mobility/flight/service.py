@@ -21,7 +21,7 @@ from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.homing import Homing
 from fractus_services.mobility.flight.motions import REACHED_M, Step, climb, come_down, come_to_rest, fly_to
 from fractus_services.mobility.flight.steering import Steering
-from fractus_services.mobility.mavlink.link import Autopilot, Permit
+from fractus_services.mobility.mavlink.autopilot import Autopilot, Permit
 from fractus_services.mobility.mavlink.vehicle import GUIDED, LAND, RTL, SMART_RTL
 
 MAX_REACHED_M = 50.0

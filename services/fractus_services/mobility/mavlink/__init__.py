@@ -1,1 +1,1 @@
-"""The autopilot: link, dialect, vehicle state, modes, failsafes and fence."""
+"""The autopilot: link, vehicle state, modes, failsafes and fence."""

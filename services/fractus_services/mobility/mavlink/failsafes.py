@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 
 from fractus_core.policy.values import Airframe
 
-from fractus_services.mobility.mavlink.link import ATTEMPTS, SYSTEM_ID, Autopilot
+from fractus_services.mobility.mavlink.autopilot import ATTEMPTS, Autopilot
+from fractus_services.mobility.mavlink.link import SYSTEM_ID
 
 log = logging.getLogger(__name__)
 

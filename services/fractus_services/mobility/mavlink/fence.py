@@ -14,9 +14,9 @@ from pathlib import Path
 from fractus_core.api.plans import GrantSpec
 
 from fractus_services.errors import AutopilotError
+from fractus_services.mobility.mavlink.autopilot import Autopilot
 from fractus_services.mobility.mavlink.bounds import Bounds, bounds_of
 from fractus_services.mobility.mavlink.itemlists import Item, NoLists, download, upload
-from fractus_services.mobility.mavlink.link import Autopilot
 
 log = logging.getLogger(__name__)
 

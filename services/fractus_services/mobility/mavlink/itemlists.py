@@ -5,21 +5,25 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+
+from fractus_mavlink import Message, message
+from fractus_mavlink.enums import MAV_FRAME, MAV_MISSION_RESULT, MAV_MISSION_TYPE
 
 from fractus_services.errors import AutopilotError
-from fractus_services.mobility.mavlink.dialect import message
-from fractus_services.mobility.mavlink.link import Autopilot
+from fractus_services.mobility.mavlink.autopilot import Autopilot
 
-FENCE = 1
 ANSWER_S = 1.0
 ATTEMPTS = 4
 
-_GLOBAL = 0
-_ACCEPTED, _UNSUPPORTED = 0, 3
-_REASONS = {
-    1: "an error", 2: "the frame", 3: "no such lists", 4: "no space", 5: "an invalid value", 13: "the order", 14: "denied",
-}  # fmt: skip
+_REASONS: dict[int, str] = {
+    MAV_MISSION_RESULT.ERROR: "an error",
+    MAV_MISSION_RESULT.UNSUPPORTED_FRAME: "the frame",
+    MAV_MISSION_RESULT.UNSUPPORTED: "no such lists",
+    MAV_MISSION_RESULT.NO_SPACE: "no space",
+    MAV_MISSION_RESULT.INVALID: "an invalid value",
+    MAV_MISSION_RESULT.INVALID_SEQUENCE: "the order",
+    MAV_MISSION_RESULT.DENIED: "denied",
+}
 
 
 class NoLists(AutopilotError):
@@ -43,7 +47,7 @@ class Item:
     lon_e7: int
 
 
-async def upload(autopilot: Autopilot, items: Sequence[Item], kind: int = FENCE) -> None:
+async def upload(autopilot: Autopilot, items: Sequence[Item], kind: MAV_MISSION_TYPE = MAV_MISSION_TYPE.FENCE) -> None:
     """Replace a list.
 
     Raises:
@@ -60,15 +64,15 @@ async def upload(autopilot: Autopilot, items: Sequence[Item], kind: int = FENCE)
                 silent += 1
                 if silent == ATTEMPTS:
                     raise AutopilotError("the autopilot stopped answering while its fence was written", link=True)
-            elif answer.get_type() == "MISSION_ACK":
-                _check(answer.type)
+            elif answer.name == "MISSION_ACK":
+                _check(answer.integer("type"))
                 return
-            elif answer.seq < len(items):
+            elif (seq := answer.integer("seq")) < len(items):
                 silent = 0
-                outgoing = _item(autopilot, items[answer.seq], answer.seq, kind)
+                outgoing = _item(autopilot, items[seq], seq, kind)
 
 
-async def download(autopilot: Autopilot, kind: int = FENCE) -> tuple[Item, ...]:
+async def download(autopilot: Autopilot, kind: MAV_MISSION_TYPE = MAV_MISSION_TYPE.FENCE) -> tuple[Item, ...]:
     """Read a list.
 
     Raises:
@@ -77,49 +81,49 @@ async def download(autopilot: Autopilot, kind: int = FENCE) -> tuple[Item, ...]:
     """
     with autopilot.listening("MISSION_COUNT", "MISSION_ITEM_INT", "MISSION_ACK") as answers:
         ask = message("MISSION_REQUEST_LIST", mission_type=kind, **autopilot.address())
-        count = (await _asked(autopilot, ask, answers, "MISSION_COUNT")).count
+        count = (await _asked(autopilot, ask, answers, "MISSION_COUNT")).integer("count")
         found = []
         for seq in range(count):
             ask = message("MISSION_REQUEST_INT", seq=seq, mission_type=kind, **autopilot.address())
             item = await _asked(autopilot, ask, answers, "MISSION_ITEM_INT", seq)
-            found.append(Item(item.command, item.param1, item.x, item.y))
+            found.append(Item(item.integer("command"), item.real("param1"), item.integer("x"), item.integer("y")))
     autopilot.send(message("MISSION_ACK", mission_type=kind, **autopilot.address()))
     return tuple(found)
 
 
 async def _asked(
-    autopilot: Autopilot, ask: Any, answers: asyncio.Queue[Any], wanted: str, seq: int | None = None
-) -> Any:
+    autopilot: Autopilot, ask: Message, answers: asyncio.Queue[Message], wanted: str, seq: int | None = None
+) -> Message:
     for _ in range(ATTEMPTS):
         autopilot.send(ask)
-        while (answer := await _answer(answers, ask.mission_type)) is not None:
-            if answer.get_type() == "MISSION_ACK":
-                _check(answer.type)
-            elif answer.get_type() == wanted and seq in {None, getattr(answer, "seq", None)}:
+        while (answer := await _answer(answers, ask.integer("mission_type"))) is not None:
+            if answer.name == "MISSION_ACK":
+                _check(answer.integer("type"))
+            elif answer.name == wanted and seq in {None, answer.values.get("seq")}:
                 return answer
     raise AutopilotError("the autopilot stopped answering while its fence was read", link=True)
 
 
-async def _answer(answers: asyncio.Queue[Any], kind: int) -> Any:
+async def _answer(answers: asyncio.Queue[Message], kind: int) -> Message | None:
     try:
         async with asyncio.timeout(ANSWER_S):
             while True:
                 answer = await answers.get()
-                if answer.mission_type == kind:
+                if answer.integer("mission_type") == kind:
                     return answer
     except TimeoutError:
         return None
 
 
 def _check(result: int) -> None:
-    if result == _UNSUPPORTED:
+    if result == MAV_MISSION_RESULT.UNSUPPORTED:
         raise NoLists("the autopilot keeps no fence items")
-    if result != _ACCEPTED:
+    if result != MAV_MISSION_RESULT.ACCEPTED:
         raise AutopilotError(f"the autopilot refused the fence: {_REASONS.get(result, f'result {result}')}")
 
 
-def _item(autopilot: Autopilot, item: Item, seq: int, kind: int) -> Any:
+def _item(autopilot: Autopilot, item: Item, seq: int, kind: MAV_MISSION_TYPE) -> Message:
     return message(
-        "MISSION_ITEM_INT", seq=seq, frame=_GLOBAL, command=item.command, param1=item.param1, x=item.lat_e7, y=item.lon_e7,
+        "MISSION_ITEM_INT", seq=seq, frame=MAV_FRAME.GLOBAL, command=item.command, param1=item.param1, x=item.lat_e7, y=item.lon_e7,
         autocontinue=1, mission_type=kind, **autopilot.address(),
     )  # fmt: skip

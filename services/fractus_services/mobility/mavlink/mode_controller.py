@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 from fractus_core.policy.values import Takeover
 
 from fractus_services.errors import AutopilotError
-from fractus_services.mobility.mavlink.link import Autopilot, Permit, always
+from fractus_services.mobility.mavlink.autopilot import Autopilot, Permit, always
 from fractus_services.mobility.mavlink.vehicle import GUIDED, HOMEWARD, LAND, RTL
 
 log = logging.getLogger(__name__)
@@ -130,7 +130,7 @@ class ModeController:
         returning = action != "land" and vehicle.mode in HOMEWARD and self.expected == vehicle.mode
         if not returning:
             await self._brake(wanted)
-            mode = LAND
+            mode: int = LAND
             if action != "land" and tries < RTL_TRIES:
                 mode = await self.approach(wanted, tries)
             await self.change_mode(mode, lambda: _check(wanted))

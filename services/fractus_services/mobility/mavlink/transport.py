@@ -13,7 +13,8 @@ import tty
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from fractus_services.mobility.mavlink.dialect import Codec
+from fractus_mavlink import Parser
+from fractus_mavlink.enums import MAV_AUTOPILOT
 
 Receive = Callable[[bytes], None]
 Closed = Callable[[Exception | None], None]
@@ -23,8 +24,6 @@ log = logging.getLogger(__name__)
 CONNECT_TIMEOUT_S = 5.0
 PEER_SILENCE_S = 3.0
 """An autopilot that is silent for so long may come back from another port."""
-
-_NO_AUTOPILOT = 8
 
 
 class BadUrl(ValueError):
@@ -111,8 +110,8 @@ class _Datagrams(asyncio.DatagramProtocol):
 
 def _from_autopilot(data: bytes) -> bool:
     """Whether a datagram holds a sound heartbeat of a flight controller."""
-    heard = Codec(0, 0).decode(data)
-    return any(m.get_type() == "HEARTBEAT" and m.autopilot != _NO_AUTOPILOT for m in heard)
+    heard = Parser().feed(data)
+    return any(m.name == "HEARTBEAT" and m.integer("autopilot") != MAV_AUTOPILOT.INVALID for m in heard)
 
 
 def _loopback(host: str) -> bool:

@@ -5,30 +5,32 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any
 
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.values import STANDING_MPS, Airframe, Home, Situation
+from fractus_mavlink import Message
+from fractus_mavlink.enums import (
+    COPTER_MODE,
+    GPS_FIX_TYPE,
+    MAV_LANDED_STATE,
+    MAV_MODE_FLAG,
+    MAV_STATE,
+    MAV_SYS_STATUS_SENSOR,
+)
 
-GUIDED, RTL, LAND, SMART_RTL, BRAKE = 4, 6, 9, 21, 17
-MODE_NAMES = {
-    0: "STABILIZE", 1: "ACRO", 2: "ALT_HOLD", 3: "AUTO", 4: "GUIDED", 5: "LOITER", 6: "RTL", 7: "CIRCLE", 9: "LAND",
-    11: "DRIFT", 13: "SPORT", 14: "FLIP", 15: "AUTOTUNE", 16: "POSHOLD", 17: "BRAKE", 18: "THROW", 19: "AVOID_ADSB",
-    20: "GUIDED_NOGPS", 21: "SMART_RTL", 22: "FLOWHOLD", 23: "FOLLOW", 24: "ZIGZAG", 25: "SYSTEMID", 26: "HELI_AUTOROTATE",
-    27: "AUTO_RTL", 28: "TURTLE",
-}  # fmt: skip
-HOMEWARD = frozenset({RTL, LAND, SMART_RTL, 27})
+GUIDED, RTL, LAND = COPTER_MODE.GUIDED, COPTER_MODE.RTL, COPTER_MODE.LAND
+SMART_RTL, BRAKE = COPTER_MODE.SMART_RTL, COPTER_MODE.BRAKE
+MODE_NAMES: dict[int, str] = {mode: mode.name for mode in COPTER_MODE}
+HOMEWARD: frozenset[int] = frozenset({RTL, LAND, SMART_RTL, COPTER_MODE.AUTO_RTL})
 """Modes in which the vehicle comes down by itself."""
 
-_ARMED = 0x80
-_CRITICAL, _EMERGENCY = 5, 6
-_PREARM = 0x10000000
-_ON_GROUND = 1
+_UNKNOWN_U16 = 0xFFFF
+"""What 16 bits say of a value that is not known."""
+
 TOLD_S = 2.0
 SURELY_M, UNTOLD_M = 1.5, 0.5
 """Above this a drone flies though it says it stands; above the other when it does not say."""
-_IN_AIR = frozenset({2, 3, 4})
-_FIX_3D = 3
+_IN_AIR = frozenset({MAV_LANDED_STATE.IN_AIR, MAV_LANDED_STATE.TAKEOFF, MAV_LANDED_STATE.LANDING})
 _LEAST_ERROR_M, _UNTOLD_ERROR_M, _WORST_ERROR_M = 0.5, 1.5, 10.0
 
 MAX_POSITION_AGE_S = 1.0
@@ -69,13 +71,13 @@ class Vehicle:
     armed: bool = False
     failsafe: bool = False
     heartbeat_at: float = -math.inf
-    landed_state: int = 0
+    landed_state: int = MAV_LANDED_STATE.UNDEFINED
     landed_at: float = -math.inf
     battery_remaining: float = math.nan
     battery_v: float = math.nan
     battery_a: float = math.nan
     ready: bool = False
-    fix_type: int = 0
+    fix_type: int = GPS_FIX_TYPE.NO_GPS
     located: bool = False
     position_error_m: float = _UNTOLD_ERROR_M
     courses: deque[tuple[float, float, float]] = field(default_factory=deque)
@@ -97,7 +99,7 @@ class Vehicle:
     @property
     def standing(self) -> bool:
         """Whether the autopilot says, now, that it stands on the ground."""
-        return self._landed_told and self.landed_state == _ON_GROUND
+        return self._landed_told and self.landed_state == MAV_LANDED_STATE.ON_GROUND
 
     @property
     def in_air(self) -> bool:
@@ -149,13 +151,13 @@ class Vehicle:
         """inactive, takingOff, flying or landing."""
         if not self.in_air:
             return "inactive"
-        if self.landed_state == 3:
+        if self.landed_state == MAV_LANDED_STATE.TAKEOFF:
             return "takingOff"
-        return "landing" if self.landed_state == 4 or self.mode == LAND else "flying"
+        return "landing" if self.landed_state == MAV_LANDED_STATE.LANDING or self.mode == LAND else "flying"
 
-    def take(self, message: Any, now: float) -> None:
+    def take(self, message: Message, now: float) -> None:
         """Update from one message."""
-        handler = _HANDLERS.get(message.get_type())
+        handler = _HANDLERS.get(message.name)
         if handler is not None:
             handler(self, message, now)
 
@@ -180,65 +182,71 @@ class Vehicle:
         )
 
 
-def _heartbeat(vehicle: Vehicle, message: Any, now: float) -> None:
+def _heartbeat(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.heartbeat_at = now
-    vehicle.mode = message.custom_mode
-    vehicle.armed = bool(message.base_mode & _ARMED)
+    vehicle.mode = message.integer("custom_mode")
+    vehicle.armed = bool(message.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED)
     vehicle.path_lost = vehicle.path_lost and vehicle.armed
-    vehicle.failsafe = message.system_status in {_CRITICAL, _EMERGENCY}
+    vehicle.failsafe = message.integer("system_status") in {MAV_STATE.CRITICAL, MAV_STATE.EMERGENCY}
 
 
-def _position(vehicle: Vehicle, message: Any, now: float) -> None:
+def _position(vehicle: Vehicle, message: Message, now: float) -> None:
     if not vehicle.located:
         return
-    if message.lat == 0 and message.lon == 0:
+    lat_e7, lon_e7 = message.integer("lat"), message.integer("lon")
+    # ArduPilot sends zeroes until its estimator has an origin.
+    if lat_e7 == 0 and lon_e7 == 0:
         return
-    vehicle.lat, vehicle.lon = message.lat / 1e7, message.lon / 1e7
-    vehicle.altitude_m, vehicle.amsl_m = message.relative_alt / 1e3, message.alt / 1e3
-    vehicle.north_mps, vehicle.east_mps, vehicle.down_mps = message.vx / 100, message.vy / 100, message.vz / 100
+    vehicle.lat, vehicle.lon = lat_e7 / 1e7, lon_e7 / 1e7
+    vehicle.altitude_m, vehicle.amsl_m = message.integer("relative_alt") / 1e3, message.integer("alt") / 1e3
+    vehicle.north_mps, vehicle.east_mps, vehicle.down_mps = (message.integer(name) / 100 for name in ("vx", "vy", "vz"))
     vehicle.courses.append((now, vehicle.north_mps, vehicle.east_mps))
     while vehicle.courses[0][0] < now - COURSE_S:
         vehicle.courses.popleft()
-    if message.hdg != 0xFFFF:
-        vehicle.yaw_deg = message.hdg / 100
+    heading_cdeg = message.integer("hdg")
+    if heading_cdeg != _UNKNOWN_U16:
+        vehicle.yaw_deg = heading_cdeg / 100
     vehicle.position_at = now
 
 
-def _attitude(vehicle: Vehicle, message: Any, now: float) -> None:
-    angles = [math.degrees(radians) for radians in (message.roll, message.pitch, message.yaw)]
+def _attitude(vehicle: Vehicle, message: Message, now: float) -> None:
+    angles = [math.degrees(message.real(name)) for name in ("roll", "pitch", "yaw")]
     if all(map(math.isfinite, angles)):
         vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg = angles[0], angles[1], angles[2] % 360.0
         vehicle.attitude_at = now
 
 
-def _home(vehicle: Vehicle, message: Any, _now: float) -> None:
-    vehicle.home = Home(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
+def _home(vehicle: Vehicle, message: Message, _now: float) -> None:
+    lat, lon = message.integer("latitude") / 1e7, message.integer("longitude") / 1e7
+    vehicle.home = Home(lat, lon, message.integer("altitude") / 1e3)
 
 
-def _landed(vehicle: Vehicle, message: Any, now: float) -> None:
-    vehicle.landed_state, vehicle.landed_at = message.landed_state, now
+def _landed(vehicle: Vehicle, message: Message, now: float) -> None:
+    vehicle.landed_state, vehicle.landed_at = message.integer("landed_state"), now
 
 
-def _status(vehicle: Vehicle, message: Any, _now: float) -> None:
-    vehicle.battery_remaining = message.battery_remaining / 100 if message.battery_remaining >= 0 else math.nan
-    vehicle.battery_v = message.voltage_battery / 1e3 if message.voltage_battery != 0xFFFF else math.nan
-    vehicle.battery_a = message.current_battery / 100 if message.current_battery >= 0 else math.nan
-    present = message.onboard_control_sensors_present & _PREARM
-    healthy = message.onboard_control_sensors_health & _PREARM
-    vehicle.ready = bool(healthy) if present else vehicle.fix_type >= 3
+def _status(vehicle: Vehicle, message: Message, _now: float) -> None:
+    # -1 and 0xFFFF: the autopilot does not measure it.
+    percent, millivolts = message.integer("battery_remaining"), message.integer("voltage_battery")
+    centiamperes = message.integer("current_battery")
+    vehicle.battery_remaining = percent / 100 if percent >= 0 else math.nan
+    vehicle.battery_v = millivolts / 1e3 if millivolts != _UNKNOWN_U16 else math.nan
+    vehicle.battery_a = centiamperes / 100 if centiamperes >= 0 else math.nan
+    present = message.integer("onboard_control_sensors_present") & MAV_SYS_STATUS_SENSOR.PREARM_CHECK
+    healthy = message.integer("onboard_control_sensors_health") & MAV_SYS_STATUS_SENSOR.PREARM_CHECK
+    vehicle.ready = bool(healthy) if present else vehicle.fix_type >= GPS_FIX_TYPE.TYPE_3D_FIX
 
 
-def _gps(vehicle: Vehicle, message: Any, _now: float) -> None:
-    vehicle.fix_type = message.fix_type
-    error = message.h_acc / 1e3 if message.h_acc else _UNTOLD_ERROR_M
-    vehicle.located = message.fix_type >= _FIX_3D and error <= _WORST_ERROR_M
+def _gps(vehicle: Vehicle, message: Message, _now: float) -> None:
+    vehicle.fix_type, accuracy_mm = message.integer("fix_type"), message.integer("h_acc")
+    error = accuracy_mm / 1e3 if accuracy_mm else _UNTOLD_ERROR_M
+    vehicle.located = vehicle.fix_type >= GPS_FIX_TYPE.TYPE_3D_FIX and error <= _WORST_ERROR_M
     if vehicle.located:
         vehicle.position_error_m = max(error, _LEAST_ERROR_M)
 
 
-def _text(vehicle: Vehicle, message: Any, now: float) -> None:
-    raw = message.text.split(b"\0", 1)[0] if isinstance(message.text, bytes) else message.text.encode()
-    text = raw.decode("utf-8", "replace")
+def _text(vehicle: Vehicle, message: Message, now: float) -> None:
+    text = message.text("text")
     vehicle.texts.append(text)
     del vehicle.texts[:-20]
     if text.startswith("SmartRTL deactivated"):

@@ -30,8 +30,8 @@ from fractus_services.mobility.flight.monitor import MotionMonitor
 from fractus_services.mobility.flight.service import MobilityService
 from fractus_services.mobility.flight.tours import Tours
 from fractus_services.mobility.flight.transit import TransitFlight
+from fractus_services.mobility.mavlink.autopilot import Autopilot
 from fractus_services.mobility.mavlink.fence import MissionFence
-from fractus_services.mobility.mavlink.link import Autopilot
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from fractus_services.mobility.rpc.streams import Streams
 from fractus_services.options import MobilityOptions
@@ -83,7 +83,7 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     monitor = MotionMonitor(control, guard, audit, supervisor)
     observer = Observer(control)
     autopilot.on_found = observer.found
-    autopilot.on_message = lambda m: observer.heartbeat() if m.get_type() == "HEARTBEAT" else None
+    autopilot.on_message = lambda m: observer.heartbeat() if m.name == "HEARTBEAT" else None
     audit.append("started", {"node": node, "autopilot": url})
     grants.listen(lambda old, new: _record_grant(audit, old, new))
     grants.scan()

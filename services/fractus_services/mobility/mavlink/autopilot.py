@@ -1,0 +1,267 @@
+"""Commands and parameters of the autopilot: each is acknowledged, or sent again, or fails with a reason."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Callable
+
+from fractus_mavlink import Message, Value, layout_named, message
+from fractus_mavlink.enums import (
+    MAV_CMD,
+    MAV_FRAME,
+    MAV_MODE_FLAG,
+    MAV_PARAM_TYPE,
+    MAV_RESULT,
+    POSITION_TARGET_TYPEMASK,
+    SPEED_TYPE,
+)
+
+from fractus_services.errors import AutopilotError
+from fractus_services.mobility.mavlink.link import Link
+
+log = logging.getLogger(__name__)
+
+ACK_TIMEOUT_S = 0.7
+MODE_TIMEOUT_S = 2.0
+REJECTED_RETRY_S = 0.3
+ATTEMPTS = 4
+
+# Messages and their rates in Hz on the ground and in the air.
+STREAMS = {
+    "GLOBAL_POSITION_INT": (4.0, 20.0),
+    "ATTITUDE": (2.0, 10.0),
+    "EXTENDED_SYS_STATE": (2.0, 5.0),
+    "SYS_STATUS": (1.0, 1.0),
+    "GPS_RAW_INT": (1.0, 2.0),
+    "HOME_POSITION": (0.2, 0.2),
+}
+
+_RESULTS: dict[int, str] = {
+    MAV_RESULT.TEMPORARILY_REJECTED: "temporarily rejected",
+    MAV_RESULT.DENIED: "denied",
+    MAV_RESULT.UNSUPPORTED: "unsupported",
+    MAV_RESULT.FAILED: "failed",
+    MAV_RESULT.CANCELLED: "cancelled",
+}
+_MASK = POSITION_TARGET_TYPEMASK
+_VELOCITY_AND_YAW = (
+    _MASK.X_IGNORE | _MASK.Y_IGNORE | _MASK.Z_IGNORE
+    | _MASK.AX_IGNORE | _MASK.AY_IGNORE | _MASK.AZ_IGNORE
+    | _MASK.YAW_RATE_IGNORE
+)  # fmt: skip
+_VELOCITY_ONLY = _VELOCITY_AND_YAW | _MASK.YAW_IGNORE
+
+Permit = Callable[[], None]
+"""Asked before each sending of a command; raises when it must not be sent any more."""
+
+
+def always() -> None:
+    """The permit of what may be sent at any time."""
+
+
+class Autopilot(Link):
+    """One vehicle behind one link, and what it can be told.
+
+    Args:
+        url: the link, see `open_link`.
+
+    Attributes:
+        starting: held by the one who prepares to start the motors.
+    """
+
+    def __init__(self, url: str) -> None:
+        super().__init__(url)
+        self.starting = asyncio.Lock()
+        self._locks: dict[int | str, asyncio.Lock] = {}
+        self._flying_rates: bool | None = None
+
+    def _lost(self) -> None:
+        self._flying_rates = None
+
+    async def command(
+        self,
+        command: MAV_CMD,
+        *params: float,
+        place: tuple[float, float, float] | None = None,
+        frame: MAV_FRAME = MAV_FRAME.GLOBAL_RELATIVE_ALT_INT,
+        permit: Permit = always,
+        attempts: int = ATTEMPTS,
+    ) -> None:
+        """Run a MAVLink command and wait for its acknowledgement.
+
+        Args:
+            command: which.
+            params: param1 onwards; the rest is zero.
+            place: latitude, longitude and altitude: sends COMMAND_INT.
+            frame: what the altitude is measured from; home by default.
+            permit: asked before each sending; what it raises ends the command.
+            attempts: how often to send it.
+
+        Raises:
+            AutopilotError: it was refused, or nobody answered.
+        """
+        async with self._locks.setdefault(command, asyncio.Lock()):
+            for attempt in range(attempts):
+                permit()
+                result = await self._attempt(
+                    _outgoing(command, params, place, frame, confirmation=attempt, **self.address()), command
+                )
+                if result is None:
+                    continue
+                if result == MAV_RESULT.ACCEPTED:
+                    return
+                if result == MAV_RESULT.TEMPORARILY_REJECTED and attempt + 1 < attempts:
+                    await asyncio.sleep(REJECTED_RETRY_S)
+                    continue
+                raise AutopilotError(self._refusal(command, result))
+        raise AutopilotError(f"the autopilot did not answer {command.name}", link=True)
+
+    async def _attempt(self, outgoing: Message, command: MAV_CMD) -> int | None:
+        """The result of one sending; None without an answer in time."""
+        with self.listening("COMMAND_ACK") as answers:
+            self.send(outgoing)
+            try:
+                async with asyncio.timeout(ACK_TIMEOUT_S):
+                    while True:
+                        ack = await answers.get()
+                        result = ack.integer("result")
+                        if ack.integer("command") == command and result != MAV_RESULT.IN_PROGRESS:
+                            return result
+            except TimeoutError:
+                return None
+
+    def _refusal(self, command: MAV_CMD, result: int) -> str:
+        why = [t for t in self.vehicle.texts[-4:] if t.startswith(("Arm", "PreArm", "Mode", "Takeoff"))]
+        said = f": {why[-1]}" if why else ""
+        return f"the autopilot {_RESULTS.get(result, 'refused')} {command.name}{said}"
+
+    async def set_mode(self, mode: int, permit: Permit = always) -> None:
+        """Change the flight mode and wait until the autopilot flies it."""
+        await self.command(MAV_CMD.DO_SET_MODE, MAV_MODE_FLAG.CUSTOM_MODE_ENABLED, mode, permit=permit)
+        deadline = self.now + MODE_TIMEOUT_S
+        while self.vehicle.mode != mode:
+            if self.now > deadline:
+                raise AutopilotError(f"the autopilot accepted mode {mode} and stays in {self.vehicle.mode_name}")
+            await self.update(0.3)
+
+    async def arm(self, permit: Permit = always) -> None:
+        """Start the motors."""
+        self.vehicle.texts.clear()
+        await self.command(MAV_CMD.COMPONENT_ARM_DISARM, 1, permit=permit)
+
+    async def disarm(self, permit: Permit = always) -> None:
+        """Stop the motors; the autopilot refuses in the air."""
+        await self.command(MAV_CMD.COMPONENT_ARM_DISARM, 0, permit=permit)
+
+    async def set_home(self, lat: float, lon: float, amsl_m: float) -> None:
+        """Fix home, so that arming elsewhere does not move it."""
+        await self.command(MAV_CMD.DO_SET_HOME, place=(lat, lon, amsl_m), frame=MAV_FRAME.GLOBAL)
+
+    async def take_off(self, altitude_m: float, permit: Permit = always) -> None:
+        """Begin to climb to an altitude above home."""
+        await self.command(MAV_CMD.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m, permit=permit)
+
+    async def go_to(
+        self, lat: float, lon: float, altitude_m: float, yaw_deg: float | None, permit: Permit = always
+    ) -> None:
+        """Begin to fly straight to a point; altitude above home.
+
+        The autopilot falls back to its own speed when it was not flying to a place before: see `set_speed`.
+        """
+        yaw = math.nan if yaw_deg is None else yaw_deg
+        await self.command(MAV_CMD.DO_REPOSITION, -1, 0, 0, yaw, place=(lat, lon, altitude_m), permit=permit)
+
+    async def turn(self, yaw_deg: float, permit: Permit = always) -> None:
+        """Point the nose, on the leg under way."""
+        await self.command(MAV_CMD.CONDITION_YAW, yaw_deg % 360.0, 0, 0, 0, permit=permit)
+
+    async def set_speed(self, speed_mps: float, permit: Permit = always) -> None:
+        """Fly the leg under way with this horizontal speed over ground; one to a place may begin with the default again."""
+        await self.command(MAV_CMD.DO_CHANGE_SPEED, SPEED_TYPE.GROUNDSPEED, speed_mps, -1, permit=permit)
+
+    def stop(self) -> None:
+        """Brake and hold: a velocity of zero; GUIDED keeps the position when it times out."""
+        self.fly(0.0, 0.0, 0.0)
+
+    def fly(self, north_mps: float, east_mps: float, down_mps: float, yaw_deg: float | None = None) -> None:
+        """Fly with a velocity over ground, which the autopilot gives up by itself after GUID_TIMEOUT."""
+        if self.found:
+            self.send(
+                message(
+                    "SET_POSITION_TARGET_LOCAL_NED",
+                    coordinate_frame=MAV_FRAME.LOCAL_NED,
+                    type_mask=_VELOCITY_ONLY if yaw_deg is None else _VELOCITY_AND_YAW,
+                    vx=north_mps,
+                    vy=east_mps,
+                    vz=down_mps,
+                    yaw=math.radians(yaw_deg or 0.0),
+                    **self.recipient(),
+                )
+            )
+
+    async def set_rates(self, flying: bool) -> None:
+        """Ask for the streams, more often in the air; one that is refused comes at the autopilot's own rate."""
+        if self._flying_rates is flying:
+            return
+        self._flying_rates = flying
+        for name, rates in STREAMS.items():
+            try:
+                interval_us = 1e6 / rates[flying]
+                await self.command(MAV_CMD.SET_MESSAGE_INTERVAL, layout_named(name).msgid, interval_us, attempts=2)
+            except AutopilotError as error:
+                log.warning("%s comes at its own rate: %s", name, error)
+
+    async def ask_home(self) -> None:
+        """Ask for the home position now."""
+        await self.command(MAV_CMD.REQUEST_MESSAGE, layout_named("HOME_POSITION").msgid)
+
+    async def read_parameter(self, name: str, attempts: int = ATTEMPTS) -> float | None:
+        """A parameter's value; None when the vehicle does not have it."""
+        # An index of -1 asks by name.
+        request = message("PARAM_REQUEST_READ", param_index=-1, param_id=name.encode(), **self.recipient())
+        return await self._exchange(name, request, attempts)
+
+    async def write_parameter(self, name: str, value: float) -> float | None:
+        """Set a parameter; returns what the vehicle says it is now."""
+        request = message(
+            "PARAM_SET",
+            param_id=name.encode(),
+            param_value=value,
+            param_type=MAV_PARAM_TYPE.REAL32,
+            **self.recipient(),
+        )
+        return await self._exchange(name, request, ATTEMPTS)
+
+    async def _exchange(self, name: str, request: Message, attempts: int) -> float | None:
+        async with self._locks.setdefault(name, asyncio.Lock()):
+            with self.listening("PARAM_VALUE") as answers:
+                for _ in range(attempts):
+                    self.send(request)
+                    try:
+                        async with asyncio.timeout(ACK_TIMEOUT_S):
+                            while (answer := await answers.get()).text("param_id") != name:
+                                pass
+                            return answer.real("param_value")
+                    except TimeoutError:
+                        continue
+        return None
+
+
+def _outgoing(
+    command: MAV_CMD,
+    params: tuple[float, ...],
+    place: tuple[float, float, float] | None,
+    frame: MAV_FRAME,
+    *,
+    confirmation: int,
+    **address: int,
+) -> Message:
+    values: dict[str, Value] = {f"param{i}": float(value) for i, value in enumerate(params, 1)}
+    values |= {"command": command, **address}
+    if place is None:
+        return message("COMMAND_LONG", confirmation=confirmation, **values)
+    # COMMAND_INT has room for seven digits of a degree; the floats of COMMAND_LONG are a metre off.
+    values |= {"frame": frame, "x": round(place[0] * 1e7), "y": round(place[1] * 1e7), "z": place[2]}
+    return message("COMMAND_INT", **values)

@@ -53,14 +53,10 @@ RUN --mount=type=cache,target=/root/.cache/uv \
       uv export --quiet --frozen --no-dev --no-emit-project $extra --output-file /build/$name.txt; \
       uv pip install --quiet --no-deps --require-hashes --target /deps/$name -r /build/$name.txt; \
       cd /deps/$name; \
-      rm -rf bin .lock numpy/_core/_simd.* numpy/_core/include numpy/_core/lib numpy/f2py numpy/distutils cv2/gapi \
-        lxml lxml-* pymavlink/dialects/v09 pymavlink/dialects/v10 pymavlink/dfindexer pymavlink/tools; \
+      rm -rf bin .lock numpy/_core/_simd.* numpy/_core/include numpy/_core/lib numpy/f2py numpy/distutils cv2/gapi; \
       find . -path '*/tests' -prune -exec rm -rf {} +; \
       find . -path './kubernetes/*' \( -path '*/client/models/*' -o -path '*/client/api/*' \) ! -name __init__.py -delete; \
       find . -path './kubernetes/*_test.py' -delete; \
-      find . -path './pymavlink/generator/*' -type d -prune -exec rm -rf {} +; \
-      find pymavlink/dialects/v20 -type f 2>/dev/null \
-        | grep -Ev '/(__init__|minimal|common|standard|ardupilotmega)\.py$' | xargs -r rm -f; \
       strip --strip-unneeded cryptography/hazmat/bindings/_rust.abi3.so 2>/dev/null || true; \
       find . \( -name '*.pyi' -o -name '*.pyx' -o -name '*.pxd' -o -name '*.c' -o -name '*.h' -o -name '*.a' \) -delete; \
     done; \

@@ -402,7 +402,7 @@ def test_a_leg_with_a_heading_waits_for_the_nose(tmp_path: Path) -> None:
             await end(world.service.goto(grant, goto(0, 30, yaw_deg=90.0), 0))
             assert world.plane.heading == 90.0
             world.plane.refuses.add(115)
-            with pytest.raises(AutopilotError, match="failed command 115"):
+            with pytest.raises(AutopilotError, match="failed command CONDITION_YAW"):
                 await end(world.service.goto(grant, goto(0, 40, yaw_deg=180.0), 0))
 
     fly(flight)

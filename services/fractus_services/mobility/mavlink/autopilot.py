@@ -116,7 +116,7 @@ class Autopilot(Link):
                     await asyncio.sleep(REJECTED_RETRY_S)
                     continue
                 raise AutopilotError(self._refusal(command, result))
-        raise AutopilotError(f"the autopilot did not answer {command.name}", link=True)
+        raise AutopilotError(f"the autopilot did not answer command {command.name}", link=True)
 
     async def _attempt(self, outgoing: Message, command: MAV_CMD) -> int | None:
         """The result of one sending; None without an answer in time."""
@@ -135,7 +135,7 @@ class Autopilot(Link):
     def _refusal(self, command: MAV_CMD, result: int) -> str:
         why = [t for t in self.vehicle.texts[-4:] if t.startswith(("Arm", "PreArm", "Mode", "Takeoff"))]
         said = f": {why[-1]}" if why else ""
-        return f"the autopilot {_RESULTS.get(result, 'refused')} {command.name}{said}"
+        return f"the autopilot {_RESULTS.get(result, 'refused')} command {command.name}{said}"
 
     async def set_mode(self, mode: int, permit: Permit = always) -> None:
         """Change the flight mode and wait until the autopilot flies it."""

@@ -28,7 +28,7 @@ from fractus_core.api.components import Component
 from fractus_core.api.geometry import Position
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.geo import LocalFrame, distance_m
-from fractus_core.planning import Host, Inventory, Settings, Whereabouts, operation_area
+from fractus_core.planning import Host, Inventory, NodeLocations, Settings, operation_area
 from fractus_core.planning.candidates import direct_reach_m, requests
 from fractus_core.planning.coverage import Samples
 from fractus_core.planning.plan import plan_in_steps
@@ -340,7 +340,7 @@ def index_updates(nodes: int, moves: int = 1000) -> tuple[float, float]:
     """Seconds to note one moved node (99th percentile), and to build the index anew."""
     stock = inventory(nodes, FIXED)
     started = time.process_time()
-    where = Whereabouts.of(edge_nodes=stock.edge_nodes, drones=stock.drones, depots=stock.depots, cloud=())
+    where = NodeLocations.of(edge_nodes=stock.edge_nodes, drones=stock.drones, depots=stock.depots, cloud=())
     built = time.process_time() - started
     rng = random.Random(SEED)
     names = rng.choices(sorted(stock.edge_nodes), k=moves)

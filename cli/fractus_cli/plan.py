@@ -175,7 +175,7 @@ def _taken(stock: Inventory, application: Application, found: DeploymentPlanSpec
         claimed[found.drone.node] = application.key
         with contextlib.suppress(InvalidObject):
             flights[found.drone.node] = flight_of(application, stock.depots)
-    return replace(stock, hosts=hosts, claimed=claimed, flights=flights, whereabouts=stock.located())
+    return replace(stock, hosts=hosts, claimed=claimed, flights=flights, locations=stock.located())
 
 
 def _settings(tuned: Mapping[str, Any]) -> Settings:

@@ -37,8 +37,8 @@ def plan_map(
                 yield _feature(shape, name, f"controlPoints[{i}]", {"fill-opacity": 0, "stroke": "#8c564b"})
         if len(area.route) > 1:
             yield _feature(geojson_line(area.route), name, "route", {"stroke": "#d62728", "stroke-width": 2})
-    for leg in plan.drone.chauffeur if plan.drone is not None else ():
-        yield _feature(geojson_line((leg.start, leg.end)), name, "chauffeur", {"stroke": "#7f7f7f"})
+    for leg in plan.drone.transit if plan.drone is not None else ():
+        yield _feature(geojson_line((leg.start, leg.end)), name, "transit", {"stroke": "#7f7f7f"})
     for node, instances in _by_node(plan.placements).items():
         place = _place(node, stock)
         if place is not None:

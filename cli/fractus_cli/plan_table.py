@@ -37,8 +37,8 @@ def _drone(choice: DroneChoice) -> str:
     if choice.mission is not None:
         mission = choice.mission
         text += f" flies {mission.distance:.0f} m in {mission.duration:.1f} min of the {mission.available:.1f} it has"
-    if choice.chauffeur:
-        legs = len(choice.chauffeur)
+    if choice.transit:
+        legs = len(choice.transit)
         text += f"; the system flies {legs} leg{'s' if legs > 1 else ''} of it"
     if choice.alternatives:
         text += f"; then {', '.join(a.node for a in choice.alternatives[:3])}"

@@ -18,7 +18,7 @@ async def watch(period_s: float) -> None:
     loop = asyncio.get_running_loop()
     loop.add_signal_handler(signal.SIGTERM, stop.set)
     due_s = loop.time()
-    async with fractus.camera(patience_s=1.0) as camera:
+    async with fractus.camera(reconnect_timeout_s=1.0) as camera:
         while not stop.is_set():
             try:
                 info = await camera.capture()

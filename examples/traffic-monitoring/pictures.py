@@ -21,7 +21,7 @@ async def watch(interval_s: float) -> None:
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
     checker = fractus.egress("ImageChecker")
     number, said = 0, ""
-    async with fractus.camera(patience_s=1.0) as camera:
+    async with fractus.camera(reconnect_timeout_s=1.0) as camera:
         while not stop.is_set():
             number += 1
             try:

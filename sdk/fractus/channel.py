@@ -16,11 +16,11 @@ from fractus.environment import Endpoint
 from fractus.errors import NotConfigured, translate
 
 CALL_TIMEOUT_S = 10.0
-PATIENCE_S = 30.0
-"""How long a call waits for a service that is restarting. It then gives a drone's driver 15 s to come back."""
+RECONNECT_TIMEOUT_S = 30.0
+"""How long a call waits for a service that is restarting: once it runs it gives a drone's driver 15 s to come back."""
 
-ONCE = frozenset({"Arm", "SetVelocity"})
-"""Methods that are for this moment: they are not tried again, for late they would do what nobody wants any more."""
+NOT_RETRIED = frozenset({"Arm", "SetVelocity"})
+"""Methods that are for this moment: repeated late, they would do what is no longer wanted."""
 
 _OPTIONS = (
     ("grpc.keepalive_time_ms", 10_000),
@@ -70,13 +70,13 @@ class ServiceChannel:
         stub: Callable[[Any], Any],
         *,
         timeout_s: float = CALL_TIMEOUT_S,
-        patience_s: float = PATIENCE_S,
+        reconnect_timeout_s: float = RECONNECT_TIMEOUT_S,
     ) -> None:
         self.address = endpoint.address
         self._endpoint = endpoint
         self._make_stub = stub
         self._timeout_s = timeout_s
-        self.patience_s = patience_s
+        self.reconnect_timeout_s = reconnect_timeout_s
         self._connection: _Connection | None = None
         self._retired: set[_Connection] = set()
 
@@ -100,19 +100,19 @@ class ServiceChannel:
             await self._close_unused()
 
     async def unary(self, method: str, request: Any, *, timeout_s: float | None = None) -> Any:
-        """One call with a deadline; while the service restarts it is tried again, for `patience_s` at most, unless in `ONCE`.
+        """One call with a deadline; while the service restarts it is tried again, for `reconnect_timeout_s` at most, unless in `NOT_RETRIED`.
 
         Raises:
             FractusError: one of the typed errors; `Unavailable` when the service did not come back.
         """
         loop = asyncio.get_running_loop()
-        give_up = loop.time() + self.patience_s
+        give_up = loop.time() + self.reconnect_timeout_s
         for delay in backoff():
             try:
                 async with self.stub() as stub:
                     return await getattr(stub, method)(request, timeout=timeout_s or self._timeout_s)
             except grpc.aio.AioRpcError as error:
-                again = error.code() is grpc.StatusCode.UNAVAILABLE and method not in ONCE
+                again = error.code() is grpc.StatusCode.UNAVAILABLE and method not in NOT_RETRIED
                 if not again or loop.time() + delay > give_up:
                     raise translate(error, method, self.address) from None
             await asyncio.sleep(delay)

@@ -1,4 +1,4 @@
-"""Control of the drone: taken, kept alive in the background, lost, given back."""
+"""Control of the drone: taken, kept alive in the background, lost, returned."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from fractus.errors import ControlLost, FractusError, MissionComplete, Unavailab
 _log = logging.getLogger("fractus")
 _Event = mobility_pb2.ControlEvent
 
-AGAIN_S = 0.5
-"""Control is asked for again at least so often while the service is away: the drone hovers meanwhile, and not for long."""
+MAX_RETRY_DELAY_S = 0.5
+"""The longest pause between requests for control while the service restarts: the drone hovers meanwhile, and not for long."""
 
 
 class Control:
@@ -149,8 +149,8 @@ class Control:
     async def _watch(self) -> None:
         """Keep the stream open; ends when control is lost or was returned."""
         loop = asyncio.get_running_loop()
-        give_up = loop.time() + self._channel.patience_s
-        delays = backoff(cap_s=AGAIN_S)
+        give_up = loop.time() + self._channel.reconnect_timeout_s
+        delays = backoff(cap_s=MAX_RETRY_DELAY_S)
         while True:
             try:
                 await self._follow()
@@ -163,8 +163,11 @@ class Control:
                 return
             if self._granted.is_set():
                 self._granted.clear()
-                delays, give_up = backoff(cap_s=AGAIN_S), loop.time() + self._channel.patience_s
-                _log.warning("the mobility service is away; waiting for it to come back")
+                delays, give_up = backoff(cap_s=MAX_RETRY_DELAY_S), loop.time() + self._channel.reconnect_timeout_s
+                _log.warning(
+                    "control: lost the connection to the mobility service; trying again (timeout_s=%g)",
+                    self._channel.reconnect_timeout_s,
+                )
             delay = next(delays)
             if not transient or loop.time() + delay > give_up:
                 self._lose(failure)

@@ -13,7 +13,7 @@ import grpc
 import grpc.aio
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
-from fractus.channel import CALL_TIMEOUT_S, PATIENCE_S, ServiceChannel, backoff
+from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, ServiceChannel, backoff
 from fractus.control import Control
 from fractus.environment import Endpoint, endpoint
 from fractus.errors import ControlLost, Corrected, FractusError, translate
@@ -88,7 +88,7 @@ class Motion:
                         yield step
             except grpc.aio.AioRpcError as error:
                 failure = translate(error, self._method, self._channel.address)
-                give_up = give_up or loop.time() + self._channel.patience_s
+                give_up = give_up or loop.time() + self._channel.reconnect_timeout_s
                 delay = next(delays)
                 again = error.code() is grpc.StatusCode.UNAVAILABLE and self._control is not None
                 if not again or loop.time() + delay > give_up:
@@ -144,7 +144,7 @@ class Mobility:
         endpoint: where the service is; by default, what the pod's environment says.
         strict: raise `Corrected` instead of accepting what a policy corrected.
         timeout_s: deadline of each call that is not a motion.
-        patience_s: how long to wait for a service that is restarting.
+        reconnect_timeout_s: how long to wait for a service that is restarting.
     """
 
     def __init__(
@@ -153,13 +153,13 @@ class Mobility:
         *,
         strict: bool = False,
         timeout_s: float = CALL_TIMEOUT_S,
-        patience_s: float = PATIENCE_S,
+        reconnect_timeout_s: float = RECONNECT_TIMEOUT_S,
     ) -> None:
         self._channel = ServiceChannel(
             endpoint,
             mobility_pb2_grpc.MobilityServiceStub,
             timeout_s=timeout_s,
-            patience_s=patience_s,
+            reconnect_timeout_s=reconnect_timeout_s,
         )
         self._strict = strict
         self._control: Control | None = None
@@ -329,14 +329,14 @@ class Mobility:
     async def _stream(self, method: str, request: Any) -> AsyncGenerator[Any, None]:
         """The messages of a stream that is opened again after the service restarts."""
         loop = asyncio.get_running_loop()
-        give_up, delays = loop.time() + self._channel.patience_s, backoff()
+        give_up, delays = loop.time() + self._channel.reconnect_timeout_s, backoff()
         while True:
             async with self._channel.stub() as stub:
                 call = getattr(stub, method)(request)
                 try:
                     async for message in call:
                         yield message
-                        give_up, delays = loop.time() + self._channel.patience_s, backoff()
+                        give_up, delays = loop.time() + self._channel.reconnect_timeout_s, backoff()
                 except grpc.aio.AioRpcError as error:
                     delay = next(delays)
                     if error.code() is not grpc.StatusCode.UNAVAILABLE or loop.time() + delay > give_up:
@@ -376,15 +376,17 @@ class Mobility:
         return result
 
 
-def mobility(target: Endpoint | None = None, *, strict: bool = False, patience_s: float = PATIENCE_S) -> Mobility:
+def mobility(
+    target: Endpoint | None = None, *, strict: bool = False, reconnect_timeout_s: float = RECONNECT_TIMEOUT_S
+) -> Mobility:
     """The mobility service of this node: `async with fractus.mobility() as drone`.
 
     Args:
         target: where it is; by default what the pod's environment says.
         strict: raise `Corrected` when a policy changes what was asked.
-        patience_s: how long calls wait for a service that is restarting.
+        reconnect_timeout_s: how long calls wait for a service that is restarting.
 
     Raises:
         NotConfigured: not in a pod of a Fractus application, and no target given.
     """
-    return Mobility(target or endpoint("mobility"), strict=strict, patience_s=patience_s)
+    return Mobility(target or endpoint("mobility"), strict=strict, reconnect_timeout_s=reconnect_timeout_s)

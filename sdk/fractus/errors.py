@@ -80,11 +80,11 @@ class Busy(FractusError):
     """The service takes no more of this component now: too many calls, or no room for another picture.
 
     Attributes:
-        again_s: in how many seconds to try again; None where waiting alone does not help.
+        retry_after_s: in how many seconds to try again; None where waiting alone does not help.
     """
 
-    def __init__(self, message: str, again_s: float | None = None) -> None:
-        self.again_s = again_s
+    def __init__(self, message: str, retry_after_s: float | None = None) -> None:
+        self.retry_after_s = retry_after_s
         super().__init__(message)
 
 
@@ -98,7 +98,7 @@ def decision_of(error: Any) -> Decision | None:
     return Decision.from_proto(message) if _detail(error, message) else None
 
 
-def _again_s(error: Any) -> float | None:
+def _retry_after_s(error: Any) -> float | None:
     """In how many seconds a failed call may be tried again, if it says so."""
     message = error_details_pb2.RetryInfo()
     if not _detail(error, message):
@@ -137,7 +137,7 @@ def translate(error: Any, what: str, address: str) -> FractusError:
     if code in {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED}:
         return Unavailable(f"{what}: no answer from {address} ({text or code.name})")
     if code is grpc.StatusCode.RESOURCE_EXHAUSTED:
-        return Busy(f"{what}: {text or code.name}", _again_s(error))
+        return Busy(f"{what}: {text or code.name}", _retry_after_s(error))
     return FractusError(f"{what}: {text or code.name}")
 
 

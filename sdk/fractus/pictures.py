@@ -9,7 +9,7 @@ import grpc
 import grpc.aio
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
 
-from fractus.channel import CALL_TIMEOUT_S, PATIENCE_S, ServiceChannel
+from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, ServiceChannel
 from fractus.environment import Endpoint, endpoint
 from fractus.errors import Unavailable, translate
 from fractus.requests import capture_request
@@ -24,10 +24,10 @@ class Camera:
     """The camera service of this node: pictures are taken, kept on the node, and fetched from there."""
 
     def __init__(
-        self, endpoint: Endpoint, *, timeout_s: float = CALL_TIMEOUT_S, patience_s: float = PATIENCE_S
+        self, endpoint: Endpoint, *, timeout_s: float = CALL_TIMEOUT_S, reconnect_timeout_s: float = RECONNECT_TIMEOUT_S
     ) -> None:
         self._channel = ServiceChannel(
-            endpoint, camera_pb2_grpc.CameraServiceStub, timeout_s=timeout_s, patience_s=patience_s
+            endpoint, camera_pb2_grpc.CameraServiceStub, timeout_s=timeout_s, reconnect_timeout_s=reconnect_timeout_s
         )
 
     async def __aenter__(self) -> Self:
@@ -92,14 +92,14 @@ class Camera:
         return Result(decision=Decision.from_proto(reply))
 
 
-def camera(target: Endpoint | None = None, *, patience_s: float = PATIENCE_S) -> Camera:
+def camera(target: Endpoint | None = None, *, reconnect_timeout_s: float = RECONNECT_TIMEOUT_S) -> Camera:
     """The camera service of this node: `async with fractus.camera() as camera`.
 
     Args:
         target: where it is; by default what the pod's environment says.
-        patience_s: how long calls wait for a service that is restarting.
+        reconnect_timeout_s: how long calls wait for a service that is restarting.
 
     Raises:
         NotConfigured: not in a pod of a Fractus application, and no target given.
     """
-    return Camera(target or endpoint("camera"), patience_s=patience_s)
+    return Camera(target or endpoint("camera"), reconnect_timeout_s=reconnect_timeout_s)

@@ -237,8 +237,8 @@ class Ride:
 class Telemetry:
     """One sample of the drone's state; altitudes of `position` and `home` are above home and AMSL.
 
-    `attitude` is None while nobody knows it. `position_error_m` bounds the horizontal error; where it is None nobody knows where
-    the drone is, and `position` and `velocity` are zeros that mean nothing. `ready` says that the autopilot would arm.
+    `attitude` is None while it is unknown. `position_error_m` bounds the horizontal error; None: the position is unknown, and
+    `position` and `velocity` are zeros that mean nothing. `ready` says that the autopilot would arm.
     """
 
     time: datetime

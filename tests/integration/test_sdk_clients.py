@@ -222,7 +222,7 @@ async def _fly(drone: Mobility) -> fractus.Progress:
 
 async def test_control_is_lost_when_the_service_stays_away(stage: Stage) -> None:
     stage.drone.release = asyncio.Event()
-    async with stage.client(patience_s=0.5) as drone:
+    async with stage.client(reconnect_timeout_s=0.5) as drone:
         with pytest.raises(fractus.ControlLost, match="no answer"):
             async with drone.control():
                 flight = asyncio.ensure_future(stage.drone.moving.wait())
@@ -237,7 +237,7 @@ async def _stop(when: asyncio.Future[bool], server: Server) -> None:
 
 async def test_a_call_waits_for_a_restarting_service_and_no_longer(stage: Stage) -> None:
     await stage.server.stop()
-    async with stage.client(patience_s=0.5) as drone:
+    async with stage.client(reconnect_timeout_s=0.5) as drone:
         with pytest.raises(fractus.Unavailable, match=stage.endpoint.address):
             await drone.position()
     async with stage.client() as drone:
@@ -266,7 +266,7 @@ async def test_a_slow_handshake_is_waited_for(stage: Stage) -> None:
     slow = await asyncio.start_server(relay, "127.0.0.1", 0)
     port = slow.sockets[0].getsockname()[1]
     endpoint = replace(stage.endpoint, address=f"127.0.0.1:{port}")
-    async with Mobility(endpoint, patience_s=WAIT_S) as drone:
+    async with Mobility(endpoint, reconnect_timeout_s=WAIT_S) as drone:
         assert (await drone.position()).velocity.north == 1.0
     slow.close()
 
@@ -287,7 +287,7 @@ async def test_a_renewed_certificate_is_used_without_ending_the_flight(stage: St
 
 async def test_the_server_must_be_the_node_that_was_meant(stage: Stage) -> None:
     other = replace(stage.endpoint, server_name="drone-2.node.fractus.dev")
-    async with Mobility(other, patience_s=0.3) as drone:
+    async with Mobility(other, reconnect_timeout_s=0.3) as drone:
         with pytest.raises(fractus.Unavailable):
             await drone.position()
     assert stage.drone.calls == []
@@ -296,7 +296,7 @@ async def test_the_server_must_be_the_node_that_was_meant(stage: Stage) -> None:
 async def test_a_stranger_gets_no_answer(stage: Stage, tmp_path: Path) -> None:
     tls = Authority().issue(tmp_path / "stranger", [x509.UniformResourceIdentifier(NAVIGATOR)])
     (tls / "ca.crt").write_bytes((stage.endpoint.tls_dir / "ca.crt").read_bytes())
-    async with Mobility(replace(stage.endpoint, tls_dir=tls), patience_s=0.3) as drone:
+    async with Mobility(replace(stage.endpoint, tls_dir=tls), reconnect_timeout_s=0.3) as drone:
         with pytest.raises(fractus.Unavailable):
             await drone.position()
     assert stage.drone.calls == []
@@ -309,7 +309,7 @@ async def test_missing_certificates_are_named(stage: Stage, tmp_path: Path) -> N
 
 
 async def test_pictures_come_whole_or_not_at_all(stage: Stage) -> None:
-    async with Camera(stage.endpoint, patience_s=0.5) as camera:
+    async with Camera(stage.endpoint, reconnect_timeout_s=0.5) as camera:
         info = await camera.capture(width=800)
         assert info.width == 800
         assert await camera.retrieve(info.name) == stage.pictures.picture

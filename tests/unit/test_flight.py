@@ -7,7 +7,7 @@ import pytest
 from depth import examples
 from fractus_core.api.geometry import Position
 from fractus_core.planning import Flight, Settings, flight_of, operation_area
-from fractus_core.planning.flight import Mission, chauffeur_legs, first_missed
+from fractus_core.planning.flight import Mission, first_missed, transit_legs
 from fractus_core.planning.tour import short_tour
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
@@ -142,15 +142,15 @@ def test_stay_in_a_region_counts():
     assert Mission(app.spec, area, Settings()).estimate(HOME, drone("d")).needed_min == pytest.approx(9 + 2, rel=1e-3)
 
 
-def test_chauffeur_flies_to_between_and_from_control_points():
+def test_the_system_flies_to_between_and_from_control_points():
     points = [{"navigation": "pathBased", "path": [at(x, 0), at(x + 50, 0)]} for x in (100, 400)]
     spec = application(navigator(PATH) | {"control": "partial", "controlPoints": points}).spec
     area = operation_area(spec, {}, 7)
-    legs = chauffeur_legs(spec, area, HOME, {})
+    legs = transit_legs(spec, area, HOME, {})
     metres = [tuple(round(FRAME.xy(p.lat, p.lon)[0]) for p in (leg.start, leg.end)) for leg in legs]
     assert metres == [(0, 100), (150, 400), (450, 0)]
     full = application(navigator(PATH)).spec
-    assert chauffeur_legs(full, area, HOME, inventory().depots) == []
+    assert transit_legs(full, area, HOME, inventory().depots) == []
 
 
 def test_unordered_points_are_joined_by_a_short_way():

@@ -62,15 +62,15 @@ def test_a_path_with_many_turns_is_granted_within_a_centimetre():
 
 
 def test_an_outline_with_more_points_than_a_ring_takes_is_rounded_further(monkeypatch):
-    monkeypatch.setattr(grants, "RING_POINTS", 150)
+    monkeypatch.setattr(grants, "MAX_RING_POINTS", 150)
     (grant,) = compiled(components=[navigator(furrows(12))])
     (area,) = grant.operation_area
     assert len(area.polygon.exterior) <= 150
-    assert 0.011 < _off_the_plan_m(grant, furrows(12)) < grants.COARSEST_M
+    assert 0.011 < _off_the_plan_m(grant, furrows(12)) < grants.MAX_ROUNDING_M
 
 
 def test_a_path_with_too_many_meshes_is_refused_with_a_sentence(monkeypatch):
-    monkeypatch.setattr(grants, "HOLES", 0)
+    monkeypatch.setattr(grants, "MAX_HOLES", 0)
     meshes = [at(0, 0, 10), at(60, 0, 10), at(60, 60, 10), at(0, 60, 10), at(0, 0, 10)]
     with pytest.raises(
         InvalidObject, match=r"^spec\.components: .* 1 holes, more than .*; give fewer waypoints, or a region"

@@ -9,7 +9,7 @@ from depth import examples
 from fractus_core.api import Drone
 from fractus_core.api.nodes import Interface
 from fractus_core.geo import geodesic_m
-from fractus_core.planning import Infeasible, Settings, Whereabouts, flight_of, plan
+from fractus_core.planning import Infeasible, NodeLocations, Settings, flight_of, plan
 from fractus_core.planning.candidates import direct_range_m, direct_reach_m
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -183,11 +183,11 @@ def test_a_cheaper_cover_does_not_move_what_covers():
 
 @given(st.integers(0, 10_000))
 @settings(max_examples=examples(15), deadline=None)
-def test_whereabouts_that_followed_every_change_plan_the_same(seed):
+def test_locations_that_followed_every_change_plan_the_same(seed):
     fleet, edges, hosts = scene(seed)
     stock = inventory(fleet, edges, hosts)
     rng = random.Random(seed)
-    followed = Whereabouts()
+    followed = NodeLocations()
     for thing in rng.sample([*fleet, *edges], k=len(fleet) + len(edges)):
         away = {"home": at(9000, 9000)} if isinstance(thing, Drone) else {"location": at(9000, 9000)}
         moved = type(thing).from_body(manifest(thing.KIND, thing.name, thing.spec.to_dict() | away))
@@ -201,14 +201,14 @@ def test_whereabouts_that_followed_every_change_plan_the_same(seed):
         followed.upsert_depot(depot)
     for one in stock.hosts.values():
         followed.upsert_host(one.name, one.node_class)
-    assert plan(TRAFFIC, dataclasses.replace(stock, whereabouts=followed)) == plan(TRAFFIC, stock)
+    assert plan(TRAFFIC, dataclasses.replace(stock, locations=followed)) == plan(TRAFFIC, stock)
 
 
 def test_drones_without_a_home_stand_in_their_depot_once_there_is_one():
     kept = Drone.from_body(
         manifest("Drone", "d", drone("d").spec.to_dict() | {"home": None}, status=drone("d").status.to_dict())
     )
-    known = Whereabouts()
+    known = NodeLocations()
     known.upsert_drone(kept)
     assert known.homeless == {"d"}
     known.upsert_depot(inventory().depots["base"])
@@ -244,14 +244,14 @@ def test_passengers_come_along_with_a_drone_that_flies_by():
     assert (result.drone.node, result.drone.shared_with) == ("busy", "default/other")
     assert result.drone.mission is None
     assert [a.node for a in result.drone.alternatives] == ["idle"]
-    assert result.drone.chauffeur == ()
+    assert result.drone.transit == ()
 
 
 def test_passengers_do_not_come_along_against_the_order():
     stock = shared([drone("busy"), drone("idle")], {"busy": flown_by_other()})
     result = plan(passenger([at(250, 3), at(120, 0)]), stock)
     assert (result.drone.node, result.drone.shared_with) == ("idle", None)
-    assert len(result.drone.chauffeur) == 3
+    assert len(result.drone.transit) == 3
     busy = next(r for r in result.rejected if r.node == "busy")
     assert busy.reason == "Claimed"
     assert "does not visit pointsOfInterest.points[1] in this order" in busy.message
@@ -286,7 +286,7 @@ def test_partial_control_takes_drones_of_depots_nearby():
     partial = application(navigator([at(950, 0, 10)], point=start, control="partial"))
     result = plan(partial, inventory(fleet))
     assert result.drone.node == "near"
-    assert [round(FRAME.xy(leg.end.lat, leg.end.lon)[0]) for leg in result.drone.chauffeur] == [900, 0]
+    assert [round(FRAME.xy(leg.end.lat, leg.end.lon)[0]) for leg in result.drone.transit] == [900, 0]
     assert reasons(result) == {("Navigator", "far"): "TooFar"}
     with pytest.raises(Infeasible):
         plan(application(navigator([at(950, 0, 10)], point=start)), inventory(fleet))

@@ -10,7 +10,7 @@ import pytest
 import shapely
 from depth import examples
 from fractus_core.api.nodes import CameraFeatures
-from fractus_core.policy.footprint import SIGHT_M, Footprint, footprint, lens_of
+from fractus_core.policy.footprint import MAX_SIGHT_M, Footprint, footprint, lens_of
 from fractus_core.policy.privacy import compose, judge_privacy, remaining
 from fractus_core.policy.values import Attitude, Call, Filter, Lens, Situation
 from hypothesis import assume, given, settings
@@ -77,7 +77,7 @@ def test_whatever_may_be_in_the_picture_is_in_the_footprint(
     for ground_m in (0.0, -errors[2]):
         reach = (above_m - ground_m) / direction[2]
         north, east = direction[0] * reach, direction[1] * reach
-        if math.hypot(north, east) > SIGHT_M:
+        if math.hypot(north, east) > MAX_SIGHT_M:
             continue
         x, y = (errors[0] * turn[0] * 0.7, errors[0] * turn[1] * 0.7)
         shown = view(now)

@@ -12,7 +12,7 @@ import pytest
 import shapely
 from fractus_core.policy.compiled import CompiledGrant, for_transit
 from fractus_core.policy.engine import judge
-from fractus_core.policy.routes import ROOM_M, route
+from fractus_core.policy.routes import CLEARANCES_M, route
 from fractus_core.policy.values import Airframe, GotoArgs, Situation
 from policy_world import Corners, altitude, at, box, compiled, exclusion, goto, inclusion, policy, ring, spec, zone
 
@@ -134,7 +134,7 @@ def test_from_a_start_too_close_to_a_zone_the_first_leg_leads_away() -> None:
 
 
 def test_a_narrow_gap_is_used_when_there_is_no_wider_one() -> None:
-    gap = 2 * (2.5 + ROOM_M[1]) + 0.6
+    gap = 2 * (2.5 + CLEARANCES_M[1]) + 0.6
     grant = free(exclusion(box(-500, 40, 0, 50), name="west"), exclusion(box(gap, 40, 500, 50), name="east"))
     way = find(grant, (-30, 0), (-30, 100))
     assert way is not None
@@ -145,7 +145,7 @@ def test_a_narrow_gap_is_used_when_there_is_no_wider_one() -> None:
 
 def _shortest(zones: list[Corners], start: tuple[float, float], to: tuple[float, float]) -> float:
     """Dijkstra over all pairs of corners of finely buffered zones: slow, simple, and apart from the engine's search."""
-    walls = shapely.union_all([shapely.Polygon(z).buffer(2.5 + ROOM_M[0], quad_segs=4) for z in zones])
+    walls = shapely.union_all([shapely.Polygon(z).buffer(2.5 + CLEARANCES_M[0], quad_segs=4) for z in zones])
     nodes = [start, to, *map(tuple, shapely.get_coordinates(walls.buffer(0.01)))]
     inner = walls.buffer(-1e-3)
     costs, done = {0: 0.0}, set()

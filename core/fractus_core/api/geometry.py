@@ -42,13 +42,13 @@ class Circle(Model):
     radius: float = Field(gt=0, le=200_000, description="Metres, above 0.")
 
 
-RING_POINTS = 10_000
+MAX_RING_POINTS = 10_000
 """Points of a ring at most: the outline of a path with a thousand turns has several a turn."""
 
-HOLES = 1000
+MAX_HOLES = 1000
 """Holes of a polygon at most: a path that crosses itself leaves one in each of its meshes."""
 
-Ring = Annotated[tuple[Point, ...], Field(min_length=3, max_length=RING_POINTS)]
+Ring = Annotated[tuple[Point, ...], Field(min_length=3, max_length=MAX_RING_POINTS)]
 
 
 class Polygon(Model):
@@ -58,7 +58,7 @@ class Polygon(Model):
     """
 
     exterior: Ring = Field(description="The outer ring, three points or more, in order, not closed.")
-    holes: tuple[Ring, ...] = Field(default=(), max_length=HOLES, description="Rings cut out of the exterior.")
+    holes: tuple[Ring, ...] = Field(default=(), max_length=MAX_HOLES, description="Rings cut out of the exterior.")
 
 
 class Area(Model):

@@ -145,7 +145,7 @@ class DroneSpec(Model):
     autonomy: int | None = Field(
         default=None,
         ge=0,
-        description="Seconds its pods stay when the node is unreachable; unset: for ever.",
+        description="Seconds its pods stay when the node is unreachable; unset: indefinitely.",
     )
 
 

@@ -55,7 +55,7 @@ class DroneChoice(Model):
         default=None, description="namespace/name of the application that flies the drone; this one comes along."
     )
     mission: Mission | None = Field(default=None, description="Unset when the application comes along.")
-    chauffeur: tuple[Leg, ...] = Field(default=(), description="The legs that the system flies, in order.")
+    transit: tuple[Leg, ...] = Field(default=(), description="The legs that the system flies, in order.")
     alternatives: tuple[Alternative, ...] = ()
 
 
@@ -183,7 +183,7 @@ class GrantSpec(Model):
     limits: GrantedLimits | None = None
     policies: tuple[GrantedPolicy, ...] = ()
     issued_at: datetime | None = Field(
-        default=None, description="Set by who signs it; of two Grants for one instance the later one counts."
+        default=None, description="Set when it is signed; of two Grants for one instance the later one counts."
     )
 
     @property

@@ -16,10 +16,10 @@ from fractus_core.api.model import InvalidObject
 from fractus_core.geo.frames import LocalFrame
 
 _SEGMENTS = (8, 32)
-"""Straight pieces per quarter of a circle, at least and at most: the area is right within 0.4 %."""
+"""Straight pieces per quarter of a circle, minimum and maximum: the area is right within 0.4 %."""
 
 _CORNER_M = 0.01
-"""Between these, so many pieces that their corners stick out of the circle by no more than this."""
+"""Between these, as few pieces as keep the corners within this distance of the circle."""
 
 _SNAPPED = 1e-5
 """GEOS merges corners that are closer than about a millionth of the radius, which would cut short a leg as short."""
@@ -94,9 +94,9 @@ def corridor(frame: LocalFrame, points: Iterable[Point], radius_m: float) -> Bas
 
 def _circumscribed(radius_m: float) -> tuple[float, int]:
     """How far the corners of a polygon around a circle lie from its middle, and how many pieces a quarter has."""
-    enough = math.ceil(math.pi / 4 / math.acos(radius_m / (radius_m + _CORNER_M)))
-    fewest, most = _SEGMENTS
-    segments = min(max(enough, fewest), most)
+    needed = math.ceil(math.pi / 4 / math.acos(radius_m / (radius_m + _CORNER_M)))
+    fewest, maximum = _SEGMENTS
+    segments = min(max(needed, fewest), maximum)
     return radius_m / math.cos(math.pi / (4 * segments)), segments
 
 

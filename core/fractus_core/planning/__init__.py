@@ -4,8 +4,8 @@ from fractus_core.planning.area import OperationArea, operation_area
 from fractus_core.planning.flight import flight_of
 from fractus_core.planning.index import SpatialIndex
 from fractus_core.planning.inventory import CLASS_LABEL, Flight, Host, Inventory, Settings
+from fractus_core.planning.locations import NodeLocations
 from fractus_core.planning.plan import Infeasible, instance_name, plan
-from fractus_core.planning.whereabouts import Whereabouts
 
 __all__ = [
     "CLASS_LABEL",
@@ -13,10 +13,10 @@ __all__ = [
     "Host",
     "Infeasible",
     "Inventory",
+    "NodeLocations",
     "OperationArea",
     "Settings",
     "SpatialIndex",
-    "Whereabouts",
     "flight_of",
     "instance_name",
     "operation_area",

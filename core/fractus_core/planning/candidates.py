@@ -15,7 +15,7 @@ from fractus_core.planning.inventory import Host, Settings
 class Ledger:
     """What hosts have left while a plan is made: allocatable minus requested minus what the plan already placed.
 
-    What a component had on a node in the plan before is kept for it until it is placed anew, so that nothing that comes
+    What a component had on a node in the plan before is kept for it until it is placed again, so that nothing that comes
     first in the manifest drives out what runs there.
     """
 

@@ -17,7 +17,7 @@ _Integers = NDArray[np.int64]
 SAMPLES = 8192
 """About how many samples an area gets; more if it is long and narrow."""
 
-_MOST_SAMPLES = 200_000
+_MAX_SAMPLES = 200_000
 _ACROSS = 4
 _TILT_RAD = math.atan((math.sqrt(5) - 1) / 2)
 """The lattice's rows follow no direction that roads and manifests like, so that straight legs are sampled evenly."""
@@ -40,7 +40,7 @@ class Samples:
     def __init__(self, shape: BaseGeometry) -> None:
         area, outline = float(shape.area), float(shape.length)
         width = 2 * area / outline
-        finest = math.sqrt(area / _MOST_SAMPLES)
+        finest = math.sqrt(area / _MAX_SAMPLES)
         self.spacing_m = max(finest, min(math.sqrt(area / SAMPLES), width / _ACROSS))
         rows, columns = _lattice(shape, self.spacing_m)
         self._first = (int(rows.min()), int(columns.min()))
@@ -128,7 +128,7 @@ CoverStrategy = Callable[[CoverScene, Callable[[str], bool]], Sequence[Pick]]
 def greedy_cover(scene: CoverScene, fits: Callable[[str], bool]) -> list[Pick]:
     """Pick the candidate that adds most, again and again, until the share is reached or nothing is added.
 
-    Candidates that are kept come first, so that a plan made anew moves as little as it can. Gains only shrink as picks
+    Candidates that are kept come first, so that a new plan moves as little as it can. Gains only shrink as picks
     are made, so that a gain known from before is an upper bound, and only the candidates with the highest bounds are
     looked at again (lazy evaluation: M. Minoux 1978; CELF: J. Leskovec et al., KDD 2007).
     """

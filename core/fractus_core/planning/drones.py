@@ -14,7 +14,7 @@ from fractus_core.geo import ground
 from fractus_core.planning.area import OperationArea, start_of
 from fractus_core.planning.candidates import SUITABLE, Check, check_host, check_resources, check_services
 from fractus_core.planning.draft import Draft
-from fractus_core.planning.flight import Estimate, Mission, chauffeur_legs, first_missed, remaining_minutes
+from fractus_core.planning.flight import Estimate, Mission, first_missed, remaining_minutes, transit_legs
 from fractus_core.planning.index import Near
 from fractus_core.planning.inventory import DroneFacts
 
@@ -89,13 +89,13 @@ def choose_drone(draft: Draft, area: OperationArea, candidates: DroneCandidates)
     for component in components:
         draft.place(component, "drone", best.drone.name)
     home = _home(draft, best.drone)
-    legs = chauffeur_legs(draft.spec, area, home, draft.inventory.depots) if home is not None and not best.used else []
+    legs = transit_legs(draft.spec, area, home, draft.inventory.depots) if home is not None and not best.used else []
     return DroneChoice(
         node=best.drone.name,
         score=round(best.score, 6),
         shared_with="/".join(draft.inventory.flights[best.drone.name].holder) if best.used else None,
         mission=_mission(best.mission) if best.mission is not None else None,
-        chauffeur=tuple(legs),
+        transit=tuple(legs),
         alternatives=tuple(
             Alternative(node=r.drone.name, score=round(r.score, 6)) for r in ranked[1 : 1 + _ALTERNATIVES]
         ),

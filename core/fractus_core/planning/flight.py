@@ -103,9 +103,7 @@ def remaining_minutes(drone: Drone) -> float:
     return mobility.max_flight_time * (battery.remaining if battery else 1.0)
 
 
-def chauffeur_legs(
-    spec: ApplicationSpec, area: OperationArea, home: Position, depots: Mapping[str, Depot]
-) -> list[Leg]:
+def transit_legs(spec: ApplicationSpec, area: OperationArea, home: Position, depots: Mapping[str, Depot]) -> list[Leg]:
     """The legs that the system flies itself.
 
     To and between the control points of a driver with partial control, through all points of interest of an
@@ -154,7 +152,7 @@ def flight_of(application: Application, depots: Mapping[str, Depot], reached: in
 def ahead(flight: Flight, place: Position, radius_m: float) -> Flight | None:
     """What is left of a flight whose drone is at a place: from there on, along the path.
 
-    Where the path passes the place more than once, the last passage counts, so that nobody is promised what may lie behind.
+    Where the path passes the place more than once, the last passage counts, so that no application is promised what may lie behind.
 
     Returns:
         The rest of the flight; None where the drone is nowhere near its path, so that nothing is known of its way.

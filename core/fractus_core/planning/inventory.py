@@ -11,7 +11,7 @@ from fractus_core.api.model import InvalidObject
 from fractus_core.api.nodes import Depot, Drone, EdgeNode
 from fractus_core.api.policies import Policy, Zone
 from fractus_core.planning.coverage import CoverStrategy
-from fractus_core.planning.whereabouts import Whereabouts
+from fractus_core.planning.locations import NodeLocations
 
 CLASS_LABEL = "fractus.dev/class"
 
@@ -58,11 +58,11 @@ class Inventory:
     """All that a plan and its grants are made from; every mapping is by object name.
 
     Attributes:
-        unreadable_policies: policies that exist but cannot be read, with what is wrong: they may hold for anybody.
+        unreadable_policies: policies that exist but cannot be read, with what is wrong: they may hold for every component.
         unreadable_zones: zones that exist but cannot be read, with what is wrong.
         claimed: drones that an application has, by drone: (namespace, name) of the application.
-        flights: what claimed drones fly, by drone, as far as it is known; without it nobody comes along.
-        whereabouts: indexes of these very mappings, from whoever keeps them current; None: built when first needed.
+        flights: what claimed drones fly, by drone, as far as it is known; without it no application can come along.
+        locations: indexes of these very mappings, kept current by the caller; None: built when first needed.
     """
 
     hosts: Mapping[str, Host] = field(default_factory=dict)
@@ -75,17 +75,17 @@ class Inventory:
     unreadable_zones: Mapping[str, str] = field(default_factory=dict)
     claimed: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     flights: Mapping[str, Flight] = field(default_factory=dict)
-    whereabouts: Whereabouts | None = field(default=None, compare=False, repr=False)
-    _built: list[Whereabouts] = field(default_factory=list, init=False, compare=False, repr=False)
+    locations: NodeLocations | None = field(default=None, compare=False, repr=False)
+    _built: list[NodeLocations] = field(default_factory=list, init=False, compare=False, repr=False)
 
-    def located(self) -> Whereabouts:
+    def located(self) -> NodeLocations:
         """The indexes: those given, or built once from the mappings."""
-        if self.whereabouts is not None:
-            return self.whereabouts
+        if self.locations is not None:
+            return self.locations
         if not self._built:
             cloud = (host.name for host in self.hosts.values() if host.node_class == "cloud")
             self._built.append(
-                Whereabouts.of(edge_nodes=self.edge_nodes, drones=self.drones, depots=self.depots, cloud=cloud)
+                NodeLocations.of(edge_nodes=self.edge_nodes, drones=self.drones, depots=self.depots, cloud=cloud)
             )
         return self._built[0]
 
@@ -162,7 +162,7 @@ class Settings:
         Raises:
             InvalidObject: naming the setting.
         """
-        for name, (spelled, least, most) in _BOUNDS.items():
+        for name, (spelled, minimum, maximum) in _BOUNDS.items():
             value = getattr(self, name)
-            if not least <= value <= most:
-                raise InvalidObject(spelled, f"must be {least:g} to {most:g}, not {value:g}")
+            if not minimum <= value <= maximum:
+                raise InvalidObject(spelled, f"must be {minimum:g} to {maximum:g}, not {value:g}")

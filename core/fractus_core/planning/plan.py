@@ -42,7 +42,7 @@ def plan(
 
     Rejected nodes: every node that was a candidate by its place and was looked at is listed with the first rule it
     fails. Of the nodes that are too far away, only the nearest are (Settings.near_misses for each place asked for);
-    nodes behind the best ones, which nobody had to look at, are not. Above Settings.rejections_listed the plan tells
+    nodes behind the best ones, which did not have to be looked at, are not. Above Settings.rejections_listed the plan tells
     how many it leaves out.
 
     Raises:
@@ -64,7 +64,7 @@ def plan_in_steps(
     settings: Settings | None = None,
     previous: DeploymentPlanSpec | None = None,
 ) -> Generator[str, None, DeploymentPlanSpec]:
-    """Plan as `plan` does, naming each phase when it is done, for who wants to measure them.
+    """Plan as `plan` does, naming each phase when it is done, for benchmarks.
 
     The phases are the thesis' own: area, then for each kind of component (drone, static, hybrid, cloud) the search of
     candidates by place (`drone.candidates`) and the choice among them (`drone.host`).

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-_EXACT = 9
+_MAX_EXACT = 9
 _MAX_PASSES = 50
 
 
@@ -22,7 +22,7 @@ def short_tour(xy: Sequence[tuple[float, float]]) -> list[int]:
     distance = np.hypot(*(places[:, None, :] - places[None, :, :]).transpose(2, 0, 1))
     if len(places) <= 2:
         return list(range(len(places)))
-    if len(places) <= _EXACT:
+    if len(places) <= _MAX_EXACT:
         return _shortest(distance)
     return _untangled(_greedy(distance), distance)
 

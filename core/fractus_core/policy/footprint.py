@@ -15,11 +15,11 @@ from fractus_core.geo import LocalFrame
 from fractus_core.policy.motion import XY
 from fractus_core.policy.values import Attitude, Lens, Situation
 
-SIGHT_M = 10_000.0
+MAX_SIGHT_M = 10_000.0
 """Nothing is told apart from further away: at 5 degrees of view, 8 megapixels resolve 0.3 m there."""
-WIDEST_DEG = 80.0
+MAX_HALF_VIEW_DEG = 80.0
 """A view that reaches further to one side, errors included, is taken to see everything."""
-_FURTHEST_TURN_DEG = 60.0
+_MAX_TURN_DEG = 60.0
 _ARC_DEG = 15.0
 _SIDES = 24
 _CIRCLE = tuple(
@@ -117,7 +117,7 @@ def footprint(now: Situation, frame: LocalFrame) -> Footprint | None:
         for sx, sy in ((1, 1), (1, -1), (-1, -1), (-1, 1))
     ]
     high = max(now.altitude_m + now.altitude_error_m + now.relief_m, 0.1)
-    if any(down * SIGHT_M <= high * math.hypot(north, east, down) for north, east, down in corners):
+    if any(down * MAX_SIGHT_M <= high * math.hypot(north, east, down) for north, east, down in corners):
         vertical = _sees_vertical(axis, right, up, half)
         return _everything(at, now) if vertical else _sector(at, now, axis, corners, attitude.yaw_error_deg)
     below = _turned([(east / down, north / down) for north, east, down in corners], attitude.yaw_error_deg)
@@ -128,7 +128,7 @@ def footprint(now: Situation, frame: LocalFrame) -> Footprint | None:
 
 
 def _attitude(now: Situation) -> Attitude | None:
-    """How the airframe is turned, as far as it matters; None where nobody knows what ground lies below the camera."""
+    """How the airframe is turned, as far as it matters; None where the ground below the camera is unknown."""
     if now.altitude_m + now.altitude_error_m + now.relief_m < 0.0:
         return None
     if now.attitude is None and now.lens is not None and now.lens.stabilised:
@@ -154,7 +154,10 @@ def lens_of(camera: CameraFeatures | None) -> Lens | None:
 def _everything(at: XY, now: Situation) -> Footprint:
     x, y = at
     return Footprint(
-        _hull([(x + SIGHT_M * e, y + SIGHT_M * n) for e, n in _CIRCLE]), now.position_error_m, math.inf, math.inf
+        _hull([(x + MAX_SIGHT_M * e, y + MAX_SIGHT_M * n) for e, n in _CIRCLE]),
+        now.position_error_m,
+        math.inf,
+        math.inf,
     )
 
 
@@ -164,7 +167,7 @@ def _widened(lens: Lens, error_deg: float) -> tuple[float, float] | None:
     On the sphere of directions a turn by e moves a ray sideways by asin(sin e / cos elevation) at most.
     """
     wide, tall, error = (math.radians(v) for v in (lens.horizontal_deg / 2, lens.vertical_deg / 2, error_deg))
-    limit = math.radians(WIDEST_DEG)
+    limit = math.radians(MAX_HALF_VIEW_DEG)
     if not (0 < wide < limit and 0 < tall < limit and 0 <= error < math.pi / 2 - max(wide, tall)):
         return None
     wider = wide + math.asin(math.sin(error) / math.cos(tall))
@@ -211,7 +214,7 @@ def _sector(at: XY, now: Situation, axis: Vector, corners: list[Vector], error_d
         return _everything(at, now)
     steps = math.ceil((right - left) / math.radians(_ARC_DEG))
     step = (right - left) / steps
-    reach_m, (x, y) = SIGHT_M / math.cos(step / 2), at
+    reach_m, (x, y) = MAX_SIGHT_M / math.cos(step / 2), at
     bearings = [ahead + left + i * step for i in range(steps + 1)]
     points = [at, *((x + reach_m * math.sin(b), y + reach_m * math.cos(b)) for b in bearings)]
     return Footprint(_hull(points), now.position_error_m, math.inf, math.inf)
@@ -221,7 +224,7 @@ def _turned(corners: list[XY], error_deg: float) -> list[XY]:
     """Points whose hull holds the corners of a piece of ground, turned around the camera by every error of yaw."""
     if error_deg <= 0.0:
         return corners
-    if error_deg > _FURTHEST_TURN_DEG:
+    if error_deg > _MAX_TURN_DEG:
         reach = max(math.hypot(e, n) for e, n in corners)
         return [(reach * e, reach * n) for e, n in _CIRCLE]
     turn = math.radians(error_deg)

@@ -10,7 +10,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api import Application, Component, Drone, EdgeNode, InvalidObject, Policy
-from fractus_core.api.geometry import HOLES, RING_POINTS, Area, Circle, Point, Position
+from fractus_core.api.geometry import MAX_HOLES, MAX_RING_POINTS, Area, Circle, Point, Position
 from fractus_core.api.plans import (
     DeploymentPlanSpec,
     GrantApplication,
@@ -28,7 +28,7 @@ from fractus_core.planning.inventory import Inventory, Settings
 ROUNDING_M = 0.01
 """How far the outline of a granted area may be from the planned one: a third of the points do."""
 
-COARSEST_M = 0.16
+MAX_ROUNDING_M = 0.16
 """How far it may be where an outline has more points than a ring takes."""
 
 FIXED_NODE_REACH_M = 1000.0
@@ -139,17 +139,17 @@ def _outlined(shape: BaseGeometry) -> BaseGeometry:
         InvalidObject: it has too many even so.
     """
     tolerance_m = ROUNDING_M
-    while tolerance_m <= COARSEST_M:
+    while tolerance_m <= MAX_ROUNDING_M:
         rounded = shape.simplify(tolerance_m)
         rings = shapely.get_rings(shapely.get_parts(rounded))
         points = int(shapely.get_num_coordinates(rings).max(initial=0)) - 1
         holes = int(shapely.get_num_interior_rings(shapely.get_parts(rounded)).max(initial=0))
-        if points <= RING_POINTS and holes <= HOLES:
+        if points <= MAX_RING_POINTS and holes <= MAX_HOLES:
             return rounded
         tolerance_m *= 2
     raise InvalidObject(
         "spec.components",
-        f"the area that the drone flies in has {points} corners and {holes} holes, more than {RING_POINTS} and {HOLES};"
+        f"the area that the drone flies in has {points} corners and {holes} holes, more than {MAX_RING_POINTS} and {MAX_HOLES};"
         " give fewer waypoints, or a region instead of a path",
     )
 

@@ -38,7 +38,7 @@ from fractus_core.policy.values import POSITION_UNKNOWN, Call, GotoArgs, Situati
 
 MAX_RANGE_M = 100_000.0
 NEAR_DEG = 30.0
-"""Nobody asks further whether a target so near, in degrees, lies on the frame's side of the globe."""
+"""A target this near, in degrees, certainly lies on the frame's side of the globe."""
 
 
 def judge_goto(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:

@@ -15,10 +15,10 @@ from fractus_core.policy.limits import Bound, altitude_bounds, speed_bounds, str
 from fractus_core.policy.motion import XY, margin_m, moving, standing, stop_altitude_m, stop_point
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Situation, Verdict
 
-STRAY = 0.3
+TRACKING_SHARE = 0.3
 """Share of the tracking margin of accepted legs that the monitor keeps as well."""
 
-SINKS_MPS = 0.5
+SINKING_MPS = 0.5
 
 DEEPER_M = 0.6
 """A drone on the wrong side of a fence is stopped again only when it moves this much further in."""
@@ -28,7 +28,7 @@ def monitor(now: Situation, grant: CompiledGrant, *, leaving: bool = False, chan
     """What the system must do about a flying drone at this moment.
 
     Judged is the way from the present position to where the drone comes to rest if it is told to stop now, with the
-    position error around it: a smaller margin than that of accepted legs, so that a leg flown as accepted never alarms.
+    position error around it: a smaller margin than that of accepted legs, so that a leg flown as accepted never triggers it.
 
     Args:
         now: the state of the drone.
@@ -49,7 +49,7 @@ def monitor(now: Situation, grant: CompiledGrant, *, leaving: bool = False, chan
     lat, lon = now.lat, now.lon
     if lat is None or lon is None or not now.sound:
         return Verdict("takeover", None, "PositionUnknown", "the drone's position is unknown", (), "hover")
-    start, margin = grant.frame.xy(lat, lon), now.position_error_m + STRAY * now.airframe.tracking_m
+    start, margin = grant.frame.xy(lat, lon), now.position_error_m + TRACKING_SHARE * now.airframe.tracking_m
     surging = stop_point(now, start)
     # A drone that speeds up does so on a way that was judged with room for it, and brakes at its end in time.
     now = replace(now, forward_mps2=min(now.forward_mps2 or 0.0, 0.0))
@@ -198,7 +198,7 @@ def _heights(now: Situation, grant: CompiledGrant, start: XY, stop: XY, rest_m: 
         return None
     bounds = altitude_bounds(grant, now, Air(shapely.points(start), 0.0, now.altitude_m, now.altitude_m))
     if isinstance(bounds, Verdict):
-        sinking = now.down_mps > -SINKS_MPS
+        sinking = now.down_mps > -SINKING_MPS
         return None if sinking else Verdict("deny", None, bounds.code, bounds.reason, bounds.policies, "hover")
     slack = now.altitude_error_m + now.airframe.tracking_m
     over, under = strictest(bounds, above=True), strictest(bounds, above=False)

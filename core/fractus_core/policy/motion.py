@@ -89,7 +89,7 @@ def surge(situation: Situation) -> Surge:
         forward = frame.accel_mps2 if STANDING_MPS <= speed < situation.speed_setpoint_mps else 0.0
     forward = min(max(forward, -frame.accel_mps2), frame.accel_mps2)
     if forward <= 0.0:
-        # Who brakes already brakes on, and has less to add.
+        # A drone that brakes already goes on braking: its speed is lower when the command takes effect.
         left = max(speed + forward * situation.latency_s, 0.0)
         bite_s *= 1.0 + forward / frame.accel_mps2
         return Surge(left, (speed + left) / 2 * situation.latency_s + left * bite_s)
@@ -264,8 +264,8 @@ def swept(now: Situation, at: XY, asked: VelocityArgs) -> Leg:
     control = (frame.accel_mps2, frame.position_gain)
     # At the earliest it obeys at once, and slower than it may be by the latest: so it comes furthest the new way.
     braked = speed - frame.accel_mps2 * now.latency_s if now.forward_mps2 is None else begin.speed_mps
-    least = max(min(speed, braked), 0.0)
-    ways = _course((ahead[0] * least, ahead[1] * least), wanted, lasting_s, frame, control)
+    slowest = max(min(speed, braked), 0.0)
+    ways = _course((ahead[0] * slowest, ahead[1] * slowest), wanted, lasting_s, frame, control)
     late = (ahead[0] * begin.run_m, ahead[1] * begin.run_m)
     ways += [(x + late[0], y + late[1]) for x, y in _course(present, wanted, lasting_s, frame, control)]
     climb = -now.down_mps

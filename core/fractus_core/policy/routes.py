@@ -22,27 +22,27 @@ from fractus_core.policy.values import Situation
 
 Floats = NDArray[np.float64]
 
-ROOM_M = (1.5, 0.25)
+CLEARANCES_M = (1.5, 0.25)
 """What legs keep beyond the engine's margin, where there is room, and else: a drone that reached a waypoint within a metre
 finds the next leg legal."""
 
 CORNER_M = 0.1
 """Waypoints lie this much further out than their legs must, so that rounding costs no leg."""
 
-PATIENCE = 3000
-"""So many legs are tested before a search gives up, half a second's work or so."""
+MAX_LEGS_TESTED = 3000
+"""A search gives up after this many legs, half a second's work or so."""
 
-LONGER = 1.2
-"""A way may be so much longer than the shortest one, for the sake of a quicker search; a percent or two is usual."""
+MAX_EXCESS = 1.2
+"""A way may be longer than the shortest one by this factor, for the sake of a quicker search; a percent or two is usual."""
 
-GLANCE, ANY_WAY = 250, 5.0
-"""The same where it only matters whether there is a way, and somebody waits: some 25 ms."""
+QUICK_MAX_LEGS_TESTED, QUICK_MAX_EXCESS = 250, 5.0
+"""The same where it only matters whether there is a way, and a caller waits for the answer: some 25 ms."""
 
 _SIMPLER_M = 0.2
-_PLAIN = 24
+_MAX_PLAIN_CORNERS = 24
 _SEGMENTS = 3
-_DETOUR = 1.2
-_ROUNDED_M = 1.5
+_MAX_DETOUR = 1.2
+_MAX_ROUNDING_M = 1.5
 _ROUNDING = 1e-6
 _START, _TARGET = 0, 1
 
@@ -89,27 +89,30 @@ def route(
 def searching(
     start: XY, target: XY, now: Situation, grant: CompiledGrant, altitude_m: float, *, from_m: float | None = None
 ) -> Steps:
-    """`route` in steps of a fraction of a millisecond, for who has other things to do meanwhile; returns the way."""
+    """`route` in steps of a fraction of a millisecond, for callers that have other things to do meanwhile; returns the way."""
     figures = (*start, *target, altitude_m, altitude_m if from_m is None else from_m)
     if now.home is None or not now.sound or not all(math.isfinite(figure) for figure in figures):
         return None
     low, high = sorted(figures[-2:])
-    roomy, narrow = (_Search(start, target, _Space.around(now, grant, low, high, room_m)) for room_m in ROOM_M)
+    roomy, narrow = (_Search(start, target, _Space.around(now, grant, low, high, room_m)) for room_m in CLEARANCES_M)
     found = yield from roomy.steps()
-    if found is not None and _length_m(start, found) <= _DETOUR * math.dist(start, target):
+    if found is not None and _length_m(start, found) <= _MAX_DETOUR * math.dist(start, target):
         return (yield from roomy.rounded(found))
     shorter = (yield from narrow.steps()) if not roomy.exhausted else None
-    if shorter is not None and (found is None or _length_m(start, shorter) < _length_m(start, found) / _DETOUR):
+    if shorter is not None and (found is None or _length_m(start, shorter) < _length_m(start, found) / _MAX_DETOUR):
         return (yield from narrow.rounded(shorter))
     return (yield from roomy.rounded(found)) if found is not None else None
 
 
 def leads(start: XY, target: XY, now: Situation, grant: CompiledGrant, altitude_m: float) -> bool:
-    """Whether a short search, of `GLANCE` legs, finds any legal way from one place to another; see `route`."""
+    """Whether a short search, of `QUICK_MAX_LEGS_TESTED` legs, finds any legal way from one place to another; see `route`."""
     if now.home is None or not now.sound:
         return False
-    space = _Space.around(now, grant, altitude_m, altitude_m, ROOM_M[1])
-    return _finished(_Search(start, target, space, longer=ANY_WAY, patience=GLANCE).steps()) is not None
+    space = _Space.around(now, grant, altitude_m, altitude_m, CLEARANCES_M[1])
+    return (
+        _finished(_Search(start, target, space, max_excess=QUICK_MAX_EXCESS, max_legs=QUICK_MAX_LEGS_TESTED).steps())
+        is not None
+    )
 
 
 def _finished(search: Steps) -> tuple[XY, ...] | None:
@@ -208,7 +211,7 @@ def _outline(shape: BaseGeometry, away_m: float) -> BaseGeometry:
     """A shape grown or shrunk, with few corners, none nearer than that."""
     # GEOS rounds the number of pieces, so one may span half as much again as a quarter circle's share.
     away_m /= math.cos(0.75 * math.pi / 2 / _SEGMENTS)
-    if shapely.get_num_coordinates(shape) > _PLAIN:
+    if shapely.get_num_coordinates(shape) > _MAX_PLAIN_CORNERS:
         return shape.buffer(away_m + math.copysign(_SIMPLER_M, away_m), quad_segs=_SEGMENTS).simplify(_SIMPLER_M)
     return shape.buffer(away_m, quad_segs=_SEGMENTS)
 
@@ -238,18 +241,18 @@ def _meeting(before: XY, first: XY, second: XY, after: XY) -> XY | None:
     along = ((after[0] - before[0]) * vy - (after[1] - before[1]) * vx) / across
     corner = (before[0] + ux * along, before[1] + uy * along)
     extra = math.dist(first, corner) + math.dist(corner, second) - math.dist(first, second)
-    return corner if along >= 1.0 and extra <= _ROUNDED_M else None
+    return corner if along >= 1.0 and extra <= _MAX_ROUNDING_M else None
 
 
 class _Search:
     """A* from start to target over tangents between corners; obstacles are found on the way."""
 
     def __init__(
-        self, start: XY, target: XY, space: _Space, *, longer: float = LONGER, patience: int = PATIENCE
+        self, start: XY, target: XY, space: _Space, *, max_excess: float = MAX_EXCESS, max_legs: int = MAX_LEGS_TESTED
     ) -> None:
         self._space = space
-        self._longer = longer
-        self._patience = patience
+        self._max_excess = max_excess
+        self._max_legs = max_legs
         self._ends = (start, target)
         # The ends count as corners without neighbours: anything is tangent to them.
         self._nodes: Floats = np.asarray([start * 3, target * 3])
@@ -291,7 +294,7 @@ class _Search:
     @property
     def exhausted(self) -> bool:
         """Whether it gave up."""
-        return len(self._clear) >= self._patience
+        return len(self._clear) >= self._max_legs
 
     def rounded(self, way: tuple[XY, ...]) -> Steps:
         """The way with neighbouring waypoints made one where the legs meet a little further on: each costs a stop."""
@@ -336,7 +339,7 @@ class _Search:
         left = np.hypot(*(tos[:, :2] - self._nodes[_TARGET, :2]).T)
         for i, j in np.argwhere(good).tolist():
             heapq.heappush(
-                self._heap, (float(cost[i, j] + self._longer * left[j]), first + j, begins[i], float(cost[i, j]))
+                self._heap, (float(cost[i, j] + self._max_excess * left[j]), first + j, begins[i], float(cost[i, j]))
             )
 
     def _open(self, begin: int, end: int) -> bool:
@@ -361,7 +364,7 @@ class _Search:
         return float(x), float(y)
 
     def _learn(self, obstacles: list[Patch | int], begin: XY) -> None:
-        """Take in what blocks a leg: areas to stay in, and of the zones the nearest; who goes round it meets the next."""
+        """Take in what blocks a leg: areas to stay in, and of the zones the nearest: a way around it meets the next."""
         new = [o for o in obstacles if (o if isinstance(o, int) else id(o)) not in self._known]
         if not new:
             return

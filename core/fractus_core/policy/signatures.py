@@ -30,8 +30,8 @@ SIGNER_ANNOTATION = f"{GROUP}/signed-by"
 DOCUMENT_SIGNING = ObjectIdentifier("1.3.6.1.5.5.7.3.36")
 """Extended key usage of RFC 9336; no certificate for TLS has it."""
 
-SKEW = timedelta(minutes=5)
-"""How far the clocks of who signs and who issues the certificate may be apart."""
+MAX_CLOCK_SKEW = timedelta(minutes=5)
+"""How far the clocks of the signer and of the issuer of its certificate may be apart."""
 
 _CONTEXT = b"fractus.dev grant 1\n"
 
@@ -145,5 +145,5 @@ def _issuer(certificate: x509.Certificate, authorities: Sequence[x509.Certificat
 def _check_time(issued_at: datetime, *certificates: x509.Certificate) -> None:
     for certificate in certificates:
         begin, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
-        if not begin - SKEW <= issued_at <= end + SKEW:
+        if not begin - MAX_CLOCK_SKEW <= issued_at <= end + MAX_CLOCK_SKEW:
             raise BadSignature(f"it was issued at {issued_at:%F %T}, when its certificate was not valid")

@@ -34,10 +34,10 @@ from fractus_core.policy.values import (
     deny,
 )
 
-BACK_MPS = 1.0
+RETURN_CLIMB_MPS = 1.0
 """A drone above or below its limits is led back with this vertical speed."""
 
-LEAST_MPS = 0.3
+MIN_SCALED_MPS = 0.3
 """A velocity that would be scaled below this is refused instead."""
 
 _HALVINGS = 8
@@ -177,10 +177,10 @@ def _lead_back(setpoint: _Setpoint, bound: Bound, *, above: bool) -> Verdict | N
     reason = f"the drone would come {side} the limit of {edge:.1f} m of {source}"
     if bound.refuses and toward:
         return deny(f"Altitude{word}Limit", f"{reason}, which refuses it", names)
-    back = BACK_MPS if above else -BACK_MPS
+    back = RETURN_CLIMB_MPS if above else -RETURN_CLIMB_MPS
     strays_m = setpoint.now.airframe.tracking_m
     near = edge + strays_m if above else edge - strays_m
-    if not toward and (abs(args.down_mps) >= BACK_MPS or not _beyond(setpoint, args, near, above=above)):
+    if not toward and (abs(args.down_mps) >= RETURN_CLIMB_MPS or not _beyond(setpoint, args, near, above=above)):
         return None
     level = replace(args, down_mps=0.0)
     if not bound.name and not above:
@@ -221,9 +221,9 @@ def _within_fences(setpoint: _Setpoint) -> Verdict | None:
         return None
     args = setpoint.args
     asked = math.hypot(args.north_mps, args.east_mps, args.down_mps)
-    if any(b.action != "adjust" for b in found) or asked < LEAST_MPS:
+    if any(b.action != "adjust" for b in found) or asked < MIN_SCALED_MPS:
         return broken(found)
-    best, low, high = None, LEAST_MPS / asked, 1.0
+    best, low, high = None, MIN_SCALED_MPS / asked, 1.0
     for _ in range(_HALVINGS):
         share = (low + high) / 2
         scaled = _scaled(args, share)

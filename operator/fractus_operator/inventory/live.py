@@ -22,7 +22,7 @@ from fractus_core.api import (
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning.candidates import requests
 from fractus_core.planning.inventory import Flight, Host, Inventory
-from fractus_core.planning.whereabouts import Whereabouts
+from fractus_core.planning.locations import NodeLocations
 
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind
@@ -111,7 +111,7 @@ class LiveInventory:
         self._aloft: set[str] = set()
         self._bookings = Bookings()
         self._pods: dict[Key, dict[Key, PodView]] = {}
-        self._where = Whereabouts()
+        self._where = NodeLocations()
         self._asked: dict[Key, tuple[OwnedPlan, Submitted, tuple[Asked, ...]]] = {}
         self.rules_revision = 0
 
@@ -168,7 +168,7 @@ class LiveInventory:
             unreadable_policies={p.name: p.problem for p in self.policies.values() if isinstance(p, Broken)},
             claimed={node: claim.holder(uid) for node, claim in self.claims().items()},
             flights=flights or {},
-            whereabouts=self._where,
+            locations=self._where,
         )
 
     def depots_by_name(self) -> Mapping[str, Depot]:

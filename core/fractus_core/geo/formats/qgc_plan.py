@@ -35,7 +35,7 @@ def read_qgc_plan(text: str) -> Imported:
     fence = fields(whole.get("geoFence"), "geoFence")
     if fence and fence.get("version") != _FENCE_VERSION:
         raise InvalidObject(
-            "geoFence.version", f"must be {_FENCE_VERSION}, not {fence.get('version')!r}; save the plan anew"
+            "geoFence.version", f"must be {_FENCE_VERSION}, not {fence.get('version')!r}; save the plan again"
         )
     drafts = Drafts()
     for i, item in enumerate(objects(fence.get("polygons"), "geoFence.polygons")):

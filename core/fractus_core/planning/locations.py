@@ -1,4 +1,4 @@
-"""Where the nodes of an inventory are, kept current one node at a time, so that a plan looks at few of many."""
+"""Indexes of where the nodes of an inventory are, kept current node by node, so that a plan looks at few of many."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from fractus_core.geo import ground
 from fractus_core.planning.index import SpatialIndex
 
 
-class Whereabouts:
+class NodeLocations:
     """Indexes of an inventory: edge nodes by place, drones by depot and by where they stand, which hosts are cloud.
 
-    Whoever keeps an inventory for long (the operator) keeps one of these beside it and tells it of every node that
+    The operator, which keeps an inventory for long, keeps one of these beside it and tells it of every node that
     appears, moves or goes, in microseconds; a plan made from manifests builds its own.
     """
 
@@ -35,8 +35,8 @@ class Whereabouts:
         drones: Mapping[str, Drone],
         depots: Mapping[str, Depot],
         cloud: Iterable[str],
-    ) -> Whereabouts:
-        """The whereabouts of whole collections, faster than one by one."""
+    ) -> NodeLocations:
+        """The indexes of whole collections, faster than one by one."""
         known = cls()
         known.edge_nodes = SpatialIndex.of(
             (n.name, n.spec.location.lat, n.spec.location.lon) for n in edge_nodes.values()

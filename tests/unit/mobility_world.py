@@ -24,6 +24,7 @@ from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.authority.leases import ControlEvent, ControlState
 from fractus_services.mobility.authority.situation import situation_of
 from fractus_services.mobility.authority.supervisor import Supervisor
+from fractus_services.mobility.flight.calls import CallJudge
 from fractus_services.mobility.flight.courses import Courses
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.homing import Homing
@@ -320,8 +321,8 @@ class World:
         control.modes.approach = homing.approach
         courses = Courses(control, self.guard)
         transit = TransitFlight(control, self.guard, courses)
-        self.tours = Tours(control, self.grants, transit, courses, boarding_s)  # type: ignore[arg-type]
-        self.service = MobilityService(control, self.guard, homing)
+        self.tours = Tours(control, self.grants, transit.launch, courses, boarding_s)  # type: ignore[arg-type]
+        self.service = MobilityService(control, CallJudge(control, self.guard), homing.around)
         self.streams = Streams(control, transit.bring)
         self.supervisor = Supervisor(control)
         self.monitor = MotionMonitor(control, self.guard, self.audit, self.supervisor)  # type: ignore[arg-type]

@@ -304,7 +304,7 @@ def test_a_sharp_turn_is_flown_from_standstill(tmp_path: Path) -> None:
             await world.up(grant)
             flying = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 56), 0)))
             await world.until(lambda: world.plane.velocity[1] > 5 and world.plane.xy[1] > 35)
-            first = world.service.check(Call("Goto", goto(-60, 50)), grant)
+            first = world.service.calls.check(Call("Goto", goto(-60, 50)), grant)
             assert first.brake_first, first
             there = await end(world.service.goto(grant, goto(-60, 50), 0))
             assert there.verdict.permits
@@ -342,7 +342,7 @@ def test_a_command_that_waits_is_not_sent_once_it_is_stale(tmp_path: Path, event
             asking = asyncio.ensure_future(refusal(world.service.set_speed(grant, SetSpeedArgs(3.0))))
             await asyncio.sleep(0.3)
             if event == "takeover":
-                world.control.take_over(world.service.check(Call("Goto", goto(0, 5000)), grant))
+                world.control.take_over(world.service.calls.check(Call("Goto", goto(0, 5000)), grant))
             elif event == "returned":
                 await world.control.give_back(grant)
             elif event == "revoked":

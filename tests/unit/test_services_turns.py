@@ -17,7 +17,7 @@ from fractus_services import answering, background
 from fractus_services.auth import Caller
 from fractus_services.background import in_slices
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.flight import courses, service
+from fractus_services.mobility.flight import calls, courses
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from google.rpc import error_details_pb2, status_pb2
 from mobility_world import World, at, fly, partial, refusal, spec, zone
@@ -75,7 +75,7 @@ def handlers_of(world: World) -> MobilityHandlers:
 def costly(world: World, method: str, monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Let each judgement of a method take a tenth of a second of computing; gives when they are made."""
     judge, clock, at_s = world.guard.judge, Clock(), list[float]()
-    monkeypatch.setattr(service, "time", clock)
+    monkeypatch.setattr(calls, "time", clock)
 
     def slow(call: Call, *args: Any, **options: Any) -> Verdict:
         if call.method == method:
@@ -136,12 +136,12 @@ def test_who_asks_much_waits_and_who_drives_waits_less(tmp_path: Path, monkeypat
             grant = world.grants.put(spec())
             other = world.grants.put(spec(instance="app-viewer", **{"class": "passenger", "control": None}), "m2")
             await world.drive(grant)
-            monkeypatch.setattr(service, "time", Clock())
+            monkeypatch.setattr(calls, "time", Clock())
 
             async def ask(who: Any, times: int) -> float:
                 async def once() -> None:
-                    await world.service.turn(who)
-                    world.service.check(Call("GetPosition"), who)
+                    await world.service.calls.turn(who)
+                    world.service.calls.check(Call("GetPosition"), who)
 
                 begun = world.plane.now
                 await asyncio.gather(*(once() for _ in range(times)))
@@ -203,11 +203,11 @@ def test_a_cheap_call_shortens_no_rest(world: Callable[[], World], monkeypatch: 
             await w.up(grant)
             costly(w, "Goto", monkeypatch)
             for who, rest_s in ((grant, 0.1), (other, 0.4)):
-                await w.service.turn(who)
+                await w.service.calls.turn(who)
                 begun = w.plane.now
-                w.service.check(Call("Goto"), who)
-                w.service.check(Call("Hover"), who)
-                await w.service.turn(who)
+                w.service.calls.check(Call("Goto"), who)
+                w.service.calls.check(Call("Hover"), who)
+                await w.service.calls.turn(who)
                 assert w.plane.now - begun == pytest.approx(rest_s, abs=0.02)
 
     fly(flight)
@@ -230,7 +230,7 @@ def test_no_call_is_carried_out_after_a_later_one(world: Callable[[], World], mo
 
             async def waiting(*calls: Any) -> list[asyncio.Future[Any]]:
                 """The calls, which came one after the other while a judgement's rest lasts."""
-                w.service.check(Call("GetSpeed"), grant)
+                w.service.calls.check(Call("GetSpeed"), grant)
                 tasks = [asyncio.ensure_future(call) for call in calls]
                 await asyncio.sleep(0.02)
                 return tasks

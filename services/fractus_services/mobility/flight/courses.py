@@ -1,4 +1,4 @@
-"""Flights by the system: the legal shortest way to a place, leg by leg, around what appears on it."""
+"""Flights by the system: the shortest legal way to a place, leg by leg, around zones that appear on it."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from contextlib import aclosing
 from dataclasses import dataclass, replace
 
 import shapely
+from fractus_core.api.geometry import Position
 from fractus_core.policy.compiled import Air, CompiledGrant, height_m
 from fractus_core.policy.limits import speed_bounds
 from fractus_core.policy.motion import margin_m
@@ -24,10 +25,14 @@ from fractus_services.mobility.mavlink.autopilot import Permit
 
 log = logging.getLogger(__name__)
 
-REPLANS = 5
-"""So often a way is looked for again after the monitor stopped the drone on it."""
+MAX_REPLANS = 5
+"""How many times a way is looked for again after the monitor stopped the drone on it."""
 
 MAX_LEGS = 60
+"""A way with more legs than this makes no headway: every leg is planned again from where the drone is."""
+
+FAULT = "the mobility service has a fault, see its log"
+"""What clients read when an error of ours ends a mission; its details are in the log."""
 
 STOPPED = frozenset(
     {
@@ -35,7 +40,7 @@ STOPPED = frozenset(
         "OperationAreaBorderAhead", "OutsideOperationArea", "AltitudeAboveLimit",
     }
 )  # fmt: skip
-"""Codes with which the monitor stops a leg that has become illegal."""
+"""Codes with which the monitor stops a leg that has become illegal: another way may exist. Other codes end the flight."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,14 +48,19 @@ class Trip:
     """A flight by the system.
 
     Attributes:
-        constraints: the fences it keeps to.
+        constraints: what it keeps to; they follow the grant when that changes in flight.
         kind: what its motions are called.
-        permit: for each motion, what its commands are asked for before they are sent.
+        permit: for each motion, the check that each of its commands must pass before it is sent.
     """
 
     constraints: FlightConstraints
     kind: str
     permit: Callable[[Motion], Permit]
+
+
+def target_of(place: Position) -> GotoArgs:
+    """A place as the engine takes it."""
+    return GotoArgs(place.lat, place.lon, place.alt, place.altitude_reference)
 
 
 def stopped_by_monitor(refusal: Refused) -> bool:
@@ -63,27 +73,27 @@ async def first_leg(
 ) -> tuple[GotoArgs, bool, float] | None:
     """The first leg of the shortest legal way to a place from where the drone stands.
 
-    It is looked for between everything else that the service does; fences that change meanwhile begin the search anew.
+    The search runs in slices between the other tasks of the event loop. Constraints that change meanwhile start it again.
 
     Args:
         goal: latitude and longitude.
         heights_m: altitudes above home to fly at, in the order of preference.
         now: the state of the drone; its position is known.
-        trip: whose fences.
+        trip: whose constraints.
 
     Returns:
         The leg, whether it is the last one, and the altitude of the way; None when there is no way.
 
     Raises:
-        Refused: the fences change faster than a way is found.
+        Refused: the constraints change faster than a way is found.
     """
     heights = tuple(dict.fromkeys(heights_m))
-    for _ in range(REPLANS + 1):
+    for _ in range(MAX_REPLANS + 1):
         grant = trip.constraints.compiled
         found = await _first_leg(goal, heights, now, grant)
         if trip.constraints.compiled is grant:
             return found
-    raise Aborted("FencesChanged", "the fences change faster than a way is found")
+    raise Aborted("FencesChanged", "the flight constraints change faster than a way is found")
 
 
 async def _first_leg(
@@ -99,7 +109,9 @@ async def _first_leg(
 
 
 def limited_mps(speed_mps: float, leg: GotoArgs, now: Situation, grant: CompiledGrant) -> float:
-    """What the speed limits along a leg leave of a speed; lower limits do not hold, and none refuses.
+    """The speed that the limits along a leg allow, at most the wanted one.
+
+    Lower limits do not count and no limit refuses the leg: the system flies home even where a driver may not fly.
 
     Args:
         speed_mps: wanted.
@@ -131,16 +143,16 @@ class Courses:
             Refused: there is no legal way, or the trip is over.
             AutopilotError: the autopilot refuses.
         """
-        for attempt in range(REPLANS + 1):
+        for attempt in range(MAX_REPLANS + 1):
             motion = self._control.begin(trip.kind)
             try:
                 async with aclosing(self._along(trip, motion, target)) as steps:  # type: ignore[type-var]
                     async for step in steps:
                         yield step
             except Refused as refusal:
-                if attempt == REPLANS or not stopped_by_monitor(refusal):
+                if attempt == MAX_REPLANS or not stopped_by_monitor(refusal):
                     raise
-                log.info("looking for another way: %s", refusal)
+                log.info("courses: leg stopped, searching another way (attempt=%d, reason=%s)", attempt + 1, refusal)
             else:
                 return
             finally:
@@ -149,6 +161,7 @@ class Courses:
     async def _along(self, trip: Trip, motion: Motion, target: GotoArgs) -> AsyncIterator[Step]:
         autopilot, permit = self._control.autopilot, trip.permit(motion)
         for _ in range(MAX_LEGS):
+            # A leg is judged from where it begins: a drone that still moves would begin it somewhere else.
             if not autopilot.vehicle.at_rest(autopilot.now):
                 await come_to_rest(autopilot, motion, permit)
             leg, last = await self._next(trip, target)
@@ -177,6 +190,7 @@ class Courses:
         if found is None:
             raise self._unreachable(trip, target)
         leg, last, height = found
+        # The only legal way was at the present height. Its end is a stop on the way: from there the drone climbs or sinks.
         if last and height != wanted:
             if self._arrived(leg):
                 raise self._unreachable(trip, target)
@@ -184,11 +198,11 @@ class Courses:
         return leg, last
 
     def _arrived(self, leg: GotoArgs) -> bool:
-        """Whether the drone is at the end of a leg already, so that flying it changes nothing."""
+        """Whether the drone is at the end of a leg already, so that flying it would change nothing."""
         return self._control.autopilot.vehicle.distance_m(leg.lat, leg.lon) <= 2 * REACHED_M
 
     def _unreachable(self, trip: Trip, target: GotoArgs) -> Refused:
-        """No way is found: what the policies say of the straight one tells why."""
+        """The refusal when no way is found; the verdict on the straight leg names the zone that is in the way."""
         verdict = self._guard.judge(Call("Goto", target), trip.constraints.grant, trip.constraints.compiled)
         why = verdict.reason or "no way around the zones is found"
         return PreconditionFailed("NoLegalWay", f"the system cannot fly to {target.lat:.6f}, {target.lon:.6f}: {why}")

@@ -1,4 +1,4 @@
-"""The way home: the autopilot's own straight one where it is legal, else around what stands in its way."""
+"""The way home: the autopilot's own straight return where it is legal, else a flight around what is in its way."""
 
 from __future__ import annotations
 
@@ -16,7 +16,14 @@ from fractus_services.errors import AutopilotError, PreconditionFailed, Refused,
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import Motion
-from fractus_services.mobility.flight.courses import MAX_LEGS, REPLANS, Trip, first_leg, limited_mps, stopped_by_monitor
+from fractus_services.mobility.flight.courses import (
+    MAX_LEGS,
+    MAX_REPLANS,
+    Trip,
+    first_leg,
+    limited_mps,
+    stopped_by_monitor,
+)
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import REACHED_M, Step, come_to_rest, fly_to
 from fractus_services.mobility.mavlink.vehicle import GUIDED, HOMEWARD, RTL, SMART_RTL
@@ -24,10 +31,11 @@ from fractus_services.mobility.mavlink.vehicle import GUIDED, HOMEWARD, RTL, SMA
 log = logging.getLogger(__name__)
 
 HOME_M = 3.0
+"""Closer to home than this the rest is left to the autopilot, which only comes down there."""
 
-TRIES = 3
-"""So often the system tries to fly around what is in the way, when the autopilot refuses; the way that the drone came is
-tried after that, and at last the straight one."""
+MAX_TRIES = 3
+"""How many times the system tries to fly around what is in the way when the autopilot refuses. After that the drone goes
+back the way it came (SmartRTL), and when that is refused too, straight (RTL)."""
 
 
 class Homing:
@@ -45,8 +53,9 @@ class Homing:
             tries: how often that has failed.
 
         Returns:
-            The mode in which the autopilot does the rest. Where no legal way home is known it is the path that the drone
-            came, if the autopilot remembers that, and else straight: a drone that stays in the air comes down anywhere.
+            The mode in which the autopilot does the rest. Where no legal way home is known, that is SMART_RTL if the
+            autopilot remembers the path flown, else RTL: flying home through a zone is the lesser evil, for a drone that
+            stays in the air comes down somewhere when its battery is empty.
 
         Raises:
             AutopilotError: the autopilot refuses, or its link broke.
@@ -56,18 +65,18 @@ class Homing:
         if grant is None or not vehicle.in_air or vehicle.mode in HOMEWARD:
             return RTL
         try:
-            why = await self._bring(grant, wanted) if tries < TRIES else self._give_up(grant, tries)
+            why = await self._bring(grant, wanted) if tries < MAX_TRIES else self._give_up(grant, tries)
         except AutopilotError:
             raise
         except Exception:
-            log.exception("the way home cannot be planned")
+            log.exception("homing: planner failed")
             why = "the planner failed"
         if not why:
             return RTL
-        back = control.retraces and tries <= TRIES
+        back = control.retraces and tries <= MAX_TRIES
         how = "goes back the way it came" if back else "flies straight"
         control.note("returnToLaunch", "system", f"no legal way home is known ({why}); the drone {how}", "NoLegalWay")
-        log.error("no legal way home is known (%s); the drone %s", why, how)
+        log.error("homing: no legal way home is known, the drone %s (reason=%s)", how, why)
         return SMART_RTL if back else RTL
 
     def _give_up(self, grant: ActiveGrant, tries: int) -> str:
@@ -83,7 +92,7 @@ class Homing:
 
         def permit() -> None:
             if not wanted() or control.constraints is not constraints:
-                raise AutopilotError("the system does not have the drone any more")
+                raise AutopilotError("the system has lost the control of the drone")
 
         try:
             await control.modes.change_mode(GUIDED, permit)
@@ -98,7 +107,7 @@ class Homing:
             AutopilotError: the drone did not fly what it was told.
         """
         why = ""
-        for _ in range(REPLANS + 1):
+        for _ in range(MAX_REPLANS + 1):
             motion = self._control.begin(trip.kind)
             try:
                 async for _ in self.around(trip, motion):
@@ -131,7 +140,7 @@ class Homing:
                     await come_to_rest(autopilot, motion, permit)
                 except Refused as refusal:
                     if refusal.verdict.code == "NotStopping" and self._clear(trip.constraints.compiled):
-                        return  # in a wind that gives it no rest the drone flies home all the same
+                        return  # Wind keeps it from resting; the straight way is legal from here, so it flies home all the same.
                     raise
             leg = await self._leg(trip)
             if leg is None:
@@ -144,14 +153,15 @@ class Homing:
     def _clear(self, grant: CompiledGrant) -> bool:
         now = self._guard.situation()
         if now.lat is None or now.lon is None or now.home is None:
-            return True  # nobody can say anything of the way; the autopilot knows more than we do
+            return True  # Without a position there is nothing to plan with; the autopilot's own estimate is the better one.
         return _straight(now, grant)
 
     async def _leg(self, trip: Trip) -> GotoArgs | None:
         now, grant = self._guard.situation(), trip.constraints.compiled
         if now.lat is None or now.lon is None or now.home is None or _straight(now, grant):
             return None
-        # The whole way is flown by us, so the autopilot's own straight one need not be legal from its waypoints.
+        # All of it is flown by us, so the autopilot's own straight return need not be legal from its waypoints:
+        # `retraces` takes that condition out of the search.
         free = replace(now, airframe=replace(now.airframe, retraces=True))
         home = (now.home.lat, now.home.lon)
         found = await first_leg(home, (now.altitude_m, now.airframe.return_altitude_m), free, trip)

@@ -1,24 +1,22 @@
-"""The mobility service: each call is judged, then carried out by whoever may."""
+"""The mobility service: each call is judged, then carried out if its caller has the drone."""
 
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import aclosing
 from dataclasses import dataclass, replace
 
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, VelocityArgs, Verdict
 
-from fractus_services.errors import Aborted, PreconditionFailed, Refused, denied
+from fractus_services.errors import Aborted, PreconditionFailed, Refused
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.arming import arm
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.authority.permits import driver_permit
+from fractus_services.mobility.flight.calls import CallJudge
 from fractus_services.mobility.flight.courses import Trip
-from fractus_services.mobility.flight.guard import Guard
-from fractus_services.mobility.flight.homing import Homing
 from fractus_services.mobility.flight.motions import REACHED_M, Step, climb, come_down, come_to_rest, fly_to
 from fractus_services.mobility.flight.steering import Steering
 from fractus_services.mobility.mavlink.autopilot import Autopilot, Permit
@@ -26,14 +24,10 @@ from fractus_services.mobility.mavlink.vehicle import GUIDED, LAND, RTL, SMART_R
 
 MAX_REACHED_M = 50.0
 JUDGE_AGAIN_S = 0.05
-"""A goto whose command waited for longer is judged again, at the place where the drone is by then."""
+"""A leg whose command waited for longer is judged again, from where the drone is by then: at 15 m/s that is 0.75 m."""
 
-REST = {True: 1.0, False: 4.0}
-"""After a costly judgement the next one waits, for so many times the time that it took, when who has the drone asks, and when
-anybody else does: a flood of calls never keeps the monitor from its work."""
-
-JUDGEMENTS = 6
-"""So often a call is judged before it is given up: a drone that does not come to rest cannot begin its leg."""
+MAX_JUDGEMENTS = 6
+"""How many times a call is judged before it is given up: a drone that does not come to rest cannot begin its leg."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,116 +46,42 @@ class _Outdated(Exception):
         self.verdict = verdict
 
 
-MOVING = frozenset(
-    {"Arm", "Disarm", "Takeoff", "Land", "Goto", "ReturnToLaunch", "Hover", "SetSpeed", "SetVelocity", "ReturnControl"}
-)
-"""Methods that only who drives may call."""
-
-
 class MobilityService:
-    """Table 8.2 of the thesis, for callers whose grant is known."""
+    """Table 8.2 of the thesis, for callers whose grant is known.
 
-    def __init__(self, control: Control, guard: Guard, homing: Homing) -> None:
+    Args:
+        control: who has the drone.
+        calls: gives calls their turn, before they come here, and judges them.
+        way_home: flies to where the autopilot's own return is legal.
+    """
+
+    def __init__(
+        self, control: Control, calls: CallJudge, way_home: Callable[[Trip, Motion], AsyncIterator[Step]]
+    ) -> None:
+        self.calls = calls
         self._control = control
-        self._guard = guard
-        self._homing = homing
+        self._way_home = way_home
         self._steering = Steering(control)
         self._autopilot: Autopilot = control.autopilot
-        self._rested_at = {True: 0.0, False: 0.0}
-        self._came = 0
-
-    def allow(self, call: Call, grant: ActiveGrant) -> Verdict:
-        """Judge a call that moves nothing.
-
-        Raises:
-            Refused: by policy.
-        """
-        verdict = self._guard.judge(call, grant)
-        if not verdict.permits:
-            raise denied(verdict)
-        return verdict
-
-    def check(self, call: Call, grant: ActiveGrant) -> Verdict:
-        """The verdict on a call that is not carried out."""
-        if grant.spec.class_ != "driver" and call.method in MOVING:
-            return self._not_a_driver(call, grant, kind="check")
-        return self._judge(call, grant, kind="check")
-
-    async def turn(self, grant: ActiveGrant) -> None:
-        """Wait until the loop has had time for the flight since a call of this caller, or its like, was judged last."""
-        left_s = self._rested_at[self._drives(grant)] - self._autopilot.now
-        while left_s > 0:
-            await asyncio.sleep(left_s)  # others that waited may have been first
-            left_s = self._rested_at[self._drives(grant)] - self._autopilot.now
-
-    async def turn_to_move(self, grant: ActiveGrant) -> None:
-        """Wait as `turn` does, before a call that moves the drone: it is void once a later such call has come.
-
-        Raises:
-            Refused: who has the drone has said since what it shall do.
-        """
-        number = self.comes(grant)
-        await self.turn(grant)
-        if self._drives(grant) and number != self._came:
-            raise Aborted("Replaced", "a later call came before this one's turn")
-
-    def comes(self, grant: ActiveGrant) -> int:
-        """Number a call on what the drone shall do as it comes; those of who does not have the drone replace none."""
-        self._came += self._drives(grant)
-        return self._came
-
-    def _drives(self, grant: ActiveGrant) -> bool:
-        lease = self._control.lease
-        return lease is not None and lease.key == grant.key
-
-    def _judge(self, call: Call, grant: ActiveGrant, *, kind: str = "call", known: Verdict | None = None) -> Verdict:
-        drives, begun = self._drives(grant), time.perf_counter()
-        try:
-            return self._guard.judge(call, grant, kind=kind, known=known)
-        finally:
-            rest_s = (time.perf_counter() - begun) * REST[drives]
-            self._rested_at[drives] = max(self._rested_at[drives], self._autopilot.now + rest_s)
-
-    def _not_a_driver(self, call: Call, grant: ActiveGrant, *, kind: str = "call") -> Verdict:
-        verdict = Verdict("deny", None, "NotADriver", f"passengers ride along; only a driver may {call.method}")
-        self._guard.record(call, grant.identity, verdict, self._guard.situation(), kind=kind)
-        return verdict
-
-    def _allow_motion(self, call: Call, grant: ActiveGrant, known: Verdict | None = None) -> Verdict:
-        """Judge a call that moves the drone, of a driver that has it; a takeover happens here."""
-        if grant.spec.class_ != "driver":
-            raise denied(self._not_a_driver(call, grant))
-        verdict = self._judge(call, grant, known=known)
-        if verdict.code == "MethodNotGranted":
-            raise denied(verdict)
-        self._control.require(grant)
-        if verdict.action == "takeover":
-            self._control.take_over(verdict)
-            raise denied(verdict)
-        if not verdict.permits:
-            if verdict.takeover is not None:
-                self._control.brake(verdict)
-            raise denied(verdict)
-        return verdict
 
     async def arm(self, grant: ActiveGrant) -> Verdict:
         """Start the motors."""
-        verdict = self._allow_motion(Call("Arm"), grant)
+        verdict = self.calls.allow_motion(Call("Arm"), grant)
         if not self._autopilot.vehicle.armed:
             await arm(self._control, grant, driver_permit(self._control, grant))
         return verdict
 
     async def disarm(self, grant: ActiveGrant) -> Verdict:
         """Stop the motors on the ground."""
-        self.comes(grant)
-        verdict = self._allow_motion(Call("Disarm"), grant)
+        self.calls.supersede(grant)
+        verdict = self.calls.allow_motion(Call("Disarm"), grant)
         await self._autopilot.disarm(driver_permit(self._control, grant))
         return verdict
 
     async def hover(self, grant: ActiveGrant) -> Verdict:
         """Stop and stay."""
-        self.comes(grant)
-        verdict = self._allow_motion(Call("Hover"), grant)
+        self.calls.supersede(grant)
+        verdict = self.calls.allow_motion(Call("Hover"), grant)
         self._flying("Hover")
         self._control.finish(self._control.begin("Hover"))
         await self._control.hold(driver_permit(self._control, grant))
@@ -169,7 +89,7 @@ class MobilityService:
 
     async def set_speed(self, grant: ActiveGrant, args: SetSpeedArgs) -> tuple[Verdict, float]:
         """Change the speed of legs."""
-        verdict = self._allow_motion(Call("SetSpeed", args), grant)
+        verdict = self.calls.allow_motion(Call("SetSpeed", args), grant)
         wanted = verdict.args.speed_mps if isinstance(verdict.args, SetSpeedArgs) else args.speed_mps
         verdict, speed = self._on_leg(grant, verdict, wanted)
         self._control.cruise(wanted, speed)
@@ -182,7 +102,7 @@ class MobilityService:
         if motion is None or motion.leg is None or motion.speed_mps is None or wanted <= motion.speed_mps:
             return verdict, wanted
         leg, speed = replace(motion.leg, speed_mps=wanted), motion.speed_mps
-        rest = self._judge(Call("Goto", leg), grant, kind="check")
+        rest = self.calls.check(Call("Goto", leg), grant)
         if rest.permits and not rest.brake_first and isinstance(rest.args, GotoArgs):
             legal_mps = rest.args.speed_mps or wanted
             speed = min(legal_mps, wanted) if replace(rest.args, speed_mps=wanted) == leg else speed
@@ -195,7 +115,7 @@ class MobilityService:
         """Climb from the ground."""
         call = Call("Takeoff", args)
         self._standing_by(call, grant)
-        verdict = self._allow_motion(call, grant)
+        verdict = self.calls.allow_motion(call, grant)
         altitude = verdict.args.altitude_m if isinstance(verdict.args, TakeoffArgs) else args.altitude_m
 
         async def steps(motion: Motion) -> AsyncIterator[Progress]:
@@ -208,14 +128,14 @@ class MobilityService:
 
     def goto(self, grant: ActiveGrant, args: GotoArgs, reached_m: float) -> AsyncIterator[Progress]:
         """Fly straight to a point."""
-        verdict = self._allow_motion(Call("Goto", args), grant)
+        verdict = self.calls.allow_motion(Call("Goto", args), grant)
         self._flying("Goto")
         radius = min(max(reached_m, 0.3), MAX_REACHED_M) if reached_m > 0 else REACHED_M
 
         async def steps(motion: Motion) -> AsyncIterator[Progress]:
             permit = driver_permit(self._control, grant, motion)
             call, final = Call("Goto", args), verdict
-            for _ in range(JUDGEMENTS):
+            for _ in range(MAX_JUDGEMENTS):
                 final = await self._settled(call, grant, final, motion, permit)
                 leg, judged = self._leg(final, args), self._judged(call, grant, final, permit)
                 try:
@@ -228,7 +148,7 @@ class MobilityService:
                     final = outdated.verdict
                 else:
                     return
-            raise Aborted("NotFollowing", f"the autopilot was told {JUDGEMENTS} times where to fly, and does not")
+            raise Aborted("NotFollowing", f"the autopilot was told {MAX_JUDGEMENTS} times where to fly, and does not")
 
         return self._run("Goto", steps)
 
@@ -247,7 +167,7 @@ class MobilityService:
             if self._autopilot.now - judged_at <= JUDGE_AGAIN_S:
                 return
             judged_at = self._autopilot.now
-            again = self._allow_motion(call, self._control.require(grant).grant, verdict)
+            again = self.calls.allow_motion(call, self._control.require(grant).grant, verdict)
             if again.brake_first or again.args != verdict.args:
                 raise _Outdated(again)
 
@@ -261,7 +181,7 @@ class MobilityService:
         Raises:
             Refused: the call is not legal from there, or the drone does not come to rest.
         """
-        for _ in range(JUDGEMENTS):
+        for _ in range(MAX_JUDGEMENTS):
             begun = self._autopilot.now
             await self._control.modes.change_mode(GUIDED, permit)
             if verdict.brake_first:
@@ -269,12 +189,12 @@ class MobilityService:
             elif self._autopilot.now - begun <= JUDGE_AGAIN_S:
                 return verdict
             permit()
-            verdict = self._allow_motion(call, self._control.require(grant).grant, verdict)
+            verdict = self.calls.allow_motion(call, self._control.require(grant).grant, verdict)
         raise Aborted("NotStopping", "the drone does not come to rest, and could not begin its leg otherwise")
 
     async def set_velocity(self, grant: ActiveGrant, args: VelocityArgs) -> tuple[Verdict, VelocityArgs]:
         """Fly with a velocity until the next one, or until its hold is over."""
-        verdict = self._allow_motion(Call("SetVelocity", args), grant)
+        verdict = self.calls.allow_motion(Call("SetVelocity", args), grant)
         self._flying("SetVelocity")
         motion = self._control.begin("SetVelocity")
         permit = driver_permit(self._control, grant, motion)
@@ -289,8 +209,8 @@ class MobilityService:
 
     def land(self, grant: ActiveGrant) -> AsyncIterator[Progress]:
         """Come down here."""
-        self.comes(grant)
-        verdict = self._allow_motion(Call("Land"), grant)
+        self.calls.supersede(grant)
+        verdict = self.calls.allow_motion(Call("Land"), grant)
         self._flying("Land")
 
         async def steps(motion: Motion) -> AsyncIterator[Progress]:
@@ -302,8 +222,8 @@ class MobilityService:
 
     def return_to_launch(self, grant: ActiveGrant) -> AsyncIterator[Progress]:
         """Fly home, around what is in the way, and land."""
-        self.comes(grant)
-        verdict = self._allow_motion(Call("ReturnToLaunch"), grant)
+        self.calls.supersede(grant)
+        verdict = self.calls.allow_motion(Call("ReturnToLaunch"), grant)
         self._flying("ReturnToLaunch")
 
         async def steps(motion: Motion) -> AsyncIterator[Progress]:
@@ -313,7 +233,7 @@ class MobilityService:
             try:
                 await control.modes.change_mode(GUIDED, permit)
                 trip = Trip(constraints, motion.kind, lambda _motion: permit)
-                async with aclosing(self._homing.around(trip, motion)) as legs:  # type: ignore[type-var]
+                async with aclosing(self._way_home(trip, motion)) as legs:  # type: ignore[type-var]
                     async for step in legs:
                         yield Progress(verdict, step)
                 mode = RTL

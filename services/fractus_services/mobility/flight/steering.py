@@ -1,4 +1,4 @@
-"""Velocity setpoints of a driver, and the watchdog that makes the drone hover when no other follows."""
+"""Velocity setpoints of a driver, and the watchdog that makes the drone hover when none follows in time."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from fractus_services.mobility.mavlink.autopilot import Permit
 
 log = logging.getLogger(__name__)
 
-AGAIN_S = 0.2
-"""A setpoint is sent again so often while it holds: one that is lost on the way must not leave the one before in force."""
+RESEND_S = 0.2
+"""How often a setpoint is sent again while it holds. A lost message must not leave the setpoint before it in force, and
+ArduCopter itself stops after GUID_TIMEOUT (1 s, set with the failsafes) without one."""
 
 
 class Steering:
-    """Keeps one setpoint in force until the next one, until its hold is over, or until somebody else flies."""
+    """Keeps one setpoint in force until the next one, until its hold is over, or until another motion begins."""
 
     def __init__(self, control: Control) -> None:
         self._control = control
@@ -40,15 +41,15 @@ class Steering:
         self._control.autopilot.fly(point.north_mps, point.east_mps, point.down_mps, point.yaw_deg)
 
     async def _watch(self, setpoint: VelocityArgs, motion: Motion, permit: Permit) -> None:
-        """Keep the setpoint in force to its end, and end it unless somebody else has said what the drone does."""
+        """Keep the setpoint in force to its end, then hover, unless another motion has begun meanwhile."""
         control = self._control
         until = control.autopilot.now + setpoint.hold_s
         while control.motion is motion and (left_s := until - control.autopilot.now) > 0:
-            await asyncio.sleep(min(left_s, AGAIN_S))
+            await asyncio.sleep(min(left_s, RESEND_S))
             try:
                 permit()
             except Refused as refusal:
-                log.info("a velocity ends: %s", refusal)
+                log.info("steering: setpoint ended early (reason=%s)", refusal)
                 break
             if control.motion is motion and control.autopilot.now < until:
                 self._send(setpoint)

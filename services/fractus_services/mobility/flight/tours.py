@@ -4,46 +4,53 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import AsyncIterator, Callable
+
+from fractus_core.api.geometry import Position
 
 from fractus_services.errors import AutopilotError, Refused, Unavailable
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Mission
 from fractus_services.mobility.authority.permits import tour_permit
-from fractus_services.mobility.flight.courses import Courses, Trip
-from fractus_services.mobility.flight.transit import FAULT, TransitFlight, target_of
+from fractus_services.mobility.flight.courses import FAULT, Courses, Trip, target_of
 
 log = logging.getLogger(__name__)
 
-LOOK_S = 0.5
+CHECK_S = 0.5
 STAY_S = 5.0
-"""At a point of interest that is the only place where passengers may use services the drone stays this long."""
+"""How long the drone stays at a point of interest when passengers may use services only there."""
 
 
 class Tours:
-    """Begins a tour when its grant is there, the drone is ready and its passengers are aboard; goes on after a restart.
+    """Begins a tour when its grant has come, the drone is ready and its passengers have connected; resumes after a restart.
 
     Args:
         control: the state machine of the drone.
         grants: grants of this node.
-        transit: arms and takes off.
+        launch: arms and takes off to the altitude of a place; says what it does.
         courses: flies the legs.
         boarding_s: a passenger that never calls the mobility service is flown this long after its grant came.
     """
 
     def __init__(
-        self, control: Control, grants: GrantFiles, transit: TransitFlight, courses: Courses, boarding_s: float
+        self,
+        control: Control,
+        grants: GrantFiles,
+        launch: Callable[[Trip, Position], AsyncIterator[str]],
+        courses: Courses,
+        boarding_s: float,
     ) -> None:
         self._control = control
         self._grants = grants
-        self._transit = transit
+        self._launch = launch
         self._courses = courses
         self._boarding_s = boarding_s
         self._since: dict[str, float] = {}
         self._aboard: set[str] = set()
 
     def heard(self, grant: ActiveGrant) -> None:
-        """A component called: the passengers of its application are aboard."""
+        """A component called: the passengers of its application are there."""
         uid = grant.spec.application.uid
         if uid not in self._aboard:
             self._aboard.add(uid)
@@ -58,7 +65,7 @@ class Tours:
                 control.stop_system()
                 control.touring = grant.key
                 control.system = control.tasks.spawn(self._fly(grant))
-            await control.wait(LOOK_S)
+            await control.wait(CHECK_S)
 
     def _due(self) -> ActiveGrant | None:
         """The grant whose tour is to begin, or to go on."""
@@ -92,15 +99,15 @@ class Tours:
             self._end(mission, "complete")
         except (Refused, AutopilotError) as error:
             if mission.outcome or control.authority != "system" or control.touring != grant.key:
-                return  # somebody else has taken the drone and has said why
+                return  # The system lost the drone to a driver or a pilot, which is in the log and the outcome already.
             if _passing(error) and mission.flown:
-                log.warning("the tour of %s waits: %s", grant.identity, error)
+                log.warning("tours: tour interrupted (identity=%s, error=%s)", grant.identity, error)
                 control.start("hover")
                 control.begin_grace(mission, str(error))
                 return
             self._end(mission, f"failed: {error}")
         except Exception:
-            log.exception("the tour of %s cannot be flown", grant.identity)
+            log.exception("tours: tour failed (identity=%s)", grant.identity)
             if not mission.outcome and control.authority == "system" and control.touring == grant.key:
                 self._end(mission, f"failed: {FAULT}")
         finally:
@@ -117,8 +124,8 @@ class Tours:
         stay_s = STAY_S if access is not None and access.service_access == "points" else 0.0
         places = grant.spec.tour
         try:
-            async for doing in self._transit.lift(trip, places[min(mission.waypoints, len(places) - 1)]):
-                log.info("%s", doing)
+            async for doing in self._launch(trip, places[min(mission.waypoints, len(places) - 1)]):
+                log.info("tours: %s (identity=%s)", doing, grant.identity)
             for number in range(mission.waypoints, len(places)):
                 async for _ in self._courses.fly(trip, target_of(places[number])):
                     pass
@@ -131,7 +138,7 @@ class Tours:
 
     def _end(self, mission: Mission, outcome: str) -> None:
         control = self._control
-        log.info("the tour of %s ends: %s", mission.identity, outcome)
+        log.info("tours: tour ended (identity=%s, outcome=%s)", mission.identity, outcome)
         mission.outcome = outcome
         control.note("returnToLaunch", "system", outcome, kind="control")
         control.journal.save_soon()
@@ -139,7 +146,7 @@ class Tours:
 
 
 def _passing(error: Refused | AutopilotError) -> bool:
-    """Whether what ended a leg may be over in a moment: the autopilot was not heard."""
+    """Whether a leg ended for a reason that may pass: the autopilot was not heard."""
     if isinstance(error, AutopilotError):
         return error.link
     return isinstance(error, Unavailable)

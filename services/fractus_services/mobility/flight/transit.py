@@ -1,4 +1,4 @@
-"""The system's own flying for drivers with partial control: to the start of each control point."""
+"""Transit: the system flies drivers with partial control to the start of each control point (the thesis' chauffeur)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fractus_core.api.components import ControlPoint
 from fractus_core.api.geometry import Position
 from fractus_core.geo import middle
 from fractus_core.policy.compiled import height_m
-from fractus_core.policy.values import Call, GotoArgs, TakeoffArgs
+from fractus_core.policy.values import Call, TakeoffArgs
 
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused
 from fractus_services.mobility.authority.arming import arm
@@ -17,13 +17,13 @@ from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Mission
 from fractus_services.mobility.authority.leases import Lease
 from fractus_services.mobility.authority.permits import transit_permit
-from fractus_services.mobility.flight.courses import Courses, Trip
+from fractus_services.mobility.flight.courses import FAULT, Courses, Trip, target_of
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import climb
 from fractus_services.mobility.mavlink.vehicle import GUIDED
 
-CRUISE_M = 10.0
-FAULT = "the mobility service has a fault, see its log"
+DEFAULT_ALTITUDE_M = 10.0
+"""How high the system takes off, above home, when the place it flies to gives no altitude."""
 
 log = logging.getLogger(__name__)
 
@@ -40,13 +40,8 @@ def start_of(point: ControlPoint) -> Position:
     raise PreconditionFailed("NoStart", "the control point has neither position, path nor region")
 
 
-def target_of(place: Position) -> GotoArgs:
-    """A place as the engine takes it."""
-    return GotoArgs(place.lat, place.lon, place.alt, place.altitude_reference)
-
-
 class TransitFlight:
-    """Arms, takes off and flies to where the driver takes over; judged like anybody else."""
+    """Arms, takes off and flies to where the driver takes over; judged by the same policies as a driver."""
 
     def __init__(self, control: Control, guard: Guard, courses: Courses) -> None:
         self._control = control
@@ -68,21 +63,21 @@ class TransitFlight:
         constraints = control.begin_transit(lease.grant, mission)
         trip = Trip(constraints, "Transit", lambda motion: transit_permit(control, lease, motion))
         try:
-            async for event in self.lift(trip, start):
-                yield event
+            async for doing in self.launch(trip, start):
+                yield doing
             yield "the system flies to the control point"
             async for _ in self._courses.fly(trip, target_of(start)):
                 pass
         except (Refused, AutopilotError):
             raise
         except Exception as error:
-            log.exception("the drone cannot be brought to %s", lease.grant.identity)
+            log.exception("transit: flight failed (identity=%s)", lease.grant.identity)
             raise self._give_up(lease, mission) from error
         finally:
             control.end_system_flight(constraints)
 
     def _give_up(self, lease: Lease, mission: Mission) -> Refused:
-        """End a mission that a fault of ours would end again and again, and bring the drone home."""
+        """End the mission and bring the drone home: after a fault of ours a retry would fail in the same way."""
         control = self._control
         if control.lease is lease and control.authority == "system" and not mission.outcome:
             mission.outcome = f"failed: {FAULT}"
@@ -92,7 +87,7 @@ class TransitFlight:
             control.start("returnToLaunch")
         return PreconditionFailed("ControlLost", FAULT)
 
-    async def lift(self, trip: Trip, place: Position) -> AsyncIterator[str]:
+    async def launch(self, trip: Trip, place: Position) -> AsyncIterator[str]:
         """Arm and take off, unless the drone is in the air, to the altitude of a place.
 
         Yields:
@@ -107,6 +102,7 @@ class TransitFlight:
         motion = control.begin("Takeoff")
         permit = trip.permit(motion)
         try:
+            # `standing` is the autopilot's own word, `in_air` counts doubt as flying: an armed drone on a raised pad is both.
             if vehicle.standing or not vehicle.in_air:
                 yield "the system arms the drone"
                 self._allow(Call("Arm"), trip)
@@ -115,7 +111,7 @@ class TransitFlight:
                 climbed = self._allow(Call("Takeoff", TakeoffArgs(self._height_m(place, trip))), trip)
                 yield "the system takes off"
                 await control.modes.change_mode(GUIDED, permit)
-                height = climbed.altitude_m if isinstance(climbed, TakeoffArgs) else CRUISE_M
+                height = climbed.altitude_m if isinstance(climbed, TakeoffArgs) else DEFAULT_ALTITUDE_M
                 async for _ in climb(autopilot, motion, height, permit):
                     pass
             await control.modes.change_mode(GUIDED, permit)
@@ -124,7 +120,7 @@ class TransitFlight:
 
     def _height_m(self, place: Position, trip: Trip) -> float:
         if place.alt is None:
-            return CRUISE_M
+            return DEFAULT_ALTITUDE_M
         home, flat = self._control.autopilot.vehicle.home, trip.constraints.compiled.flat_terrain
         height = height_m(place.alt, place.altitude_reference, home, flat)
         if height is None:

@@ -87,7 +87,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         """See mobility.proto."""
         async with self._reception.call(context, lasting=True) as caller:
             grant = self._grant_of(caller)
-            self._service.allow(Call("GetControl"), grant)
+            self._service.calls.allow(Call("GetControl"), grant)
             try:
                 async with (
                     asyncio.timeout(max(caller.valid_until_s - self._clock(), 0.0)),
@@ -102,8 +102,8 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         """See mobility.proto."""
         async with self._reception.call(context, urgent=True) as caller:
             grant = self._grant_of(caller)
-            self._service.comes(grant)
-            self._service.allow(Call("ReturnControl"), grant)
+            self._service.calls.supersede(grant)
+            self._service.calls.allow(Call("ReturnControl"), grant)
             last = await self._control.give_back(grant)
             return mobility_pb2.ReturnControlResponse(mission_complete=last)
 
@@ -127,14 +127,14 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     async def SetSpeed(self, request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context) as caller:
-            await self._service.turn(self._grant_of(caller))
+            await self._service.calls.turn(self._grant_of(caller))
             verdict, speed = await self._service.set_speed(self._grant_of(caller), SetSpeedArgs(request.speed_mps))
             return mobility_pb2.SetSpeedResponse(decision=decision(verdict), speed_mps=speed)
 
     async def GetSpeed(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context) as caller:
-            verdict = self._service.allow(Call("GetSpeed"), self._grant_of(caller))
+            verdict = self._service.calls.allow(Call("GetSpeed"), self._grant_of(caller))
             speed = self._control.autopilot.vehicle.speed_mps
             return mobility_pb2.GetSpeedResponse(decision=decision(verdict), speed_mps=speed)
 
@@ -142,7 +142,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         """See mobility.proto."""
         async with self._reception.call(context) as caller:
             args = velocity_args(request)
-            await self._service.turn_to_move(self._grant_of(caller))
+            await self._service.calls.turn_to_move(self._grant_of(caller))
             verdict, flown = await self._service.set_velocity(self._grant_of(caller), args)
             reply = mobility_pb2.SetVelocityResponse(decision=decision(verdict))
             reply.velocity.north_mps, reply.velocity.east_mps = flown.north_mps, flown.east_mps
@@ -153,13 +153,13 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         """See mobility.proto."""
         async with self._reception.call(context) as caller:
             call = call_of(request)
-            await self._service.turn(self._grant_of(caller))
-            return checked(self._service.check(call, self._grant_of(caller)))
+            await self._service.calls.turn(self._grant_of(caller))
+            return checked(self._service.calls.check(call, self._grant_of(caller)))
 
     async def GetPosition(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context) as caller:
-            verdict = self._service.allow(Call("GetPosition"), self._grant_of(caller))
+            verdict = self._service.calls.allow(Call("GetPosition"), self._grant_of(caller))
             vehicle = self._control.autopilot.vehicle
             if not located(self._control):
                 raise Unavailable("AutopilotUnavailable", "the drone's position is not known yet")
@@ -172,7 +172,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     async def Takeoff(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context, lasting=True) as caller:
-            await self._service.turn_to_move(self._grant_of(caller))
+            await self._service.calls.turn_to_move(self._grant_of(caller))
             progress = self._service.take_off(self._grant_of(caller), TakeoffArgs(request.altitude_m))
             await self._report(progress, context)
 
@@ -180,7 +180,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         """See mobility.proto."""
         async with self._reception.call(context, lasting=True) as caller:
             args, reached_m = goto_args(request), _finite(request.acceptance_radius_m)
-            await self._service.turn_to_move(self._grant_of(caller))
+            await self._service.calls.turn_to_move(self._grant_of(caller))
             progress = self._service.goto(self._grant_of(caller), args, reached_m)
             await self._report(progress, context)
 
@@ -225,7 +225,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
                     judged = loop.time()
                     caller.check(self._clock())
                     if not node:
-                        self._service.allow(Call("GetPosition"), self._grant_of(caller))
+                        self._service.calls.allow(Call("GetPosition"), self._grant_of(caller))
                 if loop.time() >= due:
                     due = loop.time() + interval
                     await context.write(telemetry_of(self._control, self._clock(), missions=node))

@@ -23,6 +23,7 @@ from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.authority.observer import Observer
 from fractus_services.mobility.authority.situation import situation_of
 from fractus_services.mobility.authority.supervisor import Supervisor
+from fractus_services.mobility.flight.calls import CallJudge
 from fractus_services.mobility.flight.courses import Courses
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.homing import Homing
@@ -77,7 +78,7 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     control.modes.approach = homing.approach
     courses = Courses(control, guard)
     transit = TransitFlight(control, guard, courses)
-    tours = Tours(control, grants, transit, courses, options.boarding)
+    tours = Tours(control, grants, transit.launch, courses, options.boarding)
     supervisor = Supervisor(control)
     autopilot.alive = supervisor.alive
     monitor = MotionMonitor(control, guard, audit, supervisor)
@@ -87,7 +88,7 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     audit.append("started", {"node": node, "autopilot": url})
     grants.listen(lambda old, new: _record_grant(audit, old, new))
     grants.scan()
-    service = MobilityService(control, guard, homing)
+    service = MobilityService(control, CallJudge(control, guard), homing.around)
     streams = Streams(control, transit.bring)
     handlers = MobilityHandlers(service, control, streams, grants=grants, node=node, clock=clock, heard=tours.heard)
     async with asyncio.TaskGroup() as tasks:

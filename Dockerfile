@@ -89,8 +89,8 @@ RUN uv build --quiet --wheel --no-build-isolation --out-dir /wheel \
       cp -a /code/fractus-*.dist-info /images/$target/; } \
  && assemble component fractus fractus_cli \
  && assemble operator fractus_core fractus_kube fractus_operator \
- && assemble agent fractus_core fractus_kube fractus_agent \
- && assemble services fractus fractus_cli fractus_core fractus_mavlink fractus_services \
+ && assemble agent fractus_core fractus_kube fractus_storage fractus_agent \
+ && assemble services fractus fractus_cli fractus_core fractus_mavlink fractus_storage fractus_services \
  && assemble sim fractus_vehicle fractus_world
 
 # ---- python: the common start of all images, with what the SDK needs

@@ -13,8 +13,8 @@ from typing import Any, Literal, Protocol
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.plans import Grant
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
+from fractus_storage import remove_file, write_file
 
-from fractus_agent.durable import remove_file, write_file
 from fractus_agent.store import Backoff, Changed, Deleted, GrantEvent, KubeError, Listed, Object
 
 LOG = logging.getLogger(__name__)

@@ -17,8 +17,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Protocol
 
+from fractus_storage import read_set, write_set
+
 from fractus_agent.certificates import Unusable, Validity, inspect
-from fractus_agent.durable import read_set, write_set
 from fractus_agent.findings import Finding
 from fractus_agent.store import Backoff, KubeError, Object
 

@@ -168,11 +168,11 @@ class Store:
             await self._client.create(_SIGNING_REQUEST, body, strict=False)
 
     async def certificate_request(self, name: str) -> Object | None:
-        """The signing request with what became of it; None when somebody deleted it."""
+        """The signing request with what became of it; None when it was deleted."""
         return await self._get(_SIGNING_REQUEST, name)
 
     async def drop_certificate_requests(self) -> None:
-        """Delete the signing requests of this node, whoever left them."""
+        """Delete the signing requests that this node left."""
         ours = {"labelSelector": f"{NODE_LABEL}={self._node}"}
         for item in (await self._client.list_whole(_SIGNING_REQUEST, selectors=ours, timeout_s=CALL_TIMEOUT_S)).items:
             name = item["metadata"]["name"]
@@ -180,9 +180,9 @@ class Store:
                 await self._client.delete(_SIGNING_REQUEST, ("", name))
 
     async def grants(self) -> AsyncIterator[GrantEvent]:
-        """Grants of this node, for ever: a complete list, then changes, and a list again after any break.
+        """Grants of this node, indefinitely: a complete list, then changes, and a list again after any break.
 
-        A break is never taken for an empty list. After one the list is read anew rather than the watch resumed: the
+        A break is never taken for an empty list. After one the list is read again rather than the watch resumed: the
         list is short, and an API server restored from a backup may count versions from an earlier number.
         """
         backoff = Backoff(self._times.first_retry_s, self._times.longest_retry_s)

@@ -12,8 +12,8 @@ from fractus_core.api.names import node_server_name
 from fractus_proto.v1.mobility_pb2 import SubscribeTelemetryRequest, Telemetry
 from fractus_proto.v1.mobility_pb2_grpc import MobilityServiceStub
 from fractus_proto.v1.types_pb2 import AltitudeReference
+from fractus_storage import read_set
 
-from fractus_agent.durable import read_set
 from fractus_agent.flight import Snapshot
 from fractus_agent.identity import FILES
 from fractus_agent.store import Backoff

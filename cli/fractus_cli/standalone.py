@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import base64
 import json
-import os
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -19,6 +18,7 @@ from fractus_core.api import Grant, InvalidObject
 from fractus_core.api.names import ComponentIdentity, is_subdomain
 from fractus_core.identity.authority import Authority, BrokenAuthority, Data
 from fractus_core.identity.grant_signer import GrantSigner
+from fractus_storage import write_file
 
 LIFE = timedelta(days=365)
 
@@ -129,7 +129,8 @@ class StandalonePki:
         path = grants / f"{name}.json"
         signed = self.sign(manifest, _present(path))
         grants.mkdir(parents=True, exist_ok=True)
-        return _replace(path, json.dumps(signed, indent=1).encode() + b"\n", 0o640)
+        write_file(path, json.dumps(signed, indent=1).encode() + b"\n", 0o640)
+        return path
 
 
 def _present(path: Path) -> Grant | None:
@@ -146,12 +147,5 @@ def _read(folder: Path) -> Data:
 def _write(folder: Path, data: Data) -> Path:
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     for name, content in data.items():
-        _replace(folder / name, base64.b64decode(content), 0o600 if name == "tls.key" else 0o644)
+        write_file(folder / name, base64.b64decode(content), 0o600 if name == "tls.key" else 0o644)
     return folder
-
-
-def _replace(path: Path, content: bytes, mode: int) -> Path:
-    fresh = path.with_name(f".{path.name}.new")
-    with open(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "wb") as file:  # noqa: PTH123
-        file.write(content)
-    return fresh.replace(path)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,6 +19,7 @@ from fractus_core.policy.signatures import (
     verify,
 )
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
+from fractus_storage import write_file
 
 log = logging.getLogger(__name__)
 
@@ -128,19 +128,14 @@ class GrantVerifier:
 
     def store(self, content: bytes) -> None:
         """Write the memory; may be called from another thread. What cannot be written is unsaved again."""
-        fresh = self._memory.with_name(f".{self._memory.name}.new")
         try:
             self._memory.parent.mkdir(parents=True, exist_ok=True)
-            with fresh.open("wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            fresh.replace(self._memory)
+            write_file(self._memory, content, 0o644)
         except OSError as error:
             if not self._failing:
                 log.critical(
                     "grants: cannot write the memory, a restart would forget replaced grants (file=%s): %s",
-                    fresh,
+                    self._memory,
                     error,
                 )
             self._failing = self._unsaved = True

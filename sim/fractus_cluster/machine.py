@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from ipaddress import IPv4Network
 from pathlib import Path
+
+from fractus_storage import write_file
 
 from fractus_cluster.addressing import choose_block
 from fractus_cluster.cgroups import find_hierarchies, remove_top
@@ -176,6 +177,4 @@ def _read() -> _Ledger:
 
 
 def _write(ledger: _Ledger) -> None:
-    scratch = _LEDGER.with_name(f".machine.{os.getpid()}")
-    scratch.write_text(json.dumps(asdict(ledger), indent=1))
-    scratch.replace(_LEDGER)
+    write_file(_LEDGER, json.dumps(asdict(ledger), indent=1).encode(), 0o644, durable=False)

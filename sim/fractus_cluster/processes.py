@@ -12,6 +12,8 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 
+from fractus_storage import write_file
+
 from fractus_cluster.errors import ClusterError
 
 _POLL_S = 0.01
@@ -141,9 +143,7 @@ def reap(pid: int) -> None:
 def write_record(path: Path, record: ProcessRecord) -> None:
     """Store a record so that it is never seen half written."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    scratch.write_text(json.dumps(asdict(record)))
-    scratch.replace(path)
+    write_file(path, json.dumps(asdict(record)).encode(), 0o644, durable=False)
 
 
 def read_record(path: Path) -> ProcessRecord | None:

@@ -9,6 +9,7 @@ from ipaddress import IPv4Network
 from pathlib import Path
 
 import yaml
+from fractus_storage import write_file
 
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.spec import ClusterSpec, parse_spec
@@ -108,9 +109,7 @@ class StateDirectory:
 
     def _write(self, name: str, text: str) -> None:
         self.path.mkdir(parents=True, exist_ok=True, mode=0o700)
-        scratch = self.path / f".{name}.{os.getpid()}"
-        scratch.write_text(text)
-        scratch.replace(self.path / name)
+        write_file(self.path / name, text.encode(), 0o644, durable=False)
 
 
 def state_of(name: str) -> StateDirectory:

@@ -11,9 +11,9 @@ from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 from fractus_agent.certificates import Unusable, inspect
 from fractus_agent.csr import make_request
-from fractus_agent.durable import read_set, write_set
 from fractus_agent.identity import FILES, Identity, Refused, make_request_apart
 from fractus_agent.store import KubeError
+from fractus_storage import read_set, write_set
 
 NODE = "drone-1"
 

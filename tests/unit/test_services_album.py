@@ -27,7 +27,7 @@ async def test_the_album_forgets_what_a_crash_left_and_makes_room(tmp_path: Path
     shot = await world.capture(active_grant())
     folder = next(path for path in world.directory.iterdir() if path.is_dir())
     (folder / "20260101000000000-0001.jpg").write_bytes(b"half")
-    (folder / "20260101000000000-0002.jpg.new").write_bytes(b"half")
+    (folder / ".20260101000000000-0002.jpg.7.tmp").write_bytes(b"half")
     (folder / "20260101000000000-0003.json").write_text('{"name": "old"}')
     album = Album(world.directory, 50, 10**9)
     assert [s.name for s in album.list(camera.owner_of(active_grant()))] == [shot.name]
@@ -89,7 +89,7 @@ async def test_a_full_disk_is_said_and_leaves_nothing_behind(world: World, monke
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as broken:
-        broken.setattr("fractus_services.camera.album.album.os.fsync", full)
+        broken.setattr("fractus_storage.files.os.fsync", full)
         with pytest.raises(OSError, match="No space left") as caught:
             await world.capture(active_grant())
     refused = camera.known(caught.value)

@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from fractus_storage import write_file
+
 from fractus_cluster.binaries.build import build, module_digest, reported_version
 from fractus_cluster.binaries.catalog import CLUSTER_PROGRAMS, KUBERNETES_VERSION, MODULES, PROGRAMS, Program
 from fractus_cluster.errors import ClusterError
@@ -142,6 +144,4 @@ def _read(path: Path) -> dict[str, str]:
 
 def _write(path: Path, content: Mapping[str, str]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    scratch.write_text(json.dumps(content, indent=1, sort_keys=True))
-    scratch.replace(path)
+    write_file(path, json.dumps(content, indent=1, sort_keys=True).encode(), 0o644, durable=False)

@@ -13,6 +13,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import MappingProxyType
 
+from fractus_storage import write_file
+
 from fractus_cluster.binaries import cache_directory
 from fractus_cluster.commands import run
 from fractus_cluster.errors import ClusterError, PrerequisiteError
@@ -201,6 +203,4 @@ def _read(path: Path) -> dict[str, str]:
 
 
 def _write(path: Path, content: Mapping[str, str]) -> None:
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    scratch.write_text(json.dumps(content, indent=1, sort_keys=True))
-    scratch.replace(path)
+    write_file(path, json.dumps(content, indent=1, sort_keys=True).encode(), 0o644, durable=False)

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
+from fractus_storage import write_file
+
 from fractus_cluster.errors import ClusterError
 
 Json = dict[str, Any]
@@ -172,17 +174,14 @@ class Layout:
         return list(content["manifests"])
 
     def _write_index(self, manifests: list[Json]) -> None:
-        scratch = self.path / f".index.{os.getpid()}"
-        scratch.write_text(json.dumps({"schemaVersion": 2, "mediaType": _INDEX_TYPE, "manifests": manifests}))
-        scratch.replace(self.path / "index.json")
+        index = {"schemaVersion": 2, "mediaType": _INDEX_TYPE, "manifests": manifests}
+        write_file(self.path / "index.json", json.dumps(index).encode(), 0o644, durable=False)
 
     def _add_blob(self, content: bytes) -> str:
         digest = "sha256:" + hashlib.sha256(content).hexdigest()
         path = self.blob(digest)
         if not path.exists():
-            scratch = path.with_name(f".{path.name}.{os.getpid()}")
-            scratch.write_bytes(content)
-            scratch.replace(path)
+            write_file(path, content, 0o644, durable=False)
         return digest
 
 

@@ -6,12 +6,13 @@ import contextlib
 import hashlib
 import json
 import logging
-import os
 import re
 import shutil
 import threading
 from collections.abc import Callable, Iterable
 from pathlib import Path
+
+from fractus_storage import write_file
 
 from fractus_services.camera.album.shots import Shot
 
@@ -102,8 +103,8 @@ class Album:
             folder.mkdir(parents=True, exist_ok=True)
             picture = folder / shot.name
             try:
-                _write(picture, data)
-                _write(picture.with_suffix(".json"), json.dumps(shot.to_json()).encode())
+                write_file(picture, data, 0o644)
+                write_file(picture.with_suffix(".json"), json.dumps(shot.to_json()).encode(), 0o644)
             except OSError:
                 picture.unlink(missing_ok=True)
                 raise
@@ -179,7 +180,7 @@ class Album:
                 log.warning("%s cannot be read: %s", record, error)
         for path in self._directory.glob("*/*"):
             orphan = path.suffix == ".jpg" and not path.with_suffix(".json").exists()
-            if orphan or path.suffix == ".new":
+            if orphan or path.suffix == ".tmp":
                 path.unlink(missing_ok=True)
 
 
@@ -194,16 +195,3 @@ def _sizes(paths: Iterable[Path]) -> list[int]:
 
 def _missing(name: str) -> NoSuchImage:
     return NoSuchImage(f"there is no picture {name[:64]!r} of this component; ListImages tells which there are")
-
-
-def _write(path: Path, data: bytes) -> None:
-    fresh = path.with_suffix(path.suffix + ".new")
-    try:
-        with fresh.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        fresh.replace(path)
-    except OSError:
-        fresh.unlink(missing_ok=True)
-        raise

@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import os
-import tempfile
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
+
+from fractus_storage import write_file
 
 from fractus_services.grants import ActiveGrant
 
@@ -144,24 +144,7 @@ class Journal:
                 self.failure = ""
 
     def _write(self, data: bytes) -> None:
-        number, name = tempfile.mkstemp(prefix="journal.", suffix=".new", dir=self._path.parent)
-        fresh = Path(name)
-        try:
-            with os.fdopen(number, "wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            if self._path.exists() and self._sound():
-                self._path.replace(self._last)
-            fresh.replace(self._path)
-        except OSError:
-            fresh.unlink(missing_ok=True)
-            raise
-        directory = os.open(self._path.parent, os.O_RDONLY)
-        try:
-            os.fsync(directory)
-        finally:
-            os.close(directory)
+        write_file(self._path, data, former=self._last if self._path.exists() and self._sound() else None)
 
     def _sound(self) -> bool:
         try:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import os
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from fractus_core.api.plans import GrantSpec
+from fractus_storage import write_file
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.autopilot import Autopilot
@@ -194,16 +193,7 @@ class MissionFence:
             return None
 
     def _store(self, owned: Owned) -> None:
-        number, name = tempfile.mkstemp(prefix="fence.", suffix=".new", dir=self._path.parent)
-        try:
-            with os.fdopen(number, "w", encoding="utf-8") as file:
-                json.dump(asdict(owned), file)
-                file.flush()
-                os.fsync(file.fileno())
-            Path(name).replace(self._path)
-        except OSError:
-            Path(name).unlink(missing_ok=True)
-            raise
+        write_file(self._path, json.dumps(asdict(owned)).encode())
 
 
 def _wanted(owned: Owned, bounds: Bounds, action: float) -> dict[str, float]:

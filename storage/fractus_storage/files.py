@@ -1,7 +1,8 @@
-"""Files that survive kill -9 and power loss: a reader sees the old content or the new, never a part."""
+"""Writing files in one step, and waiting until they are on the disk."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import uuid
@@ -12,18 +13,35 @@ CURRENT = "..data"
 """Symbolic link to the directory that holds the current set of files (as kubelet does for Secret volumes)."""
 
 
-def write_file(path: Path, content: bytes, mode: int = 0o600) -> None:
+def write_file(
+    path: Path, content: bytes, mode: int = 0o600, *, former: Path | None = None, durable: bool = True
+) -> None:
     """Replace a file in one step and wait until it is on the disk.
 
-    The temporary file begins with a dot and ends in .tmp; one that a kill left behind is written over next time.
+    The temporary file begins with a dot and ends in .tmp; each process has its own, and a kill may leave it behind.
+
+    Args:
+        path: The file; one process writes it at a time, unless it does not matter whose content stays.
+        content: What it will hold.
+        mode: Its permissions, whatever the umask.
+        former: Where the file as it was is kept, unless there was none.
+        durable: False for what can be made again: in one step, but without waiting for the disk.
 
     Raises:
         OSError: the disk is full, read-only or gone; the old content is untouched.
     """
-    temporary = path.with_name(f".{path.name}.tmp")
-    _write_new(temporary, content, mode)
-    temporary.replace(path)
-    _sync_directory(path.parent)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        _write_new(temporary, content, mode, durable=durable)
+        if former is not None:
+            with contextlib.suppress(FileNotFoundError):
+                path.replace(former)
+        temporary.replace(path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+    if durable:
+        _sync_directory(path.parent)
 
 
 def remove_file(path: Path) -> bool:
@@ -67,14 +85,15 @@ def read_set(directory: Path, names: tuple[str, ...]) -> dict[str, bytes] | None
         return None
 
 
-def _write_new(path: Path, content: bytes, mode: int) -> None:
+def _write_new(path: Path, content: bytes, mode: int, *, durable: bool = True) -> None:
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, mode)
     try:
         os.fchmod(handle, mode)
         view = memoryview(content)
         while view:
             view = view[os.write(handle, view) :]
-        os.fsync(handle)
+        if durable:
+            os.fsync(handle)
     finally:
         os.close(handle)
 

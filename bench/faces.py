@@ -20,7 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import skimage.data
-from fractus_services.camera.imaging.faces import LEAST_PX, Box, CascadeDetector
+from fractus_services.camera.imaging.faces import DEFAULT_MIN_PX, Box, CascadeDetector
 from fractus_services.camera.imaging.filters import FACE_CELLS, blur_average, blur_median, hide_faces
 from fractus_services.camera.imaging.pixels import Pixels
 
@@ -147,7 +147,7 @@ def recall_table(quick: bool) -> dict[tuple[str, int], Tally]:
     detector, tallies = CascadeDetector(), {}
     print(f"{'faces':<12}{'width px':>9}{'scenes':>8}{'ours':>8}{'hidden':>8}{'tutorial':>10}")
     for name, series in (("astronaut", astronauts), ("hundred", hundred)):
-        for width in (24, LEAST_PX) if quick else (16, 24, 32, 40, LEAST_PX, 64, 96):
+        for width in (24, DEFAULT_MIN_PX) if quick else (16, 24, 32, 40, DEFAULT_MIN_PX, 64, 96):
             tally = Tally()
             for scene in series(width, quick):
                 tally.add(scene, detector)
@@ -163,7 +163,7 @@ def timings(quick: bool) -> None:
     detector = CascadeDetector()
     photo = cv2.cvtColor(skimage.data.astronaut(), cv2.COLOR_RGB2BGR)
     print(
-        f"\n{'picture':<12}{'average':>10}{'median':>10}{'faces up':>10}{'faces all':>10}   ms of one core, smallest face {LEAST_PX} px"
+        f"\n{'picture':<12}{'average':>10}{'median':>10}{'faces up':>10}{'faces all':>10}   ms of one core, smallest face {DEFAULT_MIN_PX} px"
     )
     sizes = {"VGA": (640, 480), "720p": (1280, 720)} | ({} if quick else {"1080p": (1920, 1080), "8MP": (3264, 2448)})
     for name, (width, height) in sizes.items():
@@ -171,8 +171,8 @@ def timings(quick: bool) -> None:
         jobs: list[Callable[[], object]] = [
             lambda p=picture: blur_average(p),
             lambda p=picture: blur_median(p),
-            lambda p=picture: detector.find(p, LEAST_PX, upright=True),
-            lambda p=picture: detector.find(p, LEAST_PX, upright=False),
+            lambda p=picture: detector.find(p, DEFAULT_MIN_PX, upright=True),
+            lambda p=picture: detector.find(p, DEFAULT_MIN_PX, upright=False),
         ]
         print(f"{name:<12}" + "".join(f"{1000 * timed(job, 1 if i > 1 else 5):>10.1f}" for i, job in enumerate(jobs)))
 
@@ -189,13 +189,13 @@ def timed(job: Callable[[], object], times: int) -> float:
 def claims(tallies: dict[tuple[str, int], Tally]) -> list[dict[str, object]]:
     made = []
     for name, target in (("astronaut", 0.97), ("hundred", 0.95)):
-        trusted = [tally for (series, width), tally in tallies.items() if series == name and width >= LEAST_PX]
+        trusted = [tally for (series, width), tally in tallies.items() if series == name and width >= DEFAULT_MIN_PX]
         whole = Tally(*(sum(getattr(t, field) for t in trusted) for field in ("scenes", "ours", "theirs", "hidden")))
         for field, what in (("ours", "found"), ("hidden", "hidden")):
             ours, theirs = whole.share(field), whole.share("theirs")
             made.append(
                 {
-                    "name": f"{name}: faces {what} from {LEAST_PX} px on, every direction and light", "ours": round(ours, 4),
+                    "name": f"{name}: faces {what} from {DEFAULT_MIN_PX} px on, every direction and light", "ours": round(ours, 4),
                     "theirs": round(theirs, 4), "unit": "share", "ratio": round(ours / max(theirs, 1e-9), 2),
                     "target": target, "holds": ours >= target,
                 }

@@ -1,4 +1,4 @@
-"""Who calls: identities from client certificates, and TLS whose files may change while the service runs."""
+"""Identities of callers from client certificates, and TLS whose files may change while the service runs."""
 
 from __future__ import annotations
 
@@ -87,17 +87,17 @@ class TlsFiles:
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self._stamp: tuple[tuple[int, int, int], ...] = ()
+        self._waiting = False
 
     async def wait(self, poll_s: float = 0.5) -> None:
-        """Wait until all files are there; says so once."""
-        said = False
+        """Wait until all files are there; logs that once."""
         while True:
             missing = [name for name in FILES if not self._present(name)]
             if not missing:
                 return
-            if not said:
-                log.warning("waiting for %s in %s", ", ".join(missing), self._directory)
-                said = True
+            if not self._waiting:
+                log.warning("tls: waiting for files (directory=%s missing=%s)", self._directory, ",".join(missing))
+                self._waiting = True
             await asyncio.sleep(poll_s)
 
     def _present(self, name: str) -> bool:
@@ -126,7 +126,7 @@ class TlsFiles:
         try:
             return self._configuration() if self._stamps() != self._stamp else None
         except OSError as error:
-            log.critical("cannot read the renewed certificate, keeping the old one: %s", error)
+            log.critical("tls: cannot read the renewed certificate, keeping the old one: %s", error)
             return None
 
     def server_credentials(self) -> Any:

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from fractus_services.hosting import DIRECTORY, FILE, address, until_signalled
+from fractus_services.launch import DIRECTORY, FILE, address, until_signalled
 from fractus_services.options import CameraOptions, MobilityOptions
 
 
@@ -162,8 +162,6 @@ def camera() -> None:
 )
 def serve_camera(**given: Any) -> None:
     """Serve until stopped; waits for certificates."""
-    from fractus_services.camera.capture.driver import BadConnection  # noqa: PLC0415 - the command line stays quick
-    from fractus_services.camera.imaging.faces import BadModel  # noqa: PLC0415
-    from fractus_services.camera.rpc.server import run  # noqa: PLC0415
+    from fractus_services.camera.rpc.server import run  # noqa: PLC0415 - the command line stays quick
 
-    until_signalled(run, CameraOptions(**given), logging.INFO, BadConnection, BadModel)
+    until_signalled(run, CameraOptions(**given))

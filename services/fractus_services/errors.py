@@ -81,3 +81,7 @@ class AutopilotError(Exception):
     def __init__(self, reason: str, *, link: bool = False) -> None:
         super().__init__(reason)
         self.link = link
+
+
+class CannotServe(Exception):
+    """A service cannot run as it is told to; the message names what is wrong and the remedy."""

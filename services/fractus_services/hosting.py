@@ -1,48 +1,24 @@
-"""What both services do when they start: read the node's description, bind their port, say why they cannot."""
+"""What both services do once they run: read the node's description, bind, serve, stop."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import signal
 from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any
 
-import click
+import grpc
+import yaml
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.nodes import Drone, EdgeNode
 
-if TYPE_CHECKING:
-    import grpc
-
-    from fractus_services.auth import TlsFiles
+from fractus_services.auth import KEEPALIVE, TlsFiles
+from fractus_services.errors import CannotServe
 
 log = logging.getLogger(__name__)
 
-_Options = TypeVar("_Options")
-
-_LAST_PORT = 65535
-_SOCKET_FILES = ("unix:", "unix-abstract:")
-
-DIRECTORY = click.Path(file_okay=False, path_type=Path)
-FILE = click.Path(dir_okay=False, path_type=Path)
-
-
-def address(_context: click.Context, _parameter: click.Parameter, value: str) -> str:
-    """Check an option that says HOST:PORT; gRPC itself takes 99999 for port 34463.
-
-    Raises:
-        click.BadParameter: it is none.
-    """
-    host, _, port = value.rpartition(":")
-    if not value.startswith(_SOCKET_FILES) and not (host and port.isdecimal() and int(port) <= _LAST_PORT):
-        raise click.BadParameter(f"{value!r} is not HOST:PORT with a port of at most {_LAST_PORT}")
-    return value
-
-
-class CannotServe(Exception):
-    """The service cannot run as it is told to; the message names what is wrong and the remedy."""
+STOP_TIMEOUT_S = 2.0
 
 
 def read_description(path: Path, *kinds: type[Drone | EdgeNode]) -> Drone | EdgeNode | None:
@@ -51,8 +27,6 @@ def read_description(path: Path, *kinds: type[Drone | EdgeNode]) -> Drone | Edge
     Raises:
         CannotServe: the file is not a valid manifest of one of these kinds.
     """
-    import yaml  # noqa: PLC0415 - only for this
-
     try:
         body: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
@@ -62,10 +36,10 @@ def read_description(path: Path, *kinds: type[Drone | EdgeNode]) -> Drone | Edge
     except yaml.YAMLError as error:
         raise CannotServe(f"--description {path}: is not YAML: {' '.join(str(error).split())}") from None
     if body is None:
-        log.warning("hosting: this node has no description (path=%s)", path)
+        log.warning("service: this node has no description, using defaults (file=%s)", path)
         return None
-    said = body.get("kind") if isinstance(body, dict) else None
-    kind = next((kind for kind in kinds if said == kind.KIND), None)
+    found = body.get("kind") if isinstance(body, dict) else None
+    kind = next((kind for kind in kinds if found == kind.KIND), None)
     if kind is None:
         wanted = " or ".join(kind.KIND for kind in kinds)
         raise CannotServe(f"--description {path}: must hold one manifest of kind {wanted}")
@@ -75,12 +49,20 @@ def read_description(path: Path, *kinds: type[Drone | EdgeNode]) -> Drone | Edge
         raise CannotServe(f"--description {path}: {error}") from None
 
 
-async def bind(server: grpc.aio.Server, listen: str, tls: TlsFiles) -> None:
-    """Wait for certificates, then take calls.
+async def serve_grpc(name: str, listen: str, tls: TlsFiles, register: Callable[[grpc.aio.Server], None]) -> None:
+    """Wait for certificates, then serve calls until cancelled.
+
+    Args:
+        name: of the service, for the log.
+        listen: HOST:PORT.
+        tls: certificates of the server.
+        register: adds the handlers to the server.
 
     Raises:
         CannotServe: the address cannot be bound.
     """
+    server = grpc.aio.server(options=KEEPALIVE)
+    register(server)
     await tls.wait()
     try:
         server.add_secure_port(listen, tls.server_credentials())
@@ -90,53 +72,21 @@ async def bind(server: grpc.aio.Server, listen: str, tls: TlsFiles) -> None:
             " and in --tls a tls.key that belongs to tls.crt"
         ) from None
     await server.start()
-
-
-def until_signalled(
-    run: Callable[[_Options, asyncio.Event], Coroutine[Any, Any, None]],
-    options: _Options,
-    level: int,
-    *known: type[Exception],
-) -> None:
-    """Run a service until SIGTERM or SIGINT.
-
-    Args:
-        run: serves until the event is set.
-        options: of the command line.
-        level: of the log.
-        known: errors of the service whose message tells the user enough.
-
-    Raises:
-        click.ClickException: the service cannot run as it is told to.
-    """
-    logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-
-    expected: tuple[type[Exception], ...] = (CannotServe, *known)
-
-    async def main() -> None:
-        stop = asyncio.Event()
-        for number in (signal.SIGTERM, signal.SIGINT):
-            asyncio.get_running_loop().add_signal_handler(number, stop.set)
-        await run(options, stop)
-
+    log.info("%s: serving (address=%s)", name, listen)
     try:
-        asyncio.run(main())
-    except expected as error:
-        raise click.ClickException(str(error)) from None
-    except ExceptionGroup as failures:
-        raise _one_sentence(failures) from None
+        await asyncio.Event().wait()
+    finally:
+        await asyncio.shield(server.stop(STOP_TIMEOUT_S))
 
 
-def _one_sentence(failures: ExceptionGroup[Exception]) -> click.ClickException:
-    """What to tell the user of a service whose parts failed so.
+async def run_until(stop: asyncio.Event, *parts: Coroutine[Any, Any, None]) -> None:
+    """Run the parts of a service until `stop` is set; the failure of any one ends all.
 
     Raises:
-        ExceptionGroup: there is more to it than that it cannot serve.
+        ExceptionGroup: a part failed.
     """
-    known, rest = failures.split(CannotServe)
-    if known is None or rest is not None:
-        raise failures
-    error: BaseException = known
-    while isinstance(error, BaseExceptionGroup):
-        error = error.exceptions[0]
-    return click.ClickException(str(error))
+    async with asyncio.TaskGroup() as tasks:
+        running = [tasks.create_task(part) for part in parts]
+        await stop.wait()
+        for task in running:
+            task.cancel()

@@ -18,6 +18,11 @@ class ServiceOptions:
     description: Path
     listen: str
 
+    @property
+    def grant_memory(self) -> Path:
+        """File that remembers which grants were seen."""
+        return self.state / "grants-seen.json"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MobilityOptions(ServiceOptions):

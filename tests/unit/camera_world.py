@@ -13,14 +13,17 @@ import numpy as np
 import pytest
 from fractus_core.policy.values import Attitude, CaptureArgs, Lens, Situation
 from fractus_services.audit import AuditLog
-from fractus_services.camera.album.album import Album
+from fractus_services.camera.album.album import Album, owner_of
 from fractus_services.camera.album.shots import Shot
 from fractus_services.camera.capture.driver import Wanted
+from fractus_services.camera.capture.properties import CameraProperties
 from fractus_services.camera.capture.shutter import Shutter
 from fractus_services.camera.imaging.faces import Box
 from fractus_services.camera.imaging.pixels import Pixels, decoded
-from fractus_services.camera.pictures import service as camera
-from fractus_services.camera.pictures.service import Body, CameraService
+from fractus_services.camera.pictures.capture import PictureCapture
+from fractus_services.camera.pictures.filtering import Filtering
+from fractus_services.camera.pictures.judge import PictureJudge
+from fractus_services.camera.pictures.library import PictureLibrary
 from fractus_services.errors import Refused
 from fractus_services.grants import ActiveGrant
 from policy_world import NOW, at, box, compiled, policy, spec, zone
@@ -33,7 +36,7 @@ def private(action: str = "refuse", name: str = "p", **fields: Any) -> dict[str,
 
 
 class Drone:
-    """Whereabouts that a test moves; they remember what they told."""
+    """A pose provider that a test moves; it remembers what it told."""
 
     def __init__(self) -> None:
         self.x, self.y, self.alt, self.yaw = 0.0, 80.0, 10.0, 0.0
@@ -47,12 +50,9 @@ class Drone:
         self.told.append((time.monotonic(), now))
         return now
 
-    def way(self, begun_s: float, time_s: float) -> tuple[Situation, ...]:
+    def situations_since(self, begun_s: float, time_s: float) -> tuple[Situation, ...]:
         self.situation(time_s)
         return tuple(one for told_at, one in self.told if told_at >= begun_s)
-
-    async def run(self) -> None:
-        """Nothing to follow."""
 
 
 class Scene:
@@ -75,20 +75,20 @@ class Scene:
         return noise.astype(np.uint8)
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Nothing to close."""
 
 
 class Finder:
     """A detector that finds what a test says."""
 
     name = "test"
-    least_px = 40.0
+    min_px = 40.0
 
     def __init__(self) -> None:
         self.boxes: list[Box] = []
 
     def find(self, picture: Pixels, smallest_px: float, *, upright: bool) -> list[Box]:
-        assert smallest_px >= self.least_px
+        assert smallest_px >= self.min_px
         assert not upright
         return self.boxes
 
@@ -104,28 +104,31 @@ def active_grant(*policies: dict[str, Any], uid: str = "u1", instance: str = "ap
 
 
 class World:
-    """A service with all that it stands on."""
+    """A camera service with what it needs."""
 
-    def __init__(self, directory: Path, resolution: tuple[int, int] = (64, 64)) -> None:
+    def __init__(self, directory: Path, resolution: tuple[int, int] = (64, 64), keep: int = 50) -> None:
         self.directory = directory / "album"
         self.drone, self.scene, self.finder = Drone(), Scene(), Finder()
         self.shutter = Shutter(self.scene, timeout_s=5.0)
         self.audit = AuditLog(directory / "audit.jsonl", lambda: NOW)
-        self.album = Album(self.directory, 50, 10**9)
-        self.service = CameraService(
-            self.drone, self.shutter, Body(resolution), detector=self.finder, album=self.album, audit=self.audit,
+        self.album = Album(self.directory, keep, 10**9)
+        judge = PictureJudge(self.audit)
+        filtering = Filtering(self.finder, judge)
+        self.camera = PictureCapture(
+            self.drone, self.shutter, CameraProperties(resolution), filtering=filtering, album=self.album, judge=judge,
             clock=lambda: NOW,
         )  # fmt: skip
+        self.library = PictureLibrary(self.drone, filtering, self.album, judge, lambda: NOW)
 
     async def capture(self, grant: ActiveGrant, **size: int) -> Shot:
-        return (await self.service.capture(grant, CaptureArgs(**size)))[1]
+        return (await self.camera.capture(grant, CaptureArgs(**size)))[1]
 
     async def pixels(self, grant: ActiveGrant, shot: Shot) -> Pixels:
-        source = (await self.service.retrieve(grant, shot.name))[2]
+        source = (await self.library.retrieve(grant, shot.name))[2]
         return decoded(source if isinstance(source, bytes) else source.read_bytes())
 
     def stored(self, grant: ActiveGrant, shot: Shot) -> Pixels:
-        return decoded(self.album.path(camera.owner_of(grant), shot.name).read_bytes())
+        return decoded(self.album.path(owner_of(grant), shot.name).read_bytes())
 
 
 async def refusal(work: Any) -> str:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 from camera_world import World, active_grant, private, refusal
-from fractus_services.camera.album.album import Album, AlbumFull, NoSuchImage
-from fractus_services.camera.pictures import service as camera
+from fractus_services.camera.album.album import Album, AlbumFull, NoSuchImage, owner_of
+from fractus_services.camera.rpc.handlers import storage_failed
 from fractus_services.errors import ResourceExhausted
 
 
@@ -30,22 +30,22 @@ async def test_the_album_forgets_what_a_crash_left_and_makes_room(tmp_path: Path
     (folder / ".20260101000000000-0002.jpg.7.tmp").write_bytes(b"half")
     (folder / "20260101000000000-0003.json").write_text('{"name": "old"}')
     album = Album(world.directory, 50, 10**9)
-    assert [s.name for s in album.list(camera.owner_of(active_grant()))] == [shot.name]
+    assert [s.name for s in album.list(owner_of(active_grant()))] == [shot.name]
     assert len(list(folder.glob("*.jpg*"))) == 1
-    assert album.list(camera.owner_of(active_grant())) == (shot,), "a shot survives its record"
+    assert album.list(owner_of(active_grant())) == (shot,), "a shot survives its record"
 
-    living = [camera.owner_of(active_grant(instance="other"))]
+    living = [owner_of(active_grant(instance="other"))]
     small = Album(world.directory, 50, 10**9, 1000, lambda: living)
-    assert small.room(living[0]) == "", "pictures of those who are gone make room"
+    assert small.quota_problem(living[0]) == "", "pictures of those who are gone make room"
     assert not folder.exists()
     small.add(living[0], replace(shot, name="20260101000000000-0009.jpg"), b"x" * 2000)
-    assert "--keep-total-mb" in small.room(living[0])
+    assert "--keep-total-mb" in small.quota_problem(living[0])
     world.shutter.close()
 
 
 async def test_a_picture_whose_record_is_damaged_is_removed_and_never_handed_out(tmp_path: Path) -> None:
     world = World(tmp_path)
-    owner, shots = camera.owner_of(active_grant()), [await world.capture(active_grant()) for _ in range(5)]
+    owner, shots = owner_of(active_grant()), [await world.capture(active_grant()) for _ in range(5)]
     records = [world.album.path(owner, shot.name).with_suffix(".json") for shot in shots]
     body = json.loads(records[0].read_text())
     poses = body.pop("poses")
@@ -55,12 +55,12 @@ async def test_a_picture_whose_record_is_damaged_is_removed_and_never_handed_out
     records[3].write_text(json.dumps({**body, "poses": [{**poses[0], "lat": float("nan")}]}))
     for shot in shots[:4]:
         with pytest.raises(NoSuchImage, match=r"damaged.*DeleteImage"):
-            await world.service.retrieve(active_grant(), shot.name)
+            await world.library.retrieve(active_grant(), shot.name)
     assert world.album.list(owner) == (shots[4],)
-    await world.service.delete(active_grant(), shots[0].name)
+    await world.library.delete(active_grant(), shots[0].name)
     assert not records[0].with_suffix(".jpg").exists()
     with pytest.raises(NoSuchImage, match="there is no picture"):
-        await world.service.delete(active_grant(), shots[0].name)
+        await world.library.delete(active_grant(), shots[0].name)
     assert Album(world.directory, 50, 10**9).list(owner) == (shots[4],)
     assert [path.name for path in world.directory.glob("*/*.jpg")] == [shots[4].name]
     world.shutter.close()
@@ -69,17 +69,18 @@ async def test_a_picture_whose_record_is_damaged_is_removed_and_never_handed_out
 async def test_a_picture_of_an_earlier_release_was_taken_nobody_knows_where(tmp_path: Path) -> None:
     world = World(tmp_path)
     shot = await world.capture(active_grant())
-    record = world.album.path(camera.owner_of(active_grant()), shot.name).with_suffix(".json")
+    record = world.album.path(owner_of(active_grant()), shot.name).with_suffix(".json")
     body = json.loads(record.read_text())
     poses = body.pop("poses")
     record.write_text(json.dumps({**body, "face_px": 900.0, "before": poses[0], "after": poses[-1]}))
-    world.service._album = Album(world.directory, 50, 10**9)
-    (kept,) = (await world.service.list(active_grant()))[1]
+    world.shutter.close()
+    world = World(tmp_path)
+    (kept,) = (await world.library.list(active_grant()))[1]
     assert (kept.name, kept.poses[0].lat, kept.face_px) == (shot.name, None, 0.0)
-    assert await refusal(world.service.retrieve(active_grant(), shot.name)) == "PrivacyZone", (
+    assert await refusal(world.library.retrieve(active_grant(), shot.name)) == "PrivacyZone", (
         "every policy in force holds"
     )
-    verdict, _, _ = await world.service.retrieve(active_grant(private("black")), shot.name)
+    verdict, _, _ = await world.library.retrieve(active_grant(private("black")), shot.name)
     assert verdict.policies == ("p",)
     world.shutter.close()
 
@@ -92,8 +93,7 @@ async def test_a_full_disk_is_said_and_leaves_nothing_behind(world: World, monke
         broken.setattr("fractus_storage.files.os.fsync", full)
         with pytest.raises(OSError, match="No space left") as caught:
             await world.capture(active_grant())
-    refused = camera.known(caught.value)
-    assert isinstance(refused, ResourceExhausted)
+    refused = storage_failed(caught.value)
     assert refused.verdict.code == "StorageFailed"
     assert "make room on the node" in refused.verdict.reason
     assert [path for path in world.directory.rglob("*") if path.is_file()] == []
@@ -101,12 +101,10 @@ async def test_a_full_disk_is_said_and_leaves_nothing_behind(world: World, monke
 
 
 async def test_a_full_album_says_what_to_do(tmp_path: Path) -> None:
-    world = World(tmp_path)
-    world.album._keep = 1
+    world = World(tmp_path, keep=1)
     await world.capture(active_grant())
     with pytest.raises(AlbumFull, match="DeleteImage") as caught:
         await world.capture(active_grant())
-    refused = camera.known(caught.value)
-    assert isinstance(refused, ResourceExhausted)
+    assert isinstance(caught.value, ResourceExhausted)
     await world.capture(active_grant(instance="other"))
     world.shutter.close()

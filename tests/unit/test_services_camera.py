@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from camera_world import Scene, World, active_grant, grain, private, refusal
 from fractus_core.policy.values import CaptureArgs, Lens
+from fractus_services.camera.album.album import owner_of
 from fractus_services.camera.capture.driver import CameraFailed, Wanted
 from fractus_services.camera.capture.shutter import Shutter
-from fractus_services.camera.pictures import service as camera
-from fractus_services.camera.pictures.service import MAX_OF_ONE
-from fractus_services.errors import Refused
+from fractus_services.camera.pictures.fair_queue import MAX_PER_OWNER, QueueFull
+from fractus_services.errors import PolicyDenied, Refused
 from fractus_services.grants import ActiveGrant
 from policy_world import FRAME, NOW, at, box, policy, zone
 
@@ -31,15 +31,15 @@ def world(tmp_path: Path) -> Iterator[World]:
 
 async def test_a_drone_that_flies_over_private_ground_during_the_exposure_keeps_no_picture(world: World) -> None:
     world.scene.during = lambda: setattr(world.drone, "y", 0.0)
-    assert await refusal(world.service.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
+    assert await refusal(world.camera.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
     world.drone.y = 80.0
     assert len(world.scene.taken) == 1
-    assert (await world.service.list(active_grant()))[1] == ()
+    assert (await world.library.list(active_grant()))[1] == ()
 
 
 async def test_a_drone_that_crosses_private_ground_during_the_exposure_keeps_no_picture(world: World) -> None:
     world.scene.during = lambda: setattr(world.drone, "y", -80.0)
-    assert await refusal(world.service.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
+    assert await refusal(world.camera.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
 
 
 async def test_a_camera_that_looks_aside_and_back_during_the_exposure_keeps_no_picture(world: World) -> None:
@@ -57,15 +57,15 @@ async def test_a_camera_that_looks_aside_and_back_during_the_exposure_keeps_no_p
     shot = await world.capture(active_grant())
     assert {round(pose.attitude.yaw_deg) for pose in shot.poses if pose.attitude} == {0, 45}
     world.scene.during = lambda: looked(yaw=180.0)
-    assert await refusal(world.service.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
+    assert await refusal(world.camera.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
     world.scene.during = lambda: looked(y=0.0)
-    assert await refusal(world.service.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
+    assert await refusal(world.camera.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
     blind = policy("a", "AccessControl", "denial", [zone("z", box(-20, -20, 20, 20))], methods=["CaptureImage"])
-    assert await refusal(world.service.capture(active_grant(blind), CaptureArgs())) == "MethodDenied"
+    assert await refusal(world.camera.capture(active_grant(blind), CaptureArgs())) == "MethodDenied"
     elsewhere = policy("q", "PrivacyControl", "camera", [zone("z", box(500, 500, 510, 510))], action="refuse")
     world.scene.during = lambda: looked(yaw=180.0)
     shot = await world.capture(active_grant(elsewhere))
-    assert await refusal(world.service.retrieve(active_grant(), shot.name)) == "PrivacyZone"
+    assert await refusal(world.library.retrieve(active_grant(), shot.name)) == "PrivacyZone"
 
 
 async def test_a_camera_that_shows_what_was_is_judged_by_where_it_was(world: World) -> None:
@@ -78,7 +78,7 @@ async def test_a_camera_that_shows_what_was_is_judged_by_where_it_was(world: Wor
     await world.capture(active_grant())
     world.scene.latency_s = 600.0
     came_from_private_ground()
-    assert await refusal(world.service.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
+    assert await refusal(world.camera.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
 
 
 async def test_a_zone_counts_that_was_active_when_the_camera_may_have_seen_it(world: World) -> None:
@@ -88,13 +88,13 @@ async def test_a_zone_counts_that_was_active_when_the_camera_may_have_seen_it(wo
     world.scene.latency_s = 300.0
     await world.capture(grant)
     world.scene.latency_s = 900.0
-    assert await refusal(world.service.capture(grant, CaptureArgs())) == "PrivacyZone"
+    assert await refusal(world.camera.capture(grant, CaptureArgs())) == "PrivacyZone"
 
 
 async def test_those_who_wait_are_judged_and_placed_when_it_is_their_turn(world: World) -> None:
     held_up = threading.Event()
     world.scene.during = lambda: held_up.wait(10) and None
-    waiting = [asyncio.create_task(world.capture(active_grant())) for _ in range(MAX_OF_ONE)]
+    waiting = [asyncio.create_task(world.capture(active_grant())) for _ in range(MAX_PER_OWNER)]
     await world.scene.begun()
     assert await refusal_of_queue(world.capture(active_grant()))
     other = asyncio.create_task(world.capture(active_grant(instance="other")))
@@ -109,37 +109,42 @@ async def test_those_who_wait_are_judged_and_placed_when_it_is_their_turn(world:
 
 
 async def refusal_of_queue(work: Any) -> bool:
-    with pytest.raises(Exception, match="under way") as caught:
+    with pytest.raises(QueueFull, match="under way") as caught:
         await work
-    translated = camera.known(caught.value)
-    return translated is not None and translated.verdict.code == "ShutterBusy"
+    return caught.value.verdict.code == "ShutterBusy"
 
 
 async def test_a_caller_that_hangs_up_does_not_free_the_shutter(world: World) -> None:
     held_up = threading.Event()
     world.scene.during = lambda: held_up.wait(10) and None
-    task = asyncio.create_task(world.service.capture(active_grant(), CaptureArgs()))
+    task = asyncio.create_task(world.camera.capture(active_grant(), CaptureArgs()))
     await world.scene.begun()
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
-    assert world.service._exposing.busy
+    second = asyncio.create_task(world.capture(active_grant()))
+    await asyncio.sleep(0.05)
+    assert len(world.scene.taken) == 1, "the shutter is not free before the first picture is done"
     held_up.set()
-    await asyncio.gather(world.capture(active_grant()), *world.service._tasks)
-    assert len((await world.service.list(active_grant()))[1]) == 2
+    await second
+    for _ in range(1000):
+        if len((await world.library.list(active_grant()))[1]) == 2:
+            return
+        await asyncio.sleep(0.01)
+    raise AssertionError("the picture of the caller that hung up was not stored")
 
 
 async def test_a_grant_that_ends_while_its_caller_waits_takes_no_picture(world: World) -> None:
     def gone() -> ActiveGrant:
-        raise camera.refused(camera.Verdict("deny", None, "NoGrant", "gone"))
+        raise PolicyDenied("NoGrant", "gone")
 
-    assert await refusal(world.service.capture(active_grant(), CaptureArgs(), gone)) == "NoGrant"
+    assert await refusal(world.camera.capture(active_grant(), CaptureArgs(), gone)) == "NoGrant"
     assert not world.scene.taken
 
 
 async def test_an_application_of_the_same_name_does_not_inherit_pictures(world: World) -> None:
     await world.capture(active_grant())
-    assert len((await world.service.list(active_grant()))[1]) == 1
-    assert (await world.service.list(active_grant(uid="u2")))[1] == ()
+    assert len((await world.library.list(active_grant()))[1]) == 1
+    assert (await world.library.list(active_grant(uid="u2")))[1] == ()
 
 
 # Filters
@@ -149,13 +154,13 @@ async def test_an_application_of_the_same_name_does_not_inherit_pictures(world: 
 async def test_a_filtered_picture_is_never_on_disk_without_its_filter(world: World, action: str) -> None:
     world.drone.y = 0.0
     grant = active_grant(private(action))
-    verdict, shot = await world.service.capture(grant, CaptureArgs())
+    verdict, shot = await world.camera.capture(grant, CaptureArgs())
     assert (verdict.action, verdict.code, verdict.policies) == ("correct", "PrivacyFilter", ("p",))
     assert len(world.scene.taken) == (3 if action == "removeBackground" else 1)
     kept = world.stored(grant, shot)
     assert grain(kept) < 12
     assert np.array_equal(await world.pixels(grant, shot), kept), "it is not filtered twice"
-    data = world.album.path(camera.owner_of(grant), shot.name).read_bytes()
+    data = world.album.path(owner_of(grant), shot.name).read_bytes()
     assert b"Exif" not in data
     assert b"Camera:" not in data
 
@@ -167,11 +172,11 @@ async def test_a_picture_is_judged_again_by_where_it_was_taken(world: World) -> 
     shot = await world.capture(free)
     assert grain(world.stored(free, shot)) > 30
     world.drone.y = 150.0
-    verdict, shown, _ = await world.service.retrieve(bound, shot.name)
+    verdict, shown, _ = await world.library.retrieve(bound, shot.name)
     assert (verdict.action, verdict.policies) == ("correct", ("p",))
     assert shown.filters
     assert grain(await world.pixels(bound, shot)) < 12
-    assert await refusal(world.service.retrieve(active_grant(), shot.name)) == "PrivacyZone"
+    assert await refusal(world.library.retrieve(active_grant(), shot.name)) == "PrivacyZone"
     assert grain(await world.pixels(free, shot)) > 30
 
 
@@ -183,12 +188,12 @@ async def test_a_picture_is_judged_again_once_its_filters_are_applied(world: Wor
     )
     world.drone.y = 0.0
     shot = await world.capture(free)
-    _, shown, _ = await world.service.retrieve(bound, shot.name, lambda: bound)
+    _, shown, _ = await world.library.retrieve(bound, shot.name, lambda: bound)
     assert [one.action for one in shown.filters] == ["blurAverage"]
-    assert await refusal(world.service.retrieve(bound, shot.name, active_grant)) == "PrivacyZone"
+    assert await refusal(world.library.retrieve(bound, shot.name, active_grant)) == "PrivacyZone"
     stricter = active_grant(private("black"))
     with pytest.raises(Refused, match="ask again") as caught:
-        await world.service.retrieve(bound, shot.name, lambda: stricter)
+        await world.library.retrieve(bound, shot.name, lambda: stricter)
     assert (caught.value.verdict.code, caught.value.verdict.policies) == ("PrivacyZone", ("p",))
 
 
@@ -207,11 +212,11 @@ async def test_faces_are_hidden_where_they_are_large_enough_to_be_found(tmp_path
     assert grain(kept[700:800, 700:800]) < 12
     assert grain(kept[:600]) > 30
     world.drone.alt = 40.0
-    verdict, shot = await world.service.capture(grant, CaptureArgs())
+    verdict, shot = await world.camera.capture(grant, CaptureArgs())
     assert "blurAverage instead" in verdict.reason
     assert grain(world.stored(grant, shot)) < 12
     strict = active_grant(private("blurFaces", fallback="refuse"))
-    assert await refusal(world.service.capture(strict, CaptureArgs())) == "FacesNotFound"
+    assert await refusal(world.camera.capture(strict, CaptureArgs())) == "FacesNotFound"
     assert grain(await world.pixels(active_grant(private("black")), shot)) == 0
     world.shutter.close()
 
@@ -229,7 +234,7 @@ async def test_faces_that_were_hidden_too_softly_are_not_looked_for_again(tmp_pa
         hard = active_grant(private("blurFaces", faces="pixelate", fallback=fallback))
         assert grain(await world.pixels(hard, shot)) <= most
     strict = active_grant(private("blurFaces", faces="pixelate", fallback="refuse"))
-    assert await refusal(world.service.retrieve(strict, shot.name)) == "FacesNotFound"
+    assert await refusal(world.library.retrieve(strict, shot.name)) == "FacesNotFound"
     world.shutter.close()
 
 
@@ -254,8 +259,8 @@ async def test_no_more_is_kept_than_the_view_that_was_judged(
 
 async def test_without_a_lens_nobody_knows_how_small_faces_are(world: World) -> None:
     world.drone.lens = None
-    verdict, _ = await world.service.capture(active_grant(private("blurFaces")), CaptureArgs())
-    assert "nobody knows how small" in verdict.reason
+    verdict, _ = await world.camera.capture(active_grant(private("blurFaces")), CaptureArgs())
+    assert "unknown how small" in verdict.reason
     assert verdict.policies == ("p",), "80 m away, but who knows what the camera sees"
 
 
@@ -264,7 +269,7 @@ async def test_a_picture_that_was_enlarged_has_no_larger_faces(tmp_path: Path, m
     world.drone.y, world.drone.alt = 0.0, 2.0
     small = np.zeros((100, 100, 3), np.uint8)
     monkeypatch.setattr(world.scene, "capture", lambda _wanted: small)
-    verdict, shot = await world.service.capture(active_grant(private("blurFaces")), CaptureArgs())
+    verdict, shot = await world.camera.capture(active_grant(private("blurFaces")), CaptureArgs())
     assert (shot.width, shot.height) == (1600, 1600)
     assert "faces may be as small as 3 pixels" in verdict.reason
     world.shutter.close()
@@ -272,7 +277,7 @@ async def test_a_picture_that_was_enlarged_has_no_larger_faces(tmp_path: Path, m
 
 @pytest.mark.parametrize(("width", "height"), [(15, 64), (64, 9000), (8192, 8192), (8000, 16)])
 async def test_sizes_beyond_measure_are_refused(world: World, width: int, height: int) -> None:
-    assert await refusal(world.service.capture(active_grant(), CaptureArgs(width, height))) == "InvalidArgument"
+    assert await refusal(world.camera.capture(active_grant(), CaptureArgs(width, height))) == "InvalidArgument"
     assert not world.scene.taken
 
 

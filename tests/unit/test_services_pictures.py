@@ -15,7 +15,7 @@ import pytest
 import skimage.data
 from depth import examples
 from fractus_core.policy.values import Attitude, Filter, Home, Lens
-from fractus_services.camera.album.shots import Pose, Shot, facts
+from fractus_services.camera.album.shots import Shot
 from fractus_services.camera.capture.connection import driver_for
 from fractus_services.camera.capture.driver import BadConnection, CameraFailed, Wanted
 from fractus_services.camera.imaging.faces import BadModel, CascadeDetector, ModelDetector, smallest_face_px
@@ -27,9 +27,10 @@ from fractus_services.camera.imaging.filters import (
     moving,
     remove_background,
 )
-from fractus_services.camera.imaging.metadata import tagged
-from fractus_services.camera.imaging.pipeline import NotHidden, is_upright, recipe
+from fractus_services.camera.imaging.metadata import PictureFacts, with_metadata
+from fractus_services.camera.imaging.pipeline import FacesNotReliable, plan_filters
 from fractus_services.camera.imaging.pixels import NotAPicture, Pixels, decoded, encoded, fitted, source_size
+from fractus_services.camera.pose.pose import Pose, is_upright
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -164,12 +165,12 @@ def test_where_faces_are_not_found_reliably_the_fallback_applies(detector: Casca
     def faces(fallback: Any) -> Filter:
         return Filter("blurFaces", fallback=fallback)
 
-    assert recipe((faces("refuse"),), 48, detector).filters == (faces("refuse"),)
-    assert recipe((faces("blurAverage"),), 47, detector).filters == (Filter("blurAverage"),)
-    assert recipe((faces("black"), Filter("removeBackground")), 0, detector).filters == (Filter("black"),)
-    assert recipe((Filter("blurMedian"),), 0, detector).note == ""
-    with pytest.raises(NotHidden, match="6 pixels"):
-        recipe((faces("refuse"),), 6, detector)
+    assert plan_filters((faces("refuse"),), 48, detector).filters == (faces("refuse"),)
+    assert plan_filters((faces("blurAverage"),), 47, detector).filters == (Filter("blurAverage"),)
+    assert plan_filters((faces("black"), Filter("removeBackground")), 0, detector).filters == (Filter("black"),)
+    assert plan_filters((Filter("blurMedian"),), 0, detector).note == ""
+    with pytest.raises(FacesNotReliable, match="6 pixels"):
+        plan_filters((faces("refuse"),), 6, detector)
 
 
 def test_a_model_that_is_none_is_refused_with_a_sentence(tmp_path: Path) -> None:
@@ -209,7 +210,7 @@ def test_what_is_no_picture_is_said_so(data: bytes) -> None:
 def test_pictures_tell_where_they_were_taken(photo: Pixels) -> None:
     lens = Lens(60.0, 45.0, pitch_deg=-30.0, yaw_deg=10.0, stabilised=True)
     pose = Pose.of(at(30, 40, alt=12.5, lens=lens, attitude=Attitude(5, 5, 80.0)))
-    data = tagged(encoded(photo), facts(pose, NOW + 0.25, "Pi Camera ü", 512))
+    data = with_metadata(encoded(photo), PictureFacts.of(pose, NOW + 0.25, "Pi Camera ü", 512))
     with Image.open(io.BytesIO(data)) as picture:
         assert np.asarray(picture).shape == photo.shape
         exif = picture.getexif()
@@ -233,12 +234,12 @@ def test_pictures_tell_where_they_were_taken(photo: Pixels) -> None:
         assert name in xmp
         assert value in xmp
     with pytest.raises(ValueError, match="JPEG"):
-        tagged(b"PNG", facts(pose, NOW, "", 512))
+        with_metadata(b"PNG", PictureFacts.of(pose, NOW, "", 512))
 
 
-def test_a_picture_from_nowhere_and_below_the_sea_can_be_tagged(photo: Pixels) -> None:
+def test_a_picture_from_nowhere_and_below_the_sea_can_be_with_metadata(photo: Pixels) -> None:
     for now in (at(lens=None, home=None), at(home=Home(-33.9, -70.0, -50.0), alt=1.0)):
-        data = tagged(encoded(photo), facts(Pose.of(now), NOW, "", 512))
+        data = with_metadata(encoded(photo), PictureFacts.of(Pose.of(now), NOW, "", 512))
         with Image.open(io.BytesIO(data)) as picture:
             gps = picture.getexif().get_ifd(0x8825)
         assert (6 in gps) == (now.home is not None)
@@ -361,7 +362,9 @@ def test_a_directory_gives_the_picture_that_was_taken_nearest_in_space(tmp_path:
         ("c", 200, at(50, 0, alt=80)),
     ):
         picture = np.full((48, 64, 3), level, np.uint8)
-        (tmp_path / f"{name}.jpg").write_bytes(tagged(encoded(picture), facts(Pose.of(place), NOW, "", 64)))
+        (tmp_path / f"{name}.jpg").write_bytes(
+            with_metadata(encoded(picture), PictureFacts.of(Pose.of(place), NOW, "", 64))
+        )
     (tmp_path / "untagged.png").write_bytes(bytes(cv2.imencode(".png", np.zeros((4, 4, 3), np.uint8))[1]))
     (tmp_path / "broken.jpg").write_bytes(b"no picture")
     driver = driver_for(f"directory:{tmp_path}")
@@ -371,7 +374,9 @@ def test_a_directory_gives_the_picture_that_was_taken_nearest_in_space(tmp_path:
 
     assert (level(x=5, y=3, alt=20), level(x=40, y=0, alt=20), level(x=40, y=0, alt=70)) == (10, 100, 200)
     late = np.full((48, 64, 3), 250, np.uint8)
-    (tmp_path / "d.jpg").write_bytes(tagged(encoded(late), facts(Pose.of(at(5, 3, alt=20)), NOW, "", 64)))
+    (tmp_path / "d.jpg").write_bytes(
+        with_metadata(encoded(late), PictureFacts.of(Pose.of(at(5, 3, alt=20)), NOW, "", 64))
+    )
     assert level(x=5, y=3, alt=20) == 250
     with pytest.raises(CameraFailed, match="position is unknown"):
         driver.capture(Wanted(64, 48, (64, 48), "RGB", at().__class__(time_s=NOW)))

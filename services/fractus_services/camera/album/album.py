@@ -15,18 +15,31 @@ from pathlib import Path
 from fractus_storage import write_file
 
 from fractus_services.camera.album.shots import Shot
+from fractus_services.errors import NotFound, ResourceExhausted
+from fractus_services.grants import ActiveGrant
 
 log = logging.getLogger(__name__)
 
 _NAME = re.compile(r"[0-9]{17}-[0-9]{4}\.jpg")
 
 
-class AlbumFull(Exception):
+class AlbumFull(ResourceExhausted):
     """A quota is used up."""
 
+    def __init__(self, reason: str) -> None:
+        super().__init__("AlbumFull", reason)
 
-class NoSuchImage(Exception):
+
+class NoSuchImage(NotFound):
     """An instance has no picture of that name."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__("NoSuchImage", reason)
+
+
+def owner_of(grant: ActiveGrant) -> str:
+    """Whose pictures they are: an instance of this very application, not of a later one of the same name."""
+    return f"{grant.spec.application.uid}/{grant.identity}"
 
 
 class Album:
@@ -68,12 +81,10 @@ class Album:
             except FileNotFoundError:
                 continue
             except ValueError as error:
-                log.warning(
-                    "%s cannot be read, so its picture is not handed out (%s); DeleteImage removes it", path, error
-                )
+                log.warning("album: record is damaged, its picture is not returned (file=%s): %s", path, error)
         return tuple(shots)
 
-    def room(self, owner: str) -> str:
+    def quota_problem(self, owner: str) -> str:
         """Why an instance may not add a picture; empty when it may."""
         sizes = _sizes(self._folder(owner).glob("*.jpg"))
         used = sum(sizes)
@@ -96,7 +107,7 @@ class Album:
             OSError: the disk is full.
         """
         with self._lock:
-            problem = self.room(owner)
+            problem = self.quota_problem(owner)
             if problem:
                 raise AlbumFull(problem)
             folder = self._folder(owner)
@@ -113,7 +124,8 @@ class Album:
         """What is known of a picture.
 
         Raises:
-            NoSuchImage: there is none of that name, or its record cannot be read, so that nobody knows what it shows.
+            NoSuchImage: there is none of that name, or its record is damaged: what it shows is then unknown,
+                so no policy can be applied to it.
         """
         record = self._record(owner, name)
         try:
@@ -121,9 +133,9 @@ class Album:
         except FileNotFoundError:
             raise _missing(name) from None
         except ValueError as error:
-            log.warning("picture %s cannot be handed out: %s", name, error)
+            log.warning("album: record is damaged, its picture is not returned (picture=%s): %s", name, error)
             raise NoSuchImage(
-                f"the record of picture {name!r} is damaged, so it is not handed out; DeleteImage removes it"
+                f"the record of picture {name!r} is damaged, so it is not returned; DeleteImage removes it"
             ) from None
 
     def _record(self, owner: str, name: str) -> Path:
@@ -143,7 +155,7 @@ class Album:
         """
         record = self._record(owner, name)
         try:
-            # Without its record a picture is never handed out.
+            # The record goes first: a picture without one is never returned, whenever the process ends.
             record.unlink()
         except FileNotFoundError:
             raise _missing(name) from None
@@ -157,16 +169,16 @@ class Album:
         kept = {self._folder(owner) for owner in self._owners()}
         gone = [path for path in self._directory.iterdir() if path.is_dir() and path not in kept]
         for folder in sorted(gone, key=lambda path: path.stat().st_mtime):
-            log.warning("removing the pictures in %s: their component is gone, and room is needed", folder)
+            log.warning("album: removing pictures of a component that is gone, space is needed (folder=%s)", folder)
             shutil.rmtree(folder, ignore_errors=True)
             if self._total() < self._keep_total_bytes:
                 return True
         return False
 
     def _tidy(self) -> None:
-        """Remove what nobody can ever get: files that were being written, and pictures without a record that is understood.
+        """Remove what can never be returned: unfinished files, and pictures without a readable record.
 
-        These are what a crash, a damaged disk or another release left.
+        A crash, a damaged disk or another release may have left them.
         """
         for record in self._directory.glob("*/*.json"):
             if not _NAME.fullmatch(record.with_suffix(".jpg").name):
@@ -174,10 +186,10 @@ class Album:
             try:
                 Shot.parse(json.loads(record.read_bytes()))
             except ValueError as error:
-                log.warning("removing %s and its picture: nobody can tell any more what it shows (%s)", record, error)
+                log.warning("album: record is damaged, removing it and its picture (file=%s): %s", record, error)
                 record.unlink(missing_ok=True)
             except OSError as error:
-                log.warning("%s cannot be read: %s", record, error)
+                log.warning("album: record cannot be read (file=%s): %s", record, error)
         for path in self._directory.glob("*/*"):
             orphan = path.suffix == ".jpg" and not path.with_suffix(".json").exists()
             if orphan or path.suffix == ".tmp":

@@ -8,16 +8,20 @@ from typing import Literal, Protocol
 from fractus_core.policy.values import Situation
 
 from fractus_services.camera.imaging.pixels import Pixels
+from fractus_services.errors import CannotServe, Unavailable
 
 TIMEOUT_S = 5.0
 """A camera that takes longer for a picture is broken."""
 
 
-class CameraFailed(Exception):
+class CameraFailed(Unavailable):
     """The camera gives no picture; says why, and what to look at."""
 
+    def __init__(self, reason: str) -> None:
+        super().__init__("CameraFailed", reason)
 
-class BadConnection(Exception):
+
+class BadConnection(CannotServe):
     """A connection that names no camera."""
 
 
@@ -45,7 +49,7 @@ class Wanted:
 def as_described(picture: Pixels, wanted: Wanted) -> Pixels:
     """The picture of a camera that was set to its native size, unless it is not of that size.
 
-    Another size is another part of the sensor, and nobody knows which.
+    Another size may be another part of the sensor, so the described field of view does not hold for it.
 
     Raises:
         CameraFailed: it is not, and the picture would be judged by what its description says that it shows.
@@ -54,8 +58,8 @@ def as_described(picture: Pixels, wanted: Wanted) -> Pixels:
     if wanted.now.lens is not None and (columns, rows) != wanted.native:
         width, height = wanted.native
         raise CameraFailed(
-            f"the camera gives {columns}x{rows} pixels though it was set to {width}x{height}, so nobody knows what they"
-            " show; set services.camera.resolution of the node to a size that the camera has, and"
+            f"the camera gives {columns}x{rows} pixels though it was set to {width}x{height}, so it is unknown what"
+            " they show; set services.camera.resolution of the node to a size that the camera has, and"
             " horizontalFieldOfView to what it shows at that size"
         )
     return picture
@@ -76,4 +80,4 @@ class Driver(Protocol):
         """
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """Close the camera."""

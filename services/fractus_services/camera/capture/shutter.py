@@ -1,4 +1,4 @@
-"""Takes pictures on a thread of its own: a camera that hangs holds up nothing but itself."""
+"""Takes pictures on a thread of its own: a camera that hangs blocks nothing but itself."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Shutter:
             ) from None
 
     def close(self) -> None:
-        """Let go of the camera, when it is done with what it does."""
+        """Close the camera once it has finished."""
         self._work.put(None)
 
     def _run(self) -> None:
@@ -84,7 +84,7 @@ class Shutter:
                     time.sleep(apart_s)
                 picture = self._driver.capture(wanted)
                 pictures.append(picture if i == count // 2 else reduced(picture, MOTION_PX))
-        except Exception as error:  # whatever it is, it is the caller's to hear of
+        except Exception as error:  # a driver may raise anything; it belongs to the caller
             failure = error
         self._busy_since_s = None
         if not loop.is_closed():

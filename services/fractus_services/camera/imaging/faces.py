@@ -1,4 +1,4 @@
-"""Where faces are in a picture, and from which size on a detector can be trusted to find them."""
+"""Face detectors, and from which size on each can be trusted."""
 
 from __future__ import annotations
 
@@ -12,29 +12,35 @@ import numpy.typing as npt
 from fractus_core.policy.values import Lens
 
 from fractus_services.camera.imaging.pixels import Pixels, opencv
+from fractus_services.errors import PreconditionFailed
 
 Box = tuple[int, int, int, int]
 """Left, top, width and height in pixels."""
 
 FACE_M = 0.13
-"""A child's face is so wide."""
-LEAST_PX = 48
-"""From this width on the cascades find what `bench/faces.py` shows."""
+"""Width of a child's face, the narrowest that must be found."""
+DEFAULT_MIN_PX = 48
+"""From this width on the cascades find faces as reliably as `bench/faces.py` shows."""
 _WINDOW_PX = 28
-"""Pictures are reduced until the smallest face that matters is so wide: the cascades were trained with 20 pixels."""
-_LEAST_WINDOW_PX = 20
+"""Pictures are reduced until the smallest face that matters has this width: the cascades were trained with 20 pixels, and
+every further pixel only costs time."""
+_MIN_WINDOW_PX = 20
 _STEP = 1.1
 _PROFILE_STEP = 1.2
-"""From one size of faces to the next; the profile cascade is slow."""
+"""Ratio from one size of faces to the next; wider for the profile cascade, which is slow."""
 _PLAIN = tuple(range(0, 360, 30))
 _EQUALISED = tuple(range(15, 360, 30))
-"""Directions that faces are looked for in: in the picture as it is, and between these in one with even contrast."""
+"""Tilts at which faces are searched: the first in the picture as it is, those between them in one with equalised
+contrast, so that each face gets a second chance under other conditions."""
 _PLAIN_UPRIGHT = (0, -30, 30)
 _EQUALISED_UPRIGHT = (0, -15, 15)
 
 
-class BadModel(Exception):
+class BadModel(PreconditionFailed):
     """A face model that cannot be used."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__("FilterUnavailable", reason)
 
 
 class Detector(Protocol):
@@ -42,11 +48,11 @@ class Detector(Protocol):
 
     Attributes:
         name: for people.
-        least_px: width from which on faces are found reliably.
+        min_px: width from which on faces are found reliably.
     """
 
     name: str
-    least_px: float
+    min_px: float
 
     def find(self, picture: Pixels, smallest_px: float, *, upright: bool) -> list[Box]:
         """Boxes around faces.
@@ -59,7 +65,7 @@ class Detector(Protocol):
 
 
 def smallest_face_px(lens: Lens | None, farthest_m: float, width: int) -> float:
-    """Width of the smallest face that a picture may show, in pixels; 0 when nobody knows.
+    """Width of the smallest face that a picture may show, in pixels; 0 when it is unknown.
 
     Args:
         lens: the camera's.
@@ -77,8 +83,8 @@ class CascadeDetector:
 
     name = "cascades"
 
-    def __init__(self, least_px: float = LEAST_PX) -> None:
-        self.least_px = least_px
+    def __init__(self, min_px: float = DEFAULT_MIN_PX) -> None:
+        self.min_px = min_px
         self._frontal: list[Any] = []
         self._profile: Any = None
 
@@ -124,7 +130,7 @@ class CascadeDetector:
 
 
 def _run(cascade: Any, gray: npt.NDArray[np.uint8], step: float) -> list[Box]:
-    boxes = cascade.detectMultiScale(gray, step, 1, minSize=(_LEAST_WINDOW_PX,) * 2)
+    boxes = cascade.detectMultiScale(gray, step, 1, minSize=(_MIN_WINDOW_PX,) * 2)
     return [(int(x), int(y), int(w), int(h)) for x, y, w, h in boxes]
 
 
@@ -133,16 +139,16 @@ class ModelDetector:
 
     Args:
         path: the model's file.
-        least_px: from which width on its operator trusts it.
+        min_px: from which width on its operator trusts it.
 
     Raises:
         BadModel: the file is missing, or OpenCV cannot use it as a face detector.
     """
 
-    def __init__(self, path: Path, least_px: float = LEAST_PX, score: float = 0.5) -> None:
+    def __init__(self, path: Path, min_px: float = DEFAULT_MIN_PX, score: float = 0.5) -> None:
         cv2 = opencv()
         self.name = path.name
-        self.least_px = least_px
+        self.min_px = min_px
         if not path.is_file():
             raise BadModel(f"--face-model {path}: there is no such file; name a YuNet model (ONNX), or leave it out")
         try:

@@ -14,22 +14,22 @@ from fractus_services.camera.imaging.pixels import Pixels, opencv, reduced
 Mask = npt.NDArray[np.bool_]
 
 CELLS = 16
-"""So many averages are left of the longer side of a blurred picture: a face that fills its height keeps nine across,
-below what people and programs recognise anybody by."""
+"""Averages left along the longer side of a blurred picture: a face that fills its height keeps nine across, fewer than
+people or programs need to recognise anyone."""
 FACE_CELLS = 4
-"""So many colours are left across a hidden face."""
+"""Colours left across a hidden face."""
 MARGIN = 0.35
 """Share of a face's width that is hidden around it."""
 _SAMPLES = 33
-"""Pixels across which a median is taken, of a picture reduced to so many for each cell."""
+"""Side of the square of pixels whose median becomes one cell; the picture is reduced to this many per cell first."""
 
 MOTION_PX = 1280
 """Motion is looked for in pictures of this width at most."""
 MOTION_LEVELS = 25
-MOST_MOTION = 0.5
-"""If more of a picture moves, the camera's own motion was not made out."""
+MAX_MOTION = 0.5
+"""Share of a picture that may move; if it is more, the camera's own motion was not estimated."""
 _FEATURES = 1500
-_LEAST_MATCHES = 25
+_MIN_MATCHES = 25
 
 
 def black(picture: Pixels) -> Pixels:
@@ -76,7 +76,7 @@ def hide_faces(picture: Pixels, boxes: Sequence[Box], method: FaceMethod) -> Pix
         if x1 <= x0 or y1 <= y0:
             continue
         region = picture[y0:y1, x0:x1]
-        # The region is wider than the face by both margins, and so many cells wider.
+        # The region is wider than the face by both margins, so it gets that many more cells.
         cells = max(round(FACE_CELLS * (1 + 2 * MARGIN)), 1)
         few = cv2.resize(region, (min(cells, x1 - x0), min(cells, y1 - y0)), interpolation=cv2.INTER_AREA)
         if method == "gaussian":
@@ -88,7 +88,7 @@ def hide_faces(picture: Pixels, boxes: Sequence[Box], method: FaceMethod) -> Pix
 
 
 def remove_background(picture: Pixels, mask: Mask | None) -> Pixels:
-    """What moves, on black; all black where nobody knows what moves."""
+    """What moves, on black; all black where it is unknown what moves."""
     if mask is None:
         return black(picture)
     kept = picture.copy()
@@ -122,7 +122,7 @@ def moving(before: Pixels, picture: Pixels, after: Pixels, *, fixed: bool) -> Ma
         return None
     mask = (differs[0] & differs[1]).astype(np.uint8)
     mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    if mask.mean() > MOST_MOTION:
+    if mask.mean() > MAX_MOTION:
         return None
     mask = cv2.dilate(mask, np.ones((max(mask.shape[1] // 50, 3),) * 2, np.uint8))
     size = (picture.shape[1], picture.shape[0])
@@ -150,11 +150,11 @@ def _overlay(other: npt.NDArray[np.uint8], gray: npt.NDArray[np.uint8]) -> npt.N
     if features is None or wanted is None:
         return None
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(features, wanted)
-    if len(pairs) < _LEAST_MATCHES:
+    if len(pairs) < _MIN_MATCHES:
         return None
     source = np.array([points[p.queryIdx].pt for p in pairs], np.float32)
     target = np.array([there[p.trainIdx].pt for p in pairs], np.float32)
     matrix, inliers = cv2.findHomography(source, target, cv2.RANSAC, 2.0)
-    if matrix is None or inliers is None or int(inliers.sum()) < max(_LEAST_MATCHES, len(pairs) // 3):
+    if matrix is None or inliers is None or int(inliers.sum()) < max(_MIN_MATCHES, len(pairs) // 3):
         return None
     return np.asarray(matrix, np.float64)

@@ -1,22 +1,22 @@
-"""What a picture tells about itself: EXIF and XMP with place, height, direction and time."""
+"""Metadata of a picture: EXIF and XMP with place, height, direction and time."""
 
 from __future__ import annotations
 
-import io
 import math
 import struct
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
+from fractus_services.camera.pose.pose import Pose, directions
+
 _SOI = b"\xff\xd8"
 _APP1 = 0xE1
 _EXIF = b"Exif\x00\x00"
 _XMP = b"http://ns.adobe.com/xap/1.0/\x00"
-_GPS_IFD, _EXIF_IFD = 0x8825, 0x8769
 
 
 @dataclass(frozen=True, slots=True)
-class Facts:
+class PictureFacts:
     """What is known of a picture without filters.
 
     Attributes:
@@ -45,8 +45,34 @@ class Facts:
     yaw_deg: float | None = None
     focal_px: float | None = None
 
+    @classmethod
+    def of(cls, pose: Pose, time_s: float, camera: str, view_width_px: int) -> PictureFacts:
+        """What a pose tells of a picture that was taken there.
 
-def tagged(jpeg: bytes, facts: Facts) -> bytes:
+        Args:
+            pose: where it was taken.
+            time_s: Unix time.
+            camera: make and model.
+            view_width_px: pixels of the whole view, before the picture was cropped.
+        """
+        roll_deg, pitch_deg, yaw_deg = directions(pose)
+        half = math.radians(pose.lens.horizontal_deg) / 2 if pose.lens is not None else None
+        return cls(
+            time_s=float(time_s),
+            camera=camera,
+            lat=pose.lat,
+            lon=pose.lon,
+            amsl_m=pose.home.amsl_m + pose.altitude_m if pose.home is not None else None,
+            altitude_m=pose.altitude_m,
+            position_error_m=pose.position_error_m,
+            roll_deg=roll_deg,
+            pitch_deg=pitch_deg,
+            yaw_deg=yaw_deg,
+            focal_px=view_width_px / 2 / math.tan(half) if half else None,
+        )
+
+
+def with_metadata(jpeg: bytes, facts: PictureFacts) -> bytes:
     """The JPEG with EXIF and XMP segments right after its start, as readers expect them.
 
     Raises:
@@ -61,33 +87,35 @@ def _segment(body: bytes) -> bytes:
     return struct.pack(">BBH", 0xFF, _APP1, len(body) + 2) + body
 
 
-def _exif(facts: Facts) -> bytes:
+def _exif(facts: PictureFacts) -> bytes:
     from PIL import Image  # noqa: PLC0415 - 15 MB that a service which takes no picture does without
+    from PIL.ExifTags import GPS, IFD, Base  # noqa: PLC0415
 
     moment = datetime.fromtimestamp(facts.time_s, UTC)
     exif = Image.Exif()
-    exif[0x0131] = "Fractus"  # Software
+    exif[Base.Software] = "Fractus"
     if facts.camera:
-        exif[0x0110] = facts.camera.encode("ascii", "replace").decode()  # Model
-    exif[0x0132] = moment.strftime("%Y:%m:%d %H:%M:%S")  # DateTime
-    inner = exif.get_ifd(_EXIF_IFD)
-    inner[0x9003] = moment.strftime("%Y:%m:%d %H:%M:%S")  # DateTimeOriginal
-    inner[0x9011] = "+00:00"  # OffsetTimeOriginal
-    inner[0x9291] = f"{moment.microsecond // 1000:03d}"  # SubSecTimeOriginal
+        exif[Base.Model] = facts.camera.encode("ascii", "replace").decode()
+    exif[Base.DateTime] = moment.strftime("%Y:%m:%d %H:%M:%S")
+    inner = exif.get_ifd(IFD.Exif)
+    inner[Base.DateTimeOriginal] = moment.strftime("%Y:%m:%d %H:%M:%S")
+    inner[Base.OffsetTimeOriginal] = "+00:00"
+    inner[Base.SubsecTimeOriginal] = f"{moment.microsecond // 1000:03d}"
     if facts.lat is not None and facts.lon is not None:
-        gps = exif.get_ifd(_GPS_IFD)
-        gps[0] = b"\x02\x03\x00\x00"  # GPSVersionID
-        gps[1], gps[2] = "N" if facts.lat >= 0 else "S", _sexagesimal(facts.lat)
-        gps[3], gps[4] = "E" if facts.lon >= 0 else "W", _sexagesimal(facts.lon)
+        gps = exif.get_ifd(IFD.GPSInfo)
+        gps[GPS.GPSVersionID] = b"\x02\x03\x00\x00"
+        gps[GPS.GPSLatitudeRef], gps[GPS.GPSLatitude] = "N" if facts.lat >= 0 else "S", _sexagesimal(facts.lat)
+        gps[GPS.GPSLongitudeRef], gps[GPS.GPSLongitude] = "E" if facts.lon >= 0 else "W", _sexagesimal(facts.lon)
         if facts.amsl_m is not None:
-            gps[5], gps[6] = b"\x01" if facts.amsl_m < 0 else b"\x00", round(abs(facts.amsl_m), 3)
-        gps[7] = (moment.hour, moment.minute, moment.second + moment.microsecond // 1000 / 1000)
+            # EXIF has no sign here: the reference says whether it is below sea level.
+            gps[GPS.GPSAltitudeRef] = b"\x01" if facts.amsl_m < 0 else b"\x00"
+            gps[GPS.GPSAltitude] = round(abs(facts.amsl_m), 3)
+        gps[GPS.GPSTimeStamp] = (moment.hour, moment.minute, moment.second + moment.microsecond // 1000 / 1000)
         if facts.yaw_deg is not None:
-            gps[16], gps[17] = "T", round(facts.yaw_deg % 360, 3)  # GPSImgDirection, true
-        gps[18], gps[29] = "WGS-84", moment.strftime("%Y:%m:%d")
-        gps[31] = round(facts.position_error_m, 3)  # GPSHPositioningError
-    buffer = io.BytesIO(exif.tobytes())
-    data = buffer.getvalue()
+            gps[GPS.GPSImgDirectionRef], gps[GPS.GPSImgDirection] = "T", round(facts.yaw_deg % 360, 3)  # true north
+        gps[GPS.GPSMapDatum], gps[GPS.GPSDateStamp] = "WGS-84", moment.strftime("%Y:%m:%d")
+        gps[GPS.GPSHPositioningError] = round(facts.position_error_m, 3)
+    data = exif.tobytes()
     return data if data.startswith(_EXIF) else _EXIF + data
 
 
@@ -98,7 +126,7 @@ def _sexagesimal(degrees: float) -> tuple[float, float, float]:
     return whole, minutes, round(seconds, 6)
 
 
-def _xmp(facts: Facts) -> str:
+def _xmp(facts: PictureFacts) -> str:
     """Attitude and height as Pix4D's `Camera` schema has them, which photogrammetry reads."""
     known = {
         "AboveGroundAltitude": facts.altitude_m if facts.lat is not None else None,

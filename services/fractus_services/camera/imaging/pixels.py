@@ -11,25 +11,30 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fractus_services.errors import PreconditionFailed
+
 Pixels = npt.NDArray[np.uint8]
 """Height, width, and blue, green, red: 8 bits each."""
 
 QUALITY = 90
 _M_MMAP_THRESHOLD = -3
 _OWN_PAGES_BYTES = 1_000_000
-"""What is larger gets pages of its own, which go back to the system at once: a third less memory at peak."""
-MOST_PIXELS = 50_000_000
-MOST_BYTES = 64_000_000
+"""Larger blocks get pages of their own, which glibc gives back to the system at once: a third less memory at peak."""
+MAX_PIXELS = 50_000_000
+MAX_BYTES = 64_000_000
 
 
-class NotAPicture(Exception):
+class NotAPicture(PreconditionFailed):
     """Bytes that hold no picture, or one that is too large."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__("FilterUnavailable", reason)
 
 
 @functools.cache
 def opencv() -> Any:
     """OpenCV, on one thread: 30 MB that a service which takes no picture does without."""
-    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MOST_PIXELS))
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))
     import cv2  # noqa: PLC0415 - see above
 
     cv2.setNumThreads(1)
@@ -39,14 +44,14 @@ def opencv() -> Any:
 
 
 def decoded(data: bytes) -> Pixels:
-    """The pixels of a JPEG, PNG or the like, turned upright; whatever else the file tells is dropped.
+    """The pixels of a JPEG, PNG or the like, turned upright; all metadata is dropped.
 
     Raises:
         NotAPicture: it cannot be decoded.
     """
     cv2 = opencv()
-    if not data or len(data) > MOST_BYTES:
-        raise NotAPicture(f"{len(data)} bytes are no picture; at most {MOST_BYTES // 1_000_000} MB are read")
+    if not data or len(data) > MAX_BYTES:
+        raise NotAPicture(f"{len(data)} bytes are no picture; at most {MAX_BYTES // 1_000_000} MB are read")
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     except cv2.error as error:

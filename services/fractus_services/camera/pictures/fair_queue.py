@@ -1,4 +1,4 @@
-"""Who comes next: one at a time, in rounds over the callers, so that the flood of one does not stall the others."""
+"""A lock that is handed from owner to owner in rounds, so that a flood from one does not stall the others."""
 
 from __future__ import annotations
 
@@ -7,33 +7,36 @@ from collections import deque
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
+from fractus_services.errors import ResourceExhausted
 
-class QueueFull(Exception):
+MAX_PER_OWNER = 4
+"""Requests of one component instance that wait or are being served."""
+
+
+class QueueFull(ResourceExhausted):
     """A caller has as many requests waiting as it may have."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__("ShutterBusy", reason)
 
 
 class FairQueue:
-    """A lock that is handed from caller to caller in rounds.
+    """One request at a time, in rounds over the owners of requests.
 
     Args:
-        most: requests of one caller that may wait or be under way.
-        most_waiting: requests of all callers that may.
+        max_per_owner: requests of one owner that may wait or be served.
+        max_requests: requests of all owners that may.
     """
 
-    def __init__(self, most: int, most_waiting: int) -> None:
-        self._most = most
-        self._most_waiting = most_waiting
+    def __init__(self, max_per_owner: int, max_requests: int) -> None:
+        self._max_per_owner = max_per_owner
+        self._max_requests = max_requests
         self._waiting: dict[str, deque[asyncio.Future[None]]] = {}
         self._count: dict[str, int] = {}
         self._busy = False
 
-    @property
-    def busy(self) -> bool:
-        """Whether somebody has the turn."""
-        return self._busy
-
     def __len__(self) -> int:
-        """Requests that wait or are under way."""
+        """Requests that wait or are being served."""
         return sum(self._count.values())
 
     @asynccontextmanager
@@ -41,12 +44,14 @@ class FairQueue:
         """Wait for a turn and hold it.
 
         Raises:
-            QueueFull: too many of this caller, or of all callers, wait already.
+            QueueFull: too many of this owner, or of all owners, wait already.
         """
-        if self._count.get(owner, 0) >= self._most:
-            raise QueueFull(f"{self._most} pictures of this component are under way; wait for them and try again")
-        if len(self) >= self._most_waiting:
-            raise QueueFull(f"{self._most_waiting} pictures are under way on this node; try again")
+        if self._count.get(owner, 0) >= self._max_per_owner:
+            raise QueueFull(
+                f"{self._max_per_owner} pictures of this component are under way; wait for them and try again"
+            )
+        if len(self) >= self._max_requests:
+            raise QueueFull(f"{self._max_requests} pictures are under way on this node; try again")
         self._count[owner] = self._count.get(owner, 0) + 1
         try:
             await self._take(owner)
@@ -68,19 +73,21 @@ class FairQueue:
         try:
             await place
         except asyncio.CancelledError:
+            # The turn may have been handed to this request just before it was cancelled: it must not be lost.
             if place.done() and not place.cancelled():
                 self._pass_on(owner)
             raise
 
     def _pass_on(self, last: str) -> None:
         if last in self._waiting:
+            # Who just had a turn goes to the end of the round: dictionaries keep the order of insertion.
             self._waiting[last] = self._waiting.pop(last)
         while self._waiting:
             owner = next(iter(self._waiting))
             queue = self._waiting.pop(owner)
             place = queue.popleft()
             if queue:
-                self._waiting[owner] = queue  # back to the end of the round
+                self._waiting[owner] = queue
             if not place.done():
                 place.set_result(None)
                 return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,12 @@ from fractus_core.policy.values import CaptureArgs
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
 
 from fractus_services.answering import Reception
+from fractus_services.auth import Caller
 from fractus_services.camera.album.album import NoSuchImage
 from fractus_services.camera.album.shots import Shot
-from fractus_services.camera.pictures.service import CameraService
+from fractus_services.camera.pictures.capture import PictureCapture
+from fractus_services.camera.pictures.library import PictureLibrary
+from fractus_services.errors import ResourceExhausted
 from fractus_services.replies import decision
 
 CHUNK_BYTES = 256 * 1024
@@ -23,23 +27,32 @@ READ_BYTES = 4 * CHUNK_BYTES
 class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
     """The service on the wire."""
 
-    def __init__(self, service: CameraService, reception: Reception) -> None:
-        self._service = service
+    def __init__(self, capture: PictureCapture, library: PictureLibrary, reception: Reception) -> None:
+        self._capture = capture
+        self._library = library
         self._reception = reception
+
+    @asynccontextmanager
+    async def _call(self, context: Any) -> AsyncIterator[Caller]:
+        async with self._reception.call(context) as caller:
+            try:
+                yield caller
+            except OSError as error:
+                raise storage_failed(error) from error
 
     async def CaptureImage(self, request: Any, context: Any) -> Any:  # noqa: N802 - the protocol's name
         """See camera.proto."""
-        async with self._reception.call(context) as caller:
+        async with self._call(context) as caller:
             grant = self._reception.grant_of(caller)
             args = CaptureArgs(request.width, request.height)
-            verdict, shot = await self._service.capture(grant, args, lambda: self._reception.grant_of(caller))
+            verdict, shot = await self._capture.capture(grant, args, lambda: self._reception.grant_of(caller))
             return camera_pb2.CaptureImageResponse(decision=decision(verdict), image=_info(shot))
 
     async def RetrieveImage(self, request: Any, context: Any) -> None:  # noqa: N802
         """See camera.proto."""
-        async with self._reception.call(context) as caller:
+        async with self._call(context) as caller:
             grant = self._reception.grant_of(caller)
-            verdict, shot, source = await self._service.retrieve(
+            verdict, shot, source = await self._library.retrieve(
                 grant, request.name, lambda: self._reception.grant_of(caller)
             )
             head: dict[str, Any] = {"decision": decision(verdict), "image": _info(shot)}
@@ -50,19 +63,25 @@ class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
 
     async def ListImages(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See camera.proto."""
-        async with self._reception.call(context) as caller:
-            verdict, shots = await self._service.list(self._reception.grant_of(caller))
+        async with self._call(context) as caller:
+            verdict, shots = await self._library.list(self._reception.grant_of(caller))
             return camera_pb2.ListImagesResponse(decision=decision(verdict), images=[_info(shot) for shot in shots])
 
     async def DeleteImage(self, request: Any, context: Any) -> Any:  # noqa: N802
         """See camera.proto."""
-        async with self._reception.call(context) as caller:
-            verdict = await self._service.delete(self._reception.grant_of(caller), request.name)
+        async with self._call(context) as caller:
+            verdict = await self._library.delete(self._reception.grant_of(caller), request.name)
             return camera_pb2.DeleteImageResponse(decision=decision(verdict))
 
 
+def storage_failed(error: OSError) -> ResourceExhausted:
+    """A failure of the disk as a refusal."""
+    reason = f"the picture cannot be stored: {error.strerror or error}; delete pictures, or make room on the node"
+    return ResourceExhausted("StorageFailed", reason)
+
+
 async def _pieces(source: bytes | Path, name: str) -> AsyncIterator[bytes]:
-    """The bytes of a picture; a file is read bit by bit, so that slow readers cost no memory.
+    """The bytes of a picture; a file is read in pieces, so that slow readers cost no memory.
 
     Raises:
         NoSuchImage: it was deleted meanwhile.
@@ -85,6 +104,7 @@ def _info(shot: Shot) -> camera_pb2.ImageInfo:
     )
     info.time.FromNanoseconds(int(shot.time_s * 1e9))
     taken = shot.poses[-1]
+    # Where a filtered picture was taken is private too: a policy asked for the filter there.
     if taken.lat is not None and taken.lon is not None and not shot.filters:
         info.position.latitude_deg, info.position.longitude_deg = taken.lat, taken.lon
         info.position.altitude_m = taken.altitude_m

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import socket
 import time
 
@@ -14,48 +13,40 @@ from fractus_proto.v1 import camera_pb2_grpc
 
 from fractus_services.answering import Reception
 from fractus_services.audit import AuditLog
-from fractus_services.auth import KEEPALIVE, TlsFiles
-from fractus_services.camera.album.album import Album
+from fractus_services.auth import TlsFiles
+from fractus_services.camera.album.album import Album, owner_of
 from fractus_services.camera.capture.connection import driver_for
+from fractus_services.camera.capture.properties import CameraProperties
 from fractus_services.camera.capture.shutter import Shutter
-from fractus_services.camera.imaging.faces import CascadeDetector, Detector, ModelDetector
-from fractus_services.camera.pictures.service import Body, CameraService, Whereabouts, known, owner_of
-from fractus_services.camera.pose.provider import Airborne, Fixed
+from fractus_services.camera.imaging.faces import BadModel, CascadeDetector, Detector, ModelDetector
+from fractus_services.camera.pictures.capture import PictureCapture
+from fractus_services.camera.pictures.filtering import Filtering
+from fractus_services.camera.pictures.judge import PictureJudge
+from fractus_services.camera.pictures.library import PictureLibrary
+from fractus_services.camera.pose.history import PoseHistory
+from fractus_services.camera.pose.provider import FixedPose, PoseProvider
 from fractus_services.camera.rpc.handlers import CameraHandlers
+from fractus_services.camera.rpc.telemetry import follow_telemetry
 from fractus_services.clock import Clock
+from fractus_services.errors import CannotServe
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import GrantFiles
-from fractus_services.hosting import bind, read_description
+from fractus_services.hosting import read_description, run_until, serve_grpc
 from fractus_services.options import CameraOptions
-
-log = logging.getLogger(__name__)
-
-STOP_S = 2.0
-
-
-def body_of(description: Drone | EdgeNode | None) -> Body:
-    """The camera's own properties."""
-    camera = description.spec.services.camera if description is not None else None
-    fixed = isinstance(description, EdgeNode)
-    return Body(camera.pixels, camera.model, camera.sensor_type, fixed) if camera is not None else Body(fixed=fixed)
 
 
 def detector_of(options: CameraOptions) -> Detector:
     """What finds faces.
 
     Raises:
-        BadModel: the model that was named cannot be used.
+        CannotServe: the model that was named cannot be used.
     """
-    if options.face_model is not None:
+    if options.face_model is None:
+        return CascadeDetector(options.face_px)
+    try:
         return ModelDetector(options.face_model, options.face_px)
-    return CascadeDetector(options.face_px)
-
-
-def _whereabouts(options: CameraOptions, description: Drone | EdgeNode | None, node: str, tls: TlsFiles) -> Whereabouts:
-    if isinstance(description, EdgeNode):
-        return Fixed.of(description.spec, options.relief)
-    lens = lens_of(description.spec.services.camera) if description is not None else None
-    return Airborne(options.mobility, node, tls, time.monotonic, lens=lens, relief_m=options.relief)
+    except BadModel as error:
+        raise CannotServe(str(error)) from None
 
 
 async def run(options: CameraOptions, stop: asyncio.Event) -> None:
@@ -63,8 +54,6 @@ async def run(options: CameraOptions, stop: asyncio.Event) -> None:
 
     Raises:
         CannotServe: an option is wrong; also within an ExceptionGroup.
-        BadConnection: there is no such camera.
-        BadModel: the face detector cannot be used.
     """
     clock = Clock()
     description = read_description(options.description, Drone, EdgeNode)
@@ -72,15 +61,12 @@ async def run(options: CameraOptions, stop: asyncio.Event) -> None:
     tls = TlsFiles(options.tls)
     audit = AuditLog(options.audit, clock)
     grants = GrantFiles(
-        options.grants,
-        node,
-        GrantVerifier(options.tls, options.state / "grants-seen.json"),
-        refused=audit.refused_grant,
+        options.grants, node, GrantVerifier(options.tls, options.grant_memory), refused=audit.refused_grant
     )
     grants.scan()
-    camera = description.spec.services.camera if description is not None else None
-    shutter = Shutter(driver_for(options.camera or (camera.connection if camera is not None else "test:")))
-    whereabouts = _whereabouts(options, description, node, tls)
+    described = description.spec.services.camera if description is not None else None
+    camera = CameraProperties.of(description)
+    shutter = Shutter(driver_for(options.camera or (described.connection if described is not None else "test:")))
     album = Album(
         options.state,
         options.keep,
@@ -88,29 +74,26 @@ async def run(options: CameraOptions, stop: asyncio.Event) -> None:
         options.keep_total_mb * 1_000_000,
         lambda: [owner_of(grant) for grant in grants.active.values()],
     )
-    service = CameraService(
-        whereabouts, shutter, body_of(description), detector=detector_of(options), album=album, audit=audit, clock=clock
+    judge = PictureJudge(audit)
+    filtering = Filtering(detector_of(options), judge, fixed=camera.fixed)
+    parts = [grants.run()]
+    poses: PoseProvider
+    if isinstance(description, EdgeNode):
+        poses = FixedPose.of(description.spec, options.relief)
+    else:
+        lens = lens_of(described) if described is not None else None
+        poses = history = PoseHistory(time.monotonic, lens=lens, relief_m=options.relief)
+        parts.append(follow_telemetry(options.mobility, node, tls, history.add))
+    handlers = CameraHandlers(
+        PictureCapture(poses, shutter, camera, filtering=filtering, album=album, judge=judge, clock=clock),
+        PictureLibrary(poses, filtering, album, judge, clock),
+        Reception(grants, clock),
     )
-    handlers = CameraHandlers(service, Reception(grants, clock, known))
+
+    def register(server: grpc.aio.Server) -> None:
+        camera_pb2_grpc.add_CameraServiceServicer_to_server(handlers, server)  # type: ignore[no-untyped-call]
+
     audit.append("started", {"node": node})
-    async with asyncio.TaskGroup() as tasks:
-        running = [
-            tasks.create_task(part) for part in (grants.run(), _serve(options.listen, tls, handlers, whereabouts))
-        ]
-        await stop.wait()
-        for task in running:
-            task.cancel()
+    await run_until(stop, *parts, serve_grpc("camera", options.listen, tls, register))
     shutter.close()
     await audit.close()
-
-
-async def _serve(listen: str, tls: TlsFiles, handlers: CameraHandlers, whereabouts: Whereabouts) -> None:
-    server = grpc.aio.server(options=KEEPALIVE)
-    camera_pb2_grpc.add_CameraServiceServicer_to_server(handlers, server)  # type: ignore[no-untyped-call]
-    await bind(server, listen, tls)
-    log.info("camera service on %s", listen)
-    try:
-        await whereabouts.run()
-        await asyncio.Event().wait()
-    finally:
-        await asyncio.shield(server.stop(STOP_S))

@@ -13,11 +13,11 @@ from fractus_core.api.nodes import Drone
 from fractus_proto.v1 import mobility_pb2_grpc
 
 from fractus_services.audit import AuditLog
-from fractus_services.auth import KEEPALIVE, TlsFiles
+from fractus_services.auth import TlsFiles
 from fractus_services.clock import Clock
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import GrantFiles
-from fractus_services.hosting import bind, read_description
+from fractus_services.hosting import read_description, run_until, serve_grpc
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.authority.observer import Observer
@@ -39,7 +39,6 @@ from fractus_services.options import MobilityOptions
 
 log = logging.getLogger(__name__)
 
-STOP_S = 2.0
 DEFAULT_LINK = "tcp:127.0.0.1:5760"
 
 
@@ -67,7 +66,7 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     node, url = options.node or name, options.autopilot or link
     tls = TlsFiles(options.tls)
     audit = AuditLog(options.audit, clock)
-    verifier = GrantVerifier(options.tls, options.state / "grants-seen.json")
+    verifier = GrantVerifier(options.tls, options.grant_memory)
     grants = GrantFiles(options.grants, node, verifier, options.flat_terrain, audit.refused_grant)
     journal = Journal(options.state)
     autopilot = Autopilot(url)
@@ -91,22 +90,13 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     service = MobilityService(control, CallJudge(control, guard), homing.around)
     streams = Streams(control, transit.bring)
     handlers = MobilityHandlers(service, control, streams, grants=grants, node=node, clock=clock, heard=tours.heard)
-    async with asyncio.TaskGroup() as tasks:
-        running = [
-            tasks.create_task(part)
-            for part in (
-                autopilot.run(),
-                grants.run(),
-                monitor.run(),
-                monitor.record(),
-                tours.run(),
-                _serve(options, tls, handlers),
-            )
-        ]
-        await stop.wait()
-        log.info("stopping; a drone in the air flies home by its autopilot's failsafe")
-        for task in running:
-            task.cancel()
+
+    def register(server: grpc.aio.Server) -> None:
+        mobility_pb2_grpc.add_MobilityServiceServicer_to_server(handlers, server)  # type: ignore[no-untyped-call]
+
+    serving = serve_grpc("mobility", options.listen, tls, register)
+    await run_until(stop, autopilot.run(), grants.run(), monitor.run(), monitor.record(), tours.run(), serving)
+    log.info("mobility: stopped, a drone in flight goes home by its autopilot's failsafe")
     await audit.close()
 
 
@@ -114,14 +104,3 @@ def _record_grant(audit: AuditLog, old: Any, new: Any) -> None:
     grant = new or old
     change = "added" if old is None else "removed" if new is None else "changed"
     audit.append("grant", {"change": change, "identity": grant.identity, "name": grant.name, "key": grant.key})
-
-
-async def _serve(options: MobilityOptions, tls: TlsFiles, handlers: MobilityHandlers) -> None:
-    server = grpc.aio.server(options=KEEPALIVE)
-    mobility_pb2_grpc.add_MobilityServiceServicer_to_server(handlers, server)  # type: ignore[no-untyped-call]
-    await bind(server, options.listen, tls)
-    log.info("mobility service on %s", options.listen)
-    try:
-        await asyncio.Event().wait()
-    finally:
-        await asyncio.shield(server.stop(STOP_S))

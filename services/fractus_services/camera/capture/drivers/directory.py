@@ -16,15 +16,14 @@ from fractus_services.camera.imaging.pixels import NotAPicture, Pixels, decoded
 log = logging.getLogger(__name__)
 
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"})
-_GPS = 0x8825
-_MOST_FILES = 100_000
+_MAX_FILES = 100_000
 
 
 class GeotaggedDirectory:
-    """Pictures with a position in their EXIF data, found by it; altitudes count where they are known.
+    """Serves the picture whose EXIF position is nearest to the camera; altitudes count where they are known.
 
     Args:
-        path: the directory; it is looked through again when it changes.
+        path: the directory; it is read again when it changes.
     """
 
     latency_s = 0.0
@@ -53,14 +52,14 @@ class GeotaggedDirectory:
             raise CameraFailed(f"{self._files[nearest]} cannot be read: {error}") from None
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Nothing to close."""
 
     def _look(self) -> None:
         try:
             stamp = self._path.stat().st_mtime_ns
             if stamp == self._stamp:
                 return
-            files = sorted(p for p in self._path.iterdir() if p.suffix.lower() in _SUFFIXES)[:_MOST_FILES]
+            files = sorted(p for p in self._path.iterdir() if p.suffix.lower() in _SUFFIXES)[:_MAX_FILES]
         except OSError as error:
             raise CameraFailed(f"{self._path} cannot be read: {error.strerror or error}") from None
         found = [(file, place) for file in files if (place := position_of(file)) is not None]
@@ -74,16 +73,19 @@ class GeotaggedDirectory:
 def position_of(file: Path) -> tuple[float, float, float] | None:
     """Latitude, longitude, and metres above mean sea level (NaN where unknown) from a picture's EXIF data."""
     from PIL import Image, UnidentifiedImageError  # noqa: PLC0415 - only this camera needs it
+    from PIL.ExifTags import GPS, IFD  # noqa: PLC0415
 
     try:
         with Image.open(file) as picture:
-            tags = picture.getexif().get_ifd(_GPS)
-        lat, lon = _degrees(tags[2]), _degrees(tags[4])
-        lat, lon = (-lat if tags.get(1) == "S" else lat), (-lon if tags.get(3) == "W" else lon)
-        alt = float(tags[6]) if 6 in tags else math.nan
-        below = tags.get(5) in {1, b"\x01"}
+            tags = picture.getexif().get_ifd(IFD.GPSInfo)
+        lat, lon = _degrees(tags[GPS.GPSLatitude]), _degrees(tags[GPS.GPSLongitude])
+        lat = -lat if tags.get(GPS.GPSLatitudeRef) == "S" else lat
+        lon = -lon if tags.get(GPS.GPSLongitudeRef) == "W" else lon
+        alt = float(tags.get(GPS.GPSAltitude, math.nan))
+        # Cameras write the reference as a number or as a byte; 1 is below sea level.
+        below = tags.get(GPS.GPSAltitudeRef) in {1, b"\x01"}
     except (OSError, UnidentifiedImageError, KeyError, TypeError, ValueError, ZeroDivisionError, SyntaxError) as error:
-        log.debug("%s has no position: %s", file, error)
+        log.debug("camera directory: picture has no position (file=%s): %s", file, error)
         return None
     if not (-90 <= lat <= 90 and -180 <= lon <= 180):
         return None

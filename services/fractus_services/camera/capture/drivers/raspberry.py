@@ -18,7 +18,7 @@ class RaspberryCamera:
     """
 
     latency_s = 0.3
-    """The picture that is under way when one is asked for may be given, of a slow sensor in the dark."""
+    """In the dark a slow sensor may deliver the frame that it was already exposing."""
 
     def __init__(self, number: int) -> None:
         self._number = number
@@ -29,7 +29,7 @@ class RaspberryCamera:
         if self._camera is None:
             self._camera = self._started(wanted)
         try:
-            # What picamera2 calls RGB888 has blue first in memory, as OpenCV has it.
+            # What picamera2 calls RGB888 has blue first in memory, as OpenCV expects it.
             picture = self._camera.capture_array("main")
         except (RuntimeError, OSError) as error:
             self.close()

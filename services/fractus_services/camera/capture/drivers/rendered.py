@@ -40,4 +40,4 @@ class Rendered:
         return picture
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Nothing to close."""

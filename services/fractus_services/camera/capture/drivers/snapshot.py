@@ -9,7 +9,7 @@ import urllib.parse
 import urllib.request
 
 from fractus_services.camera.capture.driver import TIMEOUT_S, BadConnection, CameraFailed, Wanted
-from fractus_services.camera.imaging.pixels import MOST_BYTES, NotAPicture, Pixels, decoded
+from fractus_services.camera.imaging.pixels import MAX_BYTES, NotAPicture, Pixels, decoded
 
 _PIECE_BYTES = 256 * 1024
 
@@ -65,7 +65,7 @@ class Snapshot:
             raise CameraFailed(f"{self._url} sends no picture: {error}") from None
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Nothing to close."""
 
     def _address(self, wanted: Wanted) -> str:
         if "{width}" in self._url or "{height}" in self._url:
@@ -83,8 +83,8 @@ class Snapshot:
             while piece := reply.read1(_PIECE_BYTES):
                 pieces.append(piece)
                 size += len(piece)
-                if size > MOST_BYTES:
-                    raise CameraFailed(f"{self._url} sends more than {MOST_BYTES // 1_000_000} MB for one picture")
+                if size > MAX_BYTES:
+                    raise CameraFailed(f"{self._url} sends more than {MAX_BYTES // 1_000_000} MB for one picture")
                 if time.monotonic() > until:
                     raise TimeoutError(f"no whole picture in {TIMEOUT_S:.0f} s")
         return b"".join(pieces)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,9 +10,9 @@ from depth import examples
 from fractus_core.policy.footprint import footprint, seen_from
 from fractus_core.policy.values import Lens, Situation
 from fractus_proto.v1 import mobility_pb2
-from fractus_services.auth import TlsFiles
-from fractus_services.camera.pose import provider as whereabouts
-from fractus_services.camera.pose.provider import Airborne
+from fractus_services.camera.pose import history
+from fractus_services.camera.pose.history import PoseHistory
+from fractus_services.camera.rpc.telemetry import measurement
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from policy_world import FRAME, HOME
@@ -26,7 +25,7 @@ class Drone:
 
     def __init__(self) -> None:
         self.now_s = 100.0
-        self.airborne = Airborne("", "drone-1", TlsFiles(Path()), lambda: self.now_s, lens=LENS)
+        self.poses = PoseHistory(lambda: self.now_s, lens=LENS)
 
     def tell(
         self,
@@ -48,10 +47,10 @@ class Drone:
         message.home.latitude_deg, message.home.longitude_deg, message.home.altitude_m = HOME.lat, HOME.lon, 100.0
         if ages is not None:
             message.position_age_s, message.attitude_age_s = ages
-        self.airborne._hear(message)
+        self.poses.add(measurement(message, at_s))
 
     def way(self, begun_s: float) -> tuple[Situation, ...]:
-        return self.airborne.way(begun_s, 1.0)
+        return self.poses.situations_since(begun_s, 1.0)
 
 
 @pytest.fixture
@@ -70,33 +69,33 @@ def test_every_pose_since_the_begin_counts_with_the_one_before_it(drone: Drone) 
     way = drone.way(100.45)
     assert [attitude(now).yaw_deg for now in way] == [40, 50, 60, 70, 80, 90]
     # Half of what neighbours differ by, and what an airframe turns unseen in half a tenth of a second.
-    assert attitude(way[1]).yaw_error_deg == pytest.approx(whereabouts.YAW_ERROR_DEG + 5.0 + 0.05 * 60.0)
-    assert attitude(way[1]).tilt_error_deg == pytest.approx(whereabouts.TILT_ERROR_DEG + 0.05 * 60.0)
-    assert drone.airborne.situation(1.0).attitude is not None
+    assert attitude(way[1]).yaw_error_deg == pytest.approx(history.YAW_ERROR_DEG + 5.0 + 0.05 * 60.0)
+    assert attitude(way[1]).tilt_error_deg == pytest.approx(history.TILT_ERROR_DEG + 0.05 * 60.0)
+    assert drone.poses.situation(1.0).attitude is not None
 
 
 def test_errors_grow_with_the_age_of_what_they_belong_to(drone: Drone) -> None:
     drone.tell(100.0, speed=(8.0, -3.0), ages=(0.2, 0.3))
     drone.now_s = 100.4
-    now = drone.airborne.situation(1.0)
+    now = drone.poses.situation(1.0)
     assert now.position_error_m == pytest.approx(1.0 + 8.0 * 0.6 + 2.5 * 0.36)
     assert now.altitude_error_m == pytest.approx(1.0 + 3.0 * 0.6 + 2.5 * 0.36)
-    assert attitude(now).tilt_error_deg == pytest.approx(whereabouts.TILT_ERROR_DEG + 60.0 * 0.7)
+    assert attitude(now).tilt_error_deg == pytest.approx(history.TILT_ERROR_DEG + 60.0 * 0.7)
     drone.now_s = 100.75
-    now = drone.airborne.situation(1.0)
+    now = drone.poses.situation(1.0)
     assert now.lat is not None
     assert now.attitude is None, "measured more than a second ago"
     drone.now_s = 100.85
-    assert drone.airborne.situation(1.0).lat is None
+    assert drone.poses.situation(1.0).lat is None
 
 
 def test_an_age_that_is_not_told_is_not_none(drone: Drone) -> None:
     drone.tell(100.0, ages=None)
-    assert attitude(drone.airborne.situation(1.0)).yaw_error_deg > whereabouts.YAW_ERROR_DEG + 20.0
+    assert attitude(drone.poses.situation(1.0)).yaw_error_deg > history.YAW_ERROR_DEG + 20.0
 
 
 def test_where_a_part_of_the_exposure_was_not_told_it_is_unknown(drone: Drone) -> None:
-    assert drone.airborne.situation(1.0).lat is None
+    assert drone.poses.situation(1.0).lat is None
     assert [now.lat for now in drone.way(100.0)] == [None]
     drone.tell(100.0)
     assert drone.way(99.9)[0].lat is None, "nothing was told when it began"
@@ -108,7 +107,7 @@ def test_where_a_part_of_the_exposure_was_not_told_it_is_unknown(drone: Drone) -
     assert [now.lat is None for now in drone.way(101.1)] == [False, True, False]
     for i in range(400):
         drone.tell(102.0 + i / 10)
-    assert len(drone.airborne._told) <= 302
+    assert len(drone.poses) <= 302
     assert drone.way(101.3)[0].lat is None, "longer ago than anybody remembers"
 
 
@@ -145,7 +144,7 @@ def test_whatever_is_seen_between_two_messages_is_in_the_footprint(
     drone.tell(
         moment_s, x=speed[0] * (moment_s - 100.0), alt=40.0 - speed[1] * (moment_s - 100.0), turned=turned(moment_s)
     )  # fmt: skip
-    exact = drone.airborne.situation(1.0)
+    exact = drone.poses.situation(1.0)
     actual = footprint(exact, FRAME)
     assert actual is not None
     assert shown.farthest_m >= actual.farthest_m - shown.margin_m

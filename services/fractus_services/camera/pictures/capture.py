@@ -1,0 +1,210 @@
+"""Takes a picture: judged when the shutter is free and again once it is taken, filtered before it is stored."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+
+from fractus_core.policy.footprint import seen_from
+from fractus_core.policy.privacy import judge_privacy
+from fractus_core.policy.values import Call, CaptureArgs, Moment, Situation, Verdict, earliest
+
+from fractus_services.camera.album.album import Album, AlbumFull, owner_of
+from fractus_services.camera.album.shots import Shot
+from fractus_services.camera.capture.driver import Wanted
+from fractus_services.camera.capture.properties import CameraProperties
+from fractus_services.camera.capture.shutter import Shutter
+from fractus_services.camera.imaging.faces import smallest_face_px
+from fractus_services.camera.imaging.filters import MOTION_PX
+from fractus_services.camera.imaging.metadata import PictureFacts, with_metadata
+from fractus_services.camera.imaging.pixels import Pixels, cropped, encoded, fitted
+from fractus_services.camera.pictures.completion import Completion
+from fractus_services.camera.pictures.fair_queue import MAX_PER_OWNER, FairQueue
+from fractus_services.camera.pictures.filtering import Filtering
+from fractus_services.camera.pictures.judge import PictureJudge, combined
+from fractus_services.camera.pose.pose import Pose
+from fractus_services.camera.pose.provider import PoseProvider
+from fractus_services.grants import ActiveGrant
+
+MAX_EXPOSURES = 8
+"""Pictures of all components that are being taken or wait for the shutter."""
+FRAME_INTERVAL_S = 0.25
+"""Between the frames that show what moves."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Exposure:
+    """What came out of an exposure, judged.
+
+    Attributes:
+        name: of the picture.
+        grant: by which it was judged.
+        verdict: which filters it needs.
+        after: where the camera was at the end, and on which way it got there.
+        frames: what the camera gave.
+        view_width_px: width of the whole view, in pixels that the camera gave.
+    """
+
+    name: str
+    grant: ActiveGrant
+    verdict: Verdict
+    after: Situation
+    frames: list[Pixels]
+    view_width_px: int
+
+
+class PictureCapture:
+    """CaptureImage of Table 8.2 of the thesis, for callers whose grant is known.
+
+    A picture is filtered before it is stored: where a policy requires filters, no picture without them is ever on disk.
+
+    Args:
+        poses: where the camera is.
+        shutter: the camera.
+        camera: its properties.
+        filtering: filters pictures.
+        album: where pictures are stored.
+        judge: judges and records.
+        clock: Unix time.
+    """
+
+    def __init__(
+        self,
+        poses: PoseProvider,
+        shutter: Shutter,
+        camera: CameraProperties,
+        *,
+        filtering: Filtering,
+        album: Album,
+        judge: PictureJudge,
+        clock: Callable[[], float],
+    ) -> None:
+        self._poses = poses
+        self._shutter = shutter
+        self._camera = camera
+        self._filtering = filtering
+        self._album = album
+        self._judge = judge
+        self._clock = clock
+        self._numbers = itertools.count()
+        self._exposures = FairQueue(MAX_PER_OWNER, MAX_EXPOSURES)
+        self._completion = Completion()
+
+    async def capture(
+        self, grant: ActiveGrant, args: CaptureArgs, current_grant: Callable[[], ActiveGrant] | None = None
+    ) -> tuple[Verdict, Shot]:
+        """Take a picture and store it.
+
+        It is judged when the shutter is free, and again when the picture is taken, together with all that the camera saw
+        on the way: the drone moves meanwhile, and grants change.
+
+        Args:
+            grant: the caller's.
+            args: pixels; 0 means the camera's own.
+            current_grant: the caller's grant at a later moment; raises when there is none any more.
+        """
+        width, height = args.width or self._camera.resolution[0], args.height or self._camera.resolution[1]
+        self._camera.check_size(width, height)
+        sized = replace(args, width=width, height=height)
+        return await self._completion.complete(self._capture(owner_of(grant), sized, current_grant or (lambda: grant)))
+
+    async def _capture(
+        self, owner: str, args: CaptureArgs, current_grant: Callable[[], ActiveGrant]
+    ) -> tuple[Verdict, Shot]:
+        expected = judge_privacy(self._poses.situation(self._clock()), current_grant().compiled)
+        if not expected.filters:
+            exposure = await self._expose(owner, args, current_grant)
+            if not exposure.verdict.filters:
+                return await self._store(args, exposure)
+            async with self._filtering.turn(owner):
+                return await self._store(args, exposure)
+        # The picture must not wait in memory for its filters, so the turn for these comes first.
+        async with self._filtering.turn(owner):
+            return await self._store(args, await self._expose(owner, args, current_grant))
+
+    async def _expose(self, owner: str, args: CaptureArgs, current_grant: Callable[[], ActiveGrant]) -> _Exposure:
+        call = Call("CaptureImage", args)
+        async with self._exposures.turn(owner):
+            # A camera may deliver a picture that it took before it was asked.
+            begun_s = time.monotonic() - self._shutter.latency_s
+            grant, before = current_grant(), self._poses.situation(self._clock())
+            verdict = self._judge.judge(call, grant, before)
+            problem = await asyncio.to_thread(self._album.quota_problem, owner)
+            if problem:
+                raise AlbumFull(problem)
+            frames = await self._shutter.expose(*self._wanted(args, grant, before, verdict))
+            if before.lens is not None:
+                # It is judged by a view in these proportions, whatever the camera gave.
+                frames = [cropped(one, *self._camera.resolution) for one in frames]
+            way, grant = self._poses.situations_since(begun_s, self._clock()), current_grant()
+            after = replace(way[-1], way=way)
+            verdict = combined([verdict, *self._judge_again(call, grant, before, after)])
+            # Enlarging a picture does not make its faces easier to find.
+            view_width_px = min(self._camera.source_size(args.width, args.height)[0], frames[len(frames) // 2].shape[1])
+            return _Exposure(self._name(after), grant, verdict, after, frames, view_width_px)
+
+    def _wanted(
+        self, args: CaptureArgs, grant: ActiveGrant, before: Situation, verdict: Verdict
+    ) -> tuple[Wanted, int, float]:
+        """What to ask the shutter for; what moves is seen only in several frames."""
+        camera = self._camera
+        size = camera.source_size(args.width, args.height)
+        wanted = Wanted(*size, camera.resolution, camera.sensor, before, grant.spec.node)
+        moving = any(one.action == "removeBackground" for one in verdict.filters)
+        return wanted, 3 if moving else 1, FRAME_INTERVAL_S
+
+    def _judge_again(self, call: Call, grant: ActiveGrant, before: Situation, after: Situation) -> list[Verdict]:
+        """The verdicts on all that the camera saw, at every moment the picture may be from.
+
+        Policies have schedules: a zone that was active when the picture was begun counts as well as one that is active
+        now, and so does one that was active when a camera with latency may have taken it.
+        """
+        verdicts = [
+            self._judge.judge(call, grant, moment, record=False)
+            for moment in (after, replace(after, time_s=before.time_s))
+        ]
+        first_s = Moment(before.time_s, earliest(before.time_s) - self._shutter.latency_s)
+        return [*verdicts, self._judge.judge_view(call, grant, replace(after, time_s=first_s))]
+
+    def _name(self, after: Situation) -> str:
+        moment = datetime.fromtimestamp(after.time_s, UTC).strftime("%Y%m%d%H%M%S%f")[:17]
+        return f"{moment}-{next(self._numbers) % 10000:04d}.jpg"
+
+    async def _store(self, args: CaptureArgs, exposure: _Exposure) -> tuple[Verdict, Shot]:
+        grant, after, frames = exposure.grant, exposure.after, exposure.frames
+        view = seen_from(after.way, grant.compiled.frame)
+        farthest_m = view.farthest_m if view is not None else math.inf
+        face_px = smallest_face_px(after.lens, farthest_m, exposure.view_width_px)
+        call, filters = Call("CaptureImage", args), exposure.verdict.filters
+        plan, verdict = self._filtering.plan(
+            call, grant, exposure.verdict, required=filters, face_px=face_px, seen=after
+        )
+        poses, moment_s = tuple(Pose.of(one) for one in after.way), float(after.time_s)
+        source_width_px = self._camera.source_size(args.width, args.height)[0]
+
+        def work() -> bytes:
+            sized = _sized(frames, args)
+            frames.clear()
+            data = encoded(self._filtering.apply(sized, plan, face_px, poses))
+            if filters:
+                # A filtered picture tells nothing of where it was taken.
+                return data
+            return with_metadata(data, PictureFacts.of(poses[-1], moment_s, self._camera.model, source_width_px))
+
+        data = await asyncio.to_thread(work)
+        shot = Shot(exposure.name, moment_s, args.width, args.height, len(data), poses, face_px, plan.filters)
+        await asyncio.to_thread(self._album.add, owner_of(grant), shot, data)
+        return verdict, shot
+
+
+def _sized(frames: list[Pixels], args: CaptureArgs) -> list[Pixels]:
+    """The middle frame in the size that was asked for, the others no larger than motion is detected in."""
+    scale = min(MOTION_PX / args.width, 1.0)
+    sizes = [(max(round(args.width * scale), 1), max(round(args.height * scale), 1))] * len(frames)
+    sizes[len(sizes) // 2] = (args.width, args.height)
+    return [fitted(one, *size) for one, size in zip(frames, sizes, strict=True)]

@@ -1,0 +1,100 @@
+"""Judges the calls of the camera service, and writes each decision to the audit log."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, replace
+
+from fractus_core.policy.engine import judge
+from fractus_core.policy.privacy import compose, judge_privacy
+from fractus_core.policy.values import Call, Situation, Verdict
+
+from fractus_services.audit import AuditLog
+from fractus_services.camera.pose.pose import Pose
+from fractus_services.errors import denied
+from fractus_services.grants import ActiveGrant
+
+log = logging.getLogger(__name__)
+
+
+class PictureJudge:
+    """The policy engine as the camera service asks it: a denial is an exception."""
+
+    def __init__(self, audit: AuditLog) -> None:
+        self._audit = audit
+
+    def judge(self, call: Call, grant: ActiveGrant, now: Situation, *, record: bool = True) -> Verdict:
+        """The verdict on a call, which permits it.
+
+        Args:
+            call: method and arguments.
+            grant: the caller's.
+            now: where the camera is.
+            record: whether a verdict that permits is written down too; later looks at the same call are not.
+
+        Raises:
+            Refused: it is denied, or the engine failed.
+        """
+        try:
+            verdict = judge(call, now, grant.compiled)
+        except Exception:
+            log.exception("policy: the engine failed, call refused (method=%s)", call.method)
+            verdict = Verdict("deny", None, "InternalError", f"the policy engine failed on {call.method}")
+        return self.require(call, grant, verdict, now, record=record)
+
+    def judge_view(self, call: Call, grant: ActiveGrant, seen: Situation) -> Verdict:
+        """The verdict of privacy policies on what the camera saw in a situation.
+
+        Raises:
+            Refused: no picture may be taken or returned there.
+        """
+        return self.require(call, grant, judge_privacy(seen, grant.compiled), seen)
+
+    def judge_stored(
+        self, call: Call, grant: ActiveGrant, poses: Sequence[Pose], verdict: Verdict, now: Situation
+    ) -> Verdict:
+        """A verdict on a call together with that on the place where its picture was taken, under today's policies.
+
+        Raises:
+            Refused: no picture of that place may be returned.
+        """
+        return combined([verdict, self.judge_view(call, grant, taken_at(poses, now))])
+
+    def require(
+        self, call: Call, grant: ActiveGrant, verdict: Verdict, now: Situation, *, record: bool = False
+    ) -> Verdict:
+        """A verdict that permits; one that does not is written down and raised.
+
+        Raises:
+            Refused: it denies the call.
+        """
+        if record or not verdict.permits:
+            self._audit.append(
+                "call",
+                {
+                    "caller": grant.identity, "method": call.method, "args": asdict(call.args) if call.args else {},
+                    "action": verdict.action, "code": verdict.code, "reason": verdict.reason,
+                    "policies": list(verdict.policies), "filters": [one.action for one in verdict.filters],
+                    "lat": now.lat, "lon": now.lon, "alt": now.altitude_m,
+                },
+            )  # fmt: skip
+        if not verdict.permits:
+            raise denied(verdict)
+        return verdict
+
+
+def taken_at(poses: Iterable[Pose], now: Situation) -> Situation:
+    """The situation of stored poses, at the present time: policies that are active now apply to a picture from then."""
+    way = tuple(pose.at(now) for pose in poses)
+    return replace(way[-1], way=way)
+
+
+def combined(verdicts: Sequence[Verdict]) -> Verdict:
+    """What several verdicts that permit a picture require together."""
+    filters = compose(one for verdict in verdicts for one in verdict.filters)
+    if not filters:
+        return verdicts[0]
+    names = tuple(dict.fromkeys(name for verdict in verdicts for name in verdict.policies))
+    reason = f"policy {names[0]} asks for {', '.join(one.action for one in filters)}" if names else ""
+    return replace(verdicts[0], action="correct", code="PrivacyFilter", reason=reason, policies=names, filters=filters)

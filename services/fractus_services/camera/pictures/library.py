@@ -1,0 +1,105 @@
+"""Returns, lists and deletes stored pictures; each is judged again under the policies of the present."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from fractus_core.policy.privacy import remaining
+from fractus_core.policy.values import Call, Filter, Situation, Verdict
+
+from fractus_services.camera.album.album import Album, owner_of
+from fractus_services.camera.album.shots import Shot
+from fractus_services.camera.imaging.pipeline import FilterPlan
+from fractus_services.camera.imaging.pixels import decoded, encoded
+from fractus_services.camera.pictures.completion import Completion
+from fractus_services.camera.pictures.filtering import Filtering
+from fractus_services.camera.pictures.judge import PictureJudge, taken_at
+from fractus_services.camera.pose.provider import PoseProvider
+from fractus_services.grants import ActiveGrant
+
+
+class PictureLibrary:
+    """RetrieveImage, ListImages and DeleteImage of Table 8.2 of the thesis, for callers whose grant is known.
+
+    Args:
+        poses: where the camera is.
+        filtering: filters pictures.
+        album: where pictures are stored.
+        judge: judges and records.
+        clock: Unix time.
+    """
+
+    def __init__(
+        self, poses: PoseProvider, filtering: Filtering, album: Album, judge: PictureJudge, clock: Callable[[], float]
+    ) -> None:
+        self._poses = poses
+        self._filtering = filtering
+        self._album = album
+        self._judge = judge
+        self._clock = clock
+        self._completion = Completion()
+
+    async def retrieve(
+        self, grant: ActiveGrant, name: str, current_grant: Callable[[], ActiveGrant] | None = None
+    ) -> tuple[Verdict, Shot, bytes | Path]:
+        """A picture; policies apply to where it was taken and to where the camera is now, and the stricter counts.
+
+        It is judged again when its filters are applied, as other pictures may come first.
+
+        Args:
+            grant: the caller's.
+            name: of the picture.
+            current_grant: as for `PictureCapture.capture`.
+        """
+        call, now = Call("RetrieveImage"), self._now()
+        verdict = self._judge.judge(call, grant, now)
+        owner = owner_of(grant)
+        shot = await asyncio.to_thread(self._album.find, owner, name)
+        verdict = self._judge.judge_stored(call, grant, shot.poses, verdict, now)
+        missing = remaining(verdict.filters, shot.filters)
+        path = self._album.path(owner, name)
+        if not missing:
+            return verdict, shot, path
+        # In a picture that was filtered before it is unknown which faces are still found.
+        face_px = 0.0 if shot.filters else shot.face_px
+        plan, noted = self._filtering.plan(
+            call, grant, verdict, required=missing, face_px=face_px, seen=taken_at(shot.poses, now)
+        )
+        data = await self._completion.complete(self._filtered(owner, path, plan, replace(shot, face_px=face_px)))
+        done = (*shot.filters, *plan.filters)
+        self._check_again(call, current_grant() if current_grant else grant, shot, done)
+        return noted, replace(shot, size_bytes=len(data), filters=done), data
+
+    def _check_again(self, call: Call, grant: ActiveGrant, shot: Shot, done: tuple[Filter, ...]) -> None:
+        """Refuse a stored picture that by now needs more filters than it got."""
+        now = self._now()
+        verdict = self._judge.judge(call, grant, now, record=False)
+        verdict = self._judge.judge_stored(call, grant, shot.poses, verdict, now)
+        if remaining(verdict.filters, done):
+            reason = f"{verdict.reason}, which it did not when this picture was asked for; ask again"
+            refusal = Verdict("deny", None, "PrivacyZone", reason, verdict.policies)
+            self._judge.require(call, grant, refusal, now)
+
+    async def _filtered(self, owner: str, path: Path, plan: FilterPlan, shot: Shot) -> bytes:
+        def work() -> bytes:
+            return encoded(self._filtering.apply([decoded(path.read_bytes())], plan, shot.face_px, shot.poses))
+
+        async with self._filtering.turn(owner):
+            return await asyncio.to_thread(work)
+
+    async def list(self, grant: ActiveGrant) -> tuple[Verdict, tuple[Shot, ...]]:
+        """The pictures of the caller."""
+        verdict = self._judge.judge(Call("ListImages"), grant, self._now())
+        return verdict, await asyncio.to_thread(self._album.list, owner_of(grant))
+
+    async def delete(self, grant: ActiveGrant, name: str) -> Verdict:
+        """Remove a picture of the caller."""
+        verdict = self._judge.judge(Call("DeleteImage"), grant, self._now())
+        await asyncio.to_thread(self._album.delete, owner_of(grant), name)
+        return verdict
+
+    def _now(self) -> Situation:
+        return self._poses.situation(self._clock())

@@ -1,0 +1,194 @@
+"""The poses of a drone during the last seconds, with errors that cover every motion between two measurements.
+
+A picture is judged by all that its camera may have seen while it was taken. The error of each pose is a budget: what the
+autopilot's own estimate may be off by, plus what the airframe can move and turn in the time nothing was measured.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from fractus_core.policy.values import Attitude, Home, Lens, Situation
+
+MAX_AGE_S = 1.0
+"""A measurement that is older says nothing about the present."""
+KEPT_S = 30.0
+"""Longer than any exposure."""
+ALTITUDE_ERROR_M = 1.0
+TILT_ERROR_DEG = 5.0
+YAW_ERROR_DEG = 15.0
+"""Bounds of an autopilot's attitude errors: roll and pitch together, and the compass."""
+MAX_TURN_DEG_S = 60.0
+MAX_ACCELERATION_MPS2 = 5.0
+"""How fast a multicopter turns and speeds up at most; between two measurements it may do both."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """What the mobility service measured at one moment; times are monotonic seconds.
+
+    Attributes:
+        received_at: when it arrived here.
+        position_at: when the position was measured.
+        attitude_at: when the attitude was measured.
+        position: degrees north, degrees east, metres above home; None while it is unknown.
+        position_error_m: bound of the horizontal error.
+        velocity_mps: north, east, down.
+        attitude_deg: roll, pitch, yaw; None while it is unknown.
+        home: None while it is unknown.
+        armed: the motors run.
+        in_air: it flies.
+    """
+
+    received_at: float
+    position_at: float
+    attitude_at: float
+    position: tuple[float, float, float] | None
+    position_error_m: float
+    velocity_mps: tuple[float, float, float]
+    attitude_deg: tuple[float, float, float] | None
+    home: Home | None
+    armed: bool = False
+    in_air: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Gap:
+    """What may have happened around a pose without being measured.
+
+    Attributes:
+        moved_s: seconds for which the airframe may have moved on.
+        turned_s: seconds for which it may have turned on.
+        tilt_deg: how much further from the pose its roll and pitch are known to have been.
+        yaw_deg: how much further from the pose its yaw is known to have been.
+    """
+
+    moved_s: float = 0.0
+    turned_s: float = 0.0
+    tilt_deg: float = 0.0
+    yaw_deg: float = 0.0
+
+    @classmethod
+    def after(cls, last: Measurement, now_s: float) -> _Gap:
+        """From the last measurement until now."""
+        return cls(max(now_s - last.position_at, 0.0), max(now_s - last.attitude_at, 0.0))
+
+    @classmethod
+    def between(cls, one: Measurement, other: Measurement) -> _Gap:
+        """The half of the time to the next or previous measurement that lies nearer to this one."""
+        moved_s, turned_s = abs(other.position_at - one.position_at), abs(other.attitude_at - one.attitude_at)
+        here, there = one.attitude_deg or (0.0, 0.0, 0.0), other.attitude_deg or (0.0, 0.0, 0.0)
+        # Angles wrap: from 359 to 1 degree is a turn of 2.
+        roll, pitch, yaw = (abs(math.remainder(a - b, 360.0)) for a, b in zip(here, there, strict=True))
+        return cls(
+            moved_s / 2 if moved_s <= MAX_AGE_S else math.inf,
+            turned_s / 2 if turned_s <= MAX_AGE_S else math.inf,
+            (roll + pitch) / 2,
+            yaw / 2,
+        )
+
+    def joined(self, other: _Gap) -> _Gap:
+        """The larger of each."""
+        return _Gap(
+            max(self.moved_s, other.moved_s),
+            max(self.turned_s, other.turned_s),
+            max(self.tilt_deg, other.tilt_deg),
+            max(self.yaw_deg, other.yaw_deg),
+        )
+
+
+class PoseHistory:
+    """The poses of a drone, as measurements arrive; a `PoseProvider`.
+
+    Args:
+        now: monotonic seconds.
+        lens: what the camera sees; None when it is unknown.
+        relief_m: how far the ground around may lie below home.
+    """
+
+    def __init__(self, now: Callable[[], float], *, lens: Lens | None = None, relief_m: float = 0.0) -> None:
+        self._now = now
+        self._lens = lens
+        self._relief_m = relief_m
+        self._measurements: deque[Measurement] = deque()
+
+    def __len__(self) -> int:
+        """Measurements that are kept."""
+        return len(self._measurements)
+
+    def add(self, measurement: Measurement) -> None:
+        """Append the newest measurement, and forget those that are too old for any exposure."""
+        self._measurements.append(measurement)
+        while self._measurements[0].received_at < measurement.received_at - KEPT_S:
+            self._measurements.popleft()
+
+    def situation(self, time_s: float) -> Situation:
+        """See `PoseProvider`; unknown when the mobility service is silent."""
+        if not self._measurements:
+            return self._unknown(time_s)
+        last = self._measurements[-1]
+        return self._situation(last, _Gap.after(last, self._now()), time_s)
+
+    def situations_since(self, begun_s: float, time_s: float) -> tuple[Situation, ...]:
+        """See `PoseProvider`.
+
+        The errors of each pose cover half of the time to its neighbours as well: the drone was there at most that long
+        before or after, and turned away from it by at most half of what the two poses differ by, plus what
+        `MAX_TURN_DEG_S` allows. So no motion between two measurements is left out.
+        """
+        kept = list(self._measurements)
+        first = next((i for i in reversed(range(len(kept))) if kept[i].received_at <= begun_s), None)
+        # What was seen before the first measurement is unknown, and counts as everything.
+        situations = [self._unknown(time_s)] if first is None else []
+        kept = kept[first or 0 :]
+        for i, one in enumerate(kept):
+            gap = _Gap() if i < len(kept) - 1 else _Gap.after(one, self._now())
+            for neighbour in (*kept[max(i - 1, 0) : i], *kept[i + 1 : i + 2]):
+                gap = gap.joined(_Gap.between(one, neighbour))
+            situations.append(self._situation(one, gap, time_s))
+        return tuple(situations)
+
+    def _unknown(self, time_s: float) -> Situation:
+        return Situation(time_s=time_s, lens=self._lens, relief_m=self._relief_m)
+
+    def _situation(self, measured: Measurement, gap: _Gap, time_s: float) -> Situation:
+        if measured.position is None or gap.moved_s > MAX_AGE_S:
+            return self._unknown(time_s)
+        lat, lon, altitude_m = measured.position
+        north_mps, east_mps, down_mps = measured.velocity_mps
+        return Situation(
+            time_s=time_s,
+            lat=lat,
+            lon=lon,
+            altitude_m=altitude_m,
+            north_mps=north_mps,
+            east_mps=east_mps,
+            down_mps=down_mps,
+            home=measured.home,
+            armed=measured.armed,
+            in_air=measured.in_air,
+            position_error_m=measured.position_error_m + _reach_m(math.hypot(north_mps, east_mps), gap.moved_s),
+            altitude_error_m=ALTITUDE_ERROR_M + _reach_m(abs(down_mps), gap.moved_s),
+            attitude=_attitude(measured, gap),
+            lens=self._lens,
+            relief_m=self._relief_m,
+        )
+
+
+def _reach_m(speed_mps: float, time_s: float) -> float:
+    """How far a drone gets at this speed while it accelerates as fast as it can."""
+    return (speed_mps + MAX_ACCELERATION_MPS2 * time_s / 2) * time_s
+
+
+def _attitude(measured: Measurement, gap: _Gap) -> Attitude | None:
+    if measured.attitude_deg is None or gap.turned_s > MAX_AGE_S:
+        return None
+    turned_deg = MAX_TURN_DEG_S * gap.turned_s
+    return Attitude(
+        *measured.attitude_deg,
+        TILT_ERROR_DEG + turned_deg + gap.tilt_deg,
+        YAW_ERROR_DEG + turned_deg + gap.yaw_deg,
+    )

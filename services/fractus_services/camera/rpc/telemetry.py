@@ -1,0 +1,75 @@
+"""Follows the mobility service of the same node, for the poses of a drone's camera."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable
+
+import grpc
+from fractus_core.api.names import node_server_name
+from fractus_core.policy.values import Home
+from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
+
+from fractus_services.auth import TlsFiles
+from fractus_services.camera.pose.history import Measurement
+
+log = logging.getLogger(__name__)
+
+INTERVAL_S = 0.1
+RETRY_S = 1.0
+DEFAULT_ERROR_M = 10.0
+"""Position error where the mobility service reports none."""
+DEFAULT_AGE_S = 0.5
+"""Age of a measurement where the mobility service reports none."""
+
+
+async def follow_telemetry(address: str, node: str, tls: TlsFiles, add: Callable[[Measurement], None]) -> None:
+    """Subscribe to the telemetry, and again after every failure, until cancelled.
+
+    Args:
+        address: host:port of the mobility service.
+        node: name of the node, which its certificate carries.
+        tls: the node's certificate.
+        add: takes each measurement.
+    """
+    await tls.wait()
+    options = (("grpc.ssl_target_name_override", node_server_name(node)), ("grpc.enable_http_proxy", 0))
+    while True:
+        try:
+            async with grpc.aio.secure_channel(address, tls.client_credentials(), options) as channel:
+                stub = mobility_pb2_grpc.MobilityServiceStub(channel)  # type: ignore[no-untyped-call]
+                async for message in stub.SubscribeTelemetry(
+                    mobility_pb2.SubscribeTelemetryRequest(interval_s=INTERVAL_S)
+                ):
+                    add(measurement(message, time.monotonic()))
+        except grpc.aio.AioRpcError as error:
+            log.warning("telemetry: stream ended (mobility=%s): %s", address, error.details())
+        except OSError as error:
+            log.warning("telemetry: no certificate to connect with (mobility=%s): %s", address, error)
+        await asyncio.sleep(RETRY_S)
+
+
+def measurement(message: mobility_pb2.Telemetry, now_s: float) -> Measurement:
+    """Translate a message that arrived at a moment of monotonic time."""
+    position_age_s, attitude_age_s = (
+        getattr(message, name) if message.HasField(name) else DEFAULT_AGE_S
+        for name in ("position_age_s", "attitude_age_s")
+    )
+    position = message.position if message.HasField("position") and message.autopilot_connected else None
+    home = message.home if message.HasField("home") else None
+    attitude = message.attitude if message.HasField("attitude") else None
+    velocity = message.velocity
+    return Measurement(
+        received_at=now_s,
+        position_at=now_s - position_age_s,
+        attitude_at=now_s - attitude_age_s,
+        position=(position.latitude_deg, position.longitude_deg, position.altitude_m) if position is not None else None,
+        position_error_m=message.position_error_m or DEFAULT_ERROR_M,
+        velocity_mps=(velocity.north_mps, velocity.east_mps, velocity.down_mps),
+        attitude_deg=(attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg) if attitude is not None else None,
+        home=Home(home.latitude_deg, home.longitude_deg, home.altitude_m) if home is not None else None,
+        armed=message.armed,
+        in_air=message.in_air,
+    )

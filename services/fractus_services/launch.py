@@ -1,0 +1,78 @@
+"""The command lines of both services: types of options, logging, signals, and errors in one sentence."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from fractus_services.errors import CannotServe
+
+_Options = TypeVar("_Options")
+
+_MAX_PORT = 65535
+_UNIX_SOCKETS = ("unix:", "unix-abstract:")
+
+DIRECTORY = click.Path(file_okay=False, path_type=Path)
+FILE = click.Path(dir_okay=False, path_type=Path)
+
+
+def address(_context: click.Context, _parameter: click.Parameter, value: str) -> str:
+    """Check an option that says HOST:PORT; gRPC itself takes 99999 for port 34463.
+
+    Raises:
+        click.BadParameter: it is none.
+    """
+    host, _, port = value.rpartition(":")
+    if not value.startswith(_UNIX_SOCKETS) and not (host and port.isdecimal() and int(port) <= _MAX_PORT):
+        raise click.BadParameter(f"{value!r} is not HOST:PORT with a port of at most {_MAX_PORT}")
+    return value
+
+
+def until_signalled(
+    run: Callable[[_Options, asyncio.Event], Coroutine[Any, Any, None]], options: _Options, level: int = logging.INFO
+) -> None:
+    """Run a service until SIGTERM or SIGINT.
+
+    Args:
+        run: serves until the event is set.
+        options: of the command line.
+        level: of the log.
+
+    Raises:
+        click.ClickException: the service cannot run as it is told to.
+    """
+    logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+
+    async def main() -> None:
+        stop = asyncio.Event()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            asyncio.get_running_loop().add_signal_handler(number, stop.set)
+        await run(options, stop)
+
+    try:
+        asyncio.run(main())
+    except CannotServe as error:
+        raise click.ClickException(str(error)) from None
+    except ExceptionGroup as failures:
+        raise _one_sentence(failures) from None
+
+
+def _one_sentence(failures: ExceptionGroup[Exception]) -> click.ClickException:
+    """What to tell the user of a service whose parts failed.
+
+    Raises:
+        ExceptionGroup: there is more to it than that it cannot serve.
+    """
+    known, rest = failures.split(CannotServe)
+    if known is None or rest is not None:
+        raise failures
+    error: BaseException = known
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    return click.ClickException(str(error))

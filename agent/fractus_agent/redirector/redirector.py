@@ -1,0 +1,241 @@
+"""Moves the traffic of services between the cloud path and the direct link, and keeps it there while the agent lives.
+
+A planned switch moves new connections at once and lets each old one finish what it does: it is closed when it is idle, so
+that no call is lost, and at the latest when the old path is needed no longer. An abrupt switch, after a link was lost,
+closes and forgets all old connections at once: they would never recover by themselves.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from fractus_agent.redirector.conntrack import Conntrack
+from fractus_agent.redirector.netlink import NETLINK_SOCK_DIAG, Netlink, NetlinkError, in_namespace
+from fractus_agent.redirector.nft import Endpoint, Maps, Redirect
+from fractus_agent.redirector.sockets import JIFFY_MS, Connection, DestroyUnsupported, Sockets
+
+log = logging.getLogger(__name__)
+
+LEASE_S = 5.0
+"""Redirects live so long without an agent: then the kernel drops them, and new connections take the cloud path."""
+REFRESH_S = 1.5
+
+DRAIN_TIMEOUT_S = 1.0
+DRAIN_POLL_S = 0.004
+
+MIN_IDLE_MS, MAX_IDLE_MS = 2 * JIFFY_MS, 500
+WORK_MARGIN = 1.5
+WORK_DECAY = 0.9
+"""A connection is idle once nothing has come for longer than its server usually takes to answer. Frames that answer nothing,
+such as HTTP/2's pings and window updates, look like replies; so how long a service works is learned from its connections
+all the time. No longer than needed is waited: the next request comes at some time, and one that meets a connection while it
+is being closed is lost. A client that calls all the time is hardly ever idle: as the time runs out, less is asked for."""
+
+LEARN_S = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Switched:
+    """What a switch did.
+
+    Attributes:
+        drained: connections that were closed when they were idle.
+        cut: connections that were closed in the middle of something.
+    """
+
+    drained: int = 0
+    cut: int = 0
+
+
+class Namespaces:
+    """Sockets of the pods on this node, through the network namespaces that the container runtime made.
+
+    Args:
+        directory: where the runtime keeps them, /run/netns.
+        own: the node's own namespace as well, for clients in the host's network.
+    """
+
+    def __init__(self, directory: Path, *, own: Path = Path("/proc/self/ns/net")) -> None:
+        self._directory = directory
+        self._own = own
+        self._open: dict[Path, Sockets] = {}
+
+    def refresh(self) -> Collection[Sockets]:
+        """Open what is new, close what is gone; all that are there."""
+        there = {self._own, *(self._directory.iterdir() if self._directory.is_dir() else ())}
+        for path in set(self._open) - there:
+            self._open.pop(path).close()
+        for path in there - set(self._open):
+            try:
+                self._open[path] = Sockets(in_namespace(path, lambda: Netlink(NETLINK_SOCK_DIAG)))
+            except OSError as error:  # a pod that ends at this moment
+                log.debug("redirector: network namespace left out (path=%s error=%s)", path, error)
+        return self._open.values()
+
+    def close(self) -> None:
+        """Close all sockets."""
+        for sockets in self._open.values():
+            sockets.close()
+        self._open.clear()
+
+
+class Redirector:
+    """Holds the redirects of this node, and switches them.
+
+    Args:
+        maps: our table.
+        conntrack: the kernel's connections.
+        namespaces: sockets of the pods.
+    """
+
+    def __init__(self, maps: Maps, conntrack: Conntrack, namespaces: Namespaces) -> None:
+        self._maps = maps
+        self._conntrack = conntrack
+        self._namespaces = namespaces
+        self._redirects: dict[Endpoint, Endpoint] = {}
+        self._services: dict[Endpoint, int] = {}
+        self._worked_ms: dict[Endpoint, float] = {}
+        self._switching = asyncio.Lock()
+
+    @property
+    def redirects(self) -> Mapping[Endpoint, Endpoint]:
+        """Where connections to virtual endpoints go now; those that are not named take the cloud path."""
+        return dict(self._redirects)
+
+    def serve(self, services: Iterable[Endpoint]) -> None:
+        """Number the services that clients on this node connect to; redirects of others end.
+
+        Raises:
+            NetlinkError: the kernel refused.
+        """
+        wanted = set(services)
+        free = iter(sorted(set(range(len(wanted) + len(self._services))) - set(self._services.values())))
+        # A number stays with its service, for connections that are there carry it.
+        self._services = {
+            service: self._services[service] if service in self._services else next(free) for service in sorted(wanted)
+        }
+        self._maps.mark(self._services.items())
+        self._redirects = {virtual: to for virtual, to in self._redirects.items() if virtual in wanted}
+        self._write()
+
+    async def run(self) -> None:
+        """Keep the redirects alive until cancelled; then new connections take the cloud path at once."""
+        try:
+            while True:
+                for _ in range(round(REFRESH_S / LEARN_S)):
+                    await asyncio.sleep(LEARN_S)
+                    self.learn()
+                try:
+                    self._write()
+                except NetlinkError as error:
+                    log.warning("redirector: redirects not refreshed (error=%s)", error)
+        finally:
+            self._redirects = {}
+            with suppress(NetlinkError):
+                self._write()
+
+    async def switch(self, targets: Mapping[Endpoint, Endpoint | None], *, planned: bool) -> Switched:
+        """Lead services elsewhere.
+
+        Args:
+            targets: virtual endpoints and where their connections go; None for the cloud path.
+            planned: whether the old path still works, so that calls under way may finish on it.
+
+        Raises:
+            NetlinkError: the kernel refused; nothing was changed.
+        """
+        async with self._switching:
+            before = dict(self._redirects)
+            self._redirects = {v: t for v, t in (before | dict(targets)).items() if t is not None}
+            moved = {virtual for virtual in targets if before.get(virtual) != self._redirects.get(virtual)}
+            if not moved:
+                return Switched()
+            try:
+                self._write()
+            except NetlinkError:
+                self._redirects = before
+                raise
+            done = await self._drain(moved) if planned else Switched(cut=self._cut(moved))
+            for virtual in moved:
+                if virtual in self._services:
+                    self._conntrack.forget(self._services[virtual])
+            log.info(
+                "redirector: switched (services=%d planned=%s drained=%d cut=%d)",
+                len(moved), planned, done.drained, done.cut,
+            )  # fmt: skip
+            return done
+
+    def learn(self) -> None:
+        """Look at the connections to the services, and learn how long these work for a request."""
+        try:
+            found = [c for sockets in self._namespaces.refresh() for c in sockets.to(self._services)]
+        except NetlinkError as error:
+            log.debug("redirector: connections not looked at (error=%s)", error)
+            return
+        for connection in found:
+            if connection.idle_ms:
+                usual = WORK_DECAY * self._worked_ms.get(connection.peer, 0.0)
+                self._worked_ms[connection.peer] = max(usual, connection.worked_ms)
+
+    def _enough_ms(self, connection: Connection, left: float) -> float:
+        """For how long a connection must have been idle to be closed, with this share of the time left."""
+        worked_ms = max(self._worked_ms.get(connection.peer, 0.0), connection.worked_ms)
+        return max(min(WORK_MARGIN * worked_ms, MAX_IDLE_MS) * min(2 * left, 1.0), MIN_IDLE_MS)
+
+    def _write(self) -> None:
+        self._maps.redirect((Redirect(virtual, to) for virtual, to in self._redirects.items()), LEASE_S)
+
+    async def _drain(self, moved: Collection[Endpoint]) -> Switched:
+        """Close old connections as they become idle; the rest when the time is over."""
+        loop = asyncio.get_running_loop()
+        begun, drained = loop.time(), 0
+        # Only connections of before the switch: those that clients open from now on take the new path.
+        old = {c.identity for sockets in self._namespaces.refresh() for c in sockets.to(moved)}
+        while old and (left := 1 - (loop.time() - begun) / DRAIN_TIMEOUT_S) > 0:
+            there: set[bytes] = set()
+            for sockets in self._namespaces.refresh():
+                for connection in sockets.to(moved):
+                    if connection.identity not in old:
+                        continue
+                    if connection.idle_ms >= self._enough_ms(connection, left):
+                        if not _destroy(sockets, connection):
+                            return Switched(drained)
+                        drained += 1
+                    else:
+                        there.add(connection.identity)
+            old = there
+            if old:
+                await asyncio.sleep(DRAIN_POLL_S)
+        return Switched(drained, self._cut(moved, old) if old else 0)
+
+    def _cut(self, moved: Collection[Endpoint], only: Collection[bytes] | None = None) -> int:
+        """Close connections, whatever they do."""
+        cut = 0
+        for sockets in self._namespaces.refresh():
+            for connection in sockets.to(moved):
+                if only is None or connection.identity in only:
+                    if not _destroy(sockets, connection):
+                        return cut
+                    cut += 1
+        return cut
+
+    def close(self) -> None:
+        """Close the sockets of the pods' namespaces."""
+        self._namespaces.close()
+
+
+def _destroy(sockets: Sockets, connection: Connection) -> bool:
+    """Close a connection; False where the kernel cannot: then it ends when its packets find no entry any more."""
+    try:
+        sockets.destroy(connection)
+    except DestroyUnsupported as error:
+        log.warning("redirector: connections are not closed (error=%s)", error)
+        return False
+    except NetlinkError as error:
+        log.warning("redirector: a connection is not closed (error=%s)", error)
+    return True

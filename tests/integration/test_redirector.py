@@ -1,0 +1,147 @@
+"""The redirector on real namespaces, netfilter and sockets, under real gRPC clients that know nothing of it."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fractus_agent.redirector import redirector as module
+from fractus_agent.redirector.conntrack import Conntrack
+from fractus_agent.redirector.nft import Maps
+from fractus_agent.redirector.redirector import Namespaces, Redirector
+from redirect_rig import DIRECT, VIP, Rig, rig, run
+
+pytestmark = pytest.mark.root
+
+TO_EDGE, TO_CLOUD = {VIP: DIRECT}, {VIP: None}
+
+
+@pytest.fixture
+def world() -> Iterator[Rig]:
+    with rig() as found:
+        yield found
+
+
+@pytest.fixture
+def redirector(world: Rig, tmp_path: Path) -> Iterator[Redirector]:
+    """The one of the drone; it sees the namespaces of the drone and of its pod."""
+    netlink = world.netlink("drone")
+    (tmp_path / "pod").symlink_to(world.path("dpod"))
+    found = Redirector(Maps(netlink), Conntrack(netlink), Namespaces(tmp_path, own=world.path("drone")))
+    found.serve([VIP])
+    yield found
+    found.close()
+
+
+def answers(client: subprocess.Popen[str], count: int | None = None) -> list[list[str]]:
+    """The next answers that a client got; all to its end without a count."""
+    assert client.stdout is not None
+    return [line.split() for line in itertools.islice(client.stdout, count)]
+
+
+def ask_once(world: Rig, node: str = "dpod") -> str:
+    return answers(world.client(1, node=node))[0][1]
+
+
+@pytest.mark.parametrize("node", ["dpod", "drone"], ids=["pod", "host network"])
+async def test_new_connections_follow_the_map(world: Rig, redirector: Redirector, node: str) -> None:
+    world.servers()
+    assert ask_once(world, node) == "cloud"
+    await redirector.switch(TO_EDGE, planned=True)
+    assert ask_once(world, node) == "edge"
+    await redirector.switch(TO_CLOUD, planned=True)
+    assert ask_once(world, node) == "cloud"
+
+
+@pytest.mark.parametrize(("pause_s", "size", "work_s"), [(0.2, 10, 0.03), (0.2, 200_000, 0.0)])
+async def test_planned_switches_lose_no_call_of_a_client_that_knows_nothing(
+    world: Rig, redirector: Redirector, pause_s: float, size: int, work_s: float
+) -> None:
+    world.servers(work_s)
+    keeping = asyncio.create_task(redirector.run())
+    calls = round(6.0 / pause_s)
+    client = world.client(calls, pause_s, size)
+    drained = cut = 0
+    for number in range(8):
+        await asyncio.sleep(0.5)
+        done = await redirector.switch(TO_CLOUD if number % 2 else TO_EDGE, planned=True)
+        drained, cut = drained + done.drained, cut + done.cut
+    found = await asyncio.to_thread(answers, client)
+    keeping.cancel()
+    assert len(found) == calls
+    assert not [answer for answer in found if answer[1] == "FAILED"]
+    switches = sum(a[1] != b[1] for a, b in itertools.pairwise(found))
+    assert switches >= 6
+    assert drained >= 6
+    assert cut == 0
+
+
+async def test_after_an_abrupt_loss_the_cloud_answers_at_once(world: Rig, redirector: Redirector) -> None:
+    world.servers()
+    await redirector.switch(TO_EDGE, planned=True)
+    client = world.client(200)
+    await asyncio.to_thread(answers, client, 20)
+    run(*world.inside("edge"), "ip", "link", "set", "fxl0", "down")
+    lost_at = time.monotonic()
+    await asyncio.sleep(0.4)  # what supervision of a link takes to notice
+    done = await redirector.switch(TO_CLOUD, planned=False)
+    assert done.cut == 1
+    found = await asyncio.to_thread(answers, client)
+    back = next(float(answer[2]) for answer in found if answer[1] == "cloud")
+    assert back - lost_at < 1.0
+    assert sum(answer[1] == "FAILED" for answer in found) <= 1
+    assert found[-1][1] == "cloud"
+
+
+async def test_a_call_that_takes_longer_than_the_drain_is_cut(world: Rig, redirector: Redirector) -> None:
+    world.servers(work_s=1.0)
+    keeping = asyncio.create_task(redirector.run())
+    client = world.client(3, pause_s=1.5)
+    shown = await asyncio.to_thread(answers, client, 2)
+    await asyncio.sleep(0.9)  # the third call is under way
+    done = await redirector.switch(TO_EDGE, planned=True)
+    keeping.cancel()
+    assert done.drained + done.cut == 1
+    assert [answer[1] for answer in shown + await asyncio.to_thread(answers, client)] == ["cloud", "cloud", "FAILED"]
+
+
+async def test_without_an_agent_the_cloud_path_comes_back(
+    world: Rig, redirector: Redirector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "LEASE_S", 1.0)
+    monkeypatch.setattr(module, "REFRESH_S", 0.3)
+    world.servers()
+    await redirector.switch(TO_EDGE, planned=True)
+    keeping = asyncio.create_task(redirector.run())
+    await asyncio.sleep(2.0)
+    assert await asyncio.to_thread(ask_once, world) == "edge"
+    keeping.cancel()
+    await asyncio.gather(keeping, return_exceptions=True)
+    assert await asyncio.to_thread(ask_once, world) == "cloud"
+    # An agent that dies without a word leaves elements that time out.
+    await redirector.switch(TO_EDGE, planned=True)
+    await asyncio.sleep(1.5)
+    assert await asyncio.to_thread(ask_once, world) == "cloud"
+
+
+async def test_a_hundred_flaps_leave_what_was_wanted(world: Rig, redirector: Redirector) -> None:
+    world.servers()
+    client = world.client(100)
+    for number in range(100):
+        await redirector.switch(TO_CLOUD if number % 2 else TO_EDGE, planned=bool(number % 3))
+    assert redirector.redirects == {}
+    found = await asyncio.to_thread(answers, client)
+    assert found[-1][1] == "cloud"
+
+
+async def test_services_keep_their_numbers_and_redirects_end_with_them(world: Rig, redirector: Redirector) -> None:
+    await redirector.switch(TO_EDGE, planned=True)
+    redirector.serve([VIP, DIRECT])
+    assert redirector.redirects == TO_EDGE
+    redirector.serve([DIRECT])
+    assert redirector.redirects == {}

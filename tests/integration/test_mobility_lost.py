@@ -12,9 +12,11 @@ from typing import Any
 import grpc
 import pytest
 from fractus_mavlink import Endpoint
-from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_COMPONENT, MAV_TYPE
+from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_COMPONENT, MAV_TYPE
 from fractus_proto.v1 import mobility_pb2 as pb
+from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import Autopilot
+from fractus_services.mobility.mavlink.flight_stack import FlightMode
 from mobility_rig import DRIVER, FRAME, Driver, Rig, denied, fence, flown, grant, xy
 
 LOST = pb.ControlEvent.STATE_LOST
@@ -95,7 +97,7 @@ async def test_a_service_that_stays_dead_leaves_it_to_the_autopilot(rig: Rig) ->
     await flying(rig, speedup=2.0)
     rig.kill("service")
     # The autopilot's failsafe acts after five of its seconds; then the service must not hand the drone back.
-    await until_mode(rig.link, 21)
+    await until_mode(rig.link, ARDUCOPTER.return_retracing)
     rig.start_service()
     late = Driver(rig)
     code, why = await denied(first(late))
@@ -107,9 +109,9 @@ async def test_a_service_that_stays_dead_leaves_it_to_the_autopilot(rig: Rig) ->
     await rig.until(lambda t: not t.armed, 90, "landing")
 
 
-async def until_mode(link: str, mode: int) -> None:
+async def until_mode(link: str, mode: FlightMode) -> None:
     """Listen to the vehicle as a ground station: its heartbeats, of system 255, must not stand for the companion's."""
-    watcher, station = Autopilot(link), Endpoint(255, MAV_COMPONENT.MISSIONPLANNER)
+    watcher, station = Autopilot(link, ARDUCOPTER), Endpoint(255, MAV_COMPONENT.MISSIONPLANNER)
 
     def heartbeat() -> None:
         if watcher._transport is not None:
@@ -201,12 +203,12 @@ async def test_a_pilot_takes_the_drone_and_keeps_it(rig: Rig) -> None:
     driver = await flying(rig)
     going = driver.going(0, 90)
     await rig.until(lambda t: t.velocity.north_mps > 3)
-    pilot = Autopilot(rig.link)
+    pilot = Autopilot(rig.link, ARDUCOPTER)
     task = asyncio.create_task(pilot.run())
     async with asyncio.timeout(5):
         while not pilot.connected:
             await pilot.update(0.5)
-    await pilot.set_mode(5)
+    await pilot.set_mode(ARDUCOPTER.mode(COPTER_MODE.LOITER))
     event = await driver.next(LOST, 15)
     assert event.reason == "a human pilot changed the mode to LOITER"
     code, why = await denied(flown(going))
@@ -215,7 +217,7 @@ async def test_a_pilot_takes_the_drone_and_keeps_it(rig: Rig) -> None:
     assert (state.controller, state.mode) == ("pilot", "LOITER")
     code, why = await denied(driver.goto(0, 10))
     assert why.code == "NotInControl"
-    await pilot.set_mode(9)
+    await pilot.set_mode(ARDUCOPTER.land)
     await rig.until(lambda t: not t.armed, 90, "landing")
     assert outcome(await rig.telemetry()).startswith("failed: a human pilot")
     task.cancel()

@@ -8,7 +8,8 @@ from typing import Any
 
 from control_flights import Flight, missions_of
 from fractus_core.policy.values import SetSpeedArgs, TakeoffArgs, VelocityArgs
-from mobility_world import partial, spec, touring, zone
+from fractus_services.mobility.mavlink.flight_stack import FlightMode
+from mobility_world import GUIDED, LAND, LOITER, RTL, partial, spec, touring, zone
 
 Course = Callable[[Flight], Coroutine[Any, Any, None]]
 
@@ -20,8 +21,6 @@ def course(flown: Course) -> Course:
     FLIGHTS[flown.__name__] = flown
     return flown
 
-
-LOITER, GUIDED, RTL, LAND = 5, 4, 6, 9
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
 HERE = (-30.0, 10.0, 30.0, 60.0)
@@ -398,7 +397,7 @@ async def pilot_changes_modes_on_the_ground(f: Flight) -> None:
     await f.landed()
 
 
-def failsafe(mode: int) -> Callable[[Flight], Coroutine[Any, Any, None]]:
+def failsafe(mode: FlightMode) -> Callable[[Flight], Coroutine[Any, Any, None]]:
     async def course(f: Flight) -> None:
         held = f.put(spec())
         await f.up(held)
@@ -509,7 +508,7 @@ async def service_restarts_on_the_ground(f: Flight) -> None:
     await f.sleep(10)
 
 
-def restarted_in(mode: int, removed: bool = False) -> Callable[[Flight], Coroutine[Any, Any, None]]:
+def restarted_in(mode: FlightMode, removed: bool = False) -> Callable[[Flight], Coroutine[Any, Any, None]]:
     async def course(f: Flight) -> None:
         held = f.put(spec())
         await f.up(held)

@@ -16,7 +16,7 @@ from typing import Any
 from fractus_core.policy.values import TakeoffArgs
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.observer import Observer
-from fractus_services.mobility.mavlink.vehicle import MODE_NAMES
+from fractus_services.mobility.mavlink.flight_stack import FlightMode
 from mobility_world import World, fly, goto
 
 BEAT_S = 0.5
@@ -59,8 +59,8 @@ class Flight:
         world.plane.commands = Recording(self._commanded)
         obey = type(world.plane).set_to
 
-        def set_to(mode: int) -> None:
-            self._write("commands", f"mode {MODE_NAMES[mode]}")
+        def set_to(mode: FlightMode) -> None:
+            self._write("commands", f"mode {mode.name}")
             obey(world.plane, mode)
 
         def heard(outgoing: Any) -> None:
@@ -171,7 +171,7 @@ class Flight:
     async def give_back(self, held: ActiveGrant) -> None:
         await self.do("ReturnControl", lambda: self.world.control.give_back(held))
 
-    def failsafe(self, mode: int) -> None:
+    def failsafe(self, mode: FlightMode) -> None:
         """The autopilot's own failsafe acts."""
         vehicle, plane = self.world.plane.vehicle, self.world.plane
         vehicle.failsafe_text, vehicle.failsafe_text_at = "Battery Failsafe", plane.now

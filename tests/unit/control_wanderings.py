@@ -7,10 +7,10 @@ import random
 from collections.abc import Callable
 from typing import Any
 
-from control_courses import GUIDED, LAND, LOITER, POINTS, RTL, Course
+from control_courses import POINTS, Course
 from control_flights import Flight
 from fractus_core.policy.values import GotoArgs, TakeoffArgs, VelocityArgs
-from mobility_world import partial, spec, touring, zone
+from mobility_world import GUIDED, LAND, LOITER, RTL, partial, spec, touring, zone
 
 WEIGHTS = {
     "stream": 12, "leave": 4, "arm": 8, "takeoff": 8, "goto": 8, "land": 2, "home": 2, "hover": 2, "velocity": 2,

@@ -16,7 +16,7 @@ from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled import compile_grant
 from fractus_core.policy.values import Airframe, GotoArgs, Home, TakeoffArgs
 from fractus_mavlink import Message, message
-from fractus_mavlink.enums import MAV_CMD, MAV_RESULT
+from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_RESULT
 from fractus_services.errors import Refused
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
@@ -32,12 +32,17 @@ from fractus_services.mobility.flight.monitor import MotionMonitor
 from fractus_services.mobility.flight.service import MobilityService, Progress
 from fractus_services.mobility.flight.tours import Tours
 from fractus_services.mobility.flight.transit import TransitFlight
+from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import Autopilot
 from fractus_services.mobility.mavlink.failsafes import Checked
-from fractus_services.mobility.mavlink.vehicle import BRAKE, COURSE_S, GUIDED, LAND, RTL, SMART_RTL
+from fractus_services.mobility.mavlink.flight_stack import FlightMode
+from fractus_services.mobility.mavlink.vehicle import COURSE_S
 from fractus_services.mobility.rpc.streams import Streams
 
 FRAME = LocalFrame(39.36, 22.95)
+BRAKE, GUIDED, LAND, LOITER, RTL, SMART_RTL = (
+    ARDUCOPTER.mode(COPTER_MODE[name]) for name in ("BRAKE", "GUIDED", "LAND", "LOITER", "RTL", "SMART_RTL")
+)
 STEP_S = 0.05
 ACCEL, CLIMB = 2.5, 2.0
 DEFAULT_MPS = 8.0
@@ -99,7 +104,7 @@ class Plane(Autopilot):
     """An autopilot of few words: it acknowledges, and moves as ArduCopter does, roughly."""
 
     def __init__(self) -> None:
-        super().__init__("tcp:nowhere:1")
+        super().__init__("tcp:nowhere:1", ARDUCOPTER)
         self._target = (1, 1)
         self.xy, self.velocity = [0.0, 0.0], [0.0, 0.0]
         self.height, self.climb = 0.0, 0.0
@@ -158,7 +163,7 @@ class Plane(Autopilot):
     def _obey(self, outgoing: Message) -> None:
         number = outgoing.integer("command")
         if number == MAV_CMD.DO_SET_MODE:
-            self.set_to(int(outgoing.real("param2")))
+            self.set_to(self.stack.mode(int(outgoing.real("param2"))))
         elif number == MAV_CMD.COMPONENT_ARM_DISARM:
             self.vehicle.armed = outgoing.real("param1") == 1
         elif number == MAV_CMD.NAV_TAKEOFF:
@@ -173,7 +178,7 @@ class Plane(Autopilot):
         elif number == MAV_CMD.CONDITION_YAW:
             self.heading = outgoing.real("param1")
 
-    def set_to(self, mode: int) -> None:
+    def set_to(self, mode: FlightMode) -> None:
         """Change the mode, as a pilot or a failsafe does."""
         self.positions = False
         self.vehicle.mode = mode

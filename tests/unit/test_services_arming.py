@@ -13,8 +13,7 @@ from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.authority.observer import Observer
 from fractus_services.mobility.mavlink.failsafes import Checked
-from fractus_services.mobility.mavlink.vehicle import BRAKE
-from mobility_world import World, end, fly, refusal, spec
+from mobility_world import BRAKE, World, end, fly, refusal, spec
 
 
 class Slow:
@@ -89,7 +88,7 @@ def test_failsafes_that_are_set_anew_meanwhile_forbid_arming(
                 control.checked = found
                 await raise_around(grant, retraces=retraces)
 
-            async def changed(mode: int, *_: object) -> None:
+            async def changed(mode: Any, *_: object) -> None:
                 await set_mode(mode)
                 control.checked = found
 

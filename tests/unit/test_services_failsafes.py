@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from fractus_core.policy.values import Airframe
+from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.failsafes import Checked, choose_return, configure, learn_return
 from fractus_services.mobility.mavlink.link import SYSTEM_ID
 
@@ -22,6 +23,7 @@ class Parameters:
     def __init__(self, values: dict[str, float], fixed: tuple[str, ...] = ()) -> None:
         self.values = SOUND | values
         self.fixed = fixed
+        self.stack = ARDUCOPTER
 
     async def read_parameter(self, name: str, attempts: int = 4) -> float | None:
         del attempts

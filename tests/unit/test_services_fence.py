@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from fractus_mavlink import message
 from fractus_services.mobility.mavlink import autopilot as module
+from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import Autopilot
 
 
@@ -18,7 +19,7 @@ class Overtaken(Exception):
 @pytest.fixture
 def link(monkeypatch: pytest.MonkeyPatch) -> tuple[Autopilot, list[Any]]:
     monkeypatch.setattr(module, "ACK_TIMEOUT_S", 0.01)
-    autopilot = Autopilot("tcp:127.0.0.1:1")
+    autopilot = Autopilot("tcp:127.0.0.1:1", ARDUCOPTER)
     sent: list[Any] = []
     monkeypatch.setattr(autopilot, "send", sent.append)
     return autopilot, sent

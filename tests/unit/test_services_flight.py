@@ -12,8 +12,23 @@ from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, Verdict
 from fractus_services.errors import AutopilotError, Refused
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.leases import ControlState
-from fractus_services.mobility.mavlink.vehicle import GUIDED, LAND, RTL, SMART_RTL
-from mobility_world import World, clear_m, end, fly, goto, partial, refusal, spec, touring, zone
+from fractus_services.mobility.mavlink.flight_stack import FlightMode
+from mobility_world import (
+    GUIDED,
+    LAND,
+    RTL,
+    SMART_RTL,
+    World,
+    clear_m,
+    end,
+    fly,
+    goto,
+    partial,
+    refusal,
+    spec,
+    touring,
+    zone,
+)
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
 
@@ -108,7 +123,7 @@ def test_no_way_to_the_control_point_is_told(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("retraces", "mode"), [(True, SMART_RTL), (False, RTL)])
 def test_without_any_legal_way_home_the_drone_comes_home_all_the_same(
-    tmp_path: Path, retraces: bool, mode: int
+    tmp_path: Path, retraces: bool, mode: FlightMode
 ) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=retraces) as world:

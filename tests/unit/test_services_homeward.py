@@ -10,8 +10,8 @@ import pytest
 import shapely
 from fractus_core.policy.values import GotoArgs
 from fractus_services.mobility.authority.observer import Observer
-from fractus_services.mobility.mavlink.vehicle import LAND, RTL, SMART_RTL
-from mobility_world import World, at, end, fly, partial, refusal, spec, touring, zone
+from fractus_services.mobility.mavlink.flight_stack import FlightMode
+from mobility_world import LAND, RTL, SMART_RTL, World, at, end, fly, partial, refusal, spec, touring, zone
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
 REPOSITION = 192
@@ -40,7 +40,7 @@ def test_a_driver_turns_home_from_standstill(tmp_path: Path) -> None:
             turned: list[float] = []
             obey = world.plane.set_to
 
-            def noted(mode: int) -> None:
+            def noted(mode: FlightMode) -> None:
                 if mode == RTL:
                     turned.append(math.hypot(*world.plane.velocity))
                 obey(mode)
@@ -90,7 +90,7 @@ def test_one_refused_command_leads_through_no_zone(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("remembers", "mode"), [(True, SMART_RTL), (False, RTL)])
 def test_an_autopilot_that_refuses_again_and_again_brings_the_drone_home_itself(
-    tmp_path: Path, remembers: bool, mode: int
+    tmp_path: Path, remembers: bool, mode: FlightMode
 ) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:

@@ -9,6 +9,7 @@ from fractus_mavlink import Message, message
 from fractus_mavlink.enums import MAV_MISSION_TYPE
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink import itemlists
+from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import Autopilot
 from fractus_services.mobility.mavlink.itemlists import Item, NoLists, download, upload
 
@@ -19,7 +20,7 @@ class Keeper(Autopilot):
     """An autopilot that keeps one list; it hears and says every message but those whose number is in `lost`."""
 
     def __init__(self, *lost: int, result: int = 0) -> None:
-        super().__init__("tcp:nowhere:1")
+        super().__init__("tcp:nowhere:1", ARDUCOPTER)
         self._target = (1, 1)
         self.vehicle.heartbeat_at = asyncio.get_running_loop().time()
         self.items: list[Message] = []

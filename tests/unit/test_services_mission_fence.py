@@ -14,6 +14,7 @@ from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink import fence as module
+from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.bounds import ROOM_M, bounds_of
 from fractus_services.mobility.mavlink.fence import MissionFence
 from fractus_services.mobility.mavlink.itemlists import Item, NoLists
@@ -51,6 +52,7 @@ class Vehicle:
         self.items: tuple[Item, ...] = ()
         self.written: list[str] = []
         self.vehicle = SimpleNamespace(armed=False)
+        self.stack = ARDUCOPTER
 
     async def read_parameter(self, name: str, attempts: int = 4) -> float | None:
         del attempts

@@ -14,8 +14,7 @@ from fractus_core.policy.values import Call, SetSpeedArgs, VelocityArgs
 from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError, Refused
 from fractus_services.mobility.flight import monitor as monitoring
-from fractus_services.mobility.mavlink.vehicle import GUIDED
-from mobility_world import World, area, clear_m, end, fly, goto, partial, refusal, spec, zone
+from mobility_world import GUIDED, World, area, clear_m, end, fly, goto, partial, refusal, spec, zone
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
 

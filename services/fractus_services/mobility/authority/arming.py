@@ -13,7 +13,6 @@ from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Mission
 from fractus_services.mobility.mavlink.autopilot import Permit
 from fractus_services.mobility.mavlink.failsafes import BEING_SET, Checked, choose_return, learn_return
-from fractus_services.mobility.mavlink.vehicle import GUIDED
 
 ARMED_S = 3.0
 WAIT_S = 0.5
@@ -77,7 +76,7 @@ async def _start(control: Control, home: tuple[float, float, float], permit: Per
     autopilot, modes = control.autopilot, control.modes
     modes.arming = True
     try:
-        await modes.change_mode(GUIDED, permit)
+        await modes.enter_guided(permit)
         try:
             await autopilot.arm(permit)
             deadline = autopilot.now + ARMED_S

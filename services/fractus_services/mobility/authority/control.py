@@ -139,7 +139,7 @@ class Control:
             (not self.decided, "it is not known yet what the drone does"),
             (self.taken(key), "another application has the drone"),
             (self.checked is None, "the autopilot's failsafes are being set"),
-            (self.authority == "pilot", f"a human pilot has the drone ({vehicle.mode_name})"),
+            (self.authority == "pilot", f"a human pilot has the drone ({vehicle.mode.name})"),
             (self.homeward, "the system brings the drone home"),
             (not vehicle.armed and not vehicle.ready, f"the autopilot is not ready to arm{': ' if why else ''}{why}"),
             (vehicle.lat is None or vehicle.home is None, "position and home are not known yet"),

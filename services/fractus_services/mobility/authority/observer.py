@@ -10,7 +10,7 @@ from fractus_services.errors import AutopilotError
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Mission
 from fractus_services.mobility.mavlink.failsafes import BEING_SET, configure
-from fractus_services.mobility.mavlink.vehicle import GUIDED, HOMEWARD, LAND, MODE_NAMES
+from fractus_services.mobility.mavlink.flight_stack import FlightMode, ModeKind
 
 log = logging.getLogger(__name__)
 
@@ -86,20 +86,20 @@ class Observer:
             if mission is not None and mission.flown and not mission.outcome:
                 self._control.begin_grace(mission, "driver lost")
             return
-        if vehicle.mode not in HOMEWARD | {GUIDED} or (mission is None and vehicle.mode != GUIDED):
-            self._pilot(f"is flying in {vehicle.mode_name}")
+        if not vehicle.mode.commanded and (mission is None or not vehicle.mode.comes_down):
+            self._pilot(f"is flying in {vehicle.mode.name}")
         elif mission is None:
             self._control.authority = "system"
             self._control.note("returnToLaunch", "system", "found the drone armed, and no mission", kind="takeover")
             self._control.start("returnToLaunch")
-        elif vehicle.mode in HOMEWARD:
+        elif vehicle.mode.comes_down:
             self._control.authority, self._control.homeward = "system", True
             if not mission.outcome:
                 mission.outcome = "failed: the autopilot flew home by itself while the mobility service was away"
                 self._control.journal.save_soon()
-            self._control.note("homeward", "system", f"found the drone in {vehicle.mode_name}", kind="takeover")
+            self._control.note("homeward", "system", f"found the drone in {vehicle.mode.name}", kind="takeover")
             self._control.system = self._control.tasks.spawn(
-                self._control.act("returnToLaunch" if vehicle.mode != LAND else "land")
+                self._control.act("land" if vehicle.mode.kind is ModeKind.LANDING else "returnToLaunch")
             )
         else:
             self._control.authority = "system"
@@ -159,16 +159,15 @@ class Observer:
         self._control.tasks.spawn(self._control.tasks.attempt(self._control.autopilot.set_rates, flying=False))
         self._control.wake()
 
-    def _foreign_mode(self, mode: int) -> None:
+    def _foreign_mode(self, mode: FlightMode) -> None:
         """Somebody else changed the mode: the autopilot's own failsafe, or a human pilot."""
         vehicle = self._control.autopilot.vehicle
-        name = MODE_NAMES.get(mode, str(mode))
         self._control.modes.expected = mode
         recent = self._control.autopilot.now - vehicle.failsafe_text_at < SAID_S
         said = vehicle.failsafe_text if recent else ""
-        if (vehicle.failsafe or said) and mode in HOMEWARD and self._control.authority != "pilot":
-            reason = f"the autopilot's own failsafe took the drone ({said or name})"
-            self._control.note(name, "system", reason, "AutopilotFailsafe", kind="takeover")
+        if (vehicle.failsafe or said) and mode.comes_down and self._control.authority != "pilot":
+            reason = f"the autopilot's own failsafe took the drone ({said or mode.name})"
+            self._control.note(mode.name, "system", reason, "AutopilotFailsafe", kind="takeover")
             mission = self._control.journal.flying
             if mission is not None and not mission.outcome:
                 mission.outcome = f"failed: {reason}"
@@ -177,14 +176,14 @@ class Observer:
             self._control.authority, self._control.homeward = "system", True
             self._control.tasks.drop(self._control.system)
             self._control.system = self._control.tasks.spawn(
-                self._control.act("land" if mode == LAND else "returnToLaunch")
+                self._control.act("land" if mode.kind is ModeKind.LANDING else "returnToLaunch")
             )
-        elif self._control.authority == "pilot" and mode == GUIDED and self._control.journal.flying is not None:
+        elif self._control.authority == "pilot" and mode.commanded and self._control.journal.flying is not None:
             self._control.note("hover", "system", "the pilot handed the drone back", kind="takeover")
             self._control.authority = "system"
             self._take_back(self._control.journal.flying)
         else:
-            self._pilot(f"changed the mode to {name}")
+            self._pilot(f"changed the mode to {mode.name}")
 
     def _pilot(self, what: str) -> None:
         """A human pilot has the drone: applications lose it at once, and we keep our hands off."""

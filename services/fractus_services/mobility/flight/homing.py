@@ -26,7 +26,7 @@ from fractus_services.mobility.flight.courses import (
 )
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import REACHED_M, Step, come_to_rest, fly_to
-from fractus_services.mobility.mavlink.vehicle import GUIDED, HOMEWARD, RTL, SMART_RTL
+from fractus_services.mobility.mavlink.flight_stack import FlightMode
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ class Homing:
         self._control = control
         self._guard = guard
 
-    async def approach(self, wanted: Callable[[], bool], tries: int) -> int:
+    async def approach(self, wanted: Callable[[], bool], tries: int) -> FlightMode:
         """Fly, for the system, until the autopilot can do the rest.
 
         Args:
@@ -61,9 +61,9 @@ class Homing:
             AutopilotError: the autopilot refuses, or its link broke.
         """
         control = self._control
-        grant, vehicle = control.last_grant, control.autopilot.vehicle
-        if grant is None or not vehicle.in_air or vehicle.mode in HOMEWARD:
-            return RTL
+        grant, vehicle, stack = control.last_grant, control.autopilot.vehicle, control.autopilot.stack
+        if grant is None or not vehicle.in_air or vehicle.mode.comes_down:
+            return stack.return_straight
         try:
             why = await self._bring(grant, wanted) if tries < MAX_TRIES else self._give_up(grant, tries)
         except AutopilotError:
@@ -72,12 +72,12 @@ class Homing:
             log.exception("homing: planner failed")
             why = "the planner failed"
         if not why:
-            return RTL
+            return stack.return_straight
         back = control.retraces and tries <= MAX_TRIES
         how = "goes back the way it came" if back else "flies straight"
         control.note("returnToLaunch", "system", f"no legal way home is known ({why}); the drone {how}", "NoLegalWay")
         log.error("homing: no legal way home is known, the drone %s (reason=%s)", how, why)
-        return SMART_RTL if back else RTL
+        return stack.return_retracing if back else stack.return_straight
 
     def _give_up(self, grant: ActiveGrant, tries: int) -> str:
         """Why the way home is not flown by us any more; nothing where the straight one is legal."""
@@ -95,7 +95,7 @@ class Homing:
                 raise AutopilotError("the system has lost the control of the drone")
 
         try:
-            await control.modes.change_mode(GUIDED, permit)
+            await control.modes.enter_guided(permit)
             return await self._round(Trip(constraints, "Homeward", lambda motion: _both(permit, motion)))
         finally:
             control.end_system_flight(constraints)

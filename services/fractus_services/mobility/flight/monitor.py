@@ -22,7 +22,6 @@ from fractus_services.mobility.flight.courses import limited_mps
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import REACHED_M, fly_to
 from fractus_services.mobility.mavlink.autopilot import Permit
-from fractus_services.mobility.mavlink.vehicle import GUIDED
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +83,7 @@ class MotionMonitor:
             else None
         )
         coming = control.homeward and control.constraints is None
-        if compiled is None or control.authority == "pilot" or coming or control.autopilot.vehicle.mode != GUIDED:
+        if compiled is None or control.authority == "pilot" or coming or not control.autopilot.vehicle.mode.commanded:
             self._alarm = ""
             return
         verdict, ours = self._judge(compiled)
@@ -210,7 +209,7 @@ def recorded(control: Control) -> dict[str, Any]:
         "alt": round(vehicle.altitude_m, 2),
         "amsl": round(vehicle.amsl_m, 2),
         "speed": round(vehicle.speed_mps, 2),
-        "mode": vehicle.mode_name,
+        "mode": vehicle.mode.name,
         "battery": round(vehicle.battery_remaining, 3) if math.isfinite(vehicle.battery_remaining) else 0.0,
         "controller": control.controller,
         "in_air": vehicle.in_air,

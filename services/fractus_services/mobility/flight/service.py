@@ -20,7 +20,6 @@ from fractus_services.mobility.flight.courses import Trip
 from fractus_services.mobility.flight.motions import REACHED_M, Step, climb, come_down, come_to_rest, fly_to
 from fractus_services.mobility.flight.steering import Steering
 from fractus_services.mobility.mavlink.autopilot import Autopilot, Permit
-from fractus_services.mobility.mavlink.vehicle import GUIDED, LAND, RTL, SMART_RTL
 
 MAX_REACHED_M = 50.0
 JUDGE_AGAIN_S = 0.05
@@ -120,7 +119,7 @@ class MobilityService:
 
         async def steps(motion: Motion) -> AsyncIterator[Progress]:
             permit = driver_permit(self._control, grant, motion)
-            await self._control.modes.change_mode(GUIDED, permit)
+            await self._control.modes.enter_guided(permit)
             async for step in climb(self._autopilot, motion, altitude, permit):
                 yield Progress(verdict, step)
 
@@ -183,7 +182,7 @@ class MobilityService:
         """
         for _ in range(MAX_JUDGEMENTS):
             begun = self._autopilot.now
-            await self._control.modes.change_mode(GUIDED, permit)
+            await self._control.modes.enter_guided(permit)
             if verdict.brake_first:
                 await come_to_rest(self._autopilot, motion, permit)
             elif self._autopilot.now - begun <= JUDGE_AGAIN_S:
@@ -214,7 +213,9 @@ class MobilityService:
         self._flying("Land")
 
         async def steps(motion: Motion) -> AsyncIterator[Progress]:
-            await self._control.modes.change_mode(LAND, driver_permit(self._control, grant, motion))
+            await self._control.modes.change_mode(
+                self._control.autopilot.stack.land, driver_permit(self._control, grant, motion)
+            )
             async for step in come_down(self._autopilot, motion):
                 yield Progress(verdict, step)
 
@@ -231,16 +232,16 @@ class MobilityService:
             permit = driver_permit(control, grant, motion)
             constraints = control.begin_system_flight(control.require(grant).grant)
             try:
-                await control.modes.change_mode(GUIDED, permit)
+                await control.modes.enter_guided(permit)
                 trip = Trip(constraints, motion.kind, lambda _motion: permit)
                 async with aclosing(self._way_home(trip, motion)) as legs:  # type: ignore[type-var]
                     async for step in legs:
                         yield Progress(verdict, step)
-                mode = RTL
+                mode = control.autopilot.stack.return_straight
             except Refused as refusal:
                 if refusal.verdict.code != "NoLegalWay" or not control.retraces:
                     raise
-                mode = SMART_RTL
+                mode = control.autopilot.stack.return_retracing
             finally:
                 control.end_system_flight(constraints)
             await control.modes.change_mode(mode, permit)

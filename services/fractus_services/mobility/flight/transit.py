@@ -20,7 +20,6 @@ from fractus_services.mobility.authority.permits import transit_permit
 from fractus_services.mobility.flight.courses import FAULT, Courses, Trip, target_of
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import climb
-from fractus_services.mobility.mavlink.vehicle import GUIDED
 
 DEFAULT_ALTITUDE_M = 10.0
 """How high the system takes off, above home, when the place it flies to gives no altitude."""
@@ -110,11 +109,11 @@ class TransitFlight:
                     await arm(control, trip.constraints.grant, permit)
                 climbed = self._allow(Call("Takeoff", TakeoffArgs(self._height_m(place, trip))), trip)
                 yield "the system takes off"
-                await control.modes.change_mode(GUIDED, permit)
+                await control.modes.enter_guided(permit)
                 height = climbed.altitude_m if isinstance(climbed, TakeoffArgs) else DEFAULT_ALTITUDE_M
                 async for _ in climb(autopilot, motion, height, permit):
                     pass
-            await control.modes.change_mode(GUIDED, permit)
+            await control.modes.enter_guided(permit)
         finally:
             control.finish(motion)
 

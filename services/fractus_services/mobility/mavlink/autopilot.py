@@ -19,6 +19,7 @@ from fractus_mavlink.enums import (
 )
 
 from fractus_services.errors import AutopilotError
+from fractus_services.mobility.mavlink.flight_stack import FlightMode, FlightStack
 from fractus_services.mobility.mavlink.link import Link
 
 log = logging.getLogger(__name__)
@@ -66,13 +67,14 @@ class Autopilot(Link):
 
     Args:
         url: the link, see `open_link`.
+        stack: the vehicle's firmware.
 
     Attributes:
         starting: held by the one who prepares to start the motors.
     """
 
-    def __init__(self, url: str) -> None:
-        super().__init__(url)
+    def __init__(self, url: str, stack: FlightStack) -> None:
+        super().__init__(url, stack)
         self.starting = asyncio.Lock()
         self._locks: dict[int | str, asyncio.Lock] = {}
         self._flying_rates: bool | None = None
@@ -133,17 +135,19 @@ class Autopilot(Link):
                 return None
 
     def _refusal(self, command: MAV_CMD, result: int) -> str:
-        why = [t for t in self.vehicle.texts[-4:] if t.startswith(("Arm", "PreArm", "Mode", "Takeoff"))]
+        why = [t for t in self.vehicle.texts[-4:] if self.stack.explains_refusal(t)]
         said = f": {why[-1]}" if why else ""
         return f"the autopilot {_RESULTS.get(result, 'refused')} command {command.name}{said}"
 
-    async def set_mode(self, mode: int, permit: Permit = always) -> None:
+    async def set_mode(self, mode: FlightMode, permit: Permit = always) -> None:
         """Change the flight mode and wait until the autopilot flies it."""
-        await self.command(MAV_CMD.DO_SET_MODE, MAV_MODE_FLAG.CUSTOM_MODE_ENABLED, mode, permit=permit)
+        await self.command(
+            MAV_CMD.DO_SET_MODE, MAV_MODE_FLAG.CUSTOM_MODE_ENABLED, *self.stack.mode_parameters(mode), permit=permit
+        )
         deadline = self.now + MODE_TIMEOUT_S
         while self.vehicle.mode != mode:
             if self.now > deadline:
-                raise AutopilotError(f"the autopilot accepted mode {mode} and stays in {self.vehicle.mode_name}")
+                raise AutopilotError(f"the autopilot accepted mode {mode.name} and stays in {self.vehicle.mode.name}")
             await self.update(0.3)
 
     async def arm(self, permit: Permit = always) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import shapely
 from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame, polygon
+from fractus_mavlink.enums import MAV_CMD
 
 from fractus_services.mobility.mavlink.itemlists import Item
 
@@ -16,7 +17,6 @@ ROOM_M = 10.0
 HEADROOM_M = 5.0
 MOST_VERTICES = 60
 _SIMPLER_M = 0.5
-_VERTEX_IN = 5001
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,5 +51,8 @@ def bounds_of(spec: GrantSpec) -> Bounds | None:
             grown = grown.envelope
         corners = [frame.latlon(x, y) for x, y in list(grown.exterior.coords)[:-1]]
         count = len(corners)
-        items = tuple(Item(_VERTEX_IN, float(count), round(lat * 1e7), round(lon * 1e7)) for lat, lon in corners)
+        items = tuple(
+            Item(MAV_CMD.NAV_FENCE_POLYGON_VERTEX_INCLUSION, float(count), round(lat * 1e7), round(lon * 1e7))
+            for lat, lon in corners
+        )
     return Bounds(items, altitude) if items or altitude is not None else None

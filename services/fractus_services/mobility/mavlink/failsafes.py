@@ -9,67 +9,15 @@ from dataclasses import dataclass, replace
 from fractus_core.policy.values import Airframe
 
 from fractus_services.mobility.mavlink.autopilot import ATTEMPTS, Autopilot
-from fractus_services.mobility.mavlink.link import SYSTEM_ID
+from fractus_services.mobility.mavlink.flight_stack import Names, Setting
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class Setting:
-    """One parameter that must hold.
-
-    Attributes:
-        names: its name, and older or newer spellings of it.
-        value: what it is set to.
-        accepted: values that may stay as they are.
-        needed: whether arming is refused when the vehicle does not have it.
-        why: what it does, for people.
-    """
-
-    names: tuple[str, ...]
-    value: float
-    accepted: frozenset[float]
-    needed: bool
-    why: str
-
-
-_LISTENS = "listens for the companion's heartbeats, and takes no ground station for it"
-_OLD_NAME, _NEW_NAME = "SYSID_MYGCS", "MAV_GCS_SYSID"
-
-SETTINGS = (
-    Setting((_OLD_NAME, _NEW_NAME), SYSTEM_ID, frozenset(), True, _LISTENS),
-    Setting(("FS_GCS_TIMEOUT",), 5, frozenset(), False, "after five seconds of silence"),
-    Setting(("GUID_TIMEOUT",), 1, frozenset(), False, "gives a velocity up after a second without another"),
-    Setting(("BATT_FS_CRT_ACT",), 1, frozenset({1.0}), False, "lands on a critical battery"),
-    Setting(("FS_EKF_ACTION",), 1, frozenset({1.0, 3.0}), False, "lands when it no longer knows where it is"),
-)
-
-STRAIGHT = (
-    Setting(("FS_GCS_ENABLE",), 1, frozenset(), True, "returns to launch when the companion falls silent"),
-    Setting(("BATT_FS_LOW_ACT",), 2, frozenset({1.0, 2.0}), False, "returns to launch on a low battery"),
-)
-RETRACING = (
-    Setting(("FS_GCS_ENABLE",), 3, frozenset({4.0}), True, "goes back the way it came when the companion falls silent"),
-    Setting(("BATT_FS_LOW_ACT",), 3, frozenset({1.0, 4.0}), False, "goes back the way it came on a low battery"),
-)
-"""The failsafes that bring the drone home, straight or on its own path (SmartRTL)."""
-
-PATH_POINTS = 100.0
-"""A vehicle that remembers fewer points of its path (SRTL_POINTS) is not relied on to find back on it."""
-
-RANGE = Setting(("MAV_GCS_SYSID_HI",), 0, frozenset(float(n) for n in range(1, SYSTEM_ID + 1)), False, _LISTENS)
-"""Releases that know the new name can take a whole range of systems for the companion."""
 
 
 BEING_SET = "they are being set"
 """The problem of failsafes that are not read back yet."""
 
-Names = tuple[tuple[str, float], ...]
-"""A parameter's name, and older or newer spellings of it, each with what its values are multiplied by."""
-
-_RETURN_ALTITUDE: Names = (("RTL_ALT", 0.01), ("RTL_ALT_M", 1.0))
-_USUAL_FENCES, _USUAL_MARGIN_M, _CEILING = 7.0, 2.0, 1
-_USUAL_MPS = 5.0
+_DEFAULT_SPEED_MPS = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +41,7 @@ class Checked:
     known: frozenset[str] = frozenset()
 
 
-class _Reader:
+class Reader:
     """Reads parameters of how the vehicle moves, and keeps what is wrong with them.
 
     Args:
@@ -141,20 +89,23 @@ async def configure(autopilot: Autopilot, *, flying: bool = False, before: Check
     """
     problems: list[str] = []
     missing: list[str] = []
-    for setting in SETTINGS:
+    stack = autopilot.stack
+    for setting in stack.failsafes:
         name, problem = await _establish(autopilot, setting)
         if not name:
             missing.append(setting.names[0])
         problems.extend(filter(None, [problem]))
-        if name == _NEW_NAME:
-            problems.extend(filter(None, [(await _establish(autopilot, RANGE))[1]]))
+        if name in setting.also:
+            problems.extend(filter(None, [(await _establish(autopilot, setting.also[name]))[1]]))
     before = before if flying else None
-    points = await autopilot.read_parameter("SRTL_POINTS", attempts=2)
-    remembers = before.remembers if before is not None and points is None else (points or 0.0) >= PATH_POINTS
+    parameter, least_points = stack.path_memory
+    points = await autopilot.read_parameter(parameter, attempts=2)
+    remembers = before.remembers if before is not None and points is None else (points or 0.0) >= least_points
     retrace = remembers and (not flying or await _chosen(autopilot, before))
     retraces, wrong = await _choose(autopilot, retrace=retrace)
-    reader = _Reader(autopilot, before.known if before is not None else frozenset())
-    airframe, speed = await _airframe(reader, before)
+    reader = Reader(autopilot, before.known if before is not None else frozenset())
+    known, speed = (before.airframe, before.speed_mps) if before is not None else (Airframe(), _DEFAULT_SPEED_MPS)
+    airframe, speed = await stack.airframe(reader, known, speed)
     problems += wrong + reader.problems
     airframe = replace(airframe, retraces=retraces)
     checked = Checked("; ".join(problems), tuple(missing), airframe, speed, remembers, reader.known)
@@ -186,8 +137,8 @@ async def learn_return(autopilot: Autopilot, checked: Checked) -> Checked:
     Raises:
         AutopilotError: the link broke.
     """
-    reader = _Reader(autopilot, checked.known)
-    height_m = await _return_altitude_m(reader, checked.airframe.return_altitude_m)
+    reader = Reader(autopilot, checked.known)
+    height_m = await autopilot.stack.return_altitude_m(reader, checked.airframe.return_altitude_m)
     problem = "; ".join(filter(None, [checked.problem, *reader.problems]))
     airframe = replace(checked.airframe, return_altitude_m=height_m)
     return replace(checked, problem=problem, airframe=airframe, known=reader.known)
@@ -197,19 +148,20 @@ async def _chosen(autopilot: Autopilot, before: Checked | None) -> bool:
     """Whether the path was chosen as the way home of the flight under way; the vehicle knows when nobody else does."""
     if before is not None:
         return before.airframe.retraces
-    companion = RETRACING[0]
+    companion = autopilot.stack.retracing[0]
     value = await autopilot.read_parameter(companion.names[0])
     return value is not None and value in companion.accepted | {companion.value}
 
 
 async def _choose(autopilot: Autopilot, *, retrace: bool) -> tuple[bool, list[str]]:
     """Whether the failsafes retrace the path now, and what does not hold."""
+    stack = autopilot.stack
     if retrace:
-        problems = [problem for setting in RETRACING if (problem := (await _establish(autopilot, setting))[1])]
+        problems = [problem for setting in stack.retracing if (problem := (await _establish(autopilot, setting))[1])]
         if not problems:
             return True, []
         log.warning("the drone will fly home straight: %s", "; ".join(problems))
-    return False, [problem for setting in STRAIGHT if (problem := (await _establish(autopilot, setting))[1])]
+    return False, [problem for setting in stack.straight if (problem := (await _establish(autopilot, setting))[1])]
 
 
 async def _establish(autopilot: Autopilot, setting: Setting) -> tuple[str, str]:
@@ -226,40 +178,3 @@ async def _establish(autopilot: Autopilot, setting: Setting) -> tuple[str, str]:
             return name, ""
         return name, f"{name} is {found:g} and cannot be set to {setting.value:g} (the autopilot {setting.why})"
     return "", f"the autopilot has no {' or '.join(setting.names)} ({setting.why})" if setting.needed else ""
-
-
-async def _airframe(reader: _Reader, before: Checked | None) -> tuple[Airframe, float]:
-    """How the vehicle moves, and the speed of its legs."""
-    read = reader.read
-    standard, usual_mps = (before.airframe, before.speed_mps) if before is not None else (Airframe(), _USUAL_MPS)
-    accel = await read((("WPNAV_ACCEL", 0.01), ("WP_ACC", 1.0)), standard.accel_mps2)
-    gain = await read((("PSC_POSXY_P", 1.0), ("PSC_NE_POS_P", 1.0)), standard.position_gain)
-    climb = await read((("WPNAV_ACCEL_Z", 0.01), ("WP_ACC_Z", 1.0)), standard.climb_accel_mps2)
-    jerk = await read((("PSC_JERK_XY", 1.0), ("PSC_JERK_NE", 1.0)), standard.jerk_mps3)
-    height = await _return_altitude_m(reader, standard.return_altitude_m)
-    speed = await read((("WPNAV_SPEED", 0.01), ("WP_SPD", 1.0)), usual_mps)
-    airframe = Airframe(
-        accel_mps2=max(accel, 0.1),
-        position_gain=max(gain, 0.1),
-        climb_accel_mps2=max(climb, 0.1),
-        jerk_mps3=max(jerk, 0.5),
-        return_altitude_m=height,
-    )
-    return airframe, speed
-
-
-async def _return_altitude_m(reader: _Reader, usual_m: float) -> float:
-    """How high the autopilot climbs to fly home: never above its own fence's ceiling, less the fence's margin."""
-
-    async def read(name: str, default: float) -> float:
-        return await reader.read(((name, 1.0),), default)
-
-    wrong = len(reader.problems)
-    height_m = await reader.read(_RETURN_ALTITUDE, usual_m)
-    fenced = await read("FENCE_ENABLE", 0.0) or await read("FENCE_AUTOENABLE", 0.0)
-    if fenced and int(await read("FENCE_TYPE", _USUAL_FENCES)) & _CEILING:
-        ceiling_m = await read("FENCE_ALT_MAX", math.inf)
-        if math.isinf(ceiling_m) and len(reader.problems) == wrong:
-            reader.problems.append("FENCE_ALT_MAX cannot be read")
-        height_m = min(height_m, ceiling_m - await read("FENCE_MARGIN", _USUAL_MARGIN_M))
-    return usual_m if len(reader.problems) > wrong else height_m

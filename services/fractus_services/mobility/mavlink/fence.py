@@ -19,14 +19,6 @@ from fractus_services.mobility.mavlink.itemlists import Item, NoLists, download,
 
 log = logging.getLogger(__name__)
 
-ENABLE, TYPE, ALTITUDE, ACTION, OPTIONS = "FENCE_ENABLE", "FENCE_TYPE", "FENCE_ALT_MAX", "FENCE_ACTION", "FENCE_OPTIONS"
-PARAMETERS = (TYPE, ALTITUDE, ACTION, OPTIONS, ENABLE)
-"""In the order in which they are set: the fence is switched on last."""
-
-_WITNESS = "FS_GCS_ENABLE"
-_TOP, _POLYGON = 1, 4
-_RETURN, _RETRACE = 1.0, 3.0
-_UNION = 2
 _RESTORE_S = 5.0
 _CLOSE_E7 = 2
 
@@ -42,11 +34,6 @@ class Owned:
 
     parameters: dict[str, float]
     items: tuple[Item, ...]
-
-    @property
-    def enabled(self) -> bool:
-        """Whether it was in force."""
-        return self.parameters.get(ENABLE, 0.0) != 0.0
 
 
 class MissionFence:
@@ -64,6 +51,7 @@ class MissionFence:
 
     def __init__(self, autopilot: Autopilot, directory: Path) -> None:
         self._autopilot = autopilot
+        self._stack = autopilot.stack
         self._path = directory / "fence.json"
         self._lock = asyncio.Lock()
         self.missing = ""
@@ -93,7 +81,7 @@ class MissionFence:
             if not await self._offered():
                 return
             try:
-                await self._raise(bounds, _RETRACE if retraces else _RETURN)
+                await self._raise(bounds, retraces)
             except NoLists as error:
                 self._lacks(str(error))
 
@@ -114,31 +102,36 @@ class MissionFence:
 
     async def _offered(self) -> bool:
         """Whether the autopilot knows fences; only one that answers other questions surely does not."""
-        if await self._autopilot.read_parameter(ENABLE) is not None:
+        if await self._autopilot.read_parameter(self._stack.fence_switch) is not None:
             self.missing = ""
             return True
-        if await self._autopilot.read_parameter(_WITNESS) is None:
+        if await self._autopilot.read_parameter(self._stack.witness) is None:
             raise AutopilotError("the autopilot stopped answering while its fence was asked for", link=True)
-        self._lacks(f"the autopilot has no {ENABLE}")
+        self._lacks(f"the autopilot has no {self._stack.fence_switch}")
         return False
 
     def _lacks(self, why: str) -> None:
         self.missing = why
         log.warning("the vehicle has no fence of its own as a last line: %s", why)
 
-    async def _raise(self, bounds: Bounds, action: float) -> None:
+    async def _raise(self, bounds: Bounds, retraces: bool) -> None:
         owned = await asyncio.to_thread(self._load)
         if owned is None:
             owned = await self._read()
             await asyncio.to_thread(self._store, owned)
-        kept = owned.items if owned.enabled else ()
+        switch = self._stack.fence_switch
+        kept = owned.items if owned.parameters.get(switch, 0.0) else ()
         if self._autopilot.vehicle.armed:
             raise AutopilotError("the motors run; the fence stays as it is")
         # ArduPilot works out which kinds of fence are in force when a fence is switched on, and not again.
         try:
-            await self._set({ENABLE: 0.0})
+            await self._set({switch: 0.0})
             await self._write((*kept, *bounds.items))
-            await self._set(_wanted(owned, bounds, action))
+            await self._set(
+                self._stack.fence_values(
+                    owned.parameters, ceiling_m=bounds.altitude_m, polygon=bool(bounds.items), retraces=retraces
+                )
+            )
         except (AutopilotError, asyncio.CancelledError):
             await self._recover(owned)
             raise
@@ -153,14 +146,14 @@ class MissionFence:
             log.warning("the owner's fence is not put back yet: %s", str(error) or "it takes too long")
 
     async def _put_back(self, owned: Owned) -> None:
-        await self._set({ENABLE: 0.0})
+        await self._set({self._stack.fence_switch: 0.0})
         await self._write(owned.items)
         await self._set(owned.parameters)
         await asyncio.to_thread(self._path.unlink, True)
         log.info("the vehicle's own fence is as its owner left it")
 
     async def _read(self) -> Owned:
-        found = {name: await self._autopilot.read_parameter(name) for name in PARAMETERS}
+        found = {name: await self._autopilot.read_parameter(name) for name in self._stack.fence_parameters}
         parameters = {name: value for name, value in found.items() if value is not None}
         return Owned(parameters, await download(self._autopilot))
 
@@ -173,10 +166,10 @@ class MissionFence:
             )
 
     async def _set(self, values: dict[str, float]) -> None:
-        for name in PARAMETERS:
+        for name in self._stack.fence_parameters:
             if name not in values or await self._autopilot.read_parameter(name) == values[name]:
                 continue
-            if name == ENABLE and not values[name] and self._autopilot.vehicle.armed:
+            if name == self._stack.fence_switch and not values[name] and self._autopilot.vehicle.armed:
                 raise AutopilotError("the motors run; the fence is not switched off")
             after = await self._autopilot.write_parameter(name, values[name])
             if after is None or abs(after - values[name]) > 1e-3 * max(1.0, abs(values[name])):
@@ -194,25 +187,6 @@ class MissionFence:
 
     def _store(self, owned: Owned) -> None:
         write_file(self._path, json.dumps(asdict(owned)).encode())
-
-
-def _wanted(owned: Owned, bounds: Bounds, action: float) -> dict[str, float]:
-    """The parameters of a fence around some bounds, beside the owner's own where that is in force."""
-    had = owned.parameters
-    kinds = (_TOP if bounds.altitude_m is not None else 0) | (_POLYGON if bounds.items else 0)
-    values = {ENABLE: 1.0, TYPE: float(kinds), ACTION: action}
-    ceiling = bounds.altitude_m
-    if owned.enabled:
-        before = int(had.get(TYPE, 0))
-        values[TYPE] = float(before | kinds)
-        values[ACTION] = had.get(ACTION, 0.0) or action
-        if before & _TOP and ALTITUDE in had:
-            ceiling = had[ALTITUDE] if ceiling is None else min(ceiling, had[ALTITUDE])
-    if ceiling is not None:
-        values[ALTITUDE] = ceiling
-    if int(had.get(OPTIONS, 0)) & _UNION:
-        values[OPTIONS] = float(int(had[OPTIONS]) & ~_UNION)
-    return {name: value for name, value in values.items() if name in had or name == ENABLE}
 
 
 def _same(stored: Sequence[Item], sent: Sequence[Item]) -> bool:

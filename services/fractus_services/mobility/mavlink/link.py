@@ -12,6 +12,7 @@ from fractus_mavlink import Endpoint, Message, message
 from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_COMPONENT, MAV_STATE, MAV_TYPE
 
 from fractus_services.errors import AutopilotError
+from fractus_services.mobility.mavlink.flight_stack import FlightStack
 from fractus_services.mobility.mavlink.transport import BadUrl, Transport, open_link
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 
@@ -34,6 +35,7 @@ class Link:
 
     Args:
         url: where the autopilot is, see `open_link`.
+        stack: its firmware.
 
     Attributes:
         vehicle: the streamed state.
@@ -42,12 +44,13 @@ class Link:
         alive: whether the companion does its duty; when not, no heartbeat holds off the autopilot's own failsafe.
     """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, stack: FlightStack) -> None:
         self.url = url
+        self.stack = stack
         self.on_message: Callable[[Message], None] = lambda _m: None
         self.on_found: Callable[[], None] = lambda: None
         self.alive: Callable[[], bool] = lambda: True
-        self.vehicle = Vehicle()
+        self.vehicle = Vehicle(stack)
         self._endpoint = Endpoint(SYSTEM_ID, COMPONENT_ID)
         self._transport: Transport | None = None
         self._target: tuple[int, int] | None = None
@@ -134,7 +137,7 @@ class Link:
 
     def _knock(self) -> None:
         """Speak without a heartbeat: an autopilot behind a datagram link answers to whom it has heard."""
-        self.send(message("PARAM_REQUEST_READ", param_index=-1, param_id=b"FS_GCS_ENABLE"))
+        self.send(message("PARAM_REQUEST_READ", param_index=-1, param_id=self.stack.witness.encode()))
 
     def _lost(self) -> None:
         """The link broke: what was agreed with the vehicle on it no longer holds."""

@@ -10,7 +10,7 @@ from fractus_core.policy.values import Takeover
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.autopilot import Autopilot, Permit, always
-from fractus_services.mobility.mavlink.vehicle import GUIDED, HOMEWARD, LAND, RTL
+from fractus_services.mobility.mavlink.flight_stack import FlightMode
 
 log = logging.getLogger(__name__)
 
@@ -39,15 +39,15 @@ class ModeController:
     """
 
     def __init__(self, autopilot: Autopilot, moving: Callable[[], bool]) -> None:
-        self.expected: int | None = None
+        self.expected: FlightMode | None = None
         self.changing = 0
         self.arming = False
         self.preparing = 0
-        self.approach: Callable[[Callable[[], bool], int], Awaitable[int]] = _straight
+        self.approach: Callable[[Callable[[], bool], int], Awaitable[FlightMode]] = self._straight
         self._autopilot = autopilot
         self._moving = moving
 
-    async def change_mode(self, mode: int, permit: Permit = always) -> None:
+    async def change_mode(self, mode: FlightMode, permit: Permit = always) -> None:
         """Change the flight mode.
 
         Raises:
@@ -67,6 +67,17 @@ class ModeController:
             if not done and self.expected == mode and self._autopilot.vehicle.mode != mode:
                 self.expected = before
 
+    async def enter_guided(self, permit: Permit = always) -> None:
+        """Change to the mode in which the autopilot obeys.
+
+        Raises:
+            AutopilotError: it does not.
+        """
+        await self.change_mode(self._autopilot.stack.guided, permit)
+
+    async def _straight(self, _wanted: Callable[[], bool], _tries: int) -> FlightMode:
+        return self._autopilot.stack.return_straight
+
     async def hold(self, permit: Permit = always) -> None:
         """Brake and hover.
 
@@ -75,14 +86,14 @@ class ModeController:
         """
         permit()
         self._autopilot.stop()
-        await self.change_mode(GUIDED, permit)
+        await self.enter_guided(permit)
         self._autopilot.stop()
 
     async def settle(self) -> None:
         """Keep braking until the drone stands: a single velocity setpoint times out in the autopilot."""
         autopilot = self._autopilot
         deadline = autopilot.now + SETTLE_S
-        while not self._moving() and autopilot.vehicle.mode == GUIDED and autopilot.now < deadline:
+        while not self._moving() and autopilot.vehicle.mode.commanded and autopilot.now < deadline:
             known = autopilot.vehicle.position_fresh(autopilot.now)
             if known and autopilot.vehicle.speed_mps < STANDING_MPS and abs(autopilot.vehicle.down_mps) < STANDING_MPS:
                 return
@@ -127,14 +138,14 @@ class ModeController:
     async def _come_down(self, action: Takeover, tries: int, wanted: Callable[[], bool]) -> None:
         """Land here, or bring the drone home: by the autopilot's own doing, where that has begun, or else by ours first."""
         vehicle = self._autopilot.vehicle
-        returning = action != "land" and vehicle.mode in HOMEWARD and self.expected == vehicle.mode
+        returning = action != "land" and vehicle.mode.comes_down and self.expected == vehicle.mode
         if not returning:
             await self._brake(wanted)
-            mode: int = LAND
+            mode = self._autopilot.stack.land
             if action != "land" and tries < RTL_TRIES:
                 mode = await self.approach(wanted, tries)
             await self.change_mode(mode, lambda: _check(wanted))
-        while vehicle.armed and vehicle.mode in HOMEWARD:
+        while vehicle.armed and vehicle.mode.comes_down:
             await self._autopilot.update(1.0)
 
     async def _brake(self, wanted: Callable[[], bool]) -> None:
@@ -142,7 +153,7 @@ class ModeController:
         autopilot, vehicle = self._autopilot, self._autopilot.vehicle
         deadline = autopilot.now + BRAKE_S
         autopilot.stop()
-        while wanted() and vehicle.in_air and vehicle.mode == GUIDED and autopilot.now < deadline:
+        while wanted() and vehicle.in_air and vehicle.mode.commanded and autopilot.now < deadline:
             if vehicle.at_rest(autopilot.now) or not vehicle.position_fresh(autopilot.now):
                 return
             autopilot.stop()
@@ -156,10 +167,6 @@ class ModeController:
         if self._autopilot.vehicle.armed:
             await self.hold()
             await self.settle()
-
-
-async def _straight(_wanted: Callable[[], bool], _tries: int) -> int:
-    return RTL
 
 
 def _check(wanted: Callable[[], bool]) -> None:

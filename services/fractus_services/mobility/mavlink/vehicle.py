@@ -10,7 +10,6 @@ from fractus_core.geo import LocalFrame
 from fractus_core.policy.values import STANDING_MPS, Airframe, Home, Situation
 from fractus_mavlink import Message
 from fractus_mavlink.enums import (
-    COPTER_MODE,
     GPS_FIX_TYPE,
     MAV_LANDED_STATE,
     MAV_MODE_FLAG,
@@ -18,11 +17,7 @@ from fractus_mavlink.enums import (
     MAV_SYS_STATUS_SENSOR,
 )
 
-GUIDED, RTL, LAND = COPTER_MODE.GUIDED, COPTER_MODE.RTL, COPTER_MODE.LAND
-SMART_RTL, BRAKE = COPTER_MODE.SMART_RTL, COPTER_MODE.BRAKE
-MODE_NAMES: dict[int, str] = {mode: mode.name for mode in COPTER_MODE}
-HOMEWARD: frozenset[int] = frozenset({RTL, LAND, SMART_RTL, COPTER_MODE.AUTO_RTL})
-"""Modes in which the vehicle comes down by itself."""
+from fractus_services.mobility.mavlink.flight_stack import FlightMode, FlightStack, ModeKind
 
 _UNKNOWN_U16 = 0xFFFF
 """What 16 bits say of a value that is not known."""
@@ -48,11 +43,13 @@ class Vehicle:
     """The streamed state; times are monotonic seconds.
 
     Attributes:
+        stack: the firmware that says it.
         yaw_deg: heading as the position says it; `heading_deg` is the attitude's.
         path_lost: whether the autopilot has given up remembering its path since it was armed.
         located: whether GPS has a three-dimensional fix of some accuracy; positions without one are not taken.
     """
 
+    stack: FlightStack
     lat: float | None = None
     lon: float | None = None
     altitude_m: float = 0.0
@@ -67,7 +64,7 @@ class Vehicle:
     heading_deg: float = 0.0
     attitude_at: float = -math.inf
     home: Home | None = None
-    mode: int = -1
+    mode: FlightMode = field(default_factory=FlightMode)
     armed: bool = False
     failsafe: bool = False
     heartbeat_at: float = -math.inf
@@ -85,11 +82,6 @@ class Vehicle:
     path_lost: bool = False
     failsafe_text: str = ""
     failsafe_text_at: float = -math.inf
-
-    @property
-    def mode_name(self) -> str:
-        """The autopilot's name of its mode."""
-        return MODE_NAMES.get(self.mode, f"MODE{self.mode}" if self.mode >= 0 else "UNKNOWN")
 
     @property
     def _landed_told(self) -> bool:
@@ -153,7 +145,8 @@ class Vehicle:
             return "inactive"
         if self.landed_state == MAV_LANDED_STATE.TAKEOFF:
             return "takingOff"
-        return "landing" if self.landed_state == MAV_LANDED_STATE.LANDING or self.mode == LAND else "flying"
+        landing = self.landed_state == MAV_LANDED_STATE.LANDING or self.mode.kind is ModeKind.LANDING
+        return "landing" if landing else "flying"
 
     def take(self, message: Message, now: float) -> None:
         """Update from one message."""
@@ -184,7 +177,7 @@ class Vehicle:
 
 def _heartbeat(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.heartbeat_at = now
-    vehicle.mode = message.integer("custom_mode")
+    vehicle.mode = vehicle.stack.mode(message.integer("custom_mode"))
     vehicle.armed = bool(message.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED)
     vehicle.path_lost = vehicle.path_lost and vehicle.armed
     vehicle.failsafe = message.integer("system_status") in {MAV_STATE.CRITICAL, MAV_STATE.EMERGENCY}
@@ -249,9 +242,9 @@ def _text(vehicle: Vehicle, message: Message, now: float) -> None:
     text = message.text("text")
     vehicle.texts.append(text)
     del vehicle.texts[:-20]
-    if text.startswith("SmartRTL deactivated"):
+    if vehicle.stack.tells_path_lost(text):
         vehicle.path_lost = True
-    if ("ailsafe" in text or "fence" in text.lower()) and "leared" not in text:
+    if vehicle.stack.tells_failsafe(text):
         vehicle.failsafe_text, vehicle.failsafe_text_at = text, now
 
 

@@ -31,6 +31,7 @@ from fractus_services.mobility.flight.monitor import MotionMonitor
 from fractus_services.mobility.flight.service import MobilityService
 from fractus_services.mobility.flight.tours import Tours
 from fractus_services.mobility.flight.transit import TransitFlight
+from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import Autopilot
 from fractus_services.mobility.mavlink.fence import MissionFence
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
@@ -69,7 +70,7 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     verifier = GrantVerifier(options.tls, options.grant_memory)
     grants = GrantFiles(options.grants, node, verifier, options.flat_terrain, audit.refused_grant)
     journal = Journal(options.state)
-    autopilot = Autopilot(url)
+    autopilot = Autopilot(url, ARDUCOPTER)
     fence = MissionFence(autopilot, options.state)
     control = Control(autopilot, journal, grants, audit, fence=fence, grace_s=options.driver_grace)
     guard = Guard(lambda: situation_of(control, clock()), audit)

@@ -11,7 +11,6 @@ from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Mission
 from fractus_services.mobility.authority.leases import ControlEvent, ControlState, Lease
-from fractus_services.mobility.mavlink.vehicle import HOMEWARD
 
 log = logging.getLogger(__name__)
 
@@ -116,7 +115,7 @@ class Streams:
         control.note("driver lost", lease.grant.identity, "its stream broke")
         log.warning("driver %s is lost", lease.grant.identity)
         leaving = control.motion is not None and control.motion.kind in {"Land", "ReturnToLaunch"}
-        coming_down = leaving and control.autopilot.vehicle.mode in HOMEWARD
+        coming_down = leaving and control.autopilot.vehicle.mode.comes_down
         control.stop_motion(PreconditionFailed("ControlLost", "the driver's stream broke"))
         if control.autopilot.vehicle.armed and not coming_down:
             control.start("hover")

@@ -51,7 +51,7 @@ def telemetry_of(control: Control, time_s: float, missions: bool) -> Any:
         battery_current_a=_known(vehicle.battery_a),
         armed=vehicle.armed,
         in_air=vehicle.in_air,
-        mode=vehicle.mode_name,
+        mode=vehicle.mode.name,
         ready=vehicle.ready and control.checked is not None and not control.checked.problem,
         flight_state=vehicle.flight_state,
         controller=control.controller,

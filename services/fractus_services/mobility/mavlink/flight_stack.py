@@ -1,0 +1,147 @@
+"""What one kind of autopilot does in its own way: the seam between the mobility service and its firmware.
+
+MAVLink says how to ask for a mode, a parameter or a fence, not which modes and parameters there are. All that is a
+firmware's own is behind `FlightStack`; `ardupilot` has the one of ArduCopter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Protocol
+
+from fractus_core.policy.values import Airframe
+
+
+class ModeKind(Enum):
+    """What a flight mode of the autopilot means for control, whatever its number is.
+
+    COMMANDED obeys the companion; RETURNING and LANDING bring the vehicle down by themselves; in any OTHER a human pilot
+    flies.
+    """
+
+    COMMANDED = "commanded"
+    RETURNING = "returning"
+    LANDING = "landing"
+    OTHER = "other"
+
+
+@dataclass(frozen=True, slots=True)
+class FlightMode:
+    """A flight mode by the autopilot's name of it."""
+
+    name: str = "UNKNOWN"
+    kind: ModeKind = ModeKind.OTHER
+
+    @property
+    def commanded(self) -> bool:
+        """Whether the vehicle obeys the companion in it."""
+        return self.kind is ModeKind.COMMANDED
+
+    @property
+    def comes_down(self) -> bool:
+        """Whether the vehicle comes down by itself in it."""
+        return self.kind in {ModeKind.RETURNING, ModeKind.LANDING}
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One parameter that must hold.
+
+    Attributes:
+        names: its name, and older or newer spellings of it.
+        value: what it is set to.
+        accepted: values that may stay as they are.
+        needed: whether arming is refused when the vehicle does not have it.
+        why: what it does, for people.
+        also: what else must hold where the vehicle has it under one of its names.
+    """
+
+    names: tuple[str, ...]
+    value: float
+    accepted: frozenset[float]
+    needed: bool
+    why: str
+    also: Mapping[str, Setting] = field(default_factory=dict)
+
+
+Names = tuple[tuple[str, float], ...]
+"""A parameter's name, and older or newer spellings of it, each with what its values are multiplied by."""
+
+
+class ParameterReader(Protocol):
+    """Reads parameters, and keeps what is wrong with them.
+
+    Attributes:
+        problems: which are not numbers, or lost.
+    """
+
+    problems: list[str]
+
+    async def read(self, names: Names, default: float) -> float:
+        """A parameter's value; the default when it has none that can be used."""
+
+
+class FlightStack(Protocol):
+    """The firmware of an autopilot.
+
+    Attributes:
+        guided: the mode in which it obeys the companion.
+        land: the mode in which it lands where it is.
+        return_straight: the mode in which it flies home straight.
+        return_retracing: the mode in which it flies home on the path that it came; `return_straight` where there is none.
+        witness: a parameter that each such autopilot has: one that does not tell it does not answer at all.
+        failsafes: what must hold before anything may arm.
+        straight: failsafes that bring the drone home straight.
+        retracing: failsafes that bring it home on its own path; the first one tells in flight which of both was chosen.
+        path_memory: the parameter with the number of points of its path that it remembers, and how many are enough to rely
+            on that.
+        fence_switch: the parameter that switches the fence on.
+        fence_parameters: those of the fence in the order in which they are set, the switch last.
+    """
+
+    guided: FlightMode
+    land: FlightMode
+    return_straight: FlightMode
+    return_retracing: FlightMode
+    witness: str
+    failsafes: tuple[Setting, ...]
+    straight: tuple[Setting, ...]
+    retracing: tuple[Setting, ...]
+    path_memory: tuple[str, float]
+    fence_switch: str
+    fence_parameters: tuple[str, ...]
+
+    def mode(self, custom_mode: int) -> FlightMode:
+        """The flight mode of a heartbeat's `custom_mode`."""
+
+    def mode_parameters(self, mode: FlightMode) -> tuple[float, ...]:
+        """The parameters of MAV_CMD_DO_SET_MODE behind the first, which asks for a mode of the firmware's own."""
+
+    def explains_refusal(self, text: str) -> bool:
+        """Whether a status text says why a command was refused."""
+
+    def tells_failsafe(self, text: str) -> bool:
+        """Whether a status text says that a failsafe acts."""
+
+    def tells_path_lost(self, text: str) -> bool:
+        """Whether a status text says that the vehicle forgot the path that it came."""
+
+    async def airframe(self, reader: ParameterReader, known: Airframe, speed_mps: float) -> tuple[Airframe, float]:
+        """How the vehicle moves, and the speed of its legs; what cannot be read is as it is known."""
+
+    async def return_altitude_m(self, reader: ParameterReader, known_m: float) -> float:
+        """How high it climbs to fly home by itself, under the fence that it has by now."""
+
+    def fence_values(
+        self, owned: Mapping[str, float], *, ceiling_m: float | None, polygon: bool, retraces: bool
+    ) -> dict[str, float]:
+        """The parameters of a fence around a mission, beside the owner's own where that is in force.
+
+        Args:
+            owned: the owner's, as far as the vehicle has them.
+            ceiling_m: above home; None without a limit.
+            polygon: whether there is an area that must not be left.
+            retraces: whether the vehicle that breaches it is to fly back the way it came.
+        """

@@ -2,7 +2,8 @@
 
 from fractus_kube.access import Access, Unconfigured, from_environment, in_cluster, kubeconfig, with_certificate
 from fractus_kube.blocking import BlockingClient
-from fractus_kube.client import Client, ContentType, Page
+from fractus_kube.client import Client, Page
+from fractus_kube.connection import ContentType
 from fractus_kube.errors import Conflict, Expired, Invalid, KubeError, NotFound
 from fractus_kube.lease import LEASE, Lease, LostLease
 from fractus_kube.objects import Body, Key, Kind, key_of

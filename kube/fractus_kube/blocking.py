@@ -9,7 +9,8 @@ from collections.abc import Coroutine, Mapping
 from typing import Any, Self, TypeVar
 
 from fractus_kube.access import Access
-from fractus_kube.client import LIST_TIMEOUT_S, REQUEST_TIMEOUT_S, Client, ContentType
+from fractus_kube.client import LIST_TIMEOUT_S, Client
+from fractus_kube.connection import REQUEST_TIMEOUT_S, ContentType
 from fractus_kube.errors import NotFound
 from fractus_kube.objects import Body
 

@@ -191,9 +191,9 @@ def test_of_two_operators_one_acts_and_the_other_takes_over(
     )
     first.start()
     try:
-        wait_for(lambda: "one acts now" in first.log(), first.log)
+        wait_for(lambda: "became leader (identity=one)" in first.log(), first.log)
         second.start()
-        wait_for(lambda: "waiting for it to end" in second.log(), second.log)
+        wait_for(lambda: "waiting for the leader to end" in second.log(), second.log)
         world.put(traffic(namespace))
         world.phase(namespace, "Deploying")
         # Frozen, as on a machine that was paused, and then thawed beside the one that acts meanwhile.

@@ -24,7 +24,7 @@ from fractus_operator.cluster.store import KubeError, Lease, LostLease, Store, U
 from fractus_operator.identity.ca_secret import open_authority
 from fractus_operator.identity.node_requests import NodeSigning
 from fractus_operator.inventory.live import LiveInventory
-from fractus_operator.reconcile.deployments import Deployments
+from fractus_operator.reconcile.applications import Applications
 from fractus_operator.reconcile.location import Locations
 from fractus_operator.reconcile.orphans import Orphans
 from fractus_operator.reconcile.readiness import Readiness
@@ -34,8 +34,9 @@ from fractus_operator.settings import BadSetting, Settings
 logger = logging.getLogger("fractus_operator")
 
 LEASE_NAME = "fractus-operator"
-_ALLOCATIONS = 20_000
-"""Of so many containers that are not freed at once, the garbage collector looks for cycles: a deployment makes a few thousand."""
+
+_GC_THRESHOLD = 20_000
+"""Containers that are not freed at once before the garbage collector looks for cycles: a deployment makes a few thousand."""
 
 
 def _now() -> datetime:
@@ -56,14 +57,14 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
     store = await Store.connect(may_write_s=lambda: lease.left_s)
     keeping = asyncio.create_task(lease.run())
     try:
-        await _acting(lease, keeping)
+        await _leading(lease, keeping)
         authority = await open_authority(store, settings.namespace)
         live = LiveInventory(store)
-        deployments = Deployments(store, live, authority, _now, settings.planning)
+        applications = Applications(store, live, authority, _now, settings.planning)
         signing = NodeSigning(store, live.signing_requests.get, authority, settings.agent_user, _now)
         lists = worklists(store, live, signing)
         registry = kopf.OperatorRegistry()
-        handlers.register(registry, live, deployments)
+        handlers.register(registry, applications, live.silence_s)
         kopf_settings = kopf.OperatorSettings()
         handlers.configure(kopf_settings)
         background: list[Coroutine[Any, Any, None]] = [r.run() for r in live.reflectors()]
@@ -78,15 +79,15 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         )
         await _together(main, background)
     finally:
-        # Last of all: until here something of ours may still be written.
+        # Last of all: until here a write of ours may be under way, and no other operator may lead.
         keeping.cancel()
         await asyncio.gather(keeping, return_exceptions=True)
         await store.aclose()
         await beside.aclose()
 
 
-async def _acting(lease: Lease, keeping: asyncio.Task[None]) -> None:
-    """Wait until this operator may act, or it turns out that it never will."""
+async def _leading(lease: Lease, keeping: asyncio.Task[None]) -> None:
+    """Wait until this operator is the leader, or the election failed."""
     held = asyncio.create_task(lease.held())
     done, _ = await asyncio.wait((held, keeping), return_when=asyncio.FIRST_COMPLETED)
     held.cancel()
@@ -97,11 +98,11 @@ async def _acting(lease: Lease, keeping: asyncio.Task[None]) -> None:
 async def _settled(live: LiveInventory) -> None:
     """Keep the garbage collector off what is known of thousands of nodes: looking through it takes 0.1 s each time.
 
-    What goes of it is freed nonetheless, as nothing refers to it any more. And let it look less often at what comes since.
+    What is replaced is freed all the same, by its reference count. And let the collector look less often at newer objects.
     """
     await live.synced()
     gc.freeze()
-    gc.set_threshold(_ALLOCATIONS)
+    gc.set_threshold(_GC_THRESHOLD)
     await asyncio.Event().wait()
 
 
@@ -181,7 +182,7 @@ def main() -> int:
     try:
         asyncio.run(run(settings))
     except (Unconfigured, BrokenAuthority, KubeError, LostLease) as error:
-        logger.critical("%s", error)
+        logger.critical("operator: stopped: %s", error)
         return 1
     return 0
 

@@ -2,33 +2,38 @@
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
-import logging
 import os
-import random
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import kopf
 
 from fractus_operator.cluster.kinds import APPLICATION, Key
 from fractus_operator.cluster.labels import FINALIZER
 from fractus_operator.cluster.store import KubeError
-from fractus_operator.inventory.live import LiveInventory
-from fractus_operator.reconcile.deployments import BeingDeleted, Deployments
 
-logger = logging.getLogger(__name__)
-
-_LONGEST_S = 1.0
-_REST = 2.0
-"""After a reconcile the next one waits this many times as long as that took: where many are busy, each looks less often."""
-
-_BACKOFF_S = (0.5, 30.0)
 _RETRY_S = 5.0
 
 
-def register(registry: kopf.OperatorRegistry, live: LiveInventory, deployments: Deployments) -> None:
-    """Register the handlers of Applications."""
+class Service(Protocol):
+    """The service behind the handlers."""
+
+    async def follow(self, key: Key, stopped: Callable[[], bool]) -> None:
+        """Keep an application where its spec wants it, until it is deleted or this is stopped."""
+
+    async def teardown(self, key: Key, uid: str) -> None:
+        """Take an application down before its object is removed."""
+
+
+def register(registry: kopf.OperatorRegistry, applications: Service, silence_s: Callable[[], float]) -> None:
+    """Register the handlers of Applications.
+
+    Args:
+        registry: Where kopf looks for them.
+        applications: The service behind them.
+        silence_s: For how long the quietest watch has heard nothing.
+    """
     group, version = APPLICATION.api_version.split("/")
 
     @kopf.on.login(registry=registry, retries=3)
@@ -42,19 +47,18 @@ def register(registry: kopf.OperatorRegistry, live: LiveInventory, deployments: 
 
         A coroutine, because kopf runs plain functions in a thread, which has no loop whose clock to read.
         """
-        return round(max(reflector.age_s() for reflector in live.reflectors()), 1)
+        return round(silence_s(), 1)
 
     @kopf.daemon(group, version, APPLICATION.plural, registry=registry, backoff=_RETRY_S, cancellation_timeout=5.0)
     async def application(namespace: str | None, name: str, stopped: kopf.DaemonStopped, **_: object) -> None:
         """Keep an application where its spec wants it: reconcile, then wait for an input to change."""
-        await follow(live, deployments, (namespace or "", name), stopped)
+        await applications.follow((namespace or "", name), lambda: bool(stopped))
 
     @kopf.on.delete(group, version, APPLICATION.plural, registry=registry, backoff=_RETRY_S)
     async def application_deleted(namespace: str | None, name: str, uid: str, **_: object) -> None:
-        """Take an application down before its object goes."""
-        await live.synced()
+        """Take an application down before its object is removed."""
         try:
-            await deployments.teardown((namespace or "", name), uid)
+            await applications.teardown((namespace or "", name), uid)
         except KubeError as error:
             raise kopf.TemporaryError(str(error), delay=_RETRY_S) from error
 
@@ -65,30 +69,6 @@ def _by_address(info: kopf.ConnectionInfo | None) -> kopf.ConnectionInfo | None:
     if info is None or host is None or port is None:
         return info
     return dataclasses.replace(info, server=f"https://{f'[{host}]' if ':' in host else host}:{port}")
-
-
-async def follow(live: LiveInventory, deployments: Deployments, key: Key, stopped: kopf.DaemonStopped) -> None:
-    """Reconcile an application whenever one of its inputs changes, until it is deleted."""
-    failures = 0
-    loop = asyncio.get_running_loop()
-    await live.synced()
-    with live.subscription(key) as inputs:
-        while not stopped:
-            began = loop.time()
-            try:
-                again_s = await deployments.reconcile(key)
-                failures = 0
-            except BeingDeleted:
-                return
-            except KubeError as error:
-                failures += 1
-                low, high = _BACKOFF_S
-                again_s = min(high, low * 2.0 ** min(failures, 8)) * random.uniform(0.5, 1.0)  # noqa: S311  (jitter)
-                logger.warning("%s/%s: %s; again in %.1f s", *key, error, again_s)
-            took_s = loop.time() - began
-            if await inputs.changed(again_s):
-                # Changes come in bursts, such as the pods of a plan: one reconcile for all. Zones and policies do not wait.
-                await inputs.rest(min(_REST * took_s, _LONGEST_S))
 
 
 class _Unchanged(kopf.DiffBaseStorage):

@@ -68,7 +68,7 @@ def test_a_guest_whose_ride_fails_gets_another_drone(world: World, operator: Ope
     end_mission(world, namespace, "Failed", "driver lost")
     world.phase(namespace, "Failed")
     wait_for(lambda: world.status(namespace, "guest").get("phase") == "Queued", "the guest to wait")
-    wait_for(lambda: "RideLost" in events(world, namespace), "an Event")
+    wait_for(lambda: "SharedFlightLost" in events(world, namespace), "an Event")
     wait_for(lambda: not world.grants(namespace, "guest"), "the guest's grants to go")
     world.add_drone("drone-2")
     assert world.phase(namespace, "Deploying", "guest")["drone"] == "drone-2"

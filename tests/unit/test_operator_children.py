@@ -35,10 +35,6 @@ class Copy(dict[Key, Body]):
         """Nothing is remembered."""
 
 
-def live() -> Any:
-    return SimpleNamespace(children=defaultdict(Copy), children_of=lambda *_: [])
-
-
 class Webhooks:
     """An API server that never answers writes of one kind."""
 
@@ -91,7 +87,7 @@ class Webhooks:
 
 def made_on(store: Webhooks) -> Children:
     signer = SimpleNamespace(sign=lambda body, _=None: body, problem=lambda _grant: "unsigned")
-    return Children(cast(Any, store), live(), cast(Any, signer))
+    return Children(cast(Any, store), cast(Any, defaultdict(Copy)), cast(Any, signer))
 
 
 @pytest.mark.parametrize(("hanging", "full"), [(kinds.SECRET, 2), (kinds.DEPLOYMENT, 8)])

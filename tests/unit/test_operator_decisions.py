@@ -11,17 +11,13 @@ from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
 from fractus_core.planning.inventory import Host, Inventory
 from fractus_core.planning.quantities import amount_of
 from fractus_operator.cluster.pods import PodView, read_host, read_pod
-from fractus_operator.reconcile.conditions import Fact, merge
+from fractus_operator.reconcile import status
+from fractus_operator.reconcile.conditions import ConditionUpdate, merge
 from fractus_operator.reconcile.difference import contains, is_current, stamped
 from fractus_operator.reconcile.location import geohash, location_labels
-from fractus_operator.reconcile.missions import (
-    Hindered,
-    deployed_standing,
-    hindered_standing,
-    mission_outcome,
-    replan_reason,
-    stuck_nodes,
-)
+from fractus_operator.reconcile.missions import mission_outcome
+from fractus_operator.reconcile.replanning import replan_reason, stuck_nodes
+from fractus_operator.reconcile.status import Blocked
 from fractus_operator.settings import BadSetting, Settings
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
@@ -31,24 +27,24 @@ V1 = "fractus.dev/v1alpha1"
 # -- conditions --
 
 
-def test_a_transition_is_news_and_moves_the_time() -> None:
-    first, news = merge([], [Fact("Ready", "False", "PodsNotReady")], 1, NOW)
-    assert [n.reason for n in news] == ["PodsNotReady"]
+def test_a_transition_is_reported_and_moves_the_time() -> None:
+    first, transitions = merge([], [ConditionUpdate("Ready", "False", "PodsNotReady")], 1, NOW)
+    assert [n.reason for n in transitions] == ["PodsNotReady"]
     later = NOW + timedelta(minutes=1)
-    same, news = merge(first, [Fact("Ready", "False", "PodsNotReady", "two to go")], 2, later)
-    assert news == ()
+    same, transitions = merge(first, [ConditionUpdate("Ready", "False", "PodsNotReady", "two to go")], 2, later)
+    assert transitions == ()
     assert (same[0].last_transition_time, same[0].message, same[0].observed_generation) == (NOW, "two to go", 2)
-    other, news = merge(same, [Fact("Ready", "False", "NodeGone")], 2, later)
-    assert [n.reason for n in news] == ["NodeGone"]
+    other, transitions = merge(same, [ConditionUpdate("Ready", "False", "NodeGone")], 2, later)
+    assert [n.reason for n in transitions] == ["NodeGone"]
     assert other[0].last_transition_time == NOW
-    true, _ = merge(other, [Fact("Ready", "True", "PodsReady")], 2, later)
+    true, _ = merge(other, [ConditionUpdate("Ready", "True", "PodsReady")], 2, later)
     assert true[0].last_transition_time == later
 
 
-def test_only_trouble_is_a_warning() -> None:
-    assert Fact("Ready", "False", "X").warning
-    assert not Fact("Ready", "False", "X", progress=True).warning
-    assert not Fact("Ready", "True", "X").warning
+def test_only_a_problem_is_a_warning() -> None:
+    assert ConditionUpdate("Ready", "False", "X").warning
+    assert not ConditionUpdate("Ready", "False", "X", progress=True).warning
+    assert not ConditionUpdate("Ready", "True", "X").warning
 
 
 # -- differences --
@@ -121,14 +117,14 @@ def test_a_new_plan_is_made_for_a_reason() -> None:
     assert replan_reason(application(), PLAN, INVENTORY, {"edge-1": "full"}) == "NodeUnusable"
     cordoned = replace(INVENTORY, hosts={"edge-1": Host("edge-1", schedulable=False)})
     assert replan_reason(application(), PLAN, cordoned, {}) == "NodeCordoned"
-    assert replan_reason(application(), PLAN, cordoned, {}, aloft="edge-1") is None
+    assert replan_reason(application(), PLAN, cordoned, {}, in_flight="edge-1") is None
 
 
 def test_a_drone_in_the_air_keeps_its_plan() -> None:
     without = replace(INVENTORY, hosts={}, edge_nodes={})
     assert replan_reason(application(), PLAN, without, {}) == "NodeGone"
-    assert replan_reason(application(), PLAN, without, {"edge-1": "full"}, aloft="edge-1") is None
-    assert replan_reason(application(2), PLAN, without, {}, aloft="edge-1") == "SpecChanged"
+    assert replan_reason(application(), PLAN, without, {"edge-1": "full"}, in_flight="edge-1") is None
+    assert replan_reason(application(2), PLAN, without, {}, in_flight="edge-1") == "SpecChanged"
 
 
 def view(instance: str, **more: object) -> PodView:
@@ -158,12 +154,12 @@ def test_a_node_is_not_stuck_while_the_pod_before_is_on_its_way_out() -> None:
 
 def test_readiness_counts_each_instance_up_to_its_replicas() -> None:
     pods = [view("a-c"), view("a-c"), view("a-c"), view("a-1", ready=False)]
-    standing = deployed_standing(PLAN, pods, 0)
-    assert (standing.phase, standing.pods) == ("Deploying", "2/3")
-    assert "a-1" in standing.message
-    done = deployed_standing(PLAN, [view("a-1"), view("a-c"), view("a-c"), view("a-c", terminating=True)], 0)
+    update = status.deployed(PLAN, pods, 0)
+    assert (update.phase, update.pods) == ("Deploying", "2/3")
+    assert "a-1" in update.message
+    done = status.deployed(PLAN, [view("a-1"), view("a-c"), view("a-c"), view("a-c", terminating=True)], 0)
     assert (done.phase, done.pods) == ("Running", "3/3")
-    old = deployed_standing(PLAN, [view("a-1", terminating=True), view("a-c"), view("a-c")], 0)
+    old = status.deployed(PLAN, [view("a-1", terminating=True), view("a-c"), view("a-c")], 0)
     assert old.pods == "2/3"
 
 
@@ -185,15 +181,15 @@ def test_only_the_driver_of_this_application_ends_the_mission() -> None:
     assert not failed.complete
 
 
-def test_what_hinders_is_said_of_its_stage() -> None:
-    standing = hindered_standing(Hindered("Pending", "Granted", "PolicyInvalid", "no zone"), None)
-    assert [(f.type, f.status) for f in standing.facts] == [
+def test_what_blocks_is_reported_at_its_stage() -> None:
+    update = status.blocked(Blocked("Pending", "Granted", "PolicyInvalid", "no zone"), None)
+    assert [(c.type, c.status) for c in update.conditions] == [
         ("Planned", "True"),
         ("Granted", "False"),
         ("Ready", "False"),
     ]
-    queued = hindered_standing(Hindered("Queued", "Planned", "DroneBusy", "busy"), None)
-    assert not any(fact.warning for fact in queued.facts)
+    queued = status.blocked(Blocked("Queued", "Planned", "DroneBusy", "busy"), None)
+    assert not any(condition.warning for condition in queued.conditions)
 
 
 # -- locations --

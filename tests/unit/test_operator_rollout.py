@@ -18,7 +18,7 @@ from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind
 from fractus_operator.cluster.store import KubeError
-from fractus_operator.inventory.live import Subscription
+from fractus_operator.inventory.subscriptions import Subscription
 from fractus_operator.reconcile import builders, rollout
 from fractus_operator.reconcile.rollout import Rollout
 
@@ -48,11 +48,11 @@ def live() -> Any:
     return SimpleNamespace(
         children=children,
         drones={},
-        aloft=lambda _plan: None,
+        fleet=SimpleNamespace(in_flight=lambda _plan: None),
         pods=pods,
         rules_revision=0,
         pods_of=lambda _key: pods,
-        subscription=lambda _key: contextlib.nullcontext(pods.news),
+        subscriptions=SimpleNamespace(subscribe=lambda _key: contextlib.nullcontext(pods.news)),
     )
 
 
@@ -83,7 +83,8 @@ async def test_only_what_is_urgent_ends_a_rest() -> None:
 class Recorder:
     """The children of an application, as the one that deploys asks for them."""
 
-    def __init__(self) -> None:
+    def __init__(self, there: defaultdict[Kind, dict[Key, Body]]) -> None:
+        self.get = lambda kind, key: there[kind].get(key)
         self.said: list[str] = []
         self.refused: Kind | None = None
         self.hanging: Kind | None = None
@@ -131,7 +132,7 @@ def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
     authority = SimpleNamespace(
         certificate=SimpleNamespace(not_valid_before_utc=NOW), is_current=lambda *_: True, issue_component=None
     )
-    recorder = Recorder()
+    recorder = Recorder(inventory.children)
     one = Rollout(cast(Any, recorder), inventory, cast(Any, authority), lambda: NOW)
     return Scene(one, recorder, inventory)
 

@@ -53,3 +53,8 @@ def label_value(text: str) -> str:
     if len(text) <= 63:
         return text
     return text[:54].rstrip("-._") + "-" + hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def labelled(key: tuple[str, str]) -> tuple[str, str]:
+    """The key (namespace, name) of an application as the labels of its objects spell it."""
+    return key[0], label_value(key[1])

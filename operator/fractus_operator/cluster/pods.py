@@ -12,10 +12,14 @@ from datetime import datetime
 from fractus_core.planning.inventory import Host
 from fractus_core.planning.quantities import amount_of
 
-from fractus_operator.cluster.kinds import Body
+from fractus_operator.cluster.kinds import Body, Key
 from fractus_operator.cluster.labels import APPLICATION_LABEL, COMPONENT_LABEL, INSTANCE_LABEL, MANAGED_LABEL
 
 _KEPT_LABELS = (APPLICATION_LABEL, COMPONENT_LABEL, INSTANCE_LABEL, MANAGED_LABEL)
+
+
+PlannedRequest = tuple[Key, str, str, Mapping[str, float]]
+"""A planned instance: its application as labels name it, its name, its node, and what it asks of it."""
 
 
 @dataclass(frozen=True, slots=True)

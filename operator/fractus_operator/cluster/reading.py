@@ -3,25 +3,53 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
-from fractus_core.api import Application, Condition, Drone, EdgeNode, Grant, InvalidObject, Metadata, Resource
+from fractus_core.api import (
+    Application,
+    Condition,
+    DeploymentPlan,
+    Drone,
+    EdgeNode,
+    Grant,
+    InvalidObject,
+    Metadata,
+    Resource,
+)
+from fractus_core.api.plans import DeploymentPlanSpec
 from pydantic import ValidationError
 
-from fractus_operator.cluster.kinds import Body
+from fractus_operator.cluster.kinds import Body, Key
 
 logger = logging.getLogger(__name__)
 
 R = TypeVar("R", bound=Resource)
 N = TypeVar("N", Drone, EdgeNode)
 P = TypeVar("P", bound=Hashable)
+T_co = TypeVar("T_co", covariant=True)
 
 _MAKES = 10_000
 
 SETTLED = frozenset({"Completed", "Failed"})
 """Phases of an application whose mission is over."""
+
+
+class Copies(Protocol[T_co]):
+    """The current objects of a kind by their key: what a reflector keeps."""
+
+    def get(self, key: Key) -> T_co | None:
+        """The object with this key, or None."""
+
+    def items(self) -> Iterator[tuple[Key, T_co]]:
+        """Every object with its key."""
+
+    def values(self) -> Iterator[T_co]:
+        """Every object."""
+
+    def __len__(self) -> int:
+        """How many objects there are."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +71,13 @@ class Submitted:
         return str(self.body["metadata"].get("uid", ""))
 
     @property
+    def key(self) -> Key:
+        """(namespace, name)."""
+        return self.body["metadata"].get("namespace", ""), self.body["metadata"]["name"]
+
+    @property
     def phase(self) -> str:
-        """Where it stands, as its status says; empty before it has one."""
+        """The phase of its status; empty before it has one."""
         return str((self.body.get("status") or {}).get("phase") or "")
 
     @property
@@ -52,6 +85,14 @@ class Submitted:
         """The generation whose mission is over; None while a mission goes on, or before the first."""
         status = self.body.get("status") or {}
         return int(status.get("observedGeneration") or 0) if status.get("phase") in SETTLED else None
+
+
+@dataclass(frozen=True, slots=True)
+class OwnedPlan:
+    """A plan and the uid of the Application it is for."""
+
+    uid: str
+    spec: DeploymentPlanSpec
 
 
 @dataclass(frozen=True)
@@ -108,14 +149,23 @@ def read_submitted(body: Body) -> Submitted:
         return Submitted(body, None, error)
 
 
+def read_plan(body: Body) -> OwnedPlan | None:
+    """Parse a DeploymentPlan; None for one that cannot be read or that no Application owns."""
+    plan = reader(DeploymentPlan)(body)
+    owner = next((o.uid for o in plan.metadata.owner_references), None) if plan is not None else None
+    return OwnedPlan(owner, plan.spec) if plan is not None and owner is not None else None
+
+
 def reader(model: type[R]) -> Callable[[Body], R | None]:
-    """A parser for objects that can be left out where they cannot be read."""
+    """A parser that leaves out (None) what cannot be read."""
 
     def parse(body: Body) -> R | None:
         try:
             return read(model, body)
         except InvalidObject as error:
-            logger.warning("%s %s is left out: %s", model.KIND, body["metadata"]["name"], error)
+            logger.warning(
+                "reading: object is left out (kind=%s name=%s): %s", model.KIND, body["metadata"]["name"], error
+            )
             return None
 
     return parse

@@ -8,15 +8,12 @@ from typing import TypeVar
 from fractus_core.planning.inventory import Host
 
 from fractus_operator.cluster.kinds import Key
-from fractus_operator.cluster.pods import PodView
-from fractus_operator.cluster.store import Reflector
+from fractus_operator.cluster.pods import PlannedRequest, PodView
+from fractus_operator.cluster.reading import Copies
 
 T = TypeVar("T")
 
 Amounts = dict[str, float]
-
-Asked = tuple[Key, str, str, Mapping[str, float]]
-"""A planned instance: its application as labels name it, its name, its node, and what it asks of it."""
 
 
 class Bookings:
@@ -51,7 +48,7 @@ class BookedHosts(Mapping[str, Host]):
         corrections: What is to be added to the bookings of a node.
     """
 
-    def __init__(self, hosts: Reflector[Host], bookings: Bookings, corrections: Mapping[str, Amounts]) -> None:
+    def __init__(self, hosts: Copies[Host], bookings: Bookings, corrections: Mapping[str, Amounts]) -> None:
         self._hosts = hosts
         self._bookings = bookings
         self._corrections = corrections
@@ -88,7 +85,7 @@ class BookedHosts(Mapping[str, Host]):
 class ByName(Mapping[str, T]):
     """Objects of a cluster-scoped kind by name, without those that cannot be read. Good until the next change."""
 
-    def __init__(self, objects: Reflector[T | None]) -> None:
+    def __init__(self, objects: Copies[T | None]) -> None:
         self._objects = objects
 
     def __getitem__(self, name: str) -> T:
@@ -111,7 +108,7 @@ class ByName(Mapping[str, T]):
         return sum(value is not None for value in self._objects.values())
 
 
-def corrections(planned: Iterable[Asked], pods: Iterable[PodView], own: Key | None) -> dict[str, Amounts]:
+def corrections(planned: Iterable[PlannedRequest], pods: Iterable[PodView], own: Key | None) -> dict[str, Amounts]:
     """What to add to the bookings of nodes for a plan of the application `own`.
 
     Planned instances whose pods are not bound yet count as if they were; the application's own pods do not count.

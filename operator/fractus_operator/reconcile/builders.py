@@ -12,7 +12,6 @@ from fractus_core.api.names import address_variable
 from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec, PlannedInstance
 
 from fractus_operator.cluster.kinds import (
-    APPLICATION,
     DEPLOYMENT,
     DEPLOYMENT_PLAN,
     ENDPOINT_SLICE,
@@ -63,8 +62,8 @@ def grant(application: Application, spec: GrantSpec) -> Body:
     return body
 
 
-def granted_again(observed: Body, spec: GrantSpec) -> Body:
-    """A Grant that exists, with another spec, made without its application: as `grant` makes it."""
+def regranted(observed: Body, spec: GrantSpec) -> Body:
+    """A Grant that exists, with another spec: as `grant` builds it, but without its application."""
     body = GRANT.header(observed["metadata"]["name"])
     ours = (APPLICATION_LABEL, MANAGED_LABEL, NAMESPACE_LABEL, COMPONENT_LABEL, INSTANCE_LABEL)
     labels = observed["metadata"].get("labels") or {}
@@ -163,12 +162,14 @@ def deployment(application: Application, placed: PlannedInstance, drone: Drone |
         },
     }
     body = _child(DEPLOYMENT, application, placed.instance, _location_labels(component, placed), spec=spec)
-    body["metadata"]["annotations"] = {CAUSE_ANNOTATION: f"{_wish(application, component)}@{placed.node or 'cloud'}"}
+    body["metadata"]["annotations"] = {
+        CAUSE_ANNOTATION: f"{_requested_digest(application, component)}@{placed.node or 'cloud'}"
+    }
     return body
 
 
-def _wish(application: Application, component: Component) -> str:
-    """A digest of what the manifest says that concerns a component's pods."""
+def _requested_digest(application: Application, component: Component) -> str:
+    """A digest of what the manifest says of a component's pods."""
     called = [application.spec.component(name).container.ports for name in component.egress]
     # Defaults are left out: a new version of the kinds adds some.
     said = [
@@ -176,14 +177,6 @@ def _wish(application: Application, component: Component) -> str:
         [[port.port for port in ports] for ports in called],
     ]
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:12]
-
-
-def application_status(application: Body, status: Body) -> Body:
-    """The status part of an Application, for server-side apply to that one object and no later one of its name."""
-    metadata = application["metadata"]
-    body = APPLICATION.header(metadata["name"], metadata["namespace"], uid=metadata["uid"])
-    body["status"] = status
-    return body
 
 
 def _pod_spec(application: Application, component: Component, placed: PlannedInstance, drone: Drone | None) -> Body:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Awaitable, Collection, Iterable, Mapping, Sequence
 
 from fractus_core.api import Application, Grant, InvalidObject
 from fractus_core.api.plans import GrantSpec
@@ -14,18 +14,17 @@ from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind, key_of
 from fractus_operator.cluster.labels import APPLICATION_LABEL, MANAGED_SELECTOR, NAMESPACE_LABEL, label_value
 from fractus_operator.cluster.reading import read
-from fractus_operator.cluster.store import Conflict, KubeError, NotFound, Store
-from fractus_operator.inventory.live import LiveInventory
+from fractus_operator.cluster.store import Conflict, KubeError, NotFound, Reflector, Store
 from fractus_operator.reconcile import builders
 from fractus_operator.reconcile.difference import contains, digest, is_current, stamped
 
 logger = logging.getLogger(__name__)
 
-_PARALLEL = 8
-_BESIDE = 2
-"""How many objects are applied at a time that a pod merely waits for: what schedules pods needs the API server more."""
-_AHEAD = frozenset({kinds.DEPLOYMENT_PLAN, kinds.GRANT})
-"""What waits for no other kind, so that a webhook which holds up Secrets or Deployments delays neither plans nor grants."""
+_MAX_PARALLEL = 8
+_MAX_BESIDE = 2
+"""Objects that are applied at a time and that a pod merely waits for: what schedules pods needs the API server more."""
+_FIRST = frozenset({kinds.DEPLOYMENT_PLAN, kinds.GRANT})
+"""Kinds that wait for no other, so that a webhook which holds up Secrets or Deployments delays neither plans nor grants."""
 
 _EXISTS = "AlreadyExists"
 _INADMISSIBLE = frozenset({403, 422})
@@ -36,88 +35,99 @@ class NameTaken(Exception):
 
 
 class Children:
-    """The children of Applications."""
+    """The children of Applications.
 
-    def __init__(self, store: Store, live: LiveInventory, signer: GrantSigner) -> None:
+    Args:
+        store: The API server.
+        copies: What is there, by kind.
+        signer: Signs Grants.
+    """
+
+    def __init__(self, store: Store, copies: Mapping[Kind, Reflector[Body]], signer: GrantSigner) -> None:
         self._store = store
-        self._live = live
+        self._copies = copies
         self._signer = signer
-        self._parallel = asyncio.Semaphore(_PARALLEL)
-        self._scheduling = asyncio.Semaphore(_PARALLEL)
-        self._beside = asyncio.Semaphore(_BESIDE)
+        self._first = asyncio.Semaphore(_MAX_PARALLEL)
+        self._scheduling = asyncio.Semaphore(_MAX_PARALLEL)
+        self._beside = asyncio.Semaphore(_MAX_BESIDE)
         self._met: set[tuple[Kind, Key]] = set()
         self._normalised: dict[tuple[Kind, Key], tuple[object, ...]] = {}
+
+    # -- reading --
+
+    def get(self, kind: Kind, key: Key) -> Body | None:
+        """What is there of a kind under a key, as far as the watch has shown it."""
+        return self._copies[kind].get(key)
+
+    def made(self, key: Key, kind: Kind) -> list[Body]:
+        """What was made of a kind for an application."""
+        namespace, name = key
+        return [
+            body
+            for body in self._copies[kind].values()
+            if body["metadata"]["labels"][APPLICATION_LABEL] == label_value(name)
+            and (body["metadata"].get("namespace") or body["metadata"]["labels"].get(NAMESPACE_LABEL)) == namespace
+        ]
+
+    # -- applying --
 
     async def apply(self, application: Application, wanted: Mapping[Kind, Sequence[Body]]) -> None:
         """Create those objects that are not there, and apply those that are not as they should be.
 
         Raises:
-            NameTaken: somebody else's object has the name of one of them.
+            NameTaken: another's object has the name of one of them.
+            KubeError: the API server refused one, or cannot be reached.
         """
-        results = await asyncio.gather(
-            *(self._apply_one(application, kind, body) for kind, bodies in wanted.items() for body in bodies),
-            return_exceptions=True,
-        )
-        for result in results:
-            if isinstance(result, BaseException):
-                raise result
+        await _all(self._apply_one(application, kind, body) for kind, bodies in wanted.items() for body in bodies)
 
     async def refresh(self, grants: Sequence[tuple[Grant, GrantSpec]]) -> None:
         """Bring Grants that exist up to date; one that is refused stops no other."""
-        results = await asyncio.gather(*(self._refresh_one(*pair) for pair in grants), return_exceptions=True)
-        for result in results:
-            if isinstance(result, BaseException):
-                raise result
+        await _all(self._refresh_one(*pair) for pair in grants)
 
     async def _refresh_one(self, grant: Grant, spec: GrantSpec) -> None:
         key = ("", grant.name)
-        observed = self._live.children[kinds.GRANT].get(key)
+        observed = self.get(kinds.GRANT, key)
         if observed is None or "deletionTimestamp" in observed["metadata"]:
             return
-        body = self._signer.sign(stamped(builders.granted_again(observed, spec)), grant)
-        async with self._parallel:
-            self._live.children[kinds.GRANT].note(key, await self._store.rewrite(kinds.GRANT, observed, body))
+        body = self._signer.sign(stamped(builders.regranted(observed, spec)), grant)
+        async with self._first:
+            self._copies[kinds.GRANT].note(key, await self._store.rewrite(kinds.GRANT, observed, body))
 
     async def _apply_one(self, application: Application, kind: Kind, body: Body) -> None:
+        turn = self._first if kind in _FIRST else self._scheduling if kind is kinds.DEPLOYMENT else self._beside
         desired = stamped(body)
-        async with self._turn(kind):
+        async with turn:
             if kind is kinds.GRANT:
                 await self._grant(application, body, desired)
             else:
                 await self._make(application, kind, desired)
 
-    def _turn(self, kind: Kind) -> asyncio.Semaphore:
-        if kind in _AHEAD:
-            return self._parallel
-        return self._scheduling if kind is kinds.DEPLOYMENT else self._beside
-
     async def _grant(self, application: Application, body: Body, desired: Body) -> None:
         kind, key = kinds.GRANT, key_of(desired)
-        observed = self._live.children[kind].get(key)
+        observed = self.get(kind, key)
         if observed is None:
             observed = await self._create(kind, desired, self._signer.sign(desired))
         if observed is None:
             return
-        said = self._is_as_desired(kind, desired, observed) or _says_the_same(observed, body)
         present = _readable(observed)
-        problem = self._signer.problem(present) if present is not None else "the object cannot be read"
-        if said and problem is None:
-            return
+        problem = "it cannot be read" if present is None else self._signer.problem(present)
         if problem is not None:
-            logger.warning("children: Grant is not valid and is signed again (grant=%s problem=%s)", key[1], problem)
+            logger.warning("children: Grant is not valid and is signed again (grant=%s): %s", key[1], problem)
+        elif self._is_as_desired(kind, desired, observed) or _says_the_same(observed, present, body):
+            return
         _check_own(application, kind, observed)
         signed = self._signer.sign(desired, present)
-        if _moved(observed, body):
+        if observed["spec"]["node"] != desired["spec"]["node"]:
             # A Grant belongs to one node for its whole life: its status tells what happened there.
             await self._store.delete(kind, key, observed["metadata"]["uid"])
-            made = await self._store.create(kind, signed)
+            applied = await self._store.create(kind, signed)
         else:
-            made = await self._store.rewrite(kind, observed, signed)
-        self._note(kind, desired, made)
+            applied = await self._store.rewrite(kind, observed, signed)
+        self._note(kind, desired, applied)
 
     async def _make(self, application: Application, kind: Kind, desired: Body) -> None:
         key = key_of(desired)
-        observed = self._live.children[kind].get(key)
+        observed = self.get(kind, key)
         if observed is None:
             observed = await self._create(kind, desired, desired)
         if observed is None or self._is_as_desired(kind, desired, observed):
@@ -128,7 +138,7 @@ class Children:
         except KubeError as error:
             if error.status not in _INADMISSIBLE:
                 raise
-            # What it says so far may not be said any more, not even by its fields' change of hands.
+            # Its present content is no longer admitted, not even for a change of its fields' owner: replace that first.
             await self._store.apply(kind, desired)
             await self._store.count_as_applied(kind, key)
         self._note(kind, desired, await self._store.apply(kind, desired))
@@ -136,7 +146,7 @@ class Children:
     async def _create(self, kind: Kind, desired: Body, body: Body) -> Body | None:
         """Create what is most likely new without a look: the answer tells. The object that has its name, if there is one.
 
-        What was once in the way is looked for: each creation in vain counts against the quota of its namespace.
+        A name that was taken once is looked up first: each failed creation counts against the quota of its namespace.
         """
         key = key_of(desired)
         if (kind, key) in self._met:
@@ -168,10 +178,12 @@ class Children:
     def _note(self, kind: Kind, desired: Body, applied: Body) -> None:
         """Take what a write returned, ahead of the watch."""
         key = key_of(applied)
-        self._live.children[kind].note(key, applied)
+        self._copies[kind].note(key, applied)
         if not is_current(desired, applied):
             # The API server spells some value its own way (0.5 cores become 500m).
             self._normalised[kind, key] = _state(desired, applied)
+
+    # -- removing --
 
     async def prune(
         self, application: Application, wanted: Mapping[Kind, Sequence[Body]], *, keep_secrets: Collection[str]
@@ -179,34 +191,40 @@ class Children:
         """Delete children that are not wanted any more, what runs first."""
         for kind in reversed(kinds.CHILDREN):
             names = set(keep_secrets) if kind is kinds.SECRET else {body["metadata"]["name"] for body in wanted[kind]}
-            for child in self._live.children_of(application.key, kind):
+            for child in self.made(application.key, kind):
                 if child["metadata"]["name"] not in names and _is_child(application, kind, child):
                     await self._delete(kind, child)
 
-    async def remove(self, key: Key, kind: Kind) -> bool:
-        """Delete every child of a kind; True if there was any."""
-        children = self._live.children_of(key, kind)
-        for child in children:
-            self._normalised.pop((kind, key_of(child)), None)
-            self._met.discard((kind, key_of(child)))
-            await self._delete(kind, child)
-        return bool(children)
+    async def remove(self, key: Key, *of: Kind) -> bool:
+        """Delete every child of some kinds, one kind after the other; True if there was any."""
+        removed = False
+        for kind in of:
+            for child in self.made(key, kind):
+                removed = True
+                self._normalised.pop((kind, key_of(child)), None)
+                self._met.discard((kind, key_of(child)))
+                await self._delete(kind, child)
+        return removed
 
-    async def revoke(self, key: Key) -> bool:
-        """Delete every Grant of an application, also those the watch has not shown yet; True if there was any."""
+    async def revoke(self, key: Key) -> None:
+        """Delete every Grant of an application, also those that the watch has not shown yet."""
         namespace, name = key
         selector = f"{MANAGED_SELECTOR},{NAMESPACE_LABEL}={namespace},{APPLICATION_LABEL}={label_value(name)}"
-        known = bool(self._live.children_of(key, kinds.GRANT))
-        grants = await self._store.list(kinds.GRANT, selectors={"labelSelector": selector})
-        for grant in grants:
+        for grant in await self._store.list(kinds.GRANT, selectors={"labelSelector": selector}):
             await self._delete(kinds.GRANT, grant)
-        return known or bool(grants)
 
     async def _delete(self, kind: Kind, body: Body) -> None:
         if "deletionTimestamp" in body["metadata"]:
             return
-        logger.info("removing %s %s", kind.name, body["metadata"]["name"])
+        logger.info("children: removing (kind=%s name=%s)", kind.name, body["metadata"]["name"])
         await self._store.delete(kind, key_of(body), body["metadata"].get("uid"))
+
+
+async def _all(writes: Iterable[Awaitable[None]]) -> None:
+    """Run writes together; the first failure is raised once all have ended, for one that fails stops no other."""
+    for result in await asyncio.gather(*writes, return_exceptions=True):
+        if isinstance(result, BaseException):
+            raise result
 
 
 def _state(desired: Body, observed: Body) -> tuple[object, ...]:
@@ -234,20 +252,15 @@ def _is_child(application: Application, kind: Kind, body: Body) -> bool:
     return any(owner.get("uid") == application.metadata.uid for owner in owners)
 
 
-def _readable(observed: Body | None) -> Grant | None:
+def _readable(observed: Body) -> Grant | None:
     try:
-        return read(Grant, observed) if observed is not None else None
+        return read(Grant, observed)
     except InvalidObject:
         return None
 
 
-def _says_the_same(observed: Body, desired: Body) -> bool:
+def _says_the_same(observed: Body, present: Grant | None, desired: Body) -> bool:
     """Whether a Grant, however it is spelt, already says what is desired: a release that spells it in another way changes none."""
-    present = _readable(observed)
     if present is None or not contains(observed["metadata"].get("labels"), desired["metadata"]["labels"]):
         return False
     return present.spec.model_copy(update={"issued_at": None}) == read(Grant, desired).spec
-
-
-def _moved(observed: Body, desired: Body) -> bool:
-    return bool(observed["spec"]["node"] != desired["spec"]["node"])

@@ -1,4 +1,4 @@
-"""Conditions of an object's status: how observations become them, and which of them are news."""
+"""Conditions of an object's status: how observations become them, and which of them are transitions."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from fractus_core.api import Condition
 
 
 @dataclass(frozen=True, slots=True)
-class Fact:
-    """One observed fact about an object, before it is known whether it is news.
+class ConditionUpdate:
+    """What was observed of one condition of an object, before it is known whether that is a transition.
 
     Attributes:
         reason: CamelCase.
         message: one sentence.
-        progress: whether a status other than True is only a step on the way, not a trouble.
+        progress: whether a status other than True is only a step on the way, not a problem.
     """
 
     type: str
@@ -33,32 +33,31 @@ class Fact:
 
 
 def merge(
-    previous: Sequence[Condition], facts: Iterable[Fact], generation: int | None, now: datetime
-) -> tuple[tuple[Condition, ...], tuple[Fact, ...]]:
+    previous: Sequence[Condition], updates: Iterable[ConditionUpdate], generation: int | None, now: datetime
+) -> tuple[tuple[Condition, ...], tuple[ConditionUpdate, ...]]:
     """Conditions after new observations.
 
-    lastTransitionTime moves only with the status; conditions without a new fact go.
+    lastTransitionTime moves only with the status; conditions without an update are removed.
 
     Returns:
-        The conditions in the order of the facts, and the facts that are news: those whose status or
-        reason differs from before.
+        The conditions in the order of the updates, and the transitions: the updates whose status or reason is new.
     """
     before = {condition.type: condition for condition in previous}
     merged: list[Condition] = []
-    news: list[Fact] = []
-    for fact in facts:
-        old = before.get(fact.type)
-        same_status = old is not None and old.status == fact.status
+    transitions: list[ConditionUpdate] = []
+    for update in updates:
+        old = before.get(update.type)
+        same_status = old is not None and old.status == update.status
         merged.append(
             Condition(
-                type=fact.type,
-                status=fact.status,
-                reason=fact.reason,
-                message=fact.message[:32768],
+                type=update.type,
+                status=update.status,
+                reason=update.reason,
+                message=update.message[:32768],
                 last_transition_time=old.last_transition_time if old is not None and same_status else now,
                 observed_generation=generation,
             )
         )
-        if old is None or not same_status or old.reason != fact.reason:
-            news.append(fact)
-    return tuple(merged), tuple(news)
+        if old is None or not same_status or old.reason != update.reason:
+            transitions.append(update)
+    return tuple(merged), tuple(transitions)

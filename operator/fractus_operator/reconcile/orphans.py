@@ -1,4 +1,4 @@
-"""Removes Grants whose Application is gone without having been torn down (its finalizer taken off by hand)."""
+"""Removes Grants whose Application was removed without a teardown (its finalizer was taken off by hand)."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class Orphans:
         self._live = live
 
     async def reconcile(self, key: Key) -> None:
-        """Delete a Grant whose Application does not exist (any more)."""
+        """Delete a Grant whose Application does not exist."""
         body = self._live.children[GRANT].get(key)
         if body is None:
             return
         try:
             owner = Grant.from_body(body).spec.application
         except InvalidObject as error:
-            logger.warning("Grant %s: %s", key[1], error)
+            logger.warning("orphans: Grant cannot be read (grant=%s): %s", key[1], error)
             return
         submitted = self._live.applications.get((owner.namespace, owner.name))
         if submitted is not None and submitted.metadata.uid == owner.uid:
@@ -40,5 +40,10 @@ class Orphans:
                 return
         except NotFound:
             pass
-        logger.info("Grant %s has lost its Application %s/%s", key[1], owner.namespace, owner.name)
+        logger.info(
+            "orphans: removing Grant without Application (grant=%s application=%s/%s)",
+            key[1],
+            owner.namespace,
+            owner.name,
+        )
         await self._store.delete(GRANT, key, body["metadata"]["uid"])

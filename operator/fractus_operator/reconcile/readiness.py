@@ -1,4 +1,4 @@
-"""Says of every Zone and Policy whether it can be enforced, in its Ready condition."""
+"""Reports of every Zone and Policy whether it can be enforced, in its Ready condition."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fractus_operator.cluster.kinds import POLICY, ZONE, Key, Kind
 from fractus_operator.cluster.reading import Broken
 from fractus_operator.cluster.store import Conflict, NotFound, Store
 from fractus_operator.inventory.live import LiveInventory
-from fractus_operator.reconcile.conditions import Fact, merge
+from fractus_operator.reconcile.conditions import ConditionUpdate, merge
 
 
 class Readiness:
@@ -28,13 +28,13 @@ class Readiness:
         """Check one Zone beyond its schema."""
         zone = self._live.zones.get(key)
         if zone is not None:
-            await self._report(ZONE, zone, self._judge_zone(zone))
+            await self._report(ZONE, zone, self._check_zone(zone))
 
     async def reconcile_policy(self, key: Key) -> None:
         """Check one Policy beyond its schema; a policy is ready when all of its zones are."""
         policy = self._live.policies.get(key)
         if policy is not None:
-            await self._report(POLICY, policy, self._judge_policy(policy))
+            await self._report(POLICY, policy, self._check_policy(policy))
 
     def policies_of(self, zone: str) -> Sequence[Key]:
         """The policies that select a zone."""
@@ -44,35 +44,35 @@ class Readiness:
             if isinstance(policy, Policy) and zone in policy.spec.selector.zones
         ]
 
-    def _judge_zone(self, zone: Zone | Broken) -> Fact:
+    def _check_zone(self, zone: Zone | Broken) -> ConditionUpdate:
         if isinstance(zone, Broken):
-            return Fact("Ready", "False", "Invalid", zone.problem)
+            return ConditionUpdate("Ready", "False", "Invalid", zone.problem)
         try:
             check_zone(zone)
         except InvalidObject as error:
-            return Fact("Ready", "False", "Invalid", str(error))
-        return Fact("Ready", "True", "Valid", "the zone can be enforced")
+            return ConditionUpdate("Ready", "False", "Invalid", str(error))
+        return ConditionUpdate("Ready", "True", "Valid", "the zone can be enforced")
 
-    def _judge_policy(self, policy: Policy | Broken) -> Fact:
+    def _check_policy(self, policy: Policy | Broken) -> ConditionUpdate:
         if isinstance(policy, Broken):
-            return Fact("Ready", "False", "Invalid", policy.problem)
+            return ConditionUpdate("Ready", "False", "Invalid", policy.problem)
         zones = {zone.name: zone for zone in self._live.zones.values()}
         try:
             check_policy(policy, zones.keys())
         except InvalidObject as error:
-            return Fact("Ready", "False", "ZoneMissing", str(error))
+            return ConditionUpdate("Ready", "False", "ZoneMissing", str(error))
         for i, name in enumerate(policy.spec.selector.zones):
-            fact = self._judge_zone(zones[name])
-            if fact.status != "True":
-                message = f"spec.selector.zones[{i}]: Zone {name}: {fact.message}"
-                return Fact("Ready", "False", "ZoneInvalid", message)
-        return Fact("Ready", "True", "Valid", "the policy can be enforced")
+            update = self._check_zone(zones[name])
+            if update.status != "True":
+                message = f"spec.selector.zones[{i}]: Zone {name}: {update.message}"
+                return ConditionUpdate("Ready", "False", "ZoneInvalid", message)
+        return ConditionUpdate("Ready", "True", "Valid", "the policy can be enforced")
 
-    async def _report(self, kind: Kind, resource: Zone | Policy | Broken, fact: Fact) -> None:
+    async def _report(self, kind: Kind, resource: Zone | Policy | Broken, update: ConditionUpdate) -> None:
         now = self._clock()
         generation = resource.metadata.generation
         before = _conditions(resource)
-        conditions, news = merge(before, [fact], generation, now)
+        conditions, transitions = merge(before, [update], generation, now)
         if conditions == before:
             return
         body = kind.header(resource.name, uid=resource.metadata.uid)
@@ -81,15 +81,15 @@ class Readiness:
             await self._store.apply(kind, body, subresource="status")
         except (Conflict, NotFound):
             return
-        for item in news:
+        for item in transitions:
             if item.warning:
                 await self._warn(kind, resource, item, now)
 
-    async def _warn(self, kind: Kind, resource: Zone | Policy | Broken, fact: Fact, now: datetime) -> None:
+    async def _warn(self, kind: Kind, resource: Zone | Policy | Broken, update: ConditionUpdate, now: datetime) -> None:
         regarding: dict[str, Any] = kind.header(resource.name, uid=resource.metadata.uid)
         name = f"{resource.name}.{int(now.timestamp() * 1000):x}"
         await self._store.record_event(
-            regarding, reason=fact.reason, message=fact.message, warning=True, name=name, now=now
+            regarding, reason=update.reason, message=update.message, warning=True, name=name, now=now
         )
 
 

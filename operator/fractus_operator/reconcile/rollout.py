@@ -1,4 +1,4 @@
-"""How a plan becomes objects: the order in which an application's children are made, and what of them is left alone."""
+"""How a plan becomes objects: the order in which an application's children are applied, and which are left alone."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from fractus_operator.reconcile import builders
 from fractus_operator.reconcile.children import Children
 
 _HEAD_START_S = 0.5
-"""How long what makes pods goes first at most, where there are new ones: neither a webhook that holds Deployments up nor pods
-that no node takes delay a Grant for longer."""
+"""How long Deployments go first at most, where there are new ones: neither a webhook that holds them up nor pods that no node
+takes delay a Grant for longer."""
 
 
 class Rollout:
     """Makes an application's children what its plan says.
 
-    What makes pods goes first: until these have their nodes nothing else that is new takes the API server from the scheduler.
-    A pod starts without it, which takes longer, but can call nothing before it has its Grant.
+    Deployments go first: until their pods have nodes, nothing else that is new takes the API server from the scheduler.
+    A pod starts without the rest, which takes longer than applying it, but can call nothing before it has its Grant.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Rollout:
             Whether that is all; else some grants are left to the next look.
 
         Raises:
-            NameTaken: somebody else's object has the name of a child.
+            NameTaken: another's object has the name of a child.
             KubeError: the API server refuses one, or cannot be reached.
         """
         wanted = self._wanted(application, decided, grants, pods)
@@ -69,7 +69,7 @@ class Rollout:
         # The plan before all else: it tells, also after a crash, who flies the drone and who comes along.
         await self._children.apply(application, {kinds.DEPLOYMENT_PLAN: wanted[kinds.DEPLOYMENT_PLAN]})
         await self._children.prune(application, wanted, keep_secrets=secrets.keys())
-        running = [body for body in wanted[kinds.DEPLOYMENT] if not self._in_the_air(body, decided)]
+        running = [body for body in wanted[kinds.DEPLOYMENT] if not self._is_in_flight(body, decided)]
         starts = not all(self._is_there(kinds.DEPLOYMENT, body) for body in running)
         granted = [body for body in wanted[kinds.GRANT] if self._is_there(kinds.GRANT, body)]
         # What is granted already may have to shrink: it waits for nothing.
@@ -92,7 +92,7 @@ class Rollout:
             await self._children.apply(application, last)
             return valid
 
-        # Nothing is written any more when the next look begins; and an object in the way of one stops no other.
+        # All have ended when the next look begins; and an object that is in the way of one stops no other.
         results = await asyncio.gather(made, beside(), after(), return_exceptions=True)
         for result in results:
             if isinstance(result, BaseException):
@@ -122,11 +122,11 @@ class Rollout:
         return wanted
 
     def _is_there(self, kind: Kind, body: Body) -> bool:
-        return self._live.children[kind].get(key_of(body)) is not None
+        return self._children.get(kind, key_of(body)) is not None
 
     async def _scheduled(self, key: Key, decided: DeploymentPlanSpec, made: asyncio.Future[None], rules: int) -> None:
-        """Wait until every pod of a plan has its node, or will get none: the head start at most, and never when rules change."""
-        with self._live.subscription(key) as inputs, contextlib.suppress(TimeoutError):
+        """Wait until every pod of a plan has its node, or will get none: the head start at most, and not once rules change."""
+        with self._live.subscriptions.subscribe(key) as inputs, contextlib.suppress(TimeoutError):
             made.add_done_callback(lambda _: inputs.wake())
             async with asyncio.timeout(_HEAD_START_S):
                 while rules == self._live.rules_revision and not (made.done() and made.exception()):
@@ -135,13 +135,13 @@ class Rollout:
                         return
                     await inputs.changed(_HEAD_START_S)
 
-    def _in_the_air(self, desired: Body, decided: DeploymentPlanSpec) -> bool:
-        """Whether a Deployment is left alone: its drone flies, and its owner has asked for no change.
+    def _is_in_flight(self, desired: Body, decided: DeploymentPlanSpec) -> bool:
+        """Whether a Deployment is left alone: its drone flies, and the application's manifest asks for no change.
 
         So no upgrade of the operator, which may build pods in another way, restarts a driver in flight.
         """
-        drone = self._live.aloft(decided)
-        observed = self._live.children[kinds.DEPLOYMENT].get(key_of(desired))
+        drone = self._live.fleet.in_flight(decided)
+        observed = self._children.get(kinds.DEPLOYMENT, key_of(desired))
         if drone is None or observed is None:
             return False
         cause = str(desired["metadata"]["annotations"][CAUSE_ANNOTATION])
@@ -153,7 +153,7 @@ class Rollout:
         namespace, name = application.key
         identity = component_identity(namespace, name, placed.component, placed.instance)
         place = (namespace, builders.secret_name(placed.instance))
-        observed = self._live.children[kinds.SECRET].get(place)
+        observed = self._children.get(kinds.SECRET, place)
         data = dict((observed or {}).get("data") or {})
         now = self._clock()
         if not self._authority.is_current(data, identity, now):

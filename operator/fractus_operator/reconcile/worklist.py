@@ -1,4 +1,4 @@
-"""A queue of keys to reconcile: each key once, one at a time, failures again later."""
+"""A queue of keys to reconcile: each key once, one at a time; a failed one is tried again later."""
 
 from __future__ import annotations
 
@@ -61,11 +61,11 @@ class Worklist:
             expected = isinstance(error, KubeError)
             logger.log(
                 logging.INFO if expected and failures <= 2 else logging.WARNING,
-                "%s %s: %s; again in %.1f s",
+                "worklist: reconcile failed (kind=%s name=%s retry_s=%.1f): %s",
                 self.name,
                 "/".join(filter(None, key)),
-                error if expected else repr(error),
                 pause_s,
+                error if expected else repr(error),
                 exc_info=None if expected else error,
             )
             if key not in self._waiting:

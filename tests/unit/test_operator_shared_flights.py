@@ -12,10 +12,10 @@ from fractus_core.api.plans import DeploymentPlanSpec, DroneChoice
 from fractus_core.planning import flight_of, plan
 from fractus_core.planning.flight import Flight
 from fractus_operator.cluster.pods import PodView
-from fractus_operator.cluster.reading import Makes, read_submitted
+from fractus_operator.cluster.reading import Makes, OwnedPlan, read_submitted
 from fractus_operator.inventory.bookings import Bookings, corrections
-from fractus_operator.inventory.claims import Flown, OwnedPlan, claims
-from fractus_operator.reconcile.rides import flights, ride_lost, ride_outcome
+from fractus_operator.inventory.claims import Flown, claims
+from fractus_operator.reconcile.shared_flights import offered_flights, shared_flight_lost, shared_flight_outcome
 from test_planning import PATH, VIEWER, application, at, drone, inventory, manifest, navigator
 
 HOST = application(navigator(PATH))
@@ -28,7 +28,7 @@ RIDE = DeploymentPlanSpec(application="guest", drone=DroneChoice(node="d", share
 def flown(state: str = "inactive", x: float = 0.0, **more: Any) -> Flown:
     status = {"flightState": state, "position": at(x, 0, 10)}
     flying = Drone.from_body(manifest("Drone", "d", drone("d").spec.to_dict(), status=status))
-    return Flown(HOST, OWN, flying, aloft=state != "inactive", **more)
+    return Flown(HOST, OWN, flying, in_flight=state != "inactive", **more)
 
 
 def submitted(phase: str | None) -> Any:
@@ -38,20 +38,20 @@ def submitted(phase: str | None) -> Any:
 
 
 def test_a_drone_that_has_not_begun_offers_its_whole_way() -> None:
-    assert flights([flown()], DEPOTS, 7.0, None) == {"d": flight_of(HOST, DEPOTS)}
+    assert offered_flights([flown()], DEPOTS, 7.0, None) == {"d": flight_of(HOST, DEPOTS)}
 
 
 def test_a_drone_in_the_air_offers_what_lies_ahead_and_only_if_that_is_known() -> None:
-    begun = flights([flown("flying", 180)], DEPOTS, 7.0, None)["d"]
+    begun = offered_flights([flown("flying", 180)], DEPOTS, 7.0, None)["d"]
     assert begun.legs[0][0].lon == pytest.approx(at(180, 0)["lon"])
-    assert flights([flown("flying", 900)], DEPOTS, 7.0, None) == {}
+    assert offered_flights([flown("flying", 900)], DEPOTS, 7.0, None) == {}
     # Who is aboard already was promised the whole way.
-    assert flights([flown("flying", 900)], DEPOTS, 7.0, RIDE) == {"d": flight_of(HOST, DEPOTS)}
+    assert offered_flights([flown("flying", 900)], DEPOTS, 7.0, RIDE) == {"d": flight_of(HOST, DEPOTS)}
 
 
 def test_a_host_whose_manifest_was_changed_is_not_offered() -> None:
     changed = HOST.model_copy(update={"metadata": HOST.metadata.model_copy(update={"generation": 2})})
-    assert flights([replace(flown(), application=changed)], DEPOTS, 7.0, None) == {}
+    assert offered_flights([replace(flown(), application=changed)], DEPOTS, 7.0, None) == {}
 
 
 @pytest.mark.parametrize(
@@ -59,21 +59,21 @@ def test_a_host_whose_manifest_was_changed_is_not_offered() -> None:
     [("Completed", None, True), ("Completed", OWN, False), ("Failed", None, False), ("Running", OWN, False)],
 )
 def test_a_guest_is_done_when_its_host_has_completed(phase: str, host_plan: Any, done: bool) -> None:
-    outcome = ride_outcome(RIDE, submitted(phase), host_plan)
+    outcome = shared_flight_outcome(RIDE, submitted(phase), host_plan)
     assert (outcome is not None and outcome.complete) is done
-    assert ride_outcome(OWN, submitted("Completed"), None) is None
+    assert shared_flight_outcome(OWN, submitted("Completed"), None) is None
 
 
 def test_a_guest_loses_its_ride_for_a_reason() -> None:
     whole = flight_of(HOST, DEPOTS)
-    assert ride_lost(GUEST, RIDE, OWN, whole, 7.0) is None
-    assert ride_lost(GUEST, RIDE, OWN, None, 7.0) is None
-    assert ride_lost(GUEST, OWN, None, None, 7.0) is None
-    assert "does not fly d any more" in str(ride_lost(GUEST, RIDE, None, whole, 7.0))
+    assert shared_flight_lost(GUEST, RIDE, OWN, whole, 7.0) is None
+    assert shared_flight_lost(GUEST, RIDE, OWN, None, 7.0) is None
+    assert shared_flight_lost(GUEST, OWN, None, None, 7.0) is None
+    assert "does not fly d any more" in str(shared_flight_lost(GUEST, RIDE, None, whole, 7.0))
     other = OWN.model_copy(update={"drone": DroneChoice(node="e")})
-    assert "flies e now" in str(ride_lost(GUEST, RIDE, other, whole, 7.0))
+    assert "flies e now" in str(shared_flight_lost(GUEST, RIDE, other, whole, 7.0))
     elsewhere = Flight(("default", "traffic"), ((*whole.legs[0][:1],),))
-    assert "does not visit pointsOfInterest.points[0]" in str(ride_lost(GUEST, RIDE, OWN, elsewhere, 7.0))
+    assert "does not visit pointsOfInterest.points[0]" in str(shared_flight_lost(GUEST, RIDE, OWN, elsewhere, 7.0))
 
 
 def grant(name: str, uid: str, created: str) -> Grant:
@@ -165,4 +165,4 @@ def test_a_flight_that_a_guest_was_planned_on_is_the_one_it_is_judged_by() -> No
     found = plan(GUEST, shared)
     assert found.drone is not None
     assert found.drone.shared_with == "default/host"
-    assert ride_lost(GUEST, found, OWN, shared.flights["d"], 7.0) is None
+    assert shared_flight_lost(GUEST, found, OWN, shared.flights["d"], 7.0) is None

@@ -1,4 +1,4 @@
-"""Who may come along with whose drone, and what becomes of a guest when that flight ends."""
+"""Applications that share the flight of another one: which flights are offered, and when a shared one ends or is lost."""
 
 from __future__ import annotations
 
@@ -14,31 +14,29 @@ from fractus_operator.inventory.claims import Flown
 from fractus_operator.reconcile.missions import Outcome
 
 
-def is_guest(plan: DeploymentPlanSpec | None) -> bool:
-    """Whether an application comes along with another one."""
-    return plan is not None and plan.drone is not None and plan.drone.shared_with is not None
+def may_share(application: Application | None) -> bool:
+    """Whether another application's flight is enough for this one: it only has points to visit."""
+    return (
+        application is not None and application.spec.driver is None and application.spec.points_of_interest is not None
+    )
 
 
-def may_come_along(application: Application) -> bool:
-    """Whether an application can do with another one's flight: one that only has points to visit."""
-    return application.spec.driver is None and application.spec.points_of_interest is not None
-
-
-def flights(
+def offered_flights(
     flown: Iterable[Flown], depots: Mapping[str, Depot], radius_m: float, present: DeploymentPlanSpec | None
 ) -> dict[str, Flight]:
-    """What claimed drones fly, by drone, for an application that may come along.
+    """What claimed drones fly, by drone, for an application that may share a flight.
 
-    Of a drone in the air only what lies ahead of it counts, except for a guest that is aboard already. A drone whose owner's
-    manifest was changed since the plan is not offered: nobody knows its way yet.
+    Of a drone in flight only what lies ahead of it counts, except for an application that shares its flight already. A drone
+    whose application was changed since its plan is not offered: its new way is not known yet.
 
     Args:
         flown: Applications that have a drone.
         depots: By name.
         radius_m: How far from its path a drone may be.
-        present: The guest's plan.
+        present: The plan in force of the application that asks.
     """
-    aboard = present.drone.node if is_guest(present) and present is not None and present.drone is not None else None
+    choice = present.drone if present is not None else None
+    aboard = choice.node if choice is not None and choice.shared_with is not None else None
     found: dict[str, Flight] = {}
     for host in flown:
         if host.plan.application_generation != host.application.metadata.generation:
@@ -47,7 +45,7 @@ def flights(
             flight: Flight | None = flight_of(host.application, depots)
         except InvalidObject:
             continue
-        if flight is not None and host.aloft and host.drone.name != aboard:
+        if flight is not None and host.in_flight and host.drone.name != aboard:
             place = host.drone.status.position if host.drone.status is not None else None
             flight = ahead(flight, place, radius_m) if place is not None else None
         if flight is not None:
@@ -55,14 +53,14 @@ def flights(
     return found
 
 
-def ride_outcome(
+def shared_flight_outcome(
     plan: DeploymentPlanSpec | None, host: Submitted | None, host_plan: DeploymentPlanSpec | None
 ) -> Outcome | None:
-    """How a guest's mission ended, as that of its host did; None while it goes on, or where it goes on with another drone.
+    """How the mission of an application that shares a flight ended: as that of its host did; None while it goes on.
 
     Args:
-        plan: The guest's plan.
-        host: The application that it comes along with, if it still exists.
+        plan: The application's plan.
+        host: The application whose flight it shares, if that still exists.
         host_plan: That one's plan, unless its mission is over.
     """
     if plan is None or plan.drone is None or plan.drone.shared_with is None:
@@ -73,19 +71,19 @@ def ride_outcome(
     return Outcome(True, "MissionComplete", f"{name} has flown {plan.drone.node} past all points of interest")
 
 
-def ride_lost(
+def shared_flight_lost(
     application: Application,
     plan: DeploymentPlanSpec | None,
     host_plan: DeploymentPlanSpec | None,
     flight: Flight | None,
     radius_m: float,
 ) -> str | None:
-    """Why a guest can come along no longer, as a sentence; None while it can.
+    """Why an application can no longer share a flight, as a sentence; None while it can.
 
     Args:
-        application: The guest.
+        application: The application that shares it.
         plan: Its plan.
-        host_plan: The plan of the application it comes along with, if that still has one.
+        host_plan: The plan of the application whose flight it shares, if that still has one.
         flight: All that its host flies, from the beginning; None if that is not known for now.
         radius_m: How far from its path a drone may be.
     """
@@ -93,10 +91,10 @@ def ride_lost(
         return None
     name, node = plan.drone.shared_with, plan.drone.node
     if host_plan is None or host_plan.drone is None or host_plan.drone.shared_with is not None:
-        return f"{name}, which took it along, does not fly {node} any more"
+        return f"{name}, whose flight it shared, does not fly {node} any more"
     if host_plan.drone.node != node:
-        return f"{name}, which took it along, flies {host_plan.drone.node} now"
+        return f"{name}, whose flight it shared, flies {host_plan.drone.node} now"
     missed = misses(application, flight, radius_m) if flight is not None else None
     if missed is not None:
-        return f"{name}, which took it along, does not visit pointsOfInterest.points[{missed}] any more"
+        return f"{name}, whose flight it shared, does not visit pointsOfInterest.points[{missed}] any more"
     return None

@@ -1,0 +1,72 @@
+"""Wakes the reconcilers of Applications when one of their inputs changes."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+from fractus_operator.cluster.kinds import Key
+from fractus_operator.cluster.labels import labelled
+
+
+class Subscription:
+    """Wakes one reconciler when an input of its object changed."""
+
+    def __init__(self) -> None:
+        self._changed = asyncio.Event()
+        self._urgent = asyncio.Event()
+
+    def wake(self, *, urgent: bool = False) -> None:
+        """Note a change; an urgent one ends a rest."""
+        self._changed.set()
+        if urgent:
+            self._urgent.set()
+
+    async def changed(self, timeout_s: float) -> bool:
+        """Wait for a change since the last call; False after the timeout."""
+        try:
+            async with asyncio.timeout(timeout_s):
+                await self._changed.wait()
+        except TimeoutError:
+            return False
+        finally:
+            self._changed.clear()
+        return True
+
+    async def rest(self, duration_s: float) -> None:
+        """Let changes gather, unless one is urgent."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(duration_s):
+                await self._urgent.wait()
+        self._urgent.clear()
+
+
+class Subscriptions:
+    """The subscriptions of all applications, by the name that their labels give them."""
+
+    def __init__(self) -> None:
+        self._of: dict[Key, list[Subscription]] = {}
+
+    @contextmanager
+    def subscribe(self, key: Key) -> Iterator[Subscription]:
+        """Changes that concern one application, as long as the context lasts."""
+        label, subscription = labelled(key), Subscription()
+        self._of.setdefault(label, []).append(subscription)
+        try:
+            yield subscription
+        finally:
+            self._of[label].remove(subscription)
+            if not self._of[label]:
+                del self._of[label]
+
+    def wake(self, key: Key) -> None:
+        """Wake one application."""
+        for subscription in self._of.get(labelled(key), ()):
+            subscription.wake()
+
+    def wake_all(self, *, urgent: bool = False) -> None:
+        """Wake every application: something that all depend on changed."""
+        for subscription in itertools.chain.from_iterable(self._of.values()):
+            subscription.wake(urgent=urgent)

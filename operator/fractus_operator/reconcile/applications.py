@@ -1,0 +1,273 @@
+"""The service behind Applications: observe, decide, apply the difference; report it, and take it all down at the end."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timedelta
+
+from fractus_core.api import Application, InvalidObject
+from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.identity.authority import Authority
+from fractus_core.identity.grant_signer import GrantSigner
+from fractus_core.planning.inventory import Inventory, Settings
+from fractus_core.planning.plan import Infeasible
+from fractus_core.validation import check_application
+
+from fractus_operator.cluster import kinds
+from fractus_operator.cluster.kinds import Key
+from fractus_operator.cluster.labels import FINALIZER
+from fractus_operator.cluster.reading import SETTLED
+from fractus_operator.cluster.store import KubeError, Store
+from fractus_operator.inventory.live import LiveInventory
+from fractus_operator.inventory.observed import Observed
+from fractus_operator.reconcile import status
+from fractus_operator.reconcile.children import Children, NameTaken
+from fractus_operator.reconcile.contention import planning_input
+from fractus_operator.reconcile.grants import REFUSALS, ApplicationGrants
+from fractus_operator.reconcile.missions import mission_outcome
+from fractus_operator.reconcile.replanning import choose_plan, stuck_nodes
+from fractus_operator.reconcile.reporting import StatusReporter
+from fractus_operator.reconcile.rollout import Rollout
+from fractus_operator.reconcile.shared_flights import shared_flight_outcome
+from fractus_operator.reconcile.status import Blocked, Phase, StatusUpdate
+
+logger = logging.getLogger(__name__)
+
+RESYNC_S = 30.0
+_BACKOFF_S = (0.5, 30.0)
+_MAX_REST_S = 1.0
+_REST_FACTOR = 2.0
+"""After a reconcile the next one waits this many times as long as that took: where many are busy, each looks less often."""
+
+EXCLUSION = timedelta(minutes=5)
+"""How long a node that the scheduler refused is left out of an application's plans."""
+
+_OF_A_MISSION = (kinds.GRANT, kinds.DEPLOYMENT, kinds.ENDPOINT_SLICE, kinds.SERVICE, kinds.SECRET)
+"""What is removed when a mission is over, in this order. The plan stays, as its record."""
+
+
+class BeingDeleted(Exception):
+    """The application is being deleted: there is nothing more to reconcile."""
+
+
+@dataclass
+class _Memory:
+    """What is remembered of one application between reconciles; all of it can be lost."""
+
+    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+    excluded: dict[str, tuple[datetime, str]] = field(default_factory=dict)
+
+    def exclude(self, stuck: dict[str, str], now: datetime) -> dict[str, str]:
+        """Leave nodes out of plans for a while; returns all that are, with the reason."""
+        self.excluded = {node: (until, why) for node, (until, why) in self.excluded.items() if until > now}
+        self.excluded |= {node: (now + EXCLUSION, why) for node, why in stuck.items()}
+        return {node: why for node, (_, why) in self.excluded.items()}
+
+
+class Applications:
+    """Brings every Application to where its spec, the inventory and its mission want it."""
+
+    def __init__(
+        self,
+        store: Store,
+        live: LiveInventory,
+        authority: Authority,
+        clock: Callable[[], datetime],
+        settings: Settings | None = None,
+    ) -> None:
+        self._live = live
+        self._clock = clock
+        self._settings = settings or Settings()
+        signer = GrantSigner(authority, clock)
+        self._children = Children(store, live.children, signer)
+        self._grants = ApplicationGrants(live, self._children, signer, self._settings)
+        self._rollout = Rollout(self._children, live, authority, clock)
+        self._reporter = StatusReporter(store, live.applications, clock)
+        self._memories: dict[Key, _Memory] = {}
+        self._torn_down: set[str] = set()
+
+    async def follow(self, key: Key, stopped: Callable[[], bool]) -> None:
+        """Reconcile an application whenever one of its inputs changes, until it is deleted."""
+        failures = 0
+        loop = asyncio.get_running_loop()
+        await self._live.synced()
+        with self._live.subscriptions.subscribe(key) as inputs:
+            while not stopped():
+                started = loop.time()
+                try:
+                    next_s = await self.reconcile(key)
+                    failures = 0
+                except BeingDeleted:
+                    return
+                except KubeError as error:
+                    failures += 1
+                    low, high = _BACKOFF_S
+                    next_s = min(high, low * 2.0 ** min(failures, 8)) * random.uniform(0.5, 1.0)  # noqa: S311  (jitter)
+                    logger.warning(
+                        "applications: reconcile failed (application=%s/%s retry_s=%.1f): %s", *key, next_s, error
+                    )
+                took_s = loop.time() - started
+                if await inputs.changed(next_s):
+                    # Changes come in bursts, such as the pods of a plan: one reconcile for all. Zones and policies do not wait.
+                    await inputs.rest(min(_REST_FACTOR * took_s, _MAX_REST_S))
+
+    async def reconcile(self, key: Key) -> float:
+        """Go one step towards the desired state; safe to be killed at any point and to run again.
+
+        Returns:
+            In how many seconds to run again if nothing changes before.
+
+        Raises:
+            BeingDeleted: the application is being deleted.
+            KubeError: the API server refused a write, or could not be reached.
+        """
+        submitted = self._live.applications.get(key)
+        if submitted is None:
+            return RESYNC_S
+        metadata = submitted.metadata
+        if metadata.deletion_timestamp:
+            raise BeingDeleted
+        # Without the finalizer nothing is made: a deletion now would leave grants behind.
+        if FINALIZER not in metadata.finalizers:
+            return RESYNC_S
+        memory = self._memories.setdefault(key, _Memory())
+        async with memory.lock:
+            if metadata.uid in self._torn_down:
+                raise BeingDeleted
+            return min(await self._advance(self._live.observe(submitted), memory), RESYNC_S)
+
+    async def teardown(self, key: Key, uid: str) -> None:
+        """Revoke every grant of an application that is being deleted, then remove what was made for it.
+
+        The drone is brought home by its own services once its grant is gone. What a stale watch hides
+        here, the garbage collector finds by its owner.
+
+        Raises:
+            KubeError: the API server refused a delete, or could not be reached.
+        """
+        await self._live.synced()
+        self._torn_down.add(uid)
+        memory = self._memories.setdefault(key, _Memory())
+        async with memory.lock:
+            await self._children.revoke(key)
+            await self._children.remove(key, *reversed(kinds.CHILDREN))
+        self._memories.pop(key, None)
+        self._grants.forget(key)
+        self._reporter.forget(key)
+        self._live.forget(key)
+
+    # -- steps --
+
+    async def _advance(self, seen: Observed, memory: _Memory) -> float:
+        """One step; returns when to look again."""
+        submitted = seen.submitted
+        again_s = await self._settle(seen)
+        if again_s is not None:
+            return again_s
+        present = self._present(seen)
+        outcome = mission_outcome(seen.uid, seen.grants) or shared_flight_outcome(seen.plan, *seen.host)
+        if outcome is not None:
+            # Reported before anything is removed: the grants are the only other record of it.
+            await self._reporter.report(submitted, status.finished(outcome, present))
+            await self._clear(seen.key)
+            return RESYNC_S
+        try:
+            await self._grants.refresh(seen)
+            update, again_s = await self._deploy(self._live.observe(submitted), memory)
+        except Blocked as blocked:
+            update, again_s = status.blocked(blocked, present), blocked.retry_s
+        await self._reporter.report(submitted, update)
+        return again_s
+
+    async def _settle(self, seen: Observed) -> float | None:
+        """Where the mission is over: remove what is left of it; returns when to look again, None to go on with a new one."""
+        reported = self._reporter.last(seen.submitted)
+        if reported.get("phase") not in SETTLED:
+            return None
+        if reported.get("observedGeneration") == seen.submitted.metadata.generation:
+            if seen.plan is None:
+                await self._clear(seen.key)
+            return RESYNC_S
+        if seen.plan is not None:
+            return None
+        # An old plan neither claims its drone for the next mission nor excuses it from any check.
+        left_over = await self._begin_again(seen.key)
+        # The last mission's grants must be gone before a new one begins.
+        return 1.0 if left_over else None
+
+    async def _deploy(self, seen: Observed, memory: _Memory) -> tuple[StatusUpdate, float]:
+        """Plan, compile and roll out; nothing is awaited between the look at the inventory and the decision.
+
+        So two applications never get one drone.
+
+        Raises:
+            Blocked: it cannot go on for now.
+            KubeError: the API server cannot be reached.
+        """
+        inventory, lost = planning_input(self._live, seen, self._settings.safety_radius_m)
+        if lost is not None:
+            await self._begin_again(seen.key)
+            raise Blocked("Queued", "Planned", *lost, retry_s=1.0)
+        application = seen.submitted.application
+        if application is None:
+            raise Blocked("Invalid", "Planned", "Invalid", str(seen.submitted.error))
+        try:
+            check_application(application, inventory.depots)
+            plan, again_s = self._plan(application, seen, inventory, memory)
+        except InvalidObject as error:
+            raise Blocked("Invalid", "Planned", "Invalid", str(error)) from error
+        except Infeasible as none:
+            phase: Phase = "Queued" if none.reason == "DroneBusy" else "Pending"
+            raise Blocked(phase, "Planned", none.reason, none.message) from none
+        try:
+            grants = self._grants.compile(application, plan, seen, inventory)
+        except InvalidObject as error:
+            raise Blocked("Pending", "Granted", "PolicyInvalid", str(error)) from error
+        try:
+            complete = await self._rollout.carry_out(application, plan, grants, seen.pods, seen.rules)
+        except NameTaken as error:
+            raise Blocked("Pending", "Deployed", "NameTaken", str(error), retry_s=2.0) from error
+        except KubeError as error:
+            if error.status not in REFUSALS:
+                raise
+            raise Blocked("Pending", "Deployed", error.reason, str(error), retry_s=10.0) from error
+        return status.deployed(plan, seen.pods, len(grants)), again_s if complete else 0.0
+
+    def _plan(
+        self, application: Application, seen: Observed, inventory: Inventory, memory: _Memory
+    ) -> tuple[DeploymentPlanSpec, float]:
+        """The plan to deploy, noted at once where it is new; and when to look again."""
+        now = self._clock()
+        stuck, recheck_s = stuck_nodes(seen.plan, seen.pods, now)
+        stuck = {node: why for node, why in stuck.items() if node != seen.in_flight}
+        settings = replace(self._settings, excluded=memory.exclude(stuck, now))
+        choice = choose_plan(application, seen.plan, inventory, settings, stuck=stuck, in_flight=seen.in_flight)
+        if choice.reason is not None:
+            self._live.plans.decide(seen.key, seen.uid, choice.plan)
+            drone = choice.plan.drone.node if choice.plan.drone is not None else "none"
+            logger.info("applications: planned (application=%s/%s reason=%s drone=%s)", *seen.key, choice.reason, drone)
+        return choice.plan, (recheck_s or RESYNC_S) if choice.fits else RESYNC_S
+
+    async def _begin_again(self, key: Key) -> bool:
+        """Remove all that was made for an application, with its plan; True if there was anything."""
+        removed = await self._clear(key)
+        removed |= await self._children.remove(key, kinds.DEPLOYMENT_PLAN)
+        self._live.forget(key)
+        return removed
+
+    async def _clear(self, key: Key) -> bool:
+        """Remove what a mission that is over leaves, but the plan; True if there was anything."""
+        removed = await self._children.remove(key, *_OF_A_MISSION)
+        if removed:
+            self._live.forget(key)
+        return removed
+
+    def _present(self, seen: Observed) -> StatusUpdate | None:
+        """What is deployed by the plan in force, if anything."""
+        if seen.plan is None or not self._children.made(seen.key, kinds.DEPLOYMENT):
+            return None
+        return status.deployed(seen.plan, seen.pods, 0)

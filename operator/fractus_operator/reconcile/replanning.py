@@ -1,0 +1,144 @@
+"""Which plan an application is deployed by: the one in force while it fits, else a new one. Pure decisions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+
+from fractus_core.api import Application
+from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.planning.growth import room_to_grow
+from fractus_core.planning.inventory import Inventory, Settings
+from fractus_core.planning.plan import Infeasible, plan
+
+from fractus_operator.cluster.pods import PodView
+
+UNSCHEDULABLE_GRACE = timedelta(seconds=5)
+"""How long a pod may wait for its planned node before the node counts as unusable."""
+
+_OPTIONAL = frozenset({"NodeCordoned", "NodesAppeared"})
+"""Reasons for a new plan that can be ignored: what runs goes on where there is no other plan."""
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The plan to deploy.
+
+    Attributes:
+        plan: the one in force, or a new one.
+        reason: why there is a new one; None while the one in force is kept.
+        fits: whether the one in force is kept because it fits, rather than for want of another.
+    """
+
+    plan: DeploymentPlanSpec
+    reason: str | None = None
+    fits: bool = False
+
+
+def choose_plan(
+    application: Application,
+    previous: DeploymentPlanSpec | None,
+    inventory: Inventory,
+    settings: Settings,
+    *,
+    stuck: Mapping[str, str],
+    in_flight: str | None,
+) -> Choice:
+    """The plan in force while it fits, else a new one that moves as little as it can.
+
+    Args:
+        application: As submitted.
+        previous: The plan in force.
+        inventory: As of now.
+        settings: Of the planning; with the nodes that are excluded.
+        stuck: Nodes on which the scheduler refuses a pod of the application.
+        in_flight: The drone of the plan in force while it flies.
+
+    Raises:
+        Infeasible: there is no plan, and the one in force does not fit either.
+        InvalidObject: the application contradicts itself.
+    """
+    reason = replan_reason(application, previous, inventory, stuck, in_flight)
+    if previous is not None and reason is None:
+        if room_to_grow(application, inventory, settings, previous) is None:
+            return Choice(previous, fits=True)
+        reason = "NodesAppeared"
+    try:
+        decided = plan(application, inventory, settings, previous)
+    except Infeasible:
+        if previous is None or reason not in _OPTIONAL:
+            raise
+        return Choice(previous)
+    flies = decided.drone.node if decided.drone is not None else None
+    if previous is not None and in_flight is not None and reason != "SpecChanged" and flies != in_flight:
+        # A problem on another node is no reason to leave a drone that flies.
+        return Choice(previous)
+    return Choice(decided, reason)
+
+
+def replan_reason(
+    application: Application,
+    plan: DeploymentPlanSpec | None,
+    inventory: Inventory,
+    stuck: Mapping[str, str],
+    in_flight: str | None = None,
+) -> str | None:
+    """Why a (new) plan is needed, as a CamelCase reason; None while the present one stands.
+
+    A node that is out of reach is no reason: its pods run on, and it comes back. One that is cordoned is.
+
+    Args:
+        application: As submitted.
+        plan: The present plan.
+        inventory: As of now.
+        stuck: Nodes on which the scheduler refuses a pod of the application.
+        in_flight: The plan's drone while it flies: whatever becomes of its node, what runs there stays until it has landed.
+    """
+    if plan is None:
+        return "NoPlanYet"
+    if plan.application_generation != application.metadata.generation:
+        return "SpecChanged"
+    for placed in plan.placements:
+        if placed.node is None or placed.node == in_flight:
+            continue
+        described = placed.node in inventory.drones or placed.node in inventory.edge_nodes
+        if placed.node not in inventory.hosts or not described:
+            return "NodeGone"
+        if placed.node in stuck:
+            return "NodeUnusable"
+    used = {placed.node for placed in plan.placements} - {None, in_flight}
+    if any(not inventory.hosts[node].schedulable for node in used if node is not None):
+        return "NodeCordoned"
+    return None
+
+
+def stuck_nodes(
+    plan: DeploymentPlanSpec | None, pods: Iterable[PodView], now: datetime
+) -> tuple[dict[str, str], float | None]:
+    """Planned nodes that the scheduler refuses for a pod of the plan.
+
+    Returns:
+        What the scheduler says, by node; and in how many seconds to look again, if a pod may become stuck.
+    """
+    nodes = {placed.instance: placed.node for placed in plan.placements} if plan is not None else {}
+    stuck: dict[str, str] = {}
+    wait_s: float | None = None
+    pods = tuple(pods)
+    leaving = {pod.node for pod in pods if pod.terminating}
+    for pod in pods:
+        node = nodes.get(pod.instance or "")
+        if pod.unschedulable_since is None or node is None or pod.terminating:
+            continue
+        # Everyone with access to the namespace may create a pod with our labels.
+        if pod.deployment != pod.instance:
+            continue
+        left = (pod.unschedulable_since + UNSCHEDULABLE_GRACE - now).total_seconds()
+        if left <= 0 and node in leaving:
+            # The resources of its predecessor are free once that has ended.
+            wait_s = min(1.0, wait_s or 1.0)
+        elif left <= 0:
+            stuck[node] = f"the scheduler cannot place {pod.instance} on {node}: {pod.unschedulable_message}"
+        else:
+            wait_s = min(left, wait_s or left)
+    return stuck, wait_s

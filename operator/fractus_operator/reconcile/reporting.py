@@ -1,0 +1,96 @@
+"""Writes the status of objects where it changed, and an Event for each transition."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from datetime import datetime
+
+from fractus_core.api import Condition
+
+from fractus_operator.cluster import kinds
+from fractus_operator.cluster.kinds import Body, Key, key_of
+from fractus_operator.cluster.reading import Submitted
+from fractus_operator.cluster.store import Conflict, KubeError, Reflector, Store
+from fractus_operator.reconcile.conditions import ConditionUpdate, merge
+from fractus_operator.reconcile.status import StatusUpdate
+
+logger = logging.getLogger(__name__)
+
+_SILENT = frozenset({"MissionUnderway", "PodsNotReady"})
+"""Reasons without an Event: what is merely in progress is in the status."""
+
+
+class StatusReporter:
+    """Reports the status of Applications."""
+
+    def __init__(self, store: Store, applications: Reflector[Submitted], clock: Callable[[], datetime]) -> None:
+        self._store = store
+        self._applications = applications
+        self._clock = clock
+        self._written: dict[Key, tuple[str, Body]] = {}
+
+    def last(self, submitted: Submitted) -> Body:
+        """The status of an application: as last written here, for the watch may be behind, else as it was read."""
+        uid, status = self._written.get(submitted.key, ("", {}))
+        return status if uid and uid == submitted.uid else dict(submitted.body.get("status") or {})
+
+    def forget(self, key: Key) -> None:
+        """Drop what is remembered of an application."""
+        self._written.pop(key, None)
+
+    async def report(self, submitted: Submitted, update: StatusUpdate) -> None:
+        """Write the status if it differs from the present one, then an Event for each transition."""
+        now = self._clock()
+        before = self.last(submitted)
+        generation = submitted.metadata.generation
+        previous = [Condition.model_validate(c) for c in before.get("conditions") or ()]
+        conditions, transitions = merge(previous, update.conditions, generation, now)
+        status: Body = {
+            "observedGeneration": generation,
+            "phase": update.phase,
+            "message": update.message,
+            "conditions": [condition.to_dict() for condition in conditions],
+        }
+        status |= {name: value for name, value in (("drone", update.drone), ("pods", update.pods)) if value is not None}
+        if status == before:
+            return
+        namespace, name = submitted.key
+        # With the uid: a later application of this name is not written to.
+        body = {**kinds.APPLICATION.header(name, namespace, uid=submitted.uid), "status": status}
+        try:
+            applied = await self._store.apply(kinds.APPLICATION, body, subresource="status")
+        except Conflict:
+            return
+        self._applications.note(key_of(applied), applied)
+        self._written[submitted.key] = (submitted.uid, status)
+        await self._announce(submitted, transitions, now)
+
+    async def _announce(self, submitted: Submitted, transitions: Sequence[ConditionUpdate], now: datetime) -> None:
+        name = submitted.key[1]
+        for update in _announced(transitions):
+            try:
+                await self._store.record_event(
+                    submitted.body,
+                    reason=update.reason,
+                    message=update.message,
+                    warning=update.warning,
+                    name=f"{name}.{int(now.timestamp()):x}.{update.reason.lower()}",
+                    now=now,
+                )
+            except KubeError as error:
+                logger.warning(
+                    "reporting: Event not written (application=%s/%s reason=%s): %s",
+                    *submitted.key,
+                    update.reason,
+                    error,
+                )
+
+
+def _announced(transitions: Sequence[ConditionUpdate]) -> Iterator[ConditionUpdate]:
+    """The first transition for each reason: several conditions often share one."""
+    seen = set(_SILENT)
+    for update in transitions:
+        if update.reason not in seen:
+            seen.add(update.reason)
+            yield update

@@ -1,0 +1,48 @@
+"""What the vehicle sends in known flights, against digests: a change of structure must not change a message.
+
+A change of behaviour does; then `python tests/unit/test_vehicle_golden.py` prints the new digests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from fractus_vehicle.pilot import Pilot
+from vehicle_flights import at_random, breaches, by_hand, failing, mission, pilot_of, smart_return
+
+FLIGHTS: tuple[tuple[Callable[[Pilot], None], int, dict[str, float], str], ...] = (
+    (mission, 1, {}, "dc6cefd5485185c7"),
+    (mission, 2, {"SIM_WIND_SPD": 5.0, "SIM_WIND_TURB": 1.5, "WP_YAW_BEHAVIOR": 0.0}, "350e0d96fed9a01b"),
+    (by_hand, 3, {"SIM_WIND_SPD": 4.0, "SIM_WIND_TURB": 2.0}, "b12fa65eb324d6bb"),
+    (smart_return, 4, {}, "a6582fc7326517ff"),
+    (breaches, 5, {}, "f77bbbfccf381d13"),
+    (breaches, 6, {"FENCE_ACTION": 3.0}, "4078a10e9a231e40"),
+    (failing, 7, {}, "f91132080651ee31"),
+    (failing, 8, {"FS_THR_ENABLE": 4.0}, "92906238fc0ce296"),
+    (at_random, 10, {}, "75190d74dd1fb06a"),
+    (at_random, 17, {}, "b66cfa94f569c75d"),
+)
+
+
+def digest(flight: Callable[[Pilot], None], seed: int, parameters: dict[str, float]) -> str:
+    """What is heard during a flight."""
+    pilot = pilot_of(seed, **parameters)
+    flight(pilot)
+    return pilot.heard.hexdigest()[:16]
+
+
+@pytest.mark.parametrize(
+    ("flight", "seed", "parameters", "expected"),
+    FLIGHTS,
+    ids=[f"{flight.__name__}-{seed}" for flight, seed, _, _ in FLIGHTS],
+)
+def test_flights_are_as_recorded(
+    flight: Callable[[Pilot], None], seed: int, parameters: dict[str, float], expected: str
+):
+    assert digest(flight, seed, parameters) == expected
+
+
+if __name__ == "__main__":
+    for flight, seed, parameters, _ in FLIGHTS:
+        print(f'({flight.__name__}, {seed}, {parameters}, "{digest(flight, seed, parameters)}"),')

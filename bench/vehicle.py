@@ -22,12 +22,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fractus_cluster.ports import free_port
-from fractus_mavlink import Parser, encode, layout_named
 from fractus_vehicle.earth import Place
 from fractus_vehicle.mav import Command, Mode
 from fractus_vehicle.pilot import Pilot
+from fractus_vehicle.readiness import arming_refusal
 from fractus_vehicle.simulation import Simulation, formation
-from fractus_vehicle.vehicle import CONTROL_STEP_S, VehicleConfig
+from fractus_vehicle.state import CONTROL_STEP_S, VehicleConfig
+from fractus_mavlink import Parser, encode, layout_named
 
 START = Place.from_degrees(48.2, 16.37, 150.0)
 
@@ -71,7 +72,7 @@ def motion() -> list[Claim]:
     """Takeoff, a leg of 50 m, and the way home, as the real one was measured."""
     simulation = Simulation([VehicleConfig(start=START, ready_after_s=2.0)])
     pilot = Pilot(simulation, simulation.crafts[0])
-    vehicle = simulation.crafts[0].vehicle
+    vehicle = simulation.crafts[0].vehicle.state
     climb_s = pilot.take_off(10.0)
     pilot.fly_on(6.0)
     pilot.go_to(50.0, 0.0, 10.0)
@@ -97,12 +98,12 @@ def memory_and_start() -> list[Claim]:
     pilot = Pilot(simulation, simulation.crafts[0])
     pilot.send("PARAM_REQUEST_LIST", {"target_system": 1, "target_component": 1})
     begun, listed = simulation.time_s, 0
-    count = len(simulation.crafts[0].vehicle.params)
+    count = len(simulation.crafts[0].vehicle.state.params)
     while listed < count:
         listed += sum(message.name == "PARAM_VALUE" for message in pilot.step())
     list_s = simulation.time_s - begun
     pilot.mode(Mode.GUIDED)
-    ready_s = begun + pilot.wait(lambda: simulation.crafts[0].vehicle.arming_refusal() is None, 60.0)
+    ready_s = begun + pilot.wait(lambda: arming_refusal(simulation.crafts[0].vehicle.state) is None, 60.0)
     logs = [_log(seed) for seed in (3, 3, 4)]
     differs = sum(a != b for a, b in zip(logs[0], logs[1], strict=False)) + abs(len(logs[0]) - len(logs[1]))
     return [
@@ -135,7 +136,7 @@ def speed(flight_s: float) -> list[Claim]:
         simulation = Simulation(configs)
         pilots = [Pilot(simulation, craft) for craft in simulation.crafts]
         for pilot in pilots:
-            pilot.craft.vehicle.params.assign("DISARM_DELAY", 0)
+            pilot.craft.vehicle.state.params.assign("DISARM_DELAY", 0)
             pilot.channel.streams.clear()
         simulation.advance(2.5)
         for pilot in pilots:
@@ -147,7 +148,7 @@ def speed(flight_s: float) -> list[Claim]:
         begun = time.process_time()
         simulation.advance(flight_s / (1 if count == 1 else 20))
         rate = flight_s / (1 if count == 1 else 20) / (time.process_time() - begun)
-        flying = sum(not craft.vehicle.landed for craft in simulation.crafts)
+        flying = sum(not craft.vehicle.state.landed for craft in simulation.crafts)
         floor = 20.0 if count == 1 else 1.0
         claims.append(Claim(name, rate, None, "x", f">= {floor:g}", rate >= floor and flying == count))
     return claims

@@ -16,7 +16,7 @@ from fractus_vehicle.links import Hub, LinkError, LinkSpec
 from fractus_vehicle.lockstep import Conductor, conduct
 from fractus_vehicle.params import ParameterValueError, UnknownParameterError
 from fractus_vehicle.simulation import Simulation, formation
-from fractus_vehicle.vehicle import CONTROL_STEP_S, REPEATABLE_EPOCH_US, VehicleConfig
+from fractus_vehicle.state import CONTROL_STEP_S, REPEATABLE_EPOCH_US, VehicleConfig
 
 DEFAULT_LISTEN = "tcp:127.0.0.1:5760"
 MAX_SYSID = 250

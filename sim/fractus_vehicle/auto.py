@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 from fractus_vehicle.breadcrumbs import Point
 from fractus_vehicle.descent import descend
 from fractus_vehicle.flight import Flight
 from fractus_vehicle.leg import Leg
 from fractus_vehicle.mav import Command, Mode, Severity
+from fractus_vehicle.mission_commands import MissionCommands, item_target, title
+from fractus_vehicle.mission_items import Item
+from fractus_vehicle.rtl import ReturnToLaunch
 from fractus_vehicle.spline import SplineLeg
-from fractus_vehicle.todo import Todo, item_target, title
-
-if TYPE_CHECKING:
-    from fractus_vehicle.mission import Item
-    from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
 # Legs that need not stop at their end.
 CURVES = frozenset({Command.NAV_WAYPOINT, Command.NAV_SPLINE_WAYPOINT})
@@ -24,17 +23,18 @@ CURVES = frozenset({Command.NAV_WAYPOINT, Command.NAV_SPLINE_WAYPOINT})
 class AutoFlight(Flight):
     """AUTO mode: runs NAV commands one after the other, DO commands at once when reached."""
 
-    def __init__(self) -> None:
+    def __init__(self, set_mode: Callable[[Mode], bool]) -> None:
+        self._set_mode = set_mode
         self._item: Item | None = None
         self._index = 0
         self._arrived_s: float | None = None
         self._started = False
         self._landing = False
-        self._returning: Flight | None = None
+        self._returning: ReturnToLaunch | None = None
         self.paused = False
         self._leg: Leg | SplineLeg | None = None
         self._track: Point = (0.0, 0.0, 0.0)  # the direction in which the present leg arrives, if it does not stop
-        self._todo = Todo()
+        self._commands = MissionCommands()
         self._circle_centre: tuple[float, float] | None = None
         self._turned = 0.0
         self._angle = 0.0
@@ -44,12 +44,12 @@ class AutoFlight(Flight):
         """Whether the mission's own landing or return is in its last descent."""
         return self._landing or (self._returning is not None and self._returning.landing)
 
-    def begin(self, v: Vehicle) -> None:
+    def begin(self, v: VehicleState) -> None:
         """Hold; the mission starts with the first step, which needs running motors."""
         v.control.hold_here()
-        v.yaw.follow_course()
+        v.heading.follow_course()
 
-    def _start(self, v: Vehicle) -> None:
+    def _start(self, v: VehicleState) -> None:
         """Continue at the current item, or start over."""
         self._started = True
         mission = v.mission
@@ -59,7 +59,7 @@ class AutoFlight(Flight):
         else:
             self._start_from(v, mission.current)
 
-    def pause(self, v: Vehicle, *, paused: bool) -> None:
+    def pause(self, v: VehicleState, *, paused: bool) -> None:
         """DO_PAUSE_CONTINUE: stop where it is; continuing repeats the current item."""
         if paused and not self.paused:
             v.control.hold_here()
@@ -67,7 +67,7 @@ class AutoFlight(Flight):
             self._begin_item(v, self._index, self._item)
         self.paused = paused
 
-    def jump_to(self, v: Vehicle, index: int) -> None:
+    def jump_to(self, v: VehicleState, index: int) -> None:
         """Continue at an item (DO_SET_MISSION_CURRENT)."""
         self._started = True
         self._returning = None
@@ -75,12 +75,12 @@ class AutoFlight(Flight):
         v.mission.complete = False
         self._start_from(v, index)
 
-    def _start_from(self, v: Vehicle, index: int | None) -> None:
+    def _start_from(self, v: VehicleState, index: int | None) -> None:
         """Begin the next NAV command; the DO and CONDITION commands before it run while it is flown."""
         waiting: list[int] = []
         for _ in range(len(v.mission.items) + 1):
             if index is None or index >= len(v.mission.items):
-                self._todo.begin(v, waiting)
+                self._commands.begin(v, waiting)
                 self._finish(v)
                 return
             item = v.mission.items[index]
@@ -88,23 +88,20 @@ class AutoFlight(Flight):
                 v.mission.current = index
                 v.say(Severity.INFO, f"Mission: {index} {title(item)}")
                 self._begin_item(v, index, item)
-                self._todo.begin(v, waiting)
+                self._commands.begin(v, waiting)
                 return
             waiting.append(index)
             index = v.mission.next_after(index)
 
-    def _finish(self, v: Vehicle) -> None:
+    def _finish(self, v: VehicleState) -> None:
         self._item = self._leg = None
         v.mission.complete = True
         if v.landed:
-            v.disarm("mission complete")
+            v.disarm()
         else:
             v.control.hold_here()
 
-    def _place(self, v: Vehicle, item: Item) -> tuple[float, float, float]:
-        return item_target(v, item)
-
-    def _begin_item(self, v: Vehicle, index: int, item: Item) -> None:
+    def _begin_item(self, v: VehicleState, index: int, item: Item) -> None:
         self._item, self._index = item, index
         self._arrived_s = None
         self._landing = False
@@ -112,10 +109,10 @@ class AutoFlight(Flight):
         track, self._track = self._track, (0.0, 0.0, 0.0)
         if item.has_place and v.altitude_base_m(item.frame) is None:
             v.say(Severity.CRITICAL, "Failsafe: Terrain data missing")
-            if not v.set_mode(Mode.RTL):
-                v.set_mode(Mode.LAND)
+            if not self._set_mode(Mode.RTL):
+                self._set_mode(Mode.LAND)
             return
-        north, east, down = self._place(v, item)
+        north, east, down = item_target(v, item)
         match item.command:
             case Command.NAV_TAKEOFF:
                 if v.landed:
@@ -123,7 +120,7 @@ class AutoFlight(Flight):
                 else:
                     v.control.go_to(*v.control.target, down)
             case Command.NAV_RETURN_TO_LAUNCH:
-                self._returning = v.new_return()
+                self._returning = ReturnToLaunch()
                 self._returning.begin(v)
             case Command.NAV_LOITER_TURNS:
                 self._circle_centre = (north, east)
@@ -144,7 +141,7 @@ class AutoFlight(Flight):
                     self._track = (north - here[0], east - here[1], down - here[2])
                 self._leg = Leg(v, north, east, down)
 
-    def _following(self, v: Vehicle, item: Item) -> Item | None:
+    def _following(self, v: VehicleState, item: Item) -> Item | None:
         """The waypoint after this one, where it is a curve or begins one; a stay in between ends that."""
         at = v.mission.peek_after(self._index)
         if item.command not in CURVES or item.param1 > 0.0 or at is None:
@@ -152,7 +149,7 @@ class AutoFlight(Flight):
         following = v.mission.items[at]
         return following if following.command in CURVES else None
 
-    def _arrival(self, v: Vehicle, item: Item, start: Point, end: Point) -> Point:
+    def _arrival(self, v: VehicleState, item: Item, start: Point, end: Point) -> Point:
         """In which direction a curve ends: along a straight leg that follows, or past its end towards the next one."""
         following = self._following(v, item)
         if following is None:
@@ -161,7 +158,7 @@ class AutoFlight(Flight):
         base = start if following.command == Command.NAV_SPLINE_WAYPOINT else end
         return (north - base[0], east - base[1], down - base[2])
 
-    def step(self, v: Vehicle, dt: float) -> None:
+    def step(self, v: VehicleState) -> None:
         """Fly the current item and go on when it is done."""
         if not self._started:
             self._start(v)
@@ -169,23 +166,23 @@ class AutoFlight(Flight):
         if item is None or self.paused:
             return
         if self._returning is not None:
-            self._returning.step(v, dt)
+            self._returning.step(v)
             self._finish_if_down(v)
             return
-        self._todo.step(v)
+        self._commands.step(v)
         if self._leg is not None:
             self._leg.step(v)
         if item.command == Command.NAV_LAND:
             self._land(v)
         elif item.command == Command.NAV_LOITER_TURNS and self._circle_centre is not None:
-            self._turn(v, item, dt)
+            self._turn(v, item)
         elif self._done(v, item):
             v.broadcast("MISSION_ITEM_REACHED", {"seq": self._index})
             v.say(Severity.INFO, f"Reached command #{self._index}")
             self._start_from(v, v.mission.next_after(self._index))
-        v.yaw.step(v, dt)
+        v.heading.step(v.est)
 
-    def _land(self, v: Vehicle) -> None:
+    def _land(self, v: VehicleState) -> None:
         north, east = v.control.target
         if not self._landing and math.hypot(north - v.est.north, east - v.est.east) < 2.0:
             self._landing = True
@@ -194,7 +191,7 @@ class AutoFlight(Flight):
             descend(v)
             self._finish_if_down(v)
 
-    def _finish_if_down(self, v: Vehicle) -> None:
+    def _finish_if_down(self, v: VehicleState) -> None:
         """A landing or return ends with the motors off; then the next item, if any, waits for the next start."""
         if v.armed:
             return
@@ -205,10 +202,10 @@ class AutoFlight(Flight):
         if following is not None:
             v.mission.current = following
 
-    def _turn(self, v: Vehicle, item: Item, dt: float) -> None:
+    def _turn(self, v: VehicleState, item: Item) -> None:
         radius = min(max(abs(item.param3) or v.params["CIRCLE_RADIUS"] / 100.0, 1.0), 500.0)
         rate = min(math.radians(v.params["CIRCLE_RATE"]), v.control.limits.speed_mps / radius)
-        step = math.copysign(rate * dt, item.param3 or 1.0)
+        step = math.copysign(rate * CONTROL_STEP_S, item.param3 or 1.0)
         centre = self._circle_centre or (v.est.north, v.est.east)
         self._angle += step
         self._turned += abs(step)
@@ -217,7 +214,7 @@ class AutoFlight(Flight):
             v.broadcast("MISSION_ITEM_REACHED", {"seq": self._index})
             self._start_from(v, v.mission.next_after(self._index))
 
-    def _done(self, v: Vehicle, item: Item) -> bool:
+    def _done(self, v: VehicleState, item: Item) -> bool:
         if item.command == Command.NAV_TAKEOFF:
             return v.takeoff_done()
         if item.command == Command.NAV_LOITER_UNLIM:

@@ -9,14 +9,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from fractus_vehicle.mav import Mode, Severity
-
-if TYPE_CHECKING:
-    from fractus_vehicle.vehicle import Vehicle
 
 POINTS_MAX = 500
 UPDATE_INTERVAL_S = 1.0 / 3.0
@@ -43,10 +39,12 @@ class Loop:
 class Breadcrumbs:
     """The recorded path in local metres, home first."""
 
-    def __init__(self, points: float) -> None:
+    def __init__(self, params: Mapping[str, float], say: Callable[[Severity, str], None]) -> None:
+        self._params = params
+        self._say = say
         self.active = False
         self.path: list[Point] = []
-        self._limit = min(max(int(points), 0), POINTS_MAX)  # as ArduPilot: read once, at the start
+        self._limit = min(max(int(params["SRTL_POINTS"]), 0), POINTS_MAX)  # as ArduPilot: read once, at the start
         self._accuracy_m = 2.0
         self._simplified = 0  # points that need no second look
         self._pruned = 0
@@ -55,29 +53,36 @@ class Breadcrumbs:
         self._good_s = self._saved_s = 0.0
         self._low_said_s = -math.inf
 
-    def restart(self, v: Vehicle) -> None:
+    def restart(self, now_s: float, here: Point | None) -> None:
         """Forget the path and begin at the present position, if it is known (at the start, and when armed)."""
-        self._accuracy_m = v.params["SRTL_ACCURACY"]
+        self._accuracy_m = self._params["SRTL_ACCURACY"]
         self.path.clear()
         self._simplified = self._pruned = 0
         self._work = None
         if self._limit == 0 or self._accuracy_m <= 0.0:
             self.active = False
-        elif not v.position_ok:
-            self._give_up(v, "bad position")
+        elif here is None:
+            self._give_up("bad position")
         else:
             self.active = True
-            self._good_s = self._saved_s = v.time_s
-            self.path.append((v.est.north, v.est.east, v.est.down))
+            self._good_s = self._saved_s = now_s
+            self.path.append(here)
 
-    def step(self, v: Vehicle) -> None:
-        """Record, three times a second while armed, and tidy up; SMART_RTL itself leaves no crumbs."""
-        if v.time_s >= self._next_s:
-            self._next_s = v.time_s + UPDATE_INTERVAL_S
-            if not self.path and not v.armed and v.position_ok:
-                self.restart(v)
-            if self.active and v.armed and v.mode is not Mode.SMART_RTL:
-                self._record(v)
+    def step(self, now_s: float, here: Point | None, mode: Mode, *, armed: bool) -> None:
+        """Record, three times a second while armed, and tidy up; SMART_RTL itself leaves no crumbs.
+
+        Args:
+            now_s: The vehicle's time.
+            here: The position (north, east, down); None while it is unknown.
+            mode: The flight mode.
+            armed: Whether the motors run.
+        """
+        if now_s >= self._next_s:
+            self._next_s = now_s + UPDATE_INTERVAL_S
+            if not self.path and not armed and here is not None:
+                self.restart(now_s, here)
+            if self.active and armed and mode is not Mode.SMART_RTL:
+                self._record(now_s, here)
                 self._work = self._work or self._routine()
         if self._work is not None:
             try:
@@ -85,26 +90,25 @@ class Breadcrumbs:
             except StopIteration:
                 self._work = None
 
-    def _record(self, v: Vehicle) -> None:
-        now_s = v.time_s
-        if not v.position_ok:
+    def _record(self, now_s: float, here: Point | None) -> None:
+        if here is None:
             if now_s - self._good_s > TIMEOUT_S:
-                self._give_up(v, "bad position")
+                self._give_up("bad position")
             return
         self._good_s = now_s
-        if self.add((v.est.north, v.est.east, v.est.down)):
+        if self.add(here):
             self._saved_s = now_s
         elif now_s - self._saved_s > TIMEOUT_S:
-            self._give_up(v, "buffer full")
+            self._give_up("buffer full")
             return
         if len(self.path) >= self._limit - LOW_SPACE + 1 and now_s - self._low_said_s > LOW_SPACE_SAID_EVERY_S:
             self._low_said_s = now_s
-            v.say(Severity.INFO, "SmartRTL Low on space!")
+            self._say(Severity.INFO, "SmartRTL Low on space!")
 
-    def _give_up(self, v: Vehicle, reason: str) -> None:
+    def _give_up(self, reason: str) -> None:
         self.active = False
         self._work = None
-        v.say(Severity.WARNING, f"SmartRTL deactivated: {reason}")
+        self._say(Severity.WARNING, f"SmartRTL deactivated: {reason}")
 
     def add(self, point: Point) -> bool:
         """Append a point unless it is too near to the last one; False when there is no room."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from fractus_mavlink import Message, layout_of
 
@@ -12,11 +11,13 @@ from fractus_vehicle.auto import AutoFlight
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.earth import valid_coordinates
 from fractus_vehicle.guided import GuidedFlight
+from fractus_vehicle.home import set_home_at, set_home_here
 from fractus_vehicle.mav import (
     ABSOLUTE_FRAMES,
     FORCE_ARM_MAGIC,
     FORCE_MAGIC,
     GLOBAL_FRAMES,
+    VERSION_TEXT,
     Command,
     Frame,
     Mode,
@@ -24,79 +25,43 @@ from fractus_vehicle.mav import (
     Result,
     Severity,
 )
-from fractus_vehicle.mission import Item
+from fractus_vehicle.mission_commands import item_target, switch_fence
+from fractus_vehicle.mission_items import Item
+from fractus_vehicle.orders import Order, read_order
+from fractus_vehicle.readiness import arming_refusal
 from fractus_vehicle.streams import BUILDERS
-from fractus_vehicle.todo import item_target, switch_fence
+from fractus_vehicle.telemetry import send
 from fractus_vehicle.vehicle import Vehicle
 
 NOT_ARMABLE = frozenset({Mode.RTL, Mode.SMART_RTL, Mode.LAND, Mode.BRAKE, Mode.AUTO})
 
 
-@dataclass(frozen=True, slots=True)
-class Order:
-    """A command from either message, with its position as degrees times 1e7."""
-
-    command: int
-    params: tuple[float, float, float, float]
-    x: int
-    y: int
-    z: float
-    frame: int
-    has_place: bool
-    integer: bool
-
-    @property
-    def item(self) -> Item:
-        """The order's position as a mission item, for frame arithmetic."""
-        return Item(command=self.command, frame=self.frame, x=self.x, y=self.y, z=self.z)
-
-
-def read_order(message: Message) -> Order:
-    """Read COMMAND_LONG or COMMAND_INT."""
-    numbers = (
-        message.real("param1"),
-        message.real("param2"),
-        message.real("param3"),
-        message.real("param4"),
-    )
-    command = message.integer("command")
-    if message.name == "COMMAND_INT":
-        x, y, z = message.integer("x"), message.integer("y"), message.real("z")
-        frame = message.integer("frame")
-        return Order(command, numbers, x, y, z, frame, x != 0 or y != 0, integer=True)
-    lat, lon, z = message.real("param5"), message.real("param6"), message.real("param7")
-    known = math.isfinite(lat) and math.isfinite(lon) and (lat != 0.0 or lon != 0.0)
-    known = known and abs(lat) <= 90.0 and abs(lon) <= 180.0
-    x, y = (round(lat * 1e7), round(lon * 1e7)) if known else (0, 0)
-    absolute = command in (Command.DO_SET_HOME,)
-    frame = Frame.GLOBAL if absolute else Frame.GLOBAL_RELATIVE_ALT
-    return Order(command, numbers, x, y, z, frame, known, integer=False)
-
-
-def _arm_disarm(v: Vehicle, o: Order, _c: Channel) -> Result:
+def _arm_disarm(vehicle: Vehicle, o: Order, _c: Channel) -> Result:
+    v = vehicle.state
     want, magic = o.params[0], o.params[1]
     if want == 1.0:
         if v.armed:
             return Result.ACCEPTED
         if magic != FORCE_ARM_MAGIC:
-            refusal = f"{v.mode.title} mode not armable" if v.mode in NOT_ARMABLE else v.arming_refusal()
+            refusal = f"{v.mode.title} mode not armable" if v.mode in NOT_ARMABLE else arming_refusal(v)
             if refusal is not None:
                 v.say(Severity.CRITICAL, f"Arm: {refusal}")
                 return Result.FAILED
-        v.arm()
+        vehicle.arm()
         return Result.ACCEPTED
     if want == 0.0:
         if v.armed and not v.landed and magic != FORCE_MAGIC:
             return Result.FAILED
-        v.disarm("command", force=magic == FORCE_MAGIC)
+        v.disarm(force=magic == FORCE_MAGIC)
         return Result.ACCEPTED
     return Result.UNSUPPORTED
 
 
-def _takeoff(v: Vehicle, o: Order, _c: Channel) -> Result:
+def _takeoff(vehicle: Vehicle, o: Order, _c: Channel) -> Result:
+    v = vehicle.state
     if not v.armed or not v.landed or v.flying_wanted or not math.isfinite(o.z):
         return Result.FAILED
-    if isinstance(v.flight, AutoFlight) or v.mode not in (Mode.GUIDED, Mode.LOITER, Mode.ALT_HOLD):
+    if isinstance(vehicle.modes.flight, AutoFlight) or v.mode not in (Mode.GUIDED, Mode.LOITER, Mode.ALT_HOLD):
         return Result.FAILED
     if o.integer and o.frame not in (Frame.GLOBAL_RELATIVE_ALT, Frame.GLOBAL_RELATIVE_ALT_INT):
         return Result.DENIED
@@ -105,43 +70,46 @@ def _takeoff(v: Vehicle, o: Order, _c: Channel) -> Result:
     origin = v.origin or v.start
     home = v.home or origin
     down = min(origin.alt_m - home.alt_m - o.z, v.est.down - 0.1)
-    if isinstance(v.flight, GuidedFlight):
-        v.flight.take_off(v, down)
+    if isinstance(vehicle.modes.flight, GuidedFlight):
+        vehicle.modes.flight.take_off(v, down)
     else:
         v.begin_takeoff(down)
     return Result.ACCEPTED
 
 
 def _mode_command(mode: Mode) -> Callable[[Vehicle, Order, Channel], Result]:
-    def change(v: Vehicle, _o: Order, _c: Channel) -> Result:
-        return Result.ACCEPTED if v.set_mode(mode) else Result.FAILED
+    def change(vehicle: Vehicle, _o: Order, _c: Channel) -> Result:
+        return Result.ACCEPTED if vehicle.modes.change(mode) else Result.FAILED
 
     return change
 
 
-def set_mode_number(v: Vehicle, base_mode: int, custom_mode: int) -> Result:
+def set_mode_number(vehicle: Vehicle, base_mode: int, custom_mode: int) -> Result:
     """DO_SET_MODE and SET_MODE: only custom modes, as ArduPilot."""
+    v = vehicle.state
     if not base_mode & ModeFlag.CUSTOM:
         return Result.DENIED
     if custom_mode not in set(Mode):
         v.say(Severity.WARNING, f"No such mode {custom_mode}")
         return Result.FAILED
-    return Result.ACCEPTED if v.set_mode(Mode(custom_mode)) else Result.FAILED
+    return Result.ACCEPTED if vehicle.modes.change(Mode(custom_mode)) else Result.FAILED
 
 
-def _set_mode(v: Vehicle, o: Order, _c: Channel) -> Result:
+def _set_mode(vehicle: Vehicle, o: Order, _c: Channel) -> Result:
     if not all(math.isfinite(value) for value in o.params[:2]):
         return Result.DENIED
-    return set_mode_number(v, int(o.params[0]), int(o.params[1]))
+    return set_mode_number(vehicle, int(o.params[0]), int(o.params[1]))
 
 
-def _change_speed(v: Vehicle, o: Order, _c: Channel) -> Result:
+def _change_speed(vehicle: Vehicle, o: Order, _c: Channel) -> Result:
+    v = vehicle.state
     if not math.isfinite(o.params[0]):
         return Result.DENIED
-    return Result.ACCEPTED if v.change_speed(int(o.params[0]), o.params[1]) else Result.FAILED
+    return Result.ACCEPTED if v.control.limits.change_speed(int(o.params[0]), o.params[1]) else Result.FAILED
 
 
-def _reposition(v: Vehicle, o: Order, _c: Channel) -> Result:
+def _reposition(vehicle: Vehicle, o: Order, _c: Channel) -> Result:
+    v = vehicle.state
     switch = bool(int(o.params[1]) & 1) if math.isfinite(o.params[1]) else False
     if not v.armed or (v.mode is not Mode.GUIDED and not switch):
         return Result.DENIED
@@ -149,48 +117,44 @@ def _reposition(v: Vehicle, o: Order, _c: Channel) -> Result:
     if not placed or v.altitude_base_m(o.frame) is None:
         return Result.DENIED
     north, east, down = item_target(v, o.item)
-    if v.landed or outside_fence(v, north, east, down) or not v.set_mode(Mode.GUIDED):
+    if v.landed or v.outside_fence(north, east, down) or not vehicle.modes.change(Mode.GUIDED):
         return Result.FAILED
-    flight = v.flight
+    flight = vehicle.modes.flight
     if not isinstance(flight, GuidedFlight):
         return Result.FAILED
     flight.go_to(v, north, east, down)
     if math.isfinite(o.params[3]) and o.params[3] != 0.0:
-        v.turn_to(o.params[3] % 360.0, 0.0, 0, relative=False)
+        v.heading.turn_to(o.params[3] % 360.0, 0.0, 0, relative=False)
     else:
-        v.yaw.follow_course()
+        v.heading.follow_course()
     return Result.ACCEPTED
 
 
-def outside_fence(v: Vehicle, north: float, east: float, down: float) -> bool:
-    """Whether a local target lies outside the autopilot's own fence."""
-    origin = v.origin or v.start
-    home = v.home or origin
-    return bool(v.fence.outside(north, east, origin.alt_m - down - home.alt_m, v.home_xy))
-
-
-def _yaw(v: Vehicle, o: Order, _c: Channel) -> Result:
+def _yaw(vehicle: Vehicle, o: Order, _c: Channel) -> Result:
+    v = vehicle.state
     angle, rate, direction, relative = o.params
     if v.mode not in (Mode.GUIDED, Mode.AUTO) or not all(math.isfinite(p) for p in o.params):
         return Result.FAILED
-    turned = v.turn_to(angle, rate, int(direction), relative=relative > 0.5)
+    turned = v.heading.turn_to(angle, rate, int(direction), relative=relative > 0.5)
     return Result.ACCEPTED if turned else Result.FAILED
 
 
-def _roi(v: Vehicle, o: Order, _c: Channel) -> Result:
+def _roi(vehicle: Vehicle, o: Order, _c: Channel) -> Result:
+    v = vehicle.state
     if o.command == Command.DO_SET_ROI_NONE or not o.has_place:
-        v.yaw.look_at(None)
+        v.heading.look_at(None)
         return Result.ACCEPTED
     if not valid_coordinates(o.x, o.y) or o.frame not in GLOBAL_FRAMES:
         return Result.FAILED
     north, east, _ = item_target(v, Item(command=o.command, frame=o.frame, x=o.x, y=o.y))
-    v.yaw.look_at((north, east))
+    v.heading.look_at((north, east))
     return Result.ACCEPTED
 
 
-def _set_home(v: Vehicle, o: Order, _c: Channel) -> Result:
+def _set_home(vehicle: Vehicle, o: Order, _c: Channel) -> Result:
+    v = vehicle.state
     if o.params[0] == 1.0:
-        return Result.ACCEPTED if v.set_home_here() else Result.FAILED
+        return Result.ACCEPTED if set_home_here(v) else Result.FAILED
     if not o.has_place or not math.isfinite(o.z):
         return Result.DENIED
     if o.frame not in GLOBAL_FRAMES:
@@ -198,13 +162,14 @@ def _set_home(v: Vehicle, o: Order, _c: Channel) -> Result:
     altitude = o.z
     if o.frame not in ABSOLUTE_FRAMES:
         altitude += (v.home or v.start).alt_m
-    return Result.ACCEPTED if v.set_home_at(o.x, o.y, altitude) else Result.FAILED
+    return Result.ACCEPTED if set_home_at(v, o.x, o.y, altitude) else Result.FAILED
 
 
-def _get_home(v: Vehicle, _o: Order, c: Channel) -> Result:
-    if not v.send(c, "HOME_POSITION"):
+def _get_home(vehicle: Vehicle, _o: Order, c: Channel) -> Result:
+    v = vehicle.state
+    if not send(v, c, "HOME_POSITION"):
         return Result.FAILED
-    v.send(c, "GPS_GLOBAL_ORIGIN")
+    send(v, c, "GPS_GLOBAL_ORIGIN")
     return Result.ACCEPTED
 
 
@@ -213,7 +178,7 @@ def _message_name(number: float) -> str | None:
     return layout.name if layout is not None and layout.name in BUILDERS else None
 
 
-def _set_interval(v: Vehicle, o: Order, c: Channel) -> Result:
+def _set_interval(vehicle: Vehicle, o: Order, c: Channel) -> Result:
     name, interval_us = _message_name(o.params[0]), o.params[1]
     if name is None or not math.isfinite(interval_us):
         return Result.DENIED
@@ -226,7 +191,7 @@ def _set_interval(v: Vehicle, o: Order, c: Channel) -> Result:
     return Result.ACCEPTED
 
 
-def _get_interval(_v: Vehicle, o: Order, c: Channel) -> Result:
+def _get_interval(_vehicle: Vehicle, o: Order, c: Channel) -> Result:
     name = _message_name(o.params[0])
     stream = c.streams.get(name) if name is not None else None
     interval = 0 if name is None else -1 if stream is None else round(stream.interval_s * 1e6)
@@ -237,97 +202,109 @@ def _get_interval(_v: Vehicle, o: Order, c: Channel) -> Result:
     return Result.ACCEPTED if name is not None else Result.FAILED
 
 
-def _request_message(v: Vehicle, o: Order, c: Channel) -> Result:
+def _request_message(vehicle: Vehicle, o: Order, c: Channel) -> Result:
+    v = vehicle.state
     name = _message_name(o.params[0])
     if name is None:
         return Result.FAILED
-    return Result.ACCEPTED if v.send(c, name) else Result.FAILED
+    return Result.ACCEPTED if send(v, c, name) else Result.FAILED
 
 
-def _capabilities(v: Vehicle, o: Order, c: Channel) -> Result:
+def _capabilities(vehicle: Vehicle, o: Order, c: Channel) -> Result:
+    v = vehicle.state
     if o.params[0] != 1.0:
         return Result.FAILED
-    v.send(c, "AUTOPILOT_VERSION")
+    send(v, c, "AUTOPILOT_VERSION")
     return Result.ACCEPTED
 
 
-def _fence_enable(v: Vehicle, o: Order, _c: Channel) -> Result:
+def _fence_enable(vehicle: Vehicle, o: Order, _c: Channel) -> Result:
+    v = vehicle.state
     return Result.ACCEPTED if switch_fence(v, o.params[0]) else Result.FAILED
 
 
-def _mission_start(v: Vehicle, _o: Order, _c: Channel) -> Result:
-    return Result.ACCEPTED if v.set_mode(Mode.AUTO) else Result.FAILED
+def _mission_start(vehicle: Vehicle, _o: Order, _c: Channel) -> Result:
+    return Result.ACCEPTED if vehicle.modes.change(Mode.AUTO) else Result.FAILED
 
 
-def _mission_current(v: Vehicle, o: Order, c: Channel) -> Result:
+def _mission_current(vehicle: Vehicle, o: Order, c: Channel) -> Result:
+    v = vehicle.state
     if not math.isfinite(o.params[0]):
         return Result.DENIED
-    if not set_current(v, int(o.params[0])):
+    if not set_current(vehicle, int(o.params[0])):
         return Result.FAILED
-    v.send(c, "MISSION_CURRENT")
+    send(v, c, "MISSION_CURRENT")
     return Result.ACCEPTED
 
 
-def _jump_to_tag(v: Vehicle, o: Order, c: Channel) -> Result:
+def _jump_to_tag(vehicle: Vehicle, o: Order, c: Channel) -> Result:
+    v = vehicle.state
     tag = o.params[0]
     index = v.mission.tagged(int(tag)) if math.isfinite(tag) else None
-    if index is None or not set_current(v, index):
+    if index is None or not set_current(vehicle, index):
         return Result.FAILED
-    v.send(c, "MISSION_CURRENT")
+    send(v, c, "MISSION_CURRENT")
     return Result.ACCEPTED
 
 
-def set_current(v: Vehicle, index: int) -> bool:
+def set_current(vehicle: Vehicle, index: int) -> bool:
     """Make an item the current one; AUTO continues there."""
+    v = vehicle.state
     if not 0 <= index < len(v.mission.items):
         return False
-    if isinstance(v.flight, AutoFlight) and v.armed:
-        v.flight.jump_to(v, max(index, 1))
+    if isinstance(vehicle.modes.flight, AutoFlight) and v.armed:
+        vehicle.modes.flight.jump_to(v, max(index, 1))
     else:
         v.mission.current = index
         v.mission.complete = False
     return True
 
 
-def _pause(v: Vehicle, o: Order, _c: Channel) -> Result:
-    flight = v.flight
+def _pause(vehicle: Vehicle, o: Order, _c: Channel) -> Result:
+    v = vehicle.state
+    flight = vehicle.modes.flight
     if not isinstance(flight, (AutoFlight, GuidedFlight)) or o.params[0] not in (0.0, 1.0):
         return Result.DENIED
     flight.pause(v, paused=o.params[0] == 0.0)
     return Result.ACCEPTED
 
 
-def _terminate(v: Vehicle, o: Order, _c: Channel) -> Result:
+def _terminate(vehicle: Vehicle, o: Order, _c: Channel) -> Result:
+    v = vehicle.state
     if o.params[0] <= 0.5:
         return Result.FAILED
-    v.disarm("termination", force=True)
+    v.disarm(force=True)
     return Result.ACCEPTED
 
 
-def _reboot(v: Vehicle, o: Order, _c: Channel) -> Result:
+def _reboot(vehicle: Vehicle, o: Order, _c: Channel) -> Result:
+    v = vehicle.state
     if v.armed:
         return Result.FAILED
     if o.params[0] not in (1.0, 3.0):
         return Result.UNSUPPORTED
-    v.reboot_wanted = True
+    vehicle.reboot_wanted = True
     return Result.ACCEPTED
 
 
-def _prearm(v: Vehicle, _o: Order, _c: Channel) -> Result:
+def _prearm(vehicle: Vehicle, _o: Order, _c: Channel) -> Result:
+    v = vehicle.state
     if v.armed:
         return Result.TEMPORARILY_REJECTED
-    refusal = v.arming_refusal()
+    refusal = arming_refusal(v)
     if refusal is not None:
         v.say(Severity.CRITICAL, f"PreArm: {refusal}")
     return Result.ACCEPTED
 
 
-def _banner(v: Vehicle, _o: Order, _c: Channel) -> Result:
-    v.voice.banner()
+def _banner(vehicle: Vehicle, _o: Order, _c: Channel) -> Result:
+    for text in (VERSION_TEXT, "Frame: QUAD/X"):
+        vehicle.state.say(Severity.INFO, text)
     return Result.ACCEPTED
 
 
-def _grounded_only(v: Vehicle, _o: Order, _c: Channel) -> Result:
+def _grounded_only(vehicle: Vehicle, _o: Order, _c: Channel) -> Result:
+    v = vehicle.state
     return Result.FAILED if v.armed else Result.ACCEPTED
 
 
@@ -366,7 +343,7 @@ HANDLERS: dict[int, Callable[[Vehicle, Order, Channel], Result]] = {
 INT_ONLY = frozenset({Command.DO_REPOSITION})
 
 
-def handle_command(v: Vehicle, message: Message, channel: Channel) -> None:
+def handle_command(vehicle: Vehicle, message: Message, channel: Channel) -> None:
     """Carry out a command and acknowledge it."""
     order = read_order(message)
     handler = HANDLERS.get(order.command)
@@ -375,7 +352,7 @@ def handle_command(v: Vehicle, message: Message, channel: Channel) -> None:
     elif order.command in INT_ONLY and not order.integer:
         result = Result.COMMAND_INT_ONLY
     else:
-        result = handler(v, order, channel)
+        result = handler(vehicle, order, channel)
     channel.send(
         "COMMAND_ACK",
         {

@@ -52,6 +52,20 @@ class Limits:
     tilt_max_rad: float = math.radians(30.0)
     yaw_rate_rps: float = math.radians(60.0)
 
+    def change_speed(self, kind: int, speed_mps: float) -> bool:
+        """DO_CHANGE_SPEED: 0 and 1 horizontal, 2 climb, 3 descent; False for another kind, or for no speed."""
+        if not speed_mps > 0.0 or not math.isfinite(speed_mps):
+            return False
+        if kind in (0, 1):
+            self.speed_mps = max(speed_mps, 0.2)
+        elif kind == 2:
+            self.climb_mps = max(speed_mps, 0.1)
+        elif kind == 3:
+            self.sink_mps = max(speed_mps, 0.1)
+        else:
+            return False
+        return True
+
 
 class Estimate(NamedTuple):
     """What the estimator tells the controllers: local NED position and velocity, attitude and body rates."""
@@ -119,7 +133,7 @@ class Control:
         self.lean = (0.0, 0.0)
 
     def reset(self, est: Estimate) -> None:
-        """Start anew from where the vehicle is: no history, no targets elsewhere."""
+        """Start from where the vehicle is: no history, no targets elsewhere."""
         self.horizontal = self.vertical = Axis.POSITION
         self._stopping = False
         self.pos = [est.north, est.east, est.down]
@@ -176,7 +190,7 @@ class Control:
             self.climb(vd)
 
     def track(self, position: Vector, velocity: Vector, acceleration: Vector) -> None:
-        """Follow a trajectory that somebody else shapes, from this point of it."""
+        """Follow a trajectory that is shaped elsewhere, from this point of it."""
         self.horizontal = self.vertical = Axis.PATH
         self._stopping = False
         self.pos[:], self.vel[:], self.acc[:] = position, velocity, acceleration

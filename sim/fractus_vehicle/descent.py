@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from fractus_vehicle.shaping import clamp
-
-if TYPE_CHECKING:
-    from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
 LANDING_CONFIRMED_S = 1.0
 
 
-def descend(v: Vehicle) -> None:
+def descend(v: VehicleState) -> None:
     """Sink as LAND does: fast when high, slowly below LAND_ALT_LOW, disarm once down."""
     p = v.params
     slow = p["LAND_SPEED"] / 100.0
@@ -25,9 +22,9 @@ def descend(v: Vehicle) -> None:
         speed = clamp(slow + math.sqrt(2.0 * 0.7 * v.control.limits.accel_z_mps2 * above), slow, max(high, slow))
     v.control.climb(speed)
     if v.body.on_ground:
-        v.touch_time_s += v.control_step_s
+        v.touch_time_s += CONTROL_STEP_S
         if v.touch_time_s >= LANDING_CONFIRMED_S:
             v.land_complete()
-            v.disarm("landed")
+            v.disarm()
     else:
         v.touch_time_s = 0.0

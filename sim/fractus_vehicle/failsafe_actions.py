@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import TYPE_CHECKING
 
+from fractus_vehicle.landing import Land
 from fractus_vehicle.mav import Mode, Severity
-from fractus_vehicle.modes import Land
-
-if TYPE_CHECKING:
-    from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.modes import FlightModes
+from fractus_vehicle.state import VehicleState
 
 
 class Action(IntEnum):
@@ -52,41 +50,41 @@ FENCE_ACTIONS = {
 }
 
 
-def act(v: Vehicle, action: Action) -> None:
+def act(v: VehicleState, modes: FlightModes, action: Action) -> None:
     """Carry an action out; a mode that cannot be flown now gives way to the next best, LAND in the end."""
     match action:
         case Action.NONE:
             return
         case Action.TERMINATE:
-            v.disarm("failsafe", force=True)
+            v.disarm(force=True)
         case Action.LAND:
-            _land(v)
+            _land(v, modes)
         case Action.RTL:
-            _return(v)
+            _return(v, modes)
         case Action.SMART_RTL:
-            if not v.set_mode(Mode.SMART_RTL):
+            if not modes.change(Mode.SMART_RTL):
                 v.say(Severity.WARNING, "SmartRTL Unavailable, Trying RTL Mode")
-                _return(v)
+                _return(v, modes)
         case Action.SMART_RTL_LAND:
-            if not v.set_mode(Mode.SMART_RTL):
+            if not modes.change(Mode.SMART_RTL):
                 v.say(Severity.WARNING, "SmartRTL Unavailable, Using Land Mode")
-                _land(v)
+                _land(v, modes)
         case Action.AUTO_LAND_START:
             # Missions with a landing sequence to jump to are not flown here: the autopilot's own fallback.
             v.say(Severity.WARNING, "Trying RTL Mode")
-            _return(v)
+            _return(v, modes)
         case Action.BRAKE_LAND:
-            if not v.set_mode(Mode.BRAKE):
+            if not modes.change(Mode.BRAKE):
                 v.say(Severity.WARNING, "Trying Land Mode")
-                _land(v)
+                _land(v, modes)
 
 
-def _return(v: Vehicle) -> None:
-    if not v.set_mode(Mode.RTL):
-        _land(v)
+def _return(v: VehicleState, modes: FlightModes) -> None:
+    if not modes.change(Mode.RTL):
+        _land(v, modes)
 
 
-def _land(v: Vehicle) -> None:
-    v.set_mode(Mode.LAND)
-    if isinstance(v.flight, Land):
-        v.flight.pause(v)
+def _land(v: VehicleState, modes: FlightModes) -> None:
+    modes.change(Mode.LAND)
+    if isinstance(modes.flight, Land):
+        modes.flight.pause(v)

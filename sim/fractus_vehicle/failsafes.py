@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from enum import IntFlag
-from typing import TYPE_CHECKING
 
 from fractus_vehicle.failsafe_actions import FENCE_ACTIONS, GCS_ACTIONS, RADIO_ACTIONS, Action, act
 from fractus_vehicle.fence import Breach, breach_names
 from fractus_vehicle.mav import Mode, Severity
-
-if TYPE_CHECKING:
-    from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.modes import FlightModes
+from fractus_vehicle.state import VehicleState
 
 CHECK_INTERVAL_S = 0.1
 POSITION_LOST_S = 1.0
@@ -40,32 +37,29 @@ class Option(IntFlag):
     PILOT_ON_GCS = 16
 
 
-@dataclass(slots=True)
 class Failsafes:
-    """Which failsafes are active, and since when their conditions hold."""
+    """Sets and clears the failsafes of a vehicle, and acts when one begins; times are those since when a cause holds."""
 
-    gcs: bool = False
-    radio: bool = False
-    battery: bool = False
-    battery_critical: bool = False
-    ekf: bool = False
-    gcs_seen_s: float | None = None
-    _battery_action: Action = Action.NONE
-    _radio_lost_s: float | None = None
-    _low_since_s: float | None = None
-    _critical_since_s: float | None = None
-    _lost_since_s: float | None = None
-    _crash_since_s: float | None = None
-    _weak_since_s: float | None = None
-    _next_check_s: float = 0.0
+    def __init__(self, state: VehicleState, modes: FlightModes) -> None:
+        self._state = state
+        self._modes = modes
+        self._gcs_seen_s: float | None = None
+        self._battery_action = Action.NONE
+        self._radio_lost_s: float | None = None
+        self._low_since_s: float | None = None
+        self._critical_since_s: float | None = None
+        self._lost_since_s: float | None = None
+        self._crash_since_s: float | None = None
+        self._weak_since_s: float | None = None
+        self._next_check_s = 0.0
 
-    @property
-    def any_active(self) -> bool:
-        """Whether any failsafe is active."""
-        return self.gcs or self.radio or self.battery or self.ekf
+    def heard_station(self) -> None:
+        """Note a heartbeat of the ground station that is watched for."""
+        self._gcs_seen_s = self._state.time_s
 
-    def step(self, v: Vehicle) -> None:
+    def step(self) -> None:
         """Check everything; called at each control step, works at 10 Hz."""
+        v = self._state
         if v.time_s < self._next_check_s:
             return
         self._next_check_s = v.time_s + CHECK_INTERVAL_S
@@ -77,7 +71,7 @@ class Failsafes:
         self._check_thrust(v)
         self._check_crash(v)
 
-    def _check_thrust(self, v: Vehicle) -> None:
+    def _check_thrust(self, v: VehicleState) -> None:
         """Warn when all thrust is asked for, in level flight, and the vehicle sinks all the same."""
         roll, pitch, _ = v.body.euler()
         level = math.hypot(roll - v.control.lean[0], pitch - v.control.lean[1]) < math.radians(CRASH_ANGLE_DEG)
@@ -91,7 +85,7 @@ class Failsafes:
             hardest = max(range(len(v.body.motors)), key=lambda at: v.control.wanted_n[at])
             v.say(Severity.EMERGENCY, f"Potential Thrust Loss ({hardest + 1})")
 
-    def _check_crash(self, v: Vehicle) -> None:
+    def _check_crash(self, v: VehicleState) -> None:
         roll, pitch, _ = v.body.euler()
         error_deg = math.degrees(math.hypot(roll - v.control.lean[0], pitch - v.control.lean[1]))
         fallen = v.body.crashed or (v.body.on_ground and error_deg > CRASH_ANGLE_DEG)
@@ -105,16 +99,16 @@ class Failsafes:
                 f"Crash: Disarming: AngErr={error_deg:.0f}>{CRASH_ANGLE_DEG:.0f}, Accel=0.0<3.0",
             )
             v.land_complete()
-            v.disarm("crash", force=True)
+            v.disarm(force=True)
 
-    def _check_gcs(self, v: Vehicle) -> None:
+    def _check_gcs(self, v: VehicleState) -> None:
         setting = int(v.params["FS_GCS_ENABLE"])
-        if setting == 0 or self.gcs_seen_s is None:
+        if setting == 0 or self._gcs_seen_s is None:
             return
-        silent = v.time_s - self.gcs_seen_s > max(v.params["FS_GCS_TIMEOUT"], 0.0)
-        if silent == self.gcs:
+        silent = v.time_s - self._gcs_seen_s > max(v.params["FS_GCS_TIMEOUT"], 0.0)
+        if silent == v.failsafes.gcs:
             return
-        self.gcs = silent
+        v.failsafes.gcs = silent
         if not silent:
             v.say(Severity.WARNING, "GCS Failsafe Cleared")
             return
@@ -127,16 +121,16 @@ class Failsafes:
         else:
             self._take_over(v, "GCS", GCS_ACTIONS.get(setting, Action.RTL))
 
-    def _check_radio(self, v: Vehicle) -> None:
+    def _check_radio(self, v: VehicleState) -> None:
         """The receiver is simulated: SIM_RC_FAIL silences it; a station that overrides the sticks replaces it."""
         setting = int(v.params["FS_THR_ENABLE"])
         silent = int(v.params["SIM_RC_FAIL"]) != 0 and not v.receiver.overridden
         self._radio_lost_s = (v.time_s if self._radio_lost_s is None else self._radio_lost_s) if silent else None
         lost = self._radio_lost_s is not None and v.time_s - self._radio_lost_s >= v.params["RC_FS_TIMEOUT"]
         lost = lost and setting != 0
-        if lost == self.radio:
+        if lost == v.failsafes.radio:
             return
-        self.radio = lost
+        v.failsafes.radio = lost
         if not lost:
             v.say(Severity.WARNING, "Radio Failsafe Cleared")
             return
@@ -149,29 +143,29 @@ class Failsafes:
         else:
             self._take_over(v, "Radio", RADIO_ACTIONS.get(setting, Action.LAND))
 
-    def _take_over(self, v: Vehicle, what: str, action: Action) -> None:
+    def _take_over(self, v: VehicleState, what: str, action: Action) -> None:
         """Say what happened and act, unless the vehicle is down, coming down, or disarmed."""
         options = Option(int(v.params["FS_OPTIONS"]) & 31)
         if not v.armed:
             self._announce(v, what)
         elif v.landed and not v.flying_wanted:
             self._announce(v, what, "Disarming")
-            v.disarm(f"{what} failsafe")
-        elif v.flight.landing and self.battery and self._battery_action in _LAND_ACTIONS:
+            v.disarm()
+        elif self._modes.flight.landing and v.failsafes.battery and self._battery_action in _LAND_ACTIONS:
             self._announce(v, f"{what} + Battery", "Continuing Landing")
-            act(v, Action.LAND)
-        elif v.flight.landing and Option.LANDING in options:
+            act(v, self._modes, Action.LAND)
+        elif self._modes.flight.landing and Option.LANDING in options:
             self._announce(v, what, "Continuing Landing")
-            act(v, Action.LAND)
+            act(v, self._modes, Action.LAND)
         else:
             self._announce(v, what)
-            act(v, action)
+            act(v, self._modes, action)
 
     @staticmethod
-    def _announce(v: Vehicle, what: str, done: str = "") -> None:
+    def _announce(v: VehicleState, what: str, done: str = "") -> None:
         v.say(Severity.WARNING, f"{what} Failsafe - {done}" if done else f"{what} Failsafe")
 
-    def _check_battery(self, v: Vehicle) -> None:
+    def _check_battery(self, v: VehicleState) -> None:
         if not v.armed:
             self._low_since_s = self._critical_since_s = None
             return
@@ -186,14 +180,14 @@ class Failsafes:
         low_now = self._low_since_s is not None and v.time_s - self._low_since_s > timer
         critical_now = critical_now or left < p["BATT_CRT_MAH"]
         low_now = low_now or left < p["BATT_LOW_MAH"]
-        if critical_now and not self.battery_critical:
-            self.battery = self.battery_critical = True
+        if critical_now and not v.failsafes.battery_critical:
+            v.failsafes.battery = v.failsafes.battery_critical = True
             self._battery_event(v, "critical", int(p["BATT_FS_CRT_ACT"]))
-        elif low_now and not self.battery:
-            self.battery = True
+        elif low_now and not v.failsafes.battery:
+            v.failsafes.battery = True
             self._battery_event(v, "low", int(p["BATT_FS_LOW_ACT"]))
 
-    def _battery_event(self, v: Vehicle, level: str, setting: int) -> None:
+    def _battery_event(self, v: VehicleState, level: str, setting: int) -> None:
         battery = v.battery
         v.say(
             Severity.WARNING,
@@ -201,39 +195,39 @@ class Failsafes:
         )
         action = Action(setting) if setting in set(Action) else Action.NONE
         self._battery_action = action
-        landing = v.flight.landing and Option.LANDING in Option(int(v.params["FS_OPTIONS"]) & 31)
+        landing = self._modes.flight.landing and Option.LANDING in Option(int(v.params["FS_OPTIONS"]) & 31)
         if v.landed and not v.flying_wanted:
             self._announce(v, "Battery", "Disarming")
-            v.disarm("battery failsafe")
+            v.disarm()
         elif landing and action is not Action.NONE:
             self._announce(v, "Battery", "Continuing Landing")
-            act(v, Action.LAND)
+            act(v, self._modes, Action.LAND)
         else:
             self._announce(v, "Battery")
-            act(v, action)
+            act(v, self._modes, action)
 
-    def _check_position(self, v: Vehicle) -> None:
+    def _check_position(self, v: VehicleState) -> None:
         if v.position_ok or v.origin is None:
-            if self.ekf:
-                self.ekf = False
+            if v.failsafes.ekf:
+                v.failsafes.ekf = False
                 v.say(Severity.CRITICAL, "EKF Failsafe Cleared")
             self._lost_since_s = None
             return
         self._lost_since_s = self._lost_since_s if self._lost_since_s is not None else v.time_s
-        if self.ekf or not v.armed or v.time_s - self._lost_since_s < POSITION_LOST_S:
+        if v.failsafes.ekf or not v.armed or v.time_s - self._lost_since_s < POSITION_LOST_S:
             return
-        self.ekf = True
+        v.failsafes.ekf = True
         v.say(Severity.CRITICAL, "EKF variance: position lost")
         setting = int(v.params["FS_EKF_ACTION"])
         if setting == EKF_REPORTS_ONLY or v.landed or v.mode is Mode.LAND:
             return
         if v.mode in (Mode.STABILIZE, Mode.ALT_HOLD) and setting != EKF_LANDS_ALWAYS:
             return
-        if setting != EKF_HOLDS_ALTITUDE or self.radio or not v.set_mode(Mode.ALT_HOLD):
-            act(v, Action.LAND)
+        if setting != EKF_HOLDS_ALTITUDE or v.failsafes.radio or not self._modes.change(Mode.ALT_HOLD):
+            act(v, self._modes, Action.LAND)
         v.say(Severity.CRITICAL, f"EKF Failsafe: changed to {v.mode.title} Mode")
 
-    def _check_fence(self, v: Vehicle) -> None:
+    def _check_fence(self, v: VehicleState) -> None:
         if not v.fence.enabled or v.home is None or v.origin is None:
             v.fence.breaches = Breach.NONE
             return
@@ -247,4 +241,4 @@ class Failsafes:
         action = FENCE_ACTIONS.get(int(v.params["FENCE_ACTION"]), Action.NONE)
         if action is not Action.NONE and v.mode is not Mode.LAND:
             far = v.fence.distance_m(v.est.north, v.est.east, v.altitude_m, v.home_xy) > FENCE_GIVE_UP_M
-            act(v, Action.LAND if far else action)
+            act(v, self._modes, Action.LAND if far else action)

@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import math
 from enum import Enum
-from typing import TYPE_CHECKING
 
 from fractus_vehicle.control import Axis
 from fractus_vehicle.flight import Flight
 from fractus_vehicle.settings import leg_speeds_mps
 from fractus_vehicle.shaping import clamp
-
-if TYPE_CHECKING:
-    from fractus_vehicle.vehicle import Vehicle
-
-# Below this speed the nose keeps its heading instead of following the course.
-COURSE_SPEED_MPS = 1.0
+from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
 
 class Task(Enum):
@@ -38,13 +32,13 @@ class GuidedFlight(Flight):
         self.paused = False
         self._resume: tuple[float, float, float] | None = None
 
-    def begin(self, v: Vehicle) -> None:
+    def begin(self, v: VehicleState) -> None:
         """Stop and wait for a target."""
         self.task = Task.IDLE
         v.control.hold_here()
-        v.yaw.follow_course()
+        v.heading.follow_course()
 
-    def use(self, v: Vehicle, controller: Task) -> None:
+    def use(self, v: VehicleState, controller: Task) -> None:
         """Begin with positions or velocities: ArduCopter starts that controller, with the parameters' speeds.
 
         A speed that was set before is forgotten; stopping keeps the controller, and with it the speed.
@@ -54,13 +48,13 @@ class GuidedFlight(Flight):
             limits = v.control.limits
             limits.speed_mps, limits.climb_mps, limits.sink_mps = leg_speeds_mps(v.params)
 
-    def take_off(self, v: Vehicle, down: float) -> None:
+    def take_off(self, v: VehicleState, down: float) -> None:
         """Climb straight up to `down` (local, metres)."""
         self._controller = Task.TAKEOFF
         self.task = Task.TAKEOFF
         v.begin_takeoff(down)
 
-    def go_to(self, v: Vehicle, north: float, east: float, down: float) -> None:
+    def go_to(self, v: VehicleState, north: float, east: float, down: float) -> None:
         """Fly to a local position."""
         self.use(v, Task.POSITION)
         self.task = Task.POSITION
@@ -69,7 +63,7 @@ class GuidedFlight(Flight):
 
     def fly(
         self,
-        v: Vehicle,
+        v: VehicleState,
         velocity: tuple[float, float, float],
         position: tuple[float, float, float] | None = None,
     ) -> None:
@@ -86,22 +80,22 @@ class GuidedFlight(Flight):
             control.target_velocity = velocity[:2]
             control.target_vd = velocity[2]
 
-    def lean(self, v: Vehicle, roll: float, pitch: float, yaw: float | None, climb_mps: float) -> None:
+    def lean(self, v: VehicleState, roll: float, pitch: float, yaw: float | None, climb_mps: float) -> None:
         """Hold an attitude with a climb rate, until GUID_TIMEOUT."""
         self._controller = self.task = Task.ATTITUDE
         self.updated_s = v.time_s
         v.control.horizontal = Axis.ATTITUDE
         v.control.attitude = (roll, pitch)
         if yaw is not None:
-            v.yaw.hold(yaw)
+            v.heading.hold()
         v.control.climb(-climb_mps)
 
-    def stop(self, v: Vehicle) -> None:
+    def stop(self, v: VehicleState) -> None:
         """Stop and hold."""
         self.task = Task.POSITION
         v.control.hold_here()
 
-    def pause(self, v: Vehicle, *, paused: bool) -> None:
+    def pause(self, v: VehicleState, *, paused: bool) -> None:
         """DO_PAUSE_CONTINUE: stop where it is; continuing goes to the last target."""
         if paused and not self.paused:
             self._resume = (*v.control.target, v.control.target_down) if self.task is Task.POSITION else None
@@ -110,7 +104,7 @@ class GuidedFlight(Flight):
             self.go_to(v, *self._resume)
         self.paused = paused
 
-    def step(self, v: Vehicle, dt: float) -> None:
+    def step(self, v: VehicleState) -> None:
         """Follow the target; stop when it is too old."""
         if self.task is Task.TAKEOFF:
             if v.takeoff_done():
@@ -124,54 +118,13 @@ class GuidedFlight(Flight):
             elif v.control.horizontal is Axis.POSITION and self.task is Task.VELOCITY:
                 vn, ve = v.control.target_velocity
                 north, east = v.control.target
-                v.control.target = (north + vn * dt, east + ve * dt)
-                v.control.target_down += v.control.target_vd * dt
-        v.yaw.step(v, dt)
+                v.control.target = (north + vn * CONTROL_STEP_S, east + ve * CONTROL_STEP_S)
+                v.control.target_down += v.control.target_vd * CONTROL_STEP_S
+        v.heading.step(v.est)
 
 
-def _limited(v: Vehicle, velocity: tuple[float, float, float]) -> tuple[float, float, float]:
+def _limited(v: VehicleState, velocity: tuple[float, float, float]) -> tuple[float, float, float]:
     limits = v.control.limits
     size = math.hypot(velocity[0], velocity[1])
     scale = limits.speed_mps / size if size > limits.speed_mps else 1.0
     return (velocity[0] * scale, velocity[1] * scale, clamp(velocity[2], -limits.climb_mps, limits.sink_mps))
-
-
-class Heading:
-    """Where the nose points in automatic flight: along the course, at an angle, at a rate, or at a place."""
-
-    def __init__(self) -> None:
-        self._roi: tuple[float, float] | None = None
-        self._fixed = False
-
-    def follow_course(self) -> None:
-        """The default of WP_YAW_BEHAVIOR."""
-        self._roi = None
-        self._fixed = False
-
-    def hold(self, _yaw_rad: float) -> None:
-        """Keep the heading that was set in the controller."""
-        self._roi = None
-        self._fixed = True
-
-    def look_at(self, point: tuple[float, float] | None) -> None:
-        """Keep the nose on a local point; None ends it."""
-        self._roi = point
-        self._fixed = False
-
-    @property
-    def is_default(self) -> bool:
-        """Whether the default behaviour is in charge."""
-        return self._roi is None and not self._fixed
-
-    def step(self, v: Vehicle, _dt: float) -> None:
-        """Set the controller's heading target."""
-        control = v.control
-        if self._roi is not None:
-            dn, de = self._roi[0] - v.est.north, self._roi[1] - v.est.east
-            if math.hypot(dn, de) > 1.0:
-                control.target_yaw = math.atan2(de, dn)
-        elif not self._fixed and int(v.params["WP_YAW_BEHAVIOR"]) in (1, 2, 3):
-            speed = math.hypot(control.vel[0], control.vel[1])
-            far = math.hypot(control.target[0] - control.pos[0], control.target[1] - control.pos[1]) > 2.0
-            if speed > COURSE_SPEED_MPS and (far or control.horizontal is Axis.VELOCITY):
-                control.target_yaw = math.atan2(control.vel[1], control.vel[0])

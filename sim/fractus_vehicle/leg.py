@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from fractus_vehicle.shaping import clamp
-
-if TYPE_CHECKING:
-    from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.state import VehicleState
 
 # Shorter ways over ground are climbs.
 UPRIGHT_M = 0.5
@@ -19,7 +16,7 @@ LINE_GAIN = 1.0
 class Leg:
     """From where the trajectory is to a local point; made when the leg begins, and stepped until it is left."""
 
-    def __init__(self, v: Vehicle, north: float, east: float, down: float) -> None:
+    def __init__(self, v: VehicleState, north: float, east: float, down: float) -> None:
         control = v.control
         self.end = (north, east, down)
         self._start = (control.pos[0], control.pos[1], control.pos[2])
@@ -35,7 +32,7 @@ class Leg:
         if self._slope:
             control.speed_cap_mps = vertical / abs(self._slope)
 
-    def step(self, v: Vehicle) -> None:
+    def step(self, v: VehicleState) -> None:
         """Let the altitude follow the line."""
         if not self._slope:
             return
@@ -49,6 +46,6 @@ class Leg:
         keep_up = self._slope * (vel[0] * self._along[0] + vel[1] * self._along[1])
         control.climb(clamp(keep_up + LINE_GAIN * (on_line - pos[2]), -limits.climb_mps, limits.sink_mps))
 
-    def reached(self, v: Vehicle, radius_m: float) -> bool:
+    def reached(self, v: VehicleState, radius_m: float) -> bool:
         """Whether the vehicle is within a radius of the end."""
         return math.dist((v.est.north, v.est.east, v.est.down), self.end) <= radius_m

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from fractus_vehicle.control import Axis
 from fractus_vehicle.mav import (
     Mode,
 )
-from fractus_vehicle.reporting import UNKNOWN_U16, Values, boot_ms, boot_us, centi
-
-if TYPE_CHECKING:
-    from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.report_units import UNKNOWN_U16, Values, boot_ms, boot_us, centi
+from fractus_vehicle.state import VehicleState
 
 
-def global_position_int(v: Vehicle) -> Values:
+def global_position_int(v: VehicleState) -> Values:
     """GLOBAL_POSITION_INT: the estimate; zeros until there is one."""
     e = v.est
     if v.origin is None:
@@ -35,7 +32,7 @@ def global_position_int(v: Vehicle) -> Values:
     }
 
 
-def local_position_ned(v: Vehicle) -> Values | None:
+def local_position_ned(v: VehicleState) -> Values | None:
     """LOCAL_POSITION_NED, from the estimator's origin."""
     if v.origin is None:
         return None
@@ -43,7 +40,7 @@ def local_position_ned(v: Vehicle) -> Values | None:
     return {"time_boot_ms": boot_ms(v), "x": e.north, "y": e.east, "z": e.down, "vx": e.vn, "vy": e.ve, "vz": e.vd}
 
 
-def attitude(v: Vehicle) -> Values:
+def attitude(v: VehicleState) -> Values:
     """ATTITUDE."""
     e = v.est
     return {
@@ -57,7 +54,7 @@ def attitude(v: Vehicle) -> Values:
     }
 
 
-def attitude_quaternion(v: Vehicle) -> Values:
+def attitude_quaternion(v: VehicleState) -> Values:
     """ATTITUDE_QUATERNION."""
     w, x, y, z = v.est.quaternion
     e = v.est
@@ -73,7 +70,7 @@ def attitude_quaternion(v: Vehicle) -> Values:
     }
 
 
-def attitude_target(v: Vehicle) -> Values:
+def attitude_target(v: VehicleState) -> Values:
     """ATTITUDE_TARGET."""
     roll, pitch = v.control.lean
     yaw = v.control.yaw_setpoint
@@ -89,7 +86,7 @@ def attitude_target(v: Vehicle) -> Values:
     return {"time_boot_ms": boot_ms(v), "type_mask": 0, "q": q, "thrust": v.control.thrust_share}
 
 
-def vfr_hud(v: Vehicle) -> Values:
+def vfr_hud(v: VehicleState) -> Values:
     """VFR_HUD; `alt` is above mean sea level."""
     e = v.est
     speed = math.hypot(e.vn, e.ve)
@@ -103,7 +100,7 @@ def vfr_hud(v: Vehicle) -> Values:
     }
 
 
-def nav_controller_output(v: Vehicle) -> Values:
+def nav_controller_output(v: VehicleState) -> Values:
     """NAV_CONTROLLER_OUTPUT."""
     c = v.control
     dn, de = c.target[0] - v.est.north, c.target[1] - v.est.east
@@ -119,7 +116,7 @@ def nav_controller_output(v: Vehicle) -> Values:
     }
 
 
-def position_target_global_int(v: Vehicle) -> Values | None:
+def position_target_global_int(v: VehicleState) -> Values | None:
     """POSITION_TARGET_GLOBAL_INT while a guided or automatic flight has a target."""
     if v.origin is None or v.mode not in (Mode.GUIDED, Mode.AUTO, Mode.RTL, Mode.SMART_RTL) or v.landed:
         return None
@@ -139,7 +136,7 @@ def position_target_global_int(v: Vehicle) -> Values | None:
     }
 
 
-def position_target_local_ned(v: Vehicle) -> Values | None:
+def position_target_local_ned(v: VehicleState) -> Values | None:
     """POSITION_TARGET_LOCAL_NED while in GUIDED."""
     if v.origin is None or v.mode is not Mode.GUIDED or v.landed:
         return None
@@ -158,7 +155,7 @@ def position_target_local_ned(v: Vehicle) -> Values | None:
     }
 
 
-def home_position(v: Vehicle) -> Values | None:
+def home_position(v: VehicleState) -> Values | None:
     """HOME_POSITION; None until home is known."""
     if v.home is None or v.origin is None:
         return None
@@ -175,7 +172,7 @@ def home_position(v: Vehicle) -> Values | None:
     }
 
 
-def gps_global_origin(v: Vehicle) -> Values | None:
+def gps_global_origin(v: VehicleState) -> Values | None:
     """GPS_GLOBAL_ORIGIN: where the local frame begins."""
     if v.origin is None:
         return None
@@ -187,7 +184,7 @@ def gps_global_origin(v: Vehicle) -> Values | None:
     }
 
 
-def altitude(v: Vehicle) -> Values:
+def altitude(v: VehicleState) -> Values:
     """ALTITUDE."""
     place = v.place
     home = v.home.alt_m if v.home is not None else v.start.alt_m
@@ -203,7 +200,7 @@ def altitude(v: Vehicle) -> Values:
     }
 
 
-def terrain_report(v: Vehicle) -> Values | None:
+def terrain_report(v: VehicleState) -> Values | None:
     """TERRAIN_REPORT: the ground is flat, at the start's altitude, unless TERRAIN_ENABLE says that it is unknown."""
     if not int(v.params["TERRAIN_ENABLE"]):
         return None
@@ -218,7 +215,7 @@ def terrain_report(v: Vehicle) -> Values | None:
     }
 
 
-def ahrs2(v: Vehicle) -> Values:
+def ahrs2(v: VehicleState) -> Values:
     """AHRS2: the secondary estimate."""
     e = v.est
     place = v.place
@@ -232,7 +229,7 @@ def ahrs2(v: Vehicle) -> Values:
     }
 
 
-def simstate(v: Vehicle) -> Values:
+def simstate(v: VehicleState) -> Values:
     """SIMSTATE: the truth behind the estimate."""
     roll, pitch, yaw = v.body.euler()
     fn, fe, fd = v.body.specific_force

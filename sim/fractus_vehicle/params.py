@@ -86,13 +86,13 @@ def _stored(path: Path) -> Iterator[tuple[str, float]]:
             raise ParameterValueError(f"{path}, line {number}: expected NAME,VALUE") from error
 
 
-class Parameters:
-    """Current values; `changed` is called with the name after each change."""
+class Parameters(Mapping[str, float]):
+    """Current values by name."""
 
     def __init__(self, overrides: Mapping[str, float] | None = None, store: Path | None = None) -> None:
         self._values = {parameter.name: parameter.coerce(parameter.default) for parameter in table()}
         self._store = store
-        self.changed: Callable[[str], None] = lambda _name: None
+        self._watchers: list[Callable[[str], None]] = []
         if store is not None and store.exists():
             for stored, value in _stored(store):
                 if stored in self._values:
@@ -109,6 +109,10 @@ class Parameters:
     def __iter__(self) -> Iterator[str]:
         return iter(self._values)
 
+    def watch(self, watcher: Callable[[str], None]) -> None:
+        """Call `watcher` with the name after each change."""
+        self._watchers.append(watcher)
+
     def assign(self, name: str, value: float) -> float:
         """Set a parameter as its owner does (also read-only ones) and return the stored value.
 
@@ -121,7 +125,8 @@ class Parameters:
         if index is None:
             raise UnknownParameterError(name)
         self._values[name] = table()[index].coerce(value)
-        self.changed(name)
+        for watcher in self._watchers:
+            watcher(name)
         return self._values[name]
 
     def set(self, name: str, value: float) -> bool:

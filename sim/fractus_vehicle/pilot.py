@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from fractus_mavlink import Endpoint, Message, Value
 
 from fractus_vehicle.mav import Command, Mode, ModeFlag, Result
+from fractus_vehicle.readiness import arming_refusal
 from fractus_vehicle.simulation import Craft, Simulation
 
 HEARTBEAT_INTERVAL_S = 1.0
@@ -120,15 +121,15 @@ class Pilot:
         Raises:
             PilotTimeoutError: a step was refused or took too long.
         """
-        vehicle = self.craft.vehicle
+        v = self.craft.vehicle.state
         if self.mode(Mode.GUIDED) is not Result.ACCEPTED:
             raise PilotTimeoutError("GUIDED was refused")
-        self.wait(lambda: vehicle.arming_refusal() is None, timeout_s)
+        self.wait(lambda: arming_refusal(v) is None, timeout_s)
         if self.command(Command.COMPONENT_ARM_DISARM, 1.0) is not Result.ACCEPTED:
             raise PilotTimeoutError(f"arming was refused: {self.texts[-1:]}")
         if self.command(Command.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m) is not Result.ACCEPTED:
             raise PilotTimeoutError("takeoff was refused")
-        return self.wait(lambda: vehicle.altitude_m > 0.95 * altitude_m, timeout_s)
+        return self.wait(lambda: v.altitude_m > 0.95 * altitude_m, timeout_s)
 
     def go_to(self, north_m: float, east_m: float, altitude_m: float) -> None:
         """Send a position target in the local frame."""

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from fractus_vehicle.mav import Mode
+from fractus_vehicle.state import VehicleState
 
-if TYPE_CHECKING:
-    from fractus_vehicle.vehicle import Vehicle
+# The modes that fly without knowing where they are.
+WITHOUT_POSITION = frozenset({Mode.STABILIZE, Mode.ALT_HOLD, Mode.LAND})
 
 
-def arming_refusal(v: Vehicle, *, needs_position: bool) -> str | None:
-    """The first check that fails, or None."""
+def arming_refusal(v: VehicleState) -> str | None:
+    """Why the vehicle would not arm now: the first check that fails, or None."""
     volts, failsafes, params = v.battery.voltage_v, v.failsafes, v.params
+    needs_position = v.mode not in WITHOUT_POSITION
     checks = (
         (not v.estimator.healthy, "AHRS: EKF3 not healthy"),
         (needs_position and v.gps.fix_type < 3, "GPS 1: Bad fix"),

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+
+from fractus_mavlink import Value
 
 from fractus_vehicle import noise
 from fractus_vehicle.body import GRAVITY
-from fractus_vehicle.reporting import UNKNOWN_U16, Values, boot_ms, boot_us, centi, milli
+from fractus_vehicle.report_units import UNKNOWN_U16, Values, boot_ms, boot_us, centi, milli
 from fractus_vehicle.shaping import clamp
-
-if TYPE_CHECKING:
-    from fractus_mavlink import Value
-
-    from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.state import VehicleState
 
 _BARO_AXIS = 16
 
 
-def gps_raw_int(v: Vehicle) -> Values:
+def gps_raw_int(v: VehicleState) -> Values:
     """GPS_RAW_INT: the receiver's own fix, with its noise."""
     g = v.gps
     if g.fix_type < 2 or g.place is None:
@@ -46,7 +43,7 @@ def gps_raw_int(v: Vehicle) -> Values:
     }
 
 
-def _imu(v: Vehicle) -> dict[str, Value]:
+def _imu(v: VehicleState) -> dict[str, Value]:
     w, x, y, z = v.body.quaternion
     fn, fe, fd = v.body.specific_force
     # World to body.
@@ -73,17 +70,17 @@ def _imu(v: Vehicle) -> dict[str, Value]:
     }
 
 
-def raw_imu(v: Vehicle) -> Values:
+def raw_imu(v: VehicleState) -> Values:
     """RAW_IMU."""
     return {"time_usec": boot_us(v), **_imu(v)}
 
 
-def scaled_imu2(v: Vehicle) -> Values:
+def scaled_imu2(v: VehicleState) -> Values:
     """SCALED_IMU2."""
     return {"time_boot_ms": boot_ms(v), **_imu(v)}
 
 
-def scaled_pressure(v: Vehicle) -> Values:
+def scaled_pressure(v: VehicleState) -> Values:
     """SCALED_PRESSURE from the standard atmosphere."""
     altitude = v.true_altitude_amsl_m
     altitude += max(v.params["SIM_BARO_RND"], 0.0) * noise.gaussian(v.noise_seed, v.ticks, _BARO_AXIS)
@@ -94,7 +91,7 @@ def scaled_pressure(v: Vehicle) -> Values:
     }
 
 
-def servo_output_raw(v: Vehicle) -> Values:
+def servo_output_raw(v: VehicleState) -> Values:
     """SERVO_OUTPUT_RAW: motor 1 to 4."""
     full = v.body.airframe.full_thrust_n
     values: dict[str, Value] = {"time_usec": boot_us(v) & 0xFFFFFFFF, "port": 0}
@@ -103,7 +100,7 @@ def servo_output_raw(v: Vehicle) -> Values:
     return values
 
 
-def rc_channels(v: Vehicle) -> Values:
+def rc_channels(v: VehicleState) -> Values:
     """RC_CHANNELS: the sticks."""
     values: dict[str, Value] = {"time_boot_ms": boot_ms(v), "chancount": 16, "rssi": 255}
     for at, pwm in enumerate(v.sticks, start=1):
@@ -111,23 +108,23 @@ def rc_channels(v: Vehicle) -> Values:
     return values
 
 
-def ahrs(_v: Vehicle) -> Values:
+def ahrs(_v: VehicleState) -> Values:
     """AHRS."""
     return {"error_rp": 0.002, "error_yaw": 0.002}
 
 
-def wind(v: Vehicle) -> Values:
+def wind(v: VehicleState) -> Values:
     """WIND: direction it comes from, speed."""
     return {"direction": (v.wind.from_deg + 180.0) % 360.0 - 180.0, "speed": v.wind.speed_mps, "speed_z": 0.0}
 
 
-def vibration(v: Vehicle) -> Values:
+def vibration(v: VehicleState) -> Values:
     """VIBRATION."""
     level = 3.0 * v.control.thrust_share if v.armed and not v.landed else 0.002
     return {"time_usec": boot_us(v), "vibration_x": level, "vibration_y": level, "vibration_z": 1.5 * level}
 
 
-def esc_telemetry(v: Vehicle) -> Values:
+def esc_telemetry(v: VehicleState) -> Values:
     """ESC_TELEMETRY_1_TO_4."""
     full = v.body.airframe.full_thrust_n
     volts = round(v.battery.voltage_v * 100.0)
@@ -143,7 +140,7 @@ def esc_telemetry(v: Vehicle) -> Values:
     }
 
 
-def battery_status(v: Vehicle) -> Values:
+def battery_status(v: VehicleState) -> Values:
     """BATTERY_STATUS of the one battery."""
     cells = (round(v.battery.voltage_v * 1000.0),) + (UNKNOWN_U16,) * 9
     return {
@@ -161,7 +158,7 @@ def battery_status(v: Vehicle) -> Values:
     }
 
 
-def ekf_status_report(v: Vehicle) -> Values:
+def ekf_status_report(v: VehicleState) -> Values:
     """EKF_STATUS_REPORT."""
     return {
         "flags": v.estimator.flags,

@@ -11,8 +11,10 @@ from fractus_mavlink import Message, Signing
 
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.dispatch import dispatch
+from fractus_vehicle.plans import restore
+from fractus_vehicle.state import CONTROL_STEP_S, VehicleConfig
 from fractus_vehicle.streams import ALL_GROUPS, GROUPS
-from fractus_vehicle.vehicle import CONTROL_STEP_S, Vehicle, VehicleConfig
+from fractus_vehicle.vehicle import Vehicle
 
 # Never passed on from one link to another: they speak about the link itself.
 _LINK_LOCAL = frozenset({"RADIO_STATUS", "RADIO", "SETUP_SIGNING"})
@@ -31,14 +33,14 @@ class Craft:
         channel = Channel(self.config.sysid, name=name, port=port)
         key = self.vehicle.signing_key
         if key is not None:
-            channel.signing = Signing(key, signing_clock(self.vehicle.unix_us))
-        self.vehicle.voice.attach(channel)
+            channel.signing = Signing(key, signing_clock(self.vehicle.state.unix_us))
+        self.vehicle.attach(channel)
         return channel
 
     def close(self, channel: Channel) -> None:
         """Close a link."""
-        if channel in self.vehicle.channels:
-            self.vehicle.voice.detach(channel)
+        if channel in self.vehicle.state.channels:
+            self.vehicle.detach(channel)
 
     def receive(self, channel: Channel, data: bytes) -> None:
         """Take bytes that arrived on a link."""
@@ -50,13 +52,13 @@ class Craft:
 
     def _route(self, source: Channel, message: Message) -> None:
         """Pass a message on to the links where its target was heard, as ArduPilot does."""
-        if len(self.vehicle.channels) < 2 or message.name in _LINK_LOCAL or message.sysid == self.config.sysid:
+        if len(self.vehicle.state.channels) < 2 or message.name in _LINK_LOCAL or message.sysid == self.config.sysid:
             return
         system = message.integer("target_system") if message.has("target_system") else 0
         component = message.integer("target_component") if message.has("target_component") else 0
-        if system == self.config.sysid and component in (0, self.vehicle.compid):
+        if system == self.config.sysid and component in (0, self.vehicle.state.compid):
             return
-        for channel in self.vehicle.channels:
+        for channel in self.vehicle.state.channels:
             if channel is not source and (
                 any(system in (0, peer) and component in (0, part) for peer, part in channel.peers)
             ):
@@ -64,36 +66,34 @@ class Craft:
 
     def step(self) -> None:
         """Advance by one control step."""
-        vehicle = self.vehicle
-        vehicle.step()
-        if vehicle.reboot_wanted:
+        self.vehicle.step()
+        if self.vehicle.reboot_wanted:
             self._reboot()
 
     def _reboot(self) -> None:
-        """Start anew where the vehicle stands, with what a real one keeps: parameters, plans and the signing key."""
-        old = self.vehicle
+        """Restart where the vehicle stands, with what a real one keeps: parameters, plans and the signing key."""
+        old, key = self.vehicle.state, self.vehicle.signing_key
         place = replace(old.true_place, alt_m=self.config.start.alt_m)
         heading_deg = math.degrees(old.body.euler()[2]) % 360.0
         self.vehicle = Vehicle(
             replace(self.config, start=place, heading_deg=heading_deg, parameters=old.params.changes())
         )
-        self.vehicle.signing_key = old.signing_key
-        self.vehicle.plans.restore(old.plans)
+        self.vehicle.signing_key = key
+        restore(self.vehicle.state, old)
         for channel in old.channels:
             channel.streams.clear()
             channel.parameters.clear()
-            self.vehicle.voice.attach(channel)
+            self.vehicle.attach(channel)
 
     def _log(self, frame: bytes) -> None:
         if self._recorder is not None:
-            self._recorder.write(struct.pack(">Q", self.vehicle.unix_us) + frame)
+            self._recorder.write(struct.pack(">Q", self.vehicle.state.unix_us) + frame)
 
     def record(self, file: BinaryIO, rate_hz: float = 4.0) -> None:
         """Write a tlog: what the vehicle says on a link of its own, with every stream at `rate_hz`, and all it is told."""
-        vehicle = self.vehicle
         self._recorder = file
         channel = Channel(self.config.sysid, name="recorder", tap=self._log, discard=True)
-        vehicle.voice.attach(channel)
+        self.vehicle.attach(channel)
         for group in ALL_GROUPS:
             for name in GROUPS[group][1]:
                 channel.set_interval(name, 1.0 / rate_hz)
@@ -125,7 +125,11 @@ class Simulation:
     def quiet_steps(self, most: int) -> int:
         """Steps until the next one that has something to say on a link, from 1 to `most`; texts are not foreseen."""
         quiet_s = min(
-            (channel.speaks_s - craft.vehicle.time_s for craft in self.crafts for channel in craft.vehicle.channels),
+            (
+                channel.speaks_s - craft.vehicle.state.time_s
+                for craft in self.crafts
+                for channel in craft.vehicle.state.channels
+            ),
             default=math.inf,
         )
         return math.ceil(min(max(quiet_s / CONTROL_STEP_S - 1e-3, 1.0), most))

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from fractus_vehicle.breadcrumbs import Point
 from fractus_vehicle.control import Axis
 from fractus_vehicle.shaping import BRAKING_SHARE, shape_velocity
-
-if TYPE_CHECKING:
-    from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
 _SAMPLES = 64
 _SLOWEST_MPS = 0.3
@@ -21,7 +18,7 @@ AT_REST = 0.1
 class SplineLeg:
     """From where the trajectory is to a local point, along a curve that leaves and arrives in given directions."""
 
-    def __init__(self, v: Vehicle, end: Point, leave: Point, arrive: Point) -> None:
+    def __init__(self, v: VehicleState, end: Point, leave: Point, arrive: Point) -> None:
         pos, vel = v.control.pos, v.control.vel
         self.end = end
         self._stops = not any(arrive)
@@ -40,7 +37,7 @@ class SplineLeg:
         self._accel_mps2 = 0.0
         self._allowed_mps = self._profile(v)
 
-    def _profile(self, v: Vehicle) -> list[float]:
+    def _profile(self, v: VehicleState) -> list[float]:
         """The greatest speed at each sample of the curve, so that bends, climbs and the end can be braked for."""
         allowed = [self._local_limit(v, step / _SAMPLES) for step in range(_SAMPLES + 1)]
         allowed[-1] = 0.0 if self._stops else allowed[-1]
@@ -60,7 +57,7 @@ class SplineLeg:
         ddx, ddy, ddz = (6.0 * d * share + 2.0 * c for _, _, c, d in self._curve)
         return (dx, dy, dz), (ddx, ddy, ddz)
 
-    def _local_limit(self, v: Vehicle, share: float) -> float:
+    def _local_limit(self, v: VehicleState, share: float) -> float:
         limits, (slope, bend) = v.control.limits, self._slopes(share)
         size, level = max(math.hypot(*slope), 1e-6), max(math.hypot(slope[0], slope[1]), 1e-6)
         wanted = limits.speed_mps * size / level
@@ -69,9 +66,9 @@ class SplineLeg:
         curvature = abs(slope[0] * bend[1] - slope[1] * bend[0]) / level**3
         return min(wanted, math.sqrt(limits.accel_mps2 / curvature)) if curvature > 1e-6 else wanted
 
-    def step(self, v: Vehicle) -> None:
+    def step(self, v: VehicleState) -> None:
         """Move the trajectory along the curve."""
-        control, dt = v.control, v.control_step_s
+        control, dt = v.control, CONTROL_STEP_S
         if self._share >= 1.0:
             if control.horizontal is Axis.PATH:
                 if self._stops:
@@ -111,7 +108,7 @@ class SplineLeg:
             (bend[2] - along * slope[2]) * pace2 + push * slope[2],
         )
 
-    def reached(self, v: Vehicle, radius_m: float) -> bool:
+    def reached(self, v: VehicleState, radius_m: float) -> bool:
         """Whether the curve is flown."""
         here = (v.est.north, v.est.east, v.est.down)
         return self._share >= 1.0 and (not self._stops or math.dist(here, self.end) <= radius_m)

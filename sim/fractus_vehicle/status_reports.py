@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from fractus_vehicle.mav import (
     AUTOPILOT_ARDUPILOTMEGA,
     CAPABILITIES,
@@ -13,11 +11,10 @@ from fractus_vehicle.mav import (
     ModeFlag,
     State,
 )
-from fractus_vehicle.reporting import UNKNOWN_U16, Values, boot_ms
+from fractus_vehicle.readiness import arming_refusal
+from fractus_vehicle.report_units import UNKNOWN_U16, Values, boot_ms
 from fractus_vehicle.shaping import clamp
-
-if TYPE_CHECKING:
-    from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.state import VehicleState
 
 _PREARM_CHECK = 0x10000000
 _SENSORS_PRESENT = 0x5320FC2F  # gyro, accel, mag, baro, GPS, controllers, motors, AHRS, logging, battery, pre-arm
@@ -29,7 +26,7 @@ _MOTOR_OUTPUTS = 0x8000
 _POSITION_CONTROLS = 0x6000
 
 
-def heartbeat(v: Vehicle) -> Values:
+def heartbeat(v: VehicleState) -> Values:
     """HEARTBEAT as ArduCopter fills it."""
     flags = ModeFlag.CUSTOM
     if v.mode not in (Mode.STABILIZE,):
@@ -38,7 +35,7 @@ def heartbeat(v: Vehicle) -> Values:
     if v.armed:
         flags |= ModeFlag.SAFETY_ARMED
     state = State.STANDBY if v.landed else State.ACTIVE
-    if v.failsafes.any_active:
+    if v.failsafes.any:
         state = State.CRITICAL
     return {
         "type": TYPE_QUADROTOR,
@@ -50,7 +47,7 @@ def heartbeat(v: Vehicle) -> Values:
     }
 
 
-def sys_status(v: Vehicle) -> Values:
+def sys_status(v: VehicleState) -> Values:
     """SYS_STATUS with the health bits that clients look at."""
     enabled = _SENSORS_PRESENT & ~(_SENSOR_FENCE | _MOTOR_OUTPUTS | _POSITION_CONTROLS)
     if v.armed:
@@ -71,7 +68,7 @@ def sys_status(v: Vehicle) -> Values:
         healthy &= ~_SENSOR_BATTERY
     if v.fence.breaches:
         healthy &= ~_SENSOR_FENCE
-    if v.arming_refusal() is not None:
+    if arming_refusal(v) is not None:
         healthy &= ~_PREARM_CHECK
     return {
         "onboard_control_sensors_present": present,
@@ -86,12 +83,12 @@ def sys_status(v: Vehicle) -> Values:
     }
 
 
-def extended_sys_state(v: Vehicle) -> Values:
+def extended_sys_state(v: VehicleState) -> Values:
     """EXTENDED_SYS_STATE."""
     return {"vtol_state": 0, "landed_state": int(v.landed_state)}
 
 
-def autopilot_version(v: Vehicle) -> Values:
+def autopilot_version(v: VehicleState) -> Values:
     """AUTOPILOT_VERSION."""
     return {
         "capabilities": CAPABILITIES,
@@ -104,28 +101,28 @@ def autopilot_version(v: Vehicle) -> Values:
     }
 
 
-def mission_current(v: Vehicle) -> Values:
+def mission_current(v: VehicleState) -> Values:
     """MISSION_CURRENT."""
     total = max(0, len(v.mission.items) - 1)
     return {
         "seq": v.mission.current,
         "total": total if total else UNKNOWN_U16,
-        "mission_state": v.mission_state(),
+        "mission_state": v.mission.state(v.mode),
         "mission_mode": 1 if v.mode is Mode.AUTO else 2,
     }
 
 
-def power_status(_v: Vehicle) -> Values:
+def power_status(_v: VehicleState) -> Values:
     """POWER_STATUS."""
     return {"Vcc": 5000, "Vservo": 0, "flags": 0}
 
 
-def meminfo(_v: Vehicle) -> Values:
+def meminfo(_v: VehicleState) -> Values:
     """MEMINFO."""
     return {"brkval": 0, "freemem": UNKNOWN_U16, "freemem32": 131072}
 
 
-def fence_status(v: Vehicle) -> Values | None:
+def fence_status(v: VehicleState) -> Values | None:
     """FENCE_STATUS, while a fence is enabled."""
     if not v.fence.enabled:
         return None
@@ -137,6 +134,6 @@ def fence_status(v: Vehicle) -> Values | None:
     }
 
 
-def system_time(v: Vehicle) -> Values:
+def system_time(v: VehicleState) -> Values:
     """SYSTEM_TIME."""
     return {"time_unix_usec": v.unix_us, "time_boot_ms": boot_ms(v)}

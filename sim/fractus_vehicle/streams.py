@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fractus_vehicle import motion_reports, sensor_reports, status_reports
-from fractus_vehicle.reporting import Builder
+from fractus_vehicle.report_units import Builder
 
 BUILDERS: dict[str, Builder] = {
     "HEARTBEAT": status_reports.heartbeat,

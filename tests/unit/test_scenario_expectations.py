@@ -67,7 +67,7 @@ def test_logs_are_read_on_the_clock_of_the_autopilot(tmp_path: Path):
     path = tmp_path / "drone.tlog"
     with path.open("wb") as file:
         pilot.craft.record(file)
-        pilot.craft.vehicle.channels[-1].set_interval("EXTENDED_SYS_STATE", 0.5)
+        pilot.craft.vehicle.state.channels[-1].set_interval("EXTENDED_SYS_STATE", 0.5)
         pilot.take_off(8.0)
         pilot.go_to(10.0, 0.0, 8.0)
         pilot.fly_on(8.0)

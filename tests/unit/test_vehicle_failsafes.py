@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from fractus_vehicle.mav import Command, Mode, Result
 from fractus_vehicle.pilot import Pilot
-from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.state import VehicleState
 from vehicle_world import START, airborne, alone, distance_m, upload
 
 
@@ -191,7 +191,7 @@ def test_bad_fences_are_refused_and_the_old_one_stays(items: list[dict[str, floa
     shapes = vehicle.fence.shapes
     assert upload(pilot, 1, [{"frame": 0, "x": START.lat_e7, "y": START.lon_e7} | item for item in items]) != 0
     assert vehicle.fence.shapes == shapes
-    assert len(vehicle.plans.fence.items) == 4
+    assert len(vehicle.fence_items.items) == 4
 
 
 def test_failed_motor_brings_it_down():
@@ -202,6 +202,6 @@ def test_failed_motor_brings_it_down():
     assert _crashed(vehicle, pilot)
 
 
-def _crashed(vehicle: Vehicle, pilot: Pilot) -> bool:
+def _crashed(vehicle: VehicleState, pilot: Pilot) -> bool:
     pilot.wait(lambda: not vehicle.armed, 10.0)
     return any(text.startswith("Crash: Disarming") for text in pilot.texts)

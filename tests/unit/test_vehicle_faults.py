@@ -7,7 +7,8 @@ import math
 import pytest
 from fractus_vehicle.mav import Command, Mode, Result, Severity
 from fractus_vehicle.pilot import Pilot
-from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.readiness import arming_refusal
+from fractus_vehicle.state import VehicleState
 from vehicle_world import START, airborne, alone, distance_m, upload
 
 HOME = {"command": 16, "frame": 0, "x": START.lat_e7, "y": START.lon_e7, "z": 150.0}
@@ -24,7 +25,7 @@ def _waypoint(north_m: float, altitude_m: float = 10.0) -> dict[str, float]:
     return {"command": 16, "frame": 3, "x": place.lat_e7, "y": place.lon_e7, "z": altitude_m}
 
 
-def _in_mission(**parameters: float) -> tuple[Vehicle, Pilot]:
+def _in_mission(**parameters: float) -> tuple[VehicleState, Pilot]:
     vehicle, pilot = airborne(10.0, **parameters)
     assert upload(pilot, 0, [HOME, _waypoint(150.0), _waypoint(0.0)]) == 0
     assert pilot.mode(Mode.AUTO) is Result.ACCEPTED
@@ -137,7 +138,7 @@ def test_guided_flight_may_go_on_without_radio_where_the_companion_is_watched(op
 
 def test_a_lost_radio_on_the_ground_stops_the_motors_and_forbids_arming():
     vehicle, pilot = alone()
-    pilot.wait(lambda: vehicle.arming_refusal() is None, 5.0)
+    pilot.wait(lambda: arming_refusal(vehicle) is None, 5.0)
     pilot.mode(Mode.GUIDED)
     pilot.command(Command.COMPONENT_ARM_DISARM, 1.0)
     pilot.parameter("SIM_RC_FAIL", 1)

@@ -8,8 +8,9 @@ import math
 import pytest
 from fractus_vehicle.mav import Command, Landed, Mode, Result
 from fractus_vehicle.pilot import Pilot
+from fractus_vehicle.readiness import arming_refusal
 from fractus_vehicle.shaping import sqrt_controller, stopping_distance, wrap_pi
-from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.state import VehicleState
 from vehicle_world import START, airborne, alone, distance_m
 
 
@@ -78,7 +79,7 @@ def test_arming_waits_for_readiness_and_says_why():
     pilot.mode(Mode.GUIDED)
     assert pilot.command(Command.COMPONENT_ARM_DISARM, 1.0) is Result.FAILED
     assert any(text.startswith("Arm: ") for text in pilot.texts)
-    pilot.wait(lambda: vehicle.arming_refusal() is None, 5.0)
+    pilot.wait(lambda: arming_refusal(vehicle) is None, 5.0)
     assert pilot.simulation.time_s >= 2.0
     assert pilot.command(Command.COMPONENT_ARM_DISARM, 1.0) is Result.ACCEPTED
     assert pilot.command(Command.COMPONENT_ARM_DISARM, 0.0) is Result.ACCEPTED
@@ -90,14 +91,14 @@ def test_arming_waits_for_readiness_and_says_why():
 def test_idle_vehicle_disarms_by_itself():
     vehicle, pilot = alone()
     pilot.mode(Mode.GUIDED)
-    pilot.wait(lambda: vehicle.arming_refusal() is None, 5.0)
+    pilot.wait(lambda: arming_refusal(vehicle) is None, 5.0)
     pilot.command(Command.COMPONENT_ARM_DISARM, 1.0)
     assert 9.0 < pilot.wait(lambda: not vehicle.armed, 15.0) < 11.0
 
 
 def test_takeoff_needs_guided_armed_and_ground():
     vehicle, pilot = alone()
-    pilot.wait(lambda: vehicle.arming_refusal() is None, 5.0)
+    pilot.wait(lambda: arming_refusal(vehicle) is None, 5.0)
     takeoff = (Command.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5)
     assert pilot.command(*takeoff) is Result.FAILED
     pilot.command(Command.COMPONENT_ARM_DISARM, 1.0)
@@ -117,7 +118,7 @@ def test_takeoff_needs_guided_armed_and_ground():
 def test_a_target_during_spool_up_cancels_the_takeoff():
     vehicle, pilot = alone()
     pilot.mode(Mode.GUIDED)
-    pilot.wait(lambda: vehicle.arming_refusal() is None, 5.0)
+    pilot.wait(lambda: arming_refusal(vehicle) is None, 5.0)
     pilot.command(Command.COMPONENT_ARM_DISARM, 1.0)
     pilot.command(Command.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5)
     pilot.fly_on(0.5)
@@ -142,7 +143,7 @@ def test_results_of_commands(command: int, result: Result):
 
 def test_messages_for_others_are_ignored():
     vehicle, pilot = alone()
-    pilot.wait(lambda: vehicle.arming_refusal() is None, 5.0)
+    pilot.wait(lambda: arming_refusal(vehicle) is None, 5.0)
     pilot.send("COMMAND_LONG", {"target_system": 9, "target_component": 1, "command": 400, "param1": 1.0})
     pilot.fly_on(0.5)
     assert not vehicle.armed
@@ -294,7 +295,7 @@ def test_modes_are_checked_once_the_motors_run():
     vehicle, pilot = alone()
     assert pilot.mode(Mode.AUTO) is Result.ACCEPTED, "disarmed, every mode can be selected"
     assert pilot.mode(Mode.GUIDED) is Result.ACCEPTED
-    pilot.wait(lambda: vehicle.arming_refusal() is None, 5.0)
+    pilot.wait(lambda: arming_refusal(vehicle) is None, 5.0)
     pilot.command(Command.COMPONENT_ARM_DISARM, 1.0)
     assert pilot.mode(Mode.AUTO) is Result.FAILED, "there is no mission"
     assert pilot.texts[-1] == "Mode change to AUTO failed: init failed"
@@ -363,7 +364,7 @@ def test_battery_drains_and_sags():
     pilot.fly_on(60.0)
     assert vehicle.battery.percent < before
     assert vehicle.battery.voltage_v < resting - 0.2
-    assert isinstance(vehicle, Vehicle)
+    assert isinstance(vehicle, VehicleState)
     left = vehicle.battery.capacity_mah - vehicle.battery.used_mah
     endurance_min = left / (vehicle.battery.used_mah / pilot.simulation.time_s) / 60.0
     assert 8.0 < endurance_min < 25.0

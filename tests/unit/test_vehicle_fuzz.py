@@ -11,7 +11,7 @@ from fractus_mavlink import encode, layout_named
 from fractus_vehicle.dispatch import HANDLERS
 from fractus_vehicle.mav import Command, Mode
 from fractus_vehicle.pilot import Pilot
-from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.state import VehicleState
 from vehicle_world import airborne, alone
 
 WILD = (math.nan, math.inf, -math.inf, 0.0, 1.0, -1.0, 2.0, 255.0, 1e38, -1e38, 1e-40, 21196.0, 400.0, 48.2)
@@ -44,7 +44,7 @@ def _wild_frame(rng: random.Random, name: str) -> bytes:
     return encode(layout, values, sequence=rng.randrange(256), sysid=255, compid=190)
 
 
-def _sane(vehicle: Vehicle) -> bool:
+def _sane(vehicle: VehicleState) -> bool:
     body = vehicle.body
     numbers = (body.north, body.east, body.down, body.vn, body.ve, body.vd, *body.quaternion, body.p, body.q, body.r)
     return all(math.isfinite(number) and abs(number) < 1e7 for number in numbers)
@@ -66,11 +66,11 @@ def test_wild_messages_never_break_it(seed: int):
     assert pilot.command(Command.REQUEST_MESSAGE, 0) == 0
 
 
-def _restart(vehicle: Vehicle, pilot: Pilot, rng: random.Random) -> None:
+def _restart(vehicle: VehicleState, pilot: Pilot, rng: random.Random) -> None:
     """Bring it back into the air in some mode, so that every mode meets the noise."""
     if not vehicle.armed:
-        vehicle.arm()
-    vehicle.force_mode(rng.choice(list(Mode)), "fuzz")
+        pilot.craft.vehicle.arm()
+    pilot.craft.vehicle.modes.force(rng.choice(list(Mode)))
     vehicle.body.on_ground, vehicle.landed = False, False
     vehicle.body.down = min(vehicle.body.down, -5.0)
     pilot.fly_on(0.5)

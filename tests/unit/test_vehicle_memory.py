@@ -10,6 +10,7 @@ import pytest
 from fractus_mavlink import Parser, Signing, encode, layout_named
 from fractus_vehicle.mav import Command, Result
 from fractus_vehicle.params import Parameters, UnknownParameterError, table
+from fractus_vehicle.readiness import arming_refusal
 from vehicle_world import CONFIG, START, airborne, alone, upload
 
 FENCE = {"command": 5003, "param1": 80.0, "frame": 0, "x": START.lat_e7, "y": START.lon_e7}
@@ -72,23 +73,23 @@ def test_a_reboot_keeps_what_is_stored_and_forgets_the_rest():
     pilot.command(Command.SET_MESSAGE_INTERVAL, 30, 100_000)
     assert pilot.command(Command.PREFLIGHT_REBOOT_SHUTDOWN, 1) is Result.ACCEPTED
     pilot.fly_on(0.1)
-    rebooted = pilot.craft.vehicle
+    rebooted = pilot.craft.vehicle.state
     assert rebooted is not vehicle
     assert rebooted.params["WPNAV_SPEED"] == 750.0
     assert len(rebooted.fence.shapes) == 1
     assert pilot.channel.streams.keys() == {"HEARTBEAT"}
-    pilot.wait(lambda: rebooted.arming_refusal() is None, 10.0)
+    pilot.wait(lambda: arming_refusal(rebooted) is None, 10.0)
 
 
 def test_it_does_not_reboot_in_the_air():
     vehicle, pilot = airborne(5.0)
     assert pilot.command(Command.PREFLIGHT_REBOOT_SHUTDOWN, 1) is Result.FAILED
     pilot.fly_on(0.1)
-    assert pilot.craft.vehicle is vehicle
+    assert pilot.craft.vehicle.state is vehicle
 
 
 def test_signing_shuts_out_whoever_has_no_key():
-    vehicle, pilot = alone()
+    _, pilot = alone()
     key = hashlib.sha256(b"secret").digest()
     target = {"target_system": 1, "target_component": 1}
     pilot.send("SETUP_SIGNING", target | {"secret_key": tuple(key), "initial_timestamp": 5_000})
@@ -109,4 +110,4 @@ def test_signing_shuts_out_whoever_has_no_key():
     assert answers(mine)
     assert not answers(Signing(key, 8_000)), "a replayed time must not pass"
     assert answers(mine)
-    assert vehicle.signing_key == key
+    assert pilot.craft.vehicle.signing_key == key

@@ -7,7 +7,8 @@ import math
 import pytest
 from fractus_vehicle.mav import Command, MissionResult, Mode, Result
 from fractus_vehicle.pilot import Pilot
-from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.readiness import arming_refusal
+from fractus_vehicle.state import VehicleState
 from vehicle_world import START, airborne, alone, distance_m, upload
 
 HOME = {"command": 16, "frame": 0, "x": START.lat_e7, "y": START.lon_e7, "z": 150.0}
@@ -44,7 +45,7 @@ MISSION = [
 def test_a_mission_is_flown_with_its_jump_and_return():
     vehicle, pilot = alone()
     assert upload(pilot, 0, MISSION) == MissionResult.ACCEPTED
-    pilot.wait(lambda: vehicle.arming_refusal() is None, 5.0)
+    pilot.wait(lambda: arming_refusal(vehicle) is None, 5.0)
     pilot.mode(Mode.GUIDED)
     assert pilot.command(Command.COMPONENT_ARM_DISARM, 1.0) is Result.ACCEPTED
     assert pilot.command(Command.MISSION_START) is Result.ACCEPTED
@@ -58,7 +59,7 @@ def test_a_mission_is_flown_with_its_jump_and_return():
         if not vehicle.armed:
             break
     assert reached == [1, 2, 3, 4, 2, 3, 4, 6]
-    assert vehicle.mission_state() == 5
+    assert vehicle.mission.state(vehicle.mode) == 5
     assert fastest_after_change < 4.4
     assert not vehicle.armed
     assert distance_m(vehicle, 0.0, 0.0) < 1.0
@@ -237,7 +238,7 @@ def test_pause_and_continue_and_set_current():
     assert vehicle.body.north > paused_at + 3.0
     assert pilot.command(Command.DO_SET_MISSION_CURRENT, 2) is Result.ACCEPTED
     assert pilot.last["MISSION_CURRENT"].integer("seq") == 2
-    pilot.wait(lambda: vehicle.mission_state() == 5, 60.0)
+    pilot.wait(lambda: vehicle.mission.state(vehicle.mode) == 5, 60.0)
     pilot.fly_on(3.0)
     assert vehicle.mode is Mode.AUTO, "it holds where the mission ended"
     assert distance_m(vehicle, 60.0, 30.0) < 3.0
@@ -258,7 +259,9 @@ def test_land_item_lands_and_loiter_time_waits():
     assert distance_m(vehicle, 15.0, 0.0) < 1.0
 
 
-def _fly_mission(items: list[dict[str, float]], **parameters: float) -> tuple[Vehicle, Pilot, list[tuple[float, ...]]]:
+def _fly_mission(
+    items: list[dict[str, float]], **parameters: float
+) -> tuple[VehicleState, Pilot, list[tuple[float, ...]]]:
     """Fly a mission to its end; the way flown, with the speed."""
     vehicle, pilot = airborne(10.0, **parameters)
     assert upload(pilot, 0, [HOME, *items]) == MissionResult.ACCEPTED
@@ -268,7 +271,7 @@ def _fly_mission(items: list[dict[str, float]], **parameters: float) -> tuple[Ve
         pilot.step()
         body = vehicle.body
         way.append((body.north, body.east, -body.down, math.hypot(body.vn, body.ve), pilot.simulation.time_s))
-        if vehicle.mission_state() == 5:
+        if vehicle.mission.state(vehicle.mode) == 5:
             return vehicle, pilot, way
     raise AssertionError(pilot.texts[-5:])
 

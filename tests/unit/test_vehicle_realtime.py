@@ -60,7 +60,7 @@ class Line(Hub):
     def flush(self) -> None:
         self.flushes.append(self.clock.now_s)
         for message in self.parser.feed(self.channel.take()):
-            self.heard.append((self.clock.now_s - 1000.0, self.craft.vehicle.time_s, message.name))
+            self.heard.append((self.clock.now_s - 1000.0, self.craft.vehicle.state.time_s, message.name))
 
 
 def _command(number: int, *parameters: float) -> bytes:

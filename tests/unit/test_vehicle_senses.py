@@ -13,7 +13,8 @@ from fractus_mavlink import Message, Parser
 from fractus_vehicle.mav import Command, Mode, Result
 from fractus_vehicle.noise import gaussian
 from fractus_vehicle.pilot import Pilot
-from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.state import VehicleState
+from fractus_vehicle.telemetry import send
 from vehicle_world import CONFIG, START, airborne, alone, distance_m, upload
 
 
@@ -61,7 +62,7 @@ def _mask(pilot: Pilot, frame: int, mask: int, **values: float) -> None:
     pilot.send("SET_POSITION_TARGET_LOCAL_NED", target | values)
 
 
-def _flying_north() -> tuple[Vehicle, Pilot]:
+def _flying_north() -> tuple[VehicleState, Pilot]:
     vehicle, pilot = airborne(10.0)
     pilot.go_to(200.0, 0.0, 10.0)
     pilot.wait(lambda: vehicle.body.vn > 5.0, 10.0)
@@ -115,7 +116,7 @@ def test_targets_above_terrain_need_terrain(known: int, altitude_m: float):
     values = {"frame": 11, "x": place.lat_e7, "y": place.lon_e7, "z": 12.0}
     wanted = Result.ACCEPTED if known else Result.DENIED
     assert pilot.command_int(Command.DO_REPOSITION, values) is wanted
-    assert vehicle.send(pilot.channel, "TERRAIN_REPORT") is bool(known)
+    assert send(vehicle, pilot.channel, "TERRAIN_REPORT") is bool(known)
 
 
 def test_a_mission_above_unknown_terrain_is_given_up():

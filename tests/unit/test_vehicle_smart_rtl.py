@@ -10,12 +10,13 @@ import pytest
 from fractus_vehicle.breadcrumbs import Breadcrumbs, Point, distance_to_segment, segment_gap
 from fractus_vehicle.mav import Command, Mode, Result
 from fractus_vehicle.pilot import Pilot
-from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.readiness import arming_refusal
+from fractus_vehicle.state import VehicleState
 from vehicle_world import airborne, alone, distance_m
 
 
 def _crumbs(points: list[Point], limit: int = 500) -> Breadcrumbs:
-    crumbs = Breadcrumbs(limit)
+    crumbs = Breadcrumbs({"SRTL_POINTS": limit}, lambda _severity, _text: None)
     crumbs.active = True
     for point in points:
         crumbs.add(point)
@@ -104,7 +105,7 @@ def test_gap_of_segments_against_sampling():
     assert segment_gap((0, 0, 0), (4, 0, 0), (1, 1, 0), (3, 1, 0))[0] == pytest.approx(1.0), "parallel"
 
 
-def _detour(**parameters: float) -> tuple[Vehicle, Pilot, list[Point]]:
+def _detour(**parameters: float) -> tuple[VehicleState, Pilot, list[Point]]:
     """Out around a corner: north, then east; the straight way home would cut the corner."""
     vehicle, pilot = airborne(10.0, **parameters)
     flown: list[Point] = []
@@ -118,7 +119,7 @@ def _detour(**parameters: float) -> tuple[Vehicle, Pilot, list[Point]]:
     return vehicle, pilot, flown
 
 
-def _farthest_from_flown(vehicle: Vehicle, pilot: Pilot, flown: list[Point]) -> float:
+def _farthest_from_flown(vehicle: VehicleState, pilot: Pilot, flown: list[Point]) -> float:
     """Fly on until disarmed; the greatest distance from the way out."""
     way = [(0.0, 0.0, 0.0), *flown[::20], flown[-1]]
     worst = 0.0
@@ -146,7 +147,7 @@ def test_it_flies_back_along_the_path_and_lands_where_it_began():
 def test_it_waits_two_metres_above_the_start_before_it_lands():
     vehicle, pilot, _ = _detour()
     pilot.mode(Mode.SMART_RTL)
-    pilot.wait(lambda: vehicle.flight.landing, 120.0)
+    pilot.wait(lambda: pilot.craft.vehicle.modes.flight.landing, 120.0)
     assert vehicle.altitude_m == pytest.approx(2.0, abs=2.1)
     assert distance_m(vehicle, 0.0, 0.0) < 2.5
 
@@ -260,6 +261,6 @@ def test_a_new_flight_begins_a_new_path():
 def test_before_there_is_a_position_it_cannot_be_chosen():
     vehicle, pilot = alone()
     assert pilot.mode(Mode.SMART_RTL) is Result.FAILED
-    pilot.wait(lambda: vehicle.arming_refusal() is None, 5.0)
+    pilot.wait(lambda: arming_refusal(vehicle) is None, 5.0)
     pilot.fly_on(0.5)
     assert pilot.mode(Mode.SMART_RTL) is Result.ACCEPTED

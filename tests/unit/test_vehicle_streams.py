@@ -8,6 +8,7 @@ import pytest
 from fractus_vehicle.channel import OUTBOX_LIMIT, Channel
 from fractus_vehicle.mav import Command, Result
 from fractus_vehicle.streams import ALL_GROUPS, BUILDERS, GROUPS
+from fractus_vehicle.telemetry import send
 from vehicle_world import airborne, alone
 
 
@@ -52,7 +53,7 @@ def test_stopping_a_stream_and_asking_for_the_unknown():
 def test_every_message_can_be_built_in_every_phase(name: str):
     for vehicle, pilot in (alone(), airborne(5.0, FENCE_ENABLE=1)):
         pilot.read()
-        if vehicle.send(pilot.channel, name):
+        if send(vehicle, pilot.channel, name):
             assert pilot.read()[-1].name == name
         else:
             assert BUILDERS[name](vehicle) is None

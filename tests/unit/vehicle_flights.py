@@ -8,10 +8,10 @@ import random
 from collections.abc import Callable
 from dataclasses import replace
 
+from fractus_mavlink import Message
 from fractus_vehicle.mav import Command, Mode
 from fractus_vehicle.pilot import Pilot, PilotTimeoutError
 from fractus_vehicle.simulation import Simulation
-from fractus_vehicle.wire import Message
 from vehicle_world import CONFIG, START, upload
 
 TARGET = {"target_system": 1, "target_component": 1}

@@ -8,20 +8,20 @@ from dataclasses import replace
 from fractus_vehicle.earth import Place
 from fractus_vehicle.pilot import Pilot
 from fractus_vehicle.simulation import Simulation
-from fractus_vehicle.vehicle import Vehicle, VehicleConfig
+from fractus_vehicle.state import VehicleConfig, VehicleState
 
 START = Place.from_degrees(48.2, 16.37, 150.0)
 CONFIG = VehicleConfig(start=START, ready_after_s=2.0, position_noise_m=0.05)
 
 
-def alone(*, config: VehicleConfig = CONFIG, **parameters: float) -> tuple[Vehicle, Pilot]:
+def alone(*, config: VehicleConfig = CONFIG, **parameters: float) -> tuple[VehicleState, Pilot]:
     """One vehicle and its pilot."""
     simulation = Simulation([replace(config, parameters={**config.parameters, **parameters})])
     craft = simulation.crafts[0]
-    return craft.vehicle, Pilot(simulation, craft)
+    return craft.vehicle.state, Pilot(simulation, craft)
 
 
-def airborne(altitude_m: float = 10.0, **parameters: float) -> tuple[Vehicle, Pilot]:
+def airborne(altitude_m: float = 10.0, **parameters: float) -> tuple[VehicleState, Pilot]:
     """One vehicle that hovers in GUIDED."""
     vehicle, pilot = alone(**parameters)
     pilot.take_off(altitude_m)
@@ -29,7 +29,7 @@ def airborne(altitude_m: float = 10.0, **parameters: float) -> tuple[Vehicle, Pi
     return vehicle, pilot
 
 
-def distance_m(vehicle: Vehicle, north_m: float, east_m: float) -> float:
+def distance_m(vehicle: VehicleState, north_m: float, east_m: float) -> float:
     """True horizontal distance of a vehicle from a local point."""
     return math.hypot(vehicle.body.north - north_m, vehicle.body.east - east_m)
 

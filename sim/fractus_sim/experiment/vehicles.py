@@ -13,7 +13,7 @@ from fractus_vehicle.earth import Place
 from fractus_vehicle.links import Hub, LinkError, LinkSpec
 from fractus_vehicle.params import UnknownParameterError
 from fractus_vehicle.simulation import Craft, Simulation
-from fractus_vehicle.vehicle import CONTROL_STEP_S, REPEATABLE_EPOCH_US, VehicleConfig
+from fractus_vehicle.state import CONTROL_STEP_S, REPEATABLE_EPOCH_US, VehicleConfig
 
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.linktap import LinkTap

@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+
+from fractus_mavlink import Value
 
 from fractus_vehicle.shaping import clamp
+from fractus_vehicle.state import VehicleState
 
-if TYPE_CHECKING:
-    from fractus_mavlink import Value
-
-    from fractus_vehicle.vehicle import Vehicle
-
-Values = Mapping[str, "Value"]
-Builder = Callable[["Vehicle"], "Values | None"]
+Values = Mapping[str, Value]
+Builder = Callable[[VehicleState], Values | None]
 
 UNKNOWN_U16 = 65535
 
 
-def boot_ms(vehicle: Vehicle) -> int:
+def boot_ms(vehicle: VehicleState) -> int:
     """Milliseconds since boot."""
     return round(vehicle.time_s * 1000.0) & 0xFFFFFFFF
 
 
-def boot_us(vehicle: Vehicle) -> int:
+def boot_us(vehicle: VehicleState) -> int:
     """Microseconds since boot."""
     return round(vehicle.time_s * 1e6)
 

@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from enum import Enum
-from typing import TYPE_CHECKING
 
 from fractus_vehicle.breadcrumbs import Point
 from fractus_vehicle.descent import descend
 from fractus_vehicle.flight import Flight
+from fractus_vehicle.home import return_point
 from fractus_vehicle.leg import Leg
 from fractus_vehicle.mav import Severity
-
-if TYPE_CHECKING:
-    from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.state import VehicleState
 
 # The last point is approached this much above it.
 ABOVE_LAST_M = 2.0
@@ -45,19 +43,19 @@ class SmartReturn(Flight):
         """Whether it comes down for good."""
         return self.stage is SmartStage.LAND
 
-    def begin(self, v: Vehicle) -> None:
+    def begin(self, v: VehicleState) -> None:
         """Stop, and begin to tidy the path."""
         v.control.hold_here()
-        v.yaw.follow_course()
+        v.heading.follow_course()
         v.touch_time_s = 0.0
         self._tidying = v.breadcrumbs.thorough()
 
-    def end(self, v: Vehicle) -> None:
+    def end(self, v: VehicleState) -> None:
         """Give back the point that was not reached, so that the path remains whole."""
         if self.stage is SmartStage.PATH_FOLLOW and self._popped is not None and not v.breadcrumbs.add(self._popped):
             v.say(Severity.ERROR, "SmartRTL: lost one point")
 
-    def step(self, v: Vehicle, dt: float) -> None:
+    def step(self, v: VehicleState) -> None:
         """Go through the stages."""
         if self.stage is SmartStage.WAIT_FOR_PATH_CLEANUP:
             try:
@@ -73,9 +71,9 @@ class SmartReturn(Flight):
         if self._leg is not None:
             self._leg.step(v)
         if self.stage is not SmartStage.LAND:
-            v.yaw.step(v, dt)
+            v.heading.step(v.est)
 
-    def _follow(self, v: Vehicle) -> None:
+    def _follow(self, v: VehicleState) -> None:
         waiting = not self._stopped(v) if self._leg is None else not self._leg.reached(v, _radius_m(v))
         if waiting:
             return
@@ -89,10 +87,10 @@ class SmartReturn(Flight):
         self._leg = Leg(v, north, east, down)
 
     @staticmethod
-    def _stopped(v: Vehicle) -> bool:
+    def _stopped(v: VehicleState) -> bool:
         return math.hypot(v.est.vn, v.est.ve) < STOPPED_MPS
 
-    def _come_down(self, v: Vehicle) -> None:
+    def _come_down(self, v: VehicleState) -> None:
         if self._leg is not None and not (self._stopped(v) and self._leg.reached(v, _radius_m(v))):
             return
         final_m = v.params["RTL_ALT_FINAL"] / 100.0
@@ -101,9 +99,9 @@ class SmartReturn(Flight):
         else:
             self.stage = SmartStage.DESCEND
             north, east, _ = self._leg.end
-            v.control.go_to(north, east, v.return_point().base_down - final_m)
+            v.control.go_to(north, east, return_point(v).base_down - final_m)
         self._leg = None
 
 
-def _radius_m(v: Vehicle) -> float:
+def _radius_m(v: VehicleState) -> float:
     return max(v.params["WPNAV_RADIUS"] / 100.0, 0.3)

@@ -4,33 +4,31 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import TYPE_CHECKING
 
 from fractus_vehicle.fence import Breach
+from fractus_vehicle.home import set_home_at, set_home_here
 from fractus_vehicle.mav import Command, Severity
+from fractus_vehicle.mission_items import Item
 from fractus_vehicle.shaping import wrap_pi
-
-if TYPE_CHECKING:
-    from fractus_vehicle.mission import Item
-    from fractus_vehicle.vehicle import Vehicle
+from fractus_vehicle.state import VehicleState
 
 YAW_REACHED_RAD = math.radians(2.0)
 
 
-class Todo:
-    """What waits beside the present NAV command; the next NAV command drops what is left."""
+class MissionCommands:
+    """What is pending beside the present NAV command; the next NAV command drops what is left."""
 
     def __init__(self) -> None:
         self._indices: deque[int] = deque()
         self._begun_s: float | None = None
 
-    def begin(self, v: Vehicle, indices: list[int]) -> None:
+    def begin(self, v: VehicleState, indices: list[int]) -> None:
         """Take the commands that stand before a NAV command that has just begun, and run what need not wait."""
         self._indices = deque(indices)
         self._begun_s = None
         self.step(v)
 
-    def step(self, v: Vehicle) -> None:
+    def step(self, v: VehicleState) -> None:
         """Go on until a condition has to be waited for."""
         while self._indices:
             index = self._indices[0]
@@ -49,7 +47,7 @@ class Todo:
             v.broadcast("MISSION_ITEM_REACHED", {"seq": index})
 
 
-def _fulfilled(v: Vehicle, item: Item, waited_s: float) -> bool:
+def _fulfilled(v: VehicleState, item: Item, waited_s: float) -> bool:
     match item.command:
         case Command.CONDITION_DELAY:
             return waited_s >= item.param1
@@ -62,26 +60,26 @@ def _fulfilled(v: Vehicle, item: Item, waited_s: float) -> bool:
             return True
 
 
-def _do(v: Vehicle, item: Item) -> None:
+def _do(v: VehicleState, item: Item) -> None:
     match item.command:
         case Command.DO_CHANGE_SPEED:
-            v.change_speed(int(item.param1), item.param2)
+            v.control.limits.change_speed(int(item.param1), item.param2)
         case Command.CONDITION_YAW:
-            v.turn_to(item.param1, item.param2, int(item.param3), relative=item.param4 > 0.5)
+            v.heading.turn_to(item.param1, item.param2, int(item.param3), relative=item.param4 > 0.5)
         case Command.DO_SET_ROI | Command.DO_SET_ROI_LOCATION:
             north, east, _ = item_target(v, item)
-            v.yaw.look_at((north, east) if item.has_place else None)
+            v.heading.look_at((north, east) if item.has_place else None)
         case Command.DO_SET_ROI_NONE:
-            v.yaw.look_at(None)
+            v.heading.look_at(None)
         case Command.DO_FENCE_ENABLE:
             switch_fence(v, item.param1)
         case Command.DO_SET_HOME:
-            v.set_home_here() if item.param1 > 0.5 else v.set_home_at(item.x, item.y, item.z)
+            set_home_here(v) if item.param1 > 0.5 else set_home_at(v, item.x, item.y, item.z)
         case _:
             pass  # servos, relays, cameras and mounts: there are none
 
 
-def switch_fence(v: Vehicle, action: float) -> bool:
+def switch_fence(v: VehicleState, action: float) -> bool:
     """DO_FENCE_ENABLE: 0 off, 1 on, 2 only the floor off; False when there is nothing to switch on, or no such action."""
     if action == 2.0:
         v.fence.types &= ~Breach.ALT_MIN
@@ -92,7 +90,7 @@ def switch_fence(v: Vehicle, action: float) -> bool:
     return True
 
 
-def item_target(v: Vehicle, item: Item) -> tuple[float, float, float]:
+def item_target(v: VehicleState, item: Item) -> tuple[float, float, float]:
     """Where an item lies in the local frame; a missing position means here."""
     origin = v.origin or v.start
     base = v.altitude_base_m(item.frame)

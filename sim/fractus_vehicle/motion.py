@@ -1,0 +1,48 @@
+"""One control step of the body: from the controller's wishes through battery, wind and broken motors to motion."""
+
+from __future__ import annotations
+
+from fractus_vehicle.mav import Mode
+from fractus_vehicle.state import ARMING_DELAY_S, CONTROL_STEP_S, VehicleState
+
+PHYSICS_PER_CONTROL = 2
+# Share of full thrust at which armed motors idle.
+IDLE_SPIN = 0.05
+# A throttle stick above this lifts off in a mode that hands the throttle to the pilot.
+LIFT_THROTTLE_US = 1550
+
+
+def move(v: VehicleState) -> None:
+    """Advance body, battery and estimate."""
+    dt = CONTROL_STEP_S / PHYSICS_PER_CONTROL
+    body = v.body
+    full = body.airframe.full_thrust_n
+    share = v.battery.thrust_share
+    lifting = v.armed and _may_lift(v)
+    if body.on_ground and not lifting:
+        spin = IDLE_SPIN * full if v.armed and v.time_s > v.armed_at_s + ARMING_DELAY_S else 0.0
+        v.battery.step(CONTROL_STEP_S, 4.0 * spin / (body.airframe.mass_kg * 9.8))
+        body.step(dt, (spin, spin, spin, spin), (0.0, 0.0, 0.0))
+        v.est = v.estimator.estimate(body)
+        return
+    for _ in range(PHYSICS_PER_CONTROL):
+        air = v.wind.step(dt, v.rng, -body.down)
+        commands = v.control.step(dt, v.est, full * share) if lifting else (0.0, 0.0, 0.0, 0.0)
+        failed = int(v.params["SIM_ENGINE_FAIL"])
+        if failed:
+            left = v.params["SIM_ENGINE_MUL"]
+            m = [c * left if failed >> at & 1 else c for at, c in enumerate(commands)]
+            commands = (m[0], m[1], m[2], m[3])
+        body.step(dt, commands, air)
+        v.est = v.estimator.estimate(body)
+    v.battery.step(CONTROL_STEP_S, sum(body.motors) / (body.airframe.mass_kg * 9.80665))
+    if v.landed and not body.on_ground:
+        v.landed = False
+
+
+def _may_lift(v: VehicleState) -> bool:
+    if not v.landed:
+        return True
+    if v.flying_wanted:
+        return v.time_s >= v.lift_after_s
+    return v.mode is Mode.STABILIZE and v.sticks[2] > LIFT_THROTTLE_US

@@ -1,0 +1,79 @@
+"""RTL: up, back to home or a rally point, and down."""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+
+from fractus_vehicle.descent import descend
+from fractus_vehicle.flight import Flight
+from fractus_vehicle.home import return_point
+from fractus_vehicle.state import VehicleState
+
+
+class RtlStage(Enum):
+    """The stages of RTL."""
+
+    CLIMB = 1
+    RETURN = 2
+    LOITER = 3
+    LAND = 4
+    HOLD = 5
+
+
+class ReturnToLaunch(Flight):
+    """Climbs, returns to home (or the nearest rally point), waits, lands, disarms."""
+
+    def __init__(self) -> None:
+        self.stage = RtlStage.CLIMB
+        self._loiter_until_s = 0.0
+        self._target = (0.0, 0.0)
+
+    @property
+    def landing(self) -> bool:
+        """Whether it comes down for good."""
+        return self.stage is RtlStage.LAND
+
+    def begin(self, v: VehicleState) -> None:
+        """Choose target and altitude, and climb."""
+        p = v.params
+        point = return_point(v)
+        self._target, base_down = (point.north, point.east), point.base_down
+        distance = point.distance_m((v.est.north, v.est.east))
+        height = base_down - v.est.down
+        wanted = max(height + p["RTL_CLIMB_MIN"] / 100.0, p["RTL_ALT"] / 100.0, point.altitude_m, 2.0)
+        if p["RTL_CONE_SLOPE"] >= 0.5:
+            wanted = min(wanted, max(distance * p["RTL_CONE_SLOPE"], 2.0))
+        ceiling = v.fence.alt_max_m - p["FENCE_MARGIN"]
+        if v.fence.enabled and v.fence.types & 1:
+            wanted = min(wanted, ceiling)
+        wanted = max(wanted, height)
+        if p["RTL_SPEED"] > 0.0:
+            v.control.limits.speed_mps = p["RTL_SPEED"] / 100.0
+        v.control.stop()
+        v.control.go_to_altitude(base_down - wanted)
+        v.control.yaw_rate = None
+        v.control.target_yaw = v.control.yaw_setpoint
+        v.touch_time_s = 0.0
+
+    def step(self, v: VehicleState) -> None:
+        """Go through the stages."""
+        control = v.control
+        if self.stage is RtlStage.CLIMB:
+            if abs(v.est.down - control.target_down) < 0.5 or v.est.down < control.target_down:
+                self.stage = RtlStage.RETURN
+                control.go_to(*self._target)
+        elif self.stage is RtlStage.RETURN:
+            near = math.hypot(self._target[0] - v.est.north, self._target[1] - v.est.east)
+            if near < max(v.params["WPNAV_RADIUS"] / 100.0, 0.5):
+                self.stage = RtlStage.LOITER
+                self._loiter_until_s = v.time_s + v.params["RTL_LOIT_TIME"] / 1000.0
+                control.target_yaw = v.armed_heading
+        elif self.stage is RtlStage.LOITER:
+            if v.time_s >= self._loiter_until_s:
+                final = v.params["RTL_ALT_FINAL"] / 100.0
+                self.stage = RtlStage.HOLD if final > 0.0 else RtlStage.LAND
+                if final > 0.0:
+                    control.go_to(*self._target, return_point(v).base_down - final)
+        elif self.stage is RtlStage.LAND:
+            descend(v)

@@ -1,0 +1,285 @@
+"""What one vehicle is at a moment: body, senses, controllers, stored lists and flags, which the modes read and change."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fractus_mavlink import Value
+
+from fractus_vehicle.body import Airframe, Body, Wind
+from fractus_vehicle.breadcrumbs import Breadcrumbs
+from fractus_vehicle.channel import Channel
+from fractus_vehicle.control import Control
+from fractus_vehicle.earth import Place
+from fractus_vehicle.estimator import Estimator
+from fractus_vehicle.fence import Fence
+from fractus_vehicle.heading import Heading
+from fractus_vehicle.mav import ABSOLUTE_FRAMES, GLOBAL_FRAMES, TERRAIN_FRAMES, Landed, MissionKind, Mode, Severity
+from fractus_vehicle.mission import Mission
+from fractus_vehicle.mission_items import ItemStore
+from fractus_vehicle.params import Parameters
+from fractus_vehicle.receiver import Receiver
+from fractus_vehicle.sensors import Battery, Gps
+from fractus_vehicle.settings import set_fence, set_limits, set_wind
+from fractus_vehicle.shaping import clamp
+
+CONTROL_STEP_S = 0.01
+ARMING_DELAY_S = 2.0
+TEXT_CHUNK = 50
+# The time of day at which runs begin that must be repeatable.
+REPEATABLE_EPOCH_US = 1_700_000_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleConfig:
+    """What distinguishes one vehicle from another."""
+
+    start: Place
+    heading_deg: float = 0.0
+    sysid: int = 1
+    seed: int = 1
+    ready_after_s: float = 32.0
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    store: Path | None = None
+    epoch_us: int = REPEATABLE_EPOCH_US
+    position_noise_m: float = 0.12
+
+
+@dataclass(slots=True)
+class ActiveFailsafes:
+    """Which failsafes are active."""
+
+    gcs: bool = False
+    radio: bool = False
+    battery: bool = False
+    battery_critical: bool = False
+    ekf: bool = False
+
+    @property
+    def any(self) -> bool:
+        """Whether any of them is."""
+        return self.gcs or self.radio or self.battery or self.ekf
+
+
+class VehicleState:
+    """The state of one vehicle, and the questions and small changes that need no more than that."""
+
+    def __init__(self, config: VehicleConfig) -> None:
+        self.config = config
+        self.sysid = config.sysid
+        self.compid = 1
+        self.start = config.start
+        self.rng = random.Random(f"{config.seed}:{config.sysid}")  # noqa: S311 - a simulation, not a secret
+        self.noise_seed = config.seed * 251 + config.sysid
+        self.channels: list[Channel] = []
+        self.params = Parameters(config.parameters, config.store)
+        self.params.assign("SYSID_THISMAV", config.sysid)
+        self.time_s = 0.0
+        self.ticks = 0
+        self.wind = Wind()
+        self.body = Body(Airframe(), config.heading_deg)
+        self.control = Control(self.body.airframe)
+        self.battery = Battery(self.params["SIM_BATT_VOLTAGE"], self.params["BATT_CAPACITY"])
+        self.estimator = Estimator(
+            config.start,
+            ready_after_s=config.ready_after_s,
+            noise_m=config.position_noise_m,
+            rng=self.rng,
+            params=self.params,
+            say=self.say,
+        )
+        self.fence = Fence()
+        self.failsafes = ActiveFailsafes()
+        self.mission = Mission()
+        self.fence_items = ItemStore(MissionKind.FENCE)
+        self.rally = ItemStore(MissionKind.RALLY)
+        self.breadcrumbs = Breadcrumbs(self.params, self.say)
+        self.heading = Heading(self.control, self.params)
+        self.receiver = Receiver()
+        self.armed = False
+        self.armed_at_s = 0.0
+        self.armed_heading = math.radians(config.heading_deg)
+        self.mode = Mode.STABILIZE
+        self.landed = True
+        self.touch_time_s = 0.0
+        self.taking_off_until_m: float | None = None
+        self.lift_after_s = 0.0
+        self.idle_since_s = 0.0
+        self.home: Place | None = None
+        self.home_locked = False
+        self.est = self.estimator.estimate(self.body)
+        set_limits(self.params, self.control)
+        set_fence(self.params, self.fence)
+        set_wind(self.params, self.wind)
+        self.control.reset(self.est)
+
+    # -- time and place ----------------------------------------------------------------------------------------
+
+    def advance_time(self) -> None:
+        """One control step later."""
+        self.ticks += 1
+        self.time_s = self.ticks * CONTROL_STEP_S
+
+    @property
+    def unix_us(self) -> int:
+        """Time of day in microseconds."""
+        return self.config.epoch_us + round(self.time_s * 1e6)
+
+    @property
+    def origin(self) -> Place | None:
+        """Where the local frame begins; None until the estimator has a position."""
+        return self.estimator.origin
+
+    @property
+    def position_ok(self) -> bool:
+        """Whether the position can be trusted."""
+        return self.estimator.position_ok
+
+    @property
+    def gps(self) -> Gps:
+        """The GPS receiver."""
+        return self.estimator.gps
+
+    @property
+    def sticks(self) -> tuple[int, ...]:
+        """The channels of the radio, in microseconds."""
+        return self.receiver.channels
+
+    @property
+    def place(self) -> Place:
+        """Where the vehicle believes to be."""
+        return (self.origin or self.start).offset(self.est.north, self.est.east, self.est.down)
+
+    @property
+    def known_position(self) -> tuple[float, float, float] | None:
+        """The estimated position in the local frame; None while it cannot be trusted."""
+        return (self.est.north, self.est.east, self.est.down) if self.position_ok else None
+
+    @property
+    def true_place(self) -> Place:
+        """Where the vehicle is."""
+        return self.start.offset(self.body.north, self.body.east, self.body.down)
+
+    @property
+    def true_altitude_amsl_m(self) -> float:
+        """True altitude above mean sea level."""
+        return self.start.alt_m - self.body.down
+
+    @property
+    def home_xy(self) -> tuple[float, float]:
+        """Home in local metres."""
+        if self.home is None or self.origin is None:
+            return (0.0, 0.0)
+        return self.origin.vector_to(self.home)[:2]
+
+    @property
+    def altitude_m(self) -> float:
+        """Estimated altitude above home."""
+        return self.altitude_at_m(self.est.down)
+
+    def altitude_at_m(self, down: float) -> float:
+        """Altitude above home of a local height."""
+        origin = self.origin or self.start
+        return origin.alt_m - down - (self.home or origin).alt_m
+
+    @property
+    def height_m(self) -> float:
+        """Estimated height above the ground (flat, at the altitude of the start)."""
+        return -self.est.down
+
+    def altitude_base_m(self, frame: int) -> float | None:
+        """What altitudes of a global frame count from, AMSL; None for another frame or where terrain is unknown."""
+        if frame in ABSOLUTE_FRAMES:
+            return 0.0
+        if frame in TERRAIN_FRAMES:
+            return self.start.alt_m if int(self.params["TERRAIN_ENABLE"]) else None
+        return (self.home or self.origin or self.start).alt_m if frame in GLOBAL_FRAMES else None
+
+    def outside_fence(self, north: float, east: float, down: float) -> bool:
+        """Whether a local target lies outside the autopilot's own fence."""
+        return bool(self.fence.outside(north, east, self.altitude_at_m(down), self.home_xy))
+
+    # -- what telemetry and checks ask -------------------------------------------------------------------------
+
+    @property
+    def heading_cdeg(self) -> int:
+        """Heading in hundredths of a degree."""
+        return round(math.degrees(self.est.yaw) % 360.0 * 100.0) % 36000
+
+    @property
+    def throttle_percent(self) -> int:
+        """Throttle for VFR_HUD."""
+        if not self.armed:
+            return 0
+        return round(clamp(sum(self.body.motors) / (4.0 * self.body.airframe.full_thrust_n), 0.0, 1.0) * 100.0)
+
+    @property
+    def flying_wanted(self) -> bool:
+        """Whether a takeoff is under way."""
+        return self.taking_off_until_m is not None
+
+    @property
+    def landed_state(self) -> Landed:
+        """MAV_LANDED_STATE."""
+        if self.landed:
+            return Landed.ON_GROUND
+        if self.flying_wanted:
+            return Landed.TAKEOFF
+        return Landed.LANDING if self.mode is Mode.LAND else Landed.IN_AIR
+
+    # -- texts -------------------------------------------------------------------------------------------------
+
+    def broadcast(self, name: str, values: Mapping[str, Value]) -> None:
+        """Send a message on every link."""
+        for channel in self.channels:
+            channel.send(name, values)
+
+    def say(self, severity: Severity, text: str) -> None:
+        """Send a STATUSTEXT on every link, in chunks when it is long."""
+        data = text.encode("ascii", "replace")
+        # MAVLink: chunks of one text share an id other than 0.
+        number = 1 + self.ticks % 65000 if len(data) > TEXT_CHUNK else 0
+        for at in range(0, max(len(data), 1), TEXT_CHUNK):
+            chunk: dict[str, Value] = {"text": data[at : at + TEXT_CHUNK], "id": number, "chunk_seq": at // TEXT_CHUNK}
+            self.broadcast("STATUSTEXT", chunk | {"severity": int(severity)})
+
+    # -- motors and ground -------------------------------------------------------------------------------------
+
+    def disarm(self, *, force: bool = False) -> None:
+        """Stop the motors."""
+        if not self.armed:
+            return
+        self.armed = False
+        self.taking_off_until_m = None
+        if force or self.landed:
+            self.landed = self.landed or self.body.on_ground
+        self.say(Severity.INFO, "Disarming motors")
+
+    def land_complete(self) -> None:
+        """The vehicle rests on the ground."""
+        self.landed = True
+        self.taking_off_until_m = None
+        self.idle_since_s = self.time_s
+
+    def begin_takeoff(self, down: float) -> None:
+        """Spool up and climb to `down` (local)."""
+        self.taking_off_until_m = down
+        ready = self.armed_at_s + ARMING_DELAY_S
+        spool = self.params["MOT_SPOOL_TIME"] + 0.5 * self.params["TKOFF_SLEW_TIME"]
+        self.lift_after_s = max(self.time_s, ready) + spool
+        self.control.reset(self.est)
+        self.control.go_to(self.est.north, self.est.east, down)
+
+    def takeoff_done(self) -> bool:
+        """Whether the climb of a takeoff is over; ends it."""
+        target = self.taking_off_until_m
+        if target is None:
+            return True
+        if self.landed or abs(self.est.down - target) > 0.3:
+            return False
+        self.taking_off_until_m = None
+        return True

@@ -1,0 +1,176 @@
+"""Targets that a companion computer sends while the vehicle is in GUIDED: judged, and handed to the flight."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from fractus_mavlink import Message
+
+from fractus_vehicle.earth import Place, valid_coordinates
+from fractus_vehicle.flight import Flight
+from fractus_vehicle.guided import GuidedFlight
+from fractus_vehicle.mav import (
+    FORCE_SET,
+    IGNORE_ACCELERATION,
+    IGNORE_POSITION,
+    IGNORE_VELOCITY,
+    IGNORE_YAW,
+    IGNORE_YAW_RATE,
+    Frame,
+)
+from fractus_vehicle.mission_items import item_from
+from fractus_vehicle.shaping import clamp, wrap_pi
+from fractus_vehicle.state import VehicleState
+
+_BODY_FRAMES = frozenset({Frame.BODY_NED, Frame.BODY_OFFSET_NED})
+_OFFSET_FRAMES = frozenset({Frame.LOCAL_OFFSET_NED}) | _BODY_FRAMES
+_LOCAL_FRAMES = frozenset({Frame.LOCAL_NED}) | _OFFSET_FRAMES
+
+Vector = tuple[float, float, float]
+
+
+def _vector(m: Message, x: str, y: str, z: str) -> Vector:
+    return (m.real(x), m.real(y), m.real(z))
+
+
+def _rotated(v: VehicleState, vector: Vector) -> Vector:
+    cosine, sine = math.cos(v.est.yaw), math.sin(v.est.yaw)
+    return (vector[0] * cosine - vector[1] * sine, vector[0] * sine + vector[1] * cosine, vector[2])
+
+
+class Setpoint(NamedTuple):
+    """Local position, velocity and acceleration of one message, before its mask says which of them count."""
+
+    position: Vector
+    velocity: Vector
+    accel: Vector
+
+
+def local_target(v: VehicleState, flight: Flight, m: Message) -> None:
+    """SET_POSITION_TARGET_LOCAL_NED."""
+    frame = m.integer("coordinate_frame")
+    if frame not in _LOCAL_FRAMES:
+        _stop(v, flight)
+        return
+    position, velocity = _vector(m, "x", "y", "z"), _vector(m, "vx", "vy", "vz")
+    accel = _vector(m, "afx", "afy", "afz")
+    if frame in _BODY_FRAMES:
+        position, velocity, accel = _rotated(v, position), _rotated(v, velocity), _rotated(v, accel)
+    if frame in _OFFSET_FRAMES:
+        e = v.est
+        position = (position[0] + e.north, position[1] + e.east, position[2] + e.down)
+    _target(v, flight, m, Setpoint(position, velocity, accel))
+
+
+def global_target(v: VehicleState, flight: Flight, m: Message) -> None:
+    """SET_POSITION_TARGET_GLOBAL_INT."""
+    frame = m.integer("coordinate_frame")
+    lat, lon, alt = m.integer("lat_int"), m.integer("lon_int"), m.real("alt")
+    origin = v.origin
+    if origin is None:
+        return
+    base = v.altitude_base_m(frame)
+    if base is None or not valid_coordinates(lat, lon):
+        _stop(v, flight)
+        return
+    position = origin.vector_to(Place(lat, lon, base + alt))
+    _target(v, flight, m, Setpoint(position, _vector(m, "vx", "vy", "vz"), _vector(m, "afx", "afy", "afz")))
+
+
+def _stop(v: VehicleState, flight: Flight) -> None:
+    """What ArduCopter does with a target that it does not understand."""
+    if isinstance(flight, GuidedFlight) and v.armed and not v.landed:
+        v.taking_off_until_m = None
+        flight.stop(v)
+
+
+def _target(v: VehicleState, flight: Flight, m: Message, asked: Setpoint) -> None:
+    """Judge type_mask and hand the target to GUIDED; a target outside the fence is dropped in silence."""
+    if not isinstance(flight, GuidedFlight) or not v.armed:
+        return
+    # A target ends a takeoff, even one that has not left the ground: then the vehicle stays there, as the real one.
+    v.taking_off_until_m = None
+    if v.landed:
+        return
+    mask = m.integer("type_mask")
+    position = asked.position if not mask & IGNORE_POSITION else None
+    velocity = asked.velocity if not mask & IGNORE_VELOCITY else None
+    accel = asked.accel if not mask & IGNORE_ACCELERATION else None
+    understood = velocity is not None or (position is None) != (accel is None)
+    if not understood or (mask & FORCE_SET and accel is not None):
+        flight.stop(v)
+        return
+    yaw = m.real("yaw") if not mask & IGNORE_YAW else None
+    yaw_rate = m.real("yaw_rate") if not mask & IGNORE_YAW_RATE else None
+    numbers = (*(position or ()), *(velocity or ()), *(accel or ()), yaw or 0.0, yaw_rate or 0.0)
+    if not all(math.isfinite(value) for value in numbers):
+        return
+    if position is not None and v.outside_fence(*position):
+        return
+    _fly(v, flight, position, velocity, asked.accel)
+    _turn(v, yaw, yaw_rate)
+
+
+def _fly(
+    v: VehicleState, flight: GuidedFlight, position: Vector | None, velocity: Vector | None, accel: Vector
+) -> None:
+    if velocity is not None:
+        flight.fly(v, velocity, position)
+    elif position is not None:
+        flight.go_to(v, *position)
+    else:
+        e = v.control.vel
+        flight.fly(v, (e[0] + accel[0], e[1] + accel[1], e[2] + accel[2]))
+
+
+def _turn(v: VehicleState, yaw: float | None, yaw_rate: float | None) -> None:
+    if yaw is not None:
+        v.control.yaw_rate = None
+        v.control.target_yaw = wrap_pi(yaw)
+        v.heading.hold()
+    elif yaw_rate is not None:
+        v.control.yaw_rate = clamp(yaw_rate, -2.0, 2.0)
+        v.heading.hold()
+    else:
+        v.control.yaw_rate = None
+        v.heading.follow_course()
+
+
+def attitude_target(v: VehicleState, flight: Flight, m: Message) -> None:
+    """SET_ATTITUDE_TARGET."""
+    if not isinstance(flight, GuidedFlight) or not v.armed or m.integer("type_mask") & 0x80:
+        return
+    w, x, y, z = m.array("q")
+    size = math.sqrt(w * w + x * x + y * y + z * z)
+    if not math.isfinite(size) or not 0.9 < size < 1.1:
+        return
+    thrust = m.real("thrust")
+    thrust = clamp(thrust if math.isfinite(thrust) else 0.5, 0.0, 1.0)
+    lean = v.control.limits.tilt_max_rad
+    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = math.asin(clamp(2.0 * (w * y - z * x) / (size * size), -1.0, 1.0))
+    yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    limits = v.control.limits
+    climb = (thrust - 0.5) * 2.0 * (limits.climb_mps if thrust > 0.5 else limits.sink_mps)
+    if v.landed:
+        return
+    v.control.target_yaw = yaw
+    flight.lean(v, clamp(roll, -lean, lean), clamp(pitch, -lean, lean), yaw, climb)
+
+
+def guided_item(v: VehicleState, flight: Flight, m: Message) -> bool:
+    """`current` 2 is a guided target, 3 a change of altitude (both deprecated, both still accepted); False if refused."""
+    item = item_from(m)
+    base = v.altitude_base_m(item.frame)
+    if not isinstance(flight, GuidedFlight) or not v.armed or v.landed or v.origin is None or base is None:
+        return False
+    if not valid_coordinates(item.x, item.y) or not math.isfinite(item.z):
+        return False
+    north, east, down = v.origin.vector_to(Place(item.x, item.y, base + item.z))
+    if m.integer("current") == 3:
+        north, east = v.control.target
+    if v.outside_fence(north, east, down):
+        return False
+    flight.go_to(v, north, east, down)
+    return True

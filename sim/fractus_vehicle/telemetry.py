@@ -1,0 +1,75 @@
+"""What the vehicle sends on its links: streams, parameters, and what a new link hears by default."""
+
+from __future__ import annotations
+
+from fractus_vehicle.channel import PARAMETERS_PER_TICK, Channel
+from fractus_vehicle.state import VehicleState
+from fractus_vehicle.streams import ALL_GROUPS, BUILDERS, GROUPS
+
+MAX_RATE_HZ = 100.0
+
+
+def send(v: VehicleState, channel: Channel, name: str) -> bool:
+    """Send one of the telemetry messages on one link; False when there is no such message now."""
+    builder = BUILDERS.get(name)
+    values = None if builder is None else builder(v)
+    if values is None:
+        return False
+    channel.send(name, values)
+    return True
+
+
+def send_on_all(v: VehicleState, name: str) -> None:
+    """Send one of the telemetry messages on every link."""
+    for channel in v.channels:
+        send(v, channel, name)
+
+
+def serve(v: VehicleState, channel: Channel) -> None:
+    """Send what is due on a link: its streams, and a part of the parameter list it asked for."""
+    for name in channel.due(v.time_s):
+        send(v, channel, name)
+    for _ in range(min(PARAMETERS_PER_TICK, len(channel.parameters))):
+        send_parameter(v, channel, "", channel.parameters.popleft())
+
+
+def send_parameter(v: VehicleState, channel: Channel, name: str, index: int, shown_index: int | None = None) -> None:
+    """Send PARAM_VALUE by name or index, if there is such a parameter."""
+    found = v.params.find(name, index)
+    if found is None:
+        return
+    shown, row, at = found
+    channel.send(
+        "PARAM_VALUE",
+        {
+            "param_id": shown.encode("ascii"),
+            "param_value": v.params[row.name],
+            "param_type": row.wire_type,
+            "param_count": len(v.params),
+            "param_index": at if shown_index is None else shown_index,
+        },
+    )
+
+
+def attach(v: VehicleState, channel: Channel) -> None:
+    """Open a link: HEARTBEAT at 1 Hz and silence otherwise, unless SR parameters ask for streams."""
+    v.channels.append(channel)
+    channel.set_interval("HEARTBEAT", 1.0)
+    for group in ALL_GROUPS:
+        _set_default_rate(v, channel, group)
+
+
+def follow_rate(v: VehicleState, parameter: str) -> None:
+    """Apply a changed SRn_ parameter to the links it is about."""
+    for channel in v.channels:
+        for group in ALL_GROUPS:
+            if parameter == f"SR{channel.port}_{GROUPS[group][0]}":
+                _set_default_rate(v, channel, group)
+
+
+def _set_default_rate(v: VehicleState, channel: Channel, group: int) -> None:
+    label, names = GROUPS[group]
+    rate_hz = 0.0 if channel.port is None else v.params[f"SR{min(channel.port, 6)}_{label}"]
+    if rate_hz > 0.0:
+        for name in names:
+            channel.set_interval(name, 1.0 / min(rate_hz, MAX_RATE_HZ))

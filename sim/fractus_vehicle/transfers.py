@@ -1,0 +1,219 @@
+"""The vehicle's side of the MAVLink mission protocol: lists that clients upload and download."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from fractus_mavlink import Message, Value
+
+from fractus_vehicle.channel import Channel
+from fractus_vehicle.mav import Command, MissionKind, MissionResult
+from fractus_vehicle.mission_items import Item, ItemStore, item_from, judge, judge_numbers
+
+MAX_ITEMS = 724
+UPLOAD_TIMEOUT_S = 8.0
+RETRY_S = 1.0
+# What is refused until an upload of the same list has ended.
+NOT_WHILE_UPLOADED = {
+    "MISSION_REQUEST_LIST": MissionResult.DENIED,
+    "MISSION_REQUEST": MissionResult.DENIED,
+    "MISSION_REQUEST_INT": MissionResult.DENIED,
+    "MISSION_CLEAR_ALL": MissionResult.ERROR,
+}
+
+
+@dataclass(slots=True)
+class Upload:
+    """A transfer toward the vehicle."""
+
+    channel: Channel
+    sysid: int
+    compid: int
+    kind: MissionKind
+    next: int
+    last: int
+    items: list[Item]
+    partial: bool
+    heard_s: float
+    asked_s: float
+
+
+def _address(peer: Message | Upload, kind: int) -> dict[str, Value]:
+    return {"target_system": peer.sysid, "target_component": peer.compid, "mission_type": int(kind)}
+
+
+class Transfers:
+    """The vehicle's side of the mission protocol, for all kinds and links (one upload at a time, as ArduPilot)."""
+
+    def __init__(
+        self,
+        stores: Mapping[MissionKind, ItemStore],
+        replace_items: Callable[[ItemStore, list[Item]], MissionResult],
+    ) -> None:
+        self._stores = stores
+        self._replace = replace_items
+        self.upload: Upload | None = None
+        self.now_s = 0.0
+
+    @staticmethod
+    def _ack(channel: Channel, peer: Message | Upload, kind: int, result: MissionResult) -> None:
+        channel.send("MISSION_ACK", _address(peer, kind) | {"type": int(result)})
+
+    def handle(self, channel: Channel, message: Message, now_s: float) -> None:
+        """Answer one message of the protocol."""
+        self.now_s = now_s
+        kind_number = message.integer("mission_type") if message.has("mission_type") else 0
+        if kind_number == 255 and message.name == "MISSION_CLEAR_ALL":
+            for store in self._stores.values():
+                self._replace(store, [])
+            self._ack(channel, message, kind_number, MissionResult.ACCEPTED)
+        elif kind_number not in set(MissionKind):
+            self._ack(channel, message, kind_number, MissionResult.UNSUPPORTED)
+        elif self.upload is not None and self.upload.kind == kind_number and message.name in NOT_WHILE_UPLOADED:
+            self._ack(channel, message, kind_number, NOT_WHILE_UPLOADED[message.name])
+        else:
+            self._handle(channel, message, self._stores[MissionKind(kind_number)])
+
+    def detach(self, channel: Channel) -> None:
+        """Give up an upload from a link that closes."""
+        if self.upload is not None and self.upload.channel is channel:
+            self.upload = None
+
+    def _handle(self, channel: Channel, message: Message, store: ItemStore) -> None:
+        kind = store.kind
+        match message.name:
+            case "MISSION_COUNT":
+                self._begin(channel, message, store, range(message.integer("count")))
+            case "MISSION_WRITE_PARTIAL_LIST":
+                start, end = message.integer("start_index"), message.integer("end_index")
+                # One item more than there are may be written: it is appended.
+                if 0 <= start <= end <= len(store.items):
+                    self._begin(channel, message, store, range(start, end + 1))
+                else:
+                    self._ack(channel, message, kind, MissionResult.ERROR)
+            case "MISSION_ITEM" | "MISSION_ITEM_INT":
+                self._take(channel, message, store)
+            case "MISSION_REQUEST_LIST":
+                channel.send("MISSION_COUNT", _address(message, kind) | {"count": len(store.items)})
+            case "MISSION_REQUEST_PARTIAL_LIST":
+                self._ack(channel, message, kind, MissionResult.UNSUPPORTED)
+            case "MISSION_REQUEST" | "MISSION_REQUEST_INT":
+                self._give(channel, message, store)
+            case "MISSION_CLEAR_ALL":
+                self._ack(channel, message, kind, self._replace(store, []))
+            case "MISSION_ACK" if self._is_uploader(channel, message):
+                self.upload = None
+            case _:
+                pass
+
+    def _is_uploader(self, channel: Channel, message: Message) -> bool:
+        up = self.upload
+        return up is not None and up.channel is channel and (up.sysid, up.compid) == (message.sysid, message.compid)
+
+    def _begin(self, channel: Channel, message: Message, store: ItemStore, wanted: range) -> None:
+        """Begin to ask for the items of `wanted`; all of a new list, or a part of the stored one."""
+        if self.upload is not None and not self._is_uploader(channel, message):
+            self._ack(channel, message, store.kind, MissionResult.DENIED)
+        elif wanted.stop > MAX_ITEMS:
+            self._ack(channel, message, store.kind, MissionResult.NO_SPACE)
+        elif not wanted:
+            self._ack(channel, message, store.kind, self._replace(store, []))
+        else:
+            partial = message.name == "MISSION_WRITE_PARTIAL_LIST"
+            self.upload = Upload(
+                channel=channel,
+                sysid=message.sysid,
+                compid=message.compid,
+                kind=store.kind,
+                next=wanted.start,
+                last=wanted.stop - 1,
+                items=list(store.items) if partial else [],
+                partial=partial,
+                heard_s=self.now_s,
+                asked_s=self.now_s,
+            )
+            self._ask(self.upload)
+
+    def _ask(self, up: Upload) -> None:
+        up.asked_s = self.now_s
+        up.channel.send("MISSION_REQUEST", _address(up, up.kind) | {"seq": up.next})
+
+    def _take(self, channel: Channel, message: Message, store: ItemStore) -> None:
+        up = self.upload
+        if up is None or not self._is_uploader(channel, message) or up.kind is not store.kind:
+            self._ack(channel, message, store.kind, MissionResult.ERROR)
+            return
+        seq = message.integer("seq")
+        if seq != up.next:
+            if seq > up.next:
+                self._ack(channel, message, store.kind, MissionResult.INVALID_SEQUENCE)
+            return
+        item = item_from(message)
+        verdict = self._judge(message, item, store, up)
+        if verdict is not MissionResult.ACCEPTED:
+            self.upload = None
+            self._ack(channel, message, store.kind, verdict)
+            return
+        up.items[seq : seq + 1] = [item]
+        up.next += 1
+        up.heard_s = self.now_s
+        if up.next <= up.last:
+            self._ask(up)
+            return
+        self.upload = None
+        self._ack(channel, message, store.kind, self._replace(store, up.items))
+
+    @staticmethod
+    def _judge(message: Message, item: Item, store: ItemStore, up: Upload) -> MissionResult:
+        if store.kind is MissionKind.MISSION:
+            if message.integer("seq") == 0:
+                return MissionResult.ACCEPTED
+            verdict = judge_numbers(message)
+            if verdict is not MissionResult.ACCEPTED:
+                return verdict
+            if item.command == Command.DO_JUMP and not 0 < int(item.param1) < max(len(up.items), up.last + 1):
+                return MissionResult.ERROR
+        return judge(item, store.kind)
+
+    def _give(self, channel: Channel, message: Message, store: ItemStore) -> None:
+        seq = message.integer("seq")
+        # Item 0 of a mission is home, and may be read even when there is no mission.
+        homes = [store.home] if store.home is not None and not store.items else store.items
+        if not 0 <= seq < len(homes):
+            self._ack(channel, message, store.kind, MissionResult.INVALID_SEQUENCE)
+            return
+        item = homes[seq]
+        integers = message.name == "MISSION_REQUEST_INT"
+        channel.send(
+            "MISSION_ITEM_INT" if integers else "MISSION_ITEM",
+            _address(message, store.kind)
+            | {
+                "seq": seq,
+                "frame": item.frame,
+                "command": item.command,
+                "current": 0,
+                "autocontinue": item.autocontinue,
+                "param1": item.param1,
+                "param2": item.param2,
+                "param3": item.param3,
+                "param4": item.param4,
+                "x": item.x if integers else item.x * 1e-7,
+                "y": item.y if integers else item.y * 1e-7,
+                "z": item.z,
+            },
+        )
+
+    def step(self, now_s: float) -> bool:
+        """Repeat an unanswered request; True when the upload was given up."""
+        self.now_s = now_s
+        up = self.upload
+        if up is None:
+            return False
+        if now_s - up.heard_s > UPLOAD_TIMEOUT_S:
+            self.upload = None
+            self._ack(up.channel, up, up.kind, MissionResult.CANCELLED)
+            return True
+        if now_s - up.asked_s > RETRY_S:
+            self._ask(up)
+        return False

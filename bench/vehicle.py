@@ -22,13 +22,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fractus_cluster.ports import free_port
+from fractus_mavlink import Parser, encode, layout_named
 from fractus_vehicle.earth import Place
 from fractus_vehicle.mav import Command, Mode
 from fractus_vehicle.pilot import Pilot
 from fractus_vehicle.readiness import arming_refusal
 from fractus_vehicle.simulation import Simulation, formation
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleConfig
-from fractus_mavlink import Parser, encode, layout_named
 
 START = Place.from_degrees(48.2, 16.37, 150.0)
 

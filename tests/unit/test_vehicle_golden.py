@@ -12,14 +12,12 @@ from fractus_vehicle.pilot import Pilot
 from vehicle_flights import at_random, breaches, by_hand, failing, mission, pilot_of, smart_return
 
 FLIGHTS: tuple[tuple[Callable[[Pilot], None], int, dict[str, float], str], ...] = (
-    (mission, 1, {}, "dc6cefd5485185c7"),
     (mission, 2, {"SIM_WIND_SPD": 5.0, "SIM_WIND_TURB": 1.5, "WP_YAW_BEHAVIOR": 0.0}, "350e0d96fed9a01b"),
     (by_hand, 3, {"SIM_WIND_SPD": 4.0, "SIM_WIND_TURB": 2.0}, "b12fa65eb324d6bb"),
     (smart_return, 4, {}, "a6582fc7326517ff"),
     (breaches, 5, {}, "f77bbbfccf381d13"),
     (breaches, 6, {"FENCE_ACTION": 3.0}, "4078a10e9a231e40"),
     (failing, 7, {}, "f91132080651ee31"),
-    (failing, 8, {"FS_THR_ENABLE": 4.0}, "92906238fc0ce296"),
     (at_random, 10, {}, "75190d74dd1fb06a"),
     (at_random, 17, {}, "b66cfa94f569c75d"),
 )

@@ -13,17 +13,17 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from fractus_agent.grant_verifier import GrantVerifier
-from fractus_agent.grants import GrantDirectory, GrantKeeper
-from fractus_agent.identity import Identity
-from fractus_agent.registration import Registration
+from fractus_agent.cluster.store import Object, Store, Unconfigured, connect
+from fractus_agent.grants.keeper import GrantDirectory, GrantKeeper
+from fractus_agent.grants.verifier import GrantVerifier
+from fractus_agent.identity.identity import Identity
+from fractus_agent.registration.registration import Registration
+from fractus_agent.registration.status import Observed, StatusReporter
 from fractus_agent.settings import MissingSetting, Settings
-from fractus_agent.status import Observed, StatusReporter
-from fractus_agent.store import Object, Store, Unconfigured, connect
 from fractus_agent.watchdog import guard
 
 if TYPE_CHECKING:
-    from fractus_agent.telemetry import TelemetryFeed
+    from fractus_agent.telemetry.feed import TelemetryFeed
 
 LOG = logging.getLogger("fractus_agent")
 
@@ -74,7 +74,7 @@ class Agent:
         await self._mobility.wait()
         await self.identity.ready.wait()
         # Imported here: gRPC is a third of the memory, and only drones need it.
-        from fractus_agent.telemetry import TelemetryFeed  # noqa: PLC0415
+        from fractus_agent.telemetry.feed import TelemetryFeed  # noqa: PLC0415
 
         self._feed = TelemetryFeed(
             self._settings.mobility_address,

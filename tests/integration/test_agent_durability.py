@@ -111,8 +111,8 @@ def test_a_set_is_all_old_or_all_new(tmp_path: Path, before: str) -> None:
 WRITER = """
 import sys
 from pathlib import Path
-from fractus_agent.grants import GrantDirectory, GrantKeeper
-from fractus_agent.store import Listed
+from fractus_agent.grants.keeper import GrantDirectory, GrantKeeper
+from fractus_agent.cluster.store import Listed
 def grant(name, size):
     return {"apiVersion": "fractus.dev/v1alpha1", "kind": "Grant", "metadata": {"name": name, "uid": name},
         "spec": {"node": "n", "application": {"namespace": "d", "name": "a", "uid": "u"}, "component": "C",

@@ -9,10 +9,10 @@ import pytest
 from agent_pki import FakeSigner, TestAuthority
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
-from fractus_agent.certificates import Unusable, inspect
-from fractus_agent.csr import make_request
-from fractus_agent.identity import FILES, Identity, Refused, make_request_apart
-from fractus_agent.store import KubeError
+from fractus_agent.cluster.store import KubeError
+from fractus_agent.identity.certificates import Unusable, inspect
+from fractus_agent.identity.csr import make_request
+from fractus_agent.identity.identity import FILES, Identity, Refused, make_request_apart
 from fractus_storage import read_set, write_set
 
 NODE = "drone-1"

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from agent_pki import TestAuthority
 from agent_server import FRACTUS, ApiServer, running
-from fractus_agent.store import (
+from fractus_agent.cluster.store import (
     Changed,
     Conflict,
     Deleted,

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_agent.grants import HOLD_S, GrantDirectory, GrantKeeper, outcome_of, status_of, stored_form
-from fractus_agent.store import Backoff, Changed, Deleted, GrantEvent, KubeError, Listed
+from fractus_agent.cluster.store import Backoff, Changed, Deleted, GrantEvent, KubeError, Listed
+from fractus_agent.grants.keeper import HOLD_S, GrantDirectory, GrantKeeper, outcome_of, status_of, stored_form
 from fractus_core.api.plans import Grant
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
 

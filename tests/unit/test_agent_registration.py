@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 import yaml
-from fractus_agent.registration import (
+from fractus_agent.cluster.store import Invalid
+from fractus_agent.registration.registration import (
     HASH_ANNOTATION,
     InvalidDescription,
     Registration,
     description_hash,
     parse_description,
 )
-from fractus_agent.store import Invalid
 
 MANIFEST: dict[str, Any] = {
     "apiVersion": "fractus.dev/v1alpha1",

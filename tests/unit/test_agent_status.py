@@ -4,11 +4,19 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
-from fractus_agent.findings import Finding
-from fractus_agent.flight import Snapshot
-from fractus_agent.status import DRONE_PACE, EDGE_PACE, Observed, StatusReporter, due_s, node_status, readiness
-from fractus_agent.store import KubeError
-from fractus_agent.telemetry import snapshot
+from fractus_agent.cluster.store import KubeError
+from fractus_agent.conditions import Finding
+from fractus_agent.registration.status import (
+    DRONE_PACE,
+    EDGE_PACE,
+    Observed,
+    StatusReporter,
+    due_s,
+    node_status,
+    readiness,
+)
+from fractus_agent.telemetry.feed import snapshot
+from fractus_agent.telemetry.snapshot import Snapshot
 from fractus_core.api.nodes import DroneStatus, EdgeNodeStatus
 from fractus_proto.v1.mobility_pb2 import Telemetry
 from fractus_proto.v1.types_pb2 import AltitudeReference, Position

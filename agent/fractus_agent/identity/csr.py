@@ -1,6 +1,6 @@
 """A fresh key and the signing request for it; runs as a process of its own, so that the agent stays small.
 
-`python -m fractus_agent.csr NODE` prints {"key": PEM, "request": PEM} as JSON.
+`python -m fractus_agent.identity.csr NODE` prints {"key": PEM, "request": PEM} as JSON.
 """
 
 from __future__ import annotations

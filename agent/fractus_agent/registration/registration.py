@@ -14,8 +14,8 @@ import yaml
 from fractus_core.api.model import GROUP, InvalidObject
 from fractus_core.api.nodes import Drone, EdgeNode
 
-from fractus_agent.findings import Finding
-from fractus_agent.store import Backoff, Invalid, KubeError, Object
+from fractus_agent.cluster.store import Backoff, Invalid, KubeError, Object
+from fractus_agent.conditions import Finding
 
 LOG = logging.getLogger(__name__)
 

@@ -14,9 +14,9 @@ from fractus_proto.v1.mobility_pb2_grpc import MobilityServiceStub
 from fractus_proto.v1.types_pb2 import AltitudeReference
 from fractus_storage import read_set
 
-from fractus_agent.flight import Snapshot
-from fractus_agent.identity import FILES
-from fractus_agent.store import Backoff
+from fractus_agent.cluster.store import Backoff
+from fractus_agent.identity.identity import FILES
+from fractus_agent.telemetry.snapshot import Snapshot
 
 LOG = logging.getLogger(__name__)
 

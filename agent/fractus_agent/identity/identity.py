@@ -19,9 +19,9 @@ from typing import Protocol
 
 from fractus_storage import read_set, write_set
 
-from fractus_agent.certificates import Unusable, Validity, inspect
-from fractus_agent.findings import Finding
-from fractus_agent.store import Backoff, KubeError, Object
+from fractus_agent.cluster.store import Backoff, KubeError, Object
+from fractus_agent.conditions import Finding
+from fractus_agent.identity.certificates import Unusable, Validity, inspect
 
 LOG = logging.getLogger(__name__)
 
@@ -71,7 +71,7 @@ async def make_request_apart(node: str) -> tuple[bytes, bytes]:
         NotYet: the process failed or took longer than a minute.
     """
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "fractus_agent.csr", node,
+        sys.executable, "-m", "fractus_agent.identity.csr", node,
         stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
     )  # fmt: skip
     try:

@@ -12,9 +12,9 @@ from typing import Any, Protocol, get_args
 
 from fractus_core.api.nodes import FlightState
 
-from fractus_agent.findings import Finding, conditions, timestamp
-from fractus_agent.flight import Snapshot
-from fractus_agent.store import Backoff, KubeError, Object
+from fractus_agent.cluster.store import Backoff, KubeError, Object
+from fractus_agent.conditions import Finding, conditions, timestamp
+from fractus_agent.telemetry.snapshot import Snapshot
 
 LOG = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from fractus_core.api.plans import Grant
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
 from fractus_storage import remove_file, write_file
 
-from fractus_agent.store import Backoff, Changed, Deleted, GrantEvent, KubeError, Listed, Object
+from fractus_agent.cluster.store import Backoff, Changed, Deleted, GrantEvent, KubeError, Listed, Object
 
 LOG = logging.getLogger(__name__)
 

@@ -1,0 +1,1 @@
+"""The node's Grants: verified, on disk, and reported."""

@@ -1,0 +1,1 @@
+"""The node's certificate: requested, verified, renewed."""

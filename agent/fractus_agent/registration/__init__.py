@@ -1,0 +1,1 @@
+"""The node's Drone or EdgeNode, and its status."""

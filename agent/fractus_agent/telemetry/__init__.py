@@ -1,0 +1,1 @@
+"""The state of the drone, from the mobility service of the node."""

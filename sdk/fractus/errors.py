@@ -6,8 +6,8 @@ from typing import Any
 
 import grpc
 from fractus_proto.v1 import types_pb2
-from google.rpc import error_details_pb2  # type: ignore[import-untyped]
-from grpc_status import rpc_status  # type: ignore[import-untyped]
+from google.rpc import error_details_pb2
+from grpc_status import rpc_status
 
 from fractus.values import Action, Decision, Result
 

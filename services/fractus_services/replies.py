@@ -8,8 +8,8 @@ import grpc
 from fractus_core.policy.values import Verdict
 from fractus_proto.v1 import types_pb2
 from google.protobuf import any_pb2
-from google.rpc import code_pb2, error_details_pb2, status_pb2  # type: ignore[import-untyped]
-from grpc_status import rpc_status  # type: ignore[import-untyped]
+from google.rpc import code_pb2, error_details_pb2, status_pb2
+from grpc_status import rpc_status
 
 from fractus_services.errors import (
     Aborted,

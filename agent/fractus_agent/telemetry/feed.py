@@ -104,7 +104,7 @@ class TelemetryFeed:
         credentials = grpc.ssl_channel_credentials(files["ca.crt"], files["tls.key"], files["tls.crt"])
         options = (("grpc.ssl_target_name_override", node_server_name(self._node)), ("grpc.enable_http_proxy", 0))
         async with grpc.aio.secure_channel(self._address, credentials, options=options) as channel:
-            stub = MobilityServiceStub(channel)  # type: ignore[no-untyped-call]
+            stub = MobilityServiceStub(channel)
             call = stub.SubscribeTelemetry(SubscribeTelemetryRequest(interval_s=INTERVAL_S))
             try:
                 while self._serial() == serial:

@@ -91,7 +91,7 @@ async def run(options: CameraOptions, stop: asyncio.Event) -> None:
     )
 
     def register(server: grpc.aio.Server) -> None:
-        camera_pb2_grpc.add_CameraServiceServicer_to_server(handlers, server)  # type: ignore[no-untyped-call]
+        camera_pb2_grpc.add_CameraServiceServicer_to_server(handlers, server)
 
     audit.append("started", {"node": node})
     await run_until(stop, *parts, serve_grpc("camera", options.listen, tls, register))

@@ -39,7 +39,7 @@ async def follow_telemetry(address: str, node: str, tls: TlsFiles, add: Callable
     while True:
         try:
             async with grpc.aio.secure_channel(address, tls.client_credentials(), options) as channel:
-                stub = mobility_pb2_grpc.MobilityServiceStub(channel)  # type: ignore[no-untyped-call]
+                stub = mobility_pb2_grpc.MobilityServiceStub(channel)
                 async for message in stub.SubscribeTelemetry(
                     mobility_pb2.SubscribeTelemetryRequest(interval_s=INTERVAL_S)
                 ):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import AsyncIterator, Callable, Iterable
+from collections.abc import AsyncGenerator, Callable, Iterable
 from contextlib import aclosing
 from dataclasses import dataclass, replace
 
@@ -136,7 +136,7 @@ class Courses:
         self._control = control
         self._guard = guard
 
-    async def fly(self, trip: Trip, target: GotoArgs) -> AsyncIterator[Step]:
+    async def fly(self, trip: Trip, target: GotoArgs) -> AsyncGenerator[Step, None]:
         """Fly to a place; a way that becomes illegal under the flying drone is replaced by another.
 
         Raises:
@@ -146,7 +146,7 @@ class Courses:
         for attempt in range(MAX_REPLANS + 1):
             motion = self._control.begin(trip.kind)
             try:
-                async with aclosing(self._along(trip, motion, target)) as steps:  # type: ignore[type-var]
+                async with aclosing(self._along(trip, motion, target)) as steps:
                     async for step in steps:
                         yield step
             except Refused as refusal:
@@ -158,7 +158,7 @@ class Courses:
             finally:
                 self._control.finish(motion)
 
-    async def _along(self, trip: Trip, motion: Motion, target: GotoArgs) -> AsyncIterator[Step]:
+    async def _along(self, trip: Trip, motion: Motion, target: GotoArgs) -> AsyncGenerator[Step, None]:
         autopilot, permit = self._control.autopilot, trip.permit(motion)
         for _ in range(MAX_LEGS):
             # A leg is judged from where it begins: a drone that still moves would begin it somewhere else.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
 from dataclasses import replace
 
@@ -124,7 +124,7 @@ class Homing:
                 self._control.finish(motion)
         return why
 
-    async def around(self, trip: Trip, motion: Motion) -> AsyncIterator[Step]:
+    async def around(self, trip: Trip, motion: Motion) -> AsyncGenerator[Step, None]:
         """Fly the legs after which the straight way home is legal; none when it is already. The drone is in GUIDED.
 
         It comes to rest before each judgement, so that what is judged is the place where the way begins.
@@ -145,7 +145,7 @@ class Homing:
             leg = await self._leg(trip)
             if leg is None:
                 return
-            async with aclosing(fly_to(autopilot, motion, leg, REACHED_M, permit)) as steps:  # type: ignore[type-var]
+            async with aclosing(fly_to(autopilot, motion, leg, REACHED_M, permit)) as steps:
                 async for step in steps:
                     yield Step(step.distance_m, complete=False)
         raise PreconditionFailed("NoLegalWay", f"the drone is not home after {MAX_LEGS} legs")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from dataclasses import dataclass
 
 from fractus_core.policy.values import GotoArgs
@@ -36,7 +36,7 @@ class Step:
     complete: bool
 
 
-async def climb(autopilot: Autopilot, motion: Motion, altitude_m: float, permit: Permit) -> AsyncIterator[Step]:
+async def climb(autopilot: Autopilot, motion: Motion, altitude_m: float, permit: Permit) -> AsyncGenerator[Step, None]:
     """Take off to an altitude above home."""
     vehicle = autopilot.vehicle
     await autopilot.take_off(altitude_m, permit)
@@ -64,7 +64,7 @@ async def fly_to(
     permit: Permit,
     *,
     judged: Permit | None = None,
-) -> AsyncIterator[Step]:
+) -> AsyncGenerator[Step, None]:
     """Fly straight to a point; altitude above home.
 
     Args:
@@ -125,7 +125,7 @@ async def _hears_speed(autopilot: Autopilot, motion: Motion, permit: Permit) -> 
     return True
 
 
-async def come_down(autopilot: Autopilot, motion: Motion) -> AsyncIterator[Step]:
+async def come_down(autopilot: Autopilot, motion: Motion) -> AsyncGenerator[Step, None]:
     """Follow a landing or a return to launch until the motors stop."""
     vehicle = autopilot.vehicle
     while vehicle.armed:

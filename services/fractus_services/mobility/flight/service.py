@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
 from dataclasses import dataclass, replace
 
@@ -55,7 +55,7 @@ class MobilityService:
     """
 
     def __init__(
-        self, control: Control, calls: CallJudge, way_home: Callable[[Trip, Motion], AsyncIterator[Step]]
+        self, control: Control, calls: CallJudge, way_home: Callable[[Trip, Motion], AsyncGenerator[Step, None]]
     ) -> None:
         self.calls = calls
         self._control = control
@@ -110,14 +110,14 @@ class MobilityService:
         reason = f"the leg under way is flown with {speed:.1f} m/s: {rest.reason or 'it is not legal faster'}"
         return Verdict("correct", SetSpeedArgs(speed), rest.code or "SpeedAboveLimit", reason, rest.policies), speed
 
-    def take_off(self, grant: ActiveGrant, args: TakeoffArgs) -> AsyncIterator[Progress]:
+    def take_off(self, grant: ActiveGrant, args: TakeoffArgs) -> AsyncGenerator[Progress, None]:
         """Climb from the ground."""
         call = Call("Takeoff", args)
         self._standing_by(call, grant)
         verdict = self.calls.allow_motion(call, grant)
         altitude = verdict.args.altitude_m if isinstance(verdict.args, TakeoffArgs) else args.altitude_m
 
-        async def steps(motion: Motion) -> AsyncIterator[Progress]:
+        async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
             permit = driver_permit(self._control, grant, motion)
             await self._control.modes.enter_guided(permit)
             async for step in climb(self._autopilot, motion, altitude, permit):
@@ -125,20 +125,20 @@ class MobilityService:
 
         return self._run("Takeoff", steps)
 
-    def goto(self, grant: ActiveGrant, args: GotoArgs, reached_m: float) -> AsyncIterator[Progress]:
+    def goto(self, grant: ActiveGrant, args: GotoArgs, reached_m: float) -> AsyncGenerator[Progress, None]:
         """Fly straight to a point."""
         verdict = self.calls.allow_motion(Call("Goto", args), grant)
         self._flying("Goto")
         radius = min(max(reached_m, 0.3), MAX_REACHED_M) if reached_m > 0 else REACHED_M
 
-        async def steps(motion: Motion) -> AsyncIterator[Progress]:
+        async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
             permit = driver_permit(self._control, grant, motion)
             call, final = Call("Goto", args), verdict
             for _ in range(MAX_JUDGEMENTS):
                 final = await self._settled(call, grant, final, motion, permit)
                 leg, judged = self._leg(final, args), self._judged(call, grant, final, permit)
                 try:
-                    async with aclosing(fly_to(self._autopilot, motion, leg, radius, permit, judged=judged)) as flying:  # type: ignore[type-var]
+                    async with aclosing(fly_to(self._autopilot, motion, leg, radius, permit, judged=judged)) as flying:
                         async for step in flying:
                             if step.complete:
                                 self._control.reached(grant, args.lat, args.lon)
@@ -206,13 +206,13 @@ class MobilityService:
             raise
         return final, setpoint
 
-    def land(self, grant: ActiveGrant) -> AsyncIterator[Progress]:
+    def land(self, grant: ActiveGrant) -> AsyncGenerator[Progress, None]:
         """Come down here."""
         self.calls.supersede(grant)
         verdict = self.calls.allow_motion(Call("Land"), grant)
         self._flying("Land")
 
-        async def steps(motion: Motion) -> AsyncIterator[Progress]:
+        async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
             await self._control.modes.change_mode(
                 self._control.autopilot.stack.land, driver_permit(self._control, grant, motion)
             )
@@ -221,20 +221,20 @@ class MobilityService:
 
         return self._run("Land", steps)
 
-    def return_to_launch(self, grant: ActiveGrant) -> AsyncIterator[Progress]:
+    def return_to_launch(self, grant: ActiveGrant) -> AsyncGenerator[Progress, None]:
         """Fly home, around what is in the way, and land."""
         self.calls.supersede(grant)
         verdict = self.calls.allow_motion(Call("ReturnToLaunch"), grant)
         self._flying("ReturnToLaunch")
 
-        async def steps(motion: Motion) -> AsyncIterator[Progress]:
+        async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
             control = self._control
             permit = driver_permit(control, grant, motion)
             constraints = control.begin_system_flight(control.require(grant).grant)
             try:
                 await control.modes.enter_guided(permit)
                 trip = Trip(constraints, motion.kind, lambda _motion: permit)
-                async with aclosing(self._way_home(trip, motion)) as legs:  # type: ignore[type-var]
+                async with aclosing(self._way_home(trip, motion)) as legs:
                     async for step in legs:
                         yield Progress(verdict, step)
                 mode = control.autopilot.stack.return_straight
@@ -264,10 +264,12 @@ class MobilityService:
         if not self._autopilot.vehicle.in_air:
             raise PreconditionFailed("NotFlying", f"{method} needs a drone in the air; take off first")
 
-    async def _run(self, kind: str, steps: Callable[[Motion], AsyncIterator[Progress]]) -> AsyncIterator[Progress]:
+    async def _run(
+        self, kind: str, steps: Callable[[Motion], AsyncGenerator[Progress, None]]
+    ) -> AsyncGenerator[Progress, None]:
         motion = self._control.begin(kind)
         try:
-            async with aclosing(steps(motion)) as running:  # type: ignore[type-var]
+            async with aclosing(steps(motion)) as running:
                 async for progress in running:
                     yield progress
         except (asyncio.CancelledError, GeneratorExit):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 
 from fractus_core.api.geometry import Position
 
@@ -37,7 +37,7 @@ class Tours:
         self,
         control: Control,
         grants: GrantFiles,
-        launch: Callable[[Trip, Position], AsyncIterator[str]],
+        launch: Callable[[Trip, Position], AsyncGenerator[str, None]],
         courses: Courses,
         boarding_s: float,
     ) -> None:

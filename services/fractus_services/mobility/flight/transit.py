@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 
 from fractus_core.api.components import ControlPoint
 from fractus_core.api.geometry import Position
@@ -47,7 +47,7 @@ class TransitFlight:
         self._guard = guard
         self._courses = courses
 
-    async def bring(self, lease: Lease, mission: Mission) -> AsyncIterator[str]:
+    async def bring(self, lease: Lease, mission: Mission) -> AsyncGenerator[str, None]:
         """Fly to the start of the driver's next control point.
 
         Yields:
@@ -86,7 +86,7 @@ class TransitFlight:
             control.start("returnToLaunch")
         return PreconditionFailed("ControlLost", FAULT)
 
-    async def launch(self, trip: Trip, place: Position) -> AsyncIterator[str]:
+    async def launch(self, trip: Trip, place: Position) -> AsyncGenerator[str, None]:
         """Arm and take off, unless the drone is in the air, to the altitude of a place.
 
         Yields:

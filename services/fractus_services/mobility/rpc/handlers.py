@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
 from typing import Any
 
@@ -91,7 +91,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
             try:
                 async with (
                     asyncio.timeout(max(caller.valid_until_s - self._clock(), 0.0)),
-                    aclosing(self._streams.follow(grant)) as events,  # type: ignore[type-var]
+                    aclosing(self._streams.follow(grant)) as events,
                 ):
                     async for event in events:
                         await context.write(_event(event))
@@ -194,10 +194,10 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         async with self._reception.call(context, urgent=True) as caller:
             await self._report(self._service.return_to_launch(self._grant_of(caller)), context)
 
-    async def _report(self, progress: AsyncIterator[Progress], context: Any) -> None:
+    async def _report(self, progress: AsyncGenerator[Progress, None], context: Any) -> None:
         first = True
         vehicle = self._control.autopilot.vehicle
-        async with aclosing(progress) as steps:  # type: ignore[type-var]
+        async with aclosing(progress) as steps:
             async for at in steps:
                 message = mobility_pb2.MotionProgress(
                     position=position_of(vehicle), distance_m=at.step.distance_m, complete=at.step.complete

@@ -93,7 +93,7 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     handlers = MobilityHandlers(service, control, streams, grants=grants, node=node, clock=clock, heard=tours.heard)
 
     def register(server: grpc.aio.Server) -> None:
-        mobility_pb2_grpc.add_MobilityServiceServicer_to_server(handlers, server)  # type: ignore[no-untyped-call]
+        mobility_pb2_grpc.add_MobilityServiceServicer_to_server(handlers, server)
 
     serving = serve_grpc("mobility", options.listen, tls, register)
     await run_until(stop, autopilot.run(), grants.run(), monitor.run(), monitor.record(), tours.run(), serving)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
 
 from fractus_services.errors import PolicyDenied, PreconditionFailed
@@ -26,24 +26,24 @@ class Streams:
         bring: flies the drone to where a driver with partial control takes over, and says what it does meanwhile.
     """
 
-    def __init__(self, control: Control, bring: Callable[[Lease, Mission], AsyncIterator[str]]) -> None:
+    def __init__(self, control: Control, bring: Callable[[Lease, Mission], AsyncGenerator[str, None]]) -> None:
         self._control = control
         self._bring = bring
 
-    async def follow(self, grant: ActiveGrant) -> AsyncIterator[ControlEvent]:
+    async def follow(self, grant: ActiveGrant) -> AsyncGenerator[ControlEvent, None]:
         """The events of a caller's stream.
 
         Raises:
             Refused: this caller gets neither the drone nor a ride.
         """
         events = self._ride(grant) if grant.spec.tour else self._drive(grant)
-        async with aclosing(events) as running:  # type: ignore[type-var]
+        async with aclosing(events) as running:
             async for event in running:
                 yield event
 
     # Drivers
 
-    async def _drive(self, grant: ActiveGrant) -> AsyncIterator[ControlEvent]:
+    async def _drive(self, grant: ActiveGrant) -> AsyncGenerator[ControlEvent, None]:
         """A driver has the drone from GRANTED until this is closed."""
         control = self._control
         mission = self._admit(grant)
@@ -52,7 +52,7 @@ class Streams:
         lease = control.lease = Lease(grant)
         try:
             while control.lease is lease and not lease.granted:
-                async with aclosing(self._until_ready(lease, mission)) as waiting:  # type: ignore[type-var]
+                async with aclosing(self._until_ready(lease, mission)) as waiting:
                     async for reason in waiting:
                         yield ControlEvent(ControlState.WAITING, mission.points_done, reason)
                 if control.lease is lease and control.blocked_by(lease.key) is None:
@@ -83,7 +83,7 @@ class Streams:
             raise PreconditionFailed("ControlHeld", "another application has the drone; try again when it is back")
         return mission
 
-    async def _until_ready(self, lease: Lease, mission: Mission) -> AsyncIterator[str]:
+    async def _until_ready(self, lease: Lease, mission: Mission) -> AsyncGenerator[str, None]:
         control, said = self._control, ""
         while control.lease is lease:
             reason = control.blocked_by(lease.key)
@@ -93,7 +93,7 @@ class Streams:
                 if lease.grant.spec.control != "partial":
                     return
                 lease.transit = True
-                async with aclosing(self._bring(lease, mission)) as flying:  # type: ignore[type-var]
+                async with aclosing(self._bring(lease, mission)) as flying:
                     async for event in flying:
                         yield event
                 return
@@ -123,7 +123,7 @@ class Streams:
 
     # Passengers
 
-    async def _ride(self, grant: ActiveGrant) -> AsyncIterator[ControlEvent]:
+    async def _ride(self, grant: ActiveGrant) -> AsyncGenerator[ControlEvent, None]:
         """A passenger whose points of interest the system visits is told how far it is; leaving changes nothing."""
         control = self._control
         mission = control.journal.mission(grant)

@@ -101,9 +101,9 @@ async def test_after_an_abrupt_loss_the_cloud_answers_at_once(world: Rig, redire
 async def test_a_call_that_takes_longer_than_the_drain_is_cut(world: Rig, redirector: Redirector) -> None:
     world.servers(work_s=1.0)
     keeping = asyncio.create_task(redirector.run())
-    client = world.client(3, pause_s=1.5)
+    client = world.client(3, pause_s=2.0)
     shown = await asyncio.to_thread(answers, client, 2)
-    await asyncio.sleep(0.9)  # the third call is under way
+    await asyncio.sleep(1.5)  # the third call is under way
     done = await redirector.switch(TO_EDGE, planned=True)
     keeping.cancel()
     assert done.drained + done.cut == 1

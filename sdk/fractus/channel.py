@@ -13,11 +13,14 @@ import grpc
 import grpc.aio
 
 from fractus.environment import Endpoint
-from fractus.errors import NotConfigured, translate
+from fractus.errors import NotConfigured, Unavailable, translate
 
 CALL_TIMEOUT_S = 10.0
 RECONNECT_TIMEOUT_S = 30.0
 """How long a call waits for a service that is restarting: once it runs it gives a drone's driver 15 s to come back."""
+
+MAX_RETRY_DELAY_S = 2.0
+"""The longest pause between two attempts."""
 
 NOT_RETRIED = frozenset({"Arm", "SetVelocity"})
 """Methods that are for this moment: repeated late, they would do what is no longer wanted."""
@@ -39,7 +42,9 @@ _FILES = ("ca.crt", "tls.key", "tls.crt")
 _Stamp = tuple[tuple[int, int, int], ...]
 
 
-def backoff(first_s: float = 0.1, cap_s: float = 2.0, rng: random.Random | None = None) -> Iterator[float]:
+def backoff(
+    first_s: float = 0.1, cap_s: float = MAX_RETRY_DELAY_S, rng: random.Random | None = None
+) -> Iterator[float]:
     """Delays that double from `first_s` to `cap_s`, each jittered down by up to half."""
     draw = (rng or random).uniform
     delay = first_s
@@ -105,18 +110,13 @@ class ServiceChannel:
         Raises:
             FractusError: one of the typed errors; `Unavailable` when the service did not come back.
         """
-        loop = asyncio.get_running_loop()
-        give_up = loop.time() + self.reconnect_timeout_s
-        for delay in backoff():
+        retries = Retries(self, method, retried=method not in NOT_RETRIED)
+        while True:
             try:
                 async with self.stub() as stub:
                     return await getattr(stub, method)(request, timeout=timeout_s or self._timeout_s)
             except grpc.aio.AioRpcError as error:
-                again = error.code() is grpc.StatusCode.UNAVAILABLE and method not in NOT_RETRIED
-                if not again or loop.time() + delay > give_up:
-                    raise translate(error, method, self.address) from None
-            await asyncio.sleep(delay)
-        raise AssertionError("backoff is endless")
+                await retries.pause(error)
 
     def _current(self) -> _Connection:
         stamp = self._stamp()
@@ -158,3 +158,43 @@ class ServiceChannel:
         options = (*_OPTIONS, ("grpc.ssl_target_name_override", self._endpoint.server_name))
         channel = grpc.aio.secure_channel(self.address, credentials, options=options)
         return _Connection(channel, self._make_stub(channel), stamp)
+
+
+class Retries:
+    """The pauses between attempts at one call while its service restarts, and when to give up.
+
+    Args:
+        channel: where the call goes.
+        method: what is called.
+        max_delay_s: the longest pause.
+        retried: whether the call may be tried again at all.
+    """
+
+    def __init__(
+        self, channel: ServiceChannel, method: str, *, max_delay_s: float = MAX_RETRY_DELAY_S, retried: bool = True
+    ) -> None:
+        self._channel = channel
+        self._method = method
+        self._max_delay_s = max_delay_s
+        self._retried = retried
+        self.reset()
+
+    def reset(self) -> None:
+        """The service has answered: the next failure is a first one."""
+        self._delays = backoff(cap_s=self._max_delay_s)
+        self._give_up: float | None = None
+
+    async def pause(self, error: grpc.aio.AioRpcError | None = None) -> None:
+        """Wait before the next attempt, after a failure or the end of a stream (None).
+
+        Raises:
+            FractusError: there is no other attempt; this is why.
+        """
+        now, delay = asyncio.get_running_loop().time(), next(self._delays)
+        self._give_up = self._give_up or now + self._channel.reconnect_timeout_s
+        transient = error is None or error.code() is grpc.StatusCode.UNAVAILABLE
+        if not (transient and self._retried) or now + delay > self._give_up:
+            if error is None:
+                raise Unavailable(f"{self._method}: the service ended the stream")
+            raise translate(error, self._method, self._channel.address) from None
+        await asyncio.sleep(delay)

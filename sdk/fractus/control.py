@@ -11,8 +11,8 @@ import grpc
 import grpc.aio
 from fractus_proto.v1 import mobility_pb2
 
-from fractus.channel import ServiceChannel, backoff
-from fractus.errors import ControlLost, FractusError, MissionComplete, Unavailable, translate
+from fractus.channel import Retries, ServiceChannel
+from fractus.errors import ControlLost, FractusError, MissionComplete, Unavailable
 
 _log = logging.getLogger("fractus")
 _Event = mobility_pb2.ControlEvent
@@ -148,31 +148,27 @@ class Control:
 
     async def _watch(self) -> None:
         """Keep the stream open; ends when control is lost or was returned."""
-        loop = asyncio.get_running_loop()
-        give_up = loop.time() + self._channel.reconnect_timeout_s
-        delays = backoff(cap_s=MAX_RETRY_DELAY_S)
+        retries = Retries(self._channel, "GetControl", max_delay_s=MAX_RETRY_DELAY_S)
         while True:
+            error: grpc.aio.AioRpcError | None = None
             try:
                 await self._follow()
-            except grpc.aio.AioRpcError as error:
-                failure = translate(error, "GetControl", self._channel.address)
-                transient = error.code() is grpc.StatusCode.UNAVAILABLE
-            else:
-                failure, transient = Unavailable("GetControl: the service ended the stream"), True
+            except grpc.aio.AioRpcError as failed:
+                error = failed
             if self._returning or self._lost is not None:
                 return
             if self._granted.is_set():
                 self._granted.clear()
-                delays, give_up = backoff(cap_s=MAX_RETRY_DELAY_S), loop.time() + self._channel.reconnect_timeout_s
+                retries.reset()
                 _log.warning(
                     "control: lost the connection to the mobility service; trying again (timeout_s=%g)",
                     self._channel.reconnect_timeout_s,
                 )
-            delay = next(delays)
-            if not transient or loop.time() + delay > give_up:
+            try:
+                await retries.pause(error)
+            except FractusError as failure:
                 self._lose(failure)
                 return
-            await asyncio.sleep(delay)
 
     async def _follow(self) -> None:
         async with self._channel.stub() as stub:

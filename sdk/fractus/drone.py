@@ -13,10 +13,10 @@ import grpc
 import grpc.aio
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
-from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, ServiceChannel, backoff
+from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, Retries, ServiceChannel
 from fractus.control import Control
 from fractus.environment import Endpoint, endpoint
-from fractus.errors import ControlLost, Corrected, FractusError, translate
+from fractus.errors import ControlLost, Corrected, FractusError
 from fractus.questions import CanI
 from fractus.requests import goto_request, speed_request, takeoff_request, velocity_request
 from fractus.values import (
@@ -75,27 +75,19 @@ class Motion:
         return self._complete().__await__()
 
     async def __aiter__(self) -> AsyncGenerator[Progress, None]:
-        loop = asyncio.get_running_loop()
-        give_up: float | None = None
-        delays = backoff()
+        retries = Retries(self._channel, self._method, retried=self._control is not None)
         while True:
             if self._control is not None:
                 await self._control.ready()
             try:
                 async with aclosing(self._attempt()) as steps:
                     async for step in steps:
-                        give_up, delays = None, backoff()
+                        retries.reset()
                         yield step
             except grpc.aio.AioRpcError as error:
-                failure = translate(error, self._method, self._channel.address)
-                give_up = give_up or loop.time() + self._channel.reconnect_timeout_s
-                delay = next(delays)
-                again = error.code() is grpc.StatusCode.UNAVAILABLE and self._control is not None
-                if not again or loop.time() + delay > give_up:
-                    raise failure from None
+                await retries.pause(error)
             else:
                 return
-            await asyncio.sleep(delay)
 
     async def _complete(self) -> Progress:
         last: Progress | None = None
@@ -328,24 +320,21 @@ class Mobility:
 
     async def _stream(self, method: str, request: Any) -> AsyncGenerator[Any, None]:
         """The messages of a stream that is opened again after the service restarts."""
-        loop = asyncio.get_running_loop()
-        give_up, delays = loop.time() + self._channel.reconnect_timeout_s, backoff()
+        retries = Retries(self._channel, method)
         while True:
-            async with self._channel.stub() as stub:
-                call = getattr(stub, method)(request)
-                try:
-                    async for message in call:
-                        yield message
-                        give_up, delays = loop.time() + self._channel.reconnect_timeout_s, backoff()
-                except grpc.aio.AioRpcError as error:
-                    delay = next(delays)
-                    if error.code() is not grpc.StatusCode.UNAVAILABLE or loop.time() + delay > give_up:
-                        raise translate(error, method, self._channel.address) from None
-                else:
-                    return
-                finally:
-                    call.cancel()
-            await asyncio.sleep(delay)
+            try:
+                async with self._channel.stub() as stub:
+                    call = getattr(stub, method)(request)
+                    try:
+                        async for message in call:
+                            yield message
+                            retries.reset()
+                    finally:
+                        call.cancel()
+            except grpc.aio.AioRpcError as error:
+                await retries.pause(error)
+            else:
+                return
 
     async def _check(self, request: mobility_pb2.CheckCallRequest) -> Check:
         return Check.from_proto(await self._channel.unary("CheckCall", request))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from fractus_core.api.components import Component, Placement, PointsOfInterest, Reference
-from fractus_core.api.model import Condition, InvalidObject, Model, OpenModel, Resource
+from fractus_core.api.model import AGE, READY, Condition, InvalidObject, Model, OpenModel, Resource
 from fractus_core.api.rules import Broken, rule
 
 
@@ -155,19 +155,15 @@ class ApplicationStatus(OpenModel):
     conditions: tuple[Condition, ...] = ()
 
 
-class Application(Resource):
+class Application(Resource, plural="applications", short="fapp", namespaced=True):
     """An application whose components run on a drone, at the edge and in the cloud."""
 
-    KIND: ClassVar[str] = "Application"
-    PLURAL: ClassVar[str] = "applications"
-    SHORT: ClassVar[str] = "fapp"
-    NAMESPACED: ClassVar[bool] = True
     COLUMNS = (
         ("Phase", "string", ".status.phase"),
         ("Drone", "string", ".status.drone"),
         ("Pods", "string", ".status.pods"),
-        ("Ready", "string", ".status.conditions[?(@.type=='Ready')].status"),
-        ("Age", "date", ".metadata.creationTimestamp"),
+        READY,
+        AGE,
         ("Message", "string", ".status.message"),
     )
 

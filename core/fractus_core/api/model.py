@@ -115,23 +115,42 @@ class Condition(OpenModel):
     observed_generation: int | None = Field(default=None, ge=0, description="metadata.generation this was said of.")
 
 
+Column = tuple[str, str, str]
+"""A printer column: title, type, JSONPath."""
+
+READY: Column = ("Ready", "string", ".status.conditions[?(@.type=='Ready')].status")
+AGE: Column = ("Age", "date", ".metadata.creationTimestamp")
+
+
 class Resource(OpenModel):
     """An object of one of Fractus' kinds."""
 
     KIND: ClassVar[str]
     PLURAL: ClassVar[str]
     SHORT: ClassVar[str]
-    NAMESPACED: ClassVar[bool] = False
-    COLUMNS: ClassVar[Sequence[tuple[str, str, str]]] = ()
-    """Printer columns: (title, type, JSONPath)."""
-    SELECTABLE: ClassVar[Sequence[str]] = ()
+    NAMESPACED: ClassVar[bool]
+    SELECTABLE: ClassVar[Sequence[str]]
     """JSONPaths that watches may select on."""
-    WRITTEN_BY_OPERATOR: ClassVar[bool] = False
+    WRITTEN_BY_OPERATOR: ClassVar[bool]
     """The operator alone writes it, of parts that were checked where they came in: its schema needs no rules."""
+    COLUMNS: ClassVar[Sequence[Column]] = ()
 
     api_version: Literal["fractus.dev/v1alpha1"] = "fractus.dev/v1alpha1"
     kind: str
     metadata: Metadata
+
+    def __init_subclass__(
+        cls,
+        *,
+        plural: str,
+        short: str,
+        namespaced: bool = False,
+        selectable: Sequence[str] = (),
+        written_by_operator: bool = False,
+    ) -> None:
+        super().__init_subclass__()
+        cls.KIND, cls.PLURAL, cls.SHORT, cls.NAMESPACED = cls.__name__, plural, short, namespaced
+        cls.SELECTABLE, cls.WRITTEN_BY_OPERATOR = selectable, written_by_operator
 
     @classmethod
     def from_body(cls, body: Any) -> Self:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
 from fractus_core.api.geometry import Point, Position
 from fractus_core.api.methods import CameraMethod, MobilityMethod
-from fractus_core.api.model import Condition, Model, OpenModel, Resource
+from fractus_core.api.model import AGE, READY, Condition, Model, OpenModel, Resource
 from fractus_core.api.names import Name
 
 Technology = Literal["Ethernet", "4G", "5G", "WiFi", "BLE"]
@@ -168,19 +168,16 @@ class DroneStatus(OpenModel):
     conditions: tuple[Condition, ...] = ()
 
 
-class Drone(Resource):
+class Drone(Resource, plural="drones", short="drn"):
     """A drone that can host components."""
 
-    KIND: ClassVar[str] = "Drone"
-    PLURAL: ClassVar[str] = "drones"
-    SHORT: ClassVar[str] = "drn"
     COLUMNS = (
         ("Class", "string", ".spec.class"),
         ("Depot", "string", ".spec.depot"),
         ("State", "string", ".status.flightState"),
         ("Battery", "number", ".status.battery.remaining"),
-        ("Ready", "string", ".status.conditions[?(@.type=='Ready')].status"),
-        ("Age", "date", ".metadata.creationTimestamp"),
+        READY,
+        AGE,
     )
 
     kind: Literal["Drone"] = "Drone"
@@ -203,17 +200,14 @@ class EdgeNodeStatus(OpenModel):
     conditions: tuple[Condition, ...] = ()
 
 
-class EdgeNode(Resource):
+class EdgeNode(Resource, plural="edgenodes", short="edn"):
     """A fixed node at the edge that can host components."""
 
-    KIND: ClassVar[str] = "EdgeNode"
-    PLURAL: ClassVar[str] = "edgenodes"
-    SHORT: ClassVar[str] = "edn"
     COLUMNS = (
         ("Latitude", "number", ".spec.location.lat"),
         ("Longitude", "number", ".spec.location.lon"),
-        ("Ready", "string", ".status.conditions[?(@.type=='Ready')].status"),
-        ("Age", "date", ".metadata.creationTimestamp"),
+        READY,
+        AGE,
     )
 
     kind: Literal["EdgeNode"] = "EdgeNode"
@@ -228,12 +222,9 @@ class DepotSpec(Model):
     radius: float = Field(default=30, gt=0, le=10_000, description="Metres around location that belong to the depot.")
 
 
-class Depot(Resource):
+class Depot(Resource, plural="depots", short="dpt"):
     """A place where drones are kept and charged."""
 
-    KIND: ClassVar[str] = "Depot"
-    PLURAL: ClassVar[str] = "depots"
-    SHORT: ClassVar[str] = "dpt"
     COLUMNS = (
         ("Latitude", "number", ".spec.location.lat"),
         ("Longitude", "number", ".spec.location.lon"),

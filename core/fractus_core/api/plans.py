@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, WithJsonSchema
 
@@ -15,10 +15,10 @@ from fractus_core.api.components import (
     PointsOfInterest,
     ServiceRequest,
 )
-from fractus_core.api.geometry import AltitudeBand, Area, Point, Position
-from fractus_core.api.model import Condition, Model, OpenModel, Resource
+from fractus_core.api.geometry import Area, Point, Position
+from fractus_core.api.model import AGE, Condition, Model, OpenModel, Resource
 from fractus_core.api.names import component_identity
-from fractus_core.api.policies import ActiveTime, PolicySpec
+from fractus_core.api.policies import PolicySpec, ZoneShape
 
 Role = Literal["drone", "static", "hybrid-edge", "hybrid-drone", "cloud"]
 GeoJson = Annotated[dict[str, Any], WithJsonSchema({"type": "object", "x-kubernetes-preserve-unknown-fields": True})]
@@ -105,31 +105,23 @@ class DeploymentPlanSpec(Model):
     )
 
 
-class DeploymentPlan(Resource):
+class DeploymentPlan(Resource, plural="deploymentplans", short="fplan", namespaced=True, written_by_operator=True):
     """The plan of an application: areas, placements, scores, rejected nodes with reasons."""
 
-    KIND: ClassVar[str] = "DeploymentPlan"
-    PLURAL: ClassVar[str] = "deploymentplans"
-    SHORT: ClassVar[str] = "fplan"
-    WRITTEN_BY_OPERATOR: ClassVar[bool] = True
-    NAMESPACED: ClassVar[bool] = True
     COLUMNS = (
         ("Application", "string", ".spec.application"),
         ("Drone", "string", ".spec.drone.node"),
-        ("Age", "date", ".metadata.creationTimestamp"),
+        AGE,
     )
 
     kind: Literal["DeploymentPlan"] = "DeploymentPlan"
     spec: DeploymentPlanSpec
 
 
-class GrantedZone(Model):
+class GrantedZone(ZoneShape):
     """A zone of a granted policy, with its geometry, so that the node needs nothing else."""
 
     name: str
-    area: Area
-    altitude: AltitudeBand | None = None
-    schedule: tuple[ActiveTime, ...] = Field(default=(), description="When the zone is active; empty: always.")
 
 
 class GrantedPolicy(Model):
@@ -208,20 +200,15 @@ class GrantStatus(OpenModel):
     conditions: tuple[Condition, ...] = ()
 
 
-class Grant(Resource):
+class Grant(Resource, plural="grants", short="fgr", written_by_operator=True, selectable=(".spec.node",)):
     """The policy configuration of one component instance on one node."""
 
-    KIND: ClassVar[str] = "Grant"
-    PLURAL: ClassVar[str] = "grants"
-    SHORT: ClassVar[str] = "fgr"
-    WRITTEN_BY_OPERATOR: ClassVar[bool] = True
-    SELECTABLE = (".spec.node",)
     COLUMNS = (
         ("Node", "string", ".spec.node"),
         ("Application", "string", ".spec.application.name"),
         ("Component", "string", ".spec.component"),
         ("Phase", "string", ".status.phase"),
-        ("Age", "date", ".metadata.creationTimestamp"),
+        AGE,
     )
 
     kind: Literal["Grant"] = "Grant"

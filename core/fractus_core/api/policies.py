@@ -6,13 +6,13 @@ import math
 import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from typing import Annotated, ClassVar, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 from pydantic import Field
 
 from fractus_core.api.geometry import AltitudeBand, Area, Reference
 from fractus_core.api.methods import Method
-from fractus_core.api.model import Condition, Model, OpenModel, Resource
+from fractus_core.api.model import AGE, READY, Condition, Model, OpenModel, Resource
 from fractus_core.api.names import Name
 from fractus_core.api.rules import Broken, rule
 
@@ -96,8 +96,8 @@ def _unix(moment: datetime) -> float:
     return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
-class ZoneSpec(Model):
-    """A named piece of air or ground."""
+class ZoneShape(Model):
+    """A piece of air, and when it counts."""
 
     area: Area
     altitude: AltitudeBand | None = Field(default=None, description="The slab of air; unset: from the ground up.")
@@ -106,20 +106,18 @@ class ZoneSpec(Model):
         max_length=50,
         description="When the zone is active; empty: always. Outside it, it is as if not there.",
     )
+
+
+class ZoneSpec(ZoneShape):
+    """A named piece of air or ground."""
+
     description: str = Field(default="", max_length=1024)
 
 
-_READY = ("Ready", "string", ".status.conditions[?(@.type=='Ready')].status")
-_AGE = ("Age", "date", ".metadata.creationTimestamp")
-
-
-class Zone(Resource):
+class Zone(Resource, plural="zones", short="zn"):
     """A named area that policies refer to."""
 
-    KIND: ClassVar[str] = "Zone"
-    PLURAL: ClassVar[str] = "zones"
-    SHORT: ClassVar[str] = "zn"
-    COLUMNS = (("Lower", "number", ".spec.altitude.lower"), ("Upper", "number", ".spec.altitude.upper"), _READY, _AGE)
+    COLUMNS = (("Lower", "number", ".spec.altitude.lower"), ("Upper", "number", ".spec.altitude.upper"), READY, AGE)
 
     kind: Literal["Zone"] = "Zone"
     spec: ZoneSpec
@@ -343,19 +341,16 @@ class PolicySpec(Validity):
         return self.action is None or self.action in get_args(actions)
 
 
-class Policy(Resource):
+class Policy(Resource, plural="policies", short="pol"):
     """A rule of an authority or a provider."""
 
-    KIND: ClassVar[str] = "Policy"
-    PLURAL: ClassVar[str] = "policies"
-    SHORT: ClassVar[str] = "pol"
     COLUMNS = (
         ("Type", "string", ".spec.type"),
         ("Kind", "string", ".spec.kind"),
         ("Action", "string", ".spec.action"),
         ("Zones", "string", ".spec.selector.zones"),
-        _READY,
-        _AGE,
+        READY,
+        AGE,
     )
 
     kind: Literal["Policy"] = "Policy"

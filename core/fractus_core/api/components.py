@@ -11,7 +11,7 @@ from fractus_core.api.geometry import Area, Circle, Position
 from fractus_core.api.methods import METHODS_OF, Method, Service
 from fractus_core.api.model import Model
 from fractus_core.api.names import ComponentName, Name, slug
-from fractus_core.api.rules import Broken, rule
+from fractus_core.api.rules import Broken, one_of, rule
 
 Placement = Literal["drone", "edge", "hybrid", "cloud"]
 ComponentClass = Literal["driver", "passenger"]
@@ -51,9 +51,7 @@ class Start(Model):
     depot: Name | None = Field(default=None, description="Name of a Depot.")
     position: Position | None = None
 
-    @rule("has(self.depot) != has(self.position)", "give either depot or position, and only one of them")
-    def _one_start(self) -> Broken:
-        return "" if (self.depot is None) == (self.position is None) else None
+    _one_start = one_of("depot", "position")
 
 
 class ControlPoint(Model):

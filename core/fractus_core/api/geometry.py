@@ -7,10 +7,12 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from fractus_core.api.model import Model
-from fractus_core.api.rules import Broken, rule
+from fractus_core.api.rules import Broken, one_of, rule
 
 Latitude = Annotated[float, Field(ge=-90, le=90, description="Degrees north, WGS 84, -90 to 90.")]
 Longitude = Annotated[float, Field(ge=-180, le=180, description="Degrees east, WGS 84, -180 to 180.")]
+Altitude = Annotated[float, Field(ge=-1000, le=20000)]
+"""Metres, within anything that flies."""
 Reference = Literal["home", "amsl", "terrain"]
 
 
@@ -24,10 +26,8 @@ class Point(Model):
 class Position(Point):
     """A place in the air."""
 
-    alt: float | None = Field(
+    alt: Altitude | None = Field(
         default=None,
-        ge=-1000,
-        le=20000,
         description="Metres in the datum of altitudeReference; unset keeps the current altitude.",
     )
     altitude_reference: Reference = Field(
@@ -67,16 +67,14 @@ class Area(Model):
     polygon: Polygon | None = None
     circle: Circle | None = None
 
-    @rule("has(self.polygon) != has(self.circle)", "give either polygon or circle, and only one of them")
-    def _one_shape(self) -> Broken:
-        return "" if (self.polygon is None) == (self.circle is None) else None
+    _one_shape = one_of("polygon", "circle")
 
 
 class AltitudeBand(Model):
     """A slab of air between two altitudes."""
 
-    lower: float | None = Field(default=None, ge=-1000, le=20000, description="Metres; unset reaches to the ground.")
-    upper: float | None = Field(default=None, ge=-1000, le=20000, description="Metres; unset has no ceiling.")
+    lower: Altitude | None = Field(default=None, description="Metres; unset reaches to the ground.")
+    upper: Altitude | None = Field(default=None, description="Metres; unset has no ceiling.")
     reference: Reference = Field(default="home", description="What lower and upper are measured from.")
 
     @rule("!has(self.lower) || !has(self.upper) || self.lower < self.upper", "lower must be below upper")

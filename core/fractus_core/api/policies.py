@@ -10,7 +10,7 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import Field
 
-from fractus_core.api.geometry import AltitudeBand, Area, Reference
+from fractus_core.api.geometry import Altitude, AltitudeBand, Area, Reference
 from fractus_core.api.methods import Method
 from fractus_core.api.model import AGE, READY, Condition, Model, OpenModel, Resource
 from fractus_core.api.names import Name
@@ -182,6 +182,9 @@ class PolicySelector(Model):
     applications: ApplicationSelector | None = Field(default=None, description="Unset: every application.")
 
 
+Limit = Annotated[
+    Altitude | None, Field(description="For LimitControl: m/s, or metres in the datum of altitudeReference.")
+]
 PolicyType = Literal["AccessControl", "LimitControl", "GeofenceControl", "PrivacyControl"]
 AccessKind = Literal["grant", "denial"]
 LimitKind = Literal["speed", "altitude"]
@@ -219,18 +222,8 @@ class PolicySpec(Validity):
     type: PolicyType
     kind: Literal[AccessKind, LimitKind, GeofenceKind, "camera"]
     methods: tuple[Method, ...] = Field(default=(), max_length=64, description="For AccessControl: the methods meant.")
-    lower_limit: float | None = Field(
-        default=None,
-        ge=-1000,
-        le=20000,
-        description="For LimitControl: m/s, or metres in the datum of altitudeReference.",
-    )
-    upper_limit: float | None = Field(
-        default=None,
-        ge=-1000,
-        le=20000,
-        description="For LimitControl: m/s, or metres in the datum of altitudeReference.",
-    )
+    lower_limit: Limit = None
+    upper_limit: Limit = None
     altitude_reference: Reference = Field(
         default="home", description="For LimitControl altitude: what the limits are measured from."
     )

@@ -46,3 +46,13 @@ def rule(cel: str, message: str) -> Callable[[Callable[[M], Broken]], Any]:
         return model_validator(mode="after")(check)
 
     return declare
+
+
+def one_of(first: str, second: str) -> Any:
+    """The rule that of two optional fields one is given, and not both."""
+
+    @rule(f"has(self.{first}) != has(self.{second})", f"give either {first} or {second}, and only one of them")
+    def given(self: Any) -> Broken:
+        return "" if (getattr(self, first) is None) == (getattr(self, second) is None) else None
+
+    return given

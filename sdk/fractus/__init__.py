@@ -1,79 +1,40 @@
 """What a component of a Fractus application imports."""
 
-from fractus import sync
-from fractus.control import Control
-from fractus.drone import Mobility, Motion, mobility
-from fractus.environment import Endpoint, control_points, egress, endpoint
-from fractus.errors import (
-    Busy,
-    ControlLost,
-    Corrected,
-    FractusError,
-    Interrupted,
-    InvalidRequest,
-    MissionComplete,
-    NotConfigured,
-    PolicyDenied,
-    Unavailable,
-)
-from fractus.pictures import Camera, camera
-from fractus.questions import CanI
-from fractus.values import (
-    Action,
-    AltitudeReference,
-    Attitude,
-    Check,
-    ControlPoint,
-    Decision,
-    ImageInfo,
-    Position,
-    PositionResult,
-    Progress,
-    Result,
-    Ride,
-    SpeedResult,
-    Telemetry,
-    Velocity,
-    VelocityResult,
-)
-
-__all__ = [
-    "Action",
-    "AltitudeReference",
-    "Attitude",
-    "Busy",
-    "Camera",
-    "CanI",
-    "Check",
-    "Control",
-    "ControlLost",
-    "ControlPoint",
-    "Corrected",
-    "Decision",
-    "Endpoint",
-    "FractusError",
-    "ImageInfo",
-    "Interrupted",
-    "InvalidRequest",
-    "MissionComplete",
-    "Mobility",
-    "Motion",
-    "NotConfigured",
-    "PolicyDenied",
-    "Position",
-    "PositionResult",
-    "Progress",
-    "Result",
-    "Ride",
-    "SpeedResult",
-    "Telemetry",
-    "Unavailable",
-    "Velocity",
-    "VelocityResult",
-    "camera",
-    "control_points",
-    "egress",
-    "endpoint",
-    "mobility",
-    "sync",
-]
+from fractus import sync as sync
+from fractus.control import Control as Control
+from fractus.drone import Mobility as Mobility
+from fractus.drone import Motion as Motion
+from fractus.drone import mobility as mobility
+from fractus.environment import Endpoint as Endpoint
+from fractus.environment import control_points as control_points
+from fractus.environment import egress as egress
+from fractus.environment import endpoint as endpoint
+from fractus.errors import Busy as Busy
+from fractus.errors import ControlLost as ControlLost
+from fractus.errors import Corrected as Corrected
+from fractus.errors import FractusError as FractusError
+from fractus.errors import Interrupted as Interrupted
+from fractus.errors import InvalidRequest as InvalidRequest
+from fractus.errors import MissionComplete as MissionComplete
+from fractus.errors import NotConfigured as NotConfigured
+from fractus.errors import PolicyDenied as PolicyDenied
+from fractus.errors import Unavailable as Unavailable
+from fractus.pictures import Camera as Camera
+from fractus.pictures import camera as camera
+from fractus.questions import CanI as CanI
+from fractus.values import Action as Action
+from fractus.values import AltitudeReference as AltitudeReference
+from fractus.values import Attitude as Attitude
+from fractus.values import Check as Check
+from fractus.values import ControlPoint as ControlPoint
+from fractus.values import Decision as Decision
+from fractus.values import ImageInfo as ImageInfo
+from fractus.values import Position as Position
+from fractus.values import PositionResult as PositionResult
+from fractus.values import Progress as Progress
+from fractus.values import Result as Result
+from fractus.values import Ride as Ride
+from fractus.values import SpeedResult as SpeedResult
+from fractus.values import Telemetry as Telemetry
+from fractus.values import Velocity as Velocity
+from fractus.values import VelocityResult as VelocityResult

@@ -1,34 +1,23 @@
 """The kinds of the API group fractus.dev/v1alpha1, as pydantic models."""
 
-from fractus_core.api.applications import Application
-from fractus_core.api.components import Component
-from fractus_core.api.model import API_VERSION, GROUP, VERSION, Condition, InvalidObject, Metadata, Resource
-from fractus_core.api.names import component_identity, node_identity, node_server_name
-from fractus_core.api.nodes import Depot, Drone, EdgeNode
-from fractus_core.api.plans import DeploymentPlan, Grant
-from fractus_core.api.policies import Policy, Zone
+from fractus_core.api.applications import Application as Application
+from fractus_core.api.components import Component as Component
+from fractus_core.api.model import API_VERSION as API_VERSION
+from fractus_core.api.model import GROUP as GROUP
+from fractus_core.api.model import VERSION as VERSION
+from fractus_core.api.model import Condition as Condition
+from fractus_core.api.model import InvalidObject as InvalidObject
+from fractus_core.api.model import Metadata as Metadata
+from fractus_core.api.model import Resource as Resource
+from fractus_core.api.names import component_identity as component_identity
+from fractus_core.api.names import node_identity as node_identity
+from fractus_core.api.names import node_server_name as node_server_name
+from fractus_core.api.nodes import Depot as Depot
+from fractus_core.api.nodes import Drone as Drone
+from fractus_core.api.nodes import EdgeNode as EdgeNode
+from fractus_core.api.plans import DeploymentPlan as DeploymentPlan
+from fractus_core.api.plans import Grant as Grant
+from fractus_core.api.policies import Policy as Policy
+from fractus_core.api.policies import Zone as Zone
 
 KINDS: tuple[type[Resource], ...] = (Drone, EdgeNode, Depot, Zone, Policy, Application, DeploymentPlan, Grant)
-
-__all__ = [
-    "API_VERSION",
-    "GROUP",
-    "KINDS",
-    "VERSION",
-    "Application",
-    "Component",
-    "Condition",
-    "DeploymentPlan",
-    "Depot",
-    "Drone",
-    "EdgeNode",
-    "Grant",
-    "InvalidObject",
-    "Metadata",
-    "Policy",
-    "Resource",
-    "Zone",
-    "component_identity",
-    "node_identity",
-    "node_server_name",
-]

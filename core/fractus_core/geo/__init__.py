@@ -1,29 +1,14 @@
 """Frames, distances and areas."""
 
-from fractus_core.geo.areas import (
-    area_of,
-    corridor,
-    geojson,
-    geojson_line,
-    ground,
-    middle,
-    middle_of,
-    points_xy,
-    polygon,
-)
-from fractus_core.geo.frames import LocalFrame, distance_m, geodesic_m
-
-__all__ = [
-    "LocalFrame",
-    "area_of",
-    "corridor",
-    "distance_m",
-    "geodesic_m",
-    "geojson",
-    "geojson_line",
-    "ground",
-    "middle",
-    "middle_of",
-    "points_xy",
-    "polygon",
-]
+from fractus_core.geo.areas import area_of as area_of
+from fractus_core.geo.areas import corridor as corridor
+from fractus_core.geo.areas import geojson as geojson
+from fractus_core.geo.areas import geojson_line as geojson_line
+from fractus_core.geo.areas import ground as ground
+from fractus_core.geo.areas import middle as middle
+from fractus_core.geo.areas import middle_of as middle_of
+from fractus_core.geo.areas import points_xy as points_xy
+from fractus_core.geo.areas import polygon as polygon
+from fractus_core.geo.frames import LocalFrame as LocalFrame
+from fractus_core.geo.frames import distance_m as distance_m
+from fractus_core.geo.frames import geodesic_m as geodesic_m

@@ -13,7 +13,7 @@ from fractus_core.api.policies import GeofenceAction
 from fractus_core.exhaustive import exhaustive
 from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Inclusion, Patch, band_meets
 from fractus_core.policy.motion import XY, Leg, stop_altitude_m, stop_point
-from fractus_core.policy.values import Situation, Takeover, Verdict, deny
+from fractus_core.policy.values import Situation, Takeover, Verdict, deny, distinct
 
 SEVERITY: dict[GeofenceAction, int] = exhaustive(
     GeofenceAction, {"adjust": 0, "ignore": 1, "hover": 2, "returnToLaunch": 3, "land": 4, "revoke": 5}
@@ -67,7 +67,7 @@ def breaches(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float, he
 def broken(found: list[Breach]) -> Verdict:
     """What becomes of a request that breaks fences, most restrictive first."""
     worst = found[0]
-    names = tuple(dict.fromkeys(b.policy for b in found))
+    names = distinct(b.policy for b in found)
     takeover = TAKEOVERS[worst.action] if worst.enters else None
     if takeover is None:
         return deny(worst.code, worst.reason, names)

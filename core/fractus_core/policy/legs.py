@@ -15,6 +15,7 @@ from fractus_core.policy.limits import (
     Clamped,
     altitude_bounds,
     clamp,
+    corrected,
     height_on_entry,
     lower_is_fine,
     speed_bounds,
@@ -34,7 +35,7 @@ from fractus_core.policy.motion import (
 )
 from fractus_core.policy.returning import straight_home_blocked
 from fractus_core.policy.routes import leads
-from fractus_core.policy.values import POSITION_UNKNOWN, Call, GotoArgs, Situation, Verdict, deny
+from fractus_core.policy.values import POSITION_UNKNOWN, Call, GotoArgs, Situation, Verdict, deny, distinct
 
 MAX_RANGE_M = 100_000.0
 NEAR_DEG = 30.0
@@ -145,7 +146,7 @@ def _fly_leg(request: _Request, aim: _Aim, notes: list[Clamped], adjusting: bool
     shorter = last_legal(leg, found) if adjusting and all(b.action == "adjust" for b in found) else None
     if shorter is None:
         return broken(found)
-    names = tuple(dict.fromkeys(b.policy for b in found))
+    names = distinct(b.policy for b in found)
     notes.append(Clamped(0.0, "LegShortened", f"{found[0].reason}; the leg ends at the last legal point", names))
     return _fly_leg(request, replace(within, target=shorter), notes, adjusting=False)
 
@@ -206,12 +207,6 @@ def _outcome(args: GotoArgs, flown: _Aim, notes: list[Clamped], grant: CompiledG
     moved = any(note.code == "LegShortened" for note in notes)
     lat, lon = grant.frame.latlon(*flown.target) if moved else (args.lat, args.lon)
     new = replace(args, lat=lat, lon=lon, alt=flown.altitude_m, reference="home", speed_mps=flown.speed_mps)
-    if not notes:
-        return Verdict("allow", new)
-    ordered = sorted(notes, key=lambda n: n.code == "TerrainAssumedFlat")
-    names = tuple(dict.fromkeys(name for note in ordered for name in note.policies))
-    action: str = "allow" if all(n.code == "TerrainAssumedFlat" for n in notes) else "correct"
-    reason = "; ".join(note.reason for note in ordered)
-    if action == "allow":
-        return Verdict("allow", new, ordered[0].code, reason, names)
-    return Verdict("correct", new, ordered[0].code, reason, names)
+    verdict = corrected(new, sorted(notes, key=lambda note: note.code == "TerrainAssumedFlat"))
+    # Ground that is taken for flat is told, but changes nothing that was asked for.
+    return replace(verdict, action="allow") if verdict.code == "TerrainAssumedFlat" else verdict

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from shapely.geometry.base import BaseGeometry
@@ -10,7 +10,7 @@ from shapely.geometry.base import BaseGeometry
 from fractus_core.api.policies import LimitAction
 from fractus_core.exhaustive import exhaustive
 from fractus_core.policy.compiled import Air, CompiledGrant, Patch, Patches, Rule, height_m
-from fractus_core.policy.values import Situation, Verdict, deny
+from fractus_core.policy.values import Args, Situation, Verdict, deny, distinct
 
 SLACK = 1e-6
 MIN_LEG_ALTITUDE_M = 2.0
@@ -40,6 +40,15 @@ class Clamped:
     code: str = ""
     reason: str = ""
     policies: tuple[str, ...] = ()
+
+
+def corrected(args: Args, notes: Sequence[Clamped]) -> Verdict:
+    """The verdict on a call that is carried out with these arguments, after all that had to be done for them."""
+    done = [note for note in notes if note.code]
+    if not done:
+        return Verdict("allow", args)
+    names = distinct(name for note in done for name in note.policies)
+    return Verdict("correct", args, done[0].code, "; ".join(note.reason for note in done), names)
 
 
 def altitude_bounds(grant: CompiledGrant, now: Situation, air: Air) -> list[Bound] | Verdict:
@@ -127,7 +136,7 @@ def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Clampe
         return Clamped(value)
     violated, side = (above, "Above") if above else (below, "Below")
     code = f"{quantity}{side}Limit"
-    names = tuple(dict.fromkeys(b.name for b in violated if b.name))
+    names = distinct(b.name for b in violated)
     refusing = [b for b in (*above, *below) if b.refuses]
     if refusing:
         bound = refusing[0]
@@ -136,7 +145,7 @@ def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Clampe
         return deny(
             code,
             f"{quantity.lower()} {value:.1f} {unit} breaks the limit of {limit:.1f} {unit} of {_source(bound)}, which refuses it",
-            tuple(dict.fromkeys(b.name for b in refusing if b.name)),
+            distinct(b.name for b in refusing),
         )
     problem = conflict(quantity, unit, bounds)
     if problem is not None:
@@ -157,7 +166,7 @@ def conflict(quantity: str, unit: str, bounds: list[Bound]) -> Verdict | None:
     highest, lowest = _highest(bounds), _lowest(bounds)
     if lowest <= highest + SLACK:
         return None
-    every = tuple(dict.fromkeys(b.name for b in bounds if b.name and (b.upper == highest or b.lower == lowest)))
+    every = distinct(b.name for b in bounds if b.upper == highest or b.lower == lowest)
     return deny(
         "ConflictingLimits",
         f"no {quantity.lower()} is at least {lowest:.1f} and at most {highest:.1f} {unit}; ask for another place",

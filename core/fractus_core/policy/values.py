@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from operator import attrgetter
 from typing import Literal
@@ -316,6 +317,11 @@ class Verdict:
     def permits(self) -> bool:
         """Whether something is carried out."""
         return self.action in {"allow", "correct"}
+
+
+def distinct(names: Iterable[str]) -> tuple[str, ...]:
+    """Names in their order, each once; those that are empty are left out."""
+    return tuple(dict.fromkeys(name for name in names if name))
 
 
 def deny(code: str, reason: str, policies: tuple[str, ...] = ()) -> Verdict:

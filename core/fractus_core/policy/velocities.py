@@ -18,6 +18,7 @@ from fractus_core.policy.limits import (
     altitude_bounds,
     clamp,
     conflict,
+    corrected,
     height_on_entry,
     lower_is_fine,
     speed_bounds,
@@ -32,6 +33,7 @@ from fractus_core.policy.values import (
     VelocityArgs,
     Verdict,
     deny,
+    distinct,
 )
 
 RETURN_CLIMB_MPS = 1.0
@@ -52,11 +54,7 @@ def judge_speed(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
         return POSITION_UNKNOWN
     bounds = speed_bounds(grant, now, Air(shapely.points(at), margin_m(now), now.altitude_m, now.altitude_m))
     clamped = clamp("Speed", "m/s", args.speed_mps, bounds)
-    if isinstance(clamped, Verdict):
-        return clamped
-    if not clamped.code:
-        return Verdict("allow", args)
-    return Verdict("correct", SetSpeedArgs(clamped.value), clamped.code, clamped.reason, clamped.policies)
+    return clamped if isinstance(clamped, Verdict) else corrected(SetSpeedArgs(clamped.value), [clamped])
 
 
 @dataclass(slots=True)
@@ -107,11 +105,7 @@ def judge_velocity(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
         problem = way_home_blocked(leg.target, leg.upper_m, now, grant)
     if problem is not None:
         return problem
-    if not setpoint.notes:
-        return Verdict("allow", args)
-    names = tuple(dict.fromkeys(name for note in setpoint.notes for name in note.policies))
-    reason = "; ".join(note.reason for note in setpoint.notes)
-    return Verdict("correct", setpoint.args, setpoint.notes[0].code, reason, names)
+    return corrected(setpoint.args, setpoint.notes)
 
 
 def _within_speed(setpoint: _Setpoint) -> Verdict | None:
@@ -159,7 +153,7 @@ def _no_room(setpoint: _Setpoint, lower: Bound, upper: Bound | None) -> Verdict 
     edge = math.inf if upper is None or upper.upper is None else upper.upper
     if upper is None or not _beyond(setpoint, setpoint.args, edge, above=True):
         return None
-    names = tuple(dict.fromkeys(b.name for b in (upper, lower) if b.name))
+    names = distinct((upper.name, lower.name))
     reason = f"at this vertical speed the drone comes to rest neither below {edge:.1f} m nor above {lower.lower or 0.0:.1f} m"
     return deny("AltitudeAboveLimit", f"{reason}; stop it first, then use Goto", names)
 
@@ -234,7 +228,7 @@ def _within_fences(setpoint: _Setpoint) -> Verdict | None:
     if best is None:
         return broken(found)
     setpoint.args = best
-    names = tuple(dict.fromkeys(b.policy for b in found))
+    names = distinct(b.policy for b in found)
     setpoint.notes.append(Clamped(low, "VelocityScaled", f"{found[0].reason}; scaled to {low:.0%}", names))
     return None
 

@@ -7,9 +7,9 @@ import shapely
 from fractus_core.policy.compiled import Air, CompiledGrant
 from fractus_core.policy.fences import breaches
 from fractus_core.policy.legs import way_home_blocked
-from fractus_core.policy.limits import altitude_bounds, clamp
+from fractus_core.policy.limits import altitude_bounds, clamp, corrected
 from fractus_core.policy.motion import XY, height_margin_m, margin_m, standing, stop_point
-from fractus_core.policy.values import POSITION_UNKNOWN, Call, Situation, TakeoffArgs, Verdict, deny
+from fractus_core.policy.values import POSITION_UNKNOWN, Call, Situation, TakeoffArgs, Verdict, deny, distinct
 
 
 def judge_takeoff(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
@@ -23,11 +23,7 @@ def judge_takeoff(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     if isinstance(clamped, Verdict):
         return clamped
     problem = _column(at, now, grant, now.altitude_m, clamped.value) or way_home_blocked(at, clamped.value, now, grant)
-    if problem is not None:
-        return problem
-    if not clamped.code:
-        return Verdict("allow", args)
-    return Verdict("correct", TakeoffArgs(clamped.value), clamped.code, clamped.reason, clamped.policies)
+    return problem or corrected(TakeoffArgs(clamped.value), [clamped])
 
 
 def judge_arm(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
@@ -53,7 +49,7 @@ def _column(at: XY, now: Situation, grant: CompiledGrant, lower_m: float, upper_
     found = breaches(leg, now, grant, margin_m(now), height_margin_m(now))
     if not found:
         return None
-    return deny(found[0].code, found[0].reason, tuple(dict.fromkeys(b.policy for b in found)))
+    return deny(found[0].code, found[0].reason, distinct(b.policy for b in found))
 
 
 def judge_disarm(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:

@@ -53,11 +53,12 @@ RUN --mount=type=cache,target=/root/.cache/uv \
       uv export --quiet --frozen --no-dev --no-emit-project $extra --output-file /build/$name.txt; \
       uv pip install --quiet --no-deps --require-hashes --target /deps/$name -r /build/$name.txt; \
       cd /deps/$name; \
-      rm -rf bin .lock numpy/_core/_simd.* numpy/_core/include numpy/_core/lib numpy/f2py numpy/distutils cv2/gapi; \
+      rm -rf bin .lock tzdata tzdata-* numpy/_core/_simd.* numpy/_core/include numpy/_core/lib numpy/f2py numpy/distutils cv2/gapi; \
       find . -path '*/tests' -prune -exec rm -rf {} +; \
       find . -path './kubernetes/*' \( -path '*/client/models/*' -o -path '*/client/api/*' \) ! -name __init__.py -delete; \
       find . -path './kubernetes/*_test.py' -delete; \
-      strip --strip-unneeded cryptography/hazmat/bindings/_rust.abi3.so 2>/dev/null || true; \
+      strip --strip-unneeded cryptography/hazmat/bindings/_rust.abi3.so yaml/*.so aiohttp/*.so multidict/*.so \
+        frozenlist/*.so propcache/*.so 2>/dev/null || true; \
       find . \( -name '*.pyi' -o -name '*.pyx' -o -name '*.pxd' -o -name '*.c' -o -name '*.h' -o -name '*.a' \) -delete; \
     done; \
     for pair in core:sdk operator:core agent:core services:core; do \

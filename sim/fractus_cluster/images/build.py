@@ -28,13 +28,13 @@ BASE_IMAGE = f"{PREFIX}/base:bookworm"
 _RECIPE = ("Dockerfile", ".dockerignore", "pyproject.toml", "uv.lock", "README.md", "LICENSE")
 _CODE: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
-        "component": ("sdk", "proto"),
-        "operator": ("core", "operator", "proto"),
-        "agent": ("core", "agent", "proto"),
-        "services": ("core", "services", "sdk", "proto"),
-        "sim": ("core", "services", "sdk", "proto", "sim"),
-        "example-traffic-monitoring": ("sdk", "proto", "examples/traffic-monitoring"),
-        "example-field": ("sdk", "proto", "examples/field"),
+        "component": ("sdk", "cli", "proto"),
+        "operator": ("core", "kube", "operator", "proto"),
+        "agent": ("core", "kube", "storage", "agent", "proto"),
+        "services": ("core", "mavlink", "storage", "services", "sdk", "cli", "proto"),
+        "sim": ("core", "mavlink", "storage", "services", "sdk", "cli", "proto", "sim"),
+        "example-traffic-monitoring": ("sdk", "cli", "proto", "examples/traffic-monitoring"),
+        "example-field": ("sdk", "cli", "proto", "examples/field"),
     }
 )
 TARGETS = tuple(_CODE)

@@ -36,7 +36,7 @@ class Background:
     """Tasks of one service, which keeps a reference to each: the event loop itself holds them only weakly."""
 
     def __init__(self) -> None:
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks: set[asyncio.Task[Any]] = set()
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Run something in the background; failures are logged."""
@@ -45,12 +45,12 @@ class Background:
         task.add_done_callback(self._ended)
         return task
 
-    def keep(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Run something that its caller waits for, and that goes on when the caller does not."""
+    async def complete(self, work: Coroutine[Any, Any, T]) -> T:
+        """The result of work that is completed also when its caller hangs up and is cancelled."""
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
-        return task
+        return await asyncio.shield(task)
 
     def drop(self, task: asyncio.Task[None] | None) -> None:
         """Cancel a task, unless it is the one that asks."""

@@ -27,7 +27,7 @@ from fractus_services.camera.imaging.filters import (
     moving,
     remove_background,
 )
-from fractus_services.camera.imaging.metadata import PictureFacts, with_metadata
+from fractus_services.camera.imaging.metadata import with_metadata
 from fractus_services.camera.imaging.pipeline import FacesNotReliable, plan_filters
 from fractus_services.camera.imaging.pixels import NotAPicture, Pixels, decoded, encoded, fitted, source_size
 from fractus_services.camera.pose.pose import Pose, is_upright
@@ -210,7 +210,7 @@ def test_what_is_no_picture_is_said_so(data: bytes) -> None:
 def test_pictures_tell_where_they_were_taken(photo: Pixels) -> None:
     lens = Lens(60.0, 45.0, pitch_deg=-30.0, yaw_deg=10.0, stabilised=True)
     pose = Pose.of(at(30, 40, alt=12.5, lens=lens, attitude=Attitude(5, 5, 80.0)))
-    data = with_metadata(encoded(photo), PictureFacts.of(pose, NOW + 0.25, "Pi Camera ü", 512))
+    data = with_metadata(encoded(photo), pose, time_s=NOW + 0.25, camera="Pi Camera ü", view_width_px=512)
     with Image.open(io.BytesIO(data)) as picture:
         assert np.asarray(picture).shape == photo.shape
         exif = picture.getexif()
@@ -234,12 +234,12 @@ def test_pictures_tell_where_they_were_taken(photo: Pixels) -> None:
         assert name in xmp
         assert value in xmp
     with pytest.raises(ValueError, match="JPEG"):
-        with_metadata(b"PNG", PictureFacts.of(pose, NOW, "", 512))
+        with_metadata(b"PNG", pose, time_s=NOW, camera="", view_width_px=512)
 
 
 def test_a_picture_from_nowhere_and_below_the_sea_can_be_with_metadata(photo: Pixels) -> None:
     for now in (at(lens=None, home=None), at(home=Home(-33.9, -70.0, -50.0), alt=1.0)):
-        data = with_metadata(encoded(photo), PictureFacts.of(Pose.of(now), NOW, "", 512))
+        data = with_metadata(encoded(photo), Pose.of(now), time_s=NOW, camera="", view_width_px=512)
         with Image.open(io.BytesIO(data)) as picture:
             gps = picture.getexif().get_ifd(0x8825)
         assert (6 in gps) == (now.home is not None)
@@ -363,7 +363,7 @@ def test_a_directory_gives_the_picture_that_was_taken_nearest_in_space(tmp_path:
     ):
         picture = np.full((48, 64, 3), level, np.uint8)
         (tmp_path / f"{name}.jpg").write_bytes(
-            with_metadata(encoded(picture), PictureFacts.of(Pose.of(place), NOW, "", 64))
+            with_metadata(encoded(picture), Pose.of(place), time_s=NOW, camera="", view_width_px=64)
         )
     (tmp_path / "untagged.png").write_bytes(bytes(cv2.imencode(".png", np.zeros((4, 4, 3), np.uint8))[1]))
     (tmp_path / "broken.jpg").write_bytes(b"no picture")
@@ -375,7 +375,7 @@ def test_a_directory_gives_the_picture_that_was_taken_nearest_in_space(tmp_path:
     assert (level(x=5, y=3, alt=20), level(x=40, y=0, alt=20), level(x=40, y=0, alt=70)) == (10, 100, 200)
     late = np.full((48, 64, 3), 250, np.uint8)
     (tmp_path / "d.jpg").write_bytes(
-        with_metadata(encoded(late), PictureFacts.of(Pose.of(at(5, 3, alt=20)), NOW, "", 64))
+        with_metadata(encoded(late), Pose.of(at(5, 3, alt=20)), time_s=NOW, camera="", view_width_px=64)
     )
     assert level(x=5, y=3, alt=20) == 250
     with pytest.raises(CameraFailed, match="position is unknown"):

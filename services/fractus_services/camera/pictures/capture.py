@@ -14,6 +14,7 @@ from fractus_core.policy.footprint import seen_from
 from fractus_core.policy.privacy import judge_privacy
 from fractus_core.policy.values import Call, CaptureArgs, Moment, Situation, Verdict, earliest
 
+from fractus_services.background import Background
 from fractus_services.camera.album.album import Album, AlbumFull, owner_of
 from fractus_services.camera.album.shots import Shot
 from fractus_services.camera.capture.driver import Wanted
@@ -21,9 +22,8 @@ from fractus_services.camera.capture.properties import CameraProperties
 from fractus_services.camera.capture.shutter import Shutter
 from fractus_services.camera.imaging.faces import smallest_face_px
 from fractus_services.camera.imaging.filters import MOTION_PX
-from fractus_services.camera.imaging.metadata import PictureFacts, with_metadata
+from fractus_services.camera.imaging.metadata import with_metadata
 from fractus_services.camera.imaging.pixels import Pixels, cropped, encoded, fitted
-from fractus_services.camera.pictures.completion import Completion
 from fractus_services.camera.pictures.fair_queue import MAX_PER_OWNER, FairQueue
 from fractus_services.camera.pictures.filtering import Filtering
 from fractus_services.camera.pictures.judge import PictureJudge, combined
@@ -93,7 +93,7 @@ class PictureCapture:
         self._clock = clock
         self._numbers = itertools.count()
         self._exposures = FairQueue(MAX_PER_OWNER, MAX_EXPOSURES)
-        self._completion = Completion()
+        self._tasks = Background()
 
     async def capture(
         self, grant: ActiveGrant, args: CaptureArgs, current_grant: Callable[[], ActiveGrant] | None = None
@@ -111,7 +111,7 @@ class PictureCapture:
         width, height = args.width or self._camera.resolution[0], args.height or self._camera.resolution[1]
         self._camera.check_size(width, height)
         sized = replace(args, width=width, height=height)
-        return await self._completion.complete(self._capture(owner_of(grant), sized, current_grant or (lambda: grant)))
+        return await self._tasks.complete(self._capture(owner_of(grant), sized, current_grant or (lambda: grant)))
 
     async def _capture(
         self, owner: str, args: CaptureArgs, current_grant: Callable[[], ActiveGrant]
@@ -194,7 +194,8 @@ class PictureCapture:
             if filters:
                 # A filtered picture tells nothing of where it was taken.
                 return data
-            return with_metadata(data, PictureFacts.of(poses[-1], moment_s, self._camera.model, source_width_px))
+            model = self._camera.model
+            return with_metadata(data, poses[-1], time_s=moment_s, camera=model, view_width_px=source_width_px)
 
         data = await asyncio.to_thread(work)
         shot = Shot(exposure.name, moment_s, args.width, args.height, len(data), poses, face_px, plan.filters)

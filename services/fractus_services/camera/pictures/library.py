@@ -10,11 +10,11 @@ from pathlib import Path
 from fractus_core.policy.privacy import remaining
 from fractus_core.policy.values import Call, Filter, Situation, Verdict
 
+from fractus_services.background import Background
 from fractus_services.camera.album.album import Album, owner_of
 from fractus_services.camera.album.shots import Shot
 from fractus_services.camera.imaging.pipeline import FilterPlan
 from fractus_services.camera.imaging.pixels import decoded, encoded
-from fractus_services.camera.pictures.completion import Completion
 from fractus_services.camera.pictures.filtering import Filtering
 from fractus_services.camera.pictures.judge import PictureJudge, taken_at
 from fractus_services.camera.pose.provider import PoseProvider
@@ -40,7 +40,7 @@ class PictureLibrary:
         self._album = album
         self._judge = judge
         self._clock = clock
-        self._completion = Completion()
+        self._tasks = Background()
 
     async def retrieve(
         self, grant: ActiveGrant, name: str, current_grant: Callable[[], ActiveGrant] | None = None
@@ -68,7 +68,7 @@ class PictureLibrary:
         plan, noted = self._filtering.plan(
             call, grant, verdict, required=missing, face_px=face_px, seen=taken_at(shot.poses, now)
         )
-        data = await self._completion.complete(self._filtered(owner, path, plan, replace(shot, face_px=face_px)))
+        data = await self._tasks.complete(self._filtered(owner, path, plan, replace(shot, face_px=face_px)))
         done = (*shot.filters, *plan.filters)
         self._check_again(call, current_grant() if current_grant else grant, shot, done)
         return noted, replace(shot, size_bytes=len(data), filters=done), data

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from fractus_core.policy.values import Attitude, Home, Lens, Situation
+from fractus_core.policy.values import Attitude, Lens, Situation
 
 MAX_AGE_S = 1.0
 """A measurement that is older says nothing about the present."""
@@ -25,34 +25,25 @@ MAX_TURN_DEG_S = 60.0
 MAX_ACCELERATION_MPS2 = 5.0
 """How fast a multicopter turns and speeds up at most; between two measurements it may do both."""
 
+_LEVEL = Attitude(0.0, 0.0, 0.0)
+
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """What the mobility service measured at one moment; times are monotonic seconds.
+    """What the mobility service measured; times are monotonic seconds.
 
     Attributes:
         received_at: when it arrived here.
         position_at: when the position was measured.
         attitude_at: when the attitude was measured.
-        position: degrees north, degrees east, metres above home; None while it is unknown.
-        position_error_m: bound of the horizontal error.
-        velocity_mps: north, east, down.
-        attitude_deg: roll, pitch, yaw; None while it is unknown.
-        home: None while it is unknown.
-        armed: the motors run.
-        in_air: it flies.
+        situation: the state as measured: `position_error_m` is that of the position alone, the attitude has no errors yet,
+            and `lat` is None while the position is unknown.
     """
 
     received_at: float
     position_at: float
     attitude_at: float
-    position: tuple[float, float, float] | None
-    position_error_m: float
-    velocity_mps: tuple[float, float, float]
-    attitude_deg: tuple[float, float, float] | None
-    home: Home | None
-    armed: bool = False
-    in_air: bool = False
+    situation: Situation
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,14 +71,13 @@ class _Gap:
     def between(cls, one: Measurement, other: Measurement) -> _Gap:
         """The half of the time to the next or previous measurement that lies nearer to this one."""
         moved_s, turned_s = abs(other.position_at - one.position_at), abs(other.attitude_at - one.attitude_at)
-        here, there = one.attitude_deg or (0.0, 0.0, 0.0), other.attitude_deg or (0.0, 0.0, 0.0)
-        # Angles wrap: from 359 to 1 degree is a turn of 2.
-        roll, pitch, yaw = (abs(math.remainder(a - b, 360.0)) for a, b in zip(here, there, strict=True))
+        here, there = one.situation.attitude or _LEVEL, other.situation.attitude or _LEVEL
+        roll, pitch = _turn_deg(here.roll_deg, there.roll_deg), _turn_deg(here.pitch_deg, there.pitch_deg)
         return cls(
             moved_s / 2 if moved_s <= MAX_AGE_S else math.inf,
             turned_s / 2 if turned_s <= MAX_AGE_S else math.inf,
             (roll + pitch) / 2,
-            yaw / 2,
+            _turn_deg(here.yaw_deg, there.yaw_deg) / 2,
         )
 
     def joined(self, other: _Gap) -> _Gap:
@@ -155,24 +145,16 @@ class PoseHistory:
         return Situation(time_s=time_s, lens=self._lens, relief_m=self._relief_m)
 
     def _situation(self, measured: Measurement, gap: _Gap, time_s: float) -> Situation:
-        if measured.position is None or gap.moved_s > MAX_AGE_S:
+        known = measured.situation
+        if known.lat is None or gap.moved_s > MAX_AGE_S:
             return self._unknown(time_s)
-        lat, lon, altitude_m = measured.position
-        north_mps, east_mps, down_mps = measured.velocity_mps
-        return Situation(
+        return replace(
+            known,
             time_s=time_s,
-            lat=lat,
-            lon=lon,
-            altitude_m=altitude_m,
-            north_mps=north_mps,
-            east_mps=east_mps,
-            down_mps=down_mps,
-            home=measured.home,
-            armed=measured.armed,
-            in_air=measured.in_air,
-            position_error_m=measured.position_error_m + _reach_m(math.hypot(north_mps, east_mps), gap.moved_s),
-            altitude_error_m=ALTITUDE_ERROR_M + _reach_m(abs(down_mps), gap.moved_s),
-            attitude=_attitude(measured, gap),
+            position_error_m=known.position_error_m
+            + _reach_m(math.hypot(known.north_mps, known.east_mps), gap.moved_s),
+            altitude_error_m=ALTITUDE_ERROR_M + _reach_m(abs(known.down_mps), gap.moved_s),
+            attitude=_with_errors(known.attitude, gap),
             lens=self._lens,
             relief_m=self._relief_m,
         )
@@ -183,12 +165,17 @@ def _reach_m(speed_mps: float, time_s: float) -> float:
     return (speed_mps + MAX_ACCELERATION_MPS2 * time_s / 2) * time_s
 
 
-def _attitude(measured: Measurement, gap: _Gap) -> Attitude | None:
-    if measured.attitude_deg is None or gap.turned_s > MAX_AGE_S:
+def _turn_deg(one_deg: float, other_deg: float) -> float:
+    """The angle between two directions; they wrap, so from 359 to 1 degree it is 2."""
+    return abs(math.remainder(one_deg - other_deg, 360.0))
+
+
+def _with_errors(attitude: Attitude | None, gap: _Gap) -> Attitude | None:
+    if attitude is None or gap.turned_s > MAX_AGE_S:
         return None
     turned_deg = MAX_TURN_DEG_S * gap.turned_s
-    return Attitude(
-        *measured.attitude_deg,
-        TILT_ERROR_DEG + turned_deg + gap.tilt_deg,
-        YAW_ERROR_DEG + turned_deg + gap.yaw_deg,
+    return replace(
+        attitude,
+        tilt_error_deg=TILT_ERROR_DEG + turned_deg + gap.tilt_deg,
+        yaw_error_deg=YAW_ERROR_DEG + turned_deg + gap.yaw_deg,
     )

@@ -79,7 +79,7 @@ async def run(options: CameraOptions, stop: asyncio.Event) -> None:
     parts = [grants.run()]
     poses: PoseProvider
     if isinstance(description, EdgeNode):
-        poses = FixedPose.of(description.spec, options.relief)
+        poses = FixedPose(description.spec, options.relief)
     else:
         lens = lens_of(described) if described is not None else None
         poses = history = PoseHistory(time.monotonic, lens=lens, relief_m=options.relief)

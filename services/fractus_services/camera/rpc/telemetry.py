@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import grpc
 from fractus_core.api.names import node_server_name
-from fractus_core.policy.values import Home
+from fractus_core.policy.values import Attitude, Home, Situation
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
 from fractus_services.auth import TlsFiles
@@ -57,19 +57,27 @@ def measurement(message: mobility_pb2.Telemetry, now_s: float) -> Measurement:
         getattr(message, name) if message.HasField(name) else DEFAULT_AGE_S
         for name in ("position_age_s", "attitude_age_s")
     )
+    # Without a link to the autopilot the position in the message is an old one.
     position = message.position if message.HasField("position") and message.autopilot_connected else None
-    home = message.home if message.HasField("home") else None
-    attitude = message.attitude if message.HasField("attitude") else None
-    velocity = message.velocity
+    velocity, attitude, home = message.velocity, message.attitude, message.home
     return Measurement(
         received_at=now_s,
         position_at=now_s - position_age_s,
         attitude_at=now_s - attitude_age_s,
-        position=(position.latitude_deg, position.longitude_deg, position.altitude_m) if position is not None else None,
-        position_error_m=message.position_error_m or DEFAULT_ERROR_M,
-        velocity_mps=(velocity.north_mps, velocity.east_mps, velocity.down_mps),
-        attitude_deg=(attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg) if attitude is not None else None,
-        home=Home(home.latitude_deg, home.longitude_deg, home.altitude_m) if home is not None else None,
-        armed=message.armed,
-        in_air=message.in_air,
+        situation=Situation(
+            time_s=0.0,
+            lat=position.latitude_deg if position is not None else None,
+            lon=position.longitude_deg if position is not None else None,
+            altitude_m=position.altitude_m if position is not None else 0.0,
+            north_mps=velocity.north_mps,
+            east_mps=velocity.east_mps,
+            down_mps=velocity.down_mps,
+            home=Home(home.latitude_deg, home.longitude_deg, home.altitude_m) if message.HasField("home") else None,
+            armed=message.armed,
+            in_air=message.in_air,
+            position_error_m=message.position_error_m or DEFAULT_ERROR_M,
+            attitude=Attitude(attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg)
+            if message.HasField("attitude")
+            else None,
+        ),
     )

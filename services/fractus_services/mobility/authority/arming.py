@@ -36,7 +36,7 @@ async def arm(control: Control, grant: ActiveGrant, permit: Permit) -> None:
         Refused: a failsafe is not verified, audit log or journal cannot be written, or the caller may no more.
         AutopilotError: the autopilot refuses.
     """
-    await asyncio.shield(control.tasks.keep(_in_turn(control, grant, permit)))
+    await control.tasks.complete(_in_turn(control, grant, permit))
 
 
 async def _in_turn(control: Control, grant: ActiveGrant, permit: Permit) -> None:

@@ -23,8 +23,8 @@ from pathlib import Path
 
 from fractus_cluster.ports import free_port
 from fractus_mavlink import Parser, encode, layout_named
+from fractus_mavlink.enums import COPTER_MODE, MAV_CMD
 from fractus_vehicle.earth import Place
-from fractus_vehicle.mav import Command, Mode
 from fractus_vehicle.pilot import Pilot
 from fractus_vehicle.readiness import arming_refusal
 from fractus_vehicle.simulation import Simulation, formation
@@ -82,7 +82,7 @@ def motion() -> list[Claim]:
         peak = max(peak, math.hypot(vehicle.body.vn, vehicle.body.ve))
     leg_s = simulation.time_s - begun
     pilot.fly_on(6.0)
-    pilot.command(Command.NAV_RETURN_TO_LAUNCH)
+    pilot.command(MAV_CMD.NAV_RETURN_TO_LAUNCH)
     home_s = pilot.wait(lambda: not vehicle.armed, 120.0)
     return [
         near("takeoff to 9.5 m", climb_s, 9.5, "s"),
@@ -102,7 +102,7 @@ def memory_and_start() -> list[Claim]:
     while listed < count:
         listed += sum(message.name == "PARAM_VALUE" for message in pilot.step())
     list_s = simulation.time_s - begun
-    pilot.mode(Mode.GUIDED)
+    pilot.mode(COPTER_MODE.GUIDED)
     ready_s = begun + pilot.wait(lambda: arming_refusal(simulation.crafts[0].vehicle.state) is None, 60.0)
     logs = [_log(seed) for seed in (3, 3, 4)]
     differs = sum(a != b for a, b in zip(logs[0], logs[1], strict=False)) + abs(len(logs[0]) - len(logs[1]))

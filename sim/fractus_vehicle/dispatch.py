@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable
 
 from fractus_mavlink import Message, Signing
+from fractus_mavlink.enums import MAV_MISSION_RESULT, MAV_MISSION_TYPE, MAV_SEVERITY
 
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.commands import handle_command, set_current, set_mode_number
 from fractus_vehicle.flight import Flight
 from fractus_vehicle.home import set_home_at
-from fractus_vehicle.mav import MissionKind, MissionResult, Severity
 from fractus_vehicle.state import VehicleState
 from fractus_vehicle.streams import ALL_GROUPS, GROUPS
 from fractus_vehicle.targets import attitude_target, global_target, guided_item, local_target
@@ -87,7 +87,7 @@ def _parameter_set(vehicle: Vehicle, m: Message, c: Channel) -> None:
     if not math.isfinite(value):
         return
     if not v.params.set(name, value) and v.params.find(name) is not None:
-        v.say(Severity.WARNING, f"Param write denied ({name})")
+        v.say(MAV_SEVERITY.WARNING, f"Param write denied ({name})")
     for channel in v.channels:
         if channel is c or not channel.signing:
             send_parameter(v, channel, name, -1, 65535)
@@ -135,8 +135,8 @@ def _mission(vehicle: Vehicle, m: Message, c: Channel) -> None:
         {
             "target_system": m.sysid,
             "target_component": m.compid,
-            "type": int(MissionResult.ACCEPTED if taken else MissionResult.ERROR),
-            "mission_type": int(MissionKind.MISSION),
+            "type": int(MAV_MISSION_RESULT.ACCEPTED if taken else MAV_MISSION_RESULT.ERROR),
+            "mission_type": int(MAV_MISSION_TYPE.MISSION),
         },
     )
 
@@ -173,14 +173,14 @@ def _setup_signing(vehicle: Vehicle, m: Message, _c: Channel) -> None:
     """A key of zeros turns signing off; refused while armed, as ArduPilot."""
     v = vehicle.state
     if v.armed:
-        v.say(Severity.DEBUG, "ERROR: Won't setup signing when armed")
+        v.say(MAV_SEVERITY.DEBUG, "ERROR: Won't setup signing when armed")
         return
     key = bytes(int(value) for value in m.array("secret_key"))
     started = m.integer("initial_timestamp")
     for channel in v.channels:
         channel.signing = Signing(key, started) if any(key) else None
     vehicle.signing_key = key if any(key) else None
-    v.say(Severity.INFO, "Signing key set" if any(key) else "Signing off")
+    v.say(MAV_SEVERITY.INFO, "Signing key set" if any(key) else "Signing off")
 
 
 HANDLERS: dict[str, Handler] = {

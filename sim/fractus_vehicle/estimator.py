@@ -5,10 +5,11 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 
+from fractus_mavlink.enums import MAV_SEVERITY
+
 from fractus_vehicle.body import Body, euler_of
 from fractus_vehicle.control import Estimate
 from fractus_vehicle.earth import Place
-from fractus_vehicle.mav import Severity
 from fractus_vehicle.params import Parameters
 from fractus_vehicle.sensors import Drift, Gps
 
@@ -51,7 +52,7 @@ class Estimator:
         noise_m: float,
         rng: random.Random,
         params: Parameters,
-        say: Callable[[Severity, str], None],
+        say: Callable[[MAV_SEVERITY, str], None],
     ) -> None:
         self._start = start
         self._ready_after_s = ready_after_s
@@ -126,7 +127,7 @@ class Estimator:
         while (
             self._announced < len(ANNOUNCEMENTS) and time_s >= ANNOUNCEMENTS[self._announced][0] * self._ready_after_s
         ):
-            self._say(Severity.INFO, ANNOUNCEMENTS[self._announced][1])
+            self._say(MAV_SEVERITY.INFO, ANNOUNCEMENTS[self._announced][1])
             self._announced += 1
 
     def _judge(self, time_s: float) -> None:
@@ -137,5 +138,5 @@ class Estimator:
         self.ready = time_s >= self._ready_after_s
         ok = self.origin is not None and self.ready and age_s < GPS_TIMEOUT_S
         if ok != self.position_ok:
-            self._say(Severity.INFO, "EKF3 IMU0 is using GPS" if ok else "EKF3 IMU0 stopped aiding")
+            self._say(MAV_SEVERITY.INFO, "EKF3 IMU0 is using GPS" if ok else "EKF3 IMU0 stopped aiding")
         self.position_ok = ok

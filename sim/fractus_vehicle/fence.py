@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntFlag
 
-from fractus_vehicle.mav import Command
+from fractus_mavlink.enums import MAV_CMD
 
 
 class Breach(IntFlag):
@@ -103,24 +103,24 @@ def build_shapes(items: Sequence[FenceItem]) -> tuple[Shape, ...]:
     at = 0
     while at < len(items):
         item = items[at]
-        if item.command in (Command.NAV_FENCE_CIRCLE_INCLUSION, Command.NAV_FENCE_CIRCLE_EXCLUSION):
+        if item.command in (MAV_CMD.NAV_FENCE_CIRCLE_INCLUSION, MAV_CMD.NAV_FENCE_CIRCLE_EXCLUSION):
             if not item.param1 > 0.0:
                 raise FenceShapeError(f"fence item {at}: radius {item.param1} must be positive")
-            inclusion = item.command == Command.NAV_FENCE_CIRCLE_INCLUSION
+            inclusion = item.command == MAV_CMD.NAV_FENCE_CIRCLE_INCLUSION
             shapes.append(Circle(item.north, item.east, item.param1, inclusion))
             at += 1
         elif item.command in (
-            Command.NAV_FENCE_POLYGON_VERTEX_INCLUSION,
-            Command.NAV_FENCE_POLYGON_VERTEX_EXCLUSION,
+            MAV_CMD.NAV_FENCE_POLYGON_VERTEX_INCLUSION,
+            MAV_CMD.NAV_FENCE_POLYGON_VERTEX_EXCLUSION,
         ):
             count = int(item.param1)
             group = items[at : at + count]
             if count < 3 or len(group) < count or any(g.command != item.command or g.param1 != count for g in group):
                 raise FenceShapeError(f"fence item {at}: polygon of {count} vertices is incomplete")
-            inclusion = item.command == Command.NAV_FENCE_POLYGON_VERTEX_INCLUSION
+            inclusion = item.command == MAV_CMD.NAV_FENCE_POLYGON_VERTEX_INCLUSION
             shapes.append(Polygon(tuple((g.north, g.east) for g in group), inclusion))
             at += count
-        elif item.command == Command.NAV_FENCE_RETURN_POINT:
+        elif item.command == MAV_CMD.NAV_FENCE_RETURN_POINT:
             at += 1
         else:
             raise FenceShapeError(f"fence item {at}: command {item.command} is no fence command")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_FRAME, MAV_MISSION_TYPE
+
 from fractus_vehicle.earth import Place
-from fractus_vehicle.mav import Command, Frame, MissionKind, Mode
 from fractus_vehicle.mission_items import Item, ItemStore, home_item
 
 
@@ -11,18 +12,18 @@ class Mission:
     """The stored mission and the item it is at; item 0 is home, as in ArduPilot."""
 
     def __init__(self) -> None:
-        self.store = ItemStore(MissionKind.MISSION, home=Item(Command.NAV_WAYPOINT, frame=Frame.GLOBAL))
+        self.store = ItemStore(MAV_MISSION_TYPE.MISSION, home=Item(MAV_CMD.NAV_WAYPOINT, frame=MAV_FRAME.GLOBAL))
         self.current = 0
         self.complete = False
         self._jumps: dict[int, int] = {}
 
-    def state(self, mode: Mode) -> int:
+    def state(self, mode: COPTER_MODE) -> int:
         """MISSION_STATE of MISSION_CURRENT."""
         if len(self.items) <= 1:
             return 1
         if self.complete:
             return 5
-        return 3 if mode is Mode.AUTO else 2
+        return 3 if mode is COPTER_MODE.AUTO else 2
 
     @property
     def items(self) -> list[Item]:
@@ -55,9 +56,9 @@ class Mission:
             if at >= len(self.items):
                 return None
             item = self.items[at]
-            if item.command not in (Command.DO_JUMP, Command.DO_JUMP_TAG):
+            if item.command not in (MAV_CMD.DO_JUMP, MAV_CMD.DO_JUMP_TAG):
                 return at
-            target = self.tagged(int(item.param1)) if item.command == Command.DO_JUMP_TAG else int(item.param1)
+            target = self.tagged(int(item.param1)) if item.command == MAV_CMD.DO_JUMP_TAG else int(item.param1)
             if target is None or not 0 < target < len(self.items):
                 return None
             done = self._jumps.get(at, 0)
@@ -70,7 +71,7 @@ class Mission:
 
     def tagged(self, tag: int) -> int | None:
         """The first item that carries a tag."""
-        marks = (at for at, item in enumerate(self.items) if item.command == Command.JUMP_TAG and item.param1 == tag)
+        marks = (at for at, item in enumerate(self.items) if item.command == MAV_CMD.JUMP_TAG and item.param1 == tag)
         return next(marks, None)
 
     def with_home(self, home: Place) -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections import deque
 
+from fractus_mavlink.enums import MAV_CMD, MAV_SEVERITY
+
 from fractus_vehicle.fence import Breach
 from fractus_vehicle.home import set_home_at, set_home_here
-from fractus_vehicle.mav import Command, Severity
 from fractus_vehicle.mission_items import Item
 from fractus_vehicle.shaping import wrap_pi
 from fractus_vehicle.state import VehicleState
@@ -38,7 +39,7 @@ class MissionCommands:
             item = v.mission.items[index]
             if self._begun_s is None:
                 self._begun_s = v.time_s
-                v.say(Severity.INFO, f"Mission: {index} {title(item)}")
+                v.say(MAV_SEVERITY.INFO, f"Mission: {index} {title(item)}")
                 _do(v, item)
             if not _fulfilled(v, item, v.time_s - self._begun_s):
                 return
@@ -49,12 +50,12 @@ class MissionCommands:
 
 def _fulfilled(v: VehicleState, item: Item, waited_s: float) -> bool:
     match item.command:
-        case Command.CONDITION_DELAY:
+        case MAV_CMD.CONDITION_DELAY:
             return waited_s >= item.param1
-        case Command.CONDITION_DISTANCE:
+        case MAV_CMD.CONDITION_DISTANCE:
             target = v.control.target
             return math.hypot(target[0] - v.est.north, target[1] - v.est.east) <= max(item.param1, 0.0)
-        case Command.CONDITION_YAW:
+        case MAV_CMD.CONDITION_YAW:
             return abs(wrap_pi(v.control.target_yaw - v.est.yaw)) <= YAW_REACHED_RAD
         case _:
             return True
@@ -62,18 +63,18 @@ def _fulfilled(v: VehicleState, item: Item, waited_s: float) -> bool:
 
 def _do(v: VehicleState, item: Item) -> None:
     match item.command:
-        case Command.DO_CHANGE_SPEED:
+        case MAV_CMD.DO_CHANGE_SPEED:
             v.control.limits.change_speed(int(item.param1), item.param2)
-        case Command.CONDITION_YAW:
+        case MAV_CMD.CONDITION_YAW:
             v.heading.turn_to(item.param1, item.param2, int(item.param3), relative=item.param4 > 0.5)
-        case Command.DO_SET_ROI | Command.DO_SET_ROI_LOCATION:
+        case MAV_CMD.DO_SET_ROI | MAV_CMD.DO_SET_ROI_LOCATION:
             north, east, _ = item_target(v, item)
             v.heading.look_at((north, east) if item.has_place else None)
-        case Command.DO_SET_ROI_NONE:
+        case MAV_CMD.DO_SET_ROI_NONE:
             v.heading.look_at(None)
-        case Command.DO_FENCE_ENABLE:
+        case MAV_CMD.DO_FENCE_ENABLE:
             switch_fence(v, item.param1)
-        case Command.DO_SET_HOME:
+        case MAV_CMD.DO_SET_HOME:
             set_home_here(v) if item.param1 > 0.5 else set_home_at(v, item.x, item.y, item.z)
         case _:
             pass  # servos, relays, cameras and mounts: there are none
@@ -103,28 +104,28 @@ def item_target(v: VehicleState, item: Item) -> tuple[float, float, float]:
     return (north, east, down)
 
 
-_TITLES = {
-    Command.NAV_WAYPOINT: "WP",
-    Command.NAV_SPLINE_WAYPOINT: "SplineWP",
-    Command.NAV_TAKEOFF: "Takeoff",
-    Command.NAV_LAND: "Land",
-    Command.NAV_RETURN_TO_LAUNCH: "RTL",
-    Command.NAV_LOITER_UNLIM: "LoitUnlim",
-    Command.NAV_LOITER_TIME: "LoitTime",
-    Command.NAV_LOITER_TURNS: "LoitTurns",
-    Command.NAV_DELAY: "Delay",
-    Command.CONDITION_DELAY: "CondDelay",
-    Command.CONDITION_DISTANCE: "CondDist",
-    Command.CONDITION_YAW: "CondYaw",
-    Command.DO_CHANGE_SPEED: "ChangeSpeed",
-    Command.DO_SET_HOME: "SetHome",
-    Command.DO_SET_SERVO: "SetServo",
-    Command.DO_SET_RELAY: "SetRelay",
-    Command.DO_SET_ROI: "SetROI",
-    Command.JUMP_TAG: "JumpTag",
+_TITLES: dict[int, str] = {
+    MAV_CMD.NAV_WAYPOINT: "WP",
+    MAV_CMD.NAV_SPLINE_WAYPOINT: "SplineWP",
+    MAV_CMD.NAV_TAKEOFF: "Takeoff",
+    MAV_CMD.NAV_LAND: "Land",
+    MAV_CMD.NAV_RETURN_TO_LAUNCH: "RTL",
+    MAV_CMD.NAV_LOITER_UNLIM: "LoitUnlim",
+    MAV_CMD.NAV_LOITER_TIME: "LoitTime",
+    MAV_CMD.NAV_LOITER_TURNS: "LoitTurns",
+    MAV_CMD.NAV_DELAY: "Delay",
+    MAV_CMD.CONDITION_DELAY: "CondDelay",
+    MAV_CMD.CONDITION_DISTANCE: "CondDist",
+    MAV_CMD.CONDITION_YAW: "CondYaw",
+    MAV_CMD.DO_CHANGE_SPEED: "ChangeSpeed",
+    MAV_CMD.DO_SET_HOME: "SetHome",
+    MAV_CMD.DO_SET_SERVO: "SetServo",
+    MAV_CMD.DO_SET_RELAY: "SetRelay",
+    MAV_CMD.DO_SET_ROI: "SetROI",
+    MAV_CMD.JUMP_TAG: "JumpTag",
 }
 
 
 def title(item: Item) -> str:
     """ArduPilot's word for a command."""
-    return _TITLES.get(Command(item.command), "Cmd") if item.command in set(Command) else "Cmd"
+    return _TITLES.get(item.command, "Cmd")

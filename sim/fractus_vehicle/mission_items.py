@@ -6,43 +6,44 @@ import math
 from dataclasses import dataclass, field
 
 from fractus_mavlink import Message
+from fractus_mavlink.enums import MAV_CMD, MAV_FRAME, MAV_MISSION_RESULT, MAV_MISSION_TYPE
 
+from fractus_vehicle.copter import GLOBAL_FRAMES
 from fractus_vehicle.earth import ALTITUDE_MAX_M, Place, valid_coordinates
-from fractus_vehicle.mav import GLOBAL_FRAMES, Command, Frame, MissionKind, MissionResult
 
 # Commands whose fourth parameter, a heading, may be NaN; no other parameter may.
-NAN_HEADINGS = frozenset({Command.NAV_WAYPOINT, Command.NAV_LAND, Command.NAV_TAKEOFF})
+NAN_HEADINGS = frozenset({MAV_CMD.NAV_WAYPOINT, MAV_CMD.NAV_LAND, MAV_CMD.NAV_TAKEOFF})
 FENCE_COMMANDS = frozenset(range(5000, 5005))
 SUPPORTED = frozenset(
     {
-        Command.NAV_WAYPOINT,
-        Command.NAV_SPLINE_WAYPOINT,
-        Command.NAV_LOITER_UNLIM,
-        Command.NAV_LOITER_TURNS,
-        Command.NAV_LOITER_TIME,
-        Command.NAV_RETURN_TO_LAUNCH,
-        Command.NAV_LAND,
-        Command.NAV_TAKEOFF,
-        Command.NAV_DELAY,
-        Command.CONDITION_DELAY,
-        Command.CONDITION_DISTANCE,
-        Command.CONDITION_YAW,
-        Command.DO_JUMP,
-        Command.DO_CHANGE_SPEED,
-        Command.DO_SET_HOME,
-        Command.DO_SET_RELAY,
-        Command.DO_SET_SERVO,
-        Command.DO_LAND_START,
-        Command.DO_SET_ROI_LOCATION,
-        Command.DO_SET_ROI_NONE,
-        Command.DO_SET_ROI,
-        Command.DO_DIGICAM_CONTROL,
-        Command.DO_MOUNT_CONTROL,
-        Command.DO_SET_CAM_TRIGG_DIST,
-        Command.DO_FENCE_ENABLE,
-        Command.DO_PAUSE_CONTINUE,
-        Command.JUMP_TAG,
-        Command.DO_JUMP_TAG,
+        MAV_CMD.NAV_WAYPOINT,
+        MAV_CMD.NAV_SPLINE_WAYPOINT,
+        MAV_CMD.NAV_LOITER_UNLIM,
+        MAV_CMD.NAV_LOITER_TURNS,
+        MAV_CMD.NAV_LOITER_TIME,
+        MAV_CMD.NAV_RETURN_TO_LAUNCH,
+        MAV_CMD.NAV_LAND,
+        MAV_CMD.NAV_TAKEOFF,
+        MAV_CMD.NAV_DELAY,
+        MAV_CMD.CONDITION_DELAY,
+        MAV_CMD.CONDITION_DISTANCE,
+        MAV_CMD.CONDITION_YAW,
+        MAV_CMD.DO_JUMP,
+        MAV_CMD.DO_CHANGE_SPEED,
+        MAV_CMD.DO_SET_HOME,
+        MAV_CMD.DO_SET_RELAY,
+        MAV_CMD.DO_SET_SERVO,
+        MAV_CMD.DO_LAND_START,
+        MAV_CMD.DO_SET_ROI_LOCATION,
+        MAV_CMD.DO_SET_ROI_NONE,
+        MAV_CMD.DO_SET_ROI,
+        MAV_CMD.DO_DIGICAM_CONTROL,
+        MAV_CMD.DO_MOUNT_CONTROL,
+        MAV_CMD.DO_SET_CAM_TRIGG_DIST,
+        MAV_CMD.DO_FENCE_ENABLE,
+        MAV_CMD.DO_PAUSE_CONTINUE,
+        MAV_CMD.JUMP_TAG,
+        MAV_CMD.DO_JUMP_TAG,
         531,
         532,
         1000,
@@ -59,7 +60,7 @@ class Item:
     """One item of a list; x and y are degrees times 1e7."""
 
     command: int
-    frame: int = Frame.GLOBAL_RELATIVE_ALT
+    frame: int = MAV_FRAME.GLOBAL_RELATIVE_ALT
     param1: float = 0.0
     param2: float = 0.0
     param3: float = 0.0
@@ -77,25 +78,33 @@ class Item:
     @property
     def navigates(self) -> bool:
         """Whether this is a NAV command: one with a position, which a mission waits for."""
-        return 0 < self.command < 95 or self.command >= Command.NAV_FENCE_RETURN_POINT
+        return 0 < self.command < 95 or self.command >= MAV_CMD.NAV_FENCE_RETURN_POINT
 
 
 def home_item(home: Place) -> Item:
     """Item 0 of every mission: home, as ArduPilot keeps it."""
-    return Item(Command.NAV_WAYPOINT, frame=Frame.GLOBAL, x=home.lat_e7, y=home.lon_e7, z=home.alt_m)
+    return Item(MAV_CMD.NAV_WAYPOINT, frame=MAV_FRAME.GLOBAL, x=home.lat_e7, y=home.lon_e7, z=home.alt_m)
 
 
 @dataclass(slots=True)
 class ItemStore:
     """One list; `home` stands for item 0 while a mission is empty."""
 
-    kind: MissionKind
+    kind: MAV_MISSION_TYPE
     items: list[Item] = field(default_factory=list)
     home: Item | None = None
 
 
 def _finite(value: float) -> float:
     return value if math.isfinite(value) else 0.0
+
+
+# The *_INT frames are deprecated, and are stored as what replaces them.
+_CURRENT_FRAMES: dict[int, int] = {
+    MAV_FRAME.GLOBAL_INT: MAV_FRAME.GLOBAL,
+    MAV_FRAME.GLOBAL_RELATIVE_ALT_INT: MAV_FRAME.GLOBAL_RELATIVE_ALT,
+    MAV_FRAME.GLOBAL_TERRAIN_ALT_INT: MAV_FRAME.GLOBAL_TERRAIN_ALT,
+}
 
 
 def item_from(message: Message) -> Item:
@@ -105,11 +114,10 @@ def item_from(message: Message) -> Item:
     scale = 1e7 if frame in GLOBAL_FRAMES else 1e4
     if message.name == "MISSION_ITEM":
         x, y = (x * scale if math.isfinite(x) else 0.0), (y * scale if math.isfinite(y) else 0.0)
-    aliases = {Frame.GLOBAL_INT: 0, Frame.GLOBAL_RELATIVE_ALT_INT: 3, Frame.GLOBAL_TERRAIN_ALT_INT: 10}
     command, z = message.integer("command"), message.real("z")
     return Item(
         command=command,
-        frame=int(aliases.get(Frame(frame), frame)) if frame in set(Frame) else frame,
+        frame=_CURRENT_FRAMES.get(frame, frame),
         param1=_finite(message.real("param1")),
         param2=_finite(message.real("param2")),
         param3=_finite(message.real("param3")),
@@ -121,30 +129,30 @@ def item_from(message: Message) -> Item:
     )
 
 
-def judge(item: Item, kind: MissionKind) -> MissionResult:
+def judge(item: Item, kind: MAV_MISSION_TYPE) -> MAV_MISSION_RESULT:
     """Whether an item may be stored in a list of that kind."""
-    if kind is MissionKind.FENCE:
+    if kind is MAV_MISSION_TYPE.FENCE:
         known = item.command in FENCE_COMMANDS
-    elif kind is MissionKind.RALLY:
-        known = item.command == Command.NAV_RALLY_POINT
+    elif kind is MAV_MISSION_TYPE.RALLY:
+        known = item.command == MAV_CMD.NAV_RALLY_POINT
     else:
         known = item.command in SUPPORTED
     if not known:
-        return MissionResult.UNSUPPORTED
-    if item.frame not in GLOBAL_FRAMES and item.frame != Frame.MISSION and item.has_place:
-        return MissionResult.UNSUPPORTED_FRAME
+        return MAV_MISSION_RESULT.UNSUPPORTED
+    if item.frame not in GLOBAL_FRAMES and item.frame != MAV_FRAME.MISSION and item.has_place:
+        return MAV_MISSION_RESULT.UNSUPPORTED_FRAME
     if item.navigates and not valid_coordinates(item.x, item.y):
-        return MissionResult.INVALID_PARAM5_X if abs(item.x) > 900_000_000 else MissionResult.INVALID_PARAM6_Y
+        return MAV_MISSION_RESULT.INVALID_PARAM5_X if abs(item.x) > 900_000_000 else MAV_MISSION_RESULT.INVALID_PARAM6_Y
     if item.navigates and not abs(item.z) < ALTITUDE_MAX_M:
-        return MissionResult.INVALID_PARAM7
-    return MissionResult.ACCEPTED
+        return MAV_MISSION_RESULT.INVALID_PARAM7
+    return MAV_MISSION_RESULT.ACCEPTED
 
 
-def judge_numbers(message: Message) -> MissionResult:
+def judge_numbers(message: Message) -> MAV_MISSION_RESULT:
     """Whether the parameters of a mission's item are numbers, as ArduPilot wants them."""
     may_be_nan = message.integer("command") in NAN_HEADINGS
     for at in range(1, 5):
         value = message.real(f"param{at}")
         if not math.isfinite(value) and not (at == 4 and may_be_nan and math.isnan(value)):
-            return MissionResult(MissionResult.INVALID_PARAM1 + at - 1)
-    return MissionResult.ACCEPTED
+            return MAV_MISSION_RESULT(MAV_MISSION_RESULT.INVALID_PARAM1 + at - 1)
+    return MAV_MISSION_RESULT.ACCEPTED

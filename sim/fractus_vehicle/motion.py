@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from fractus_vehicle.mav import Mode
+from fractus_mavlink.enums import COPTER_MODE
+
 from fractus_vehicle.state import ARMING_DELAY_S, CONTROL_STEP_S, VehicleState
 
 PHYSICS_PER_CONTROL = 2
@@ -45,4 +46,4 @@ def _may_lift(v: VehicleState) -> bool:
         return True
     if v.flying_wanted:
         return v.time_s >= v.lift_after_s
-    return v.mode is Mode.STABILIZE and v.sticks[2] > LIFT_THROTTLE_US
+    return v.mode is COPTER_MODE.STABILIZE and v.sticks[2] > LIFT_THROTTLE_US

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 
+from fractus_mavlink.enums import COPTER_MODE
+
 from fractus_vehicle.control import Axis
-from fractus_vehicle.mav import (
-    Mode,
-)
 from fractus_vehicle.report_units import UNKNOWN_U16, Values, boot_ms, boot_us, centi
 from fractus_vehicle.state import VehicleState
 
@@ -118,7 +117,11 @@ def nav_controller_output(v: VehicleState) -> Values:
 
 def position_target_global_int(v: VehicleState) -> Values | None:
     """POSITION_TARGET_GLOBAL_INT while a guided or automatic flight has a target."""
-    if v.origin is None or v.mode not in (Mode.GUIDED, Mode.AUTO, Mode.RTL, Mode.SMART_RTL) or v.landed:
+    if (
+        v.origin is None
+        or v.mode not in (COPTER_MODE.GUIDED, COPTER_MODE.AUTO, COPTER_MODE.RTL, COPTER_MODE.SMART_RTL)
+        or v.landed
+    ):
         return None
     c = v.control
     place = v.origin.offset(c.target[0], c.target[1], c.target_down)
@@ -138,7 +141,7 @@ def position_target_global_int(v: VehicleState) -> Values | None:
 
 def position_target_local_ned(v: VehicleState) -> Values | None:
     """POSITION_TARGET_LOCAL_NED while in GUIDED."""
-    if v.origin is None or v.mode is not Mode.GUIDED or v.landed:
+    if v.origin is None or v.mode is not COPTER_MODE.GUIDED or v.landed:
         return None
     c = v.control
     moving = c.horizontal is Axis.VELOCITY

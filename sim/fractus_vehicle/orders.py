@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 from fractus_mavlink import Message
+from fractus_mavlink.enums import MAV_CMD, MAV_FRAME
 
-from fractus_vehicle.mav import Command, Frame
 from fractus_vehicle.mission_items import Item
 
 
@@ -47,6 +47,6 @@ def read_order(message: Message) -> Order:
     known = math.isfinite(lat) and math.isfinite(lon) and (lat != 0.0 or lon != 0.0)
     known = known and abs(lat) <= 90.0 and abs(lon) <= 180.0
     x, y = (round(lat * 1e7), round(lon * 1e7)) if known else (0, 0)
-    absolute = command in (Command.DO_SET_HOME,)
-    frame = Frame.GLOBAL if absolute else Frame.GLOBAL_RELATIVE_ALT
+    absolute = command in (MAV_CMD.DO_SET_HOME,)
+    frame = MAV_FRAME.GLOBAL if absolute else MAV_FRAME.GLOBAL_RELATIVE_ALT
     return Order(command, numbers, x, y, z, frame, known, integer=False)

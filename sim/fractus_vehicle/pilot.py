@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from fractus_mavlink import Endpoint, Message, Value
+from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_MODE_FLAG, MAV_RESULT
 
-from fractus_vehicle.mav import Command, Mode, ModeFlag, Result
 from fractus_vehicle.readiness import arming_refusal
 from fractus_vehicle.simulation import Craft, Simulation
 
@@ -84,22 +84,22 @@ class Pilot:
             found = [message for message in self.step() if message.name == name]
         return found[-1]
 
-    def command(self, command: int, *params: float) -> Result:
+    def command(self, command: int, *params: float) -> MAV_RESULT:
         """Send COMMAND_LONG and return the result."""
         values: dict[str, Value] = {f"param{at}": float(value) for at, value in enumerate(params, start=1)}
         target: dict[str, Value] = {"target_system": self.craft.config.sysid, "target_component": 1}
         self.send("COMMAND_LONG", values | target | {"command": command})
-        return Result(self.expect("COMMAND_ACK").integer("result"))
+        return MAV_RESULT(self.expect("COMMAND_ACK").integer("result"))
 
-    def command_int(self, command: int, values: Mapping[str, Value]) -> Result:
+    def command_int(self, command: int, values: Mapping[str, Value]) -> MAV_RESULT:
         """Send COMMAND_INT and return the result."""
         target: dict[str, Value] = {"target_system": self.craft.config.sysid, "target_component": 1}
         self.send("COMMAND_INT", dict(values) | target | {"command": command})
-        return Result(self.expect("COMMAND_ACK").integer("result"))
+        return MAV_RESULT(self.expect("COMMAND_ACK").integer("result"))
 
-    def mode(self, mode: Mode) -> Result:
+    def mode(self, mode: COPTER_MODE) -> MAV_RESULT:
         """Ask for a mode."""
-        return self.command(Command.DO_SET_MODE, ModeFlag.CUSTOM, mode)
+        return self.command(MAV_CMD.DO_SET_MODE, MAV_MODE_FLAG.CUSTOM_MODE_ENABLED, mode)
 
     def parameter(self, name: str, value: float) -> float:
         """Set a parameter and return what the vehicle answers."""
@@ -122,12 +122,12 @@ class Pilot:
             PilotTimeoutError: a step was refused or took too long.
         """
         v = self.craft.vehicle.state
-        if self.mode(Mode.GUIDED) is not Result.ACCEPTED:
+        if self.mode(COPTER_MODE.GUIDED) is not MAV_RESULT.ACCEPTED:
             raise PilotTimeoutError("GUIDED was refused")
         self.wait(lambda: arming_refusal(v) is None, timeout_s)
-        if self.command(Command.COMPONENT_ARM_DISARM, 1.0) is not Result.ACCEPTED:
+        if self.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is not MAV_RESULT.ACCEPTED:
             raise PilotTimeoutError(f"arming was refused: {self.texts[-1:]}")
-        if self.command(Command.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m) is not Result.ACCEPTED:
+        if self.command(MAV_CMD.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m) is not MAV_RESULT.ACCEPTED:
             raise PilotTimeoutError("takeoff was refused")
         return self.wait(lambda: v.altitude_m > 0.95 * altitude_m, timeout_s)
 

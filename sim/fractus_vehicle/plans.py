@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import assert_never
 
+from fractus_mavlink.enums import COPTER_MODE, MAV_MISSION_RESULT, MAV_MISSION_TYPE, MAV_SEVERITY
+
 from fractus_vehicle.earth import Place
 from fractus_vehicle.fence import FenceItem, FenceShapeError, build_shapes
-from fractus_vehicle.mav import MissionKind, MissionResult, Mode, Severity
 from fractus_vehicle.mission_items import Item, ItemStore, home_item
 from fractus_vehicle.state import VehicleState
 
 
-def stores_of(v: VehicleState) -> dict[MissionKind, ItemStore]:
+def stores_of(v: VehicleState) -> dict[MAV_MISSION_TYPE, ItemStore]:
     """The three lists of one vehicle."""
     return {store.kind: store for store in (v.mission.store, v.fence_items, v.rally)}
 
@@ -24,34 +25,36 @@ def restore(v: VehicleState, kept: VehicleState) -> None:
             replace_items(v, mine, list(theirs.items))
 
 
-def replace_items(v: VehicleState, store: ItemStore, items: list[Item]) -> MissionResult:
+def replace_items(v: VehicleState, store: ItemStore, items: list[Item]) -> MAV_MISSION_RESULT:
     """Store a list in place of what is there, unless the vehicle cannot use it."""
     result = _accept(v, store.kind, items)
-    if result is MissionResult.ACCEPTED:
+    if result is MAV_MISSION_RESULT.ACCEPTED:
         store.items = items
     return result
 
 
-def _accept(v: VehicleState, kind: MissionKind, items: list[Item]) -> MissionResult:
+def _accept(v: VehicleState, kind: MAV_MISSION_TYPE, items: list[Item]) -> MAV_MISSION_RESULT:
     match kind:
-        case MissionKind.MISSION:
+        case MAV_MISSION_TYPE.MISSION:
             if items and v.home is not None:
                 items[0] = home_item(v.home)
             v.params.assign("MIS_TOTAL", len(items))
-            if v.mode is not Mode.AUTO:
+            if v.mode is not COPTER_MODE.AUTO:
                 v.mission.rewind()
-        case MissionKind.FENCE:
+        case MAV_MISSION_TYPE.FENCE:
             try:
                 v.fence.shapes = build_shapes(_local(v, items))
             except FenceShapeError as error:
-                v.say(Severity.WARNING, f"Fence: {error}")
-                return MissionResult.INVALID
+                v.say(MAV_SEVERITY.WARNING, f"Fence: {error}")
+                return MAV_MISSION_RESULT.INVALID
             v.params.assign("FENCE_TOTAL", len(items))
-        case MissionKind.RALLY:
+        case MAV_MISSION_TYPE.RALLY:
             v.params.assign("RALLY_TOTAL", len(items))
+        case MAV_MISSION_TYPE.ALL:
+            raise ValueError("plans: a list has one kind; only MISSION_CLEAR_ALL names all of them")
         case _:
             assert_never(kind)
-    return MissionResult.ACCEPTED
+    return MAV_MISSION_RESULT.ACCEPTED
 
 
 def _local(v: VehicleState, items: Sequence[Item]) -> list[FenceItem]:

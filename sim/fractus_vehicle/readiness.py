@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from fractus_vehicle.mav import Mode
+from fractus_mavlink.enums import COPTER_MODE
+
 from fractus_vehicle.state import VehicleState
 
 # The modes that fly without knowing where they are.
-WITHOUT_POSITION = frozenset({Mode.STABILIZE, Mode.ALT_HOLD, Mode.LAND})
+WITHOUT_POSITION = frozenset({COPTER_MODE.STABILIZE, COPTER_MODE.ALT_HOLD, COPTER_MODE.LAND})
 
 
 def arming_refusal(v: VehicleState) -> str | None:

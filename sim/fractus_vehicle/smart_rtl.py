@@ -6,12 +6,13 @@ import math
 from collections.abc import Iterator
 from enum import Enum
 
+from fractus_mavlink.enums import MAV_SEVERITY
+
 from fractus_vehicle.breadcrumbs import Point
 from fractus_vehicle.descent import descend
 from fractus_vehicle.flight import Flight
 from fractus_vehicle.home import return_point
 from fractus_vehicle.leg import Leg
-from fractus_vehicle.mav import Severity
 from fractus_vehicle.state import VehicleState
 
 # The last point is approached this much above it.
@@ -53,7 +54,7 @@ class SmartReturn(Flight):
     def end(self, v: VehicleState) -> None:
         """Give back the point that was not reached, so that the path remains whole."""
         if self.stage is SmartStage.PATH_FOLLOW and self._popped is not None and not v.breadcrumbs.add(self._popped):
-            v.say(Severity.ERROR, "SmartRTL: lost one point")
+            v.say(MAV_SEVERITY.ERROR, "SmartRTL: lost one point")
 
     def step(self, v: VehicleState) -> None:
         """Go through the stages."""

@@ -9,16 +9,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fractus_mavlink import Value
+from fractus_mavlink.enums import COPTER_MODE, MAV_LANDED_STATE, MAV_MISSION_TYPE, MAV_SEVERITY
 
 from fractus_vehicle.body import Airframe, Body, Wind
 from fractus_vehicle.breadcrumbs import Breadcrumbs
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.control import Control
+from fractus_vehicle.copter import ABSOLUTE_FRAMES, GLOBAL_FRAMES, TERRAIN_FRAMES
 from fractus_vehicle.earth import Place
 from fractus_vehicle.estimator import Estimator
 from fractus_vehicle.fence import Fence
 from fractus_vehicle.heading import Heading
-from fractus_vehicle.mav import ABSOLUTE_FRAMES, GLOBAL_FRAMES, TERRAIN_FRAMES, Landed, MissionKind, Mode, Severity
 from fractus_vehicle.mission import Mission
 from fractus_vehicle.mission_items import ItemStore
 from fractus_vehicle.params import Parameters
@@ -95,15 +96,15 @@ class VehicleState:
         self.fence = Fence()
         self.failsafes = ActiveFailsafes()
         self.mission = Mission()
-        self.fence_items = ItemStore(MissionKind.FENCE)
-        self.rally = ItemStore(MissionKind.RALLY)
+        self.fence_items = ItemStore(MAV_MISSION_TYPE.FENCE)
+        self.rally = ItemStore(MAV_MISSION_TYPE.RALLY)
         self.breadcrumbs = Breadcrumbs(self.params, self.say)
         self.heading = Heading(self.control, self.params)
         self.receiver = Receiver()
         self.armed = False
         self.armed_at_s = 0.0
         self.armed_heading = math.radians(config.heading_deg)
-        self.mode = Mode.STABILIZE
+        self.mode = COPTER_MODE.STABILIZE
         self.landed = True
         self.touch_time_s = 0.0
         self.taking_off_until_m: float | None = None
@@ -223,13 +224,13 @@ class VehicleState:
         return self.taking_off_until_m is not None
 
     @property
-    def landed_state(self) -> Landed:
+    def landed_state(self) -> MAV_LANDED_STATE:
         """MAV_LANDED_STATE."""
         if self.landed:
-            return Landed.ON_GROUND
+            return MAV_LANDED_STATE.ON_GROUND
         if self.flying_wanted:
-            return Landed.TAKEOFF
-        return Landed.LANDING if self.mode is Mode.LAND else Landed.IN_AIR
+            return MAV_LANDED_STATE.TAKEOFF
+        return MAV_LANDED_STATE.LANDING if self.mode is COPTER_MODE.LAND else MAV_LANDED_STATE.IN_AIR
 
     # -- texts -------------------------------------------------------------------------------------------------
 
@@ -238,7 +239,7 @@ class VehicleState:
         for channel in self.channels:
             channel.send(name, values)
 
-    def say(self, severity: Severity, text: str) -> None:
+    def say(self, severity: MAV_SEVERITY, text: str) -> None:
         """Send a STATUSTEXT on every link, in chunks when it is long."""
         data = text.encode("ascii", "replace")
         # MAVLink: chunks of one text share an id other than 0.
@@ -257,7 +258,7 @@ class VehicleState:
         self.taking_off_until_m = None
         if force or self.landed:
             self.landed = self.landed or self.body.on_ground
-        self.say(Severity.INFO, "Disarming motors")
+        self.say(MAV_SEVERITY.INFO, "Disarming motors")
 
     def land_complete(self) -> None:
         """The vehicle rests on the ground."""

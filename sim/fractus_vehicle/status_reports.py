@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-from fractus_vehicle.mav import (
-    AUTOPILOT_ARDUPILOTMEGA,
-    CAPABILITIES,
-    FLIGHT_VERSION,
-    TYPE_QUADROTOR,
-    Mode,
-    ModeFlag,
-    State,
-)
+from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_MODE_FLAG, MAV_STATE, MAV_TYPE
+
+from fractus_vehicle.copter import CAPABILITIES, FLIGHT_VERSION
 from fractus_vehicle.readiness import arming_refusal
 from fractus_vehicle.report_units import UNKNOWN_U16, Values, boot_ms
 from fractus_vehicle.shaping import clamp
@@ -28,18 +22,22 @@ _POSITION_CONTROLS = 0x6000
 
 def heartbeat(v: VehicleState) -> Values:
     """HEARTBEAT as ArduCopter fills it."""
-    flags = ModeFlag.CUSTOM
-    if v.mode not in (Mode.STABILIZE,):
-        flags |= ModeFlag.GUIDED if v.mode in (Mode.AUTO, Mode.RTL, Mode.GUIDED, Mode.LOITER) else ModeFlag.CUSTOM
-    flags |= ModeFlag.STABILIZE | ModeFlag.MANUAL_INPUT
+    flags = MAV_MODE_FLAG.CUSTOM_MODE_ENABLED
+    if v.mode not in (COPTER_MODE.STABILIZE,):
+        flags |= (
+            MAV_MODE_FLAG.GUIDED_ENABLED
+            if v.mode in (COPTER_MODE.AUTO, COPTER_MODE.RTL, COPTER_MODE.GUIDED, COPTER_MODE.LOITER)
+            else MAV_MODE_FLAG.CUSTOM_MODE_ENABLED
+        )
+    flags |= MAV_MODE_FLAG.STABILIZE_ENABLED | MAV_MODE_FLAG.MANUAL_INPUT_ENABLED
     if v.armed:
-        flags |= ModeFlag.SAFETY_ARMED
-    state = State.STANDBY if v.landed else State.ACTIVE
+        flags |= MAV_MODE_FLAG.SAFETY_ARMED
+    state = MAV_STATE.STANDBY if v.landed else MAV_STATE.ACTIVE
     if v.failsafes.any:
-        state = State.CRITICAL
+        state = MAV_STATE.CRITICAL
     return {
-        "type": TYPE_QUADROTOR,
-        "autopilot": AUTOPILOT_ARDUPILOTMEGA,
+        "type": MAV_TYPE.QUADROTOR,
+        "autopilot": MAV_AUTOPILOT.ARDUPILOTMEGA,
         "base_mode": int(flags),
         "custom_mode": int(v.mode),
         "system_status": int(state),
@@ -52,7 +50,7 @@ def sys_status(v: VehicleState) -> Values:
     enabled = _SENSORS_PRESENT & ~(_SENSOR_FENCE | _MOTOR_OUTPUTS | _POSITION_CONTROLS)
     if v.armed:
         enabled |= _MOTOR_OUTPUTS
-    if v.mode not in (Mode.STABILIZE, Mode.ALT_HOLD):
+    if v.mode not in (COPTER_MODE.STABILIZE, COPTER_MODE.ALT_HOLD):
         enabled |= _POSITION_CONTROLS
     present = _SENSORS_PRESENT
     if v.fence.enabled:
@@ -108,7 +106,7 @@ def mission_current(v: VehicleState) -> Values:
         "seq": v.mission.current,
         "total": total if total else UNKNOWN_U16,
         "mission_state": v.mission.state(v.mode),
-        "mission_mode": 1 if v.mode is Mode.AUTO else 2,
+        "mission_mode": 1 if v.mode is COPTER_MODE.AUTO else 2,
     }
 
 

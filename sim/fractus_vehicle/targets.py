@@ -6,26 +6,19 @@ import math
 from typing import NamedTuple
 
 from fractus_mavlink import Message
+from fractus_mavlink.enums import MAV_FRAME, POSITION_TARGET_TYPEMASK
 
+from fractus_vehicle.copter import IGNORE_ACCELERATION, IGNORE_POSITION, IGNORE_VELOCITY
 from fractus_vehicle.earth import Place, valid_coordinates
 from fractus_vehicle.flight import Flight
 from fractus_vehicle.guided import GuidedFlight
-from fractus_vehicle.mav import (
-    FORCE_SET,
-    IGNORE_ACCELERATION,
-    IGNORE_POSITION,
-    IGNORE_VELOCITY,
-    IGNORE_YAW,
-    IGNORE_YAW_RATE,
-    Frame,
-)
 from fractus_vehicle.mission_items import item_from
 from fractus_vehicle.shaping import clamp, wrap_pi
 from fractus_vehicle.state import VehicleState
 
-_BODY_FRAMES = frozenset({Frame.BODY_NED, Frame.BODY_OFFSET_NED})
-_OFFSET_FRAMES = frozenset({Frame.LOCAL_OFFSET_NED}) | _BODY_FRAMES
-_LOCAL_FRAMES = frozenset({Frame.LOCAL_NED}) | _OFFSET_FRAMES
+_BODY_FRAMES = frozenset({MAV_FRAME.BODY_NED, MAV_FRAME.BODY_OFFSET_NED})
+_OFFSET_FRAMES = frozenset({MAV_FRAME.LOCAL_OFFSET_NED}) | _BODY_FRAMES
+_LOCAL_FRAMES = frozenset({MAV_FRAME.LOCAL_NED}) | _OFFSET_FRAMES
 
 Vector = tuple[float, float, float]
 
@@ -98,11 +91,11 @@ def _target(v: VehicleState, flight: Flight, m: Message, asked: Setpoint) -> Non
     velocity = asked.velocity if not mask & IGNORE_VELOCITY else None
     accel = asked.accel if not mask & IGNORE_ACCELERATION else None
     understood = velocity is not None or (position is None) != (accel is None)
-    if not understood or (mask & FORCE_SET and accel is not None):
+    if not understood or (mask & POSITION_TARGET_TYPEMASK.FORCE_SET and accel is not None):
         flight.stop(v)
         return
-    yaw = m.real("yaw") if not mask & IGNORE_YAW else None
-    yaw_rate = m.real("yaw_rate") if not mask & IGNORE_YAW_RATE else None
+    yaw = m.real("yaw") if not mask & POSITION_TARGET_TYPEMASK.YAW_IGNORE else None
+    yaw_rate = m.real("yaw_rate") if not mask & POSITION_TARGET_TYPEMASK.YAW_RATE_IGNORE else None
     numbers = (*(position or ()), *(velocity or ()), *(accel or ()), yaw or 0.0, yaw_rate or 0.0)
     if not all(math.isfinite(value) for value in numbers):
         return

@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from fractus_mavlink import Message, Value
+from fractus_mavlink.enums import MAV_CMD, MAV_MISSION_RESULT, MAV_MISSION_TYPE
 
 from fractus_vehicle.channel import Channel
-from fractus_vehicle.mav import Command, MissionKind, MissionResult
 from fractus_vehicle.mission_items import Item, ItemStore, item_from, judge, judge_numbers
 
 MAX_ITEMS = 724
@@ -16,10 +16,10 @@ UPLOAD_TIMEOUT_S = 8.0
 RETRY_S = 1.0
 # What is refused until an upload of the same list has ended.
 NOT_WHILE_UPLOADED = {
-    "MISSION_REQUEST_LIST": MissionResult.DENIED,
-    "MISSION_REQUEST": MissionResult.DENIED,
-    "MISSION_REQUEST_INT": MissionResult.DENIED,
-    "MISSION_CLEAR_ALL": MissionResult.ERROR,
+    "MISSION_REQUEST_LIST": MAV_MISSION_RESULT.DENIED,
+    "MISSION_REQUEST": MAV_MISSION_RESULT.DENIED,
+    "MISSION_REQUEST_INT": MAV_MISSION_RESULT.DENIED,
+    "MISSION_CLEAR_ALL": MAV_MISSION_RESULT.ERROR,
 }
 
 
@@ -30,7 +30,7 @@ class Upload:
     channel: Channel
     sysid: int
     compid: int
-    kind: MissionKind
+    kind: MAV_MISSION_TYPE
     next: int
     last: int
     items: list[Item]
@@ -48,8 +48,8 @@ class Transfers:
 
     def __init__(
         self,
-        stores: Mapping[MissionKind, ItemStore],
-        replace_items: Callable[[ItemStore, list[Item]], MissionResult],
+        stores: Mapping[MAV_MISSION_TYPE, ItemStore],
+        replace_items: Callable[[ItemStore, list[Item]], MAV_MISSION_RESULT],
     ) -> None:
         self._stores = stores
         self._replace = replace_items
@@ -57,23 +57,23 @@ class Transfers:
         self.now_s = 0.0
 
     @staticmethod
-    def _ack(channel: Channel, peer: Message | Upload, kind: int, result: MissionResult) -> None:
+    def _ack(channel: Channel, peer: Message | Upload, kind: int, result: MAV_MISSION_RESULT) -> None:
         channel.send("MISSION_ACK", _address(peer, kind) | {"type": int(result)})
 
     def handle(self, channel: Channel, message: Message, now_s: float) -> None:
         """Answer one message of the protocol."""
         self.now_s = now_s
         kind_number = message.integer("mission_type") if message.has("mission_type") else 0
-        if kind_number == 255 and message.name == "MISSION_CLEAR_ALL":
+        if kind_number == MAV_MISSION_TYPE.ALL and message.name == "MISSION_CLEAR_ALL":
             for store in self._stores.values():
                 self._replace(store, [])
-            self._ack(channel, message, kind_number, MissionResult.ACCEPTED)
-        elif kind_number not in set(MissionKind):
-            self._ack(channel, message, kind_number, MissionResult.UNSUPPORTED)
+            self._ack(channel, message, kind_number, MAV_MISSION_RESULT.ACCEPTED)
+        elif kind_number not in self._stores:
+            self._ack(channel, message, kind_number, MAV_MISSION_RESULT.UNSUPPORTED)
         elif self.upload is not None and self.upload.kind == kind_number and message.name in NOT_WHILE_UPLOADED:
             self._ack(channel, message, kind_number, NOT_WHILE_UPLOADED[message.name])
         else:
-            self._handle(channel, message, self._stores[MissionKind(kind_number)])
+            self._handle(channel, message, self._stores[MAV_MISSION_TYPE(kind_number)])
 
     def detach(self, channel: Channel) -> None:
         """Give up an upload from a link that closes."""
@@ -91,13 +91,13 @@ class Transfers:
                 if 0 <= start <= end <= len(store.items):
                     self._begin(channel, message, store, range(start, end + 1))
                 else:
-                    self._ack(channel, message, kind, MissionResult.ERROR)
+                    self._ack(channel, message, kind, MAV_MISSION_RESULT.ERROR)
             case "MISSION_ITEM" | "MISSION_ITEM_INT":
                 self._take(channel, message, store)
             case "MISSION_REQUEST_LIST":
                 channel.send("MISSION_COUNT", _address(message, kind) | {"count": len(store.items)})
             case "MISSION_REQUEST_PARTIAL_LIST":
-                self._ack(channel, message, kind, MissionResult.UNSUPPORTED)
+                self._ack(channel, message, kind, MAV_MISSION_RESULT.UNSUPPORTED)
             case "MISSION_REQUEST" | "MISSION_REQUEST_INT":
                 self._give(channel, message, store)
             case "MISSION_CLEAR_ALL":
@@ -114,9 +114,9 @@ class Transfers:
     def _begin(self, channel: Channel, message: Message, store: ItemStore, wanted: range) -> None:
         """Begin to ask for the items of `wanted`; all of a new list, or a part of the stored one."""
         if self.upload is not None and not self._is_uploader(channel, message):
-            self._ack(channel, message, store.kind, MissionResult.DENIED)
+            self._ack(channel, message, store.kind, MAV_MISSION_RESULT.DENIED)
         elif wanted.stop > MAX_ITEMS:
-            self._ack(channel, message, store.kind, MissionResult.NO_SPACE)
+            self._ack(channel, message, store.kind, MAV_MISSION_RESULT.NO_SPACE)
         elif not wanted:
             self._ack(channel, message, store.kind, self._replace(store, []))
         else:
@@ -142,16 +142,16 @@ class Transfers:
     def _take(self, channel: Channel, message: Message, store: ItemStore) -> None:
         up = self.upload
         if up is None or not self._is_uploader(channel, message) or up.kind is not store.kind:
-            self._ack(channel, message, store.kind, MissionResult.ERROR)
+            self._ack(channel, message, store.kind, MAV_MISSION_RESULT.ERROR)
             return
         seq = message.integer("seq")
         if seq != up.next:
             if seq > up.next:
-                self._ack(channel, message, store.kind, MissionResult.INVALID_SEQUENCE)
+                self._ack(channel, message, store.kind, MAV_MISSION_RESULT.INVALID_SEQUENCE)
             return
         item = item_from(message)
         verdict = self._judge(message, item, store, up)
-        if verdict is not MissionResult.ACCEPTED:
+        if verdict is not MAV_MISSION_RESULT.ACCEPTED:
             self.upload = None
             self._ack(channel, message, store.kind, verdict)
             return
@@ -165,15 +165,15 @@ class Transfers:
         self._ack(channel, message, store.kind, self._replace(store, up.items))
 
     @staticmethod
-    def _judge(message: Message, item: Item, store: ItemStore, up: Upload) -> MissionResult:
-        if store.kind is MissionKind.MISSION:
+    def _judge(message: Message, item: Item, store: ItemStore, up: Upload) -> MAV_MISSION_RESULT:
+        if store.kind is MAV_MISSION_TYPE.MISSION:
             if message.integer("seq") == 0:
-                return MissionResult.ACCEPTED
+                return MAV_MISSION_RESULT.ACCEPTED
             verdict = judge_numbers(message)
-            if verdict is not MissionResult.ACCEPTED:
+            if verdict is not MAV_MISSION_RESULT.ACCEPTED:
                 return verdict
-            if item.command == Command.DO_JUMP and not 0 < int(item.param1) < max(len(up.items), up.last + 1):
-                return MissionResult.ERROR
+            if item.command == MAV_CMD.DO_JUMP and not 0 < int(item.param1) < max(len(up.items), up.last + 1):
+                return MAV_MISSION_RESULT.ERROR
         return judge(item, store.kind)
 
     def _give(self, channel: Channel, message: Message, store: ItemStore) -> None:
@@ -181,7 +181,7 @@ class Transfers:
         # Item 0 of a mission is home, and may be read even when there is no mission.
         homes = [store.home] if store.home is not None and not store.items else store.items
         if not 0 <= seq < len(homes):
-            self._ack(channel, message, store.kind, MissionResult.INVALID_SEQUENCE)
+            self._ack(channel, message, store.kind, MAV_MISSION_RESULT.INVALID_SEQUENCE)
             return
         item = homes[seq]
         integers = message.name == "MISSION_REQUEST_INT"
@@ -212,7 +212,7 @@ class Transfers:
             return False
         if now_s - up.heard_s > UPLOAD_TIMEOUT_S:
             self.upload = None
-            self._ack(up.channel, up, up.kind, MissionResult.CANCELLED)
+            self._ack(up.channel, up, up.kind, MAV_MISSION_RESULT.OPERATION_CANCELLED)
             return True
         if now_s - up.asked_s > RETRY_S:
             self._ask(up)

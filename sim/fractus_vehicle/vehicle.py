@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from fractus_mavlink.enums import COPTER_MODE, MAV_SEVERITY
+
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.failsafes import Failsafes
 from fractus_vehicle.home import set_home
-from fractus_vehicle.mav import Mode, Severity
 from fractus_vehicle.modes import FlightModes
 from fractus_vehicle.motion import move
 from fractus_vehicle.plans import replace_items, stores_of
@@ -15,7 +16,7 @@ from fractus_vehicle.telemetry import attach, follow_rate, serve
 from fractus_vehicle.transfers import Transfers
 
 # The modes that switch the motors off as soon as they have landed.
-_LANDING_MODES = frozenset({Mode.LAND, Mode.RTL, Mode.SMART_RTL})
+_LANDING_MODES = frozenset({COPTER_MODE.LAND, COPTER_MODE.RTL, COPTER_MODE.SMART_RTL})
 
 
 class Vehicle:
@@ -53,7 +54,7 @@ class Vehicle:
             set_home(v, v.place)
         v.control.reset(v.est)
         v.breadcrumbs.restart(v.time_s, v.known_position)
-        v.say(Severity.INFO, "Arming motors")
+        v.say(MAV_SEVERITY.INFO, "Arming motors")
 
     def step(self) -> None:
         """Advance by one control step."""
@@ -70,7 +71,7 @@ class Vehicle:
             self._check_idle()
         move(v)
         if self.transfers.upload is not None and self.transfers.step(v.time_s):
-            v.say(Severity.WARNING, "Mission upload timeout")
+            v.say(MAV_SEVERITY.WARNING, "Mission upload timeout")
         for channel in v.channels:
             serve(v, channel)
 

@@ -6,7 +6,7 @@ import itertools
 import math
 
 import pytest
-from fractus_vehicle.mav import Command, Landed, Mode, Result
+from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_LANDED_STATE, MAV_RESULT
 from fractus_vehicle.pilot import Pilot
 from fractus_vehicle.readiness import arming_refusal
 from fractus_vehicle.shaping import sqrt_controller, stopping_distance, wrap_pi
@@ -37,7 +37,7 @@ def test_measured_figures_of_the_real_thing_hold_within_20_percent():
     assert 7.44 <= pilot.simulation.time_s - begun <= 11.16
     assert 6.72 <= peak <= 10.08
     pilot.fly_on(6.0)
-    assert pilot.command(Command.NAV_RETURN_TO_LAUNCH) is Result.ACCEPTED
+    assert pilot.command(MAV_CMD.NAV_RETURN_TO_LAUNCH) is MAV_RESULT.ACCEPTED
     home_s = pilot.wait(lambda: not vehicle.armed, 120.0)
     assert 39.2 <= home_s <= 58.8
     assert distance_m(vehicle, 0.0, 0.0) < 1.0
@@ -76,51 +76,51 @@ def test_wind_is_held_and_gusts_do_not_carry_it_away():
 
 def test_arming_waits_for_readiness_and_says_why():
     vehicle, pilot = alone()
-    pilot.mode(Mode.GUIDED)
-    assert pilot.command(Command.COMPONENT_ARM_DISARM, 1.0) is Result.FAILED
+    pilot.mode(COPTER_MODE.GUIDED)
+    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.FAILED
     assert any(text.startswith("Arm: ") for text in pilot.texts)
     pilot.wait(lambda: arming_refusal(vehicle) is None, 5.0)
     assert pilot.simulation.time_s >= 2.0
-    assert pilot.command(Command.COMPONENT_ARM_DISARM, 1.0) is Result.ACCEPTED
-    assert pilot.command(Command.COMPONENT_ARM_DISARM, 0.0) is Result.ACCEPTED
-    assert pilot.mode(Mode.RTL) is Result.ACCEPTED
-    assert pilot.command(Command.COMPONENT_ARM_DISARM, 1.0) is Result.FAILED
+    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.ACCEPTED
+    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 0.0) is MAV_RESULT.ACCEPTED
+    assert pilot.mode(COPTER_MODE.RTL) is MAV_RESULT.ACCEPTED
+    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.FAILED
     assert pilot.texts[-1] == "Arm: RTL mode not armable"
 
 
 def test_idle_vehicle_disarms_by_itself():
     vehicle, pilot = alone()
-    pilot.mode(Mode.GUIDED)
+    pilot.mode(COPTER_MODE.GUIDED)
     pilot.wait(lambda: arming_refusal(vehicle) is None, 5.0)
-    pilot.command(Command.COMPONENT_ARM_DISARM, 1.0)
+    pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0)
     assert 9.0 < pilot.wait(lambda: not vehicle.armed, 15.0) < 11.0
 
 
 def test_takeoff_needs_guided_armed_and_ground():
     vehicle, pilot = alone()
     pilot.wait(lambda: arming_refusal(vehicle) is None, 5.0)
-    takeoff = (Command.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5)
-    assert pilot.command(*takeoff) is Result.FAILED
-    pilot.command(Command.COMPONENT_ARM_DISARM, 1.0)
-    assert pilot.command(*takeoff) is Result.FAILED, "STABILIZE has no takeoff"
-    pilot.mode(Mode.GUIDED)
-    assert pilot.command(*takeoff[:-1], -3) is Result.FAILED
-    assert pilot.command(*takeoff) is Result.ACCEPTED
+    takeoff = (MAV_CMD.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5)
+    assert pilot.command(*takeoff) is MAV_RESULT.FAILED
+    pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0)
+    assert pilot.command(*takeoff) is MAV_RESULT.FAILED, "STABILIZE has no takeoff"
+    pilot.mode(COPTER_MODE.GUIDED)
+    assert pilot.command(*takeoff[:-1], -3) is MAV_RESULT.FAILED
+    assert pilot.command(*takeoff) is MAV_RESULT.ACCEPTED
     pilot.wait(lambda: not vehicle.landed, 10.0)
-    assert vehicle.landed_state is Landed.TAKEOFF
-    assert pilot.command(*takeoff) is Result.FAILED
-    assert pilot.command(Command.COMPONENT_ARM_DISARM, 0.0) is Result.FAILED, "in the air only with the force magic"
+    assert vehicle.landed_state is MAV_LANDED_STATE.TAKEOFF
+    assert pilot.command(*takeoff) is MAV_RESULT.FAILED
+    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 0.0) is MAV_RESULT.FAILED, "in the air only with the force magic"
     assert vehicle.armed
-    assert pilot.command(Command.COMPONENT_ARM_DISARM, 0.0, 21196) is Result.ACCEPTED
+    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 0.0, 21196) is MAV_RESULT.ACCEPTED
     assert not vehicle.armed
 
 
 def test_a_target_during_spool_up_cancels_the_takeoff():
     vehicle, pilot = alone()
-    pilot.mode(Mode.GUIDED)
+    pilot.mode(COPTER_MODE.GUIDED)
     pilot.wait(lambda: arming_refusal(vehicle) is None, 5.0)
-    pilot.command(Command.COMPONENT_ARM_DISARM, 1.0)
-    pilot.command(Command.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5)
+    pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0)
+    pilot.command(MAV_CMD.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5)
     pilot.fly_on(0.5)
     pilot.go_to(10.0, 0.0, 10.0)
     pilot.fly_on(8.0)
@@ -130,13 +130,13 @@ def test_a_target_during_spool_up_cancels_the_takeoff():
 @pytest.mark.parametrize(
     ("command", "result"),
     [
-        (31999, Result.UNSUPPORTED),
-        (Command.DO_REPOSITION, Result.COMMAND_INT_ONLY),
-        (Command.REQUEST_MESSAGE, Result.ACCEPTED),
-        (Command.DO_FLIGHTTERMINATION, Result.FAILED),
+        (31999, MAV_RESULT.UNSUPPORTED),
+        (MAV_CMD.DO_REPOSITION, MAV_RESULT.COMMAND_INT_ONLY),
+        (MAV_CMD.REQUEST_MESSAGE, MAV_RESULT.ACCEPTED),
+        (MAV_CMD.DO_FLIGHTTERMINATION, MAV_RESULT.FAILED),
     ],
 )
-def test_results_of_commands(command: int, result: Result):
+def test_results_of_commands(command: int, result: MAV_RESULT):
     _, pilot = alone()
     assert pilot.command(command) is result
 
@@ -173,9 +173,9 @@ def test_global_targets_in_every_frame(frame: int):
 def test_local_targets_in_every_frame(frame: int, north: float, east: float):
     vehicle, pilot = airborne(10.0)
     pilot.go_to(10.0, 0.0, 10.0)
-    pilot.command(Command.CONDITION_YAW, 90, 90, 1, 0)
+    pilot.command(MAV_CMD.CONDITION_YAW, 90, 90, 1, 0)
     pilot.fly_on(12.0)
-    pilot.command(Command.CONDITION_YAW, 90, 90, 1, 0)
+    pilot.command(MAV_CMD.CONDITION_YAW, 90, 90, 1, 0)
     pilot.fly_on(4.0)
     assert vehicle.est.yaw == pytest.approx(math.radians(90), abs=0.05)
     z = -10.0 if frame == 1 else 0.0
@@ -217,7 +217,7 @@ def test_nose_follows_the_course_and_looks_at_a_region_of_interest():
     assert vehicle.est.yaw == pytest.approx(math.radians(90), abs=0.1)
     roi = START.offset(100.0, vehicle.body.east)
     values = {"frame": 3, "x": roi.lat_e7, "y": roi.lon_e7, "z": 0.0}
-    assert pilot.command_int(Command.DO_SET_ROI_LOCATION, values) is Result.ACCEPTED
+    assert pilot.command_int(MAV_CMD.DO_SET_ROI_LOCATION, values) is MAV_RESULT.ACCEPTED
     pilot.fly_on(10.0)
     bearing = math.atan2(vehicle.body.east * 0 + START.vector_to(roi)[1] - vehicle.body.east, 100.0)
     assert wrap_pi(vehicle.est.yaw - bearing) == pytest.approx(0.0, abs=0.1)
@@ -225,12 +225,12 @@ def test_nose_follows_the_course_and_looks_at_a_region_of_interest():
 
 def test_reposition_switches_mode_only_when_asked():
     vehicle, pilot = airborne(10.0)
-    assert pilot.mode(Mode.LOITER) is Result.ACCEPTED
+    assert pilot.mode(COPTER_MODE.LOITER) is MAV_RESULT.ACCEPTED
     place = START.offset(10.0, 5.0)
     values = {"frame": 6, "x": place.lat_e7, "y": place.lon_e7, "z": 15.0, "param1": -1.0, "param4": math.nan}
-    assert pilot.command_int(Command.DO_REPOSITION, values) is Result.DENIED
-    assert pilot.command_int(Command.DO_REPOSITION, values | {"param2": 1.0}) is Result.ACCEPTED
-    assert vehicle.mode is Mode.GUIDED
+    assert pilot.command_int(MAV_CMD.DO_REPOSITION, values) is MAV_RESULT.DENIED
+    assert pilot.command_int(MAV_CMD.DO_REPOSITION, values | {"param2": 1.0}) is MAV_RESULT.ACCEPTED
+    assert vehicle.mode is COPTER_MODE.GUIDED
     pilot.fly_on(15.0)
     assert distance_m(vehicle, 10.0, 5.0) < 0.7
     assert vehicle.altitude_m == pytest.approx(15.0, abs=0.4)
@@ -238,12 +238,12 @@ def test_reposition_switches_mode_only_when_asked():
 
 def test_change_speed_holds_until_the_controller_changes():
     vehicle, pilot = airborne(10.0)
-    assert pilot.command(Command.DO_CHANGE_SPEED, 1, 2.0) is Result.ACCEPTED
-    assert pilot.command(Command.DO_CHANGE_SPEED, 1, -1.0) is Result.FAILED
+    assert pilot.command(MAV_CMD.DO_CHANGE_SPEED, 1, 2.0) is MAV_RESULT.ACCEPTED
+    assert pilot.command(MAV_CMD.DO_CHANGE_SPEED, 1, -1.0) is MAV_RESULT.FAILED
     pilot.go_to(40.0, 0.0, 10.0)
     pilot.fly_on(4.0)
     assert vehicle.body.vn > 5.0, "the first position starts the position controller, with the parameter's speed"
-    assert pilot.command(Command.DO_CHANGE_SPEED, 1, 2.0) is Result.ACCEPTED
+    assert pilot.command(MAV_CMD.DO_CHANGE_SPEED, 1, 2.0) is MAV_RESULT.ACCEPTED
     pilot.fly_on(5.0)
     assert vehicle.body.vn == pytest.approx(2.0, abs=0.2)
     pilot.go_to(-60.0, 0.0, 10.0)
@@ -256,17 +256,19 @@ def test_change_speed_holds_until_the_controller_changes():
     assert vehicle.body.vn < -5.0, "a velocity in between ends it"
 
 
-@pytest.mark.parametrize(("mode", "slack_m"), [(Mode.BRAKE, 0.0), (Mode.LOITER, 4.0), (Mode.GUIDED, 4.0)])
-def test_stops_about_as_fast_as_the_autopilots_own_formula(mode: Mode, slack_m: float):
+@pytest.mark.parametrize(
+    ("mode", "slack_m"), [(COPTER_MODE.BRAKE, 0.0), (COPTER_MODE.LOITER, 4.0), (COPTER_MODE.GUIDED, 4.0)]
+)
+def test_stops_about_as_fast_as_the_autopilots_own_formula(mode: COPTER_MODE, slack_m: float):
     vehicle, pilot = airborne(10.0)
     pilot.go_to(100.0, 0.0, 10.0)
     pilot.wait(lambda: vehicle.body.vn > 8.0, 10.0)
     at = vehicle.body.north
     speed = vehicle.body.vn
-    if mode is Mode.GUIDED:
+    if mode is COPTER_MODE.GUIDED:
         _local(pilot, 1, 0xFFF)
     else:
-        assert pilot.mode(mode) is Result.ACCEPTED
+        assert pilot.mode(mode) is MAV_RESULT.ACCEPTED
     pilot.fly_on(10.0)
     assert abs(vehicle.body.vn) < 0.2
     assert vehicle.body.north - at < stopping_distance(speed, 1.0, 2.5) + slack_m
@@ -275,32 +277,32 @@ def test_stops_about_as_fast_as_the_autopilots_own_formula(mode: Mode, slack_m: 
 
 def test_land_disarms_on_the_ground():
     vehicle, pilot = airborne(8.0)
-    assert pilot.command(Command.NAV_LAND) is Result.ACCEPTED
+    assert pilot.command(MAV_CMD.NAV_LAND) is MAV_RESULT.ACCEPTED
     took = pilot.wait(lambda: not vehicle.armed, 60.0)
     assert 14.0 < took < 25.0
     assert vehicle.body.on_ground
-    assert vehicle.landed_state is Landed.ON_GROUND
+    assert vehicle.landed_state is MAV_LANDED_STATE.ON_GROUND
     assert vehicle.body.impact_mps < 0.8
 
 
 def test_unknown_modes_are_refused():
     vehicle, pilot = alone()
-    assert pilot.command(Command.DO_SET_MODE, 1, 99) is Result.FAILED
+    assert pilot.command(MAV_CMD.DO_SET_MODE, 1, 99) is MAV_RESULT.FAILED
     assert pilot.texts[-1] == "No such mode 99"
-    assert pilot.command(Command.DO_SET_MODE, 0, 4) is Result.DENIED
-    assert vehicle.mode is Mode.STABILIZE
+    assert pilot.command(MAV_CMD.DO_SET_MODE, 0, 4) is MAV_RESULT.DENIED
+    assert vehicle.mode is COPTER_MODE.STABILIZE
 
 
 def test_modes_are_checked_once_the_motors_run():
     vehicle, pilot = alone()
-    assert pilot.mode(Mode.AUTO) is Result.ACCEPTED, "disarmed, every mode can be selected"
-    assert pilot.mode(Mode.GUIDED) is Result.ACCEPTED
+    assert pilot.mode(COPTER_MODE.AUTO) is MAV_RESULT.ACCEPTED, "disarmed, every mode can be selected"
+    assert pilot.mode(COPTER_MODE.GUIDED) is MAV_RESULT.ACCEPTED
     pilot.wait(lambda: arming_refusal(vehicle) is None, 5.0)
-    pilot.command(Command.COMPONENT_ARM_DISARM, 1.0)
-    assert pilot.mode(Mode.AUTO) is Result.FAILED, "there is no mission"
+    pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0)
+    assert pilot.mode(COPTER_MODE.AUTO) is MAV_RESULT.FAILED, "there is no mission"
     assert pilot.texts[-1] == "Mode change to AUTO failed: init failed"
-    assert pilot.command(Command.MISSION_START) is Result.FAILED
-    assert vehicle.mode is Mode.GUIDED
+    assert pilot.command(MAV_CMD.MISSION_START) is MAV_RESULT.FAILED
+    assert vehicle.mode is COPTER_MODE.GUIDED
 
 
 def test_nan_targets_are_ignored():

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from fractus_mavlink import Parser, Signing, encode, layout_named
-from fractus_vehicle.mav import Command, Result
+from fractus_mavlink.enums import MAV_CMD, MAV_RESULT
 from fractus_vehicle.params import Parameters, UnknownParameterError, table
 from fractus_vehicle.readiness import arming_refusal
 from vehicle_world import CONFIG, START, airborne, alone, upload
@@ -70,8 +70,8 @@ def test_a_reboot_keeps_what_is_stored_and_forgets_the_rest():
     vehicle, pilot = alone()
     pilot.parameter("WPNAV_SPEED", 750.0)
     assert upload(pilot, 1, [FENCE]) == 0
-    pilot.command(Command.SET_MESSAGE_INTERVAL, 30, 100_000)
-    assert pilot.command(Command.PREFLIGHT_REBOOT_SHUTDOWN, 1) is Result.ACCEPTED
+    pilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, 30, 100_000)
+    assert pilot.command(MAV_CMD.PREFLIGHT_REBOOT_SHUTDOWN, 1) is MAV_RESULT.ACCEPTED
     pilot.fly_on(0.1)
     rebooted = pilot.craft.vehicle.state
     assert rebooted is not vehicle
@@ -83,7 +83,7 @@ def test_a_reboot_keeps_what_is_stored_and_forgets_the_rest():
 
 def test_it_does_not_reboot_in_the_air():
     vehicle, pilot = airborne(5.0)
-    assert pilot.command(Command.PREFLIGHT_REBOOT_SHUTDOWN, 1) is Result.FAILED
+    assert pilot.command(MAV_CMD.PREFLIGHT_REBOOT_SHUTDOWN, 1) is MAV_RESULT.FAILED
     pilot.fly_on(0.1)
     assert pilot.craft.vehicle.state is vehicle
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from fractus_vehicle.mav import Command, MissionResult, Mode, Result
+from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_MISSION_RESULT, MAV_RESULT
 from fractus_vehicle.pilot import Pilot
 from fractus_vehicle.readiness import arming_refusal
 from fractus_vehicle.state import VehicleState
@@ -44,17 +44,17 @@ MISSION = [
 
 def test_a_mission_is_flown_with_its_jump_and_return():
     vehicle, pilot = alone()
-    assert upload(pilot, 0, MISSION) == MissionResult.ACCEPTED
+    assert upload(pilot, 0, MISSION) == MAV_MISSION_RESULT.ACCEPTED
     pilot.wait(lambda: arming_refusal(vehicle) is None, 5.0)
-    pilot.mode(Mode.GUIDED)
-    assert pilot.command(Command.COMPONENT_ARM_DISARM, 1.0) is Result.ACCEPTED
-    assert pilot.command(Command.MISSION_START) is Result.ACCEPTED
+    pilot.mode(COPTER_MODE.GUIDED)
+    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.ACCEPTED
+    assert pilot.command(MAV_CMD.MISSION_START) is MAV_RESULT.ACCEPTED
     reached: list[int] = []
     fastest_after_change = 0.0
     for _ in range(20_000):
         messages = pilot.step()
         reached += [message.integer("seq") for message in messages if message.name == "MISSION_ITEM_REACHED"]
-        if 3 in reached[-1:] and vehicle.mode is Mode.AUTO:
+        if 3 in reached[-1:] and vehicle.mode is COPTER_MODE.AUTO:
             fastest_after_change = max(fastest_after_change, abs(vehicle.body.ve))
         if not vehicle.armed:
             break
@@ -67,7 +67,7 @@ def test_a_mission_is_flown_with_its_jump_and_return():
 
 def test_download_returns_what_was_uploaded_with_home_in_front():
     vehicle, pilot = airborne(5.0)
-    assert upload(pilot, 0, MISSION) == MissionResult.ACCEPTED
+    assert upload(pilot, 0, MISSION) == MAV_MISSION_RESULT.ACCEPTED
     items = _download(pilot)
     assert [item["command"] for item in items] == [item["command"] for item in MISSION]
     assert items[2]["x"] == MISSION[2]["x"]
@@ -84,12 +84,12 @@ def test_partial_upload_replaces_a_part():
     pilot.send("MISSION_WRITE_PARTIAL_LIST", target | {"start_index": 2, "end_index": 2})
     pilot.expect("MISSION_REQUEST")
     pilot.send("MISSION_ITEM_INT", target | {"seq": 2} | new)
-    assert pilot.expect("MISSION_ACK").integer("type") == MissionResult.ACCEPTED
+    assert pilot.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.ACCEPTED
     items = _download(pilot)
     assert len(items) == len(MISSION)
     assert items[2]["z"] == 12.0
     pilot.send("MISSION_WRITE_PARTIAL_LIST", target | {"start_index": 3, "end_index": 99})
-    assert pilot.expect("MISSION_ACK").integer("type") == MissionResult.ERROR
+    assert pilot.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.ERROR
 
 
 def test_old_float_items_are_understood():
@@ -100,7 +100,7 @@ def test_old_float_items_are_understood():
         pilot.expect("MISSION_REQUEST")
         values = {"seq": seq, "command": 16, "frame": 3, "x": 48.2001, "y": 16.3702, "z": 10.0}
         pilot.send("MISSION_ITEM", target | values)
-    assert pilot.expect("MISSION_ACK").integer("type") == MissionResult.ACCEPTED
+    assert pilot.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.ACCEPTED
     assert vehicle.mission.items[1].x == pytest.approx(482_001_000, abs=50)
     pilot.send("MISSION_REQUEST", target | {"seq": 1})
     assert pilot.expect("MISSION_ITEM").real("x") == pytest.approx(48.2001, abs=1e-5)
@@ -113,25 +113,25 @@ def test_a_stalled_upload_is_repeated_then_given_up_and_changes_nothing():
     pilot.expect("MISSION_REQUEST")
     pilot.expect("MISSION_REQUEST", 2.0)
     pilot.expect("MISSION_ACK", 12.0)
-    assert pilot.last["MISSION_ACK"].integer("type") != MissionResult.ACCEPTED
+    assert pilot.last["MISSION_ACK"].integer("type") != MAV_MISSION_RESULT.ACCEPTED
     assert len(vehicle.mission.items) == len(MISSION)
 
 
 @pytest.mark.parametrize(
     ("item", "result"),
     [
-        ({"command": 4000, "frame": 3}, MissionResult.UNSUPPORTED),
-        ({"command": 16, "frame": 1, "x": 5, "y": 5}, MissionResult.UNSUPPORTED_FRAME),
-        ({"command": 16, "frame": 3, "x": 950_000_000, "y": 5}, MissionResult.INVALID_PARAM5_X),
-        ({"command": 16, "frame": 3, "x": 5, "y": 1_850_000_000}, MissionResult.INVALID_PARAM6_Y),
-        ({"command": 16, "frame": 3, "x": 5, "y": 5, "z": math.nan}, MissionResult.INVALID_PARAM7),
-        ({"command": 16, "frame": 3, "x": 5, "y": 5, "param1": math.nan}, MissionResult.INVALID_PARAM1),
-        ({"command": 16, "frame": 3, "x": 5, "y": 5, "param4": math.inf}, MissionResult.INVALID_PARAM4),
-        ({"command": 19, "frame": 3, "x": 5, "y": 5, "param4": math.nan}, MissionResult.INVALID_PARAM4),
-        ({"command": 177, "param1": 2, "param2": 1}, MissionResult.ERROR),
+        ({"command": 4000, "frame": 3}, MAV_MISSION_RESULT.UNSUPPORTED),
+        ({"command": 16, "frame": 1, "x": 5, "y": 5}, MAV_MISSION_RESULT.UNSUPPORTED_FRAME),
+        ({"command": 16, "frame": 3, "x": 950_000_000, "y": 5}, MAV_MISSION_RESULT.INVALID_PARAM5_X),
+        ({"command": 16, "frame": 3, "x": 5, "y": 1_850_000_000}, MAV_MISSION_RESULT.INVALID_PARAM6_Y),
+        ({"command": 16, "frame": 3, "x": 5, "y": 5, "z": math.nan}, MAV_MISSION_RESULT.INVALID_PARAM7),
+        ({"command": 16, "frame": 3, "x": 5, "y": 5, "param1": math.nan}, MAV_MISSION_RESULT.INVALID_PARAM1),
+        ({"command": 16, "frame": 3, "x": 5, "y": 5, "param4": math.inf}, MAV_MISSION_RESULT.INVALID_PARAM4),
+        ({"command": 19, "frame": 3, "x": 5, "y": 5, "param4": math.nan}, MAV_MISSION_RESULT.INVALID_PARAM4),
+        ({"command": 177, "param1": 2, "param2": 1}, MAV_MISSION_RESULT.ERROR),
     ],
 )
-def test_bad_items_end_the_upload(item: dict[str, float], result: MissionResult):
+def test_bad_items_end_the_upload(item: dict[str, float], result: MAV_MISSION_RESULT):
     vehicle, pilot = alone()
     assert upload(pilot, 0, [HOME, item]) == result
     assert vehicle.mission.items == []
@@ -139,7 +139,7 @@ def test_bad_items_end_the_upload(item: dict[str, float], result: MissionResult)
 
 def test_a_heading_may_be_nan():
     _, pilot = alone()
-    assert upload(pilot, 0, [HOME, _waypoint(5.0, 0.0, 10.0, param4=math.nan)]) == MissionResult.ACCEPTED
+    assert upload(pilot, 0, [HOME, _waypoint(5.0, 0.0, 10.0, param4=math.nan)]) == MAV_MISSION_RESULT.ACCEPTED
 
 
 def test_a_partial_upload_may_append_one_item():
@@ -150,7 +150,7 @@ def test_a_partial_upload_may_append_one_item():
     pilot.send("MISSION_WRITE_PARTIAL_LIST", target | {"start_index": end, "end_index": end})
     assert pilot.expect("MISSION_REQUEST").integer("seq") == end
     pilot.send("MISSION_ITEM_INT", target | {"seq": end} | _waypoint(1.0, 2.0, 3.0))
-    assert pilot.expect("MISSION_ACK").integer("type") == MissionResult.ACCEPTED
+    assert pilot.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.ACCEPTED
     assert [item.z for item in vehicle.mission.items[end - 1 :]] == [0.0, 3.0]
 
 
@@ -160,9 +160,9 @@ def test_a_list_that_is_being_uploaded_is_neither_read_nor_cleared():
     target = {"target_system": 1, "target_component": 1}
     pilot.send("MISSION_COUNT", target | {"count": 3})
     for name, more, result in (
-        ("MISSION_REQUEST_LIST", {}, MissionResult.DENIED),
-        ("MISSION_REQUEST_INT", {"seq": 1}, MissionResult.DENIED),
-        ("MISSION_CLEAR_ALL", {}, MissionResult.ERROR),
+        ("MISSION_REQUEST_LIST", {}, MAV_MISSION_RESULT.DENIED),
+        ("MISSION_REQUEST_INT", {"seq": 1}, MAV_MISSION_RESULT.DENIED),
+        ("MISSION_CLEAR_ALL", {}, MAV_MISSION_RESULT.ERROR),
     ):
         pilot.send(name, target | more)
         assert pilot.expect("MISSION_ACK").integer("type") == result
@@ -175,15 +175,15 @@ def test_jumps_lead_to_tags():
     jump = {"command": 601, "param1": 7.0, "param2": 1.0}
     lost = {"command": 601, "param1": 8.0, "param2": -1.0}
     points = [_waypoint(north, 0.0, 10.0) for north in (1.0, 2.0, 3.0)]
-    assert upload(pilot, 0, [HOME, points[0], tag, points[1], jump, lost, points[2]]) == MissionResult.ACCEPTED
+    assert upload(pilot, 0, [HOME, points[0], tag, points[1], jump, lost, points[2]]) == MAV_MISSION_RESULT.ACCEPTED
     mission, at, order = vehicle.mission, 0, []
     while (following := mission.next_after(at)) is not None:
         at = following
         order.append(at)
     assert order == [1, 2, 3, 2, 3]  # a jump to a tag that is missing ends the mission
-    assert pilot.command(Command.DO_JUMP_TAG, 7.0) is Result.ACCEPTED
+    assert pilot.command(MAV_CMD.DO_JUMP_TAG, 7.0) is MAV_RESULT.ACCEPTED
     assert mission.current == 2
-    assert pilot.command(Command.DO_JUMP_TAG, 9.0) is Result.FAILED
+    assert pilot.command(MAV_CMD.DO_JUMP_TAG, 9.0) is MAV_RESULT.FAILED
 
 
 @pytest.mark.parametrize(("times", "following"), [(-1.0, None), (1.0, 4)])
@@ -192,7 +192,7 @@ def test_jumps_that_pass_no_waypoint_come_to_an_end(times, following):
     tag = {"command": 600, "param1": 1.0}
     jump = {"command": 601, "param1": 1.0, "param2": times}
     points = [_waypoint(north, 0.0, 10.0) for north in (1.0, 2.0)]
-    assert upload(pilot, 0, [HOME, points[0], tag, jump, points[1]]) == MissionResult.ACCEPTED
+    assert upload(pilot, 0, [HOME, points[0], tag, jump, points[1]]) == MAV_MISSION_RESULT.ACCEPTED
     assert vehicle.mission.peek_after(1) == following
     assert vehicle.mission.peek_after(1) == following, "nothing was counted as done"
 
@@ -200,7 +200,7 @@ def test_jumps_that_pass_no_waypoint_come_to_an_end(times, following):
 def test_too_many_items_are_refused():
     _, pilot = alone()
     pilot.send("MISSION_COUNT", {"target_system": 1, "target_component": 1, "count": 5000})
-    assert pilot.expect("MISSION_ACK").integer("type") == MissionResult.NO_SPACE
+    assert pilot.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.NO_SPACE
 
 
 def test_a_second_uploader_has_to_wait():
@@ -208,17 +208,17 @@ def test_a_second_uploader_has_to_wait():
     other = Pilot(pilot.simulation, pilot.craft, sysid=200)
     pilot.send("MISSION_COUNT", {"target_system": 1, "target_component": 1, "count": 2})
     other.send("MISSION_COUNT", {"target_system": 1, "target_component": 1, "count": 2})
-    assert other.expect("MISSION_ACK").integer("type") == MissionResult.DENIED
+    assert other.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.DENIED
 
 
 def test_rtl_goes_to_the_nearest_rally_point():
     vehicle, pilot = airborne(10.0)
     rally = START.offset(60.0, 10.0)
     item = {"command": 5100, "frame": 3, "x": rally.lat_e7, "y": rally.lon_e7, "z": 10.0}
-    assert upload(pilot, 2, [item]) == MissionResult.ACCEPTED
+    assert upload(pilot, 2, [item]) == MAV_MISSION_RESULT.ACCEPTED
     pilot.go_to(50.0, 0.0, 10.0)
     pilot.fly_on(15.0)
-    pilot.command(Command.NAV_RETURN_TO_LAUNCH)
+    pilot.command(MAV_CMD.NAV_RETURN_TO_LAUNCH)
     pilot.wait(lambda: not vehicle.armed, 90.0)
     assert distance_m(vehicle, 60.0, 10.0) < 1.0
 
@@ -226,21 +226,21 @@ def test_rtl_goes_to_the_nearest_rally_point():
 def test_pause_and_continue_and_set_current():
     vehicle, pilot = airborne(10.0)
     upload(pilot, 0, [HOME, _waypoint(60.0, 0.0, 10.0), _waypoint(60.0, 30.0, 10.0)])
-    assert pilot.mode(Mode.AUTO) is Result.ACCEPTED
+    assert pilot.mode(COPTER_MODE.AUTO) is MAV_RESULT.ACCEPTED
     pilot.fly_on(4.0)
-    assert pilot.command(Command.DO_PAUSE_CONTINUE, 0) is Result.ACCEPTED
+    assert pilot.command(MAV_CMD.DO_PAUSE_CONTINUE, 0) is MAV_RESULT.ACCEPTED
     pilot.fly_on(6.0)
     paused_at = vehicle.body.north
     assert 5.0 < paused_at < 50.0
     assert abs(vehicle.body.vn) < 0.2
-    assert pilot.command(Command.DO_PAUSE_CONTINUE, 1) is Result.ACCEPTED
+    assert pilot.command(MAV_CMD.DO_PAUSE_CONTINUE, 1) is MAV_RESULT.ACCEPTED
     pilot.fly_on(4.0)
     assert vehicle.body.north > paused_at + 3.0
-    assert pilot.command(Command.DO_SET_MISSION_CURRENT, 2) is Result.ACCEPTED
+    assert pilot.command(MAV_CMD.DO_SET_MISSION_CURRENT, 2) is MAV_RESULT.ACCEPTED
     assert pilot.last["MISSION_CURRENT"].integer("seq") == 2
     pilot.wait(lambda: vehicle.mission.state(vehicle.mode) == 5, 60.0)
     pilot.fly_on(3.0)
-    assert vehicle.mode is Mode.AUTO, "it holds where the mission ended"
+    assert vehicle.mode is COPTER_MODE.AUTO, "it holds where the mission ended"
     assert distance_m(vehicle, 60.0, 30.0) < 3.0
 
 
@@ -253,7 +253,7 @@ def test_land_item_lands_and_loiter_time_waits():
         {"command": 21, "frame": 3, "x": place.lat_e7, "y": place.lon_e7},
     ]
     upload(pilot, 0, items)
-    pilot.mode(Mode.AUTO)
+    pilot.mode(COPTER_MODE.AUTO)
     took = pilot.wait(lambda: not vehicle.armed, 90.0)
     assert 24.0 < took < 45.0
     assert distance_m(vehicle, 15.0, 0.0) < 1.0
@@ -264,8 +264,8 @@ def _fly_mission(
 ) -> tuple[VehicleState, Pilot, list[tuple[float, ...]]]:
     """Fly a mission to its end; the way flown, with the speed."""
     vehicle, pilot = airborne(10.0, **parameters)
-    assert upload(pilot, 0, [HOME, *items]) == MissionResult.ACCEPTED
-    assert pilot.mode(Mode.AUTO) is Result.ACCEPTED
+    assert upload(pilot, 0, [HOME, *items]) == MAV_MISSION_RESULT.ACCEPTED
+    assert pilot.mode(COPTER_MODE.AUTO) is MAV_RESULT.ACCEPTED
     way = []
     for _ in range(12_000):
         pilot.step()
@@ -336,12 +336,12 @@ def test_a_part_of_a_mission_is_replaced():
     for seq in (2, 3):
         assert pilot.expect("MISSION_REQUEST").integer("seq") == seq
         pilot.send("MISSION_ITEM_INT", target | {"seq": seq} | _waypoint(33.0, seq, 9.0))
-    assert pilot.expect("MISSION_ACK").integer("type") == MissionResult.ACCEPTED
+    assert pilot.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.ACCEPTED
     assert len(vehicle.mission.items) == len(MISSION)
     assert [item.z for item in vehicle.mission.items[2:4]] == [9.0, 9.0]
     assert vehicle.mission.items[4].z == 15.0
     pilot.send("MISSION_WRITE_PARTIAL_LIST", target | {"start_index": 5, "end_index": 50})
-    assert pilot.expect("MISSION_ACK").integer("type") == MissionResult.ERROR
+    assert pilot.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.ERROR
 
 
 @pytest.mark.parametrize(("near_home", "include", "north"), [(True, 1, 0.0), (True, 0, 60.0), (False, 1, 60.0)])
@@ -351,7 +351,7 @@ def test_home_counts_as_a_rally_point_where_it_is_included(near_home: bool, incl
     upload(pilot, 2, [{"command": 5100, "frame": 3, "x": rally.lat_e7, "y": rally.lon_e7, "z": 25.0}])
     pilot.go_to(20.0 if near_home else 45.0, 0.0, 10.0)
     pilot.fly_on(12.0)
-    pilot.command(Command.NAV_RETURN_TO_LAUNCH)
+    pilot.command(MAV_CMD.NAV_RETURN_TO_LAUNCH)
     highest = 0.0
     while vehicle.armed:
         pilot.step()
@@ -367,6 +367,6 @@ def test_a_rally_point_that_is_too_far_is_none():
     upload(pilot, 2, [{"command": 5100, "frame": 3, "x": rally.lat_e7, "y": rally.lon_e7, "z": 25.0}])
     pilot.go_to(10.0, 0.0, 10.0)
     pilot.fly_on(5.0)
-    pilot.command(Command.NAV_RETURN_TO_LAUNCH)
+    pilot.command(MAV_CMD.NAV_RETURN_TO_LAUNCH)
     pilot.wait(lambda: not vehicle.armed, 90.0)
     assert distance_m(vehicle, 0.0, 0.0) < 1.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 
 import pytest
+from fractus_mavlink.enums import MAV_CMD, MAV_RESULT
 from fractus_vehicle.channel import OUTBOX_LIMIT, Channel
-from fractus_vehicle.mav import Command, Result
 from fractus_vehicle.streams import ALL_GROUPS, BUILDERS, GROUPS
 from fractus_vehicle.telemetry import send
 from vehicle_world import airborne, alone
@@ -15,7 +15,7 @@ from vehicle_world import airborne, alone
 @pytest.mark.parametrize("interval_us", [10_000, 20_000, 30_000, 33_333, 100_000, 250_000, 1_000_000])
 def test_intervals_are_exact(interval_us: int):
     vehicle, pilot = alone()
-    assert pilot.command(Command.SET_MESSAGE_INTERVAL, 30, interval_us) is Result.ACCEPTED
+    assert pilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, 30, interval_us) is MAV_RESULT.ACCEPTED
     times = []
     for _ in range(3000):
         times += [m.integer("time_boot_ms") for m in pilot.step() if m.name == "ATTITUDE"]
@@ -38,15 +38,15 @@ def test_every_stream_at_4_hz_gives_the_measured_rate():
 
 def test_stopping_a_stream_and_asking_for_the_unknown():
     _, pilot = alone()
-    pilot.command(Command.SET_MESSAGE_INTERVAL, 30, 100_000)
+    pilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, 30, 100_000)
     pilot.fly_on(1.0)
-    assert pilot.command(Command.SET_MESSAGE_INTERVAL, 30, -1) is Result.ACCEPTED
+    assert pilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, 30, -1) is MAV_RESULT.ACCEPTED
     pilot.last.clear()
     pilot.fly_on(2.0)
     assert pilot.last.keys() <= {"HEARTBEAT", "STATUSTEXT", "HOME_POSITION"}
-    assert pilot.command(Command.SET_MESSAGE_INTERVAL, 9999, 1000) is Result.DENIED
-    assert pilot.command(Command.REQUEST_MESSAGE, 9999) is Result.FAILED
-    assert pilot.command(Command.REQUEST_MESSAGE, float("nan")) is Result.FAILED
+    assert pilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, 9999, 1000) is MAV_RESULT.DENIED
+    assert pilot.command(MAV_CMD.REQUEST_MESSAGE, 9999) is MAV_RESULT.FAILED
+    assert pilot.command(MAV_CMD.REQUEST_MESSAGE, float("nan")) is MAV_RESULT.FAILED
 
 
 @pytest.mark.parametrize("name", sorted(BUILDERS))
@@ -80,7 +80,7 @@ def test_a_deaf_client_costs_bounded_memory_and_loses_only_its_own_messages():
     deaf = pilot.craft.open("deaf")
     for name in BUILDERS:
         deaf.set_interval(name, 0.01)
-    pilot.command(Command.SET_MESSAGE_INTERVAL, 30, 100_000)
+    pilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, 30, 100_000)
     seen = 0
     for _ in range(3000):
         seen += sum(m.name == "ATTITUDE" for m in pilot.step())

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Sequence
 
+from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_RESULT
 from fractus_vehicle import earth
-from fractus_vehicle.mav import Command, Mode, Result
 
 from fractus_sim.experiment.station import Station
 from fractus_sim.experiment.tasks import (
@@ -57,20 +57,20 @@ def fly(station: Station, steps: Sequence[Step], tell: Callable[[str], None]) ->
                 yield from _go(station, step, speed_mps)
             case Speed():
                 speed_mps = step.speed
-                yield from _command(station, Command.DO_CHANGE_SPEED, 1, speed_mps, -1)
+                yield from _command(station, MAV_CMD.DO_CHANGE_SPEED, 1, speed_mps, -1)
             case Hold():
                 yield from _hold(station, step.seconds)
             case SetMode():
-                yield from _enter(station, Mode[step.mode])
+                yield from _enter(station, COPTER_MODE[step.mode])
             case FlyMission():
                 yield from _mission(station, step)
             case ReturnToLaunch():
-                yield from _down(station, Mode.RTL)
+                yield from _down(station, COPTER_MODE.RTL)
             case Land():
-                yield from _down(station, Mode.LAND)
+                yield from _down(station, COPTER_MODE.LAND)
 
 
-def _command(station: Station, command: Command, *params: float) -> Flight:
+def _command(station: Station, command: MAV_CMD, *params: float) -> Flight:
     """Send a command until it is answered.
 
     Raises:
@@ -82,16 +82,16 @@ def _command(station: Station, command: Command, *params: float) -> Flight:
         while station.now_s < deadline:
             yield
             if command in station.acks:
-                result = Result(station.acks[command])
-                if result is not Result.ACCEPTED:
+                result = MAV_RESULT(station.acks[command])
+                if result is not MAV_RESULT.ACCEPTED:
                     said = f": {station.state.texts[-1][2]}" if station.state.texts else ""
                     raise TaskFailed(f"{command.name} was answered {result.name}{said}")
                 return
     raise TaskFailed(f"{command.name} was not answered")
 
 
-def _enter(station: Station, mode: Mode) -> Flight:
-    yield from _command(station, Command.DO_SET_MODE, 1, mode)
+def _enter(station: Station, mode: COPTER_MODE) -> Flight:
+    yield from _command(station, MAV_CMD.DO_SET_MODE, 1, mode)
     deadline = station.now_s + 3.0
     while station.state.mode != mode.name:
         if station.now_s > deadline:
@@ -102,7 +102,7 @@ def _enter(station: Station, mode: Mode) -> Flight:
 def _arm(station: Station) -> Flight:
     deadline = station.now_s + ARM_S
     while not station.state.armed:
-        station.command(Command.COMPONENT_ARM_DISARM, 1)
+        station.command(MAV_CMD.COMPONENT_ARM_DISARM, 1)
         again = station.now_s + ANSWER_S
         while station.now_s < again and not station.state.armed:
             yield
@@ -112,11 +112,11 @@ def _arm(station: Station) -> Flight:
 
 
 def _take_off(station: Station, altitude_m: float) -> Flight:
-    yield from _enter(station, Mode.GUIDED)
+    yield from _enter(station, COPTER_MODE.GUIDED)
     yield from _arm(station)
-    yield from _command(station, Command.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m)
+    yield from _command(station, MAV_CMD.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m)
     while station.state.alt_m < CLIMBED * altitude_m:
-        _expect(station, Mode.GUIDED)
+        _expect(station, COPTER_MODE.GUIDED)
         yield
 
 
@@ -131,9 +131,9 @@ def _go(station: Station, step: Goto, speed_mps: float | None) -> Flight:
             frame = {"coordinate_frame": RELATIVE_FRAME, "type_mask": POSITION_ONLY}
             station.tell("SET_POSITION_TARGET_GLOBAL_INT", {**where, **frame})
             if speed_mps is not None:  # the first leg begins with the parameters' speed, whatever was set before
-                station.command(Command.DO_CHANGE_SPEED, 1, speed_mps, -1)
+                station.command(MAV_CMD.DO_CHANGE_SPEED, 1, speed_mps, -1)
         yield
-        _expect(station, Mode.GUIDED)
+        _expect(station, COPTER_MODE.GUIDED)
         here = earth.Place.from_degrees(station.state.lat, station.state.lon, 0.0)
         north, east, _ = here.vector_to(target)
         if math.hypot(north, east, step.alt - station.state.alt_m) <= step.within:
@@ -148,7 +148,7 @@ def _hold(station: Station, seconds: float) -> Flight:
             raise TaskFailed(f"the autopilot changed to {station.state.mode}")
 
 
-def _down(station: Station, mode: Mode) -> Flight:
+def _down(station: Station, mode: COPTER_MODE) -> Flight:
     yield from _enter(station, mode)
     while station.state.armed:
         if station.state.mode not in {mode.name, "LAND"}:
@@ -156,7 +156,7 @@ def _down(station: Station, mode: Mode) -> Flight:
         yield
 
 
-def _expect(station: Station, mode: Mode) -> None:
+def _expect(station: Station, mode: COPTER_MODE) -> None:
     if station.state.mode != mode.name:
         raise TaskFailed(f"the autopilot changed to {station.state.mode}")
     if not station.state.armed:
@@ -179,10 +179,10 @@ def _point(station: Station, place: Place) -> earth.Place:
 
 def _mission(station: Station, step: FlyMission) -> Flight:
     yield from _upload(station, _items(station, step))
-    yield from _enter(station, Mode.GUIDED)
+    yield from _enter(station, COPTER_MODE.GUIDED)
     yield from _arm(station)
-    yield from _enter(station, Mode.AUTO)
-    yield from _command(station, Command.MISSION_START, 0, 0)
+    yield from _enter(station, COPTER_MODE.AUTO)
+    yield from _command(station, MAV_CMD.MISSION_START, 0, 0)
     while station.state.armed:
         if station.state.mode != "AUTO":
             raise TaskFailed(f"the autopilot changed to {station.state.mode}")
@@ -191,13 +191,13 @@ def _mission(station: Station, step: FlyMission) -> Flight:
 
 def _items(station: Station, step: FlyMission) -> list[dict[str, float]]:
     """The mission as MISSION_ITEM_INT fields; the first is home, as ArduPilot keeps it."""
-    first: dict[str, float] = {"command": int(Command.NAV_WAYPOINT), "frame": 0}
-    items: list[dict[str, float]] = [first, {"command": int(Command.NAV_TAKEOFF), "frame": 6, "z": step.takeoff}]
+    first: dict[str, float] = {"command": int(MAV_CMD.NAV_WAYPOINT), "frame": 0}
+    items: list[dict[str, float]] = [first, {"command": int(MAV_CMD.NAV_TAKEOFF), "frame": 6, "z": step.takeoff}]
     for waypoint in step.waypoints:
         at = _point(station, waypoint)
         place = {"x": at.lat_e7, "y": at.lon_e7, "z": waypoint.alt}
-        items.append({"command": int(Command.NAV_WAYPOINT), "frame": 6, "param1": waypoint.hold, **place})
-    last = Command.NAV_RETURN_TO_LAUNCH if step.land == "home" else Command.NAV_LAND
+        items.append({"command": int(MAV_CMD.NAV_WAYPOINT), "frame": 6, "param1": waypoint.hold, **place})
+    last = MAV_CMD.NAV_RETURN_TO_LAUNCH if step.land == "home" else MAV_CMD.NAV_LAND
     return [*items, {"command": int(last), "frame": 6}]
 
 

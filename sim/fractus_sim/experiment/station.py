@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from fractus_mavlink import Endpoint, Message, Value, layout_named
+from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_MODE_FLAG
 from fractus_vehicle.channel import Channel
-from fractus_vehicle.mav import Command, Mode, ModeFlag
 from fractus_vehicle.simulation import Craft
 
 from fractus_sim.experiment.errors import ExperimentError
@@ -227,9 +227,9 @@ class Station:
         values: dict[str, Value] = {f"param{at}": float(value) for at, value in enumerate(params, start=1)}
         self.tell("COMMAND_LONG", {**values, "command": command})
 
-    def ask_mode(self, mode: Mode) -> None:
+    def ask_mode(self, mode: COPTER_MODE) -> None:
         """Ask for a flight mode; the answer will be in `acks`."""
-        self.command(Command.DO_SET_MODE, ModeFlag.CUSTOM, mode)
+        self.command(MAV_CMD.DO_SET_MODE, MAV_MODE_FLAG.CUSTOM_MODE_ENABLED, mode)
 
     def read_parameter(self, name: str) -> None:
         """Ask for a parameter; it will be in `parameters`."""
@@ -249,15 +249,15 @@ class Station:
 
     def _ask_for_streams(self) -> None:
         for name, rate_hz in RATES_HZ.items():
-            self.command(Command.SET_MESSAGE_INTERVAL, layout_named(name).msgid, 1e6 / rate_hz)
+            self.command(MAV_CMD.SET_MESSAGE_INTERVAL, layout_named(name).msgid, 1e6 / rate_hz)
 
 
 def _heartbeat(station: Station, message: Message) -> None:
     state = station.state
     state.heard = True
-    state.armed = bool(message.integer("base_mode") & ModeFlag.SAFETY_ARMED)
+    state.armed = bool(message.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED)
     number = message.integer("custom_mode")
-    state.mode = Mode(number).name if number in Mode._value2member_map_ else f"MODE_{number}"
+    state.mode = COPTER_MODE(number).name if number in set(COPTER_MODE) else f"MODE_{number}"
 
 
 def _position(station: Station, message: Message) -> None:

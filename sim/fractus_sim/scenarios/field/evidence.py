@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from fractus_mavlink import Message, Parser, frame_length
-from fractus_vehicle.mav import Mode, ModeFlag
+from fractus_mavlink.enums import COPTER_MODE, MAV_MODE_FLAG
 
 from fractus_sim.report.track import Place, Sample, Track
 
@@ -137,8 +137,8 @@ def _flight(path: Path) -> tuple[tuple[Sample, ...], _Clock, list[str]]:
             continue
         if message.name == "HEARTBEAT":
             number = message.integer("custom_mode")
-            mode = Mode(number).name if number in set(Mode) else f"MODE {number}"
-            armed = bool(message.integer("base_mode") & ModeFlag.SAFETY_ARMED)
+            mode = COPTER_MODE(number).name if number in set(COPTER_MODE) else f"MODE {number}"
+            armed = bool(message.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED)
         elif message.name == "EXTENDED_SYS_STATE":
             landed = message.integer("landed_state")
         elif message.name == "SYS_STATUS":

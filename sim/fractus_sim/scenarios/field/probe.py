@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from fractus_mavlink import Endpoint, Message, Value, layout_named
-from fractus_vehicle.mav import AUTOPILOT_ARDUPILOTMEGA, Command, ModeFlag
+from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_CMD, MAV_MODE_FLAG
 
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.station import OBSERVER_ID, STATION_COMPONENT, TcpLink
@@ -51,9 +51,9 @@ def look(link: str, tell: Callable[[str], None]) -> Standing:
     visitor = _Visitor(TcpLink.connect(host, port, CONNECT_S))
     try:
         heartbeat = visitor.wait(lambda m: m.name == "HEARTBEAT" and m.compid == 1, HEARTBEAT_S, "no heartbeat")
-        if heartbeat.integer("autopilot") != AUTOPILOT_ARDUPILOTMEGA:
+        if heartbeat.integer("autopilot") != MAV_AUTOPILOT.ARDUPILOTMEGA:
             raise ExperimentError(f"the autopilot at {link} is no ArduPilot")
-        if heartbeat.integer("base_mode") & ModeFlag.SAFETY_ARMED:
+        if heartbeat.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED:
             raise ExperimentError(f"the vehicle at {link} is armed; land and disarm it first")
         visitor.system_id = heartbeat.sysid
         tell(f"vehicle {heartbeat.sysid} at {link}; waiting for its position")
@@ -78,7 +78,7 @@ class _Visitor:
 
     def ask(self, name: str) -> None:
         """Ask for one message of a kind."""
-        values: dict[str, Value] = {"command": int(Command.REQUEST_MESSAGE), "param1": float(layout_named(name).msgid)}
+        values: dict[str, Value] = {"command": int(MAV_CMD.REQUEST_MESSAGE), "param1": float(layout_named(name).msgid)}
         values |= {"target_system": self.system_id, "target_component": 1}
         self._link.send(self._endpoint.encode("COMMAND_LONG", values))
 

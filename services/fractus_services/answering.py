@@ -1,4 +1,4 @@
-"""What every handler does: know the caller, and turn what goes wrong into a status with details."""
+"""What every handler does: authenticate the caller, limit its rate, and turn errors into a status with details."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ URGENT_PER_S = 20.0
 URGENT_BURST = 40.0
 """The same for calls that only make things safer; these are counted apart, so that no other call uses them up."""
 
-OPEN_CALLS = 32
-"""So many calls of one identity may be under way at a time, streams included."""
+MAX_OPEN_CALLS = 32
+"""How many calls of one identity may be under way at a time, streams included."""
 
-_MOST_COUNTED = 1_000
+_MAX_COUNTED = 1_000
 
 
 class Allowance:
@@ -49,7 +49,7 @@ class Allowance:
             self._left[identity] = (left, time_s)
             return (1.0 - left) / self.rate
         self._left[identity] = (left - 1.0, time_s)
-        if len(self._left) > _MOST_COUNTED:
+        if len(self._left) > _MAX_COUNTED:
             full_s = self._burst / self.rate
             self._left = {name: entry for name, entry in self._left.items() if time_s - entry[1] < full_s}
         return 0.0
@@ -62,7 +62,7 @@ class Reception:
         grants: grants of this node.
         clock: Unix time.
         translate: a failure of the service's own kind as a refusal; None for what it does not know.
-        failed: called with the verdict on an error that nobody foresaw.
+        failed: called with the verdict on an error that no one foresaw.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class Reception:
             known = self._translate(error)
             if known is not None:
                 await abort(context, known)
-            log.exception("a call failed inside the service; refused")
+            log.exception("rpc: a call failed inside the service, refused")
             reason = "the service failed; nothing was done"
             self._failed(Verdict("deny", None, "InternalError", reason, (), "hover"))
             await abort(context, InternalError("InternalError", reason))
@@ -125,8 +125,8 @@ class Reception:
         """
         again_s = allowance.take(identity, time.monotonic())
         reason = f"more than {allowance.rate:.0f} calls a second; slow down"
-        if not again_s and not urgent and self._open[identity] >= OPEN_CALLS:
-            again_s, reason = 1.0, f"{OPEN_CALLS} calls are under way; end one before the next"
+        if not again_s and not urgent and self._open[identity] >= MAX_OPEN_CALLS:
+            again_s, reason = 1.0, f"{MAX_OPEN_CALLS} calls are under way; end one before the next"
         if again_s:
             raise ResourceExhausted("TooManyCalls", reason, retry_after_s=again_s)
 

@@ -10,7 +10,7 @@ import grpc
 import pytest
 from fractus_proto.v1 import types_pb2
 from fractus_services import answering
-from fractus_services.answering import BURST, OPEN_CALLS, URGENT_BURST, Reception
+from fractus_services.answering import BURST, MAX_OPEN_CALLS, URGENT_BURST, Reception
 from fractus_services.auth import Caller
 from google.protobuf import any_pb2
 from google.rpc import error_details_pb2, status_pb2
@@ -78,9 +78,9 @@ async def test_an_urgent_call_is_let_through_a_flood_and_no_flood_of_its_own(rec
 
 async def test_only_so_many_calls_at_a_time(reception: Reception) -> None:
     async with AsyncExitStack() as stack:
-        for _ in range(OPEN_CALLS):
+        for _ in range(MAX_OPEN_CALLS):
             await stack.enter_async_context(reception.call(Context(), lasting=True))
-        with pytest.raises(Aborted, match=f"RESOURCE_EXHAUSTED: {OPEN_CALLS} calls are under way"):
+        with pytest.raises(Aborted, match=f"RESOURCE_EXHAUSTED: {MAX_OPEN_CALLS} calls are under way"):
             async with reception.call(Context()):
                 pass
         async with reception.call(Context(), urgent=True):

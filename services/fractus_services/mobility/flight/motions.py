@@ -15,17 +15,23 @@ from fractus_services.mobility.mavlink.autopilot import Autopilot, Permit
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 
 REACHED_M = 1.0
-HEIGHT_REACHED_M = 0.8
+HEIGHT_REACHED_M, HEIGHT_REACHED_MPS = 0.8, 0.6
+"""A climb is complete this near to its altitude and this slow: ArduCopter approaches the last metre ever more slowly."""
+
 REPORT_S = 0.2
-STUCK_S = 6.0
-RESENDS = 3
-TURNED_DEG, TURN_S = 8.0, 8.0
-"""A leg with a heading is complete when the nose points there, or had so long to turn."""
+CLIMB_TIMEOUT_S, CLIMB_PROGRESS_M = 20.0, 0.2
+STUCK_TIMEOUT_S, LEG_PROGRESS_M = 6.0, 0.3
+MAX_RESENDS = 3
+"""A leg on which the drone gets no nearer for that long is sent again: a stop of ours may have overtaken the command, or the
+autopilot may have restarted its controller."""
 
-SPEED_S = 1.3
-"""A leg whose speed is not acknowledged for so long, in which it is sent twice, is stopped and begun once more."""
+TURNED_DEG, TURN_TIMEOUT_S = 8.0, 8.0
+"""A leg with a heading is complete when the nose points there, or had this long to turn."""
 
-REST_S, REST_AGAIN_S = 12.0, 0.4
+SPEED_TIMEOUT_S = 1.3
+"""A leg whose speed is not acknowledged in this time, in which it is sent twice, is stopped and begun once more."""
+
+REST_TIMEOUT_S, STOP_RESEND_S = 12.0, 0.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,13 +49,13 @@ async def climb(autopilot: Autopilot, motion: Motion, altitude_m: float, permit:
     begun, best = autopilot.now, -math.inf
     while True:
         left = altitude_m - vehicle.altitude_m
-        done = left < HEIGHT_REACHED_M and abs(vehicle.down_mps) < 0.6
+        done = left < HEIGHT_REACHED_M and abs(vehicle.down_mps) < HEIGHT_REACHED_MPS
         yield Step(max(left, 0.0), done)
         if done:
             return
-        if vehicle.altitude_m > best + 0.2:
+        if vehicle.altitude_m > best + CLIMB_PROGRESS_M:
             best, begun = vehicle.altitude_m, autopilot.now
-        if autopilot.now - begun > 20.0:
+        if autopilot.now - begun > CLIMB_TIMEOUT_S:
             raise Aborted("NotFollowing", f"the drone does not climb above {vehicle.altitude_m:.1f} m")
         if not vehicle.armed:
             raise Aborted("Disarmed", "the autopilot disarmed before the drone took off")
@@ -71,9 +77,10 @@ async def fly_to(
         autopilot: flies.
         motion: what it belongs to.
         args: the leg; with a speed, since the autopilot may not remember the last one.
-        reached_m: how near is there.
-        permit: asked before each command.
-        judged: asked instead each time before the leg is begun, for the drone moves while commands are lost.
+        reached_m: how near to the point the leg is complete.
+        permit: the check that each command must pass before it is sent.
+        judged: the check instead of `permit` each time before the leg is begun: the drone moves on while commands are lost,
+            and a leg that was legal from there may not be legal from here.
     """
     altitude = args.alt if args.alt is not None else autopilot.vehicle.altitude_m
     motion.leg, motion.speed_mps = args, args.speed_mps
@@ -81,10 +88,11 @@ async def fly_to(
     async def begin() -> None:
         await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg, judged or permit)
         if not await _hears_speed(autopilot, motion, permit):
+            # It flies at an unknown speed, maybe its own default: above a limit that was judged. Stop, and try once more.
             await come_to_rest(autopilot, motion, permit)
             await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg, judged or permit)
             if not await _hears_speed(autopilot, motion, permit):
-                raise AutopilotError("the autopilot does not answer how fast it shall fly", link=True)
+                raise AutopilotError("the autopilot does not acknowledge the speed of the leg", link=True)
         if args.yaw_deg is not None:
             await autopilot.turn(args.yaw_deg, permit)
 
@@ -98,15 +106,15 @@ async def fly_to(
         done = away <= reached_m and rise <= HEIGHT_REACHED_M
         if done and args.yaw_deg is not None:
             there = autopilot.now if there is None else there
-            sent = autopilot.now
-            done = _turned(vehicle, args.yaw_deg) or autopilot.now - there > TURN_S
+            sent = autopilot.now  # turning on the spot is progress
+            done = _turned(vehicle, args.yaw_deg) or autopilot.now - there > TURN_TIMEOUT_S
         yield Step(math.hypot(away, rise), done)
         if done:
             return
-        if math.hypot(away, rise) < best - 0.3:
+        if math.hypot(away, rise) < best - LEG_PROGRESS_M:
             best, sent = math.hypot(away, rise), autopilot.now
-        if autopilot.now - sent > STUCK_S:
-            if resends == RESENDS:
+        if autopilot.now - sent > STUCK_TIMEOUT_S:
+            if resends == MAX_RESENDS:
                 raise Aborted("NotFollowing", f"the drone stays {math.hypot(away, rise):.1f} m away from the target")
             resends, sent = resends + 1, autopilot.now
             await begin()
@@ -118,7 +126,7 @@ async def _hears_speed(autopilot: Autopilot, motion: Motion, permit: Permit) -> 
     if motion.speed_mps is None:
         return True
     try:
-        async with asyncio.timeout(SPEED_S):
+        async with asyncio.timeout(SPEED_TIMEOUT_S):
             await autopilot.set_speed(motion.speed_mps, permit)
     except TimeoutError:
         return False
@@ -140,14 +148,14 @@ async def come_to_rest(autopilot: Autopilot, motion: Motion, permit: Permit) -> 
     Raises:
         Refused: the motion was stopped, or the drone does not come to rest.
     """
-    deadline, sent = autopilot.now + REST_S, -math.inf
+    deadline, sent = autopilot.now + REST_TIMEOUT_S, -math.inf
     motion.braking = True
     try:
         while not autopilot.vehicle.at_rest(autopilot.now):
             if autopilot.now > deadline:
                 speed = autopilot.vehicle.speed_mps
                 raise Aborted("NotStopping", f"the drone does not stop; it still flies {speed:.1f} m/s")
-            if autopilot.now - sent >= REST_AGAIN_S:
+            if autopilot.now - sent >= STOP_RESEND_S:
                 permit()
                 autopilot.stop()
                 sent = autopilot.now

@@ -31,14 +31,14 @@ MAX_JUDGEMENTS = 6
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """A motion under way: the verdict on it, and where it is."""
+    """A motion under way: the verdict on it, and how far it is."""
 
     verdict: Verdict
     step: Step
 
 
 class _Outdated(Exception):
-    """A leg is not the one that was judged any more."""
+    """The leg that was judged is not legal any more, or another one is; carries the verdict that holds now."""
 
     def __init__(self, verdict: Verdict) -> None:
         super().__init__(verdict.reason)
@@ -100,6 +100,7 @@ class MobilityService:
         motion = self._control.motion
         if motion is None or motion.leg is None or motion.speed_mps is None or wanted <= motion.speed_mps:
             return verdict, wanted
+        # The leg was judged with its speed: a faster drone needs a wider margin to every border along the rest of it.
         leg, speed = replace(motion.leg, speed_mps=wanted), motion.speed_mps
         rest = self.calls.check(Call("Goto", leg), grant)
         if rest.permits and not rest.brake_first and isinstance(rest.args, GotoArgs):
@@ -157,7 +158,7 @@ class MobilityService:
         return replace(goal, speed_mps=goal.speed_mps or self._control.cruise_mps)
 
     def _judged(self, call: Call, grant: ActiveGrant, verdict: Verdict, permit: Permit) -> Permit:
-        """Permits a leg only as it is judged where the drone is when the command is sent, maybe again."""
+        """A permit that judges the leg again when its command is sent late, from where the drone is by then."""
         judged_at = self._autopilot.now
 
         def check() -> None:
@@ -175,7 +176,9 @@ class MobilityService:
     async def _settled(
         self, call: Call, grant: ActiveGrant, verdict: Verdict, motion: Motion, permit: Permit
     ) -> Verdict:
-        """The verdict to carry out, given where the drone is once it may be: in GUIDED, and standing if need be.
+        """The verdict to carry out, once the drone is ready for it: in GUIDED, and at rest where the verdict asks for that.
+
+        Changing the mode and braking take time in which the drone moves, so the call is judged again after them.
 
         Raises:
             Refused: the call is not legal from there, or the drone does not come to rest.
@@ -201,7 +204,7 @@ class MobilityService:
             final = await self._settled(Call("SetVelocity", args), grant, verdict, motion, permit)
             setpoint = final.args if isinstance(final.args, VelocityArgs) else args
             self._steering.steer(setpoint, motion, permit)
-        except BaseException:
+        except BaseException:  # a caller that hangs up while the drone brakes leaves it hovering, too
             self._control.failed(motion)
             raise
         return final, setpoint
@@ -251,7 +254,10 @@ class MobilityService:
         return self._run("ReturnToLaunch", steps)
 
     def _standing_by(self, call: Call, grant: ActiveGrant) -> None:
-        """Refuse a takeoff that cannot be, before its costly judgement; methods that are not granted are left to that."""
+        """Refuse a takeoff that cannot be carried out before its costly judgement.
+
+        Methods that are not granted are left to the judgement: it writes their refusal to the audit log.
+        """
         if grant.spec.class_ != "driver" or call.method not in grant.compiled.methods:
             return
         self._control.require(grant)

@@ -1,4 +1,4 @@
-"""Transit: the system flies drivers with partial control to the start of each control point (the thesis' chauffeur)."""
+"""Transit: the system flies drivers with partial control to the start of each control point."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Calls on the wire and calls of the policy engine: one from the other, both ways."""
+"""Requests as calls of the policy engine, and its verdicts as replies."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from fractus_proto.v1 import mobility_pb2, types_pb2
 from fractus_services.errors import InvalidRequest, Refused
 from fractus_services.replies import decision
 
-HOLD_S = 0.5
-"""How long a velocity holds when the caller does not say."""
+DEFAULT_HOLD_S = 0.5
+"""How long a velocity holds when the caller does not say; proto3 cannot tell an absent number from 0."""
 
 _REFERENCES: dict[int, Reference] = {
     types_pb2.ALTITUDE_REFERENCE_HOME: "home",
@@ -26,7 +26,7 @@ def goto_args(request: mobility_pb2.GotoRequest) -> GotoArgs:
     """Read a goto.
 
     Raises:
-        Refused: it has no target, or an altitude reference that nobody knows.
+        Refused: it has no target, or an unknown altitude reference.
     """
     if not request.HasField("target"):
         raise _invalid("target is missing; give the position to fly to")
@@ -56,12 +56,12 @@ def velocity_args(request: mobility_pb2.SetVelocityRequest) -> VelocityArgs:
         east_mps=request.velocity.east_mps,
         down_mps=request.velocity.down_mps,
         yaw_deg=request.yaw_deg if request.HasField("yaw_deg") else None,
-        hold_s=request.hold_s if request.hold_s != 0.0 else HOLD_S,
+        hold_s=request.hold_s if request.hold_s != 0.0 else DEFAULT_HOLD_S,
     )
 
 
 def call_of(request: mobility_pb2.CheckCallRequest) -> Call:
-    """The call that somebody wants to have judged.
+    """The call that a client wants to have judged.
 
     Raises:
         Refused: it names no method, or lacks an argument.
@@ -74,7 +74,7 @@ def call_of(request: mobility_pb2.CheckCallRequest) -> Call:
 
 
 def checked(verdict: Verdict) -> mobility_pb2.CheckCallResponse:
-    """The answer to who wanted to know."""
+    """The reply to a dry run."""
     reply = mobility_pb2.CheckCallResponse(
         decision=decision(verdict), takeover=verdict.takeover or "", brake_first=verdict.brake_first
     )

@@ -104,7 +104,7 @@ class Manifests:
 
 
 class Unlimited(Mapping[str, float]):
-    """Resources of a host that nobody described: as much as anyone asks for."""
+    """Resources of a host without a description: as much as is asked for."""
 
     def __getitem__(self, resource: str) -> float:
         """Without end."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import pathlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -41,57 +41,41 @@ class Decided:
     refusal: Infeasible | None = None
 
 
+_PATH = click.Path(exists=True, path_type=pathlib.Path)
+_SHARE = click.FloatRange(0, 1)
+_POSITIVE = click.FloatRange(min=0, min_open=True)
+_TUNING: dict[str, tuple[str, click.FloatRange, str]] = {
+    "--safety-radius": ("safety_radius_m", _POSITIVE, "How far paths are dilated, in metres."),
+    "--depot-radius": ("depot_radius_m", click.FloatRange(min=0), "How far a depot may be from an open or partial start, in metres."),
+    "--coverage": ("coverage_share", _SHARE, "Share of the operation area to reach with direct links."),
+    "--cruise-speed": ("cruise_speed_mps", _POSITIVE, "Ground speed assumed for flight times, in m/s."),
+    "--battery-reserve": ("battery_reserve", _SHARE, "Share of a full charge to be left after landing."),
+}  # fmt: skip
+"""Which option sets what of the planning, and within which bounds."""
+
+
+def _tunable(command: Callable[..., None]) -> Callable[..., None]:
+    for name, (setting, bounds, text) in reversed(_TUNING.items()):
+        default = getattr(_DEFAULTS, setting)
+        command = click.option(name, setting, type=bounds, default=default, show_default=True, help=text)(command)
+    return command
+
+
 @click.command()
 @click.option(
-    "-f",
-    "--filename",
-    "paths",
-    type=click.Path(exists=True, path_type=pathlib.Path),
-    multiple=True,
-    required=True,
+    "-f", "--filename", "paths", type=_PATH, multiple=True, required=True,
     help="A file of manifests, or a directory of them; may be repeated.",
-)
-@click.argument("more", type=click.Path(exists=True, path_type=pathlib.Path), nargs=-1)
+)  # fmt: skip
+@click.argument("more", type=_PATH, nargs=-1)
 @click.option("-o", "--output", type=click.Choice(["table", "yaml", "json", "geojson"]), default="table")
-@click.option(
-    "--safety-radius",
-    type=click.FloatRange(min=0, min_open=True),
-    default=_DEFAULTS.safety_radius_m,
-    show_default=True,
-    help="How far paths are dilated, in metres.",
-)
-@click.option(
-    "--depot-radius",
-    type=click.FloatRange(min=0),
-    default=_DEFAULTS.depot_radius_m,
-    show_default=True,
-    help="How far a depot may be from an open or partial start, in metres.",
-)
-@click.option(
-    "--coverage",
-    type=click.FloatRange(0, 1),
-    default=_DEFAULTS.coverage_share,
-    show_default=True,
-    help="Share of the operation area to reach with direct links.",
-)
-@click.option(
-    "--cruise-speed",
-    type=click.FloatRange(min=0, min_open=True),
-    default=_DEFAULTS.cruise_speed_mps,
-    show_default=True,
-    help="Ground speed assumed for flight times, in m/s.",
-)
-@click.option(
-    "--battery-reserve",
-    type=click.FloatRange(0, 1),
-    default=_DEFAULTS.battery_reserve,
-    show_default=True,
-    help="Share of a full charge to be left after landing.",
-)
+@_tunable
 @click.option("--ranking", help=f"Name of a plug-in (entry point group {PLUGINS}) that scores drones.")
 @click.option("--covering", help=f"Name of a plug-in (entry point group {PLUGINS}) that chooses nodes along the way.")
 @click.pass_context
-def plan(context: click.Context, /, paths: Sequence[pathlib.Path], more: Sequence[pathlib.Path], output: str, **tuned: Any) -> None:  # fmt: skip
+def plan(
+    context: click.Context, /, paths: Sequence[pathlib.Path], more: Sequence[pathlib.Path], *, output: str,
+    ranking: str | None, covering: str | None, **tuned: Any,
+) -> None:  # fmt: skip
     """Plan the Applications in some manifests, without a cluster.
 
     Reads Applications, Drones, EdgeNodes, Depots, Zones, Policies, DeploymentPlans (in force: what still fits stays)
@@ -109,7 +93,8 @@ def plan(context: click.Context, /, paths: Sequence[pathlib.Path], more: Sequenc
     """
     try:
         manifests = read_manifests([*paths, *more])
-        settings = _settings(tuned)
+        score, cover = _plugin(ranking, "--ranking"), _plugin(covering, "--covering")
+        settings = Settings(**tuned, score_drone=score, cover=cover)
         decided = plan_all(manifests, settings)
     except BadManifest as error:
         raise click.ClickException(str(error)) from None
@@ -129,19 +114,19 @@ def plan_all(manifests: Manifests, settings: Settings) -> list[Decided]:
     """
     stock = manifests.inventory()
     decided = []
-    standing = {}
+    in_force = {}
     applications = manifests.applications()
     if not applications:
         raise BadManifest("there is no Application in the manifests; name a file that has one")
     for application in applications:
         before = manifests.previous(application)
         if before is not None:
-            standing[application.key] = (application, before.spec)
+            in_force[application.key] = (application, before.spec)
     for application in applications:
-        previous = standing.pop(application.key, (application, None))[1]
+        previous = in_force.pop(application.key, (application, None))[1]
         left = stock
-        for other, plan_in_force in standing.values():
-            left = _taken(left, other, plan_in_force)
+        for other, its_plan in in_force.values():
+            left = _taken(left, other, its_plan)
         try:
             check_application(application, stock.depots)
             found = decide(application, left, settings, previous)
@@ -178,18 +163,6 @@ def _taken(stock: Inventory, application: Application, found: DeploymentPlanSpec
     return replace(stock, hosts=hosts, claimed=claimed, flights=flights, locations=stock.located())
 
 
-def _settings(tuned: Mapping[str, Any]) -> Settings:
-    return Settings(
-        safety_radius_m=tuned["safety_radius"],
-        depot_radius_m=tuned["depot_radius"],
-        coverage_share=tuned["coverage"],
-        cruise_speed_mps=tuned["cruise_speed"],
-        battery_reserve=tuned["battery_reserve"],
-        score_drone=_plugin(tuned["ranking"], "--ranking"),
-        cover=_plugin(tuned["covering"], "--covering"),
-    )
-
-
 def _plugin(name: str | None, option: str) -> Any:
     try:
         return load_plugin(name)
@@ -200,30 +173,17 @@ def _plugin(name: str | None, option: str) -> Any:
 # -- output --
 
 
-def deployment_plan(application: Application, found: DeploymentPlanSpec) -> DeploymentPlan:
-    """The object that the operator would write."""
-    namespace, name = application.key
-    return DeploymentPlan.model_validate(
-        {
-            "apiVersion": API_VERSION,
-            "kind": DeploymentPlan.KIND,
-            "metadata": {"name": name, "namespace": namespace},
-            "spec": found,
-        }
-    )
-
-
 def _bodies(decided: Sequence[Decided]) -> list[dict[str, Any]]:
+    """The DeploymentPlans that the operator would write; where there is no plan, why not."""
     bodies = []
     for answer in decided:
-        found = answer.plan or _without_placements(answer)
-        body = deployment_plan(answer.application, found).to_dict()
-        body["metadata"] = {"name": body["metadata"]["name"], "namespace": body["metadata"]["namespace"]}
+        namespace, name = answer.application.key
+        metadata: dict[str, Any] = {"name": name, "namespace": namespace}
         if answer.refusal is not None:
-            body["metadata"]["annotations"] = {
-                INFEASIBLE_ANNOTATION: f"{answer.refusal.reason}: {answer.refusal.message}"
-            }
-        bodies.append(body)
+            why = f"{answer.refusal.reason}: {answer.refusal.message}"
+            metadata["annotations"] = {INFEASIBLE_ANNOTATION: why}
+        spec = (answer.plan or _without_placements(answer)).to_dict()
+        bodies.append({"apiVersion": API_VERSION, "kind": DeploymentPlan.KIND, "metadata": metadata, "spec": spec})
     return bodies
 
 

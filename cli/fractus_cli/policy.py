@@ -5,15 +5,14 @@ from __future__ import annotations
 import json
 import math
 import pathlib
-import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar
 
 import click
 from fractus_core.api import Application, Drone, Policy, Resource
-from fractus_core.api.methods import METHODS_OF, Method
+from fractus_core.api.methods import METHODS_OF
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.plans import GrantApplication, GrantedLimits, GrantSpec
 from fractus_core.planning import Settings
@@ -21,98 +20,15 @@ from fractus_core.policy.compiled import compile_grant
 from fractus_core.policy.engine import judge
 from fractus_core.policy.footprint import lens_of
 from fractus_core.policy.grants import compile_grants, refresh
-from fractus_core.policy.values import (
-    Airframe,
-    Args,
-    Attitude,
-    Call,
-    CaptureArgs,
-    GotoArgs,
-    Home,
-    SetSpeedArgs,
-    Situation,
-    TakeoffArgs,
-    VelocityArgs,
-    Verdict,
-)
+from fractus_core.policy.values import Airframe, Attitude, Call, Home, Situation, Verdict
 
+from fractus_cli.calls import Figures, Time, parse_call
 from fractus_cli.manifests import BadManifest, Manifests, read_manifests
 from fractus_cli.plan import plan_all
 
 R = TypeVar("R", bound=Resource)
 
 IN_AIR_M = 0.5
-METHODS: tuple[str, ...] = get_args(Method)
-
-_TAKES: dict[str, type[GotoArgs | TakeoffArgs | SetSpeedArgs | VelocityArgs | CaptureArgs]] = {
-    "Goto": GotoArgs,
-    "Takeoff": TakeoffArgs,
-    "SetSpeed": SetSpeedArgs,
-    "SetVelocity": VelocityArgs,
-    "CaptureImage": CaptureArgs,
-}
-_NEEDED: dict[str, frozenset[str]] = {
-    "Goto": frozenset({"lat", "lon"}),
-    "Takeoff": frozenset({"altitude_m"}),
-    "SetSpeed": frozenset({"speed_mps"}),
-    "SetVelocity": frozenset({"north_mps", "east_mps"}),
-}
-
-
-class Figures(click.ParamType):  # type: ignore[type-arg]
-    """Numbers with commas between them."""
-
-    name = "figures"
-
-    def __init__(self, *names: str) -> None:
-        self._names = names
-
-    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
-        """How help shows it."""
-        del param, ctx
-        return ",".join(self._names)
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
-        """The numbers, all of them and none too many."""
-        try:
-            found = tuple(float(part) for part in str(value).split(","))
-        except ValueError:
-            found = ()
-        if len(found) != len(self._names) or not all(math.isfinite(figure) for figure in found):
-            self.fail(f"{value!r} is not {','.join(self._names)}: {len(self._names)} numbers with commas", param, ctx)
-        for name, figure in zip(self._names, found, strict=True):
-            lower, upper, unit = _BOUNDS[name]
-            if not lower <= figure <= upper:
-                self.fail(f"{name} must be {lower:g} to {upper:g} {unit}, not {figure:g}", param, ctx)
-        return found
-
-
-_BOUNDS: dict[str, tuple[float, float, str]] = {
-    "lat": (-90.0, 90.0, "degrees"),
-    "lon": (-180.0, 180.0, "degrees"),
-    "alt": (-1000.0, 20_000.0, "m"),
-    "n": (-100.0, 100.0, "m/s"),
-    "e": (-100.0, 100.0, "m/s"),
-    "d": (-100.0, 100.0, "m/s"),
-}
-
-
-class Time(click.ParamType):  # type: ignore[type-arg]
-    """A moment as RFC 3339 spells it, as Unix time."""
-
-    name = "RFC3339"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Seconds since 1970 UTC."""
-        if isinstance(value, float):
-            return value
-        try:
-            moment = datetime.fromisoformat(str(value))
-        except ValueError:
-            moment = None
-        if moment is None or moment.tzinfo is None:
-            self.fail(f"{value!r} is no time with its zone, such as 2026-06-01T12:00:00Z", param, ctx)
-        return moment.timestamp()
 
 
 @click.group()
@@ -130,7 +46,7 @@ def policy() -> None:
 )
 @click.option(
     "--application", "application_file", type=click.Path(exists=True, path_type=pathlib.Path),
-    help="The Application whose component asks; without it, somebody who may do everything asks.",
+    help="The Application whose component asks; without it, a caller that may do everything asks.",
 )  # fmt: skip
 @click.option("--component", help="The component that asks; needed with --application.")
 @click.option("--method", required=True, help="Goto, Takeoff, SetSpeed, SetVelocity, Land, Arm, CaptureImage, ...")
@@ -181,7 +97,7 @@ class Question:
 
 
 def _question(paths: Sequence[pathlib.Path], drone_file: pathlib.Path, asked: Mapping[str, Any]) -> Question:
-    call = _call(asked["method"], asked["arguments"])
+    call = parse_call(asked["method"], asked["arguments"])
     application, component = asked["application_file"], asked["component"]
     if (application is None) != (component is None):
         raise BadManifest("give --application and --component together, or neither")
@@ -228,7 +144,7 @@ def _granted(manifests: Manifests, drone: Drone, file: pathlib.Path, component: 
     if len(applications) != 1:
         raise BadManifest(f"{file}: --application takes a manifest of one Application, not of {len(applications)}")
     application = applications[0]
-    # Nobody else is to be planned, and on no other drone.
+    # No other application is to be planned, and on no other drone.
     for key, found in list(manifests.found.items()):
         if isinstance(found.resource, Application | Drone) and found.resource not in (application, drone):
             del manifests.found[key]
@@ -249,7 +165,7 @@ def _granted(manifests: Manifests, drone: Drone, file: pathlib.Path, component: 
 
 
 def _anything(manifests: Manifests, drone: Drone) -> GrantSpec:
-    """A grant of everything, under the policies that hold for whoever flies the drone."""
+    """A grant of everything, under the policies that hold for every flight of the drone."""
     features = drone.spec.services.mobility
     depots = manifests.inventory().depots
     depot = depots.get(drone.spec.depot or "")
@@ -304,65 +220,6 @@ def _home(drone: Drone, asked: Mapping[str, Any]) -> Home:
     return Home(stated.lat, stated.lon, stated.alt if known and stated.alt is not None else 0.0)
 
 
-def _call(method: str, text: str) -> Call:
-    """The call with its arguments.
-
-    Raises:
-        BadManifest: there is no such method, or an argument is missing, unknown or no number.
-    """
-    if method not in METHODS:
-        raise BadManifest(f"--method: there is no method {method} (there are {', '.join(sorted(METHODS))})")
-    try:
-        given = json.loads(text, parse_int=float)  # an integer of any length is a number out of range
-    except json.JSONDecodeError as error:
-        raise BadManifest(f"--args: this is no JSON: {error.msg} at character {error.pos + 1}") from None
-    except RecursionError:
-        raise BadManifest("--args: this JSON is nested too deeply; give an object of numbers") from None
-    if not isinstance(given, dict):
-        raise BadManifest('--args: give a JSON object, such as {"lat": 39.36, "lon": 22.95, "alt": 10}')
-    takes = _TAKES.get(method)
-    if takes is None:
-        if given:
-            raise BadManifest(f"--args: {method} takes no arguments")
-        return Call(method)
-    spelled = {_plain(f.name): f.name for f in fields(takes)} | {f.name: f.name for f in fields(takes)}
-    if takes is GotoArgs:
-        spelled |= {"altitude": "alt", "altitudeReference": "reference"}
-    found: dict[str, Any] = {}
-    for name, value in given.items():
-        field = spelled.get(name)
-        if field is None:
-            raise BadManifest(f"--args: {method} has no {name} (it takes {', '.join(f.name for f in fields(takes))})")
-        if field in found:
-            raise BadManifest(f"--args: {name} is there twice under two names; give it once")
-        if value is not None:
-            found[field] = _value(name, field, value)
-    missing = sorted(_NEEDED.get(method, frozenset()) - set(found))
-    if missing:
-        raise BadManifest(f"--args: {method} needs {' and '.join(missing)}")
-    args: Args = takes(**found)
-    return Call(method, args)
-
-
-def _plain(name: str) -> str:
-    """An argument's name without its unit: speed for speed_mps."""
-    return re.sub(r"_(mps|m|deg|s)$", "", name)
-
-
-def _value(name: str, field: str, value: Any) -> Any:
-    if field == "reference":
-        if value not in ("home", "amsl", "terrain"):
-            raise BadManifest(f"--args: {name} must be home, amsl or terrain, not {value!r}")
-        return value
-    if not isinstance(value, float):
-        raise BadManifest(f"--args: {name} must be a number, not {value!r}")
-    if field not in {"width", "height"}:
-        return value
-    if not value.is_integer():
-        raise BadManifest(f"--args: {name} must be a whole number of pixels, not {value!r}")
-    return int(value)
-
-
 # -- output --
 
 
@@ -387,27 +244,19 @@ def _as_json(verdict: Verdict) -> str:
 
 
 def _as_text(verdict: Verdict) -> str:
-    args = _spelled(verdict)
-    lines = [f"action:   {verdict.action}"]
-    if verdict.takeover is not None:
-        lines.append(f"takeover: {verdict.takeover}")
-    if args:
-        lines.append(
-            "args:     "
-            + ", ".join(
-                f"{k}={v:g}" if isinstance(v, float) and k not in {"lat", "lon"} else f"{k}={v}"
-                for k, v in args.items()
-            )
-        )
-    if verdict.reason:
-        lines.append(f"reason:   {verdict.reason}" + (f" ({verdict.code})" if verdict.code else ""))
-    if verdict.policies:
-        lines.append(f"policies: {', '.join(verdict.policies)}")
-    if verdict.filters:
-        lines.append(f"filters:  {', '.join(f.action for f in verdict.filters)}")
-    if verdict.brake_first:
-        lines.append("first:    the drone is brought to a stop")
-    return "\n".join(lines) + "\n"
+    args = (_spelled(verdict) or {}).items()
+    lines = {
+        "action:   ": verdict.action,
+        "takeover: ": verdict.takeover,
+        "args:     ": ", ".join(
+            f"{k}={v:g}" if isinstance(v, float) and k not in {"lat", "lon"} else f"{k}={v}" for k, v in args
+        ),
+        "reason:   ": verdict.reason + (f" ({verdict.code})" if verdict.reason and verdict.code else ""),
+        "policies: ": ", ".join(verdict.policies),
+        "filters:  ": ", ".join(f.action for f in verdict.filters),
+        "first:    ": "the drone is brought to a stop" if verdict.brake_first else "",
+    }
+    return "".join(f"{title}{text}\n" for title, text in lines.items() if text)
 
 
 _FORMATS: dict[str, Callable[[Verdict], str]] = {"text": _as_text, "json": _as_json}

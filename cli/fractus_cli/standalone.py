@@ -74,7 +74,7 @@ class StandalonePki:
             raise BrokenAuthority(f"{folder}: tls.key and tls.crt are damaged or do not belong together") from None
 
     def node(self, name: str) -> Path:
-        """The directory with the certificate of a node's services, made anew.
+        """The directory with the certificate of a node's services, made again.
 
         Raises:
             InvalidObject: the name is none that a node can have.
@@ -84,7 +84,7 @@ class StandalonePki:
         return _write(self._directory / "nodes" / name, self._authority.issue_node(name, self._clock(), self._life))
 
     def component(self, identity: str) -> Path:
-        """The directory with the certificate of a component instance; made anew when it is due for renewal.
+        """The directory with the certificate of a component instance; made again when it is due for renewal.
 
         Args:
             identity: Its SPIFFE id; `GrantSpec.identity` of its grant.

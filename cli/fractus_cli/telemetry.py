@@ -25,10 +25,10 @@ from fractus.values import Telemetry
     default=DEFAULT_TLS_DIR,
     show_default=True,
     type=click.Path(path_type=Path, file_okay=False),
-    help="Folder with tls.crt, tls.key and ca.crt of whoever asks.",
+    help="Folder with tls.crt, tls.key and ca.crt of the caller.",
 )
 @click.option("--interval", "interval_s", default=1.0, show_default=True, help="Seconds between lines, 0.05 at least.")
-@click.option("--count", type=click.IntRange(min=1), help="Stop after so many lines.")
+@click.option("--count", type=click.IntRange(min=1), help="Stop after this many lines.")
 @click.option("-o", "--output", type=click.Choice(["text", "json"]), default="text", show_default=True)
 def telemetry(*, node: str, address: str, tls: Path, interval_s: float, count: int | None, output: str) -> None:
     """Print the state of the drone of a node until interrupted.
@@ -61,5 +61,5 @@ def _line(sample: Telemetry) -> str:
     speed = (sample.velocity.north**2 + sample.velocity.east**2) ** 0.5
     return (
         f"{sample.time:%H:%M:%S}  {sample.flight_state:<9}  {sample.mode:<9}  {sample.position}  {speed:4.1f} m/s"
-        f"  battery {sample.battery_remaining:.0%}  by {sample.controller or 'nobody'}"
+        f"  battery {sample.battery_remaining:.0%}  by {sample.controller or 'no one'}"
     )

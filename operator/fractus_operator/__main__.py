@@ -10,11 +10,10 @@ import secrets
 import socket
 import sys
 import time
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Callable, Coroutine
 from datetime import UTC, datetime
 from typing import Any
 
-import kopf
 from fractus_core.identity.authority import BrokenAuthority
 
 from fractus_operator import handlers
@@ -62,22 +61,11 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         live = LiveInventory(store)
         applications = Applications(store, live, authority, _now, settings.planning)
         signing = NodeSigning(store, live.signing_requests.get, authority, settings.agent_user, _now)
-        lists = worklists(store, live, signing)
-        registry = kopf.OperatorRegistry()
-        handlers.register(registry, applications, live.silence_s)
-        kopf_settings = kopf.OperatorSettings()
-        handlers.configure(kopf_settings)
-        background: list[Coroutine[Any, Any, None]] = [r.run() for r in live.reflectors()]
-        background += [worklist.run() for worklist in lists]
-        background += [_outlasting(keeping), _settled(live)]
-        main = kopf.operator(
-            registry=registry,
-            settings=kopf_settings,
-            clusterwide=True,
-            liveness_endpoint=settings.health,
-            stop_flag=stop,
-        )
-        await _together(main, background)
+        background: list[Coroutine[Any, Any, None]] = [reflector.run() for reflector in live.reflectors()]
+        background += [worklist.run() for worklist in worklists(store, live, signing)]
+        # Cancelling what waits for the lease must not cancel the lease: the last writes need it.
+        background += [_wait_for(asyncio.shield(keeping)), _settled(live)]
+        await _together(handlers.operator(applications, live.silence_s, settings.health, stop), background)
     finally:
         # Last of all: until here a write of ours may be under way, and no other operator may lead.
         keeping.cancel()
@@ -106,53 +94,40 @@ async def _settled(live: LiveInventory) -> None:
     await asyncio.Event().wait()
 
 
-async def _outlasting(keeping: asyncio.Task[None]) -> None:
-    """Follow a task that goes on when this is cancelled."""
-    await asyncio.shield(keeping)
+async def _wait_for(future: asyncio.Future[None]) -> None:
+    await future
 
 
 def worklists(store: Store, live: LiveInventory, signing: NodeSigning) -> list[Worklist]:
     """What is reconciled beside Applications, each fed by the reflectors of its inputs."""
-    locations, readiness, orphans = Locations(store, live), Readiness(store, live, _now), Orphans(store, live)
-    lists: list[Worklist] = []
+    readiness = Readiness(store, live, _now)
+    nodes = Worklist("node", Locations(store, live).reconcile, after=live.synced)
+    requests = Worklist("signing request", signing.reconcile)
+    zones = Worklist("zone", readiness.reconcile_zone)
+    policies = Worklist("policy", readiness.reconcile_policy, after=live.synced)
+    grants = Worklist("grant", Orphans(store, live).reconcile, after=live.synced)
 
-    def listed(name: str, reconcile: Callable[[Key], Awaitable[None]], *inputs: Kind) -> Worklist:
-        worklist = Worklist(name, reconcile)
-        lists.append(worklist)
-        for kind in inputs:
-            live.listen(kind, worklist.add)
-        return worklist
-
-    async def once_synced(key: Key) -> None:
-        await live.synced()
-        await locations.reconcile(key)
-
-    async def policy_once_synced(key: Key) -> None:
-        await live.synced()
-        await readiness.reconcile_policy(key)
-
-    async def orphan_once_synced(key: Key) -> None:
-        await live.synced()
-        await orphans.reconcile(key)
-
-    listed("signing request", signing.reconcile, kinds.SIGNING_REQUEST)
-    listed("node", once_synced, kinds.NODE, kinds.DRONE, kinds.EDGE_NODE)
-    listed("zone", readiness.reconcile_zone, kinds.ZONE)
-    policies = listed("policy", policy_once_synced, kinds.POLICY)
-    grants = listed("grant", orphan_once_synced, kinds.GRANT)
-
-    def zone_changed(key: Key) -> None:
+    def policies_of_zone(key: Key) -> None:
         for policy in readiness.policies_of(key[1]):
             policies.add(policy)
 
-    def application_changed(key: Key) -> None:
+    def grants_of_removed(key: Key) -> None:
         if live.applications.get(key) is None:
             for grant in live.grants_of(key):
                 grants.add(("", grant.name))
 
-    live.listen(kinds.ZONE, zone_changed)
-    live.listen(kinds.APPLICATION, application_changed)
-    return lists
+    listeners: list[tuple[Kind, Callable[[Key], None]]] = [
+        *((kind, nodes.add) for kind in (kinds.NODE, kinds.DRONE, kinds.EDGE_NODE)),
+        (kinds.SIGNING_REQUEST, requests.add),
+        (kinds.ZONE, zones.add),
+        (kinds.ZONE, policies_of_zone),
+        (kinds.POLICY, policies.add),
+        (kinds.GRANT, grants.add),
+        (kinds.APPLICATION, grants_of_removed),
+    ]
+    for kind, listener in listeners:
+        live.listen(kind, listener)
+    return [nodes, requests, zones, policies, grants]
 
 
 async def _together(main: Coroutine[Any, Any, None], background: list[Coroutine[Any, Any, None]]) -> None:

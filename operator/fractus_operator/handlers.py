@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import os
 from collections.abc import Callable
@@ -26,14 +27,26 @@ class Service(Protocol):
         """Take an application down before its object is removed."""
 
 
-def register(registry: kopf.OperatorRegistry, applications: Service, silence_s: Callable[[], float]) -> None:
-    """Register the handlers of Applications.
+async def operator(
+    applications: Service, silence_s: Callable[[], float], health: str, stop: asyncio.Event | None
+) -> None:
+    """Run kopf with the handlers of Applications until it is told to stop.
 
     Args:
-        registry: Where kopf looks for them.
-        applications: The service behind them.
+        applications: The service behind the handlers.
         silence_s: For how long the quietest watch has heard nothing.
+        health: URL that the liveness endpoint listens on.
+        stop: Set it to end the operator; signals do so as well.
     """
+    registry, settings = kopf.OperatorRegistry(), kopf.OperatorSettings()
+    _configure(settings)
+    _register(registry, applications, silence_s)
+    await kopf.operator(
+        registry=registry, settings=settings, clusterwide=True, liveness_endpoint=health, stop_flag=stop
+    )
+
+
+def _register(registry: kopf.OperatorRegistry, applications: Service, silence_s: Callable[[], float]) -> None:
     group, version = APPLICATION.api_version.split("/")
 
     @kopf.on.login(registry=registry, retries=3)
@@ -82,7 +95,7 @@ class _Unchanged(kopf.DiffBaseStorage):
         """Nothing is kept."""
 
 
-def configure(settings: kopf.OperatorSettings) -> None:
+def _configure(settings: kopf.OperatorSettings) -> None:
     """Set kopf up: our names on objects, no Events of its own, watches that cannot go silent."""
     settings.persistence.finalizer = FINALIZER
     settings.persistence.progress_storage = kopf.AnnotationsProgressStorage(prefix="kopf.fractus.dev")

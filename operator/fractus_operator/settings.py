@@ -19,7 +19,20 @@ _PLANNING = {
     "climb_speed_mps": "FRACTUS_PLANNING_CLIMB_SPEED",
     "battery_reserve": "FRACTUS_PLANNING_BATTERY_RESERVE",
 }
-"""Which variable sets what of the planning."""
+"""Which variable sets which figure of the planning."""
+
+
+_TEXTS = {
+    "namespace": "FRACTUS_SYSTEM_NAMESPACE",
+    "agent_account": "FRACTUS_AGENT_ACCOUNT",
+    "identity": "FRACTUS_IDENTITY",
+    "health": "FRACTUS_HEALTH",
+}
+"""Which variable sets what is taken as it is."""
+
+
+DEFAULT_LEASE_S = 15.0
+MIN_LEASE_S = 1.0
 
 
 class BadSetting(ValueError):
@@ -34,15 +47,15 @@ class Settings:
         namespace: where the system lives.
         agent_account: name of the agents' service account in that namespace.
         health: URL that the liveness endpoint listens on.
-        identity: under which this operator acts, such as the name of its pod; empty: one that no other process has.
-        lease_s: for how long no other operator acts after this one was last heard of.
+        identity: under which this operator leads, such as the name of its pod; empty: one that no other process has.
+        lease_s: for how long no other operator leads after this one was last heard of.
     """
 
     namespace: str = "fractus-system"
     agent_account: str = "fractus-agent"
     health: str = "http://0.0.0.0:8080/healthz"
     identity: str = ""
-    lease_s: float = 15.0
+    lease_s: float = DEFAULT_LEASE_S
     log_level: int = logging.INFO
     planning: PlanningSettings = field(default_factory=PlanningSettings)
 
@@ -58,7 +71,6 @@ class Settings:
         Raises:
             BadSetting: naming the variable.
         """
-        default = cls()
         level = environment.get("FRACTUS_LOG_LEVEL", "INFO").upper()
         if level not in logging.getLevelNamesMapping():
             raise BadSetting(f"FRACTUS_LOG_LEVEL: {level} is no level; use DEBUG, INFO, WARNING or ERROR")
@@ -72,15 +84,12 @@ class Settings:
                 planning = replace(planning, **change)
             except InvalidObject as error:
                 raise BadSetting(f"{variable}: {error.problem}") from None
-        return cls(
-            namespace=environment.get("FRACTUS_SYSTEM_NAMESPACE", default.namespace),
-            agent_account=environment.get("FRACTUS_AGENT_ACCOUNT", default.agent_account),
-            identity=environment.get("FRACTUS_IDENTITY", default.identity),
-            lease_s=_duration(environment, "FRACTUS_LEASE", default.lease_s),
-            health=environment.get("FRACTUS_HEALTH", default.health),
-            log_level=logging.getLevelNamesMapping()[level],
-            planning=planning,
-        )
+        lease_s = _number(environment, "FRACTUS_LEASE", DEFAULT_LEASE_S)
+        if lease_s < MIN_LEASE_S:
+            raise BadSetting(f"FRACTUS_LEASE: must be at least {MIN_LEASE_S:g} second, but is {lease_s:g}")
+        texts = {name: environment[variable] for name, variable in _TEXTS.items() if variable in environment}
+        log_level = logging.getLevelNamesMapping()[level]
+        return cls(**texts, lease_s=lease_s, log_level=log_level, planning=planning)
 
 
 def _plugin(environment: Mapping[str, str], name: str) -> Any:
@@ -88,13 +97,6 @@ def _plugin(environment: Mapping[str, str], name: str) -> Any:
         return load_plugin(environment.get(name))
     except UnknownPlugin as error:
         raise BadSetting(f"{name}: {error}") from None
-
-
-def _duration(environment: Mapping[str, str], name: str, default: float) -> float:
-    value = _number(environment, name, default)
-    if value < 1:
-        raise BadSetting(f"{name}: must be at least 1 second, but is {value:g}")
-    return value
 
 
 def _number(environment: Mapping[str, str], name: str, default: float) -> float:

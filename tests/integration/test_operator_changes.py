@@ -201,11 +201,11 @@ def test_of_two_operators_one_acts_and_the_other_takes_over(
         world.add_drone("drone-2")
         world.put(traffic(namespace, "second"))
         world.phase(namespace, "Deploying", "second")
-        assert "second is planned" in second.log()
+        assert f"planned (application={namespace}/second " in second.log()
         first.signal(signal.SIGCONT)
         wait_for(lambda: not first.running, "the first one to end")
         assert "two has acted since one last did" in first.log()
-        assert "second is planned" not in first.log()
+        assert f"planned (application={namespace}/second " not in first.log()
     finally:
         if first.running:
             first.stop(signal.SIGKILL)

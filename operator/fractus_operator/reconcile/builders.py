@@ -11,30 +11,9 @@ from fractus_core.api import API_VERSION, Application, Component, Drone
 from fractus_core.api.names import address_variable
 from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec, PlannedInstance
 
-from fractus_operator.cluster.kinds import (
-    DEPLOYMENT,
-    DEPLOYMENT_PLAN,
-    ENDPOINT_SLICE,
-    GRANT,
-    SECRET,
-    SERVICE,
-    Body,
-    Kind,
-)
-from fractus_operator.cluster.labels import (
-    APPLICATION_LABEL,
-    CAUSE_ANNOTATION,
-    CLASS_LABEL,
-    COMPONENT_LABEL,
-    INSTANCE_LABEL,
-    MANAGED_BY,
-    MANAGED_LABEL,
-    NAMESPACE_LABEL,
-    PLACEMENT_LABEL,
-    grant_name,
-    label_value,
-    service_name,
-)
+from fractus_operator.cluster import kinds, labels
+from fractus_operator.cluster.kinds import Body, Kind
+from fractus_operator.cluster.labels import grant_name, label_value, service_name
 from fractus_operator.cluster.pods import PodView
 
 COMPONENT_USER = 10001
@@ -45,18 +24,18 @@ CAMERA_PORT = 50052
 
 def deployment_plan(application: Application, plan: DeploymentPlanSpec) -> Body:
     """The DeploymentPlan of an application; it carries the application's name."""
-    return _child(DEPLOYMENT_PLAN, application, application.name, {}, spec=plan.to_dict())
+    return _child(kinds.DEPLOYMENT_PLAN, application, application.name, {}, spec=plan.to_dict())
 
 
 def grant(application: Application, spec: GrantSpec) -> Body:
     """The Grant of an instance. It is cluster-scoped, so labels and not an owner say whose it is."""
     namespace, _ = application.key
-    body = GRANT.header(grant_name(namespace, spec.instance))
+    body = kinds.GRANT.header(grant_name(namespace, spec.instance))
     body["metadata"]["labels"] = {
         **_labels(application),
-        NAMESPACE_LABEL: namespace,
-        COMPONENT_LABEL: spec.component,
-        INSTANCE_LABEL: spec.instance,
+        labels.NAMESPACE_LABEL: namespace,
+        labels.COMPONENT_LABEL: spec.component,
+        labels.INSTANCE_LABEL: spec.instance,
     }
     body["spec"] = _unsigned(spec)
     return body
@@ -64,10 +43,16 @@ def grant(application: Application, spec: GrantSpec) -> Body:
 
 def regranted(observed: Body, spec: GrantSpec) -> Body:
     """A Grant that exists, with another spec: as `grant` builds it, but without its application."""
-    body = GRANT.header(observed["metadata"]["name"])
-    ours = (APPLICATION_LABEL, MANAGED_LABEL, NAMESPACE_LABEL, COMPONENT_LABEL, INSTANCE_LABEL)
-    labels = observed["metadata"].get("labels") or {}
-    body["metadata"]["labels"] = {label: labels[label] for label in ours if label in labels}
+    body = kinds.GRANT.header(observed["metadata"]["name"])
+    ours = (
+        labels.APPLICATION_LABEL,
+        labels.MANAGED_LABEL,
+        labels.NAMESPACE_LABEL,
+        labels.COMPONENT_LABEL,
+        labels.INSTANCE_LABEL,
+    )
+    present = observed["metadata"].get("labels") or {}
+    body["metadata"]["labels"] = {label: present[label] for label in ours if label in present}
     body["spec"] = _unsigned(spec)
     return body
 
@@ -82,8 +67,10 @@ def _unsigned(spec: GrantSpec) -> Body:
 
 def tls_secret(application: Application, placed: PlannedInstance, data: dict[str, str]) -> Body:
     """The Secret with an instance's client certificate."""
-    labels = {COMPONENT_LABEL: placed.component, INSTANCE_LABEL: placed.instance}
-    return _child(SECRET, application, secret_name(placed.instance), labels, type="kubernetes.io/tls", data=data)
+    described = {labels.COMPONENT_LABEL: placed.component, labels.INSTANCE_LABEL: placed.instance}
+    return _child(
+        kinds.SECRET, application, secret_name(placed.instance), described, type="kubernetes.io/tls", data=data
+    )
 
 
 def secret_name(instance: str) -> str:
@@ -104,25 +91,28 @@ def service(application: Application, component: Component) -> Body:
         ],
     }
     if component.placement != "hybrid":
-        spec["selector"] = {APPLICATION_LABEL: label_value(application.name), COMPONENT_LABEL: component.name}
+        spec["selector"] = {
+            labels.APPLICATION_LABEL: label_value(application.name),
+            labels.COMPONENT_LABEL: component.name,
+        }
     name = service_name(application.name, component)
-    return _child(SERVICE, application, name, {COMPONENT_LABEL: component.name}, spec=spec)
+    return _child(kinds.SERVICE, application, name, {labels.COMPONENT_LABEL: component.name}, spec=spec)
 
 
 def endpoint_slice(application: Application, component: Component, pods: Iterable[PodView]) -> Body:
     """Where a hybrid component's Service leads: to the ready pods of its base instance."""
     name = service_name(application.name, component)
     ready = sorted((pod for pod in pods if pod.ready and not pod.terminating and pod.ip), key=lambda pod: pod.name)
-    labels = {
-        COMPONENT_LABEL: component.name,
+    described = {
+        labels.COMPONENT_LABEL: component.name,
         "kubernetes.io/service-name": name,
         "endpointslice.kubernetes.io/managed-by": "operator.fractus.dev",
     }
     return _child(
-        ENDPOINT_SLICE,
+        kinds.ENDPOINT_SLICE,
         application,
         name,
-        labels,
+        described,
         addressType="IPv6" if any(":" in (pod.ip or "") for pod in ready) else "IPv4",
         endpoints=[
             {
@@ -149,21 +139,24 @@ def deployment(application: Application, placed: PlannedInstance, drone: Drone |
         drone: The Drone behind its node, if it is one: its autonomy bounds how long pods outlive a lost link.
     """
     component = application.spec.component(placed.component)
-    identity = {APPLICATION_LABEL: label_value(application.name), INSTANCE_LABEL: placed.instance}
-    labels = {**_labels(application), **_location_labels(component, placed)}
+    identity = {labels.APPLICATION_LABEL: label_value(application.name), labels.INSTANCE_LABEL: placed.instance}
+    described = {**_labels(application), **_location_labels(component, placed)}
     spec: Body = {
         "replicas": placed.replicas,
         "revisionHistoryLimit": 1,
         "selector": {"matchLabels": identity},
         "strategy": {"type": "Recreate" if placed.node is not None else "RollingUpdate"},
         "template": {
-            "metadata": {"labels": labels, "annotations": {"kubectl.kubernetes.io/default-container": component.slug}},
+            "metadata": {
+                "labels": described,
+                "annotations": {"kubectl.kubernetes.io/default-container": component.slug},
+            },
             "spec": _pod_spec(application, component, placed, drone),
         },
     }
-    body = _child(DEPLOYMENT, application, placed.instance, _location_labels(component, placed), spec=spec)
+    body = _child(kinds.DEPLOYMENT, application, placed.instance, _location_labels(component, placed), spec=spec)
     body["metadata"]["annotations"] = {
-        CAUSE_ANNOTATION: f"{_requested_digest(application, component)}@{placed.node or 'cloud'}"
+        labels.CAUSE_ANNOTATION: f"{_requested_digest(application, component)}@{placed.node or 'cloud'}"
     }
     return body
 
@@ -263,7 +256,7 @@ def _affinity(placed: PlannedInstance) -> Body:
     if placed.node is not None:
         term = {"matchFields": [{"key": "metadata.name", "operator": "In", "values": [placed.node]}]}
     else:
-        term = {"matchExpressions": [{"key": CLASS_LABEL, "operator": "In", "values": ["cloud"]}]}
+        term = {"matchExpressions": [{"key": labels.CLASS_LABEL, "operator": "In", "values": ["cloud"]}]}
     return {"requiredDuringSchedulingIgnoredDuringExecution": {"nodeSelectorTerms": [term]}}
 
 
@@ -274,7 +267,7 @@ def _tolerations(placed: PlannedInstance, drone: Drone | None) -> list[Body]:
     autonomy = drone.spec.autonomy if drone is not None else None
     bound: Body = {} if autonomy is None else {"tolerationSeconds": autonomy}
     return [
-        {"key": CLASS_LABEL, "operator": "Exists"},
+        {"key": labels.CLASS_LABEL, "operator": "Exists"},
         {"key": "node.kubernetes.io/not-ready", "operator": "Exists", "effect": "NoExecute", **bound},
         {"key": "node.kubernetes.io/unreachable", "operator": "Exists", "effect": "NoExecute", **bound},
     ]
@@ -286,22 +279,22 @@ def _port_name(component: Component, index: int) -> str:
 
 
 def _labels(application: Application) -> dict[str, str]:
-    return {APPLICATION_LABEL: label_value(application.name), MANAGED_LABEL: MANAGED_BY}
+    return {labels.APPLICATION_LABEL: label_value(application.name), labels.MANAGED_LABEL: labels.MANAGED_BY}
 
 
 def _location_labels(component: Component, placed: PlannedInstance) -> dict[str, str]:
     return {
         "app.kubernetes.io/name": component.slug,
-        COMPONENT_LABEL: component.name,
-        INSTANCE_LABEL: placed.instance,
-        PLACEMENT_LABEL: placed.placement,
+        labels.COMPONENT_LABEL: component.name,
+        labels.INSTANCE_LABEL: placed.instance,
+        labels.PLACEMENT_LABEL: placed.placement,
     }
 
 
-def _child(kind: Kind, application: Application, name: str, labels: dict[str, str], **content: Any) -> Body:
+def _child(kind: Kind, application: Application, name: str, described: dict[str, str], **content: Any) -> Body:
     namespace, _ = application.key
     body = kind.header(name, namespace)
-    body["metadata"]["labels"] = {**_labels(application), **labels}
+    body["metadata"]["labels"] = {**_labels(application), **described}
     body["metadata"]["ownerReferences"] = [
         {
             "apiVersion": API_VERSION,

@@ -20,14 +20,26 @@ class Worklist:
 
     A failing key is tried again with growing, jittered pauses, up to a minute apart: what is
     reconciled is a level, so a later try can only find a newer one.
+
+    Args:
+        name: What the keys are of, for the log.
+        reconcile: Brings one key to its desired state.
+        after: What is waited for before each.
+        rng: Of the jitter.
     """
 
     def __init__(
-        self, name: str, reconcile: Callable[[Key], Awaitable[None]], *, rng: random.Random | None = None
+        self,
+        name: str,
+        reconcile: Callable[[Key], Awaitable[None]],
+        *,
+        after: Callable[[], Awaitable[None]] | None = None,
+        rng: random.Random | None = None,
     ) -> None:
         self.name = name
         self.failures: dict[Key, int] = {}
         self._reconcile = reconcile
+        self._after = after
         self._rng = rng or random.Random()  # noqa: S311  (jitter)
         self._waiting: dict[Key, None] = {}
         self._added = asyncio.Event()
@@ -53,6 +65,8 @@ class Worklist:
 
     async def _attempt(self, key: Key) -> None:
         try:
+            if self._after is not None:
+                await self._after()
             await self._reconcile(key)
         except Exception as error:
             failures = self.failures[key] = self.failures.get(key, 0) + 1

@@ -1,0 +1,176 @@
+"""The air between stations: one frame at a time, for as long as it takes to send, acknowledged and repeated (802.11g, DCF).
+
+A pure discrete-event model: it is given frames and the time, and says which frames arrive when.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+from fractus_radio.propagation import SENSITIVITY_DBM, Propagation
+
+Position = tuple[float, float, float]
+
+RATE_BPS = 24e6
+HEADER_BYTES = 76
+"""LLC, MAC and check sum, as far as they are sent with the data rate."""
+FIXED_S = 269e-6
+"""DIFS, mean first back-off, preambles, SIFS and the ACK; fits ns-3 within 2 us from 40 to 1400 bytes."""
+SLOT_S = 20e-6
+FIRST_WINDOW, MAX_WINDOW = 16, 1024
+ATTEMPTS = 7
+QUEUE_FRAMES = 100
+
+MIN_FRAME_BYTES = 14
+GROUP_BIT = 0x01
+
+
+def airtime_s(frame_bytes: int, attempt: int = 0) -> float:
+    """For how long an attempt to send an Ethernet frame occupies the air; each repetition backs off for longer."""
+    window = min(FIRST_WINDOW << attempt, MAX_WINDOW)
+    back_off_s = (window - FIRST_WINDOW) / 2 * SLOT_S
+    return (frame_bytes - MIN_FRAME_BYTES + HEADER_BYTES) * 8 / RATE_BPS + FIXED_S + back_off_s
+
+
+@dataclass(slots=True)
+class Station:
+    """A radio.
+
+    Attributes:
+        position: in metres, in the frame that all stations share.
+        address: MAC address, by which frames find it.
+        network: stations hear each other in the same network only (SSID).
+        silent: hears, but sends nothing: a peer that pairs and never answers.
+        off: neither hears nor sends.
+        loss_db: loss beyond the path's, by a fade or interference.
+    """
+
+    position: Position
+    address: bytes
+    network: str = ""
+    silent: bool = False
+    off: bool = False
+    loss_db: float = 0.0
+    queue: deque[bytes] = field(default_factory=deque)
+    dropped: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """A frame in the air.
+
+    Attributes:
+        station: the sender.
+        frame: Ethernet frame.
+        number: 0 for the first.
+        arrived: whether an earlier attempt arrived and only its ACK was lost: the receiver drops the copy.
+    """
+
+    station: str
+    frame: bytes
+    number: int = 0
+    arrived: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """A frame that a station receives."""
+
+    station: str
+    frame: bytes
+
+
+class Medium:
+    """The air that all stations share.
+
+    Args:
+        propagation: the channel.
+        seed: of fading.
+    """
+
+    def __init__(self, propagation: Propagation, seed: int = 0) -> None:
+        self.stations: dict[str, Station] = {}
+        self._propagation = propagation
+        self._chance = random.Random(seed)  # noqa: S311 - a simulation, not a secret
+        self._sending: Attempt | None = None
+        self._free_s = 0.0
+        self._order: deque[str] = deque()
+
+    def add(self, name: str, station: Station) -> None:
+        """Add a station."""
+        self.stations[name] = station
+        self._order.append(name)
+
+    def offer(self, name: str, frame: bytes, now_s: float) -> None:
+        """A station wants to send an Ethernet frame; a full queue drops it."""
+        station = self.stations[name]
+        if station.off or station.silent or len(frame) < MIN_FRAME_BYTES:
+            return
+        if len(station.queue) >= QUEUE_FRAMES:
+            station.dropped += 1
+            return
+        station.queue.append(frame)
+        if self._sending is None:
+            self._begin(max(now_s, self._free_s))
+
+    @property
+    def next_s(self) -> float:
+        """When the next attempt ends; infinite while the air is free."""
+        return self._free_s if self._sending is not None else math.inf
+
+    def advance(self, now_s: float) -> Iterator[Arrival]:
+        """What has arrived by now."""
+        while self._sending is not None and self._free_s <= now_s:
+            attempt, self._sending = self._sending, None
+            yield from self._end(attempt)
+            if self._sending is None:
+                self._begin(self._free_s)
+
+    def _begin(self, at_s: float) -> None:
+        """The next station in turn sends: contention is fair."""
+        for _ in range(len(self._order)):
+            name = self._order[0]
+            self._order.rotate(-1)
+            if self.stations[name].queue:
+                frame = self.stations[name].queue.popleft()
+                self._sending, self._free_s = Attempt(name, frame), at_s + airtime_s(len(frame))
+                return
+
+    def _end(self, attempt: Attempt) -> Iterator[Arrival]:
+        name, frame = attempt.station, attempt.frame
+        if frame[0] & GROUP_BIT:  # broadcasts are neither acknowledged nor repeated
+            yield from (Arrival(other, frame) for other in self.stations if other != name and self._hears(name, other))
+            return
+        receiver = next((n for n, s in self.stations.items() if s.address == frame[:6] and n != name), None)
+        arrived = receiver is not None and self._hears(name, receiver)
+        if receiver is not None and arrived:
+            if not attempt.arrived:
+                yield Arrival(receiver, frame)
+            if self._hears(receiver, name):
+                return
+        if attempt.number + 1 < ATTEMPTS and not self.stations[name].off:
+            self._sending = Attempt(name, frame, attempt.number + 1, attempt.arrived or arrived)
+            self._free_s += airtime_s(len(frame), attempt.number + 1)
+
+    def _hears(self, sender: str, receiver: str) -> bool:
+        a, b = self.stations[sender], self.stations[receiver]
+        if a.off or b.off or a.network != b.network:
+            return False
+        distance_m = math.dist(a.position, b.position)
+        return self._propagation.receives(distance_m, self._chance, loss_db=a.loss_db + b.loss_db)
+
+    def neighbours(self, name: str) -> Mapping[str, float]:
+        """The stations of the same network that a station hears, and their mean power in dBm: what a scan finds."""
+        own = self.stations[name]
+        found = {}
+        for other, station in self.stations.items():
+            if other != name and not own.off and not station.off and station.network == own.network:
+                distance_m = math.dist(own.position, station.position)
+                power = self._propagation.received_dbm(distance_m) - own.loss_db - station.loss_db
+                if power >= SENSITIVITY_DBM:
+                    found[other] = power
+        return found

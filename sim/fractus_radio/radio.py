@@ -1,0 +1,168 @@
+"""The radio as a process: TAP devices of all nodes on one air, and uplinks; positions and faults come over a socket.
+
+Commands are JSON objects, one a datagram, on a Unix socket:
+`{"station": "drone-1", "position": [0, 0, 20], "off": false, "silent": false, "loss_db": 0, "network": "fleet"}` changes what it
+names of a station, `{"uplink": "drone-1", "off": true, "rate_bps": 8e6, "delay_s": 0.06}` both directions of an uplink.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import selectors
+import socket
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fractus_radio.medium import Medium, Station
+from fractus_radio.taps import Tap
+from fractus_radio.uplink import Uplink
+
+log = logging.getLogger(__name__)
+
+COMMAND_BYTES = 8192
+FRAMES_A_TURN = 32
+"""Frames read from one device before the others have their turn."""
+
+_STATION = {"position": list, "off": bool, "silent": bool, "loss_db": (int, float), "network": str}
+_UPLINK = {"off": bool, "rate_bps": (int, float), "delay_s": (int, float)}
+
+
+class BadCommand(ValueError):
+    """A command that the radio does not understand."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wire:
+    """Both ends and directions of an uplink."""
+
+    ends: tuple[Tap, Tap]
+    directions: tuple[Uplink, Uplink]
+
+
+class Radio:
+    """Carries frames between devices.
+
+    Args:
+        medium: the air.
+        control: path of the socket for commands; its folder exists.
+        clock: monotonic seconds.
+    """
+
+    def __init__(self, medium: Medium, control: Path, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._medium = medium
+        self._clock = clock
+        self._taps: dict[str, Tap] = {}
+        self._wires: dict[str, Wire] = {}
+        self._selector = selectors.DefaultSelector()
+        self._control = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        control.unlink(missing_ok=True)
+        self._control.bind(str(control))
+        self._selector.register(self._control, selectors.EVENT_READ, self._commanded)
+
+    def add_station(self, name: str, tap: Tap, station: Station) -> None:
+        """Put a device on the air."""
+        self._medium.add(name, station)
+        self._taps[name] = tap
+        self._selector.register(tap, selectors.EVENT_READ, lambda now_s: self._sent(name, tap, now_s))
+
+    def add_uplink(self, name: str, ends: tuple[Tap, Tap], directions: tuple[Uplink, Uplink]) -> None:
+        """Join two devices by an uplink; the first direction is from the first to the second."""
+        self._wires[name] = Wire(ends, directions)
+        for tap, uplink in zip(ends, directions, strict=True):
+            self._selector.register(tap, selectors.EVENT_READ, lambda now_s, t=tap, u=uplink: _offered(t, u, now_s))
+
+    def turn(self, max_wait_s: float = 0.5) -> None:
+        """Wait for the next event, and handle what is due."""
+        due_s = min(
+            (self._medium.next_s, *(u.next_s for wire in self._wires.values() for u in wire.directions)),
+            default=math.inf,
+        )
+        wait_s = min(max(due_s - self._clock(), 0.0), max_wait_s)
+        for key, _ in self._selector.select(wait_s):
+            key.data(self._clock())
+        now_s = self._clock()
+        for arrival in self._medium.advance(now_s):
+            self._taps[arrival.station].write(arrival.frame)
+        for wire in self._wires.values():
+            for uplink, end in zip(wire.directions, reversed(wire.ends), strict=True):
+                for frame in uplink.advance(now_s):
+                    end.write(frame)
+
+    def _sent(self, name: str, tap: Tap, now_s: float) -> None:
+        for _ in range(FRAMES_A_TURN):
+            frame = tap.read()
+            if frame is None:
+                return
+            self._medium.offer(name, frame, now_s)
+
+    def _commanded(self, _now_s: float) -> None:
+        try:
+            self.command(json.loads(self._control.recv(COMMAND_BYTES)))
+        except (BadCommand, ValueError) as error:
+            log.warning("radio: command refused (error=%s)", error)
+
+    def command(self, command: Mapping[str, Any]) -> None:
+        """Change stations and uplinks.
+
+        Raises:
+            BadCommand: it names what is not there, or has a wrong type; nothing was changed.
+        """
+        if not isinstance(command, dict):
+            raise BadCommand("a command is a JSON object")
+        if name := command.get("station"):
+            station = self._medium.stations.get(name)
+            if station is None:
+                raise BadCommand(f"there is no station {name}; there are {', '.join(self._medium.stations)}")
+            changes = _checked(command, "station", _STATION)
+            if "position" in changes:
+                changes["position"] = _position(changes["position"])
+            for field, value in changes.items():
+                setattr(station, field, value)
+        elif name := command.get("uplink"):
+            wire = self._wires.get(name)
+            if wire is None:
+                raise BadCommand(f"there is no uplink {name}; there are {', '.join(self._wires) or 'none'}")
+            for field, value in _checked(command, "uplink", _UPLINK).items():
+                for uplink in wire.directions:
+                    setattr(uplink, field, value)
+        else:
+            raise BadCommand("a command names a station or an uplink")
+
+    def close(self) -> None:
+        """Remove all devices."""
+        for tap in (*self._taps.values(), *(tap for wire in self._wires.values() for tap in wire.ends)):
+            tap.close()
+        self._control.close()
+        self._selector.close()
+
+
+def _offered(tap: Tap, uplink: Uplink, now_s: float) -> None:
+    for _ in range(FRAMES_A_TURN):
+        frame = tap.read()
+        if frame is None:
+            return
+        uplink.offer(frame, now_s)
+
+
+def _checked(command: Mapping[str, Any], subject: str, known: Mapping[str, Any]) -> dict[str, Any]:
+    changes = {field: value for field, value in command.items() if field != subject}
+    for field, value in changes.items():
+        if field not in known:
+            raise BadCommand(f"{field} is not known of a {subject}; known are {', '.join(known)}")
+        if not isinstance(value, known[field]) or (isinstance(value, bool) and known[field] is not bool):
+            raise BadCommand(f"{field} has a wrong type: {value!r}")
+        if isinstance(value, float) and not math.isfinite(value):
+            raise BadCommand(f"{field} is not a finite number")
+    return changes
+
+
+def _position(value: list[Any]) -> tuple[float, float, float]:
+    if len(value) != 3 or not all(isinstance(v, int | float) and math.isfinite(v) for v in value):
+        raise BadCommand("position takes three finite numbers: east, north and up in metres")
+    east, north, up = value
+    return float(east), float(north), float(up)

@@ -1,0 +1,50 @@
+"""A mobile uplink: a rate and a delay each way, with a queue that drops at its end (thesis 8.9.3: 60 ms, 8 Mbit/s)."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+QUEUE_BYTES = 128 * 1024
+
+
+@dataclass(slots=True)
+class Uplink:
+    """One direction of the uplink; a pure model that is told the time.
+
+    Attributes:
+        rate_bps: bits a second.
+        delay_s: from the end of sending until arrival.
+        off: whether it carries nothing; what is under way is lost.
+    """
+
+    rate_bps: float = 8e6
+    delay_s: float = 0.06
+    off: bool = False
+    dropped: int = 0
+    _free_s: float = -math.inf
+    _under_way: deque[tuple[float, bytes]] = field(default_factory=deque)
+
+    def offer(self, frame: bytes, now_s: float) -> None:
+        """Send a frame; a full queue drops it."""
+        waiting_s = max(self._free_s - now_s, 0.0)
+        if self.off or waiting_s * self.rate_bps / 8 > QUEUE_BYTES:
+            self.dropped += 1
+            return
+        sent_s = max(self._free_s, now_s) + len(frame) * 8 / self.rate_bps
+        self._free_s = sent_s
+        self._under_way.append((sent_s + self.delay_s, frame))
+
+    @property
+    def next_s(self) -> float:
+        """When the next frame arrives; infinite while none is under way."""
+        return self._under_way[0][0] if self._under_way else math.inf
+
+    def advance(self, now_s: float) -> Iterator[bytes]:
+        """What has arrived by now."""
+        while self._under_way and self._under_way[0][0] <= now_s:
+            _, frame = self._under_way.popleft()
+            if not self.off:
+                yield frame

@@ -1,0 +1,144 @@
+"""The simulated radio's devices: real IP traffic between network namespaces, by range, faults and uplink."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fractus_agent.redirector.netlink import in_namespace
+from fractus_radio.medium import Medium, Station
+from fractus_radio.propagation import Propagation
+from fractus_radio.radio import BadCommand, Radio
+from fractus_radio.taps import Tap
+from fractus_radio.uplink import Uplink
+
+pytestmark = pytest.mark.root
+
+
+PORT = 7777
+
+
+def _udp() -> socket.socket:
+    found = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    found.settimeout(1.0)
+    return found
+
+
+class Air:
+    """Two nodes on one air and on an uplink, and the radio on a thread."""
+
+    def __init__(self, directory: Path) -> None:
+        self.names = [f"fxair{os.getpid() % 100000}{end}" for end in "ab"]
+        self.control = directory / "radio.sock"
+        self.radio = Radio(Medium(Propagation.reaching(80.0), 1), self.control)
+        self._over = threading.Event()
+        ends = []
+        for number, name in enumerate(self.names, 1):
+            subprocess.run(["ip", "netns", "add", name], check=True)
+            path = Path("/run/netns", name)
+            wifi = Tap(path, "wlan0", bytes([2, 0, 0, 0, 0, number]))
+            self.radio.add_station(name[-1], wifi, Station((0.0, 0.0, 0.0), wifi.address, "net"))
+            ends.append(Tap(path, "lte0", bytes([2, 0, 0, 0, 1, number])))
+            for device, network in (("wlan0", "10.77.0"), ("lte0", "10.78.0")):
+                self.run(name, "ip", "addr", "add", f"{network}.{number}/24", "dev", device)
+                self.run(name, "ip", "link", "set", device, "up")
+        self.radio.add_uplink("a", (ends[0], ends[1]), (Uplink(), Uplink()))
+        self._asking, self._answering = (in_namespace(Path("/run/netns", name), _udp) for name in self.names)
+        self._answering.bind(("", PORT))
+        self._threads = [threading.Thread(target=target) for target in (self._carry, self._echo)]
+        for thread in self._threads:
+            thread.start()
+
+    def _carry(self) -> None:
+        while not self._over.is_set():
+            self.radio.turn(0.05)
+
+    def run(self, name: str, *words: str) -> None:
+        subprocess.run(["nsenter", f"--net=/run/netns/{name}", *words], capture_output=True, timeout=30, check=True)
+
+    def command(self, **command: object) -> None:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+            sender.sendto(json.dumps(command).encode(), str(self.control))
+
+    def ping(self, network: str, count: int = 3) -> list[float]:
+        """Round-trip times in ms of the datagrams that come back."""
+        found = []
+        for number in range(count):
+            begun = time.monotonic()
+            self._asking.sendto(b"%d" % number, (f"{network}.2", PORT))
+            try:
+                while self._asking.recv(100) != b"%d" % number:
+                    pass
+            except TimeoutError:
+                continue
+            found.append((time.monotonic() - begun) * 1e3)
+        return found
+
+    def _echo(self) -> None:
+        while not self._over.is_set():
+            try:
+                data, sender = self._answering.recvfrom(100)
+                self._answering.sendto(data, sender)
+            except OSError:
+                continue
+
+    def close(self) -> None:
+        self._over.set()
+        for thread in self._threads:
+            thread.join()
+        self._asking.close()
+        self._answering.close()
+        self.radio.close()
+        for name in self.names:
+            subprocess.run(["ip", "netns", "del", name], check=True)
+
+
+@pytest.fixture
+def air(tmp_path: Path) -> Iterator[Air]:
+    found = Air(tmp_path)
+    yield found
+    found.close()
+
+
+def test_nodes_talk_while_they_are_in_reach(air: Air) -> None:
+    assert len(air.ping("10.77.0")) == 3
+    air.command(station="b", position=[81.0, 0.0, 0.0])
+    assert not air.ping("10.77.0", 1)
+    air.command(station="b", position=[79.0, 0.0, 0.0])
+    assert air.ping("10.77.0", 2)
+
+
+@pytest.mark.parametrize("fault", [{"off": True}, {"silent": True}, {"loss_db": 90}, {"network": "other"}])
+def test_faults_are_injected_and_end(air: Air, fault: dict[str, object]) -> None:
+    air.command(station="b", **fault)
+    assert not air.ping("10.77.0", 1)
+    air.command(station="b", off=False, silent=False, loss_db=0, network="net")
+    assert air.ping("10.77.0", 2)
+
+
+def test_the_uplink_delays(air: Air) -> None:
+    found = air.ping("10.78.0", 5)
+    assert min(found) >= 120.0
+    air.command(uplink="a", off=True)
+    assert not air.ping("10.78.0", 1)
+
+
+def test_bad_commands_change_nothing(air: Air) -> None:
+    for command, what in (
+        ({"station": "c"}, "no station c"),
+        ({"station": "a", "speed": 3}, "speed is not known"),
+        ({"station": "a", "off": 1}, "wrong type"),
+        ({"station": "a", "position": [1.0, float("nan"), 0.0]}, "three finite numbers"),
+        ({"uplink": "a", "rate_bps": float("inf")}, "finite"),
+        ({}, "names a station"),
+    ):
+        with pytest.raises(BadCommand, match=what):
+            air.radio.command(command)
+    assert air.ping("10.77.0", 1)

@@ -1,0 +1,162 @@
+"""The simulated radio against ns-3's 802.11g: rates over distance, half duplex, faults; and the mobile uplink."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import pytest
+from fractus_radio.medium import ATTEMPTS, QUEUE_FRAMES, Medium, Station, airtime_s
+from fractus_radio.propagation import Propagation
+from fractus_radio.uplink import Uplink
+
+NS3_POWER_DBM, NS3_EXPONENT = 16.02, 3.0
+UDP_BYTES = 1400
+FRAME_BYTES = UDP_BYTES + 8 + 20 + 14
+
+A, B, C = b"\x02aaaaa", b"\x02bbbbb", b"\x02ccccc"
+
+
+def frame(to: bytes, size: int = FRAME_BYTES) -> bytes:
+    return to + b"\x02fffff" + b"\x08\x00" + b"x" * (size - 14)
+
+
+def pair(distance_m: float, propagation: Propagation, seed: int = 1) -> Medium:
+    medium = Medium(propagation, seed)
+    medium.add("a", Station((0.0, 0.0, 0.0), A, "net"))
+    medium.add("b", Station((distance_m, 0.0, 0.0), B, "net"))
+    return medium
+
+
+def udp_mbps(medium: Medium, seconds: float = 2.0) -> float:
+    """Payload that arrives while the sender's queue is never empty."""
+    now, arrived = 0.0, 0
+    while now < seconds:
+        while len(medium.stations["a"].queue) < 10:
+            medium.offer("a", frame(B), now)
+        now = medium.next_s
+        arrived += sum(1 for _ in medium.advance(now))
+    return arrived * UDP_BYTES * 8 / seconds / 1e6
+
+
+@pytest.mark.parametrize(
+    ("distance_m", "fading", "ns3_mbps", "tolerance"),
+    [
+        (10, None, 14.68, 0.02), (50, None, 14.67, 0.02), (51, None, 14.67, 0.02), (52, None, 0.0, 0.0),
+        (10, 1.5, 14.65, 0.03), (30, 1.5, 11.3, 0.12), (90, 1.5, 0.0, 0.0),
+    ],
+)  # fmt: skip
+def test_rates_are_those_of_ns3(distance_m: float, fading: float | None, ns3_mbps: float, tolerance: float) -> None:
+    propagation = Propagation(NS3_POWER_DBM, NS3_EXPONENT, fading)
+    assert udp_mbps(pair(distance_m, propagation)) == pytest.approx(ns3_mbps, rel=tolerance, abs=0.02)
+
+
+@pytest.mark.parametrize(("distance_m", "ns3_mbps"), [(50, 0.96), (60, 0.35), (70, 0.10)])
+def test_the_soft_edge_fades_like_ns3(distance_m: float, ns3_mbps: float) -> None:
+    found = udp_mbps(pair(distance_m, Propagation(NS3_POWER_DBM, NS3_EXPONENT, 1.5)), 10.0)
+    assert found == pytest.approx(ns3_mbps, rel=0.25, abs=0.1)
+
+
+@pytest.mark.parametrize("range_m", [80.0, 100.0, 120.0])
+def test_a_declared_range_is_the_edge(range_m: float) -> None:
+    propagation = Propagation.reaching(range_m)
+    assert udp_mbps(pair(range_m - 0.5, propagation), 0.5) > 14
+    assert udp_mbps(pair(range_m + 0.5, propagation), 0.5) == 0
+
+
+@pytest.mark.parametrize("size", [40, 200, 800, 1400])
+def test_small_frames_take_mostly_overhead(size: int) -> None:
+    assert airtime_s(size + 14) == pytest.approx((size + 76) * 8 / 24e6 + 269e-6)
+
+
+def test_both_directions_share_the_air() -> None:
+    medium = pair(10, Propagation.reaching(100))
+    now, arrived = 0.0, {"a": 0, "b": 0}
+    while now < 2.0:
+        for name, to in (("a", B), ("b", A)):
+            while len(medium.stations[name].queue) < 10:
+                medium.offer(name, frame(to), now)
+        now = medium.next_s
+        for arrival in medium.advance(now):
+            arrived[arrival.station] += 1
+    assert arrived["a"] == pytest.approx(arrived["b"], rel=0.01)
+    assert sum(arrived.values()) * UDP_BYTES * 8 / 2.0 / 1e6 == pytest.approx(14.68, rel=0.02)
+
+
+def test_frames_arrive_in_order_and_once() -> None:
+    medium = pair(60, Propagation(NS3_POWER_DBM, NS3_EXPONENT, 1.5), seed=5)
+    sent = [frame(B, 100)[:-4] + n.to_bytes(4, "big") for n in range(400)]
+    found, now = [], 0.0
+    for one in sent:
+        medium.offer("a", one, now)
+        while medium.next_s < math.inf:
+            now = medium.next_s
+            found += [arrival.frame for arrival in medium.advance(now)]
+    assert len(found) == len(set(found))
+    assert found == sorted(found)
+    assert len(found) < len(sent)  # after so many attempts a frame is given up
+
+
+def test_only_stations_of_a_network_in_reach_hear_each_other() -> None:
+    medium = pair(10, Propagation.reaching(100))
+    medium.add("c", Station((20.0, 0.0, 0.0), C, "other"))
+    medium.add("d", Station((200.0, 0.0, 0.0), b"\x02ddddd", "net"))
+    medium.offer("a", frame(b"\xff" * 6), 0.0)
+    assert [arrival.station for arrival in medium.advance(1.0)] == ["b"]
+    assert list(medium.neighbours("a")) == ["b"]
+
+
+@pytest.mark.parametrize("fault", [{"off": True}, {"silent": True}, {"loss_db": 60.0}])
+def test_faults_silence_a_station(fault: dict[str, object]) -> None:
+    medium = pair(10, Propagation.reaching(100))
+    for name, value in fault.items():
+        setattr(medium.stations["b"], name, value)
+    medium.offer("b", frame(A), 0.0)
+    assert not list(medium.advance(1.0))
+
+
+def test_a_full_queue_drops() -> None:
+    medium = pair(10, Propagation.reaching(100))
+    for _ in range(QUEUE_FRAMES + 11):
+        medium.offer("a", frame(B), 0.0)
+    assert medium.stations["a"].dropped == 10  # one is in the air
+
+
+def test_out_of_reach_attempts_end() -> None:
+    medium = pair(200, Propagation.reaching(100))
+    medium.offer("a", frame(B), 0.0)
+    assert not list(medium.advance(10.0))
+    assert medium.next_s == math.inf
+    assert sum(airtime_s(FRAME_BYTES, n) for n in range(ATTEMPTS)) < 0.1
+
+
+def test_the_same_seed_gives_the_same_air() -> None:
+    found = [udp_mbps(pair(40, Propagation(NS3_POWER_DBM, NS3_EXPONENT, 1.5), seed=9), 0.5) for _ in range(2)]
+    assert found[0] == found[1]
+
+
+def test_the_uplink_has_a_rate_a_delay_and_a_queue() -> None:
+    uplink = Uplink()
+    uplink.offer(b"x" * 1000, 0.0)
+    assert uplink.next_s == pytest.approx(0.061)
+    assert not list(uplink.advance(0.0609))
+    assert list(uplink.advance(0.0611)) == [b"x" * 1000]
+    rng = random.Random(2)
+    now, arrived = 1.0, 0
+    while now < 3.0:
+        uplink.offer(b"x" * 1500, now)
+        now += rng.uniform(0.0005, 0.0015)  # 12 Mbit/s offered
+        arrived += sum(len(one) for one in uplink.advance(now))
+    assert arrived * 8 / 2.0 == pytest.approx(8e6, rel=0.06)
+    assert uplink.dropped > 0
+
+
+def test_an_uplink_that_is_cut_carries_nothing() -> None:
+    uplink = Uplink()
+    uplink.offer(b"x", 0.0)
+    uplink.off = True
+    uplink.offer(b"y", 0.01)
+    assert not list(uplink.advance(1.0))
+    uplink.off = False
+    uplink.offer(b"z", 1.0)
+    assert list(uplink.advance(2.0)) == [b"z"]

@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 
 import yaml
 from fractus_core.api import API_VERSION, Drone, EdgeNode, InvalidObject, Resource
+from fractus_core.api.geometry import Home
 from fractus_core.api.names import DNS_LABEL
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
@@ -49,20 +50,6 @@ def parse_quantity(text: str) -> Decimal:
 
 class _Value(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Home(_Value):
-    """Where a vehicle stands when it is switched on.
-
-    Attributes:
-        lat: Latitude, degrees (WGS 84).
-        lon: Longitude, degrees (WGS 84).
-        alt: Altitude above mean sea level, metres.
-    """
-
-    lat: Annotated[float, Field(ge=-90, le=90)]
-    lon: Annotated[float, Field(ge=-180, le=180)]
-    alt: float = 0.0
 
 
 class VehicleHardware(_Value):

@@ -23,6 +23,12 @@ class Point(Model):
     lon: Longitude
 
 
+class Home(Point):
+    """Where a vehicle stands."""
+
+    alt: float = Field(default=0, ge=-500, le=9000, description="Ground height, metres above mean sea level.")
+
+
 class Position(Point):
     """A place in the air."""
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import yaml
-from fractus_core.api.geometry import AltitudeBand, Area, Latitude, Longitude
+from fractus_core.api.geometry import AltitudeBand, Area, Home
 from fractus_core.api.model import InvalidObject, Model
 from fractus_core.api.names import Name
 from fractus_vehicle.earth import Place
@@ -33,14 +33,6 @@ from fractus_sim.experiment.tasks import Step
 Mode = Literal["vehicles", "standalone", "cluster"]
 ParameterName = Annotated[str, Field(pattern=r"^[A-Z][A-Z0-9_]{0,15}$")]
 MAX_VEHICLES = 50
-
-
-class Home(Model):
-    """Where a vehicle stands."""
-
-    lat: Latitude
-    lon: Longitude
-    alt: float = Field(default=0, ge=-500, le=9000, description="Ground height, metres above mean sea level.")
 
 
 class Wind(Model):

@@ -7,16 +7,21 @@ from typing import Any
 
 from fractus_core.api import Application
 from fractus_core.api.geometry import Point
-from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
+from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance, Role
+from fractus_core.exhaustive import exhaustive
 from fractus_core.geo import geojson, geojson_line
 from fractus_core.planning import Inventory, Settings, operation_area
 
-_COLOURS = {
-    "drone": "#d62728",
-    "static": "#1f77b4",
-    "hybrid-edge": "#2ca02c",
-    "hybrid-drone": "#ff7f0e",
-}
+_COLOURS: dict[Role, str] = exhaustive(
+    Role,
+    {
+        "drone": "#d62728",
+        "static": "#1f77b4",
+        "hybrid-edge": "#2ca02c",
+        "hybrid-drone": "#ff7f0e",
+        "cloud": "#7f7f7f",
+    },
+)
 
 Feature = dict[str, Any]
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any, NoReturn
 
 import grpc
-from fractus_core.policy.values import Verdict
+from fractus_core.exhaustive import exhaustive
+from fractus_core.policy.values import Action, Verdict
 from fractus_proto.v1 import types_pb2
 from google.protobuf import any_pb2
 from google.rpc import code_pb2, error_details_pb2, status_pb2
@@ -26,12 +27,15 @@ from fractus_services.errors import (
 
 DOMAIN = "fractus.dev"
 
-_ACTIONS = {
-    "allow": types_pb2.Decision.ACTION_ALLOW,
-    "correct": types_pb2.Decision.ACTION_CORRECT,
-    "deny": types_pb2.Decision.ACTION_DENY,
-    "takeover": types_pb2.Decision.ACTION_TAKEOVER,
-}
+_ACTIONS: dict[Action, types_pb2.Decision.Action] = exhaustive(
+    Action,
+    {
+        "allow": types_pb2.Decision.ACTION_ALLOW,
+        "correct": types_pb2.Decision.ACTION_CORRECT,
+        "deny": types_pb2.Decision.ACTION_DENY,
+        "takeover": types_pb2.Decision.ACTION_TAKEOVER,
+    },
+)
 
 
 STATUS: dict[type[Refused], grpc.StatusCode] = {

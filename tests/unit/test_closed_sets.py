@@ -9,11 +9,14 @@ from typing import Literal, get_args
 
 import pytest
 from fractus_core.api.geometry import Reference
+from fractus_core.api.methods import METHODS_OF
 from fractus_core.api.policies import FilterAction, GeofenceAction, LimitAction, PolicySpec
 from fractus_core.exhaustive import exhaustive
 from fractus_core.policy.compiled import Rule, height_m
 from fractus_core.policy.privacy import compose, filter_of
 from fractus_core.policy.values import Filter
+from fractus_proto.v1 import mobility_pb2
+from fractus_services.mobility.rpc.arguments import call_of
 
 ROOT = Path(__file__).parents[2]
 
@@ -69,3 +72,15 @@ def test_mypy_notices_a_filter_that_is_not_applied(tmp_path: Path) -> None:
     paths = ":".join(map(str, (tmp_path, ROOT / "services")))
     found = subprocess.run(command, env={"MYPYPATH": paths}, capture_output=True, text=True, cwd=tmp_path, check=False)
     assert 'Argument 1 to "assert_never" has incompatible type "Literal[\'mosaic\']"' in found.stdout, found.stdout
+
+
+def test_every_method_of_the_mobility_service_can_be_checked() -> None:
+    fields = {field.name for field in mobility_pb2.CheckCallRequest.DESCRIPTOR.oneofs_by_name["call"].fields}
+    asked = {call_of(mobility_pb2.CheckCallRequest(**_filled(field))).method for field in fields}
+    assert asked == METHODS_OF["mobility"]
+
+
+def _filled(field: str) -> dict[str, object]:
+    kind = type(getattr(mobility_pb2.CheckCallRequest(), field))
+    needed = {"goto": {"target": {}}, "set_velocity": {"velocity": {}}}
+    return {field: kind(**needed.get(field, {}))}

@@ -8,7 +8,9 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 import grpc
+from fractus_core.api.geometry import Reference
 from fractus_core.api.names import node_server_name
+from fractus_core.exhaustive import exhaustive
 from fractus_proto.v1.mobility_pb2 import SubscribeTelemetryRequest, Telemetry
 from fractus_proto.v1.mobility_pb2_grpc import MobilityServiceStub
 from fractus_proto.v1.types_pb2 import AltitudeReference
@@ -24,11 +26,15 @@ INTERVAL_S = 1.0
 SILENCE_S = 5.0
 """Seconds without a message after which the service counts as unreachable."""
 
-_REFERENCES = {
-    AltitudeReference.ALTITUDE_REFERENCE_HOME: "home",
-    AltitudeReference.ALTITUDE_REFERENCE_AMSL: "amsl",
-    AltitudeReference.ALTITUDE_REFERENCE_TERRAIN: "terrain",
-}
+_WIRE: dict[Reference, AltitudeReference] = exhaustive(
+    Reference,
+    {
+        "home": AltitudeReference.ALTITUDE_REFERENCE_HOME,
+        "amsl": AltitudeReference.ALTITUDE_REFERENCE_AMSL,
+        "terrain": AltitudeReference.ALTITUDE_REFERENCE_TERRAIN,
+    },
+)
+_REFERENCES = {wire: reference for reference, wire in _WIRE.items()}
 
 
 def snapshot(message: Telemetry) -> Snapshot:

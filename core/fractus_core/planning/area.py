@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import assert_never
 
 import shapely
 from shapely.geometry.base import BaseGeometry
@@ -64,10 +65,14 @@ def operation_area(spec: ApplicationSpec, depots: Mapping[str, Depot], safety_ra
             parts.append(
                 _control_area(frame, point, depots, safety_radius_m, f"components[{index}].controlPoints[{i}]")
             )
-    elif poi is not None and poi.service_access == "points":
-        parts.append(shapely.union_all([corridor(frame, [ground(p)], safety_radius_m) for p in poi.points]))
     elif poi is not None:
-        parts.append(corridor(frame, [ground(p) for p in route], safety_radius_m))
+        match poi.service_access:
+            case "points":
+                parts.append(shapely.union_all([corridor(frame, [ground(p)], safety_radius_m) for p in poi.points]))
+            case "path":
+                parts.append(corridor(frame, [ground(p) for p in route], safety_radius_m))
+            case _:
+                assert_never(poi.service_access)
     length = length_m(frame, [ground(p) for p in route])
     return OperationArea(frame, shapely.union_all(parts), tuple(route), tuple(parts), length)
 

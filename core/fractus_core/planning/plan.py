@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Generator
+from typing import assert_never
 
 from fractus_core.api.applications import Application
-from fractus_core.api.components import Component
+from fractus_core.api.components import Component, Placement
 from fractus_core.api.plans import DeploymentPlanSpec, DroneChoice
+from fractus_core.exhaustive import exhaustive
 from fractus_core.geo import geojson
 from fractus_core.planning.area import OperationArea, operation_area
 from fractus_core.planning.candidates import check_host, check_resources
@@ -25,6 +27,7 @@ from fractus_core.planning.inventory import Inventory, Settings
 __all__ = ["Infeasible", "instance_name", "plan", "plan_in_steps"]
 
 
+_IN_ORDER: tuple[Placement, ...] = exhaustive(Placement, ("drone", "edge", "hybrid", "cloud"))
 _ROUNDING_M = 0.01
 """How far from the area its outline in a plan may be: it is written to the centimetre anyway."""
 
@@ -88,18 +91,26 @@ def _drafted(draft: Draft) -> Generator[str, None, DeploymentPlanSpec]:
         yield "drone.candidates"
         choice = choose_drone(draft, area, drones)
         yield "drone.host"
-    for component in draft.spec.on("edge"):
-        nodes = find_static(draft, component)
-        yield "static.candidates"
-        place_static(draft, component, nodes)
-        yield "static.host"
-    for component in draft.spec.on("hybrid"):
-        _place_cloud(draft, component, 1)
-        yield "cloud.host"
-        yield from _place_hybrid(draft, component, area, choice)
-    for component in draft.spec.on("cloud"):
-        _place_cloud(draft, component, component.replicas or 1)
-        yield "cloud.host"
+    # Hybrid components go beside those that have their places already, so these come first.
+    for placement in _IN_ORDER:
+        for component in draft.spec.on(placement):
+            match placement:
+                case "drone":
+                    pass  # choose_drone has placed them, all on one drone.
+                case "edge":
+                    nodes = find_static(draft, component)
+                    yield "static.candidates"
+                    place_static(draft, component, nodes)
+                    yield "static.host"
+                case "hybrid":
+                    _place_cloud(draft, component, 1)
+                    yield "cloud.host"
+                    yield from _place_hybrid(draft, component, area, choice)
+                case "cloud":
+                    _place_cloud(draft, component, component.replicas or 1)
+                    yield "cloud.host"
+                case _:
+                    assert_never(placement)
     rejected, omitted = draft.listed()
     decided = DeploymentPlanSpec(
         application=application.name,

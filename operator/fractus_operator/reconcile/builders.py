@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, assert_never
 
 from fractus_core.api import API_VERSION, Application, Component, Drone
 from fractus_core.api.names import address_variable
@@ -235,10 +235,17 @@ def _environment(application: Application, component: Component, placed: Planned
         {"name": "FRACTUS_INSTANCE", "value": placed.instance},
         {"name": "FRACTUS_TLS_DIR", "value": TLS_DIR},
     ]
-    if placed.placement == "drone":
-        env.append({"name": "FRACTUS_MOBILITY_ADDRESS", "value": f"$(FRACTUS_HOST_IP):{MOBILITY_PORT}"})
-    if placed.placement in {"drone", "edge"}:
-        env.append({"name": "FRACTUS_CAMERA_ADDRESS", "value": f"$(FRACTUS_HOST_IP):{CAMERA_PORT}"})
+    mobility = {"name": "FRACTUS_MOBILITY_ADDRESS", "value": f"$(FRACTUS_HOST_IP):{MOBILITY_PORT}"}
+    camera = {"name": "FRACTUS_CAMERA_ADDRESS", "value": f"$(FRACTUS_HOST_IP):{CAMERA_PORT}"}
+    match placed.placement:
+        case "drone":
+            env += [mobility, camera]
+        case "edge":
+            env.append(camera)
+        case "hybrid" | "cloud":
+            pass
+        case _:
+            assert_never(placed.placement)
     if component.control_points:
         points = [point.to_dict() for point in component.control_points]
         env.append({"name": "FRACTUS_CONTROL_POINTS", "value": json.dumps(points, separators=(",", ":"))})

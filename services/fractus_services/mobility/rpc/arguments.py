@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, assert_never
 
 from fractus_core.api.geometry import Reference
-from fractus_core.policy.values import Args, Call, GotoArgs, SetSpeedArgs, TakeoffArgs, VelocityArgs, Verdict
+from fractus_core.api.methods import CONTROL_METHODS, MOBILITY_METHODS, Method
+from fractus_core.exhaustive import exhaustive
+from fractus_core.policy.values import (
+    Args,
+    Call,
+    CaptureArgs,
+    GotoArgs,
+    SetSpeedArgs,
+    TakeoffArgs,
+    VelocityArgs,
+    Verdict,
+)
 from fractus_proto.v1 import mobility_pb2, types_pb2
+from pydantic.alias_generators import to_snake
 
 from fractus_services.errors import InvalidRequest, Refused
 from fractus_services.replies import decision
@@ -15,11 +27,15 @@ from fractus_services.replies import decision
 DEFAULT_HOLD_S = 0.5
 """How long a velocity holds when the caller does not say; proto3 cannot tell an absent number from 0."""
 
-_REFERENCES: dict[int, Reference] = {
-    types_pb2.ALTITUDE_REFERENCE_HOME: "home",
-    types_pb2.ALTITUDE_REFERENCE_AMSL: "amsl",
-    types_pb2.ALTITUDE_REFERENCE_TERRAIN: "terrain",
-}
+_WIRE: dict[Reference, int] = exhaustive(
+    Reference,
+    {
+        "home": types_pb2.ALTITUDE_REFERENCE_HOME,
+        "amsl": types_pb2.ALTITUDE_REFERENCE_AMSL,
+        "terrain": types_pb2.ALTITUDE_REFERENCE_TERRAIN,
+    },
+)
+_REFERENCES = {wire: reference for reference, wire in _WIRE.items()}
 
 
 def goto_args(request: mobility_pb2.GotoRequest) -> GotoArgs:
@@ -78,15 +94,19 @@ def checked(verdict: Verdict) -> mobility_pb2.CheckCallResponse:
     reply = mobility_pb2.CheckCallResponse(
         decision=decision(verdict), takeover=verdict.takeover or "", brake_first=verdict.brake_first
     )
-    args = verdict.args if verdict.permits else None
-    if isinstance(args, TakeoffArgs):
-        reply.takeoff.altitude_m = args.altitude_m
-    elif isinstance(args, SetSpeedArgs):
-        reply.set_speed.speed_mps = args.speed_mps
-    elif isinstance(args, GotoArgs):
-        _write_goto(reply.goto, args)
-    elif isinstance(args, VelocityArgs):
-        _write_velocity(reply.set_velocity, args)
+    match verdict.args if verdict.permits else None:
+        case TakeoffArgs() as args:
+            reply.takeoff.altitude_m = args.altitude_m
+        case SetSpeedArgs() as args:
+            reply.set_speed.speed_mps = args.speed_mps
+        case GotoArgs() as args:
+            _write_goto(reply.goto, args)
+        case VelocityArgs() as args:
+            _write_velocity(reply.set_velocity, args)
+        case CaptureArgs() | None:
+            pass
+        case never:
+            assert_never(never)
     return reply
 
 
@@ -115,18 +135,5 @@ _ARGUMENTS: dict[str, Callable[[Any], Args]] = {
     "set_speed": lambda request: SetSpeedArgs(request.speed_mps),
     "set_velocity": velocity_args,
 }
-_METHODS = {
-    "arm": "Arm",
-    "disarm": "Disarm",
-    "takeoff": "Takeoff",
-    "land": "Land",
-    "goto": "Goto",
-    "return_to_launch": "ReturnToLaunch",
-    "hover": "Hover",
-    "set_speed": "SetSpeed",
-    "set_velocity": "SetVelocity",
-    "get_speed": "GetSpeed",
-    "get_position": "GetPosition",
-    "get_control": "GetControl",
-    "return_control": "ReturnControl",
-}
+_METHODS: dict[str, Method] = {to_snake(method): method for method in (*MOBILITY_METHODS, *CONTROL_METHODS)}
+"""Methods by the field of a CheckCallRequest that holds their request."""

@@ -1,16 +1,16 @@
-"""What the agent has found out about its node: the material of conditions."""
+"""Conditions of the node, as the agent observes them and as Kubernetes writes them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Literal
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
-    """One observed fact; becomes a Kubernetes condition."""
+class Condition:
+    """One condition, before it gets its time stamps."""
 
     type: str
     status: Literal["True", "False", "Unknown"]
@@ -18,7 +18,7 @@ class Finding:
     message: str = ""
 
     @property
-    def holds(self) -> bool:
+    def is_true(self) -> bool:
         """Whether the status is True."""
         return self.status == "True"
 
@@ -28,23 +28,16 @@ def timestamp(moment: datetime) -> str:
     return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def conditions(
-    findings: Iterable[Finding], previous: Sequence[dict[str, Any]], generation: int | None, now: datetime
+def to_kubernetes(
+    conditions: Iterable[Condition], previous: Sequence[dict[str, Any]], generation: int | None, now: datetime
 ) -> list[dict[str, Any]]:
-    """Findings as conditions; lastTransitionTime is kept while the status stays the same."""
+    """Conditions as Kubernetes has them; lastTransitionTime is kept while the status stays the same."""
     before = {condition.get("type"): condition for condition in previous}
     result = []
-    for finding in findings:
-        old = before.get(finding.type, {})
-        since = old.get("lastTransitionTime") if old.get("status") == finding.status else None
-        condition = {
-            "type": finding.type,
-            "status": finding.status,
-            "reason": finding.reason,
-            "message": finding.message,
-            "lastTransitionTime": since or timestamp(now),
-        }
+    for condition in conditions:
+        old = before.get(condition.type, {})
+        since = old.get("lastTransitionTime") if old.get("status") == condition.status else None
+        result.append({**asdict(condition), "lastTransitionTime": since or timestamp(now)})
         if generation is not None:
-            condition["observedGeneration"] = generation
-        result.append(condition)
+            result[-1]["observedGeneration"] = generation
     return result

@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives import serialization
 from fractus_agent.cluster.store import KubeError
 from fractus_agent.identity.certificates import Unusable, inspect
 from fractus_agent.identity.csr import make_request
-from fractus_agent.identity.identity import FILES, Identity, Refused, make_request_apart
+from fractus_agent.identity.identity import FILES, Identity, SigningRefused, make_request_in_process
 from fractus_storage import read_set, write_set
 
 NODE = "drone-1"
@@ -54,7 +54,7 @@ def bench(tmp_path: Path) -> Bench:
 async def test_round_trip(bench: Bench) -> None:
     await bench.identity.step()
     assert bench.identity.ready.is_set()
-    assert bench.identity.finding.holds
+    assert bench.identity.condition.is_true
     assert (bench.directory / "tls.key").stat().st_mode & 0o777 == 0o600
     certificate = x509.load_pem_x509_certificate(bench.files()["tls.crt"])
     names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -67,7 +67,7 @@ async def test_round_trip(bench: Bench) -> None:
 
 
 async def test_the_key_process_makes_a_usable_pair(bench: Bench) -> None:
-    key, request = await make_request_apart(NODE)
+    key, request = await make_request_in_process(NODE)
     write_set(
         bench.directory, {"tls.key": key, "tls.crt": bench.signer.ca.sign(request), "ca.crt": bench.signer.ca.pem}
     )
@@ -106,7 +106,7 @@ async def test_a_renewal_that_fails_leaves_the_certificate_in_use(bench: Bench) 
     with pytest.raises(KubeError):
         await bench.identity.step()
     assert bench.files() == before
-    assert bench.identity.finding.holds
+    assert bench.identity.condition.is_true
 
 
 async def test_an_expired_certificate_is_replaced(bench: Bench) -> None:
@@ -115,7 +115,7 @@ async def test_an_expired_certificate_is_replaced(bench: Bench) -> None:
     bench.signer.sign_with = {"begin": bench.clock.now}
     await bench.identity.step()
     assert bench.signer.made == 2
-    assert bench.identity.finding.holds
+    assert bench.identity.condition.is_true
 
 
 async def test_rotation_to_a_bundle_keeps_the_certificate(bench: Bench) -> None:
@@ -171,7 +171,7 @@ async def test_a_spoilt_directory_is_mended(bench: Bench, harm: str) -> None:
 @pytest.mark.parametrize("kind", ["Denied", "Failed"])
 async def test_a_refusal_is_said(bench: Bench, kind: str) -> None:
     bench.signer.conditions = [{"type": kind, "message": "node drone-1 is not in the fleet"}]
-    with pytest.raises(Refused, match="not in the fleet") as refusal:
+    with pytest.raises(SigningRefused, match="not in the fleet") as refusal:
         await bench.identity.step()
     assert refusal.value.reason == kind
     assert not bench.identity.ready.is_set()
@@ -184,15 +184,15 @@ async def test_a_refusal_reaches_the_condition(bench: Bench) -> None:
     identity = Identity(bench.signer, bench.directory, NODE, bench.clock, changed=said.set, make_request=made_here)
     task = asyncio.create_task(identity.run())
     try:
-        while identity.finding.reason != "Denied":
+        while identity.condition.reason != "Denied":
             await asyncio.wait_for(said.wait(), 10.0)
             said.clear()
     finally:
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await task
-    assert (identity.finding.type, identity.finding.status) == ("Certified", "False")
-    assert "not in the fleet" in identity.finding.message
+    assert (identity.condition.type, identity.condition.status) == ("Certified", "False")
+    assert "not in the fleet" in identity.condition.message
 
 
 async def test_a_denied_renewal_leaves_the_node_certified(bench: Bench) -> None:
@@ -203,27 +203,27 @@ async def test_a_denied_renewal_leaves_the_node_certified(bench: Bench) -> None:
     identity = Identity(bench.signer, bench.directory, NODE, bench.clock, changed=said.set, make_request=made_here)
     task = asyncio.create_task(identity.run())
     try:
-        while "fleet frozen" not in identity.finding.message:
+        while "fleet frozen" not in identity.condition.message:
             await asyncio.wait_for(said.wait(), 10.0)
             said.clear()
     finally:
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await task
-    assert identity.finding.holds
+    assert identity.condition.is_true
     assert bench.signer.made == 2
 
 
 async def test_a_certificate_of_a_strange_authority_is_not_installed(bench: Bench) -> None:
     bench.signer.published = TestAuthority("other").pem
-    with pytest.raises(Refused, match="of no use"):
+    with pytest.raises(SigningRefused, match="of no use"):
         await bench.identity.step()
     assert not (bench.directory / "tls.crt").exists()
 
 
 async def test_no_authority_is_said(bench: Bench) -> None:
     bench.signer.published = None
-    with pytest.raises(Refused) as refusal:
+    with pytest.raises(SigningRefused) as refusal:
         await bench.identity.step()
     assert refusal.value.reason == "NoAuthority"
 
@@ -233,20 +233,20 @@ async def test_a_clock_behind_asks_for_nothing_and_recovers(bench: Bench) -> Non
     now = bench.clock.now
     bench.clock.now = datetime(1970, 1, 1, tzinfo=UTC)
     await bench.identity.step()
-    assert bench.identity.finding.reason == "ClockSkew"
+    assert bench.identity.condition.reason == "ClockSkew"
     assert bench.signer.made == 1
     bench.clock.now = now
     await bench.identity.step()
-    assert bench.identity.finding.holds
+    assert bench.identity.condition.is_true
 
 
 async def test_a_clock_ahead_is_said_and_recovers(bench: Bench) -> None:
     now = bench.clock.now
     bench.clock.now = now + timedelta(days=900)
-    with pytest.raises(Refused) as refusal:
+    with pytest.raises(SigningRefused) as refusal:
         await bench.identity.step()
     assert refusal.value.reason == "ClockSkew"
     bench.clock.now = now
     await bench.identity.step()
-    assert bench.identity.finding.holds
+    assert bench.identity.condition.is_true
     assert bench.signer.made == 1

@@ -7,7 +7,14 @@ from typing import Any
 
 import pytest
 from fractus_agent.cluster.store import Backoff, Changed, Deleted, GrantEvent, KubeError, Listed
-from fractus_agent.grants.keeper import HOLD_S, GrantDirectory, GrantKeeper, outcome_of, status_of, stored_form
+from fractus_agent.grants.keeper import (
+    UNVERIFIED_TIMEOUT_S,
+    GrantDirectory,
+    GrantKeeper,
+    outcome_of,
+    status_of,
+    stored_form,
+)
 from fractus_core.api.plans import Grant
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
 
@@ -160,7 +167,7 @@ async def test_a_grant_that_cannot_be_stored_is_pending_until_it_can(
     await keeper.report_once()
     assert store.statuses[-1][1]["phase"] == "Pending"
     assert "No space left" in store.statuses[-1][1]["message"]
-    keeper._retry_disk()
+    keeper.retry_disk()
     await keeper.report_once()
     assert store.statuses[-1][1]["phase"] == "Active"
 
@@ -190,7 +197,9 @@ def doubter() -> Doubter:
 def doubting(store: FakeStore, doubter: Doubter, tmp_path: Path) -> GrantKeeper:
     directory = GrantDirectory(tmp_path)
     directory.open()
-    return GrantKeeper(store, directory, "drone-1", doubter.check, ask=doubter.ask, monotonic=lambda: doubter.now_s)
+    return GrantKeeper(
+        store, directory, "drone-1", doubter.check, refresh_authority=doubter.ask, monotonic=lambda: doubter.now_s
+    )
 
 
 async def test_a_grant_that_is_not_signed_is_not_stored_and_takes_away_the_one_before(
@@ -233,11 +242,11 @@ def test_an_authority_that_stays_unknown_ends_the_grant(
     doubting.take(Listed((manifest(),)))
     doubter.error = UnknownAuthority("it is of an authority that is not in ca.crt")
     doubting.take(Changed(manifest(spec={"control": "full"})))
-    doubter.now_s = HOLD_S
-    doubting._give_up_undecided()
+    doubter.now_s = UNVERIFIED_TIMEOUT_S
+    doubting.give_up_unverified()
     assert on_disk(tmp_path) == {"g1.json"}
-    doubter.now_s = HOLD_S + 1
-    doubting._give_up_undecided()
+    doubter.now_s = UNVERIFIED_TIMEOUT_S + 1
+    doubting.give_up_unverified()
     assert on_disk(tmp_path) == set()
     doubting.take(Listed(()))
     doubter.error = None
@@ -252,8 +261,8 @@ async def test_a_stored_grant_outlives_its_authority_and_the_agent(
     doubter.error = UnknownAuthority("it is of an authority that is not in ca.crt")
     again = GrantKeeper(store, GrantDirectory(tmp_path), "drone-1", doubter.check, monotonic=lambda: doubter.now_s)
     again.take(Listed((manifest(),)))
-    doubter.now_s = HOLD_S * 2
-    again._give_up_undecided()
+    doubter.now_s = UNVERIFIED_TIMEOUT_S * 2
+    again.give_up_unverified()
     await again.report_once()
     assert on_disk(tmp_path) == {"g1.json"}
     assert store.statuses[-1][1]["phase"] == "Active"
@@ -268,8 +277,8 @@ async def test_an_api_server_that_is_gone_for_a_month_takes_no_grant_away(
     for _ in range(30):
         doubter.now_s += 86_400
         doubting.missions_changed({"u1": f"failed: {doubter.now_s}"})
-        doubting._give_up_undecided()
-        doubting._retry_disk()
+        doubting.give_up_unverified()
+        doubting.retry_disk()
         doubting.authority_changed()
         with pytest.raises(KubeError):
             await doubting.report_once()

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 from fractus_agent.cluster.store import KubeError
-from fractus_agent.conditions import Finding
+from fractus_agent.conditions import Condition
 from fractus_agent.registration.status import (
     DRONE_PACE,
     EDGE_PACE,
@@ -22,7 +22,7 @@ from fractus_proto.v1.mobility_pb2 import Telemetry
 from fractus_proto.v1.types_pb2 import AltitudeReference, Position
 
 NOW = datetime(2026, 5, 1, 12, 0, 0, tzinfo=UTC)
-ISSUED = Finding("Certified", "True", "Issued", "Valid.")
+ISSUED = Condition("Certified", "True", "Issued", "Valid.")
 
 
 def seen(**changes: Any) -> Snapshot:
@@ -80,7 +80,7 @@ def test_telemetry_becomes_a_valid_drone_status() -> None:
 @pytest.mark.parametrize(
     ("facts", "reason"),
     [
-        ({"certified": Finding("Certified", "False", "Denied", "no")}, "NoCertificate"),
+        ({"certified": Condition("Certified", "False", "Denied", "no")}, "NoCertificate"),
         ({"problem": "The mobility service is out of reach: x."}, "MobilityUnreachable"),
         ({"snapshot": None}, "MobilityUnreachable"),
         ({"snapshot": seen(connected=False)}, "AutopilotDisconnected"),
@@ -88,24 +88,24 @@ def test_telemetry_becomes_a_valid_drone_status() -> None:
     ],
 )
 def test_a_drone_is_not_ready_when(facts: dict[str, Any], reason: str) -> None:
-    finding = readiness(observed(**facts))
-    assert (finding.status, finding.reason) == ("False", reason)
-    assert finding.message
+    ready = readiness(observed(**facts))
+    assert (ready.status, ready.reason) == ("False", reason)
+    assert ready.message
 
 
 def test_a_flying_drone_is_ready_though_it_would_not_arm() -> None:
-    assert readiness(observed(snapshot=seen(ready=False, in_air=True))).holds
+    assert readiness(observed(snapshot=seen(ready=False, in_air=True))).is_true
 
 
 def test_edge_node_without_services_is_ready_without_certificate() -> None:
     bare = observed(
         kind="EdgeNode", has_mobility=False, needs_certificate=False, snapshot=None,
-        certified=Finding("Certified", "False", "Requested", "waits"),
+        certified=Condition("Certified", "False", "Requested", "waits"),
     )  # fmt: skip
     status = node_status(bare, {}, 1, NOW)
     EdgeNodeStatus.model_validate(status)
     assert "flightState" not in status
-    assert readiness(bare).holds
+    assert readiness(bare).is_true
 
 
 def test_what_cannot_be_seen_is_kept() -> None:

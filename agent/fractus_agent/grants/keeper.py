@@ -6,36 +6,28 @@ import asyncio
 import json
 import logging
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.plans import Grant
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
 from fractus_storage import remove_file, write_file
 
-from fractus_agent.cluster.store import Backoff, Changed, Deleted, GrantEvent, KubeError, Listed, Object
+from fractus_agent.cluster.store import Changed, Deleted, GrantEvent, Listed, Object, Store
+from fractus_agent.supervisor import repeat
 
 LOG = logging.getLogger(__name__)
 
 Phase = Literal["Pending", "Active", "Complete", "Revoked", "Failed"]
 ENDED: frozenset[str] = frozenset({"Complete", "Revoked", "Failed"})
 _OUTCOMES: dict[str, Phase] = {"complete": "Complete", "revoked": "Revoked", "failed": "Failed"}
-REVIEW_S = 60.0
-"""Seconds after which reports and failed writes are looked at again, if nothing happens before."""
-HOLD_S = 120.0
-"""Seconds for which a Grant outlives a newer one whose authority is unknown: as long as the change of authorities takes."""
-
-
-class GrantStore(Protocol):
-    """What the keeper of grants needs of the store."""
-
-    def grants(self) -> AsyncIterator[GrantEvent]:
-        """Follow the node's grants."""
-
-    async def apply_status(self, kind: str, name: str, status: Object) -> Object | None:
-        """Apply a status."""
+REVIEW_INTERVAL_S = 60.0
+"""Seconds after which reports and failed writes are tried again."""
+UNVERIFIED_TIMEOUT_S = 120.0
+"""Seconds for which a stored Grant outlives a newer one whose authority is unknown: a change of authorities takes that
+long to reach every node."""
 
 
 class GrantDirectory:
@@ -113,35 +105,35 @@ def status_of(grant: Grant, missions: Mapping[str, str], problem: str | None) ->
 class GrantKeeper:
     """Mirrors the node's grants to disk and reports their phases.
 
-    Files go only on word of the API server: a deletion, absence from a complete list, or a Grant that the operator did
-    not sign.
+    Files are removed only when the API server says so: by a deletion, by absence from a complete list, or by a Grant that
+    the operator did not sign. An API server that is out of reach removes nothing, so a flight goes on.
 
     Args:
         store: the API server.
         directory: the disk.
         node: whose grants.
         check: raises BadSignature or UnknownAuthority for a Grant that is not to be stored.
-        ask: called when the authority that the node trusts may be out of date.
+        refresh_authority: called when the authority that the node trusts may be out of date.
         monotonic: seconds that never jump.
     """
 
     def __init__(
         self,
-        store: GrantStore,
+        store: Store,
         directory: GrantDirectory,
         node: str,
         check: Callable[[Grant], None],
         *,
-        ask: Callable[[], None] = lambda: None,
+        refresh_authority: Callable[[], None] = lambda: None,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._store = store
         self._directory = directory
         self._node = node
         self._check = check
-        self._ask = ask
+        self._refresh_authority = refresh_authority
         self._monotonic = monotonic
-        self._undecided: dict[str, tuple[Object, float]] = {}
+        self._unverified: dict[str, tuple[Object, float]] = {}
         self._grants: dict[str, Grant] = {}
         self._unreadable: dict[str, dict[str, Any]] = {}
         self._unstored: dict[str, str] = {}
@@ -149,31 +141,32 @@ class GrantKeeper:
         self._reported: dict[str, dict[str, Any]] = {}
         self._missions: Mapping[str, str] = {}
         self._work = asyncio.Event()
+        self._reviewed_s = monotonic()
 
     def missions_changed(self, missions: Mapping[str, str]) -> None:
-        """Take what the mobility service says of ended missions."""
+        """Take the outcomes of missions from the mobility service."""
         if dict(missions) != self._missions:
             self._missions = dict(missions)
             self._work.set()
 
     def authority_changed(self) -> None:
-        """Look again at Grants whose authority was not known."""
-        for body, _ in tuple(self._undecided.values()):
+        """Verify again the Grants whose authority was not known."""
+        for body, _ in tuple(self._unverified.values()):
             self._put(body)
         self._work.set()
 
     async def follow(self) -> None:
-        """Keep the directory in step with the API server, for ever."""
+        """Keep the directory in step with the API server until cancelled."""
         self._directory.open()
         async for event in self._store.grants():
             self.take(event)
 
     def take(self, event: GrantEvent) -> None:
-        """Bring one piece of news to the disk."""
+        """Apply one event to the disk."""
         match event:
             case Listed(grants):
                 names = {body["metadata"]["name"] for body in grants}
-                known = self._directory.names().union(self._grants, self._unreadable, self._undecided)
+                known = self._directory.names().union(self._grants, self._unreadable, self._unverified)
                 for gone in known - names:
                     self._remove(gone)
                 for body in grants:
@@ -185,24 +178,15 @@ class GrantKeeper:
         self._work.set()
 
     async def report(self) -> None:
-        """Bring phases to the API server, for ever; what cannot be written now is written later."""
-        backoff = Backoff(0.5, 15.0)
-        while True:
-            delay_s = REVIEW_S
-            self._work.clear()
-            self._give_up_undecided()
-            try:
-                await self.report_once()
-                backoff.succeeded()
-            except KubeError as error:
-                LOG.log(logging.DEBUG if backoff.attempts else logging.WARNING, "phases wait: %s", error)
-                delay_s = backoff.delay_s()
-                await asyncio.sleep(delay_s)
-                continue
-            try:
-                await asyncio.wait_for(self._work.wait(), delay_s)
-            except TimeoutError:
-                self._retry_disk()
+        """Report phases to the API server until cancelled; what cannot be written now is written later."""
+        await repeat("grants", self._report_step, self._work)
+
+    async def _report_step(self) -> float:
+        if self._monotonic() - self._reviewed_s >= REVIEW_INTERVAL_S:
+            self.retry_disk()
+        self.give_up_unverified()
+        await self.report_once()
+        return REVIEW_INTERVAL_S
 
     async def report_once(self) -> None:
         """Report every grant whose status at the API server is not what the node knows."""
@@ -214,15 +198,15 @@ class GrantKeeper:
                 continue
             await self._store.apply_status("Grant", name, status)
             self._reported[name] = status
-            LOG.info("grant %s is %s%s", name, status["phase"], f": {status['message']}" if status["message"] else "")
+            LOG.info("grants: reported (grant=%s phase=%s): %s", name, status["phase"], status["message"] or "-")
 
     def _put(self, body: Object) -> None:
         name = body["metadata"]["name"]
         try:
             grant = Grant.from_body(body)
         except InvalidObject as error:
-            # What it forbids cannot be known, so nothing of it is kept: the services bring the drone home.
-            LOG.error("grant %s cannot be read, so nothing is granted: %s", name, error)  # noqa: TRY400
+            # What it forbids is unknown, so nothing of it is stored: without a grant the services bring the drone home.
+            LOG.error("grants: cannot be read, nothing is granted (grant=%s): %s", name, error)  # noqa: TRY400
             self._remove(name)
             self._unreadable[name] = {
                 "phase": "Failed",
@@ -238,14 +222,14 @@ class GrantKeeper:
         except UnknownAuthority as doubt:
             # One that was stored once was verified then, whatever became of its authority since.
             if not self._stored(grant):
-                self._doubt(body, str(doubt))
+                self._hold(body, str(doubt))
                 return
         except BadSignature as problem:
-            LOG.error("grant %s is not stored: %s", name, problem)  # noqa: TRY400
+            LOG.error("grants: not stored (grant=%s): %s", name, problem)  # noqa: TRY400
             self._remove(name)
             self._wait(body, str(problem))
             return
-        self._undecided.pop(name, None)
+        self._unverified.pop(name, None)
         self._unreadable.pop(name, None)
         self._unremoved.discard(name)
         old = self._grants.get(name)
@@ -266,22 +250,23 @@ class GrantKeeper:
         except OSError:
             return False
 
-    def _doubt(self, body: Object, why: str) -> None:
-        """Keep what is stored for a while: the authority may be changing."""
+    def _hold(self, body: Object, why: str) -> None:
+        """Keep what is stored for a while: the authority may be about to change."""
         name = body["metadata"]["name"]
-        if name not in self._undecided:
-            LOG.warning("grant %s is not stored yet: %s", name, why)
-        self._undecided[name] = (body, self._undecided.get(name, (body, self._monotonic()))[1])
+        if name not in self._unverified:
+            LOG.warning("grants: not stored yet (grant=%s): %s", name, why)
+        self._unverified[name] = (body, self._unverified.get(name, (body, self._monotonic()))[1])
         if name not in self._grants:
             self._wait(body, why)
-        self._ask()
+        self._refresh_authority()
 
-    def _give_up_undecided(self) -> None:
-        for name, (body, since_s) in tuple(self._undecided.items()):
-            if name in self._directory.names() and self._monotonic() - since_s > HOLD_S:
-                LOG.error("grant %s was replaced by one of an authority that nobody knows; it is removed", name)
+    def give_up_unverified(self) -> None:
+        """Remove stored grants whose replacement could not be verified in time."""
+        for name, (body, since_s) in tuple(self._unverified.items()):
+            if name in self._directory.names() and self._monotonic() - since_s > UNVERIFIED_TIMEOUT_S:
+                LOG.error("grants: removed, its replacement is of an unknown authority (grant=%s)", name)
                 self._remove(name)
-                self._doubt(body, "it is of an authority that this node does not know")
+                self._hold(body, "it is of an authority that this node does not know")
 
     def _wait(self, body: Object, why: str) -> None:
         self._unreadable[body["metadata"]["name"]] = {
@@ -293,25 +278,27 @@ class GrantKeeper:
     def _write(self, grant: Grant) -> None:
         try:
             if self._directory.put(grant):
-                LOG.info("stored grant %s of %s", grant.name, grant.spec.identity)
+                LOG.info("grants: stored (grant=%s identity=%s)", grant.name, grant.spec.identity)
             self._unstored.pop(grant.name, None)
         except OSError as error:
-            LOG.exception("grant %s cannot be stored", grant.name)
+            LOG.exception("grants: cannot be written to disk (grant=%s)", grant.name)
             self._unstored[grant.name] = f"The node cannot store the grant: {error.strerror or error}."
 
-    def _retry_disk(self) -> None:
+    def retry_disk(self) -> None:
+        """Try again to write and remove files."""
+        self._reviewed_s = self._monotonic()
         for name in list(self._unstored):
             self._write(self._grants[name])
         for name in list(self._unremoved):
             self._remove(name)
 
     def _remove(self, name: str) -> None:
-        for record in (self._grants, self._unreadable, self._unstored, self._reported, self._undecided):
+        for record in (self._grants, self._unreadable, self._unstored, self._reported, self._unverified):
             record.pop(name, None)
         self._unremoved.discard(name)
         try:
             if self._directory.drop(name):
-                LOG.info("removed grant %s", name)
+                LOG.info("grants: removed (grant=%s)", name)
         except OSError:
-            LOG.exception("grant %s cannot be removed from the disk; trying again soon", name)
+            LOG.exception("grants: cannot be removed from disk, trying again (grant=%s)", name)
             self._unremoved.add(name)

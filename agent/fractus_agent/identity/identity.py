@@ -1,4 +1,4 @@
-"""The node's certificate: asked for through the CSR API, kept on disk, renewed in time, followed through CA rotations."""
+"""The node's certificate: requested through the CSR API, stored, renewed in time, and replaced when the CA rotates."""
 
 from __future__ import annotations
 
@@ -15,48 +15,31 @@ import uuid
 from collections.abc import Awaitable, Callable
 from datetime import datetime
 from pathlib import Path
-from typing import Protocol
 
 from fractus_storage import read_set, write_set
 
-from fractus_agent.cluster.store import Backoff, KubeError, Object
-from fractus_agent.conditions import Finding
+from fractus_agent.cluster.store import Backoff, KubeError, Store
+from fractus_agent.conditions import Condition
 from fractus_agent.identity.certificates import Unusable, Validity, inspect
 
 LOG = logging.getLogger(__name__)
 
 FILES = ("tls.crt", "tls.key", "ca.crt")
 LIFE_S = 30 * 86400
-LOOK_S = 10.0
-"""Seconds between looks at the files and the clock."""
-ASK_CA_S = 300.0
-"""Seconds between looks at the published authority."""
+CHECK_INTERVAL_S = 10.0
+"""Seconds between checks of the files and the clock."""
+AUTHORITY_INTERVAL_S = 300.0
+"""Seconds between reads of the published authority."""
 SIGNING_TIMEOUT_S = 600.0
 
 RequestMaker = Callable[[str], Awaitable[tuple[bytes, bytes]]]
-
-
-class Authority(Protocol):
-    """What identity needs of the store."""
-
-    async def authority(self) -> bytes | None:
-        """The PEM certificates that nodes trust."""
-
-    async def request_certificate(self, name: str, request_pem: bytes, life_s: int) -> None:
-        """Create a signing request."""
-
-    async def certificate_request(self, name: str) -> Object | None:
-        """What became of it."""
-
-    async def drop_certificate_requests(self) -> None:
-        """Delete this node's signing requests."""
 
 
 class NotYet(Exception):
     """A step did not succeed this time: try again later."""
 
 
-class Refused(Exception):
+class SigningRefused(Exception):
     """The signer denied the request, or failed."""
 
     def __init__(self, reason: str, message: str) -> None:
@@ -64,7 +47,7 @@ class Refused(Exception):
         super().__init__(message)
 
 
-async def make_request_apart(node: str) -> tuple[bytes, bytes]:
+async def make_request_in_process(node: str) -> tuple[bytes, bytes]:
     """A key and a signing request, made by a process of its own.
 
     Raises:
@@ -97,13 +80,13 @@ class Identity:
 
     def __init__(
         self,
-        store: Authority,
+        store: Store,
         directory: Path,
         node: str,
         clock: Callable[[], datetime],
         *,
         changed: Callable[[], None] = lambda: None,
-        make_request: RequestMaker = make_request_apart,
+        make_request: RequestMaker = make_request_in_process,
     ) -> None:
         self._store = store
         self._directory = directory
@@ -114,50 +97,54 @@ class Identity:
         self._jitter = int(hashlib.sha256(node.encode()).hexdigest()[:4], 16) / 0xFFFF / 30
         self._backoff = Backoff(0.5, 300.0)
         self._known: tuple[object, Validity | None] | None = None
-        self._doubted = False
+        self._authority_outdated = False
         self.ready = asyncio.Event()
         self.serial = 0
-        self.finding = Finding("Certified", "False", "Requested", "The node has no certificate yet.")
+        self.condition = Condition("Certified", "False", "Requested", "The node has no certificate yet.")
 
     async def run(self) -> None:
-        """Keep the certificate usable, for ever."""
+        """Keep the certificate usable until cancelled."""
         asked_s = float("-inf")
         loop = asyncio.get_running_loop()
         while True:
-            delay_s = LOOK_S
+            delay_s = CHECK_INTERVAL_S
             try:
-                ask = self._doubted or loop.time() - asked_s >= ASK_CA_S or self._wanting()
-                self._doubted = False
+                ask = (
+                    self._authority_outdated
+                    or loop.time() - asked_s >= AUTHORITY_INTERVAL_S
+                    or self._needs_certificate()
+                )
+                self._authority_outdated = False
                 await self.step(ask)
                 if ask:
                     asked_s = loop.time()
                 self._backoff.succeeded()
-            except Refused as refusal:
+            except SigningRefused as refusal:
                 self._refused(refusal)
-                # A new installation's operator is about to publish its authority; a refusal wants patience.
+                # The operator of a new installation is about to publish its authority; other refusals last longer.
                 pause_s = self._backoff.delay_s()
                 delay_s = min(5.0, pause_s) if refusal.reason == "NoAuthority" else max(30.0, pause_s)
             except (KubeError, NotYet, OSError) as error:
-                if self._wanting():
-                    self._find("False", "Requested", f"The node has no usable certificate yet: {error}")
+                if self._needs_certificate():
+                    self._set_condition("False", "Requested", f"The node has no usable certificate yet: {error}")
                     delay_s = min(15.0, self._backoff.delay_s())
                 else:
-                    LOG.debug("the certificate cannot be looked after now: %s", error)
-                    asked_s = loop.time() - ASK_CA_S + 15.0
+                    LOG.debug("identity: the API server failed, certificate still valid: %s", error)
+                    asked_s = loop.time() - AUTHORITY_INTERVAL_S + 15.0
             await asyncio.sleep(delay_s)
 
-    def doubt_authority(self) -> None:
-        """Look at the published authority soon: a certificate of another one was presented."""
-        self._doubted = True
+    def refresh_authority(self) -> None:
+        """Read the published authority soon: a grant came that was signed under another one."""
+        self._authority_outdated = True
 
     async def step(self, ask: bool = True) -> None:
-        """Look at files, authority and clock once, and do what is due.
+        """Check files, authority and clock once, and do what is due.
 
         Args:
-            ask: whether to look at the published authority too.
+            ask: whether to read the published authority too.
 
         Raises:
-            Refused: the signer denied the request, or failed.
+            SigningRefused: the signer denied the request, or failed.
             KubeError: something is due and the API server is out of reach.
         """
         validity, now = self._validity(), self._clock()
@@ -165,7 +152,9 @@ class Identity:
         if validity is not None and authority is not None:
             validity = self._follow_authority(authority, validity)
         if validity is not None and not validity.begun(now):
-            self._find("False", "ClockSkew", f"The node's clock says {now:%F %T}, before the certificate begins.")
+            self._set_condition(
+                "False", "ClockSkew", f"The node's clock says {now:%F %T}, before the certificate begins."
+            )
             return
         if validity is not None and now < validity.renewal(self._jitter):
             self._usable(validity)
@@ -173,12 +162,14 @@ class Identity:
         if authority is None:
             authority = await self._store.authority()
         if authority is None:
-            raise Refused("NoAuthority", "ConfigMap fractus-ca in fractus-system has no ca.crt: is the operator up?")
+            raise SigningRefused(
+                "NoAuthority", "ConfigMap fractus-ca in fractus-system has no ca.crt: is the operator up?"
+            )
         if validity is not None and now < validity.not_after:
             self._usable(validity)
         await self._renew(authority)
 
-    def _wanting(self) -> bool:
+    def _needs_certificate(self) -> bool:
         validity = self._validity()
         return validity is None or self._clock() >= validity.not_after
 
@@ -194,23 +185,23 @@ class Identity:
                 try:
                     validity = inspect(self._directory, self._node)
                 except Unusable as problem:
-                    LOG.warning("the certificate in %s is of no use: %s", self._directory, problem)
+                    LOG.warning("identity: certificate unusable (directory=%s): %s", self._directory, problem)
             self._known = (stamp, validity)
         return self._known[1]
 
     def _follow_authority(self, authority: bytes, validity: Validity) -> Validity | None:
-        """Take a changed authority; None when it does not cover our certificate, which then is asked for anew."""
+        """Take a changed authority; None when it does not cover our certificate, which then is requested again."""
         current = read_set(self._directory, FILES)
         if current is None or current["ca.crt"] == authority:
             return validity
         files = {**current, "ca.crt": authority}
         try:
-            self._inspect_apart(files)
+            self._inspect_copy(files)
         except Unusable as problem:
-            LOG.warning("the new authority does not cover the node's certificate: %s", problem)
+            LOG.warning("identity: the new authority did not issue this certificate, requesting another: %s", problem)
             return None
         self._install(files)
-        LOG.info("took the changed authority")
+        LOG.info("identity: stored the changed authority")
         return self._validity()
 
     async def _renew(self, authority: bytes) -> None:
@@ -218,19 +209,19 @@ class Identity:
         name = f"fractus-{self._node}-{hashlib.sha256(request).hexdigest()[:10]}"
         await self._store.drop_certificate_requests()
         await self._store.request_certificate(name, request, LIFE_S)
-        LOG.info("asked for a certificate: signing request %s", name)
+        LOG.info("identity: certificate requested (request=%s)", name)
         certificate = await self._signed(name)
         files = {"tls.crt": certificate, "tls.key": key, "ca.crt": authority}
         try:
-            validity = self._inspect_apart(files)
+            validity = self._inspect_copy(files)
         except Unusable as problem:
-            raise Refused("Failed", f"The signed certificate is of no use: {problem}.") from problem
+            raise SigningRefused("Failed", f"The signed certificate is of no use: {problem}.") from problem
         self._install(files)
         with contextlib.suppress(KubeError):
             await self._store.drop_certificate_requests()
         now = self._clock()
         if not validity.begun(now) or now >= validity.not_after:
-            raise Refused("ClockSkew", f"The node's clock says {now:%F %T}, outside the new certificate's life.")
+            raise SigningRefused("ClockSkew", f"The node's clock says {now:%F %T}, outside the new certificate's life.")
         self._usable(validity)
 
     async def _signed(self, name: str) -> bytes:
@@ -246,18 +237,18 @@ class Identity:
             for condition in status.get("conditions") or ():
                 if condition["type"] in ("Denied", "Failed"):
                     said = condition.get("message") or condition.get("reason") or "no reason given"
-                    raise Refused(condition["type"], f"Signing request {name}: {said}")
+                    raise SigningRefused(condition["type"], f"Signing request {name}: {said}")
             if status.get("certificate"):
                 try:
                     return base64.b64decode(status["certificate"], validate=True)
                 except binascii.Error as error:
-                    raise Refused("Failed", f"Signing request {name} holds no base64: {error}") from error
-            if self._wanting():
-                self._find("False", "Requested", f"Signing request {name} waits for the operator.")
+                    raise SigningRefused("Failed", f"Signing request {name} holds no base64: {error}") from error
+            if self._needs_certificate():
+                self._set_condition("False", "Requested", f"Signing request {name} waits for the operator.")
             await asyncio.sleep(backoff.delay_s())
         raise NotYet(f"no one signed {name} in {SIGNING_TIMEOUT_S:.0f} s")
 
-    def _inspect_apart(self, files: dict[str, bytes]) -> Validity:
+    def _inspect_copy(self, files: dict[str, bytes]) -> Validity:
         trial = self._directory / f"..{uuid.uuid4().hex}"
         try:
             write_set(trial, files)
@@ -272,21 +263,21 @@ class Identity:
         self._changed()
 
     def _usable(self, validity: Validity) -> None:
-        self._find("True", "Issued", f"Valid until {validity.not_after:%F %T} UTC.")
+        self._set_condition("True", "Issued", f"Valid until {validity.not_after:%F %T} UTC.")
         self.ready.set()
 
-    def _refused(self, refusal: Refused) -> None:
+    def _refused(self, refusal: SigningRefused) -> None:
         validity = self._validity()
-        if validity is None or self._wanting():
-            self._find("False", refusal.reason, str(refusal))
+        if validity is None or self._needs_certificate():
+            self._set_condition("False", refusal.reason, str(refusal))
         else:
             until = f"Valid until {validity.not_after:%F %T} UTC"
-            self._find("True", "Issued", f"{until}, but not renewed: {refusal.reason}: {refusal}")
+            self._set_condition("True", "Issued", f"{until}, but not renewed: {refusal.reason}: {refusal}")
 
-    def _find(self, status: str, reason: str, message: str) -> None:
-        found = Finding("Certified", "True" if status == "True" else "False", reason, message)
-        if found == self.finding:
+    def _set_condition(self, status: str, reason: str, message: str) -> None:
+        found = Condition("Certified", "True" if status == "True" else "False", reason, message)
+        if found == self.condition:
             return
-        LOG.log(logging.INFO if found.holds else logging.WARNING, "certificate %s: %s", reason, message)
-        self.finding = found
+        LOG.log(logging.INFO if found.is_true else logging.WARNING, "identity: %s: %s", reason, message)
+        self.condition = found
         self._changed()

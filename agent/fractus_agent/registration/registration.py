@@ -8,45 +8,29 @@ import json
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
 
 import yaml
 from fractus_core.api.model import GROUP, InvalidObject
 from fractus_core.api.nodes import Drone, EdgeNode
 
-from fractus_agent.cluster.store import Backoff, Invalid, KubeError, Object
-from fractus_agent.conditions import Finding
+from fractus_agent.cluster.store import Invalid, KubeError, Object, Store
+from fractus_agent.conditions import Condition
+from fractus_agent.supervisor import repeat
 
 LOG = logging.getLogger(__name__)
 
 HASH_ANNOTATION = f"{GROUP}/description-hash"
 CLASS_LABEL = f"{GROUP}/class"
-LOOK_S = 10.0
-"""Seconds between looks at the description on the node."""
-RESYNC_S = 300.0
-"""Seconds between looks at the object, beside what every status write tells of it."""
+CHECK_INTERVAL_S = 10.0
+"""Seconds between checks of the description on the node."""
+RESYNC_INTERVAL_S = 300.0
+"""Seconds between reads of the object; every status write returns it too."""
 _KINDS: dict[str, type[Drone] | type[EdgeNode]] = {"Drone": Drone, "EdgeNode": EdgeNode}
 _KIND_OF_CLASS = {"drone": "Drone", "edge": "EdgeNode"}
 
 
 class InvalidDescription(Exception):
-    """The description on the node cannot be used; the message says what to mend."""
-
-
-class NodeStore(Protocol):
-    """What registration needs of the store."""
-
-    async def node_labels(self) -> dict[str, str] | None:
-        """Labels of the Kubernetes Node."""
-
-    async def described(self, kind: str) -> Object | None:
-        """The node's object."""
-
-    async def create(self, body: Object) -> Object:
-        """Create it."""
-
-    async def replace(self, body: Object) -> Object:
-        """Replace it."""
+    """The description on the node cannot be used; the message says what to fix."""
 
 
 def parse_description(text: str, node: str) -> Drone | EdgeNode:
@@ -78,51 +62,45 @@ def description_hash(described: Drone | EdgeNode) -> str:
 
 
 class Registration:
-    """Sees to it that the node has its object.
+    """Keeps the node registered.
 
     The object is written in two cases only: it is absent, or the description on the node changed since it was last
     taken over (annotation fractus.dev/description-hash). The owner's edits of an object stay.
     """
 
-    def __init__(self, store: NodeStore, path: Path, node: str, *, changed: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, store: Store, path: Path, node: str, *, changed: Callable[[], None] = lambda: None) -> None:
         self._store = store
         self._path = path
         self._node = node
         self._changed = changed
         self._stamp: object = None
-        self._again = asyncio.Event()
+        self._gone = asyncio.Event()
+        self._resync_s = 0.0
         self.body: Object | None = None
         self.resource: Drone | EdgeNode | None = None
-        self.described: Finding | None = None
+        self.described: Condition | None = None
 
     async def run(self) -> None:
-        """Keep the node registered, for ever."""
-        backoff = Backoff(0.5, 15.0)
-        loop = asyncio.get_running_loop()
-        resync_s = loop.time()
-        while True:
-            self._again.clear()
+        """Keep the node registered until cancelled."""
+        await repeat("registration", self._check, self._gone)
+
+    async def _check(self) -> float:
+        now_s = asyncio.get_running_loop().time()
+        if self._file_changed() or self.body is None or now_s >= self._resync_s:
             try:
-                if self._file_changed() or self.body is None or loop.time() >= resync_s:
-                    await self.step()
-                    resync_s = loop.time() + RESYNC_S
-                    backoff.succeeded()
-            except KubeError as error:
-                LOG.log(logging.DEBUG if backoff.attempts else logging.WARNING, "registration waits: %s", error)
-                self._stamp = None
-                await asyncio.sleep(backoff.delay_s())
-                continue
-            try:
-                await asyncio.wait_for(self._again.wait(), LOOK_S)
-            except TimeoutError:
-                continue
+                await self.step()
+            except KubeError:
+                self._stamp = None  # so that the next check registers, whatever the file says
+                raise
+            self._resync_s = now_s + RESYNC_INTERVAL_S
+        return CHECK_INTERVAL_S
 
     def seen(self, body: Object | None) -> None:
         """Take the object as a write of its status returned it; None when it is gone."""
         if body is None:
-            LOG.info("the node's object is gone")
+            LOG.warning("registration: the node's object was deleted")
             self.body = None
-            self._again.set()
+            self._gone.set()
             return
         old, self.body = self.body, body
         if old is None or old["metadata"].get("generation") != body["metadata"].get("generation"):
@@ -140,11 +118,11 @@ class Registration:
         labels = await self._store.node_labels()
         kind = _KIND_OF_CLASS.get((labels or {}).get(CLASS_LABEL, ""))
         if described is not None and kind not in (None, described.kind):
-            self._undescribed(f"kind: is {described.kind}, but the node's label {CLASS_LABEL} calls for {kind}")
+            self._set_invalid(f"kind: is {described.kind}, but the node's label {CLASS_LABEL} calls for {kind}")
             described = None
         kind = described.kind if described is not None else kind
         if kind is None:
-            LOG.debug("neither %s nor the label %s tells what this node is", self._path, CLASS_LABEL)
+            LOG.debug("registration: the node's kind is unknown (description=%s label=%s)", self._path, CLASS_LABEL)
             return
         body = await self._store.described(kind)
         if described is not None:
@@ -162,7 +140,7 @@ class Registration:
                 }
                 said = {key: value for key, value in described.to_dict().items() if key != "status"}
                 created = await self._store.create(said | {"metadata": made})
-                LOG.info("registered %s %s", described.kind, self._node)
+                LOG.info("registration: created (kind=%s node=%s)", described.kind, self._node)
                 return created
             known = body["metadata"].get("annotations", {}).get(HASH_ANNOTATION)
             if known == digest:
@@ -171,13 +149,13 @@ class Registration:
             metadata["annotations"] = metadata.get("annotations", {}) | {HASH_ANNOTATION: digest}
             changed = body | {"metadata": metadata}
             if known is not None:
-                # The description changed on the node: the newest word on the hardware.
+                # Who changes the description on the node has the hardware in front of them: it overrides the owner's edits.
                 metadata["labels"] = metadata.get("labels", {}) | described.metadata.labels
                 changed["spec"] = described.to_dict()["spec"]
-                LOG.info("took over the changed description of %s %s", described.kind, self._node)
+                LOG.info("registration: description changed (kind=%s node=%s)", described.kind, self._node)
             return await self._store.replace(changed)
         except Invalid as error:
-            self._undescribed(f"the API server refuses it: {error}")
+            self._set_invalid(f"the API server refuses it: {error}")
             self._take(body)
             raise
 
@@ -185,7 +163,7 @@ class Registration:
         self.body = body
         if body is None:
             if self.described is None:
-                LOG.debug("waiting for the owner's object of %s", self._node)
+                LOG.debug("registration: waiting for the owner's object (node=%s)", self._node)
             return
         self._read(body)
 
@@ -193,7 +171,7 @@ class Registration:
         try:
             self.resource = _KINDS[body["kind"]].from_body({k: v for k, v in body.items() if k != "status"})
         except InvalidObject as error:
-            LOG.warning("the agent cannot read the node's object: %s", error)
+            LOG.warning("registration: the node's object cannot be read: %s", error)
         self._changed()
 
     def _file_changed(self) -> bool:
@@ -212,14 +190,14 @@ class Registration:
             self.described = None
             return None
         except (OSError, UnicodeDecodeError, InvalidDescription) as error:
-            self._undescribed(str(error))
+            self._set_invalid(str(error))
             return None
         self.described = None
         return described
 
-    def _undescribed(self, problem: str) -> None:
-        found = Finding("Described", "False", "InvalidDescription", f"{self._path}: {problem}.")
+    def _set_invalid(self, problem: str) -> None:
+        found = Condition("Described", "False", "InvalidDescription", f"{self._path}: {problem}.")
         if found != self.described:
-            LOG.error("the description of this node cannot be used: %s: %s", self._path, problem)
+            LOG.error("registration: the description cannot be used (file=%s): %s", self._path, problem)
             self.described = found
             self._changed()

@@ -8,12 +8,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, Protocol, get_args
+from typing import Any, get_args
 
 from fractus_core.api.nodes import FlightState
 
-from fractus_agent.cluster.store import Backoff, KubeError, Object
-from fractus_agent.conditions import Finding, conditions, timestamp
+from fractus_agent.cluster.store import Object, Store
+from fractus_agent.conditions import Condition, timestamp, to_kubernetes
+from fractus_agent.supervisor import repeat
 from fractus_agent.telemetry.snapshot import Snapshot
 
 LOG = logging.getLogger(__name__)
@@ -21,7 +22,7 @@ LOG = logging.getLogger(__name__)
 _FLIGHT_STATES = get_args(FlightState)
 _DEGREE_M = 111_320.0
 STILL_M = 2.0
-"""Metres that a standing drone's position may wander without being worth a write."""
+"""Metres that the position of a drone on the ground wanders by GPS noise: not worth a write."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,40 +48,40 @@ class Observed:
     kind: str
     has_mobility: bool
     needs_certificate: bool
-    certified: Finding
+    certified: Condition
     snapshot: Snapshot | None = None
     problem: str | None = None
-    described: Finding | None = None
+    described: Condition | None = None
 
 
-def readiness(observed: Observed) -> Finding:
-    """Whether components can work on the node, and the first thing in the way."""
+def readiness(observed: Observed) -> Condition:
+    """Whether components can work on the node, and the first problem otherwise."""
 
-    def unready(reason: str, message: str) -> Finding:
-        return Finding("Ready", "False", reason, message)
+    def unready(reason: str, message: str) -> Condition:
+        return Condition("Ready", "False", reason, message)
 
     seen = observed.snapshot
-    if observed.needs_certificate and not observed.certified.holds:
+    if observed.needs_certificate and not observed.certified.is_true:
         return unready("NoCertificate", observed.certified.message)
     if not observed.has_mobility:
-        return Finding("Ready", "True", "AgentRunning", "The node's agent runs.")
+        return Condition("Ready", "True", "AgentRunning", "The node's agent runs.")
     if observed.problem is not None or seen is None:
         return unready("MobilityUnreachable", observed.problem or "The mobility service has not answered yet.")
     if not seen.connected:
         return unready("AutopilotDisconnected", "The mobility service has no link to the autopilot.")
     if not (seen.ready or seen.in_air):
         return unready("AutopilotNotReady", f"The autopilot would not arm now (mode {seen.mode or 'unknown'}).")
-    return Finding("Ready", "True", "AutopilotReady", "The mobility service answers and the autopilot is ready.")
+    return Condition("Ready", "True", "AutopilotReady", "The mobility service answers and the autopilot is ready.")
 
 
 def node_status(observed: Observed, previous: Object, generation: int | None, now: datetime) -> dict[str, Any]:
     """The status to write; what cannot be seen now is kept from the previous one."""
-    findings = [readiness(observed), observed.certified]
+    conditions = [readiness(observed), observed.certified]
     if observed.described is not None:
-        findings.append(observed.described)
+        conditions.append(observed.described)
     status: dict[str, Any] = {
         "lastSeen": timestamp(now),
-        "conditions": conditions(findings, previous.get("conditions") or (), generation, now),
+        "conditions": to_kubernetes(conditions, previous.get("conditions") or (), generation, now),
     }
     if observed.kind == "Drone":
         kept = {key: previous[key] for key in ("flightState", "position", "battery", "controller") if key in previous}
@@ -147,13 +148,6 @@ def _moved(old: Object, new: Object) -> bool:
     return math.hypot(north_m, east_m, (after.get("alt") or 0.0) - (before.get("alt") or 0.0)) > STILL_M
 
 
-class StatusStore(Protocol):
-    """What the reporter needs of the store."""
-
-    async def apply_status(self, kind: str, name: str, status: Object) -> Object | None:
-        """Apply a status."""
-
-
 class StatusReporter:
     """Writes the node's status when it is due.
 
@@ -168,7 +162,7 @@ class StatusReporter:
 
     def __init__(
         self,
-        store: StatusStore,
+        store: Store,
         *,
         body: Callable[[], Object | None],
         observe: Callable[[Object], Observed],
@@ -185,28 +179,15 @@ class StatusReporter:
         self._last: Object | None = None
         self._last_uid: str | None = None
         self._last_s = 0.0
-        self._news = asyncio.Event()
+        self._changed = asyncio.Event()
 
-    def poke(self) -> None:
+    def changed(self) -> None:
         """Something may have changed."""
-        self._news.set()
+        self._changed.set()
 
     async def run(self) -> None:
-        """Report, for ever."""
-        backoff = Backoff(0.5, 15.0)
-        while True:
-            self._news.clear()
-            try:
-                wait_s = await self.step()
-                backoff.succeeded()
-            except KubeError as error:
-                LOG.log(logging.DEBUG if backoff.attempts else logging.WARNING, "the status waits: %s", error)
-                await asyncio.sleep(backoff.delay_s())
-                continue
-            try:
-                await asyncio.wait_for(self._news.wait(), wait_s)
-            except TimeoutError:
-                continue
+        """Report until cancelled."""
+        await repeat("status", self.step, self._changed)
 
     async def step(self) -> float:
         """Write the status if it is due; seconds until it will be if nothing happens."""

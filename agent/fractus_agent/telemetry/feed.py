@@ -1,4 +1,4 @@
-"""What the drone is doing, from the mobility service of the node."""
+"""Follows the telemetry of the node's mobility service."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from fractus_agent.telemetry.snapshot import Snapshot
 LOG = logging.getLogger(__name__)
 
 INTERVAL_S = 1.0
-SILENCE_S = 5.0
+SILENCE_TIMEOUT_S = 5.0
 """Seconds without a message after which the service counts as unreachable."""
 
 _WIRE: dict[Reference, AltitudeReference] = exhaustive(
@@ -82,13 +82,13 @@ class TelemetryFeed:
         self.problem: str | None = "The mobility service has not answered yet."
 
     async def run(self) -> None:
-        """Stay subscribed, for ever."""
+        """Stay subscribed until cancelled."""
         backoff = Backoff(0.5, 5.0)
         while True:
             try:
                 async for message in self._messages():
                     if self.problem is not None:
-                        LOG.info("telemetry of the mobility service flows")
+                        LOG.info("telemetry: connected (mobility=%s)", self._address)
                     self.latest, self.problem = snapshot(message), None
                     backoff.succeeded()
                     self._changed()
@@ -97,7 +97,7 @@ class TelemetryFeed:
             except grpc.aio.AioRpcError as error:
                 self._lost(f"{error.code().name}: {error.details()}")
             except TimeoutError:
-                self._lost(f"silent for {SILENCE_S:.0f} s")
+                self._lost(f"silent for {SILENCE_TIMEOUT_S:.0f} s")
             except (OSError, ValueError) as error:
                 self._lost(str(error))
             await asyncio.sleep(backoff.delay_s())
@@ -114,7 +114,7 @@ class TelemetryFeed:
             call = stub.SubscribeTelemetry(SubscribeTelemetryRequest(interval_s=INTERVAL_S))
             try:
                 while self._serial() == serial:
-                    message = await asyncio.wait_for(call.read(), SILENCE_S)
+                    message = await asyncio.wait_for(call.read(), SILENCE_TIMEOUT_S)
                     if message is grpc.aio.EOF:
                         raise ConnectionResetError(f"the service ended the stream: {await call.details()}")
                     yield message
@@ -124,7 +124,7 @@ class TelemetryFeed:
     def _lost(self, why: str, *, expected: bool = False) -> None:
         problem = f"The mobility service is out of reach: {why}."
         if self.problem is None and not expected:
-            LOG.warning("%s", problem)
+            LOG.warning("telemetry: lost (mobility=%s): %s", self._address, why)
         if problem != self.problem and not expected:
             self.problem = problem
             self._changed()

@@ -1,0 +1,120 @@
+"""The parts of the agent, and how they hear of each other."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+from fractus_agent.cluster.store import Object, Store
+from fractus_agent.grants.keeper import GrantDirectory, GrantKeeper
+from fractus_agent.grants.verifier import GrantVerifier
+from fractus_agent.identity.identity import Identity
+from fractus_agent.registration.registration import Registration
+from fractus_agent.registration.status import Observed, StatusReporter
+from fractus_agent.settings import Settings
+from fractus_agent.supervisor import Supervisor
+from fractus_agent.watchdog import guard
+
+if TYPE_CHECKING:
+    from fractus_agent.telemetry.feed import TelemetryFeed
+
+
+class Agent:
+    """The agent of one node.
+
+    Args:
+        settings: of the node.
+        store: the API server.
+    """
+
+    def __init__(self, settings: Settings, store: Store) -> None:
+        self._settings = settings
+        node = settings.node
+        self._identity = Identity(store, settings.tls, node, _now, changed=self._changed)
+        self._keeper = GrantKeeper(
+            store,
+            GrantDirectory(settings.grants),
+            node,
+            GrantVerifier(settings.tls).verify,
+            refresh_authority=self._identity.refresh_authority,
+        )
+        self._certificates = 0
+        self._registration = Registration(store, settings.description, node, changed=self._changed)
+        self._mobility = asyncio.Event()
+        self._feed: TelemetryFeed | None = None
+        self._reporter = StatusReporter(
+            store,
+            body=lambda: self._registration.body,
+            observe=self._observe,
+            written=self._registration.seen,
+            wall=_now,
+            monotonic=time.monotonic,
+        )
+        self._supervisor = Supervisor()
+        self._supervisor.add("watchdog", guard)
+        self._supervisor.add("grants", self._keeper.follow)
+        self._supervisor.add("grant reports", self._keeper.report)
+        self._supervisor.add("identity", self._identity.run)
+        self._supervisor.add("registration", self._registration.run)
+        self._supervisor.add("status", self._reporter.run)
+        self._supervisor.add("telemetry", self._follow_telemetry)
+
+    async def run(self) -> None:
+        """Run all parts until cancelled.
+
+        Raises:
+            ExceptionGroup: one of them failed.
+        """
+        await self._supervisor.run()
+
+    async def _follow_telemetry(self) -> None:
+        """Follow telemetry once the node has a mobility service and a certificate."""
+        await self._mobility.wait()
+        await self._identity.ready.wait()
+        # Imported here: gRPC is a third of the memory, and only drones need it.
+        from fractus_agent.telemetry.feed import TelemetryFeed  # noqa: PLC0415
+
+        self._feed = TelemetryFeed(
+            self._settings.mobility_address,
+            self._settings.tls,
+            self._settings.node,
+            serial=lambda: self._identity.serial,
+            changed=self._telemetry_changed,
+        )
+        await self._feed.run()
+
+    def _has_mobility(self) -> bool:
+        resource = self._registration.resource
+        return resource is not None and resource.kind == "Drone" and resource.spec.services.mobility is not None
+
+    def _observe(self, body: Object) -> Observed:
+        services = (body.get("spec") or {}).get("services") or {}
+        return Observed(
+            kind=body["kind"],
+            has_mobility=self._has_mobility(),
+            needs_certificate=bool(services),
+            certified=self._identity.condition,
+            snapshot=self._feed.latest if self._feed else None,
+            problem=self._feed.problem if self._feed else None,
+            described=self._registration.described,
+        )
+
+    def _telemetry_changed(self) -> None:
+        if self._feed is not None and self._feed.latest is not None:
+            self._keeper.missions_changed(self._feed.latest.missions)
+        self._changed()
+
+    def _changed(self) -> None:
+        """Pass on what one part found out to the parts that depend on it."""
+        if self._has_mobility():
+            self._mobility.set()
+        if self._certificates != self._identity.serial:
+            self._certificates = self._identity.serial
+            self._keeper.authority_changed()
+        self._reporter.changed()
+
+
+def _now() -> datetime:
+    return datetime.now(UTC)

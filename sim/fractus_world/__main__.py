@@ -107,7 +107,7 @@ def _origin(_context: click.Context, _option: click.Parameter, text: str | None)
 )
 @click.option(
     "--crs",
-    help="System of the orthophoto's world file: EPSG:4326 (the default), a UTM zone such as EPSG:32633, or local "
+    help="System of the orthophoto's world file: EPSG:4326 (the default), a projected one such as EPSG:32633, or local "
     "(metres from --origin).",
 )
 @click.option(

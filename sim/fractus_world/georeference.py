@@ -1,24 +1,22 @@
-"""Where the pixels of a picture lie on the earth: world files and GeoTIFF tags, in degrees, UTM or metres around a place."""
+"""Where the pixels of a picture lie on the earth: world files and GeoTIFF tags, in degrees, a projected system or metres around a place."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 from fractus_core.geo import LocalFrame
 from numpy.typing import NDArray
 
 Points = NDArray[np.float64]
 
-_DEGREES = (4326, 4979, 4258, 4269)
+_WGS84 = 4326
+_DEGREES = (_WGS84, 4979, 4258, 4269)
 """Geographic systems that agree with WGS 84 to within a metre or so."""
-_A = 6_378_137.0
-_F = 1 / 298.257223563
-_UTM_SCALE = 0.9996
 _WORLD_FILES = {".png": ".pgw", ".jpg": ".jgw", ".jpeg": ".jgw", ".tif": ".tfw", ".tiff": ".tfw"}
 
 
@@ -39,46 +37,30 @@ class Degrees:
         return y, x
 
 
-@dataclass(frozen=True, slots=True)
-class Utm:
-    """Universal Transverse Mercator.
+class Projected:
+    """Eastings and northings of a projected system of the EPSG registry, such as a UTM zone, by PROJ.
 
-    Krüger's series to the third order in the flattening: millimetres within a zone (Karney, "Transverse Mercator with
-    an accuracy of a few nanometers", J. Geodesy 85, 2011).
+    Raises:
+        GeoreferenceError: There is none of that code.
     """
 
-    zone: int
-    north: bool
+    def __init__(self, code: int) -> None:
+        try:
+            crs = pyproj.CRS.from_epsg(code)
+        except pyproj.exceptions.CRSError:
+            raise GeoreferenceError(f"EPSG:{code} is no coordinate reference system that PROJ knows") from None
+        if not crs.is_projected:
+            raise GeoreferenceError(f"EPSG:{code} ({crs.name}) is not projected; convert the picture to EPSG:4326")
+        self._from_degrees = pyproj.Transformer.from_crs(_WGS84, crs, always_xy=True)
 
     def to_plane(self, lats: Points, lons: Points) -> Points:
         """Easting and northing, shape (n, 2), of degrees."""
-        n, radius, alpha, _ = _series()
-        meridian = 6 * self.zone - 183
-        away = np.radians((lons - meridian + 180.0) % 360.0 - 180.0)
-        phi = np.radians(lats)
-        root = 2 * math.sqrt(n) / (1 + n)
-        t = np.sinh(np.arctanh(np.sin(phi)) - root * np.arctanh(root * np.sin(phi)))
-        xi, eta = np.arctan2(t, np.cos(away)), np.arctanh(np.sin(away) / np.sqrt(1 + t * t))
-        east, north = eta.copy(), xi.copy()
-        for k, a in enumerate(alpha, start=1):
-            east += a * np.cos(2 * k * xi) * np.sinh(2 * k * eta)
-            north += a * np.sin(2 * k * xi) * np.cosh(2 * k * eta)
-        offset = 0.0 if self.north else 10_000_000.0
-        return np.column_stack((500_000.0 + _UTM_SCALE * radius * east, offset + _UTM_SCALE * radius * north))
+        return np.column_stack(self._from_degrees.transform(lons, lats))
 
     def to_degrees(self, x: float, y: float) -> tuple[float, float]:
         """Latitude and longitude of an easting and northing."""
-        _, radius, _, beta = _series()
-        xi = (y - (0.0 if self.north else 10_000_000.0)) / (_UTM_SCALE * radius)
-        eta = (x - 500_000.0) / (_UTM_SCALE * radius)
-        xi0, eta0 = xi, eta
-        for k, b in enumerate(beta, start=1):
-            xi0 -= b * math.sin(2 * k * xi) * math.cosh(2 * k * eta)
-            eta0 -= b * math.cos(2 * k * xi) * math.sinh(2 * k * eta)
-        away = math.atan2(math.sinh(eta0), math.cos(xi0))
-        goal = math.sin(xi0) / math.hypot(math.sinh(eta0), math.cos(xi0))
-        lat = math.atan(_latitude_tangent(goal))
-        return math.degrees(lat), (math.degrees(away) + 6 * self.zone - 183 + 180.0) % 360.0 - 180.0
+        lon, lat = self._from_degrees.transform(x, y, direction="INVERSE")
+        return lat, lon
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +78,7 @@ class Metres:
         return self.frame.latlon(x, y)
 
 
-System = Degrees | Utm | Metres
+System = Degrees | Projected | Metres
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,21 +123,12 @@ def parse_system(text: str, origin: tuple[float, float] | None) -> System:
         return Metres(LocalFrame(*origin))
     code = text.upper().removeprefix("EPSG:")
     if not code.isdigit():
-        raise GeoreferenceError(f"crs {text!r}: expected local, EPSG:4326, or a UTM zone such as EPSG:32633")
+        raise GeoreferenceError(f"crs {text!r}: expected local, EPSG:4326, or a projected system such as EPSG:32633")
     return _system_of(int(code))
 
 
 def _system_of(code: int) -> System:
-    if code in _DEGREES:
-        return Degrees()
-    for first, north in ((32600, True), (32700, False)):
-        if first < code <= first + 60:
-            return Utm(code - first, north)
-    if 25828 <= code <= 25838:
-        return Utm(code - 25800, north=True)
-    raise GeoreferenceError(
-        f"EPSG:{code} is not supported; convert the picture to EPSG:4326 or to its UTM zone, for example with gdalwarp"
-    )
+    return Degrees() if code in _DEGREES else Projected(code)
 
 
 def read_world_file(picture: Path, system: System) -> Georeference:
@@ -212,31 +185,3 @@ def _checked(affine: Points, system: System, source: str) -> Georeference:
     if isinstance(system, Degrees) and not (abs(affine[1, 2]) <= 90.5 and abs(affine[0, 2]) <= 540.0):
         raise GeoreferenceError(f"{source}: its corner is not a longitude and latitude; is its system EPSG:4326?")
     return Georeference(system, affine)
-
-
-def _series() -> tuple[float, float, tuple[float, ...], tuple[float, ...]]:
-    """Third flattening, rectifying radius, and the coefficients there and back."""
-    n = _F / (2 - _F)
-    radius = _A / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
-    alpha = (
-        n / 2 - 2 * n**2 / 3 + 5 * n**3 / 16,
-        13 * n**2 / 48 - 3 * n**3 / 5,
-        61 * n**3 / 240,
-    )
-    beta = (n / 2 - 2 * n**2 / 3 + 37 * n**3 / 96, n**2 / 48 + n**3 / 15, 17 * n**3 / 480)
-    return n, radius, alpha, beta
-
-
-def _latitude_tangent(conformal: float) -> float:
-    """The tangent of the latitude whose conformal latitude's tangent is given; Newton's method, after Karney."""
-    e = math.sqrt(_F * (2 - _F))
-    tangent = conformal
-    for _ in range(8):
-        root = math.hypot(1.0, tangent)
-        sigma = math.sinh(e * math.atanh(e * tangent / root))
-        now = tangent * math.hypot(1.0, sigma) - sigma * root
-        step = (conformal - now) / math.hypot(1.0, now) * (1 + (1 - e * e) * tangent**2) / ((1 - e * e) * root)
-        tangent += step
-        if abs(step) < 1e-14 * max(abs(tangent), 1.0):
-            break
-    return tangent

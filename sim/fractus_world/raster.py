@@ -104,7 +104,7 @@ def read_raster(path: Path, crs: str | None = None, origin: tuple[float, float] 
 
     Args:
         path: TIFF, PNG or JPEG.
-        crs: System of the world file: `local`, `EPSG:4326` (the default) or a UTM zone; a GeoTIFF says it itself.
+        crs: System of the world file: `local`, `EPSG:4326` (the default) or a projected one; a GeoTIFF says it itself.
         origin: Latitude and longitude that `local` coordinates count from.
 
     Raises:

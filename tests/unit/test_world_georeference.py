@@ -10,7 +10,7 @@ import pytest
 import tifffile
 from fractus_core.api.geometry import Point
 from fractus_core.geo import LocalFrame, geodesic_m
-from fractus_world.georeference import GeoreferenceError, Utm, parse_system, read_world_file
+from fractus_world.georeference import GeoreferenceError, Projected, parse_system, read_world_file
 from fractus_world.optics import Intrinsics, Pose
 from fractus_world.raster import NOTHING, read_raster
 from fractus_world.survey import Sheet
@@ -20,25 +20,27 @@ LENS = Intrinsics(640, 480, 60.0)
 
 
 @pytest.mark.parametrize(
-    ("zone", "north", "lat", "lon", "east", "northing"),
+    ("code", "lat", "lon", "east", "northing"),
     [
-        (33, True, 52.0, 15.0, 500_000.0, 5_761_038.2125),
-        (17, True, 43.642566, -79.387139, 630_084.303, 4_833_438.475),
-        (32, True, 0.0, 9.0, 500_000.0, 0.0),
+        (32633, 52.0, 15.0, 500_000.0, 5_761_038.2125),
+        (32617, 43.642566, -79.387139, 630_084.303, 4_833_438.475),
+        (32632, 0.0, 9.0, 500_000.0, 0.0),
+        (25833, 52.0, 15.0, 500_000.0, 5_761_038.2125),
+        (3857, 0.0, 180.0, 20_037_508.3428, 0.0),
     ],
 )
-def test_utm_knows_published_places(
-    zone: int, north: bool, lat: float, lon: float, east: float, northing: float
+def test_projected_systems_know_published_places(
+    code: int, lat: float, lon: float, east: float, northing: float
 ) -> None:
-    plane = Utm(zone, north).to_plane(np.array([lat]), np.array([lon]))
+    plane = Projected(code).to_plane(np.array([lat]), np.array([lon]))
     assert plane[0] == pytest.approx((east, northing), abs=2e-3)
 
 
 @pytest.mark.parametrize(
-    ("lat", "lon", "zone"), [(80.0, 17.0, 33), (-45.0, 179.9, 60), (-1e-9, -177.0, 1), (60.0, -179.9, 60)]
+    ("lat", "lon", "code"), [(80.0, 17.0, 32633), (-45.0, 179.9, 32760), (-1e-9, -177.0, 32701), (60.0, -179.9, 32660)]
 )
-def test_utm_there_and_back(lat: float, lon: float, zone: int) -> None:
-    system = Utm(zone, lat >= 0)
+def test_projections_there_and_back(lat: float, lon: float, code: int) -> None:
+    system = Projected(code)
     x, y = system.to_plane(np.array([lat]), np.array([lon]))[0]
     back = system.to_degrees(float(x), float(y))
     assert geodesic_m(Point(lat=back[0], lon=back[1]), Point(lat=lat, lon=lon)) < 1e-3
@@ -93,7 +95,7 @@ def test_geotiff_in_utm(tmp_path: Path) -> None:
         (34735, "H", len(keys), keys, True),
     ]
     tifffile.imwrite(tmp_path / "map.tif", picture[..., ::-1], photometric="rgb", extratags=tags)
-    system = Utm(31, north=True)
+    system = Projected(32631)
     places = [system.to_degrees(corner[0] + (c + 0.5) * size, corner[1] - (r + 0.5) * size) for c, r in marks]
     check(World.on(read_raster(tmp_path / "map.tif")), places, 200.0)
 
@@ -151,7 +153,10 @@ def test_bad_pictures_are_named(tmp_path: Path, name: str, content: str | None, 
         read_raster(tmp_path / name)
 
 
-@pytest.mark.parametrize(("crs", "message"), [("EPSG:3857", "not supported"), ("mercator", "expected local")])
+@pytest.mark.parametrize(
+    ("crs", "message"),
+    [("EPSG:999999", "no coordinate"), ("EPSG:4978", "not projected"), ("mercator", "expected local")],
+)
 def test_unknown_systems_are_named(crs: str, message: str) -> None:
     with pytest.raises(GeoreferenceError, match=message):
         parse_system(crs, None)

@@ -162,6 +162,26 @@ class MAV_BATTERY_CHARGE_STATE(IntEnum):
     CHARGING = 7
 
 
+class MAV_BATTERY_FUNCTION(IntEnum):
+    """MAV_BATTERY_FUNCTION_*."""
+
+    UNKNOWN = 0
+    ALL = 1
+    PROPULSION = 2
+    AVIONICS = 3
+    PAYLOAD = 4
+
+
+class MAV_BATTERY_TYPE(IntEnum):
+    """MAV_BATTERY_TYPE_*."""
+
+    UNKNOWN = 0
+    LIPO = 1
+    LIFE = 2
+    LION = 3
+    NIMH = 4
+
+
 class MAV_CMD(IntEnum):
     """MAV_CMD_*."""
 

@@ -6,7 +6,16 @@ import math
 from collections.abc import Callable
 
 from fractus_mavlink import Message, layout_of
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_FRAME, MAV_MODE_FLAG, MAV_RESULT, MAV_SEVERITY
+from fractus_mavlink.enums import (
+    COPTER_MODE,
+    MAV_CMD,
+    MAV_DO_REPOSITION_FLAGS,
+    MAV_FRAME,
+    MAV_MODE_FLAG,
+    MAV_RESULT,
+    MAV_SEVERITY,
+    REBOOT_SHUTDOWN_ACTION,
+)
 
 from fractus_vehicle.auto import AutoFlight
 from fractus_vehicle.channel import Channel
@@ -111,7 +120,7 @@ def _change_speed(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
 
 def _reposition(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
     v = vehicle.state
-    switch = bool(int(o.params[1]) & 1) if math.isfinite(o.params[1]) else False
+    switch = bool(int(o.params[1]) & MAV_DO_REPOSITION_FLAGS.CHANGE_MODE) if math.isfinite(o.params[1]) else False
     if not v.armed or (v.mode is not COPTER_MODE.GUIDED and not switch):
         return MAV_RESULT.DENIED
     placed = o.has_place and valid_coordinates(o.x, o.y) and math.isfinite(o.z)
@@ -282,7 +291,7 @@ def _reboot(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
     v = vehicle.state
     if v.armed:
         return MAV_RESULT.FAILED
-    if o.params[0] not in (1.0, 3.0):
+    if o.params[0] not in (REBOOT_SHUTDOWN_ACTION.REBOOT, REBOOT_SHUTDOWN_ACTION.REBOOT_TO_BOOTLOADER):
         return MAV_RESULT.UNSUPPORTED
     vehicle.reboot_wanted = True
     return MAV_RESULT.ACCEPTED

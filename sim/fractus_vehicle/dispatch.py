@@ -6,7 +6,14 @@ import math
 from collections.abc import Callable
 
 from fractus_mavlink import Message, Signing
-from fractus_mavlink.enums import MAV_MISSION_RESULT, MAV_MISSION_TYPE, MAV_SEVERITY
+from fractus_mavlink.enums import (
+    MAV_DATA_STREAM,
+    MAV_FTP_ERR,
+    MAV_FTP_OPCODE,
+    MAV_MISSION_RESULT,
+    MAV_MISSION_TYPE,
+    MAV_SEVERITY,
+)
 
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.commands import handle_command, set_current, set_mode_number
@@ -17,9 +24,6 @@ from fractus_vehicle.streams import ALL_GROUPS, GROUPS
 from fractus_vehicle.targets import attitude_target, global_target, guided_item, local_target
 from fractus_vehicle.telemetry import send, send_parameter
 from fractus_vehicle.vehicle import Vehicle
-
-_FTP_NAK = 129
-_FTP_UNKNOWN = 7
 
 Handler = Callable[[Vehicle, Message, Channel], None]
 
@@ -64,7 +68,7 @@ def _set_mode(vehicle: Vehicle, m: Message, _c: Channel) -> None:
 def _request_stream(vehicle: Vehicle, m: Message, c: Channel) -> None:
     group = m.integer("req_stream_id")
     rate = m.integer("req_message_rate") if m.integer("start_stop") else 0
-    for number in ALL_GROUPS if group == 0 else (group,):
+    for number in ALL_GROUPS if group == MAV_DATA_STREAM.ALL else (group,):
         for name in GROUPS.get(number, ("", ()))[1]:
             c.set_interval(name, 1.0 / min(rate, 100) if rate > 0 else None)
 
@@ -117,7 +121,7 @@ def _file_transfer(_vehicle: Vehicle, m: Message, c: Channel) -> None:
     request = bytes(int(value) for value in m.array("payload"))
     sequence = (int.from_bytes(request[:2], "little") + 1) & 0xFFFF
     answer = sequence.to_bytes(2, "little") + bytes(
-        (request[2], _FTP_NAK, 1, request[3], 0, 0, 0, 0, 0, 0, _FTP_UNKNOWN)
+        (request[2], MAV_FTP_OPCODE.NAK, 1, request[3], 0, 0, 0, 0, 0, 0, MAV_FTP_ERR.UNKNOWNCOMMAND)
     )
     c.send(
         "FILE_TRANSFER_PROTOCOL",

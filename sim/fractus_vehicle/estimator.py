@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 
-from fractus_mavlink.enums import MAV_SEVERITY
+from fractus_mavlink.enums import EKF_STATUS_FLAGS, GPS_FIX_TYPE, MAV_SEVERITY
 
 from fractus_vehicle.body import Body, euler_of
 from fractus_vehicle.control import Estimate
@@ -28,10 +28,23 @@ ANNOUNCEMENTS = (
     (ORIGIN_SET, "EKF3 IMU0 origin set"),
 )
 
-_FLAGS_READY = 831  # all estimates, and predicted positions
-_FLAGS_NO_POSITION = 167  # attitude and altitude, constant position
-_FLAGS_STARTING = 165
-_FLAGS_UNINITIALISED = 1024
+_FLAGS_STARTING = (
+    EKF_STATUS_FLAGS.ATTITUDE
+    | EKF_STATUS_FLAGS.VELOCITY_VERT
+    | EKF_STATUS_FLAGS.POS_VERT_ABS
+    | EKF_STATUS_FLAGS.CONST_POS_MODE
+)
+_FLAGS_NO_POSITION = _FLAGS_STARTING | EKF_STATUS_FLAGS.VELOCITY_HORIZ
+_FLAGS_READY = (
+    EKF_STATUS_FLAGS.ATTITUDE
+    | EKF_STATUS_FLAGS.VELOCITY_HORIZ
+    | EKF_STATUS_FLAGS.VELOCITY_VERT
+    | EKF_STATUS_FLAGS.POS_HORIZ_REL
+    | EKF_STATUS_FLAGS.POS_HORIZ_ABS
+    | EKF_STATUS_FLAGS.POS_VERT_ABS
+    | EKF_STATUS_FLAGS.PRED_POS_HORIZ_REL
+    | EKF_STATUS_FLAGS.PRED_POS_HORIZ_ABS
+)
 
 
 def _tilted(q: tuple[float, float, float, float], tilt: list[float]) -> tuple[float, float, float, float]:
@@ -76,13 +89,13 @@ class Estimator:
         return self._time_s >= 0.5 * self._ready_after_s
 
     @property
-    def flags(self) -> int:
-        """EKF_STATUS_FLAGS."""
+    def flags(self) -> EKF_STATUS_FLAGS:
+        """What EKF_STATUS_REPORT says of the filter."""
         if self.position_ok:
             return _FLAGS_READY
         if self.origin is not None:
             return _FLAGS_NO_POSITION
-        return _FLAGS_UNINITIALISED if self._time_s < 0.1 * self._ready_after_s else _FLAGS_STARTING
+        return EKF_STATUS_FLAGS.UNINITIALIZED if self._time_s < 0.1 * self._ready_after_s else _FLAGS_STARTING
 
     def estimate(self, body: Body) -> Estimate:
         """The estimate of the moment."""
@@ -119,7 +132,7 @@ class Estimator:
                 satellites=int(self._params["SIM_GPS1_NUMSATS"]),
                 rng=self._rng,
             )
-            if self.gps.fix_type >= 3:
+            if self.gps.fix_type >= GPS_FIX_TYPE.TYPE_3D_FIX:
                 self._fix_s = time_s
         elif time_s >= 0.05 * self._ready_after_s:
             self.gps.lose()
@@ -133,7 +146,11 @@ class Estimator:
     def _judge(self, time_s: float) -> None:
         age_s = time_s - self._fix_s
         self._drift.step(GPS_INTERVAL_S, aided=self.origin is None or age_s <= 2.0 * GPS_INTERVAL_S)
-        if self.origin is None and self.gps.fix_type >= 3 and time_s >= ORIGIN_SET * self._ready_after_s:
+        if (
+            self.origin is None
+            and self.gps.fix_type >= GPS_FIX_TYPE.TYPE_3D_FIX
+            and time_s >= ORIGIN_SET * self._ready_after_s
+        ):
             self.origin = self._start
         self.ready = time_s >= self._ready_after_s
         ok = self.origin is not None and self.ready and age_s < GPS_TIMEOUT_S

@@ -9,7 +9,7 @@ from fractus_mavlink.enums import COPTER_MODE, MAV_SEVERITY
 
 from fractus_vehicle.copter import mode_title
 from fractus_vehicle.failsafe_actions import FENCE_ACTIONS, GCS_ACTIONS, RADIO_ACTIONS, Action, act
-from fractus_vehicle.fence import Breach, breach_names
+from fractus_vehicle.fence import NO_BREACH, breach_names
 from fractus_vehicle.modes import FlightModes
 from fractus_vehicle.state import VehicleState
 
@@ -231,10 +231,10 @@ class Failsafes:
 
     def _check_fence(self, v: VehicleState) -> None:
         if not v.fence.enabled or v.home is None or v.origin is None:
-            v.fence.breaches = Breach.NONE
+            v.fence.breaches = NO_BREACH
             return
         if not v.armed or v.landed:
-            v.fence.breaches = Breach.NONE
+            v.fence.breaches = NO_BREACH
             return
         new = v.fence.check(v.est.north, v.est.east, v.altitude_m, v.home_xy, v.time_s)
         if not new:

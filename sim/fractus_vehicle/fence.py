@@ -5,22 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntFlag
 
-from fractus_mavlink.enums import MAV_CMD
+from fractus_mavlink.enums import FENCE_BREACH, FENCE_TYPE, MAV_CMD
 
-
-class Breach(IntFlag):
-    """FENCE_TYPE bits."""
-
-    NONE = 0
-    ALT_MAX = 1
-    CIRCLE = 2
-    POLYGON = 4
-    ALT_MIN = 8
-
-
-NAMES = {Breach.ALT_MAX: "Max Alt", Breach.CIRCLE: "Circle", Breach.POLYGON: "Polygon", Breach.ALT_MIN: "Min Alt"}
+NO_BREACH = FENCE_TYPE(0)
+NAMES = {
+    FENCE_TYPE.ALT_MAX: "Max Alt",
+    FENCE_TYPE.CIRCLE: "Circle",
+    FENCE_TYPE.POLYGON: "Polygon",
+    FENCE_TYPE.ALT_MIN: "Min Alt",
+}
 
 Vertex = tuple[float, float]
 
@@ -137,46 +131,46 @@ class Fence:
     alt_min_m: float = -10.0
     radius_m: float = 300.0
     shapes: tuple[Shape, ...] = ()
-    breaches: Breach = Breach.NONE
+    breaches: FENCE_TYPE = NO_BREACH
     breach_count: int = 0
     breach_time_s: float = 0.0
 
     @property
     def present(self) -> bool:
         """Whether there is anything to enable: a limit, or a shape."""
-        return bool(self.types & ~Breach.POLYGON) or (bool(self.types & Breach.POLYGON) and bool(self.shapes))
+        return bool(self.types & ~FENCE_TYPE.POLYGON) or (bool(self.types & FENCE_TYPE.POLYGON) and bool(self.shapes))
 
-    def outside(self, north: float, east: float, altitude_m: float, home: Vertex = (0.0, 0.0)) -> Breach:
+    def outside(self, north: float, east: float, altitude_m: float, home: Vertex = (0.0, 0.0)) -> FENCE_TYPE:
         """What a point (local metres, altitude above home) would breach if the fence is enabled."""
-        found = Breach.NONE
+        found = NO_BREACH
         if not self.enabled:
             return found
-        if self.types & Breach.ALT_MAX and altitude_m >= self.alt_max_m:
-            found |= Breach.ALT_MAX
-        if self.types & Breach.ALT_MIN and altitude_m <= self.alt_min_m:
-            found |= Breach.ALT_MIN
-        if self.types & Breach.CIRCLE and math.hypot(north - home[0], east - home[1]) >= self.radius_m:
-            found |= Breach.CIRCLE
-        if self.types & Breach.POLYGON and any(s.contains(north, east) != s.inclusion for s in self.shapes):
-            found |= Breach.POLYGON
+        if self.types & FENCE_TYPE.ALT_MAX and altitude_m >= self.alt_max_m:
+            found |= FENCE_TYPE.ALT_MAX
+        if self.types & FENCE_TYPE.ALT_MIN and altitude_m <= self.alt_min_m:
+            found |= FENCE_TYPE.ALT_MIN
+        if self.types & FENCE_TYPE.CIRCLE and math.hypot(north - home[0], east - home[1]) >= self.radius_m:
+            found |= FENCE_TYPE.CIRCLE
+        if self.types & FENCE_TYPE.POLYGON and any(s.contains(north, east) != s.inclusion for s in self.shapes):
+            found |= FENCE_TYPE.POLYGON
         return found
 
     def distance_m(self, north: float, east: float, altitude_m: float, home: Vertex = (0.0, 0.0)) -> float:
         """How far a point lies beyond the limits that it breaches, at least; 0 inside."""
         found = self.outside(north, east, altitude_m, home)
         beyond = [0.0]
-        if Breach.ALT_MAX in found:
+        if FENCE_TYPE.ALT_MAX in found:
             beyond.append(altitude_m - self.alt_max_m)
-        if Breach.ALT_MIN in found:
+        if FENCE_TYPE.ALT_MIN in found:
             beyond.append(self.alt_min_m - altitude_m)
-        if Breach.CIRCLE in found:
+        if FENCE_TYPE.CIRCLE in found:
             beyond.append(math.hypot(north - home[0], east - home[1]) - self.radius_m)
-        if Breach.POLYGON in found:
+        if FENCE_TYPE.POLYGON in found:
             wrong = [shape for shape in self.shapes if shape.contains(north, east) != shape.inclusion]
             beyond += [shape.edge_distance_m(north, east) for shape in wrong]
         return max(beyond)
 
-    def check(self, north: float, east: float, altitude_m: float, home: Vertex, now_s: float) -> Breach:
+    def check(self, north: float, east: float, altitude_m: float, home: Vertex, now_s: float) -> FENCE_TYPE:
         """Update the breaches and return the new ones."""
         found = self.outside(north, east, altitude_m, home)
         new = found & ~self.breaches
@@ -187,16 +181,16 @@ class Fence:
         return new
 
     @property
-    def breach_type(self) -> int:
-        """FENCE_BREACH for FENCE_STATUS."""
-        if self.breaches & Breach.ALT_MIN:
-            return 1
-        if self.breaches & Breach.ALT_MAX:
-            return 2
-        return 3 if self.breaches else 0
+    def breach_type(self) -> FENCE_BREACH:
+        """What FENCE_STATUS says of the breaches."""
+        if self.breaches & FENCE_TYPE.ALT_MIN:
+            return FENCE_BREACH.MINALT
+        if self.breaches & FENCE_TYPE.ALT_MAX:
+            return FENCE_BREACH.MAXALT
+        return FENCE_BREACH.BOUNDARY if self.breaches else FENCE_BREACH.NONE
 
 
-def breach_names(breaches: Breach) -> str:
+def breach_names(breaches: FENCE_TYPE) -> str:
     """The breaches as ArduPilot writes them: `Max Alt and Circle fences`."""
     names = [name for bit, name in NAMES.items() if breaches & bit]
     if len(names) <= 1:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_FRAME, MAV_MISSION_TYPE
+from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_FRAME, MAV_MISSION_TYPE, MISSION_STATE
 
 from fractus_vehicle.earth import Place
 from fractus_vehicle.mission_items import Item, ItemStore, home_item
@@ -17,13 +17,13 @@ class Mission:
         self.complete = False
         self._jumps: dict[int, int] = {}
 
-    def state(self, mode: COPTER_MODE) -> int:
+    def state(self, mode: COPTER_MODE) -> MISSION_STATE:
         """MISSION_STATE of MISSION_CURRENT."""
         if len(self.items) <= 1:
-            return 1
+            return MISSION_STATE.NO_MISSION
         if self.complete:
-            return 5
-        return 3 if mode is COPTER_MODE.AUTO else 2
+            return MISSION_STATE.COMPLETE
+        return MISSION_STATE.ACTIVE if mode is COPTER_MODE.AUTO else MISSION_STATE.NOT_STARTED
 
     @property
     def items(self) -> list[Item]:

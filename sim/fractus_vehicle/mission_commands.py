@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from fractus_mavlink.enums import MAV_CMD, MAV_SEVERITY
+from fractus_mavlink.enums import FENCE_TYPE, MAV_CMD, MAV_SEVERITY
 
-from fractus_vehicle.fence import Breach
 from fractus_vehicle.home import set_home_at, set_home_here
 from fractus_vehicle.mission_items import Item
 from fractus_vehicle.shaping import wrap_pi
@@ -83,7 +82,7 @@ def _do(v: VehicleState, item: Item) -> None:
 def switch_fence(v: VehicleState, action: float) -> bool:
     """DO_FENCE_ENABLE: 0 off, 1 on, 2 only the floor off; False when there is nothing to switch on, or no such action."""
     if action == 2.0:
-        v.fence.types &= ~Breach.ALT_MIN
+        v.fence.types &= ~FENCE_TYPE.ALT_MIN
         return True
     if action not in (0.0, 1.0) or (action == 1.0 and not v.fence.present):
         return False

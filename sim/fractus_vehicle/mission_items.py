@@ -78,7 +78,7 @@ class Item:
     @property
     def navigates(self) -> bool:
         """Whether this is a NAV command: one with a position, which a mission waits for."""
-        return 0 < self.command < 95 or self.command >= MAV_CMD.NAV_FENCE_RETURN_POINT
+        return MAV_CMD.NAV_WAYPOINT <= self.command < MAV_CMD.NAV_LAST or self.command >= MAV_CMD.NAV_FENCE_RETURN_POINT
 
 
 def home_item(home: Place) -> Item:

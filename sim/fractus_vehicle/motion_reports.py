@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
-from fractus_mavlink.enums import COPTER_MODE
+from fractus_mavlink.enums import COPTER_MODE, MAV_FRAME
 
 from fractus_vehicle.control import Axis
+from fractus_vehicle.copter import POSITION_ONLY, VELOCITY_ONLY
 from fractus_vehicle.report_units import UNKNOWN_U16, Values, boot_ms, boot_us, centi
 from fractus_vehicle.state import VehicleState
 
@@ -82,7 +83,7 @@ def attitude_target(v: VehicleState) -> Values:
         cr * sp * cy + sr * cp * sy,
         cr * cp * sy - sr * sp * cy,
     )
-    return {"time_boot_ms": boot_ms(v), "type_mask": 0, "q": q, "thrust": v.control.thrust_share}
+    return {"time_boot_ms": boot_ms(v), "q": q, "thrust": v.control.thrust_share}
 
 
 def vfr_hud(v: VehicleState) -> Values:
@@ -128,8 +129,8 @@ def position_target_global_int(v: VehicleState) -> Values | None:
     moving = c.horizontal is Axis.VELOCITY
     return {
         "time_boot_ms": boot_ms(v),
-        "coordinate_frame": 5,
-        "type_mask": 0xDC7 if moving else 0xDF8,
+        "coordinate_frame": MAV_FRAME.GLOBAL_INT,
+        "type_mask": VELOCITY_ONLY if moving else POSITION_ONLY,
         "lat_int": 0 if moving else place.lat_e7,
         "lon_int": 0 if moving else place.lon_e7,
         "alt": 0.0 if moving else place.alt_m,
@@ -147,8 +148,8 @@ def position_target_local_ned(v: VehicleState) -> Values | None:
     moving = c.horizontal is Axis.VELOCITY
     return {
         "time_boot_ms": boot_ms(v),
-        "coordinate_frame": 1,
-        "type_mask": 0xDC7 if moving else 0xDF8,
+        "coordinate_frame": MAV_FRAME.LOCAL_NED,
+        "type_mask": VELOCITY_ONLY if moving else POSITION_ONLY,
         "x": 0.0 if moving else c.target[0],
         "y": 0.0 if moving else c.target[1],
         "z": 0.0 if moving else c.target_down,

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
-TYPES = {"INT8": 2, "INT16": 4, "INT32": 6, "REAL32": 9}
+from fractus_mavlink.enums import MAV_PARAM_TYPE
+
 RANGES = {
     "INT8": (-128.0, 127.0),
     "INT16": (-32768.0, 32767.0),
@@ -31,9 +32,9 @@ class Parameter:
     kind: str
 
     @property
-    def wire_type(self) -> int:
-        """MAV_PARAM_TYPE."""
-        return TYPES[self.kind]
+    def wire_type(self) -> MAV_PARAM_TYPE:
+        """What PARAM_VALUE says of its type."""
+        return MAV_PARAM_TYPE[self.kind]
 
     def coerce(self, value: float) -> float:
         """The value as this type stores it; the nearest one where it does not fit.

@@ -5,8 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from fractus_mavlink import Endpoint, Message, Value
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_MODE_FLAG, MAV_RESULT
+from fractus_mavlink.enums import (
+    COPTER_MODE,
+    MAV_AUTOPILOT,
+    MAV_CMD,
+    MAV_COMPONENT,
+    MAV_FRAME,
+    MAV_MODE_FLAG,
+    MAV_PARAM_TYPE,
+    MAV_RESULT,
+    MAV_TYPE,
+)
 
+from fractus_vehicle.copter import POSITION_ONLY
 from fractus_vehicle.readiness import arming_refusal
 from fractus_vehicle.simulation import Craft, Simulation
 
@@ -20,7 +31,9 @@ class PilotTimeoutError(TimeoutError):
 class Pilot:
     """One link to one vehicle; every wait advances the whole simulation."""
 
-    def __init__(self, simulation: Simulation, craft: Craft, sysid: int = 255, compid: int = 190) -> None:
+    def __init__(
+        self, simulation: Simulation, craft: Craft, sysid: int = 255, compid: int = MAV_COMPONENT.MISSIONPLANNER
+    ) -> None:
         self.simulation = simulation
         self.craft = craft
         self.channel = craft.open("pilot")
@@ -47,7 +60,7 @@ class Pilot:
         """Advance by one control step and read; beats the heart once a second."""
         if self.heartbeats and self.simulation.time_s >= self._next_heartbeat_s:
             self._next_heartbeat_s = self.simulation.time_s + HEARTBEAT_INTERVAL_S
-            self.send("HEARTBEAT", {"type": 6, "autopilot": 8, "mavlink_version": 3})
+            self.send("HEARTBEAT", {"type": MAV_TYPE.GCS, "autopilot": MAV_AUTOPILOT.INVALID, "mavlink_version": 3})
         self.simulation.step()
         return self.read()
 
@@ -110,7 +123,7 @@ class Pilot:
                 "target_component": 1,
                 "param_id": name.encode("ascii"),
                 "param_value": value,
-                "param_type": 9,
+                "param_type": MAV_PARAM_TYPE.REAL32,
             },
         )
         return self.expect("PARAM_VALUE").real("param_value")
@@ -138,8 +151,8 @@ class Pilot:
             {
                 "target_system": self.craft.config.sysid,
                 "target_component": 1,
-                "coordinate_frame": 1,
-                "type_mask": 0xDF8,
+                "coordinate_frame": MAV_FRAME.LOCAL_NED,
+                "type_mask": POSITION_ONLY,
                 "x": north_m,
                 "y": east_m,
                 "z": -altitude_m,

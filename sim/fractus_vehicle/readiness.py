@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fractus_mavlink.enums import COPTER_MODE
+from fractus_mavlink.enums import COPTER_MODE, GPS_FIX_TYPE
 
 from fractus_vehicle.state import VehicleState
 
@@ -16,7 +16,7 @@ def arming_refusal(v: VehicleState) -> str | None:
     needs_position = v.mode not in WITHOUT_POSITION
     checks = (
         (not v.estimator.healthy, "AHRS: EKF3 not healthy"),
-        (needs_position and v.gps.fix_type < 3, "GPS 1: Bad fix"),
+        (needs_position and v.gps.fix_type < GPS_FIX_TYPE.TYPE_3D_FIX, "GPS 1: Bad fix"),
         (not v.position_ok and (needs_position or v.fence.enabled), "Need Position Estimate"),
         (not v.estimator.ready, "AHRS: waiting for home"),
         (0.0 < volts < params["BATT_ARM_VOLT"], "Battery 1 below minimum arming voltage"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from fractus_mavlink import Value
+from fractus_mavlink.enums import GPS_FIX_TYPE, MAV_BATTERY_CHARGE_STATE, MAV_BATTERY_FUNCTION, MAV_BATTERY_TYPE
 
 from fractus_vehicle import noise
 from fractus_vehicle.body import GRAVITY
@@ -18,7 +19,7 @@ _BARO_AXIS = 16
 def gps_raw_int(v: VehicleState) -> Values:
     """GPS_RAW_INT: the receiver's own fix, with its noise."""
     g = v.gps
-    if g.fix_type < 2 or g.place is None:
+    if g.fix_type < GPS_FIX_TYPE.TYPE_2D_FIX or g.place is None:
         return {
             "time_usec": boot_us(v),
             "fix_type": g.fix_type,
@@ -145,8 +146,8 @@ def battery_status(v: VehicleState) -> Values:
     cells = (round(v.battery.voltage_v * 1000.0),) + (UNKNOWN_U16,) * 9
     return {
         "id": 0,
-        "battery_function": 0,
-        "type": 0,
+        "battery_function": MAV_BATTERY_FUNCTION.UNKNOWN,
+        "type": MAV_BATTERY_TYPE.UNKNOWN,
         "temperature": 32767,
         "voltages": cells,
         "current_battery": int(clamp(round(v.battery.current_a * 100.0), -1, 32767)),
@@ -154,8 +155,14 @@ def battery_status(v: VehicleState) -> Values:
         "energy_consumed": round(v.battery.used_j / 100.0),
         "battery_remaining": v.battery.percent,
         "time_remaining": 0,
-        "charge_state": 3 if v.failsafes.battery_critical else 2 if v.failsafes.battery else 1,
+        "charge_state": _charge_state(v),
     }
+
+
+def _charge_state(v: VehicleState) -> MAV_BATTERY_CHARGE_STATE:
+    if v.failsafes.battery_critical:
+        return MAV_BATTERY_CHARGE_STATE.CRITICAL
+    return MAV_BATTERY_CHARGE_STATE.LOW if v.failsafes.battery else MAV_BATTERY_CHARGE_STATE.OK
 
 
 def ekf_status_report(v: VehicleState) -> Values:

@@ -7,6 +7,8 @@ import math
 import random
 from dataclasses import dataclass
 
+from fractus_mavlink.enums import GPS_FIX_TYPE
+
 from fractus_vehicle.earth import Place
 from fractus_vehicle.shaping import clamp
 
@@ -75,7 +77,7 @@ class Battery:
 class Gps:
     """The receiver: when it has a fix, where it believes to be."""
 
-    fix_type: int = 0
+    fix_type: GPS_FIX_TYPE = GPS_FIX_TYPE.NO_GPS
     satellites: int = 0
     place: Place | None = None
     vn: float = 0.0
@@ -90,11 +92,14 @@ class Gps:
         self.place = truth
         self.vn, self.ve = velocity
         self.satellites = satellites
-        self.fix_type = 6 if satellites >= 10 else 3 if satellites >= 6 else 1
+        if satellites >= 10:
+            self.fix_type = GPS_FIX_TYPE.RTK_FIXED
+        else:
+            self.fix_type = GPS_FIX_TYPE.TYPE_3D_FIX if satellites >= 6 else GPS_FIX_TYPE.NO_FIX
 
     def lose(self) -> None:
         """Lose the fix."""
-        self.fix_type = 1
+        self.fix_type = GPS_FIX_TYPE.NO_FIX
         self.satellites = 0
 
 

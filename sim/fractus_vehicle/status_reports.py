@@ -2,7 +2,16 @@
 
 from __future__ import annotations
 
-from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_MODE_FLAG, MAV_STATE, MAV_TYPE
+from fractus_mavlink.enums import (
+    COPTER_MODE,
+    GPS_FIX_TYPE,
+    MAV_AUTOPILOT,
+    MAV_MODE_FLAG,
+    MAV_STATE,
+    MAV_SYS_STATUS_SENSOR,
+    MAV_TYPE,
+    MAV_VTOL_STATE,
+)
 
 from fractus_vehicle.copter import CAPABILITIES, FLIGHT_VERSION
 from fractus_vehicle.readiness import arming_refusal
@@ -10,14 +19,26 @@ from fractus_vehicle.report_units import UNKNOWN_U16, Values, boot_ms
 from fractus_vehicle.shaping import clamp
 from fractus_vehicle.state import VehicleState
 
-_PREARM_CHECK = 0x10000000
-_SENSORS_PRESENT = 0x5320FC2F  # gyro, accel, mag, baro, GPS, controllers, motors, AHRS, logging, battery, pre-arm
-_SENSOR_GPS = 0x20
-_SENSOR_AHRS = 0x200000
-_SENSOR_BATTERY = 0x2000000
-_SENSOR_FENCE = 0x100000
-_MOTOR_OUTPUTS = 0x8000
-_POSITION_CONTROLS = 0x6000
+_SENSOR = MAV_SYS_STATUS_SENSOR
+_POSITION_CONTROLS = _SENSOR.SENSOR_Z_ALTITUDE_CONTROL | _SENSOR.SENSOR_XY_POSITION_CONTROL
+_PRESENT = (
+    _SENSOR.SENSOR_3D_GYRO
+    | _SENSOR.SENSOR_3D_ACCEL
+    | _SENSOR.SENSOR_3D_MAG
+    | _SENSOR.SENSOR_ABSOLUTE_PRESSURE
+    | _SENSOR.SENSOR_GPS
+    | _SENSOR.SENSOR_ANGULAR_RATE_CONTROL
+    | _SENSOR.SENSOR_ATTITUDE_STABILIZATION
+    | _SENSOR.SENSOR_YAW_POSITION
+    | _POSITION_CONTROLS
+    | _SENSOR.SENSOR_MOTOR_OUTPUTS
+    | _SENSOR.AHRS
+    | _SENSOR.LOGGING
+    | _SENSOR.SENSOR_BATTERY
+    | _SENSOR.PREARM_CHECK
+    | _SENSOR.SENSOR_PROPULSION
+)
+_ENABLED_ON_GROUND = _PRESENT & ~(_SENSOR.SENSOR_MOTOR_OUTPUTS | _POSITION_CONTROLS)
 
 
 def heartbeat(v: VehicleState) -> Values:
@@ -47,27 +68,27 @@ def heartbeat(v: VehicleState) -> Values:
 
 def sys_status(v: VehicleState) -> Values:
     """SYS_STATUS with the health bits that clients look at."""
-    enabled = _SENSORS_PRESENT & ~(_SENSOR_FENCE | _MOTOR_OUTPUTS | _POSITION_CONTROLS)
+    enabled = _ENABLED_ON_GROUND
     if v.armed:
-        enabled |= _MOTOR_OUTPUTS
+        enabled |= _SENSOR.SENSOR_MOTOR_OUTPUTS
     if v.mode not in (COPTER_MODE.STABILIZE, COPTER_MODE.ALT_HOLD):
         enabled |= _POSITION_CONTROLS
-    present = _SENSORS_PRESENT
+    present = _PRESENT
     if v.fence.enabled:
-        enabled |= _SENSOR_FENCE
+        enabled |= _SENSOR.GEOFENCE
     if v.fence.enabled or v.fence.shapes:
-        present |= _SENSOR_FENCE
-    healthy = _SENSORS_PRESENT | _SENSOR_FENCE
-    if v.gps.fix_type < 3:
-        healthy &= ~_SENSOR_GPS
+        present |= _SENSOR.GEOFENCE
+    healthy = _PRESENT | _SENSOR.GEOFENCE
+    if v.gps.fix_type < GPS_FIX_TYPE.TYPE_3D_FIX:
+        healthy &= ~_SENSOR.SENSOR_GPS
     if not v.position_ok:
-        healthy &= ~_SENSOR_AHRS
+        healthy &= ~_SENSOR.AHRS
     if v.failsafes.battery:
-        healthy &= ~_SENSOR_BATTERY
+        healthy &= ~_SENSOR.SENSOR_BATTERY
     if v.fence.breaches:
-        healthy &= ~_SENSOR_FENCE
+        healthy &= ~_SENSOR.GEOFENCE
     if arming_refusal(v) is not None:
-        healthy &= ~_PREARM_CHECK
+        healthy &= ~_SENSOR.PREARM_CHECK
     return {
         "onboard_control_sensors_present": present,
         "onboard_control_sensors_enabled": enabled,
@@ -83,7 +104,7 @@ def sys_status(v: VehicleState) -> Values:
 
 def extended_sys_state(v: VehicleState) -> Values:
     """EXTENDED_SYS_STATE."""
-    return {"vtol_state": 0, "landed_state": int(v.landed_state)}
+    return {"vtol_state": MAV_VTOL_STATE.UNDEFINED, "landed_state": int(v.landed_state)}
 
 
 def autopilot_version(v: VehicleState) -> Values:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from fractus_mavlink.enums import MAV_DATA_STREAM
+
 from fractus_vehicle import motion_reports, sensor_reports, status_reports
 from fractus_vehicle.report_units import Builder
 
@@ -46,8 +48,8 @@ BUILDERS: dict[str, Builder] = {
 
 # MAV_DATA_STREAM groups as ArduCopter fills them; the second column names the SRn_ parameter.
 GROUPS: dict[int, tuple[str, tuple[str, ...]]] = {
-    1: ("RAW_SENS", ("RAW_IMU", "SCALED_IMU2", "SCALED_PRESSURE")),
-    2: (
+    MAV_DATA_STREAM.RAW_SENSORS: ("RAW_SENS", ("RAW_IMU", "SCALED_IMU2", "SCALED_PRESSURE")),
+    MAV_DATA_STREAM.EXTENDED_STATUS: (
         "EXT_STAT",
         (
             "SYS_STATUS",
@@ -60,12 +62,12 @@ GROUPS: dict[int, tuple[str, tuple[str, ...]]] = {
             "POSITION_TARGET_GLOBAL_INT",
         ),
     ),
-    3: ("RC_CHAN", ("SERVO_OUTPUT_RAW", "RC_CHANNELS")),
-    4: ("RAW_CTRL", ()),
-    6: ("POSITION", ("GLOBAL_POSITION_INT", "LOCAL_POSITION_NED")),
-    10: ("EXTRA1", ("ATTITUDE", "SIMSTATE", "AHRS2")),
-    11: ("EXTRA2", ("VFR_HUD",)),
-    12: (
+    MAV_DATA_STREAM.RC_CHANNELS: ("RC_CHAN", ("SERVO_OUTPUT_RAW", "RC_CHANNELS")),
+    MAV_DATA_STREAM.RAW_CONTROLLER: ("RAW_CTRL", ()),
+    MAV_DATA_STREAM.POSITION: ("POSITION", ("GLOBAL_POSITION_INT", "LOCAL_POSITION_NED")),
+    MAV_DATA_STREAM.EXTRA1: ("EXTRA1", ("ATTITUDE", "SIMSTATE", "AHRS2")),
+    MAV_DATA_STREAM.EXTRA2: ("EXTRA2", ("VFR_HUD",)),
+    MAV_DATA_STREAM.EXTRA3: (
         "EXTRA3",
         (
             "AHRS",
@@ -79,4 +81,4 @@ GROUPS: dict[int, tuple[str, tuple[str, ...]]] = {
         ),
     ),
 }
-ALL_GROUPS = (1, 2, 3, 4, 6, 10, 11, 12)
+ALL_GROUPS = tuple(GROUPS)

@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 from fractus_mavlink import Message
-from fractus_mavlink.enums import MAV_FRAME, POSITION_TARGET_TYPEMASK
+from fractus_mavlink.enums import ATTITUDE_TARGET_TYPEMASK, MAV_FRAME, POSITION_TARGET_TYPEMASK
 
 from fractus_vehicle.copter import IGNORE_ACCELERATION, IGNORE_POSITION, IGNORE_VELOCITY
 from fractus_vehicle.earth import Place, valid_coordinates
@@ -19,6 +19,8 @@ from fractus_vehicle.state import VehicleState
 _BODY_FRAMES = frozenset({MAV_FRAME.BODY_NED, MAV_FRAME.BODY_OFFSET_NED})
 _OFFSET_FRAMES = frozenset({MAV_FRAME.LOCAL_OFFSET_NED}) | _BODY_FRAMES
 _LOCAL_FRAMES = frozenset({MAV_FRAME.LOCAL_NED}) | _OFFSET_FRAMES
+
+_NO_ATTITUDE = ATTITUDE_TARGET_TYPEMASK.ATTITUDE_IGNORE
 
 Vector = tuple[float, float, float]
 
@@ -132,7 +134,7 @@ def _turn(v: VehicleState, yaw: float | None, yaw_rate: float | None) -> None:
 
 def attitude_target(v: VehicleState, flight: Flight, m: Message) -> None:
     """SET_ATTITUDE_TARGET."""
-    if not isinstance(flight, GuidedFlight) or not v.armed or m.integer("type_mask") & 0x80:
+    if not isinstance(flight, GuidedFlight) or not v.armed or m.integer("type_mask") & _NO_ATTITUDE:
         return
     w, x, y, z = m.array("q")
     size = math.sqrt(w * w + x * x + y * y + z * z)

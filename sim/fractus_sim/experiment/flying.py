@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Sequence
 
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_RESULT
+from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_FRAME, MAV_RESULT, SPEED_TYPE
 from fractus_vehicle import earth
+from fractus_vehicle.copter import POSITION_ONLY
 
 from fractus_sim.experiment.station import Station
 from fractus_sim.experiment.tasks import (
@@ -25,8 +26,7 @@ from fractus_sim.experiment.tasks import (
 ANSWER_S = 1.0
 ATTEMPTS = 5
 ARM_S = 60.0
-RELATIVE_FRAME = 6
-POSITION_ONLY = 0xDF8
+RELATIVE_FRAME = MAV_FRAME.GLOBAL_RELATIVE_ALT_INT
 REMIND_S = 5.0
 CLIMBED = 0.95
 Flight = Generator[None, None, None]
@@ -57,7 +57,7 @@ def fly(station: Station, steps: Sequence[Step], tell: Callable[[str], None]) ->
                 yield from _go(station, step, speed_mps)
             case Speed():
                 speed_mps = step.speed
-                yield from _command(station, MAV_CMD.DO_CHANGE_SPEED, 1, speed_mps, -1)
+                yield from _command(station, MAV_CMD.DO_CHANGE_SPEED, SPEED_TYPE.GROUNDSPEED, speed_mps, -1)
             case Hold():
                 yield from _hold(station, step.seconds)
             case SetMode():
@@ -128,10 +128,10 @@ def _go(station: Station, step: Goto, speed_mps: float | None) -> Flight:
         if station.now_s >= remind_s:
             remind_s = station.now_s + REMIND_S
             where = {"lat_int": lat, "lon_int": lon, "alt": step.alt}
-            frame = {"coordinate_frame": RELATIVE_FRAME, "type_mask": POSITION_ONLY}
+            frame = {"coordinate_frame": int(RELATIVE_FRAME), "type_mask": int(POSITION_ONLY)}
             station.tell("SET_POSITION_TARGET_GLOBAL_INT", {**where, **frame})
             if speed_mps is not None:  # the first leg begins with the parameters' speed, whatever was set before
-                station.command(MAV_CMD.DO_CHANGE_SPEED, 1, speed_mps, -1)
+                station.command(MAV_CMD.DO_CHANGE_SPEED, SPEED_TYPE.GROUNDSPEED, speed_mps, -1)
         yield
         _expect(station, COPTER_MODE.GUIDED)
         here = earth.Place.from_degrees(station.state.lat, station.state.lon, 0.0)
@@ -191,14 +191,17 @@ def _mission(station: Station, step: FlyMission) -> Flight:
 
 def _items(station: Station, step: FlyMission) -> list[dict[str, float]]:
     """The mission as MISSION_ITEM_INT fields; the first is home, as ArduPilot keeps it."""
-    first: dict[str, float] = {"command": int(MAV_CMD.NAV_WAYPOINT), "frame": 0}
-    items: list[dict[str, float]] = [first, {"command": int(MAV_CMD.NAV_TAKEOFF), "frame": 6, "z": step.takeoff}]
+    first: dict[str, float] = {"command": int(MAV_CMD.NAV_WAYPOINT), "frame": MAV_FRAME.GLOBAL}
+    items: list[dict[str, float]] = [
+        first,
+        {"command": int(MAV_CMD.NAV_TAKEOFF), "frame": RELATIVE_FRAME, "z": step.takeoff},
+    ]
     for waypoint in step.waypoints:
         at = _point(station, waypoint)
         place = {"x": at.lat_e7, "y": at.lon_e7, "z": waypoint.alt}
-        items.append({"command": int(MAV_CMD.NAV_WAYPOINT), "frame": 6, "param1": waypoint.hold, **place})
+        items.append({"command": int(MAV_CMD.NAV_WAYPOINT), "frame": RELATIVE_FRAME, "param1": waypoint.hold, **place})
     last = MAV_CMD.NAV_RETURN_TO_LAUNCH if step.land == "home" else MAV_CMD.NAV_LAND
-    return [*items, {"command": int(last), "frame": 6}]
+    return [*items, {"command": int(last), "frame": RELATIVE_FRAME}]
 
 
 def _upload(station: Station, items: Sequence[dict[str, float]]) -> Flight:

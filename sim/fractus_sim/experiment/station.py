@@ -10,7 +10,17 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from fractus_mavlink import Endpoint, Message, Value, layout_named
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_MODE_FLAG
+from fractus_mavlink.enums import (
+    COPTER_MODE,
+    MAV_AUTOPILOT,
+    MAV_CMD,
+    MAV_COMPONENT,
+    MAV_LANDED_STATE,
+    MAV_MODE_FLAG,
+    MAV_PARAM_TYPE,
+    MAV_SYS_STATUS_SENSOR,
+    MAV_TYPE,
+)
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.simulation import Craft
 
@@ -19,10 +29,9 @@ from fractus_sim.experiment.tlog import TlogWriter
 
 GROUND_STATION_ID = 255
 OBSERVER_ID = 254
-STATION_COMPONENT = 190
+STATION_COMPONENT = MAV_COMPONENT.MISSIONPLANNER
 HEARTBEAT_S = 1.0
-PREARM_CHECK = 1 << 28
-FLYING_STATES = frozenset({2, 3, 4})
+FLYING_STATES = frozenset({MAV_LANDED_STATE.IN_AIR, MAV_LANDED_STATE.TAKEOFF, MAV_LANDED_STATE.LANDING})
 RATES_HZ: Mapping[str, float] = {
     "GLOBAL_POSITION_INT": 5.0,
     "ATTITUDE": 5.0,
@@ -192,7 +201,7 @@ class Station:
         self.now_s, self._unix_us = now_s, unix_us
         data = self._link.receive()
         messages = [] if self.cut else self._endpoint.decode(data)
-        self.inbox = [m for m in messages if m.sysid == self._system_id and m.compid == 1]
+        self.inbox = [m for m in messages if m.sysid == self._system_id and m.compid == MAV_COMPONENT.AUTOPILOT1]
         for message in messages:
             if self._log is not None:
                 self._log.write(unix_us, message.frame)
@@ -202,7 +211,7 @@ class Station:
                 reader(self, message)
         if self._beats and now_s >= self._next_beat_s:
             self._next_beat_s = now_s + HEARTBEAT_S
-            self.send("HEARTBEAT", {"type": 6, "autopilot": 8, "mavlink_version": 3})
+            self.send("HEARTBEAT", {"type": MAV_TYPE.GCS, "autopilot": MAV_AUTOPILOT.INVALID, "mavlink_version": 3})
         if self.state.heard and not self._asked:
             self._asked = True
             self._ask_for_streams()
@@ -239,7 +248,9 @@ class Station:
     def set_parameter(self, name: str, value: float) -> None:
         """Set a parameter; what the vehicle made of it will be in `parameters`."""
         self.parameters.pop(name, None)
-        self.tell("PARAM_SET", {"param_id": name.encode("ascii"), "param_value": value, "param_type": 9})
+        self.tell(
+            "PARAM_SET", {"param_id": name.encode("ascii"), "param_value": value, "param_type": MAV_PARAM_TYPE.REAL32}
+        )
 
     def close(self) -> None:
         """Close link and log."""
@@ -272,7 +283,7 @@ def _position(station: Station, message: Message) -> None:
 
 def _sys_status(station: Station, message: Message) -> None:
     state = station.state
-    state.ready = bool(message.integer("onboard_control_sensors_health") & PREARM_CHECK)
+    state.ready = bool(message.integer("onboard_control_sensors_health") & MAV_SYS_STATUS_SENSOR.PREARM_CHECK)
     state.voltage_v = message.integer("voltage_battery") / 1000.0
     state.current_a = message.integer("current_battery") / 100.0
     remaining = message.integer("battery_remaining")

@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from fractus_mavlink import Message, Parser, frame_length
-from fractus_mavlink.enums import COPTER_MODE, MAV_MODE_FLAG
+from fractus_mavlink.enums import COPTER_MODE, MAV_COMPONENT, MAV_MODE_FLAG
 
+from fractus_sim.experiment.station import FLYING_STATES
 from fractus_sim.report.track import Place, Sample, Track
 
 _STAMP = struct.Struct(">Q")
 _SAMPLE_S = 0.2
-_FLYING = frozenset({2, 3, 4})
 SYSTEM = "system"
 
 
@@ -133,7 +133,7 @@ def _flight(path: Path) -> tuple[tuple[Sample, ...], _Clock, list[str]]:
     clock, samples, texts = _Clock(), list[Sample](), list[str]()
     mode, armed, landed, battery = "", False, 0, 1.0
     for unix_s, message in _frames(path):
-        if message.compid != 1:
+        if message.compid != MAV_COMPONENT.AUTOPILOT1:
             continue
         if message.name == "HEARTBEAT":
             number = message.integer("custom_mode")
@@ -153,7 +153,7 @@ def _flight(path: Path) -> tuple[tuple[Sample, ...], _Clock, list[str]]:
             height = message.integer("relative_alt") / 1000.0
             place = Place(message.integer("lat") / 1e7, message.integer("lon") / 1e7, height)
             speed = (message.integer("vx") ** 2 + message.integer("vy") ** 2) ** 0.5 / 100.0
-            in_air = armed and (landed in _FLYING if landed else height > 0.5)
+            in_air = armed and (landed in FLYING_STATES if landed else height > 0.5)
             samples.append(Sample(boot_s, place, speed, mode, in_air, battery))
     return tuple(samples), clock, texts
 

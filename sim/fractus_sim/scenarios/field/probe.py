@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from fractus_mavlink import Endpoint, Message, Value, layout_named
-from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_CMD, MAV_MODE_FLAG
+from fractus_mavlink.enums import GPS_FIX_TYPE, MAV_AUTOPILOT, MAV_CMD, MAV_COMPONENT, MAV_MODE_FLAG
 
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.station import OBSERVER_ID, STATION_COMPONENT, TcpLink
@@ -17,7 +17,6 @@ HEARTBEAT_S = 15.0
 READY_S = 120.0
 ASK_S = 1.0
 POLL_S = 0.05
-FIX_3D = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +49,9 @@ def look(link: str, tell: Callable[[str], None]) -> Standing:
     host, port = parse_link(link)
     visitor = _Visitor(TcpLink.connect(host, port, CONNECT_S))
     try:
-        heartbeat = visitor.wait(lambda m: m.name == "HEARTBEAT" and m.compid == 1, HEARTBEAT_S, "no heartbeat")
+        heartbeat = visitor.wait(
+            lambda m: m.name == "HEARTBEAT" and m.compid == MAV_COMPONENT.AUTOPILOT1, HEARTBEAT_S, "no heartbeat"
+        )
         if heartbeat.integer("autopilot") != MAV_AUTOPILOT.ARDUPILOTMEGA:
             raise ExperimentError(f"the autopilot at {link} is no ArduPilot")
         if heartbeat.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED:
@@ -59,7 +60,10 @@ def look(link: str, tell: Callable[[str], None]) -> Standing:
         tell(f"vehicle {heartbeat.sysid} at {link}; waiting for its position")
         visitor.ask("GPS_RAW_INT")
         visitor.wait(
-            lambda m: m.name == "GPS_RAW_INT" and m.integer("fix_type") >= FIX_3D, READY_S, "no GPS fix", "GPS_RAW_INT"
+            lambda m: m.name == "GPS_RAW_INT" and m.integer("fix_type") >= GPS_FIX_TYPE.TYPE_3D_FIX,
+            READY_S,
+            "no GPS fix",
+            "GPS_RAW_INT",
         )
         home = visitor.wait(lambda m: m.name == "HOME_POSITION", READY_S, "no home position", "HOME_POSITION")
     finally:

@@ -82,6 +82,13 @@ images: packages env ## Build the container images
 bench: env ## Run every benchmark
 	for file in bench/*.py; do $(RUN) python "$$file" --quick; done
 
+.PHONY: release
+release: env ## Set VERSION=X.Y.Z and gather the changelog for it; commit and tag what this leaves
+	@[[ "$${VERSION:-}" =~ ^[0-9]+\.[0-9]+\.[0-9]+$$ ]] || { echo "give VERSION=X.Y.Z" >&2; exit 1; }
+	sed -i 's/^version = ".*"/version = "$(VERSION)"/' pyproject.toml
+	$(UV) lock --quiet
+	$(RUN) towncrier build --yes --version "$(VERSION)"
+
 .PHONY: packages
 packages: ## Install the Debian packages whose programs are missing (root); nothing is ever removed
 	@missing=""; PATH="$$PATH:/usr/sbin:/sbin"; \

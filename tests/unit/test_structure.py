@@ -105,3 +105,21 @@ def test_the_lint_finds_words_and_numbers() -> None:
     assert [name for _, name, _ in vocabulary.numbers("if vehicle.mode == 4: send(frame=3, command=NAV, mode=mode)")] == [
         "mode", "frame",
     ]  # fmt: skip
+
+
+DOCUMENTS = ("README.md", "CONTRIBUTING.md", "SECURITY.md", "docs")
+FILE = re.compile(
+    r"`((?:core|storage|kube|mavlink|operator|agent|services|cli|sdk|sim|proto|tests|bench|docs|charts|crds|examples)/[\w./-]+)`"
+)
+LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)")
+
+
+@pytest.mark.parametrize(
+    "document",
+    [d for name in DOCUMENTS for d in ([ROOT / name] if "." in name else (ROOT / name).rglob("*.md"))],
+    ids=lambda path: path.name,
+)
+def test_documents_name_files_that_exist(document: Path) -> None:
+    text = document.read_text()
+    named = [ROOT / name for name in FILE.findall(text)] + [document.parent / name for name in LINK.findall(text)]
+    assert [str(path) for path in named if "NNNN" not in path.name and not path.exists()] == []

@@ -29,20 +29,20 @@ from fractus_services.chain import (
 
 log = logging.getLogger(__name__)
 
-SYNC_S = 0.5
-"""Entries that do not decide anything are on disk after this time at the latest."""
+SYNC_INTERVAL_S = 0.5
+"""Entries that record no decision wait this long for others, so that one fsync serves them all."""
 
-SEGMENT_BYTES = 16_000_000
-"""A file of this size is closed, and the chain goes on in the next one."""
+MAX_SEGMENT_BYTES = 16_000_000
+"""A file of this size is closed, and the chain continues in the next one."""
 
-KEPT_SEGMENTS = 32
-"""So many closed files are kept; the oldest goes, and an entry tells that it went."""
+MAX_SEGMENTS = 32
+"""Closed files that are kept; then the oldest is removed, and an entry records that."""
 
-MOST_WAITING = 10_000
-"""So many entries wait for a disk that does not take them."""
+MAX_WAITING = 10_000
+"""Entries that wait in memory while the disk does not take them."""
 
-HUNG_S = 2.0
-"""A write that takes longer counts as failed until it comes back."""
+HANG_TIMEOUT_S = 2.0
+"""A write that takes longer counts as failed until it returns."""
 
 
 def _plain(value: Any) -> Any:
@@ -66,13 +66,13 @@ class _Waiting:
 
 
 class AuditLog:
-    """Appends entries; a thread writes them, so that a slow disk never holds up a flight.
+    """Appends entries; a thread writes them, so that a slow disk never delays a flight.
 
-    While the disk is full or does not answer, entries wait; those beyond `MOST_WAITING` are lost, and one entry in their
-    place tells how many.
+    While the disk is full or does not answer, entries wait; those beyond `MAX_WAITING` are lost, and one entry in their
+    place records how many.
 
     Args:
-        path: the file; a chain that it holds is continued, a last line torn by a crash is cut off and noted.
+        path: the file; a chain that it holds is continued, a last line that a crash left incomplete is cut off and recorded.
         clock: Unix time in seconds.
         segment_bytes: when the file is closed and the next one begun.
         keep: how many closed files are kept.
@@ -83,17 +83,17 @@ class AuditLog:
         path: Path,
         clock: Callable[[], float],
         *,
-        segment_bytes: int = SEGMENT_BYTES,
-        keep: int = KEPT_SEGMENTS,
+        segment_bytes: int = MAX_SEGMENT_BYTES,
+        keep: int = MAX_SEGMENTS,
     ) -> None:
         self._path = path
         self._clock = clock
         self._segment_bytes = segment_bytes
         self._keep = keep
-        self._doomed: list[Path] = []
+        self._pruned: list[Path] = []
         self._waiting: deque[_Waiting] = deque()
         self._lost = 0
-        self._news = threading.Condition()
+        self._changed = threading.Condition()
         self._urgent = False
         self._closing = False
         self._problem = ""
@@ -113,7 +113,7 @@ class AuditLog:
             try:
                 end = last_link(path)
             except ValueError:
-                log.critical("the last entry of %s cannot be read; a new chain begins after it", path)
+                log.critical("audit: the last entry cannot be read, a new chain begins after it (file=%s)", path)
                 return Link()
             if end is not None:
                 return end
@@ -123,7 +123,7 @@ class AuditLog:
     def failure(self) -> str:
         """Why entries do not reach the disk; empty while they do."""
         since_s = self._busy_since_s
-        if since_s is not None and time.monotonic() - since_s > HUNG_S:
+        if since_s is not None and time.monotonic() - since_s > HANG_TIMEOUT_S:
             return f"the audit log cannot be written: the disk has not answered for {time.monotonic() - since_s:.0f} s"
         return self._problem
 
@@ -136,45 +136,46 @@ class AuditLog:
             now: whether it must reach the disk at once.
         """
         entry = _Waiting(self._moment(), kind, _plain(content))
-        canonical(entry.content)  # what is no JSON is the caller's error, not the thread's
-        with self._news:
-            if len(self._waiting) >= MOST_WAITING:
+        # Content that is not JSON fails here, in the caller, and not in the thread.
+        canonical(entry.content)
+        with self._changed:
+            if len(self._waiting) >= MAX_WAITING:
                 self._lost += 1
                 return
             self._waiting.append(entry)
             self._urgent = self._urgent or now
-            self._news.notify()
+            self._changed.notify()
 
     def refused_grant(self, name: str, reason: str) -> None:
-        """Write down that a file of the grants grants nothing."""
+        """Record that a grant file grants nothing."""
         self.append("grant", {"change": "refused", "name": name, "reason": reason})
 
     async def close(self) -> None:
         """Write what is left."""
-        with self._news:
+        with self._changed:
             self._closing = True
-            self._news.notify()
+            self._changed.notify()
         await asyncio.to_thread(self._thread.join, 5.0)
 
     def _write(self) -> None:
         """The thread: append in batches, one fsync for each."""
         while True:
-            with self._news:
+            with self._changed:
                 while not self._waiting and not self._closing:
-                    self._news.wait()
-                self._news.wait_for(lambda: self._closing or (self._urgent and not self._problem), SYNC_S)
+                    self._changed.wait()
+                self._changed.wait_for(lambda: self._closing or (self._urgent and not self._problem), SYNC_INTERVAL_S)
                 batch, self._urgent, closing = tuple(self._waiting), False, self._closing
             written = not batch or self._flush(batch)
             if written and batch:
-                self._forget(len(batch))
+                self._take_off(len(batch))
                 self._tidy()
-            with self._news:
+            with self._changed:
                 if closing and (not written or not self._waiting):
                     return
 
-    def _forget(self, written: int) -> None:
-        """Take what is on disk off the queue, and note what was lost while it was full."""
-        with self._news:
+    def _take_off(self, written: int) -> None:
+        """Remove what is on disk from the queue, and record what was lost while it was full."""
+        with self._changed:
             for _ in range(written):
                 self._waiting.popleft()
             if self._lost:
@@ -182,7 +183,7 @@ class AuditLog:
                 self._lost, self._urgent = 0, True
 
     def _flush(self, batch: Iterable[_Waiting]) -> bool:
-        """Append and sync; what could not be written is tried again."""
+        """Append and sync; what could not be written is tried again with the next batch."""
         lines, end = [], self._end
         for waiting in batch:
             sequence = end.sequence + 1
@@ -195,7 +196,7 @@ class AuditLog:
             self._store(b"".join(lines))
         except OSError as error:
             if not self._problem:
-                log.critical("cannot write the audit log %s: %s", self._path, error)
+                log.critical("audit: cannot be written (file=%s): %s", self._path, error)
             self._problem = f"the audit log cannot be written: {error.strerror or error}"
             return False
         finally:
@@ -205,17 +206,17 @@ class AuditLog:
         return True
 
     def _tidy(self) -> None:
-        """Close a full file, and remove the oldest closed ones once the chain tells of it."""
+        """Close a full file, and remove the oldest closed ones once the entry that records it is on disk."""
         self._busy_since_s = time.monotonic()
         try:
-            while self._doomed:
-                self._doomed[0].unlink(missing_ok=True)
-                del self._doomed[0]
+            while self._pruned:
+                self._pruned[0].unlink(missing_ok=True)
+                del self._pruned[0]
             if self._path.stat().st_size >= self._segment_bytes:
                 self._path.rename(segment(self._path, self._first_entry()))
-                self._announce_pruning()
+                self._record_pruning()
         except (OSError, ValueError) as error:
-            log.warning("cannot close a segment of the audit log %s: %s", self._path, error)
+            log.warning("audit: cannot close a segment (file=%s): %s", self._path, error)
         finally:
             self._busy_since_s = None
 
@@ -224,7 +225,7 @@ class AuditLog:
         with self._path.open("rb") as file:
             return int(json.loads(file.readline())["seq"])
 
-    def _announce_pruning(self) -> None:
+    def _record_pruning(self) -> None:
         closed = segments(self._path)
         surplus = closed[: max(len(closed) - self._keep, 0)]
         if not surplus:
@@ -233,18 +234,18 @@ class AuditLog:
         if end is None:
             return
         content = {"first": first_of(surplus[0]), "last": end.sequence, "last_hash": end.hash}
-        with self._news:
+        with self._changed:
             self._waiting.append(_Waiting(self._moment(), PRUNED, content))
             self._urgent = True
-        self._doomed = list(surplus)
+        self._pruned = list(surplus)
 
     def _moment(self) -> str:
         return datetime.fromtimestamp(self._clock(), UTC).isoformat(timespec="milliseconds")
 
     def _store(self, data: bytes) -> None:
-        """Have bytes at the end of the file and on disk, or leave the file as it was.
+        """Append bytes and wait until they are on disk, or leave the file as it was: half an entry would break the chain.
 
-        What a failed attempt left and could not be cut off then is cut off before the next.
+        What a failed attempt left and could not cut off is cut off before the next.
         """
         file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o640)
         try:
@@ -265,7 +266,7 @@ class AuditLog:
 
 
 def _cut_torn_line(path: Path) -> int:
-    """Cut what a crash left of a last line; returns how many bytes that were."""
+    """Cut off an incomplete last line, as a crash leaves it; returns its bytes."""
     try:
         data_end = path.stat().st_size
     except FileNotFoundError:

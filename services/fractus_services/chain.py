@@ -1,4 +1,4 @@
-"""The hash chain of an audit log: entries, the segments they are kept in, and how to tell that none was touched."""
+"""The hash chain of an audit log: its entries, the segments that store them, and its verification."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 
 GENESIS = "0" * 64
 PRUNED = "pruned"
-"""Kind of the entry that tells of segments which were removed to make room."""
+"""Kind of the entry that records which segments were removed to free space."""
 
 _TAIL_BYTES = 1_000_000
 _SEGMENT = re.compile(r"^(?P<name>.+)\.(?P<first>\d{12})$")
@@ -110,7 +110,7 @@ class Finding:
         line: number of the first bad line; 0 when all are sound.
         problem: what is wrong with it; empty when all are sound.
         torn: the last line is incomplete, as after a crash or while one is being written.
-        before: how many entries came before the first one and were removed to make room, as a later entry tells.
+        before: how many entries before the first one were removed to free space, as a later entry records.
     """
 
     entries: int
@@ -153,7 +153,11 @@ def verify(lines: Iterable[bytes], part: bool = False) -> Finding:
     if begin == Link() or part:
         return Finding(count, torn=torn)
     if (begin.sequence, begin.hash) not in pruned:
-        return Finding(0, 1, f"is number {begin.sequence + 1}, and what came before was removed by somebody")
+        return Finding(
+            0,
+            1,
+            f"is number {begin.sequence + 1}, and the entries before it were removed, and no entry records that",
+        )
     return Finding(count, torn=torn, before=begin.sequence)
 
 

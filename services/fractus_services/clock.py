@@ -1,4 +1,4 @@
-"""Wall-clock time that a clock which is set back does not take back."""
+"""Wall-clock time that does not go back when the clock is set back."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from fractus_core.policy.values import Moment
 
 log = logging.getLogger(__name__)
 
-TRUST_S = 120.0
-"""A clock that was set back and goes on so long is right: what it showed before was a glitch."""
+TRUST_AFTER_S = 120.0
+"""A clock that was set back and has run this long since is right: what it showed before was a glitch."""
 
-SLEW_S = 1.0
-"""What a clock is set back by in the course of its upkeep."""
+MAX_SLEW_S = 1.0
+"""How far NTP sets a clock back in normal operation."""
 
 
 class Clock:
     """Unix time in seconds.
 
     A clock that is set back must not bring expired certificates and policies back to life, and one that jumped ahead for
-    a moment must not end them for ever. Until it is clear which of the two happened, the time is a `Moment`: what it is
+    a moment must not end them for good. Until it is clear which of the two happened, the time is a `Moment`: what it is
     as a number is the later reading, so that certificates are expired at either, and the policy engine counts both
     against the caller.
     """
@@ -34,13 +34,13 @@ class Clock:
         steady_s = time.monotonic()
         offset_s = time.time() - steady_s
         back_s = self._offset_s - offset_s
-        if back_s <= SLEW_S:
+        if back_s <= MAX_SLEW_S:
             self._behind_since_s = None
         elif self._behind_since_s is None:
             self._behind_since_s = steady_s
-        if self._behind_since_s is not None and steady_s - self._behind_since_s < TRUST_S:
+        if self._behind_since_s is not None and steady_s - self._behind_since_s < TRUST_AFTER_S:
             return Moment(steady_s + self._offset_s, steady_s + offset_s)
-        if back_s > SLEW_S:
-            log.warning("the clock was set back by %.0f s and stayed there; it is taken for right", back_s)
+        if back_s > MAX_SLEW_S:
+            log.warning("clock: set back, now trusted (seconds=%.0f)", back_s)
         self._offset_s, self._behind_since_s = offset_s, None
         return steady_s + offset_s

@@ -18,16 +18,17 @@ from fractus_services.grant_verifier import GrantVerifier
 
 log = logging.getLogger(__name__)
 
-RESCAN_MS = 2_000
+RESCAN_INTERVAL_MS = 2_000
+"""Files are also read this often: inotify misses changes on some file systems."""
 _Stamp = tuple[int, int, int]
 
 
 @dataclass(frozen=True, slots=True)
 class ActiveGrant:
-    """One grant that is in force on this node.
+    """A grant that is in force on this node.
 
     Attributes:
-        key: names the mission: the grant object's uid, or the identity where nobody gave it one.
+        key: names the mission: the uid of the Grant object, or the identity where it has none.
         digest: of the grant with its signature.
     """
 
@@ -46,22 +47,22 @@ class ActiveGrant:
 Listener = Callable[[ActiveGrant | None, ActiveGrant | None], None]
 """Called with the grant before and after a change; None: there is none."""
 
-Complaint = Callable[[str, str], None]
+Refusal = Callable[[str, str], None]
 """Called with the name of a file that grants nothing, and why."""
 
 
 class GrantFiles:
     """Watches a directory of Grant manifests.
 
-    What cannot be read or understood, or is not signed by the operator, is not a grant: a file that turns bad takes its
-    grant away.
+    A file that cannot be read or parsed, or is not signed by the operator, is no grant: when a file turns bad, its grant is
+    revoked, as nothing tells any more what it forbids.
 
     Args:
         directory: where the agent stores the grants; it may not exist yet.
         node: the node that grants must be for.
-        verifier: tells which are the operator's.
+        verifier: verifies their signatures.
         flat_terrain: see `compile_grant`.
-        refused: told of files that grant nothing.
+        refused: called for files that grant nothing.
     """
 
     def __init__(
@@ -70,7 +71,7 @@ class GrantFiles:
         node: str,
         verifier: GrantVerifier,
         flat_terrain: bool = False,
-        refused: Complaint = lambda _name, _why: None,
+        refused: Refusal = lambda _name, _why: None,
     ) -> None:
         self._directory = directory
         self._node = node
@@ -97,25 +98,25 @@ class GrantFiles:
         self._listeners.append(listener)
 
     async def run(self) -> None:
-        """Watch until cancelled; every change is known within a moment, and all files are looked at every 2 s."""
+        """Watch until cancelled: changes are read at once, and all files every 2 s."""
         from watchfiles import awatch  # noqa: PLC0415 - starts a thread pool on import
 
         while True:
             self._directory.mkdir(parents=True, exist_ok=True)
             try:
                 async for _ in awatch(
-                    self._directory, debounce=50, step=20, rust_timeout=RESCAN_MS, yield_on_timeout=True,
+                    self._directory, debounce=50, step=20, rust_timeout=RESCAN_INTERVAL_MS, yield_on_timeout=True,
                     recursive=False,
                 ):  # fmt: skip
                     self.scan()
                     self._remember()
             except (OSError, RuntimeError) as error:
-                log.warning("cannot watch %s, looking again: %s", self._directory, error)
-            await asyncio.sleep(RESCAN_MS / 1000)
+                log.warning("grants: cannot watch, scanning instead (directory=%s): %s", self._directory, error)
+            await asyncio.sleep(RESCAN_INTERVAL_MS / 1000)
             self.scan()
 
     def _remember(self) -> None:
-        """Store what was seen, beside the loop: a disk that hangs must hold up no news."""
+        """Store what was seen, in a thread: a disk that hangs must not delay a change of grants."""
         if self._saving is None or self._saving.done():
             content = self._verifier.unsaved()
             if content is not None:
@@ -123,7 +124,7 @@ class GrantFiles:
 
     def scan(self) -> None:
         """Read what changed."""
-        found, whole = self._look()
+        found, whole = self._list()
         trusted = self._verifier.reload_authorities()
         if found == self._stamps and not trusted:
             return
@@ -142,8 +143,8 @@ class GrantFiles:
                     self._revoke(gone)
         self._replace()
 
-    def _look(self) -> tuple[dict[Path, _Stamp], bool]:
-        """The files, and whether those that are missing are gone for certain."""
+    def _list(self) -> tuple[dict[Path, _Stamp], bool]:
+        """The files, and whether those that are missing were certainly removed, and are not just unreadable."""
         found: dict[Path, _Stamp] = {}
         whole = True
         try:
@@ -154,27 +155,29 @@ class GrantFiles:
                     continue
                 except OSError as error:
                     whole = False
-                    log.critical("cannot look at %s, so nothing is granted by it: %s", path, error)
+                    log.critical("grants: file cannot be read, grants nothing (file=%s): %s", path, error)
                     continue
                 found[path] = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
         except OSError as error:
             whole = False
-            log.critical("cannot read the grants in %s: %s; nothing is granted", self._directory, error)
+            log.critical(
+                "grants: directory cannot be read, nothing is granted (directory=%s): %s", self._directory, error
+            )
         return found, whole and self._directory.is_dir()
 
     def _load(self, path: Path) -> ActiveGrant | None:
-        """The grant of a file; one that it held before and holds no more is revoked."""
+        """The grant of a file; the one that was there before and no longer is gets revoked."""
         before = self._loaded.get(path)
         try:
             grant = self._read(path)
         except (OSError, ValueError, InvalidObject, BadSignature) as error:
-            log.critical("%s is no grant, so nothing is granted by it: %s", path, error)
+            log.critical("grants: file is no valid grant, grants nothing (file=%s): %s", path, error)
             self._refused(path.name, str(error))
             if not isinstance(error, OSError):
                 self._revoke(before)
             return None
         except Exception as error:
-            log.exception("%s cannot be made sense of, so nothing is granted by it", path)
+            log.exception("grants: reading failed, grants nothing (file=%s)", path)
             self._refused(path.name, f"{type(error).__name__}: {error}")
             return None
         if grant is None or (before is not None and before.identity != grant.identity):
@@ -184,7 +187,7 @@ class GrantFiles:
     def _read(self, path: Path) -> ActiveGrant | None:
         grant = Grant.from_body(json.loads(path.read_bytes()))
         if grant.spec.node != self._node:
-            log.error("%s is a grant for node %s, not for %s; ignored", path, grant.spec.node, self._node)
+            log.error("grants: for another node, ignored (file=%s node=%s)", path, grant.spec.node)
             return None
         digest = self._verifier.verify(grant)
         compiled = compile_grant(grant.spec, flat_terrain=self._flat_terrain)
@@ -200,24 +203,23 @@ class GrantFiles:
             if grant is None:
                 continue
             if not self._verifier.is_latest(grant.identity, grant.digest):
-                log.error("%s was replaced by a later grant of %s; ignored", path, grant.identity)
+                log.error("grants: replaced by a later one, ignored (file=%s identity=%s)", path, grant.identity)
                 continue
             if grant.identity in fresh:
-                log.error("%s grants %s a second time; ignored", path, grant.identity)
+                log.error("grants: second grant of an identity, ignored (file=%s identity=%s)", path, grant.identity)
                 continue
             fresh[grant.identity] = grant
         before, self._active = self._active, fresh
         for identity in sorted(before.keys() | fresh.keys()):
             old, new = before.get(identity), fresh.get(identity)
             if old is not new:
-                log.info(
-                    "grant of %s %s", identity, "added" if old is None else "removed" if new is None else "changed"
-                )
-                self._tell(old, new)
+                change = "added" if old is None else "removed" if new is None else "changed"
+                log.info("grants: %s (identity=%s)", change, identity)
+                self._notify(old, new)
 
-    def _tell(self, old: ActiveGrant | None, new: ActiveGrant | None) -> None:
+    def _notify(self, old: ActiveGrant | None, new: ActiveGrant | None) -> None:
         for listener in self._listeners:
             try:
                 listener(old, new)
             except Exception:
-                log.exception("a listener failed on a change of grants; the others are told")
+                log.exception("grants: a listener failed, the others are still called")

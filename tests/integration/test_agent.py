@@ -242,7 +242,7 @@ def test_registration_and_the_owner(server: ApiServer, drone: Node) -> None:
     drone.stop(signal.SIGKILL)
     before = len(drone.log())
     drone.start()
-    wait_for(lambda: "signing request" in drone.log()[before:], "a started agent", timeout_s=30)
+    wait_for(lambda: "certificate requested" in drone.log()[before:], "a started agent", timeout_s=30)
     wait_for(lambda: drone.condition("Ready"), "status", timeout_s=30)
     body = wait_for(drone.object, "drone")
     assert body["spec"]["depot"] == "harbour"

@@ -10,7 +10,7 @@ import pytest
 from fractus_core.policy.values import Moment, earliest
 from fractus_services.answering import Allowance
 from fractus_services.auth import Caller, caller_of
-from fractus_services.clock import TRUST_S, Clock
+from fractus_services.clock import TRUST_AFTER_S, Clock
 from fractus_services.errors import NotAuthenticated
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import ActiveGrant, GrantFiles
@@ -129,10 +129,10 @@ def test_a_jump_ahead_that_is_corrected_does_not_last_for_ever(monkeypatch: pyte
     wall[0], steady[0] = 1001.0, 51.0
     doubtful = clock()
     assert (doubtful, earliest(doubtful)) == (900_001.0, 1001.0), "both readings count"
-    wall[0], steady[0] = 1000.0 + TRUST_S, 50.0 + TRUST_S
+    wall[0], steady[0] = 1000.0 + TRUST_AFTER_S, 50.0 + TRUST_AFTER_S
     assert isinstance(clock(), Moment)
-    wall[0], steady[0] = 1002.0 + TRUST_S, 52.0 + TRUST_S
-    assert (clock(), type(clock())) == (1002.0 + TRUST_S, float)
+    wall[0], steady[0] = 1002.0 + TRUST_AFTER_S, 52.0 + TRUST_AFTER_S
+    assert (clock(), type(clock())) == (1002.0 + TRUST_AFTER_S, float)
     wall[0] -= 0.5
     assert type(clock()) is float, "a clock is set right all the time"
 

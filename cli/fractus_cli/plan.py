@@ -188,7 +188,7 @@ def _bodies(decided: Sequence[Decided]) -> list[dict[str, Any]]:
 
 
 def _without_placements(answer: Decided) -> DeploymentPlanSpec:
-    """What programs are told of an application that is infeasible."""
+    """What yaml and json say of an application that is infeasible."""
     rejected = answer.refusal.rejected if answer.refusal is not None else ()
     omitted = max(len(rejected) - _DEFAULTS.rejections_listed, 0)
     return DeploymentPlanSpec(

@@ -35,7 +35,7 @@ def zones() -> None:
 @click.option("--from", "source", type=click.Choice(sorted(_READERS)), required=True, help="The format of the file.")
 @click.option("--prefix", default="", help="Put before the name of every zone.")
 def import_(file: pathlib.Path, source: str, prefix: str) -> None:
-    """Print a Zone manifest for each zone in a file; what does not map is told on standard error."""
+    """Print a Zone manifest for each zone in a file; what does not map is listed on standard error."""
     try:
         found = _READERS[source](file.read_text(encoding="utf-8"))
         named = [_renamed(zone, prefix) for zone in found.zones]
@@ -54,7 +54,7 @@ def import_(file: pathlib.Path, source: str, prefix: str) -> None:
 @click.option("--to", "target", type=click.Choice(sorted(_READERS)), required=True, help="The format to print.")
 @click.option("--inclusion", is_flag=True, help="For qgc-plan: fences to stay in, instead of out of.")
 def export(paths: tuple[pathlib.Path, ...], target: str, inclusion: bool) -> None:
-    """Print the Zones of some manifests in another format; what does not map is told on standard error."""
+    """Print the Zones of some manifests in another format; what does not map is listed on standard error."""
     if inclusion and target != "qgc-plan":
         raise click.ClickException("--inclusion is for --to qgc-plan")
     try:

@@ -85,7 +85,7 @@ def _by_address(info: kopf.ConnectionInfo | None) -> kopf.ConnectionInfo | None:
 
 
 class _Unchanged(kopf.DiffBaseStorage):
-    """Tells kopf that nothing changed: no handler asks, and a copy of its spec on each Application would cost a write."""
+    """Tells kopf that nothing changed: no handler uses the difference, and its annotation would cost a write."""
 
     def fetch(self, *, body: kopf.Body) -> kopf.BodyEssence:
         """What was handled last: what is there."""

@@ -1,4 +1,4 @@
-"""`python -m fractus_operator.uninstall_check`: says whether Fractus can be uninstalled without leaving a drone in the air."""
+"""`python -m fractus_operator.uninstall_check`: tells whether Fractus can be uninstalled without leaving a drone in the air."""
 
 from __future__ import annotations
 

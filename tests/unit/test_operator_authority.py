@@ -11,7 +11,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, ExtensionOID
 from fractus_core.identity.authority import COMPONENT_LIFE, Authority, BrokenAuthority
-from fractus_operator.identity.node_requests import NODE_NAME_CLAIM, judge
+from fractus_operator.identity.node_requests import NODE_NAME_CLAIM, review
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
 IDENTITY = "spiffe://fractus.dev/ns/a/app/b/component/C/instance/b-c"
@@ -84,5 +84,5 @@ def test_a_request_whose_names_cannot_be_read_is_malformed(names: str) -> None:
         "usages": ["server auth", "client auth"],
         "request": base64.b64encode(request.public_bytes(serialization.Encoding.PEM)).decode(),
     }
-    judgement = judge({"spec": spec}, "agent")
-    assert (judgement.reason, judgement.node) == ("Malformed", None)
+    found = review({"spec": spec}, "agent")
+    assert (found.reason, found.node) == ("Malformed", None)

@@ -12,7 +12,7 @@ from fractus_core.api.plans import DeploymentPlanSpec, DroneChoice
 from fractus_core.planning import flight_of, plan
 from fractus_core.planning.flight import Flight
 from fractus_operator.cluster.pods import PodView
-from fractus_operator.cluster.reading import Makes, OwnedPlan, read_submitted
+from fractus_operator.cluster.reading import OwnedPlan, PartPool, read_submitted
 from fractus_operator.inventory.bookings import Bookings, corrections
 from fractus_operator.inventory.claims import Flown, claims
 from fractus_operator.reconcile.shared_flights import offered_flights, shared_flight_lost, shared_flight_outcome
@@ -45,7 +45,7 @@ def test_a_drone_in_the_air_offers_what_lies_ahead_and_only_if_that_is_known() -
     begun = offered_flights([flown("flying", 180)], DEPOTS, 7.0, None)["d"]
     assert begun.legs[0][0].lon == pytest.approx(at(180, 0)["lon"])
     assert offered_flights([flown("flying", 900)], DEPOTS, 7.0, None) == {}
-    # Who is aboard already was promised the whole way.
+    # Who is shared already was promised the whole way.
     assert offered_flights([flown("flying", 900)], DEPOTS, 7.0, RIDE) == {"d": flight_of(HOST, DEPOTS)}
 
 
@@ -115,7 +115,7 @@ def test_grants_share_the_areas_they_have_in_common() -> None:
     ring = [{"lat": 0.0, "lon": 0.0}, {"lat": 0.0, "lon": 1.0}, {"lat": 1.0, "lon": 0.0}]
     area = [{"polygon": {"exterior": ring}}]
     spec = grant("a", "a", "2026-01-01T00:00:00Z").spec.to_dict()
-    makes = Makes(parts=2)
+    makes = PartPool(parts=2)
     read = [makes.grant(manifest("Grant", name, {**spec, "operationArea": area, "corridor": area})) for name in "ab"]
     first, second = (found.spec for found in read if found is not None)
     assert first.operation_area is first.corridor is second.operation_area is second.corridor

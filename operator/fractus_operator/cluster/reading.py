@@ -30,7 +30,7 @@ N = TypeVar("N", Drone, EdgeNode)
 P = TypeVar("P", bound=Hashable)
 T_co = TypeVar("T_co", covariant=True)
 
-_MAKES = 10_000
+_MAX_PARTS = 10_000
 
 SETTLED = frozenset({"Completed", "Failed"})
 """Phases of an application whose mission is over."""
@@ -96,7 +96,7 @@ class OwnedPlan:
 
 
 @dataclass(frozen=True)
-class Broken:
+class Unreadable:
     """An object that the API server took and that cannot be read."""
 
     body: Body
@@ -171,14 +171,14 @@ def reader(model: type[R]) -> Callable[[Body], R | None]:
     return parse
 
 
-class Makes:
-    """What objects of one make have in common, such as the services of thousands of nodes, or the areas of grants.
+class PartPool:
+    """Equal parts of objects, kept once: the services of thousands of nodes of one model, or the areas of grants.
 
     Args:
         parts: How many parts are remembered to be shared.
     """
 
-    def __init__(self, parts: int = _MAKES) -> None:
+    def __init__(self, parts: int = _MAX_PARTS) -> None:
         self._known: dict[Hashable, Any] = {}
         self._parts = parts
 
@@ -212,13 +212,13 @@ class Makes:
         return found
 
 
-def keeping_broken(model: type[R]) -> Callable[[Body], R | Broken]:
+def tolerant_reader(model: type[R]) -> Callable[[Body], R | Unreadable]:
     """A parser for objects that count also where they cannot be read."""
 
-    def parse(body: Body) -> R | Broken:
+    def parse(body: Body) -> R | Unreadable:
         try:
             return read(model, body)
         except InvalidObject as error:
-            return Broken(body, str(error))
+            return Unreadable(body, str(error))
 
     return parse

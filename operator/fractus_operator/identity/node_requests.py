@@ -26,7 +26,7 @@ _TOLERATED_USAGES = frozenset({"digital signature"})
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
+class Review:
     """Whether a request may be signed, for which node, and why not.
 
     Attributes:
@@ -48,32 +48,32 @@ class Refused(Exception):
         super().__init__(message)
 
 
-def judge(body: Body, agent: str) -> Judgement:
-    """Judge a CertificateSigningRequest of the signer fractus.dev/node.
+def review(body: Body, agent: str) -> Review:
+    """Review a CertificateSigningRequest of the signer fractus.dev/node.
 
     Args:
-        body: The request, with what the API server says of who made it.
+        body: The request, with what the API server adds about its requester.
         agent: User name of the agents' service account.
     """
     spec = body["spec"]
     if spec.get("username") != agent:
-        return Judgement("WrongRequester", f"{spec.get('username')} is not the agent ({agent})")
+        return Review("WrongRequester", f"{spec.get('username')} is not the agent ({agent})")
     nodes = (spec.get("extra") or {}).get(NODE_NAME_CLAIM) or []
     if len(nodes) != 1:
-        return Judgement("NotNodeBound", "the requester's token is not bound to a pod on a node")
+        return Review("NotNodeBound", "the requester's token is not bound to a pod on a node")
     node = nodes[0]
     usages = set(spec.get("usages") or ())
     if not usages >= _USAGES or usages - _USAGES - _TOLERATED_USAGES:
-        return Judgement("WrongUsages", f"usages must be server auth and client auth, not {', '.join(sorted(usages))}")
+        return Review("WrongUsages", f"usages must be server auth and client auth, not {', '.join(sorted(usages))}")
     try:
         request, asked = _read(spec["request"])
     except Refused as refused:
-        return Judgement(refused.reason, str(refused))
+        return Review(refused.reason, str(refused))
     wanted = {(x509.UniformResourceIdentifier, node_identity(node)), (x509.DNSName, node_server_name(node))}
     if asked != wanted:
         listed = ", ".join(sorted(str(value) for _, value in asked))
-        return Judgement("WrongNames", f"the agent of {node} may ask for the names of {node} only, not for {listed}")
-    return Judgement("NodeAgent", f"the agent on {node} asks for its own certificate", node, request)
+        return Review("WrongNames", f"the agent of {node} may ask for the names of {node} only, not for {listed}")
+    return Review("NodeAgent", f"the agent on {node} asks for its own certificate", node, request)
 
 
 def _read(encoded: str) -> tuple[x509.CertificateSigningRequest, frozenset[tuple[type[x509.GeneralName], object]]]:
@@ -119,7 +119,7 @@ class NodeSigning:
     async def reconcile(self, key: Key) -> None:
         """Bring one request to its end: denied with the reason, or approved and signed.
 
-        Also an approved request is judged, whoever approved it.
+        An approved request is reviewed, too: others may approve requests.
         """
         body = self._read(key)
         if body is None:
@@ -128,43 +128,37 @@ class NodeSigning:
         conditions = {c["type"] for c in status.get("conditions") or ()}
         if status.get("certificate") or conditions & {"Denied", "Failed"}:
             return
-        judgement = judge(body, self._agent)
+        reviewed = review(body, self._agent)
         try:
             if "Approved" not in conditions:
-                body = await self._decide(body, judgement)
-            if judgement.node is not None and judgement.request is not None:
-                certificate = self._authority.sign_node(judgement.request, judgement.node, self._clock())
+                verdict = "Approved" if reviewed.node is not None else "Denied"
+                body = await self._conclude(body, verdict, reviewed, "approval")
+            if reviewed.node is not None and reviewed.request is not None:
+                certificate = self._authority.sign_node(reviewed.request, reviewed.node, self._clock())
                 status = {**(body.get("status") or {}), "certificate": base64.b64encode(certificate).decode()}
                 await self._store.replace(SIGNING_REQUEST, {**body, "status": status}, subresource="status")
-                logger.info("signed the certificate of node %s (%s)", judgement.node, key[1])
+                logger.info("node requests: certificate signed (node=%s request=%s)", reviewed.node, key[1])
             elif "Approved" in conditions:
-                await self._fail(body, judgement)
+                # Another approved what this signer does not sign.
+                await self._conclude(body, "Failed", reviewed, "status")
         except (Conflict, NotFound):
             # It changed or went meanwhile: the watch brings the newer one.
             return
 
-    async def _decide(self, body: Body, judgement: Judgement) -> Body:
-        verdict = "Approved" if judgement.node is not None else "Denied"
-        logger.info("%s request %s: %s", verdict.lower(), body["metadata"]["name"], judgement.message)
-        return await self._store.replace(
-            SIGNING_REQUEST, self._with_condition(body, verdict, judgement), subresource="approval"
-        )
-
-    async def _fail(self, body: Body, judgement: Judgement) -> None:
-        logger.warning("request %s was approved but is not signed: %s", body["metadata"]["name"], judgement.message)
-        await self._store.replace(
-            SIGNING_REQUEST, self._with_condition(body, "Failed", judgement), subresource="status"
-        )
-
-    def _with_condition(self, body: Body, type_: str, judgement: Judgement) -> Body:
+    async def _conclude(self, body: Body, verdict: str, reviewed: Review, subresource: str) -> Body:
+        """Write a condition of the type `verdict`."""
+        level = logging.WARNING if verdict == "Failed" else logging.INFO
+        name = body["metadata"]["name"]
+        logger.log(level, "node requests: %s (request=%s): %s", verdict.lower(), name, reviewed.message)
         stamp = self._clock().strftime("%Y-%m-%dT%H:%M:%SZ")
         condition = {
-            "type": type_,
+            "type": verdict,
             "status": "True",
-            "reason": judgement.reason,
-            "message": judgement.message,
+            "reason": reviewed.reason,
+            "message": reviewed.message,
             "lastUpdateTime": stamp,
             "lastTransitionTime": stamp,
         }
         status = body.get("status") or {}
-        return {**body, "status": {**status, "conditions": [*(status.get("conditions") or ()), condition]}}
+        status = {**status, "conditions": [*(status.get("conditions") or ()), condition]}
+        return await self._store.replace(SIGNING_REQUEST, {**body, "status": status}, subresource=subresource)

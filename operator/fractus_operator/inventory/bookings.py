@@ -40,7 +40,7 @@ def add(total: Amounts, amounts: Mapping[str, float], sign: float = 1.0) -> None
 
 
 class BookedHosts(Mapping[str, Host]):
-    """Nodes by name, each made when it is asked for: of thousands a plan looks at few. Good until the next change.
+    """Nodes by name, each made when it is asked for: a plan reads few of thousands. Good until the next change.
 
     Args:
         hosts: Nodes.

@@ -63,19 +63,19 @@ def claims(plans: Mapping[Key, OwnedPlan], grants: Iterable[Grant]) -> dict[str,
         grants: All grants.
     """
     found: dict[str, Claim] = {}
-    guests: set[tuple[str, str]] = set()
+    sharing: set[tuple[str, str]] = set()
     flyers: set[tuple[str, str]] = set()
     for key, plan in sorted(plans.items(), key=lambda item: item[0]):
         drone = plan.spec.drone
         if drone is not None and drone.shared_with is not None:
-            guests.add((plan.uid, drone.node))
+            sharing.add((plan.uid, drone.node))
         elif drone is not None:
             flyers.add((plan.uid, drone.node))
             found.setdefault(drone.node, Claim(key, plan.uid))
     first: dict[str, tuple[bool, datetime, Key, str]] = {}
     for grant in grants:
         owner, node = grant.spec.application, grant.spec.node
-        if (owner.uid, node) in guests:
+        if (owner.uid, node) in sharing:
             continue
         created = grant.metadata.creation_timestamp or _LATEST
         rank = ((owner.uid, node) not in flyers, created, (owner.namespace, owner.name), owner.uid)

@@ -13,7 +13,7 @@ from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind
 from fractus_operator.cluster.labels import APPLICATION_LABEL, MANAGED_SELECTOR, NAMESPACE_LABEL, labelled
 from fractus_operator.cluster.pods import PodView, read_host, read_pod
-from fractus_operator.cluster.reading import Broken, Makes, Submitted, keeping_broken, read_submitted, reader
+from fractus_operator.cluster.reading import PartPool, Submitted, Unreadable, read_submitted, reader, tolerant_reader
 from fractus_operator.cluster.store import Reflector, Store
 from fractus_operator.inventory.bookings import BookedHosts, Bookings, ByName, corrections
 from fractus_operator.inventory.claims import Claim, Fleet, is_flying
@@ -28,14 +28,14 @@ class LiveInventory:
     """What the operator knows of the cluster, current within a watch event's delay."""
 
     def __init__(self, store: Store) -> None:
-        makes = Makes()
+        parts = PartPool()
         self.hosts = Reflector(store, kinds.NODE, read_host, self._host_changed)
         self.pods = Reflector(store, kinds.POD, read_pod, self._pod_changed)
-        self.drones = Reflector(store, kinds.DRONE, makes.sharing(reader(Drone)), self._drone_changed)
-        self.edge_nodes = Reflector(store, kinds.EDGE_NODE, makes.sharing(reader(EdgeNode)), self._edge_node_changed)
+        self.drones = Reflector(store, kinds.DRONE, parts.sharing(reader(Drone)), self._drone_changed)
+        self.edge_nodes = Reflector(store, kinds.EDGE_NODE, parts.sharing(reader(EdgeNode)), self._edge_node_changed)
         self.depots = Reflector(store, kinds.DEPOT, reader(Depot), self._depot_changed)
-        self.zones = Reflector(store, kinds.ZONE, keeping_broken(Zone), self._spec_changed(kinds.ZONE))
-        self.policies = Reflector(store, kinds.POLICY, keeping_broken(Policy), self._spec_changed(kinds.POLICY))
+        self.zones = Reflector(store, kinds.ZONE, tolerant_reader(Zone), self._spec_changed(kinds.ZONE))
+        self.policies = Reflector(store, kinds.POLICY, tolerant_reader(Policy), self._spec_changed(kinds.POLICY))
         self.applications = Reflector(store, kinds.APPLICATION, read_submitted, self._application_changed)
         self.signing_requests = Reflector(
             store,
@@ -61,7 +61,7 @@ class LiveInventory:
         """Counts the changes of what grants are compiled from: zones, policies, depots, and specs of nodes."""
         self._listeners: dict[Kind, list[Callable[[Key], None]]] = {}
         self._grants: dict[Key, Grant] = {}
-        self._areas = Makes(parts=64)
+        self._areas = PartPool(parts=64)
         self._bookings = Bookings()
         self._pods: dict[Key, dict[Key, PodView]] = {}
         self._locations = NodeLocations()
@@ -126,8 +126,8 @@ class LiveInventory:
             depots=self.depots_by_name(),
             zones={z.name: z for z in self.zones.values() if isinstance(z, Zone)},
             policies={p.name: p for p in self.policies.values() if isinstance(p, Policy)},
-            unreadable_zones={z.name: z.problem for z in self.zones.values() if isinstance(z, Broken)},
-            unreadable_policies={p.name: p.problem for p in self.policies.values() if isinstance(p, Broken)},
+            unreadable_zones={z.name: z.problem for z in self.zones.values() if isinstance(z, Unreadable)},
+            unreadable_policies={p.name: p.problem for p in self.policies.values() if isinstance(p, Unreadable)},
             claimed={node: claim.holder(uid) for node, claim in held.items()},
             flights=flights or {},
             locations=self._locations,

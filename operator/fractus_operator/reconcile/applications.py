@@ -41,7 +41,7 @@ RESYNC_S = 30.0
 _BACKOFF_S = (0.5, 30.0)
 _MAX_REST_S = 1.0
 _REST_FACTOR = 2.0
-"""After a reconcile the next one waits this many times as long as that took: where many are busy, each looks less often."""
+"""After a reconcile the next one waits this many times as long as that took: where many are busy, each runs less often."""
 
 EXCLUSION = timedelta(minutes=5)
 """How long a node that the scheduler refused is left out of an application's plans."""
@@ -163,7 +163,7 @@ class Applications:
     # -- steps --
 
     async def _advance(self, seen: Observed, memory: _Memory) -> float:
-        """One step; returns when to look again."""
+        """One step; returns when to run again."""
         submitted = seen.submitted
         again_s = await self._settle(seen)
         if again_s is not None:
@@ -184,7 +184,7 @@ class Applications:
         return again_s
 
     async def _settle(self, seen: Observed) -> float | None:
-        """Where the mission is over: remove what is left of it; returns when to look again, None to go on with a new one."""
+        """Where the mission is over, remove what is left of it; returns when to run again, None to go on with a new one."""
         reported = self._reporter.last(seen.submitted)
         if reported.get("phase") not in SETTLED:
             return None
@@ -200,7 +200,7 @@ class Applications:
         return 1.0 if left_over else None
 
     async def _deploy(self, seen: Observed, memory: _Memory) -> tuple[StatusUpdate, float]:
-        """Plan, compile and roll out; nothing is awaited between the look at the inventory and the decision.
+        """Plan, compile and roll out; nothing is awaited between reading the inventory and the decision.
 
         So two applications never get one drone.
 
@@ -240,7 +240,7 @@ class Applications:
     def _plan(
         self, application: Application, seen: Observed, inventory: Inventory, memory: _Memory
     ) -> tuple[DeploymentPlanSpec, float]:
-        """The plan to deploy, noted at once where it is new; and when to look again."""
+        """The plan to deploy, noted at once where it is new; and when to run again."""
         now = self._clock()
         stuck, recheck_s = stuck_nodes(seen.plan, seen.pods, now)
         stuck = {node: why for node, why in stuck.items() if node != seen.in_flight}
@@ -268,6 +268,6 @@ class Applications:
 
     def _present(self, seen: Observed) -> StatusUpdate | None:
         """What is deployed by the plan in force, if anything."""
-        if seen.plan is None or not self._children.made(seen.key, kinds.DEPLOYMENT):
+        if seen.plan is None or not self._children.of(seen.key, kinds.DEPLOYMENT):
             return None
         return status.deployed(seen.plan, seen.pods, 0)

@@ -79,7 +79,7 @@ def secret_name(instance: str) -> str:
 
 
 def service(application: Application, component: Component) -> Body:
-    """The Service that callers of a component use.
+    """The Service of a component.
 
     A hybrid component's has no selector: the operator says by an EndpointSlice which instance answers.
     """

@@ -1,4 +1,4 @@
-"""What the operator makes for an Application: created where it lacks, applied where it differs, removed where it is stale."""
+"""What the operator makes for an Application: created if missing, applied if different, removed if stale."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Children:
         """What is there of a kind under a key, as far as the watch has shown it."""
         return self._copies[kind].get(key)
 
-    def made(self, key: Key, kind: Kind) -> list[Body]:
+    def of(self, key: Key, kind: Kind) -> list[Body]:
         """What was made of a kind for an application."""
         namespace, name = key
         return [
@@ -113,7 +113,7 @@ class Children:
         problem = "it cannot be read" if present is None else self._signer.problem(present)
         if problem is not None:
             logger.warning("children: Grant is not valid and is signed again (grant=%s): %s", key[1], problem)
-        elif self._is_as_desired(kind, desired, observed) or _says_the_same(observed, present, body):
+        elif self._is_as_desired(kind, desired, observed) or _says_as_desired(observed, present, body):
             return
         _check_own(application, kind, observed)
         signed = self._signer.sign(desired, present)
@@ -191,7 +191,7 @@ class Children:
         """Delete children that are not wanted any more, what runs first."""
         for kind in reversed(kinds.CHILDREN):
             names = set(keep_secrets) if kind is kinds.SECRET else {body["metadata"]["name"] for body in wanted[kind]}
-            for child in self.made(application.key, kind):
+            for child in self.of(application.key, kind):
                 if child["metadata"]["name"] not in names and _is_child(application, kind, child):
                     await self._delete(kind, child)
 
@@ -199,7 +199,7 @@ class Children:
         """Delete every child of some kinds, one kind after the other; True if there was any."""
         removed = False
         for kind in of:
-            for child in self.made(key, kind):
+            for child in self.of(key, kind):
                 removed = True
                 self._normalised.pop((kind, key_of(child)), None)
                 self._met.discard((kind, key_of(child)))
@@ -228,7 +228,7 @@ async def _all(writes: Iterable[Awaitable[None]]) -> None:
 
 
 def _state(desired: Body, observed: Body) -> tuple[object, ...]:
-    """What tells that neither the desired nor the observed object changed; status changes do not count."""
+    """The versions of the desired and of the observed object; status changes do not count."""
     metadata = observed["metadata"]
     return (digest(desired), metadata.get("uid"), metadata.get("generation") or metadata.get("resourceVersion"))
 
@@ -259,8 +259,8 @@ def _readable(observed: Body) -> Grant | None:
         return None
 
 
-def _says_the_same(observed: Body, present: Grant | None, desired: Body) -> bool:
-    """Whether a Grant, however it is spelt, already says what is desired: a release that spells it in another way changes none."""
+def _says_as_desired(observed: Body, present: Grant | None, desired: Body) -> bool:
+    """Whether a Grant already says what is desired, however it is serialized: another release may do that differently."""
     if present is None or not contains(observed["metadata"].get("labels"), desired["metadata"]["labels"]):
         return False
     return present.spec.model_copy(update={"issued_at": None}) == read(Grant, desired).spec

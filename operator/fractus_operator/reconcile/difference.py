@@ -26,7 +26,7 @@ def is_current(desired: Body, observed: Body | None) -> bool:
     """Whether applying the stamped object would change nothing.
 
     Two things must hold: the digest is that of the last apply (so no field was dropped since), and
-    every field still has the applied value (so nobody else changed one).
+    every field still has the applied value (so no one else changed one).
     """
     if observed is None:
         return False

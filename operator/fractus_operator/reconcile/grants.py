@@ -21,10 +21,10 @@ from fractus_operator.reconcile.children import Children
 logger = logging.getLogger(__name__)
 
 REFUSALS = frozenset({400, 403, 422})
-"""HTTP statuses by which the API server says that it does not want an object: the user should know."""
+"""HTTP statuses by which the API server refuses an object itself: the user has to change something."""
 
 Inputs = tuple[object, ...]
-"""What tells that nothing changed of which grants are compiled, nor the grants themselves."""
+"""The versions of what grants are compiled from, and of the grants themselves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class _Compiled:
 
 
 class ApplicationGrants:
-    """Compiles and refreshes grants; remembers the last results, for most looks find nothing changed."""
+    """Compiles and refreshes grants; remembers the last results, because most reconciles find nothing changed."""
 
     def __init__(self, live: LiveInventory, children: Children, signer: GrantSigner, settings: Settings) -> None:
         self._live = live
@@ -65,7 +65,7 @@ class ApplicationGrants:
         try:
             await self._children.refresh(stale)
         except KubeError as error:
-            # The watch of grants brings a newer one, or the next look finds it refused again.
+            # The watch of grants brings a newer one, or the next reconcile finds it refused again.
             logger.warning("grants: not up to date (application=%s/%s): %s", *seen.key, error)
             if error.status not in REFUSALS and not isinstance(error, Conflict | NotFound):
                 raise
@@ -73,7 +73,7 @@ class ApplicationGrants:
     def compile(
         self, application: Application, plan: DeploymentPlanSpec, seen: Observed, inventory: Inventory
     ) -> tuple[GrantSpec, ...]:
-        """The grants of a plan; those of the last look while nothing changed.
+        """The grants of a plan; those of the last reconcile while nothing changed.
 
         Raises:
             InvalidObject: nothing can be granted.

@@ -10,7 +10,7 @@ from fractus_core.api import Condition, InvalidObject, Policy, Zone
 from fractus_core.validation import check_policy, check_zone
 
 from fractus_operator.cluster.kinds import POLICY, ZONE, Key, Kind
-from fractus_operator.cluster.reading import Broken
+from fractus_operator.cluster.reading import Unreadable
 from fractus_operator.cluster.store import Conflict, NotFound, Store
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile.conditions import ConditionUpdate, merge
@@ -44,8 +44,8 @@ class Readiness:
             if isinstance(policy, Policy) and zone in policy.spec.selector.zones
         ]
 
-    def _check_zone(self, zone: Zone | Broken) -> ConditionUpdate:
-        if isinstance(zone, Broken):
+    def _check_zone(self, zone: Zone | Unreadable) -> ConditionUpdate:
+        if isinstance(zone, Unreadable):
             return ConditionUpdate("Ready", "False", "Invalid", zone.problem)
         try:
             check_zone(zone)
@@ -53,8 +53,8 @@ class Readiness:
             return ConditionUpdate("Ready", "False", "Invalid", str(error))
         return ConditionUpdate("Ready", "True", "Valid", "the zone can be enforced")
 
-    def _check_policy(self, policy: Policy | Broken) -> ConditionUpdate:
-        if isinstance(policy, Broken):
+    def _check_policy(self, policy: Policy | Unreadable) -> ConditionUpdate:
+        if isinstance(policy, Unreadable):
             return ConditionUpdate("Ready", "False", "Invalid", policy.problem)
         zones = {zone.name: zone for zone in self._live.zones.values()}
         try:
@@ -68,7 +68,7 @@ class Readiness:
                 return ConditionUpdate("Ready", "False", "ZoneInvalid", message)
         return ConditionUpdate("Ready", "True", "Valid", "the policy can be enforced")
 
-    async def _report(self, kind: Kind, resource: Zone | Policy | Broken, update: ConditionUpdate) -> None:
+    async def _report(self, kind: Kind, resource: Zone | Policy | Unreadable, update: ConditionUpdate) -> None:
         now = self._clock()
         generation = resource.metadata.generation
         before = _conditions(resource)
@@ -85,7 +85,9 @@ class Readiness:
             if item.warning:
                 await self._warn(kind, resource, item, now)
 
-    async def _warn(self, kind: Kind, resource: Zone | Policy | Broken, update: ConditionUpdate, now: datetime) -> None:
+    async def _warn(
+        self, kind: Kind, resource: Zone | Policy | Unreadable, update: ConditionUpdate, now: datetime
+    ) -> None:
         regarding: dict[str, Any] = kind.header(resource.name, uid=resource.metadata.uid)
         name = f"{resource.name}.{int(now.timestamp() * 1000):x}"
         await self._store.record_event(
@@ -93,7 +95,7 @@ class Readiness:
         )
 
 
-def _conditions(resource: Zone | Policy | Broken) -> tuple[Condition, ...]:
-    if isinstance(resource, Broken):
+def _conditions(resource: Zone | Policy | Unreadable) -> tuple[Condition, ...]:
+    if isinstance(resource, Unreadable):
         return resource.conditions
     return resource.status.conditions if resource.status is not None else ()

@@ -119,7 +119,7 @@ def stuck_nodes(
     """Planned nodes that the scheduler refuses for a pod of the plan.
 
     Returns:
-        What the scheduler says, by node; and in how many seconds to look again, if a pod may become stuck.
+        What the scheduler says, by node; and in how many seconds to run again, if a pod may become stuck.
     """
     nodes = {placed.instance: placed.node for placed in plan.placements} if plan is not None else {}
     stuck: dict[str, str] = {}

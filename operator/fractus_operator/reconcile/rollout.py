@@ -26,7 +26,7 @@ takes delay a Grant for longer."""
 
 
 class Rollout:
-    """Makes an application's children what its plan says.
+    """PartPool an application's children what its plan says.
 
     Deployments go first: until their pods have nodes, nothing else that is new takes the API server from the scheduler.
     A pod starts without the rest, which takes longer than applying it, but can call nothing before it has its Grant.
@@ -92,7 +92,7 @@ class Rollout:
             await self._children.apply(application, last)
             return valid
 
-        # All have ended when the next look begins; and an object that is in the way of one stops no other.
+        # All have ended when the next reconcile begins, and one that fails stops no other.
         results = await asyncio.gather(made, beside(), after(), return_exceptions=True)
         for result in results:
             if isinstance(result, BaseException):

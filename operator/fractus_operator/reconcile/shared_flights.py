@@ -36,7 +36,7 @@ def offered_flights(
         present: The plan in force of the application that asks.
     """
     choice = present.drone if present is not None else None
-    aboard = choice.node if choice is not None and choice.shared_with is not None else None
+    shared = choice.node if choice is not None and choice.shared_with is not None else None
     found: dict[str, Flight] = {}
     for host in flown:
         if host.plan.application_generation != host.application.metadata.generation:
@@ -45,7 +45,7 @@ def offered_flights(
             flight: Flight | None = flight_of(host.application, depots)
         except InvalidObject:
             continue
-        if flight is not None and host.in_flight and host.drone.name != aboard:
+        if flight is not None and host.in_flight and host.drone.name != shared:
             place = host.drone.status.position if host.drone.status is not None else None
             flight = ahead(flight, place, radius_m) if place is not None else None
         if flight is not None:

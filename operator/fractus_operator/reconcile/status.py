@@ -43,7 +43,7 @@ class Blocked(Exception):
         stage: the condition that is not reached.
         reason: CamelCase.
         message: one sentence.
-        retry_s: when to look again even if no input changes.
+        retry_s: when to run again even if no input changes.
     """
 
     def __init__(self, phase: Phase, stage: str, reason: str, message: str, *, retry_s: float = 30.0) -> None:

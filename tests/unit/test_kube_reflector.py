@@ -271,7 +271,7 @@ async def test_a_failure_is_tried_again_and_holds_up_nobody(monkeypatch: pytest.
         if key == ("", "bad"):
             done.set()
 
-    worklist = Worklist("test", reconcile, rng=random.Random(1))
+    worklist = Worklist("test", reconcile)
     worklist.add(("", "bad"))
     worklist.add(("", "good"))
     task = asyncio.create_task(worklist.run())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from dataclasses import dataclass
 from typing import Annotated, Self
@@ -25,6 +26,13 @@ _DNS_SUBDOMAIN = re.compile(r"[a-z0-9]([-a-z0-9.]{0,251}[a-z0-9])?")
 def is_subdomain(text: str) -> bool:
     """Whether a text is a DNS subdomain (RFC 1123), as Kubernetes names nodes and pods; it is safe as a file name."""
     return _DNS_SUBDOMAIN.fullmatch(text) is not None
+
+
+def shortened(text: str, limit: int, *, digits: int = 8) -> str:
+    """The text with at most `limit` characters: a longer one ends in a hash of all of it."""
+    if len(text) <= limit:
+        return text
+    return text[: limit - digits - 1].rstrip("-._") + "-" + hashlib.sha256(text.encode()).hexdigest()[:digits]
 
 
 def slug(component: str) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -16,7 +15,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from fractus_core.api import GROUP, node_identity, node_server_name
-from fractus_core.api.names import OPERATOR_IDENTITY
+from fractus_core.api.names import OPERATOR_IDENTITY, shortened
 from fractus_core.policy.signatures import DOCUMENT_SIGNING
 
 CA_LIFE = timedelta(days=3650)
@@ -222,7 +221,7 @@ def _key_usage(*, signs_certificates: bool = False, signs_grants: bool = False) 
 
 def _short(text: str) -> str:
     """A common name has 64 characters at most (X.520); identities are read from the alternative names."""
-    return text if len(text) <= 64 else text[:47] + "-" + hashlib.sha256(text.encode()).hexdigest()[:16]
+    return shortened(text, 64, digits=16)
 
 
 def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Iterator
 
 from fractus_core.api.applications import Application
 from fractus_core.api.components import Component
+from fractus_core.api.names import shortened
 from fractus_core.api.nodes import EdgeNode
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance, Rejection, Role, Serves
 from fractus_core.planning.candidates import Check, Ledger, check_host, check_resources, check_services
 from fractus_core.planning.inventory import Inventory, Settings
+
+_MAX_INSTANCE_NAME = 57
+"""Leaves room for a suffix, such as -tls of its Secret, within the 63 characters of a DNS label."""
 
 
 class Infeasible(Exception):
@@ -25,11 +28,8 @@ class Infeasible(Exception):
 
 
 def instance_name(application: str, component: Component, node: str | None = None) -> str:
-    """Name of an instance: at most 63 characters, a DNS label; long names end in a hash instead."""
-    name = "-".join(filter(None, (application, component.slug, node))).replace(".", "-")
-    if len(name) <= 57:
-        return name
-    return name[:48].rstrip("-") + "-" + hashlib.sha256(name.encode()).hexdigest()[:8]
+    """Name of an instance: a DNS label; a long one ends in a hash."""
+    return shortened("-".join(filter(None, (application, component.slug, node))).replace(".", "-"), _MAX_INSTANCE_NAME)
 
 
 class Draft:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
-
 from fractus_core.api import GROUP, Component
+from fractus_core.api.names import shortened
 
 APPLICATION_LABEL = f"{GROUP}/application"
 COMPONENT_LABEL = f"{GROUP}/component"
@@ -32,10 +31,7 @@ INTERFACE_LABEL = f"{GROUP}/interface-"
 
 def object_name(text: str) -> str:
     """A DNS label of at most 63 characters that begins with a letter, as Services need; long names end in a hash."""
-    name = text if text[:1].isalpha() else f"a-{text}"
-    if len(name) <= 63:
-        return name
-    return name[:54].rstrip("-") + "-" + hashlib.sha256(text.encode()).hexdigest()[:8]
+    return shortened(text if text[:1].isalpha() else f"a-{text}", 63)
 
 
 def service_name(application: str, component: Component) -> str:
@@ -49,10 +45,8 @@ def grant_name(namespace: str, instance: str) -> str:
 
 
 def label_value(text: str) -> str:
-    """The text as a label value: at most 63 characters; longer ones end in a hash."""
-    if len(text) <= 63:
-        return text
-    return text[:54].rstrip("-._") + "-" + hashlib.sha256(text.encode()).hexdigest()[:8]
+    """The text as a label value, which has at most 63 characters."""
+    return shortened(text, 63)
 
 
 def labelled(key: tuple[str, str]) -> tuple[str, str]:

@@ -8,6 +8,7 @@ from typing import Self
 
 from fractus_kube import (
     Access,
+    Backoff,
     Client,
     Conflict,
     ContentType,
@@ -23,7 +24,18 @@ from fractus_kube import (
 
 from fractus_operator.cluster.kinds import EVENT, Body, Key, Kind, key_of
 
-__all__ = ["Conflict", "Invalid", "KubeError", "Lease", "LostLease", "NotFound", "Reflector", "Store", "Unconfigured"]
+__all__ = [
+    "Backoff",
+    "Conflict",
+    "Invalid",
+    "KubeError",
+    "Lease",
+    "LostLease",
+    "NotFound",
+    "Reflector",
+    "Store",
+    "Unconfigured",
+]
 
 FIELD_MANAGER = "fractus-operator"
 _TRIES = 3

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import random
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
@@ -21,7 +20,7 @@ from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Key
 from fractus_operator.cluster.labels import FINALIZER
 from fractus_operator.cluster.reading import SETTLED
-from fractus_operator.cluster.store import KubeError, Store
+from fractus_operator.cluster.store import Backoff, KubeError, Store
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.inventory.observed import Observed
 from fractus_operator.reconcile import status
@@ -38,7 +37,7 @@ from fractus_operator.reconcile.status import Blocked, Phase, StatusUpdate
 logger = logging.getLogger(__name__)
 
 RESYNC_S = 30.0
-_BACKOFF_S = (0.5, 30.0)
+_BACKOFF_S = (1.0, 30.0)
 _MAX_REST_S = 1.0
 _REST_FACTOR = 2.0
 """After a reconcile the next one waits this many times as long as that took: where many are busy, each runs less often."""
@@ -92,7 +91,7 @@ class Applications:
 
     async def follow(self, key: Key, stopped: Callable[[], bool]) -> None:
         """Reconcile an application whenever one of its inputs changes, until it is deleted."""
-        failures = 0
+        backoff = Backoff(*_BACKOFF_S)
         loop = asyncio.get_running_loop()
         await self._live.synced()
         with self._live.subscriptions.subscribe(key) as inputs:
@@ -100,13 +99,11 @@ class Applications:
                 started = loop.time()
                 try:
                     next_s = await self.reconcile(key)
-                    failures = 0
+                    backoff.succeeded()
                 except BeingDeleted:
                     return
                 except KubeError as error:
-                    failures += 1
-                    low, high = _BACKOFF_S
-                    next_s = min(high, low * 2.0 ** min(failures, 8)) * random.uniform(0.5, 1.0)  # noqa: S311  (jitter)
+                    next_s = backoff.delay_s()
                     logger.warning(
                         "applications: reconcile failed (application=%s/%s retry_s=%.1f): %s", *key, next_s, error
                     )

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import random
 from collections.abc import Awaitable, Callable
 
 from fractus_operator.cluster.kinds import Key
-from fractus_operator.cluster.store import KubeError
+from fractus_operator.cluster.store import Backoff, KubeError
 
 logger = logging.getLogger(__name__)
 
-_BACKOFF_S = (0.5, 60.0)
+_BACKOFF_S = (1.0, 60.0)
 
 
 class Worklist:
@@ -25,7 +24,6 @@ class Worklist:
         name: What the keys are of, for the log.
         reconcile: Brings one key to its desired state.
         after: What is waited for before each.
-        rng: Of the jitter.
     """
 
     def __init__(
@@ -34,13 +32,11 @@ class Worklist:
         reconcile: Callable[[Key], Awaitable[None]],
         *,
         after: Callable[[], Awaitable[None]] | None = None,
-        rng: random.Random | None = None,
     ) -> None:
         self.name = name
-        self.failures: dict[Key, int] = {}
+        self.failures: dict[Key, Backoff] = {}
         self._reconcile = reconcile
         self._after = after
-        self._rng = rng or random.Random()  # noqa: S311  (jitter)
         self._waiting: dict[Key, None] = {}
         self._added = asyncio.Event()
         self._later: dict[Key, asyncio.TimerHandle] = {}
@@ -69,12 +65,11 @@ class Worklist:
                 await self._after()
             await self._reconcile(key)
         except Exception as error:
-            failures = self.failures[key] = self.failures.get(key, 0) + 1
-            low, high = _BACKOFF_S
-            pause_s = min(high, low * 2.0 ** min(failures, 8)) * self._rng.uniform(0.5, 1.0)
+            backoff = self.failures.setdefault(key, Backoff(*_BACKOFF_S))
+            pause_s = backoff.delay_s()
             expected = isinstance(error, KubeError)
             logger.log(
-                logging.INFO if expected and failures <= 2 else logging.WARNING,
+                logging.INFO if expected and backoff.attempts <= 2 else logging.WARNING,
                 "worklist: reconcile failed (kind=%s name=%s retry_s=%.1f): %s",
                 self.name,
                 "/".join(filter(None, key)),

@@ -155,8 +155,8 @@ def test_an_exposure_shows_what_lies_between_its_begin_and_its_end() -> None:
     grant = compiled(private)
     now, later = at(0, 0, alt=10), at(100, 0, alt=10)
     assert judge_privacy(now, grant).action == judge_privacy(later, grant).action == "allow"
-    assert judge_privacy(replace(later, way=(now, later)), grant).code == "PrivacyZone"
-    assert judge_privacy(replace(later, way=(now, Situation(time_s=NOW))), grant).code == "PrivacyZone", (
+    assert judge_privacy(replace(later, exposure=(now, later)), grant).code == "PrivacyZone"
+    assert judge_privacy(replace(later, exposure=(now, Situation(time_s=NOW))), grant).code == "PrivacyZone", (
         "where it went is unknown"
     )
 

@@ -19,13 +19,18 @@ SAMPLES = 8192
 
 _MAX_SAMPLES = 200_000
 _ACROSS = 4
+"""Samples across the width of a narrow area, so that a corridor is not missed between two rows."""
 _TILT_RAD = math.atan((math.sqrt(5) - 1) / 2)
 """The lattice's rows follow no direction that roads and manifests like, so that straight legs are sampled evenly."""
 
 _BATCH = 256
+"""Stale bounds looked at again at once: numpy's overhead for one call is that of hundreds of numbers."""
 _CHUNK = 2048
+"""Candidates whose runs are found at once; bounds the memory of one step."""
 _TABLE = 2_000_000
+"""Places of a lattice up to which ranks come from a table; beyond, from a binary search."""
 _REMEMBERED = 4_000_000
+"""Runs up to which all of them are kept, some 64 MB; beyond, they are found again when needed."""
 
 
 class Samples:

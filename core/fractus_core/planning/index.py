@@ -25,13 +25,19 @@ _B_M = SEMI_MAJOR_AXIS_M * (1 - FLATTENING)
 _E2 = FLATTENING * (2 - FLATTENING)
 _SQUARES = np.array([SEMI_MAJOR_AXIS_M**-2, SEMI_MAJOR_AXIS_M**-2, _B_M**-2])
 _CELLS_M = tuple(128.0 * 2**level for level in range(12))
+"""Edges of the cubes of each grid, 128 m to 262 km: a coarser query asks few large cubes instead of many small ones."""
 _BITS = 21
+"""Three cell numbers make one dictionary key of 63 bits; 21 bits hold 12,800 km / 128 m with room to spare."""
 _OFFSET = 1 << (_BITS - 1)
+"""Earth-centred coordinates are signed, cell numbers in a key are not."""
 _HALF_GLOBE_M = 20_100_000.0
+"""Farther than any two points are apart."""
 _GROWTH = 1.5
+"""The search for the nearest widens its radius by this factor, or its third power while it is far from enough."""
 _BOX_DEPTH = 12
 _BOX_MARGINS = 8.0
 _BOX_FILL = 0.3
+"""An area is halved into boxes until each is small beside the margin, or this full, or has been halved this often."""
 
 
 class SpatialIndex:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import shapely
 
-from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Patches, Rule
+from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, PolicyIndex, Rule
 from fractus_core.policy.privacy import names, ordered, seen
 from fractus_core.policy.values import Call, Situation, Verdict, deny, earliest
 
@@ -31,7 +31,7 @@ def judge_access(call: Call, now: Situation, grant: CompiledGrant) -> Verdict | 
             return deny("MethodDenied", f"policy {rule.name} denies {method} here", names(forbidding))
     allowances = grant.allowances.get(method)
     if allowances is not None and not _allowing(allowances, now, grant):
-        rules = ordered({p.rule.name: p.rule for p in allowances.patches} | {r.name: r for r in allowances.everywhere})
+        rules = ordered({p.rule.name: p.rule for p in allowances.zones} | {r.name: r for r in allowances.everywhere})
         return deny("MethodNotGrantedHere", f"{method} is granted elsewhere or at other times only", names(rules))
     if method in IN_OPERATION_AREA and grant.operation is not None:
         return _outside_operation_area(method, now, grant)
@@ -52,14 +52,14 @@ def _outside_operation_area(method: str, now: Situation, grant: CompiledGrant) -
     )
 
 
-def _allowing(patches: Patches, now: Situation, grant: CompiledGrant) -> bool:
+def _allowing(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> bool:
     """Whether some policy of an index surely holds, whichever reading of a doubtful clock is right."""
     readings = {float(now.time_s), earliest(now.time_s)}
-    return all(_matching(patches, replace(now, time_s=t), grant, 0.0, certain=True) for t in readings)
+    return all(_matching(index, replace(now, time_s=t), grant, 0.0, certain=True) for t in readings)
 
 
 def _matching(
-    patches: Patches,
+    index: PolicyIndex,
     now: Situation,
     grant: CompiledGrant,
     distance_m: float,
@@ -70,15 +70,15 @@ def _matching(
 
     While the position is unknown every policy in force may hold; with `certain`, none of those with zones does.
     """
-    found = {rule.name: rule for rule in patches.everywhere if rule.in_force(now.time_s)}
+    found = {rule.name: rule for rule in index.everywhere if rule.in_force(now.time_s)}
     if now.lat is None or now.lon is None:
         if not certain:
-            found |= {p.rule.name: p.rule for p in patches.patches if p.in_force(now.time_s)}
+            found |= {p.rule.name: p.rule for p in index.zones if p.in_force(now.time_s)}
         return ordered(found)
-    if patches.patches:
+    if index.zones:
         here = shapely.points(grant.frame.xy(now.lat, now.lon))
         slack_m = 0.0 if certain else now.altitude_error_m
         air = Air(here, distance_m, now.altitude_m - slack_m, now.altitude_m + slack_m)
-        for patch in patches.near(air, now, grant.flat_terrain):
-            found[patch.rule.name] = patch.rule
+        for zone in index.near(air, now, grant.flat_terrain):
+            found[zone.rule.name] = zone.rule
     return ordered(found)

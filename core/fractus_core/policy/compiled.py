@@ -41,11 +41,11 @@ class Rule:
 
 
 @dataclass(frozen=True, slots=True)
-class Patch:
+class PolicyZone:
     """One zone of one policy."""
 
     rule: Rule
-    zone: str
+    name: str
     shape: BaseGeometry
     band: AltitudeBand | None
     schedule: tuple[ActiveTime, ...] = ()
@@ -82,32 +82,33 @@ class Air:
     upper_m: float
 
 
-class Patches:
+class PolicyIndex:
     """Zones of policies in a spatial index, and the policies that hold everywhere."""
 
-    __slots__ = ("_tree", "everywhere", "patches")
+    __slots__ = ("_tree", "everywhere", "zones")
 
-    def __init__(self, patches: Iterable[Patch] = (), everywhere: Iterable[Rule] = ()) -> None:
-        self.patches = tuple(patches)
+    def __init__(self, zones: Iterable[PolicyZone] = (), everywhere: Iterable[Rule] = ()) -> None:
+        self.zones = tuple(zones)
         self.everywhere = tuple(everywhere)
-        many = len(self.patches) > MAX_UNINDEXED
-        self._tree = shapely.STRtree([p.shape for p in self.patches]) if many else None
+        many = len(self.zones) > MAX_UNINDEXED
+        self._tree = shapely.STRtree([z.shape for z in self.zones]) if many else None
 
     def __bool__(self) -> bool:
-        return bool(self.patches or self.everywhere)
+        return bool(self.zones or self.everywhere)
 
-    def near(self, air: Air, now: Situation, flat: bool) -> Iterator[Patch]:
-        """Patches in force that come within the margin of a piece of air.
+    def near(self, air: Air, now: Situation, flat: bool) -> Iterator[PolicyZone]:
+        """Zones in force that come within the margin of a piece of air.
 
         A band whose datum is unknown reaches from the ground to the sky.
         """
+        # Distances, not bounding boxes: a box around a long slanted zone would hold half the sky, and deny it.
         if self._tree is None:
-            near = [p for p in self.patches if p.shape.dwithin(air.ground, air.margin_m)]
+            near = [z for z in self.zones if z.shape.dwithin(air.ground, air.margin_m)]
         else:
-            near = [self.patches[i] for i in self._tree.query(air.ground, predicate="dwithin", distance=air.margin_m)]
-        for patch in near:
-            if patch.in_force(now.time_s) and band_meets(patch.band, air.lower_m, air.upper_m, now.home, flat):
-                yield patch
+            near = [self.zones[i] for i in self._tree.query(air.ground, predicate="dwithin", distance=air.margin_m)]
+        for zone in near:
+            if zone.in_force(now.time_s) and band_meets(zone.band, air.lower_m, air.upper_m, now.home, flat):
+                yield zone
 
 
 def band_meets(band: AltitudeBand | None, lower_m: float, upper_m: float, home: Home | None, flat: bool) -> bool:
@@ -134,8 +135,8 @@ def band_holds(band: AltitudeBand | None, lower_m: float, upper_m: float, home: 
     return floor is not None and ceiling is not None and floor <= lower_m and upper_m <= ceiling
 
 
-def _surely_active(patch: Patch, time_s: float) -> bool:
-    return active_at(patch.schedule, time_s) and active_at(patch.schedule, earliest(time_s))
+def _surely_active(zone: PolicyZone, time_s: float) -> bool:
+    return active_at(zone.schedule, time_s) and active_at(zone.schedule, earliest(time_s))
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +144,7 @@ class Inclusion:
     """A policy that keeps the drone inside the union of its zones."""
 
     rule: Rule
-    patches: tuple[Patch, ...]
+    zones: tuple[PolicyZone, ...]
     shape: BaseGeometry
     border: BaseGeometry
     banded: bool
@@ -154,7 +155,7 @@ class Inclusion:
             return self.shape, self.border
         kept = [
             p.shape
-            for p in self.patches
+            for p in self.zones
             if band_holds(p.band, lower_m, upper_m, now.home, flat) and _surely_active(p, now.time_s)
         ]
         shape = shapely.union_all(kept) if kept else shapely.Polygon()
@@ -180,13 +181,13 @@ class CompiledGrant:
     driver: bool
     max_altitude_m: float | None
     max_speed_mps: float | None
-    denials: dict[str, Patches]
-    allowances: dict[str, Patches]
-    altitude_limits: Patches
-    speed_limits: Patches
-    exclusions: Patches
+    denials: dict[str, PolicyIndex]
+    allowances: dict[str, PolicyIndex]
+    altitude_limits: PolicyIndex
+    speed_limits: PolicyIndex
+    exclusions: PolicyIndex
     inclusions: tuple[Inclusion, ...]
-    privacy: Patches
+    privacy: PolicyIndex
     operation: BaseGeometry | None
     operation_border: BaseGeometry | None
     passage: BaseGeometry | None
@@ -226,11 +227,11 @@ def compile_grant(spec: GrantSpec, origin: Point | None = None, flat_terrain: bo
         max_speed_mps=spec.limits.max_speed if spec.limits else None,
         denials=_by_method(frame, zoned, "denial", methods),
         allowances=_by_method(frame, zoned, "grant", methods),
-        altitude_limits=_patches(frame, zoned, "LimitControl", "altitude"),
-        speed_limits=_patches(frame, zoned, "LimitControl", "speed"),
-        exclusions=_patches(frame, zoned, "GeofenceControl", "exclusion"),
+        altitude_limits=_index(frame, zoned, "LimitControl", "altitude"),
+        speed_limits=_index(frame, zoned, "LimitControl", "speed"),
+        exclusions=_index(frame, zoned, "GeofenceControl", "exclusion"),
         inclusions=tuple(_inclusion(frame, r, p) for r, p in zoned if p.spec.kind == "inclusion"),
-        privacy=_patches(frame, zoned, "PrivacyControl", "camera"),
+        privacy=_index(frame, zoned, "PrivacyControl", "camera"),
         operation=operation,
         operation_border=_prepared(operation.boundary) if operation is not None else None,
         passage=_prepared(passage) if passage is not None else None,
@@ -269,6 +270,7 @@ def _rule(policy: GrantedPolicy) -> Rule:
 
 
 def _prepared(shape: BaseGeometry) -> BaseGeometry:
+    # GEOS indexes the edges of a prepared shape: thousands of checks against it pay for that once.
     shapely.prepare(shape)
     return shape
 
@@ -279,9 +281,9 @@ def _union(frame: LocalFrame, areas: tuple[Area, ...]) -> BaseGeometry | None:
     return _prepared(shapely.union_all([polygon(frame, area) for area in areas]))
 
 
-def _zone_patches(frame: LocalFrame, rule: Rule, policy: GrantedPolicy) -> list[Patch]:
+def _policy_zones(frame: LocalFrame, rule: Rule, policy: GrantedPolicy) -> list[PolicyZone]:
     return [
-        Patch(rule, zone.name, _prepared(polygon(frame, zone.area)), zone.altitude, zone.schedule)
+        PolicyZone(rule, zone.name, _prepared(polygon(frame, zone.area)), zone.altitude, zone.schedule)
         for zone in policy.zones
         if _within_reach(frame, zone.area)
     ]
@@ -308,16 +310,16 @@ def _same_side(frame: LocalFrame, point: Point) -> bool:
     return apart < 80.0 or (abs(frame.lat) > 60.0 and abs(point.lat) > 30.0)
 
 
-def _patches(
+def _index(
     frame: LocalFrame, zoned: list[tuple[Rule, GrantedPolicy]], kind: str, which: str, method: str | None = None
-) -> Patches:
+) -> PolicyIndex:
     chosen = [
         (rule, policy)
         for rule, policy in zoned
         if rule.spec.type == kind and rule.spec.kind == which and (method is None or method in rule.spec.methods)
     ]
-    return Patches(
-        [patch for rule, policy in chosen for patch in _zone_patches(frame, rule, policy)],
+    return PolicyIndex(
+        [zone for rule, policy in chosen for zone in _policy_zones(frame, rule, policy)],
         [rule for rule, policy in chosen if not policy.zones],
     )
 
@@ -327,18 +329,18 @@ def _by_method(
     zoned: list[tuple[Rule, GrantedPolicy]],
     which: Literal["grant", "denial"],
     methods: frozenset[str],
-) -> dict[str, Patches]:
+) -> dict[str, PolicyIndex]:
     named = {m for rule, _ in zoned if rule.spec.kind == which for m in rule.spec.methods} & methods
-    return {method: _patches(frame, zoned, "AccessControl", which, method) for method in sorted(named)}
+    return {method: _index(frame, zoned, "AccessControl", which, method) for method in sorted(named)}
 
 
 def _inclusion(frame: LocalFrame, rule: Rule, policy: GrantedPolicy) -> Inclusion:
-    patches = tuple(_zone_patches(frame, rule, policy))
-    shape = shapely.union_all([p.shape for p in patches]) if patches else shapely.Polygon()
+    zones = tuple(_policy_zones(frame, rule, policy))
+    shape = shapely.union_all([p.shape for p in zones]) if zones else shapely.Polygon()
     return Inclusion(
         rule,
-        patches,
+        zones,
         _prepared(shape),
         _prepared(shape.boundary),
-        any(p.band is not None or p.schedule for p in patches),
+        any(p.band is not None or p.schedule for p in zones),
     )

@@ -11,7 +11,7 @@ from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.policies import GeofenceAction
 from fractus_core.exhaustive import exhaustive
-from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Inclusion, Patch, band_meets
+from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Inclusion, PolicyZone, band_meets
 from fractus_core.policy.motion import XY, Leg, stop_altitude_m, stop_point
 from fractus_core.policy.values import Situation, Takeover, Verdict, deny, distinct
 
@@ -27,6 +27,7 @@ INSIDE_M = 0.25
 """A corrected target keeps this much more than the margin, so that it never lies on a border."""
 
 _SAMPLES = 24
+"""Points of a leg's illegal part at which its distance to the border must not shrink."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,22 +146,22 @@ def _area_breach(reason: str, enters: bool) -> Breach:
 
 
 def _exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Iterator[Breach]:
-    if not grant.exclusions.patches:
+    if not grant.exclusions.zones:
         return
     margin_m = air.margin_m
-    for patch in grant.exclusions.near(air, now, grant.flat_terrain):
-        shape = patch.shape
+    for zone in grant.exclusions.near(air, now, grant.flat_terrain):
+        shape = zone.shape
         clearance_m = _clearance_outside(shape, leg.unavoidable)
-        level = _is_level_with(patch, now, grant)
+        level = _is_level_with(zone, now, grant)
         if (
             shape.dwithin(_certain_way(leg, now), margin_m)
-            and (level or not _comes_level(patch, leg, now, grant))
+            and (level or not _comes_level(zone, leg, now, grant))
             and _leads_out(shape, leg, margin_m, clearance_m)
         ):
             continue
-        # What the drone does anyway is not the request's doing.
+        # A drone that is inside already, or cannot stop outside, does not enter by this request: it costs the request only.
         enters = (clearance_m > 0 or not level) and shape.intersects(air.ground)
-        yield _exclusion_breach(patch, leg, margin_m, enters)
+        yield _exclusion_breach(zone, leg, margin_m, enters)
 
 
 def _certain_way(leg: Leg, now: Situation) -> BaseGeometry:
@@ -174,35 +175,35 @@ def _certain_way(leg: Leg, now: Situation) -> BaseGeometry:
     return shapely.points(leg.start) if stop == leg.start else shapely.linestrings((leg.start, stop))
 
 
-def _is_level_with(patch: Patch, now: Situation, grant: CompiledGrant) -> bool:
+def _is_level_with(zone: PolicyZone, now: Situation, grant: CompiledGrant) -> bool:
     """Whether the drone is, or comes to rest, between the altitudes of a zone."""
     rest_m = stop_altitude_m(now)
     low, high = min(now.altitude_m, rest_m), max(now.altitude_m, rest_m)
-    return band_meets(patch.band, low, high, now.home, grant.flat_terrain)
+    return band_meets(zone.band, low, high, now.home, grant.flat_terrain)
 
 
-def _comes_level(patch: Patch, leg: Leg, now: Situation, grant: CompiledGrant) -> bool:
+def _comes_level(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant) -> bool:
     """Whether a leg comes between the altitudes of a zone."""
-    return band_meets(patch.band, leg.lower_m, leg.upper_m, now.home, grant.flat_terrain)
+    return band_meets(zone.band, leg.lower_m, leg.upper_m, now.home, grant.flat_terrain)
 
 
-def _exclusion_breach(patch: Patch, leg: Leg, margin_m: float, enters: bool) -> Breach:
-    shape, name = patch.shape, patch.rule.name
+def _exclusion_breach(zone: PolicyZone, leg: Leg, margin_m: float, enters: bool) -> Breach:
+    shape, name = zone.shape, zone.rule.name
     target = shapely.points(leg.target)
     if shape.intersects(target):
         depth_m = shape.boundary.distance(target)
-        code, reason = "InsideExclusionZone", f"the target is {depth_m:.1f} m inside zone {patch.zone}"
+        code, reason = "InsideExclusionZone", f"the target is {depth_m:.1f} m inside zone {zone.name}"
     elif shape.intersects(leg.ground):
         inside_m = shape.intersection(leg.line).length
-        code, reason = "LegThroughExclusionZone", f"the leg crosses zone {patch.zone} for {inside_m:.1f} m"
+        code, reason = "LegThroughExclusionZone", f"the leg crosses zone {zone.name} for {inside_m:.1f} m"
     else:
         away_m = shape.distance(leg.ground)
         code = "TooCloseToExclusionZone"
-        reason = f"the leg comes within {away_m:.1f} m of zone {patch.zone}; keep {margin_m:.1f} m away"
+        reason = f"the leg comes within {away_m:.1f} m of zone {zone.name}; keep {margin_m:.1f} m away"
     return Breach(
         name,
-        patch.rule.spec.priority,
-        patch.rule.spec.geofence_action,
+        zone.rule.spec.priority,
+        zone.rule.spec.geofence_action,
         code,
         f"{reason} of policy {name}",
         enters,
@@ -236,7 +237,7 @@ def _leaves_by_height(fence: Inclusion, shape: BaseGeometry, leg: Leg, now: Situ
 def _inclusion_breach(fence: Inclusion, shape: BaseGeometry, border: BaseGeometry, leg: Leg, margin_m: float) -> Breach:
     name = fence.rule.name
     target = shapely.points(leg.target)
-    zones = ", ".join(dict.fromkeys(p.zone for p in fence.patches)) or "its zones"
+    zones = ", ".join(dict.fromkeys(p.name for p in fence.zones)) or "its zones"
     if shape.is_empty:
         code, reason = "OutsideInclusionZone", f"none of {zones} allows this altitude"
     elif not shape.covers(target):

@@ -20,7 +20,9 @@ MAX_SIGHT_M = 10_000.0
 MAX_HALF_VIEW_DEG = 80.0
 """A view that reaches further to one side, errors included, is taken to see everything."""
 _MAX_TURN_DEG = 60.0
+"""Up to this yaw error the hull of turned corners follows the tangents, which run off beyond; then a circle does."""
 _ARC_DEG = 15.0
+"""Step of the arc that closes a sector."""
 _SIDES = 24
 _CIRCLE = tuple(
     (math.sin(2 * math.pi * i / _SIDES) / math.cos(math.pi / _SIDES),

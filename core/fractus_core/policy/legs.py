@@ -38,6 +38,7 @@ from fractus_core.policy.routes import leads
 from fractus_core.policy.values import POSITION_UNKNOWN, Call, GotoArgs, Situation, Verdict, deny, distinct
 
 MAX_RANGE_M = 100_000.0
+"""Farther than any drone here flies, and well inside what the grant's frame shows true to scale."""
 NEAR_DEG = 30.0
 """A target this near, in degrees, certainly lies on the frame's side of the globe."""
 

@@ -9,10 +9,11 @@ from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.policies import LimitAction
 from fractus_core.exhaustive import exhaustive
-from fractus_core.policy.compiled import Air, CompiledGrant, Patch, Patches, Rule, height_m
+from fractus_core.policy.compiled import Air, CompiledGrant, PolicyIndex, PolicyZone, Rule, height_m
 from fractus_core.policy.values import Args, Situation, Verdict, deny, distinct
 
 SLACK = 1e-6
+"""Rounding of a value that was corrected to a limit exactly must not break that limit."""
 MIN_LEG_ALTITUDE_M = 2.0
 """A motion other than landing ends at least this high above home, where no altitude limit says that lower is fine."""
 
@@ -56,7 +57,7 @@ def altitude_bounds(grant: CompiledGrant, now: Situation, air: Air) -> list[Boun
     bounds = []
     if grant.max_altitude_m is not None:
         bounds.append(Bound("", 0, None, grant.max_altitude_m, refuses=False))
-    for rule, patch in _in_force(grant.altitude_limits, grant, now, air):
+    for rule, zone in _in_force(grant.altitude_limits, grant, now, air):
         spec = rule.spec
         edges = []
         for edge in (spec.lower_limit, spec.upper_limit):
@@ -71,7 +72,7 @@ def altitude_bounds(grant: CompiledGrant, now: Situation, air: Air) -> list[Boun
                 edges[0],
                 edges[1],
                 _REFUSES[spec.limit_action],
-                patch.shape if patch else None,
+                zone.shape if zone else None,
             )
         )
     return bounds
@@ -87,9 +88,9 @@ def _datum_unknown(rule: Rule) -> Verdict:
     )
 
 
-def forbids_height(patch: Patch, lower_m: float, upper_m: float, now: Situation, flat: bool) -> bool:
+def forbids_height(zone: PolicyZone, lower_m: float, upper_m: float, now: Situation, flat: bool) -> bool:
     """Whether the altitude limit of a zone does not allow all heights from lower to upper (above home)."""
-    spec = patch.rule.spec
+    spec = zone.rule.spec
     for edge, reaches_m in ((spec.upper_limit, upper_m), (spec.lower_limit, lower_m)):
         if edge is not None:
             height = height_m(edge, spec.altitude_reference, now.home, flat)
@@ -109,12 +110,14 @@ def speed_bounds(grant: CompiledGrant, now: Situation, air: Air) -> list[Bound]:
     return bounds
 
 
-def _in_force(patches: Patches, grant: CompiledGrant, now: Situation, air: Air) -> Iterator[tuple[Rule, Patch | None]]:
-    for rule in patches.everywhere:
+def _in_force(
+    index: PolicyIndex, grant: CompiledGrant, now: Situation, air: Air
+) -> Iterator[tuple[Rule, PolicyZone | None]]:
+    for rule in index.everywhere:
         if rule.in_force(now.time_s):
             yield rule, None
-    for patch in patches.near(air, now, grant.flat_terrain):
-        yield patch.rule, patch
+    for zone in index.near(air, now, grant.flat_terrain):
+        yield zone.rule, zone
 
 
 def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Clamped | Verdict:

@@ -9,7 +9,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.policies import GeofenceAction
-from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Patch
+from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, PolicyZone
 from fractus_core.policy.fences import SEVERITY, TAKEOVERS, breaches, signed_depth_m
 from fractus_core.policy.limits import Bound, altitude_bounds, speed_bounds, strictest
 from fractus_core.policy.motion import XY, margin_m, moving, standing, stop_altitude_m, stop_point
@@ -19,6 +19,7 @@ TRACKING_SHARE = 0.3
 """Share of the tracking margin of accepted legs that the monitor keeps as well."""
 
 SINKING_MPS = 0.5
+"""A drone that climbs no faster than this may go on while its altitude limits cannot be worked out."""
 
 DEEPER_M = 0.6
 """A drone on the wrong side of a fence is stopped again only when it moves this much further in."""
@@ -129,8 +130,8 @@ class _Finding:
 def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead, *, leaving: bool) -> list[tuple[int, Verdict]]:
     """What fences ask for, each with its policy's priority."""
     found: list[tuple[int, _Finding | None]] = [
-        (patch.rule.spec.priority, _kept_out(patch, ahead))
-        for patch in grant.exclusions.near(ahead.air, now, grant.flat_terrain)
+        (zone.rule.spec.priority, _kept_out(zone, ahead))
+        for zone in grant.exclusions.near(ahead.air, now, grant.flat_terrain)
     ]
     if grant.passage is not None and grant.passage_border is not None:
         area = _Fence(
@@ -140,7 +141,7 @@ def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead, *, leaving: boo
     for inclusion in grant.inclusions:
         if inclusion.rule.in_force(now.time_s):
             shape, border = inclusion.at(ahead.air.lower_m, ahead.air.upper_m, now, grant.flat_terrain)
-            zones = ", ".join(dict.fromkeys(p.zone for p in inclusion.patches)) or "its zones"
+            zones = ", ".join(dict.fromkeys(p.name for p in inclusion.zones)) or "its zones"
             rule = inclusion.rule
             name = f"{zones} of policy {rule.name}"
             fence = _Fence(rule.name, rule.spec.geofence_action, name, "OutsideInclusionZone", "InclusionBorderAhead")
@@ -149,14 +150,14 @@ def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead, *, leaving: boo
     return [(priority, verdict) for priority, verdict in reactions if verdict is not None]
 
 
-def _kept_out(patch: Patch, ahead: _Ahead) -> _Finding:
-    inside = bool(patch.shape.intersects(ahead.here))
-    border = patch.shape.boundary
-    rest_m, here_m = (signed_depth_m(patch.shape, border, point) for point in (ahead.rest, ahead.here))
+def _kept_out(zone: PolicyZone, ahead: _Ahead) -> _Finding:
+    inside = bool(zone.shape.intersects(ahead.here))
+    border = zone.shape.boundary
+    rest_m, here_m = (signed_depth_m(zone.shape, border, point) for point in (ahead.rest, ahead.here))
     worse = rest_m > here_m + DEEPER_M
-    entering = not inside and bool(patch.shape.intersects(ahead.air.ground))
-    name = f"zone {patch.zone} of policy {patch.rule.name}"
-    fence = _Fence(patch.rule.name, patch.rule.spec.geofence_action, name, "InsideExclusionZone", "ExclusionZoneAhead")
+    entering = not inside and bool(zone.shape.intersects(ahead.air.ground))
+    name = f"zone {zone.name} of policy {zone.rule.name}"
+    fence = _Fence(zone.rule.name, zone.rule.spec.geofence_action, name, "InsideExclusionZone", "ExclusionZoneAhead")
     return _Finding(fence, inside, worse or entering, "is inside" if inside else "is about to enter")
 
 
@@ -242,6 +243,7 @@ def _speeds(now: Situation, grant: CompiledGrant, start: XY) -> Verdict | None:
     speed = math.hypot(now.north_mps, now.east_mps)
     bounds = speed_bounds(grant, now, Air(shapely.points(start), 0.0, now.altitude_m, now.altitude_m))
     over = strictest(bounds, above=True)
+    # Gusts push a drone that keeps its setpoint beyond it for a moment: a tenth and 1 m/s are not its doing.
     if over is None or over.upper is None or speed <= over.upper * 1.1 + 1.0:
         return None
     reason = f"the drone flies at {speed:.1f} m/s, above the limit of {over.upper:.1f} m/s"

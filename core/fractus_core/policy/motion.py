@@ -106,6 +106,7 @@ def surge(situation: Situation) -> Surge:
 def stop_point(situation: Situation, at: XY) -> XY:
     """Where the drone comes to rest, in frame metres, when it is told to stop now."""
     speed = math.hypot(situation.north_mps, situation.east_mps)
+    # Below the noise of a GNSS velocity its direction says nothing.
     if speed < 0.05:
         return at
     frame, begin = situation.airframe, surge(situation)

@@ -9,7 +9,7 @@ import shapely
 
 from fractus_core.api.policies import FaceMethod, Fallback, FilterAction
 from fractus_core.exhaustive import exhaustive
-from fractus_core.policy.compiled import Air, CompiledGrant, Patch, Patches, Rule, height_m
+from fractus_core.policy.compiled import Air, CompiledGrant, PolicyIndex, PolicyZone, Rule, height_m
 from fractus_core.policy.footprint import seen_from
 from fractus_core.policy.values import Filter, Situation, Verdict, deny
 
@@ -26,7 +26,7 @@ def judge_privacy(now: Situation, grant: CompiledGrant) -> Verdict:
     """What privacy policies ask of a picture taken or handed out here: nothing, filters, or refusal.
 
     Args:
-        now: where the camera is and how it is turned, and on which way it got there during the exposure.
+        now: where the camera is and how it is turned, and where it was during the exposure.
         grant: whose policies hold.
     """
     rules = seen(grant.privacy, now, grant) if grant.privacy else []
@@ -86,31 +86,31 @@ def _satisfied(asked: Filter, done: Sequence[Filter]) -> bool:
     return any(one.action == "blurFaces" and (one.faces == "pixelate" or asked.faces == "gaussian") for one in done)
 
 
-def seen(patches: Patches, now: Situation, grant: CompiledGrant) -> list[Rule]:
+def seen(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> list[Rule]:
     """Policies of an index that hold where the camera is, or of which a picture may show a zone.
 
     While the position is unknown every policy in force may hold.
     """
-    found = {rule.name: rule for rule in patches.everywhere if rule.in_force(now.time_s)}
-    view = seen_from([*now.way, now], grant.frame)
+    found = {rule.name: rule for rule in index.everywhere if rule.in_force(now.time_s)}
+    view = seen_from([*now.exposure, now], grant.frame)
     if now.lat is None or now.lon is None or view is None:
-        return ordered(found | {p.rule.name: p.rule for p in patches.patches if p.in_force(now.time_s)})
-    if not patches.patches:
+        return ordered(found | {p.rule.name: p.rule for p in index.zones if p.in_force(now.time_s)})
+    if not index.zones:
         return ordered(found)
     here = shapely.Point(grant.frame.xy(now.lat, now.lon))
     lower_m, upper_m = now.altitude_m - now.altitude_error_m, now.altitude_m + now.altitude_error_m
-    for patch in patches.near(Air(here, now.position_error_m, lower_m, upper_m), now, grant.flat_terrain):
-        found[patch.rule.name] = patch.rule
+    for zone in index.near(Air(here, now.position_error_m, lower_m, upper_m), now, grant.flat_terrain):
+        found[zone.rule.name] = zone.rule
     air = Air(view.sight, view.margin_m, -math.inf, view.upper_m)
-    for patch in patches.near(air, now, grant.flat_terrain):
-        if patch.rule.name not in found and view.shows(patch.shape, *_heights(patch, now, grant.flat_terrain)):
-            found[patch.rule.name] = patch.rule
+    for zone in index.near(air, now, grant.flat_terrain):
+        if zone.rule.name not in found and view.shows(zone.shape, *_heights(zone, now, grant.flat_terrain)):
+            found[zone.rule.name] = zone.rule
     return ordered(found)
 
 
-def _heights(patch: Patch, now: Situation, flat_terrain: bool) -> tuple[float, float]:
+def _heights(zone: PolicyZone, now: Situation, flat_terrain: bool) -> tuple[float, float]:
     """Floor and ceiling of a zone above home; one that is unknown reaches from the ground to the sky."""
-    band = patch.band
+    band = zone.band
     if band is None:
         return -math.inf, math.inf
     floor = None if band.lower is None else height_m(band.lower, band.reference, now.home, flat_terrain)

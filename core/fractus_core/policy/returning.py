@@ -28,7 +28,7 @@ def straight_home_blocked(
         return deny(
             "HomeUnknown", "home is unknown, so nothing can be said of the way back; wait for the home position"
         )
-    if not grant.exclusions.patches and not grant.inclusions:
+    if not grant.exclusions.zones and not grant.inclusions:
         return None
     home = grant.frame.xy(now.home.lat, now.home.lon)
     height_m = max(altitude_m, now.airframe.return_altitude_m)
@@ -43,9 +43,9 @@ def straight_home_blocked(
     )
     for part in parts:
         air = Air(part.ground, margin, part.lower_m - slack, part.upper_m + slack)
-        for patch in grant.exclusions.near(air, now, grant.flat_terrain):
+        for zone in grant.exclusions.near(air, now, grant.flat_terrain):
             return _blocked(
-                f"at {height_m:.1f} m, is blocked by zone {patch.zone} of policy {patch.rule.name}", patch.rule.name
+                f"at {height_m:.1f} m, is blocked by zone {zone.name} of policy {zone.rule.name}", zone.rule.name
             )
     for fence in grant.inclusions:
         if fence.rule.in_force(now.time_s):

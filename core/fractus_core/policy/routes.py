@@ -13,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from fractus_core.policy.compiled import Air, CompiledGrant, Patch
+from fractus_core.policy.compiled import Air, CompiledGrant, PolicyZone
 from fractus_core.policy.fences import breaches
 from fractus_core.policy.limits import forbids_height
 from fractus_core.policy.motion import XY, Leg, height_margin_m, margin_m
@@ -154,15 +154,15 @@ class _Space:
             kept_in.append((grant.passage, grant.passage_border))
         return cls(now, moving, lower_m, upper_m, margin_m(now) + room_m, slack, tuple(kept_in))
 
-    def blockers(self, line: BaseGeometry) -> list[Patch | int]:
-        """What stands in the way of a line: patches to keep out of, and numbers of areas to stay in."""
+    def blockers(self, line: BaseGeometry) -> list[PolicyZone | int]:
+        """What stands in the way of a line: zones to keep out of, and numbers of areas to stay in."""
         slack, flat = self.height_margin_m, self.grant.flat_terrain
         air = Air(line, self.margin_m, self.lower_m - slack, self.upper_m + slack)
-        found: list[Patch | int] = list(self.grant.exclusions.near(air, self.now, flat))
-        if self.grant.altitude_limits.patches:
+        found: list[PolicyZone | int] = list(self.grant.exclusions.near(air, self.now, flat))
+        if self.grant.altitude_limits.zones:
             low, high = self.lower_m, self.upper_m
             limiting = self.grant.altitude_limits.near(air, self.now, flat)
-            found += [patch for patch in limiting if forbids_height(patch, low, high, self.now, flat)]
+            found += [zone for zone in limiting if forbids_height(zone, low, high, self.now, flat)]
         for i, (shape, border) in enumerate(self.kept_in):
             if not shape.covers(line) or border.dwithin(line, self.margin_m):
                 found.append(i)
@@ -176,7 +176,7 @@ class _Space:
         air = Air(leg.ground, self.margin_m, self.lower_m, self.upper_m)
         limiting = self.grant.altitude_limits.near(air, self.now, self.grant.flat_terrain)
         return not any(
-            forbids_height(patch, self.lower_m, self.upper_m, self.now, self.grant.flat_terrain) for patch in limiting
+            forbids_height(zone, self.lower_m, self.upper_m, self.now, self.grant.flat_terrain) for zone in limiting
         )
 
     def returns(self, place: XY) -> bool:
@@ -186,19 +186,19 @@ class _Space:
         margin, slack = self.margin_m, self.height_margin_m
         return straight_home_blocked(place, self.upper_m, self.now, self.grant, margin=margin, slack=slack) is None
 
-    def corners(self, obstacle: Patch | int) -> Floats:
+    def corners(self, obstacle: PolicyZone | int) -> Floats:
         """Where ways may turn around an obstacle: rows of x, y of a corner, the one before it and the one after."""
         away = self.margin_m + CORNER_M
-        if isinstance(obstacle, Patch):
+        if isinstance(obstacle, PolicyZone):
             return _corners(_outline(obstacle.shape, away), 1.0)
         return _corners(_outline(self.kept_in[obstacle][0], -away), -1.0)
 
-    def way_out(self, obstacle: Patch | int, begin: shapely.Point) -> Floats:
+    def way_out(self, obstacle: PolicyZone | int, begin: shapely.Point) -> Floats:
         """The nearest place that an obstacle leaves free, as a corner without neighbours; none may be left."""
         away = self.margin_m + CORNER_M
         outline = (
             _outline(obstacle.shape, away)
-            if isinstance(obstacle, Patch)
+            if isinstance(obstacle, PolicyZone)
             else _outline(self.kept_in[obstacle][0], -away)
         )
         if outline.is_empty:
@@ -363,14 +363,14 @@ class _Search:
         x, y = self._nodes[node, :2]
         return float(x), float(y)
 
-    def _learn(self, obstacles: list[Patch | int], begin: XY) -> None:
+    def _learn(self, obstacles: list[PolicyZone | int], begin: XY) -> None:
         """Take in what blocks a leg: areas to stay in, and of the zones the nearest: a way around it meets the next."""
         new = [o for o in obstacles if (o if isinstance(o, int) else id(o)) not in self._known]
         if not new:
             return
         here = shapely.points(begin)
-        zones = [o for o in new if isinstance(o, Patch)]
-        nearest = min(zones, key=lambda o: (o.shape.distance(here), o.rule.name, o.zone), default=None)
+        zones = [o for o in new if isinstance(o, PolicyZone)]
+        nearest = min(zones, key=lambda o: (o.shape.distance(here), o.rule.name, o.name), default=None)
         new = [o for o in new if o is nearest or isinstance(o, int)]
         self._known.update(o if isinstance(o, int) else id(o) for o in new)
         corners = np.vstack([self._space.corners(obstacle) for obstacle in new])

@@ -217,8 +217,8 @@ class Situation:
         attitude: None while it is unknown; the camera may look anywhere then, unless a gimbal keeps it level.
         lens: None on a node whose camera is not described: it may see everything around it.
         relief_m: how far the ground around may lie below home.
-        way: states since a picture began to be taken, one after the other: it may show what is seen from each of these,
-            and between them.
+        exposure: states since a picture began to be taken, one after the other: it may show what is seen from each of
+            these, and between them.
     """
 
     time_s: float
@@ -241,7 +241,7 @@ class Situation:
     attitude: Attitude | None = None
     lens: Lens | None = None
     relief_m: float = 0.0
-    way: tuple[Situation, ...] = ()
+    exposure: tuple[Situation, ...] = ()
 
     @property
     def sound(self) -> bool:

@@ -142,7 +142,7 @@ class PictureCapture:
                 # It is judged by a view in these proportions, whatever the camera gave.
                 frames = [cropped(one, *self._camera.resolution) for one in frames]
             way, grant = self._poses.situations_since(begun_s, self._clock()), current_grant()
-            after = replace(way[-1], way=way)
+            after = replace(way[-1], exposure=way)
             verdict = combined([verdict, *self._judge_again(call, grant, before, after)])
             # Enlarging a picture does not make its faces easier to find.
             view_width_px = min(self._camera.source_size(args.width, args.height)[0], frames[len(frames) // 2].shape[1])
@@ -177,14 +177,14 @@ class PictureCapture:
 
     async def _store(self, args: CaptureArgs, exposure: _Exposure) -> tuple[Verdict, Shot]:
         grant, after, frames = exposure.grant, exposure.after, exposure.frames
-        view = seen_from(after.way, grant.compiled.frame)
+        view = seen_from(after.exposure, grant.compiled.frame)
         farthest_m = view.farthest_m if view is not None else math.inf
         face_px = smallest_face_px(after.lens, farthest_m, exposure.view_width_px)
         call, filters = Call("CaptureImage", args), exposure.verdict.filters
         plan, verdict = self._filtering.plan(
             call, grant, exposure.verdict, required=filters, face_px=face_px, seen=after
         )
-        poses, moment_s = tuple(Pose.of(one) for one in after.way), float(after.time_s)
+        poses, moment_s = tuple(Pose.of(one) for one in after.exposure), float(after.time_s)
         source_width_px = self._camera.source_size(args.width, args.height)[0]
 
         def work() -> bytes:

@@ -87,7 +87,7 @@ class PictureJudge:
 def taken_at(poses: Iterable[Pose], now: Situation) -> Situation:
     """The situation of stored poses, at the present time: policies that are active now apply to a picture from then."""
     way = tuple(pose.at(now) for pose in poses)
-    return replace(way[-1], way=way)
+    return replace(way[-1], exposure=way)
 
 
 def combined(verdicts: Sequence[Verdict]) -> Verdict:

@@ -5,6 +5,7 @@ from fractus.control import Control as Control
 from fractus.drone import Mobility as Mobility
 from fractus.drone import Motion as Motion
 from fractus.drone import mobility as mobility
+from fractus.dry_runs import CanI as CanI
 from fractus.environment import Endpoint as Endpoint
 from fractus.environment import control_points as control_points
 from fractus.environment import egress as egress
@@ -21,7 +22,6 @@ from fractus.errors import PolicyDenied as PolicyDenied
 from fractus.errors import Unavailable as Unavailable
 from fractus.pictures import Camera as Camera
 from fractus.pictures import camera as camera
-from fractus.questions import CanI as CanI
 from fractus.values import Action as Action
 from fractus.values import AltitudeReference as AltitudeReference
 from fractus.values import Attitude as Attitude

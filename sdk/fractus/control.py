@@ -55,7 +55,7 @@ class Control:
         """Why control was lost; None while it is ours."""
         return self._lost
 
-    async def take(self) -> Self:
+    async def acquire(self) -> Self:
         """Wait until the drone is at the control point and is ours.
 
         Raises:
@@ -94,7 +94,7 @@ class Control:
         if not self._granted.is_set():
             raise ControlLost("control was returned")
 
-    async def give_back(self) -> bool:
+    async def release(self) -> bool:
         """Return control at the end of this control point's task.
 
         Returns:
@@ -127,14 +127,14 @@ class Control:
     async def __aenter__(self) -> Self:
         self._owner = asyncio.current_task()
         self._cancellations = self._owner.cancelling() if self._owner else 0
-        return await self.take()
+        return await self.acquire()
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         owner, self._owner = self._owner, None
         if kind is None and self._lost is None:
-            await self.give_back()
+            await self.release()
             return
         try:
             await self.abandon()

@@ -15,9 +15,9 @@ from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
 from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, Retries, ServiceChannel
 from fractus.control import Control
+from fractus.dry_runs import CanI
 from fractus.environment import Endpoint, endpoint
 from fractus.errors import ControlLost, Corrected, FractusError
-from fractus.questions import CanI
 from fractus.requests import goto_request, speed_request, takeoff_request, velocity_request
 from fractus.values import (
     AltitudeReference,

@@ -15,8 +15,8 @@ from typing import Any, Concatenate, Generic, ParamSpec, Protocol, Self, TypeVar
 
 from fractus import control as _control
 from fractus import drone as _drone
+from fractus import dry_runs as _dry_runs
 from fractus import pictures as _pictures
-from fractus import questions as _questions
 from fractus.environment import Endpoint
 from fractus.errors import FractusError
 
@@ -156,34 +156,34 @@ class Control(_Wrapper[_control.Control]):
         return self._async.lost
 
     def __enter__(self) -> Self:
-        self._loop.run(self._async.take)
+        self._loop.run(self._async.acquire)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if kind is None and self.lost is None:
-            self._loop.run(self._async.give_back)
+            self._loop.run(self._async.release)
             return
         self._loop.run(self._async.abandon)
         if kind is None and self.lost is not None:
             raise self.lost
 
 
-class CanI(_Wrapper[_questions.CanI]):
+class CanI(_Wrapper[_dry_runs.CanI]):
     """Dry runs of calls; see `fractus.CanI`."""
 
-    arm = _waiting(_questions.CanI.arm)
-    disarm = _waiting(_questions.CanI.disarm)
-    takeoff = _waiting(_questions.CanI.takeoff)
-    land = _waiting(_questions.CanI.land)
-    return_to_launch = _waiting(_questions.CanI.return_to_launch)
-    hover = _waiting(_questions.CanI.hover)
-    goto = _waiting(_questions.CanI.goto)
-    set_speed = _waiting(_questions.CanI.set_speed)
-    set_velocity = _waiting(_questions.CanI.set_velocity)
-    position = _waiting(_questions.CanI.position)
-    speed = _waiting(_questions.CanI.speed)
+    arm = _waiting(_dry_runs.CanI.arm)
+    disarm = _waiting(_dry_runs.CanI.disarm)
+    takeoff = _waiting(_dry_runs.CanI.takeoff)
+    land = _waiting(_dry_runs.CanI.land)
+    return_to_launch = _waiting(_dry_runs.CanI.return_to_launch)
+    hover = _waiting(_dry_runs.CanI.hover)
+    goto = _waiting(_dry_runs.CanI.goto)
+    set_speed = _waiting(_dry_runs.CanI.set_speed)
+    set_velocity = _waiting(_dry_runs.CanI.set_velocity)
+    position = _waiting(_dry_runs.CanI.position)
+    speed = _waiting(_dry_runs.CanI.speed)
 
 
 class Mobility(_Client[_drone.Mobility]):

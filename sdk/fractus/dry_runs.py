@@ -1,4 +1,4 @@
-"""May this component make a call? Asked without making it: `await drone.can_i.goto(lat, lon, 20)`."""
+"""Dry runs of calls: `await drone.can_i.goto(lat, lon, 20)` asks whether this component may, and does nothing."""
 
 from __future__ import annotations
 

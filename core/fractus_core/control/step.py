@@ -1,0 +1,187 @@
+"""One transition under way: the state as it is by now, the actions so far, and the moves that transitions are made of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from fractus_core.control.actions import (
+    Action,
+    RecordAudit,
+    SaveJournal,
+    SendEvent,
+    StartSystemTask,
+    StopKind,
+    StopMotion,
+    StopSystemTask,
+    WakeWaiters,
+)
+from fractus_core.control.values import (
+    Authority,
+    ControlEvent,
+    ControlState,
+    Grace,
+    Mission,
+    Outcome,
+    OutcomeKind,
+    StreamState,
+    SystemTask,
+    TaskKind,
+)
+
+REMEMBERED_MISSIONS = 200
+DRIVER_LOST = "driver lost"
+GRANT_REMOVED = "the grant was removed"
+
+
+class Step:
+    """Collects what one event changes; nothing outside of it sees what is not finished.
+
+    Attributes:
+        state: as it is by now.
+        actions: to be carried out, in order.
+        now: monotonic seconds.
+    """
+
+    def __init__(self, state: ControlState, now: float) -> None:
+        self.state = state
+        self.actions: list[Action] = []
+        self.now = now
+
+    def set(self, **changes: Any) -> None:
+        """Change the state."""
+        self.state = replace(self.state, **changes)
+
+    def act(self, action: Action) -> None:
+        """Ask for an action."""
+        self.actions.append(action)
+
+    def audit(
+        self,
+        kind: str,
+        action: str,
+        controller: str,
+        reason: str,
+        code: str = "",
+        *,
+        policies: tuple[str, ...] = (),
+    ) -> None:
+        """Write a change of control down."""
+        self.act(RecordAudit(kind, action, controller, reason, code, policies))
+
+    # Missions
+
+    def mission(self, key: str, identity: str) -> Mission:
+        """The mission of a grant, begun when it is new; the oldest are forgotten."""
+        found = self.state.missions.get(key)
+        if found is None:
+            found = Mission(key, identity)
+            missions = {**self.state.missions, key: found}
+            for old in list(missions)[: max(len(missions) - REMEMBERED_MISSIONS, 0)]:
+                del missions[old]
+            self.set(missions=missions)
+        return found
+
+    def update_mission(self, mission: Mission, **changes: Any) -> Mission:
+        """Change a mission."""
+        changed = replace(mission, **changes)
+        self.set(missions={**self.state.missions, mission.key: changed})
+        return changed
+
+    def end_mission(self, mission: Mission | None, kind: OutcomeKind, reason: str) -> Mission | None:
+        """Give a mission its outcome and keep it, unless it has one."""
+        if mission is None or mission.outcome is not None:
+            return mission
+        self.act(SaveJournal())
+        return self.update_mission(mission, outcome=Outcome(kind, reason))
+
+    def adopt(self, mission: Mission) -> None:
+        """The vehicle flies for this mission."""
+        if self.state.active != mission.key:
+            self.set(speed_mps=None)
+        self.set(active=mission.key, removed=None)
+        self.act(SaveJournal())
+
+    # Motions and leases
+
+    def stop_motion(self, kind: StopKind, code: str, reason: str, policies: tuple[str, ...] = ()) -> None:
+        """End the motion under way."""
+        if self.state.motion is not None:
+            self.act(StopMotion(self.state.motion.motion_id, kind, code, reason, policies))
+            self.set(motion=None)
+
+    def lose_lease(self, reason: str) -> None:
+        """Take the vehicle from the driver, or from who waits for it, and say why; a grace is over."""
+        lease = self.state.lease
+        self.stop_motion(StopKind.LOST, "ControlLost", reason)
+        self.set(lease=None, grace=None)
+        if lease is not None:
+            self.act(SendEvent(lease.lease_id, ControlEvent(StreamState.LOST, reason=reason)))
+        self.act(WakeWaiters())
+
+    # The system
+
+    def start(self, kind: TaskKind) -> None:
+        """Begin what the system wants of the vehicle; what it did before ends.
+
+        Coming down counts as returning from here on, so that no monitor or supervisor interferes before the task runs.
+        """
+        self.stop_task()
+        task = SystemTask(self.state.last_task_id + 1, kind)
+        self.set(task=task, last_task_id=task.task_id)
+        self.set(returning=kind is not TaskKind.HOVER and self.state.vehicle.armed)
+        self.act(StartSystemTask(task))
+
+    def stop_task(self) -> None:
+        """End what the system does with the vehicle."""
+        task = self.state.task
+        if task is not None:
+            self.act(StopSystemTask(task.task_id))
+            self.set(task=None)
+            if task.kind is TaskKind.TOUR:
+                self.act(WakeWaiters())
+
+    def begin_grace(self, mission: Mission, reason: str) -> None:
+        """Give a lost driver its time to come back; on the ground, before any flight, there is nothing to save."""
+        waits = mission.flown or self.state.vehicle.armed
+        grace = Grace(self.now + self.state.grace_s, mission.key, reason) if waits else None
+        self.set(grace=grace)
+
+    def follow_descent(self, kind: TaskKind) -> None:
+        """The autopilot comes down by itself: the system watches it to the ground, and does the rest if it stops."""
+        self.set(authority=Authority.SYSTEM)
+        self.start(kind)
+        self.set(returning=True)
+
+    def take_back(self, mission: Mission) -> None:
+        """Hover and wait for the driver of a mission that goes on; fly home otherwise."""
+        if mission.outcome is not None or not self.state.grant_in_force:
+            self.end_mission(mission, OutcomeKind.REVOKED, GRANT_REMOVED)
+            self.start(TaskKind.RETURN)
+        else:
+            self.start(TaskKind.HOVER)
+            self.begin_grace(mission, DRIVER_LOST)
+
+    def seize(
+        self, kind: TaskKind, code: str, reason: str, policies: tuple[str, ...], outcome: OutcomeKind | None
+    ) -> None:
+        """The system takes the vehicle from its driver, or goes on with another task; a mission without outcome gets its grace."""
+        mission = self.state.mission
+        self.audit("takeover", kind.value, "system", reason, code, policies=policies)
+        self.lose_lease(reason)
+        self.set(authority=Authority.SYSTEM)
+        if outcome is not None:
+            mission = self.end_mission(mission, outcome, reason)
+        self.start(kind)
+        if mission is not None and mission.outcome is None:
+            self.begin_grace(mission, reason)
+
+    def give_to_pilot(self, what: str) -> None:
+        """A human pilot has the vehicle: applications lose it at once, and the system commands nothing any more."""
+        reason = f"a human pilot {what}"
+        if self.state.authority is not Authority.PILOT:
+            self.audit("takeover", "pilot", "pilot", reason, "PilotTookOver")
+        self.stop_task()
+        self.set(returning=False)
+        self.lose_lease(reason)
+        self.set(authority=Authority.PILOT)

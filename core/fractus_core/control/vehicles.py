@@ -1,0 +1,160 @@
+"""The vehicle: it appears, arms, lands, changes its mode; and whose doing that is: the system's, a failsafe's or a pilot's."""
+
+from __future__ import annotations
+
+from typing import assert_never
+
+from fractus_core.control.actions import SaveJournal, SetStreamRates, WakeWaiters
+from fractus_core.control.events import (
+    Airborne,
+    ArmingEvent,
+    ArmingPrepared,
+    ArmingRequested,
+    Heartbeat,
+    ModeChangeBegan,
+    ModeChangeEnded,
+    MotorStart,
+    VehicleEvent,
+    VehicleFound,
+    VehicleObserved,
+)
+from fractus_core.control.step import DRIVER_LOST, Step
+from fractus_core.control.values import Authority, ModeKind, OutcomeKind, TaskKind
+
+FAILSAFE_TEXT_S = 3.0
+"""A mode change this soon after the autopilot spoke of a failsafe is the failsafe's."""
+
+FLEW_HOME_ALONE = "the autopilot flew home by itself while the mobility service was away"
+
+
+def on_vehicle(step: Step, event: VehicleEvent) -> None:
+    """What the vehicle does, or is told to do."""
+    match event:
+        case VehicleObserved(vehicle):
+            step.state = step.state.observed(vehicle)
+        case VehicleFound():
+            _found(step)
+            step.set(decided=True)
+        case Heartbeat():
+            _heartbeat(step)
+        case Airborne():
+            mission = step.state.mission
+            if mission is not None and not mission.flown and step.state.authority is not Authority.PILOT:
+                step.update_mission(mission, flown=True)
+                step.act(SaveJournal())
+        case ModeChangeBegan(mode):
+            step.set(expected_mode=mode, mode_changes=step.state.mode_changes + 1)
+        case ModeChangeEnded(mode, before, done):
+            step.set(mode_changes=max(step.state.mode_changes - 1, 0))
+            # A change that failed for certain is not expected any more; one that the vehicle shows after all is.
+            if not done and step.state.expected_mode == mode and step.state.vehicle.mode != mode:
+                step.set(expected_mode=before)
+        case _:
+            assert_never(event)
+
+
+def on_arming(step: Step, event: ArmingEvent) -> None:
+    """What arming changes: the mission that is flown next, and what a heartbeat that shows running motors means."""
+    match event:
+        case ArmingRequested(key, identity, home):
+            step.update_mission(step.mission(key, identity), home=home)
+            step.set(active=key)
+        case ArmingPrepared(begins):
+            step.set(preparing=max(step.state.preparing + (1 if begins else -1), 0))
+        case MotorStart(begins):
+            step.set(starting_motors=begins)
+        case _:
+            assert_never(event)
+
+
+def _found(step: Step) -> None:
+    """Decide who has a vehicle that was there before the service, or comes back from a broken link."""
+    vehicle, mission, lease = step.state.vehicle, step.state.mission, step.state.lease
+    if step.state.armed_seen is None:
+        step.set(armed_seen=vehicle.armed)
+    if lease is not None and (lease.granted or step.state.flight is not None):
+        return  # the driver, or the transit for one, goes on where the link broke
+    step.set(expected_mode=vehicle.mode)
+    if vehicle.armed and step.state.authority is Authority.PILOT:
+        return
+    if not vehicle.armed:
+        if mission is not None and mission.flown and mission.outcome is None:
+            step.begin_grace(mission, DRIVER_LOST)
+        return
+    commanded, comes_down = vehicle.mode.kind is ModeKind.COMMANDED, vehicle.mode.comes_down
+    if not (commanded or comes_down) or (mission is None and not commanded):
+        step.give_to_pilot(f"is flying in {vehicle.mode.name}")
+    elif mission is None:
+        step.set(authority=Authority.SYSTEM)
+        reason = "found the drone armed, and no mission"
+        step.audit("takeover", TaskKind.RETURN.value, "system", reason)
+        step.start(TaskKind.RETURN)
+    elif comes_down:
+        step.end_mission(mission, OutcomeKind.FAILED, FLEW_HOME_ALONE)
+        step.audit("takeover", "homeward", "system", f"found the drone in {vehicle.mode.name}")
+        step.follow_descent(TaskKind.LAND if vehicle.mode.kind is ModeKind.LANDING else TaskKind.RETURN)
+    else:
+        step.set(authority=Authority.SYSTEM)
+        step.audit("takeover", TaskKind.HOVER.value, "system", "found the drone in the air")
+        step.take_back(mission)
+
+
+def _heartbeat(step: Step) -> None:
+    """Look at arming and mode."""
+    vehicle = step.state.vehicle
+    if step.state.armed_seen is None:
+        return
+    if vehicle.armed != step.state.armed_seen:
+        step.set(armed_seen=vehicle.armed)
+        if vehicle.armed:
+            _armed(step)
+        else:
+            _disarmed(step)
+    if step.state.mode_changes:
+        return  # until the change is confirmed or given up, either mode is ours
+    if not vehicle.armed:
+        step.set(expected_mode=vehicle.mode)
+    elif step.state.expected_mode is not None and vehicle.mode != step.state.expected_mode:
+        _foreign_mode(step)
+
+
+def _armed(step: Step) -> None:
+    if step.state.authority is not Authority.DRIVER and not step.state.starting_motors:
+        step.give_to_pilot("armed the drone")
+    step.act(SetStreamRates(flying=True))
+
+
+def _disarmed(step: Step) -> None:
+    """The motors stopped; a driver that has the vehicle keeps it."""
+    mission = step.state.mission
+    step.stop_task()
+    step.set(returning=False)
+    if step.state.authority is Authority.PILOT and mission is not None and mission.flown:
+        mission = step.end_mission(mission, OutcomeKind.FAILED, "a human pilot took the drone and landed it")
+    if not step.state.granted:
+        step.set(authority=Authority.SYSTEM)
+        if mission is None or mission.outcome is not None:
+            step.set(active=None)
+    step.audit("control", "landed", step.state.controller, "the motors are stopped")
+    step.act(SaveJournal())
+    step.act(SetStreamRates(flying=False))
+    step.act(WakeWaiters())
+
+
+def _foreign_mode(step: Step) -> None:
+    """The mode was changed by others: the autopilot's own failsafe, or a human pilot, who may also hand the vehicle back."""
+    state, vehicle, mission = step.state, step.state.vehicle, step.state.mission
+    step.set(expected_mode=vehicle.mode)
+    said = vehicle.failsafe_text if step.now - vehicle.failsafe_text_at < FAILSAFE_TEXT_S else ""
+    if (vehicle.failsafe or said) and vehicle.mode.comes_down and state.authority is not Authority.PILOT:
+        reason = f"the autopilot's own failsafe took the drone ({said or vehicle.mode.name})"
+        step.audit("takeover", vehicle.mode.name, "system", reason, "AutopilotFailsafe")
+        step.end_mission(mission, OutcomeKind.FAILED, reason)
+        step.lose_lease(reason)
+        step.follow_descent(TaskKind.LAND if vehicle.mode.kind is ModeKind.LANDING else TaskKind.RETURN)
+    elif state.authority is Authority.PILOT and vehicle.mode.kind is ModeKind.COMMANDED and mission is not None:
+        step.audit("takeover", TaskKind.HOVER.value, "system", "the pilot handed the drone back")
+        step.set(authority=Authority.SYSTEM)
+        step.take_back(mission)
+    else:
+        step.give_to_pilot(f"changed the mode to {vehicle.mode.name}")

@@ -95,6 +95,14 @@ def passenger_grant(*policies: dict[str, Any], **changes: Any) -> dict[str, Any]
     )
 
 
+def outcomes(telemetry: pb.Telemetry) -> dict[str, str]:
+    """How missions ended, in words."""
+    kinds = {key: pb.MissionOutcome.Kind.Name(ended.kind) for key, ended in telemetry.missions.items()}
+    words = {key: kind.removeprefix("KIND_").lower() for key, kind in kinds.items()}
+    reasons = {key: ended.reason for key, ended in telemetry.missions.items()}
+    return {key: f"{word}: {reasons[key]}" if reasons[key] else word for key, word in words.items()}
+
+
 class Authority:
     """A certificate authority."""
 

@@ -24,7 +24,7 @@ from fractus_cluster.ports import free_port
 from fractus_core.api.plans import Grant
 from fractus_core.policy.signatures import sign
 from fractus_proto.v1 import mobility_pb2_grpc
-from fractus_proto.v1.mobility_pb2 import SubscribeTelemetryRequest, Telemetry
+from fractus_proto.v1.mobility_pb2 import MissionOutcome, SubscribeTelemetryRequest, Telemetry
 from fractus_proto.v1.types_pb2 import Position
 from mobility_rig import issue_signer
 
@@ -217,7 +217,8 @@ def test_a_drones_life(server: ApiServer, drone: Node) -> None:
 
     drone.mobility.now.flight_state = "flying"
     drone.mobility.now.in_air = True
-    drone.mobility.now.missions[uid] = "failed: driver lost"
+    ended = MissionOutcome(kind=MissionOutcome.KIND_FAILED, reason="driver lost")
+    drone.mobility.now.missions[uid].CopyFrom(ended)
     wait_for(lambda: (drone.object() or {})["status"]["flightState"] == "flying", "flying", timeout_s=10)
     wait_for(lambda: phase(server, "mine") == "Failed", "failed grant", timeout_s=10)
     grant = server.get(f"{FRACTUS}/grants/mine")

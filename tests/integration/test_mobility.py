@@ -25,6 +25,7 @@ from mobility_rig import (
     fence,
     flown,
     grant,
+    outcomes,
     passenger_grant,
     xy,
 )
@@ -94,7 +95,7 @@ async def _return_and_land(rig: Rig, driver: Driver) -> None:
     await driver.next(pb.ControlEvent.STATE_COMPLETE)
     landed = await rig.until(lambda t: not t.armed, 90, "landing")
     assert math.dist(xy(landed.position), (0, 0)) < 2.0
-    assert dict(landed.missions) == {"uid-app-navigator": "complete"}
+    assert outcomes(landed) == {"uid-app-navigator": "complete"}
 
     code, why = await denied(_first_event(Driver(rig)))
     assert (code, why.code) == (grpc.StatusCode.FAILED_PRECONDITION, "MissionComplete")

@@ -11,13 +11,13 @@ from typing import Any
 
 import grpc
 import pytest
+from fractus_core.control.values import FlightMode
 from fractus_mavlink import Endpoint
 from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_COMPONENT, MAV_TYPE
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import Autopilot
-from fractus_services.mobility.mavlink.flight_stack import FlightMode
-from mobility_rig import DRIVER, FRAME, Driver, Rig, denied, fence, flown, grant, xy
+from mobility_rig import DRIVER, FRAME, Driver, Rig, denied, fence, flown, grant, outcomes, xy
 
 LOST = pb.ControlEvent.STATE_LOST
 
@@ -41,7 +41,7 @@ async def flying(rig: Rig, *policies: dict[str, Any], speedup: float = 3.0, **ch
 
 
 def outcome(telemetry: pb.Telemetry) -> str:
-    return telemetry.missions.get("uid-app-navigator", "")
+    return outcomes(telemetry).get("uid-app-navigator", "")
 
 
 def speed(telemetry: pb.Telemetry) -> float:

@@ -15,7 +15,7 @@ from fractus.drone import Mobility
 from fractus.environment import Endpoint
 from fractus.errors import ControlLost, InvalidRequest, MissionComplete, PolicyDenied
 from fractus_core.api.names import node_server_name
-from mobility_rig import DRIVER, FRAME, NODE, PASSENGER, Rig, altitude_limit, fence, grant, passenger_grant
+from mobility_rig import DRIVER, FRAME, NODE, PASSENGER, Rig, altitude_limit, fence, grant, outcomes, passenger_grant
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ async def test_a_mission_through_the_sdk(rig: Rig) -> None:
                 assert taken.value.decision.action.name == "TAKEOVER"
                 await drone.goto(*FRAME.latlon(0, 0), 7)
     state = await rig.until(lambda t: "uid-app-navigator" in t.missions, 30, "the outcome")
-    assert state.missions["uid-app-navigator"].startswith("revoked:")
+    assert outcomes(state)["uid-app-navigator"].startswith("revoked:")
 
 
 async def test_control_returned_through_the_sdk(rig: Rig) -> None:

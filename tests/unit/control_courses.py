@@ -7,8 +7,8 @@ from collections.abc import Callable, Coroutine
 from typing import Any
 
 from control_flights import Flight, missions_of
+from fractus_core.control.values import FlightMode
 from fractus_core.policy.values import SetSpeedArgs, TakeoffArgs, VelocityArgs
-from fractus_services.mobility.mavlink.flight_stack import FlightMode
 from mobility_world import GUIDED, LAND, LOITER, RTL, partial, spec, touring, zone
 
 Course = Callable[[Flight], Coroutine[Any, Any, None]]

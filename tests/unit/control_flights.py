@@ -13,10 +13,10 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
+from fractus_core.control.values import FlightMode
 from fractus_core.policy.values import TakeoffArgs
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.observer import Observer
-from fractus_services.mobility.mavlink.flight_stack import FlightMode
 from mobility_world import World, fly, goto
 
 BEAT_S = 0.5
@@ -192,11 +192,10 @@ class Flight:
         old = self.world
         await self._stop_tasks()
         await old.__aexit__()
-        self.world = self._wired(World(self._directory, **self._options, after=old))
+        self.world = self._wired(World(self._directory, **self._options, after=old, known=False))
         grants, self._grants = self._grants, []
         for grant, key in grants:
             self.put(grant, key)
-        unknown(self.world)
         self.observer.found()
         await self.world.__aenter__()
         self._beat()
@@ -253,14 +252,9 @@ class Flight:
             self.texts.append(f"mission {mission.key} {mission.outcome or ''}")
 
 
-def unknown(world: World) -> None:
-    """What the vehicle does is not known yet."""
-    world.control.decided, world.control.was_armed = False, None
-
-
 def missions_of(world: World) -> list[Any]:
     """The missions that the service remembers."""
-    return list(world.journal.missions.values())
+    return list(world.control.state.missions.values())
 
 
 def _code(error: Exception) -> str:

@@ -12,6 +12,8 @@ from typing import Any
 
 import shapely
 from fractus_core.api.plans import GrantSpec
+from fractus_core.control import ControlEvent, ControlState, StreamState
+from fractus_core.control.values import FlightMode
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled import compile_grant
 from fractus_core.policy.values import Airframe, GotoArgs, Home, TakeoffArgs
@@ -21,7 +23,6 @@ from fractus_services.errors import Refused
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Journal
-from fractus_services.mobility.authority.leases import ControlEvent, ControlState
 from fractus_services.mobility.authority.situation import situation_of
 from fractus_services.mobility.authority.supervisor import Supervisor
 from fractus_services.mobility.flight.calls import CallJudge
@@ -35,7 +36,6 @@ from fractus_services.mobility.flight.transit import TransitFlight
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import Autopilot
 from fractus_services.mobility.mavlink.failsafes import Checked
-from fractus_services.mobility.mavlink.flight_stack import FlightMode
 from fractus_services.mobility.mavlink.vehicle import COURSE_S
 from fractus_services.mobility.rpc.streams import Streams
 
@@ -307,6 +307,7 @@ class World:
         grace_s: float = 5.0,
         boarding_s: float = 0.0,
         after: World | None = None,
+        known: bool = True,
     ) -> None:
         self.plane = after.plane if after is not None else Plane()
         self.grants = Grants()
@@ -315,15 +316,16 @@ class World:
         self.journal = after.journal if after is not None else Journal(directory)
         self.journal._write = lambda _data: None  # type: ignore[method-assign]
         self.fence = Fence()
+        facts = self.plane.vehicle
         self.control = Control(
             self.plane, self.journal, self.grants, self.audit, fence=self.fence, grace_s=grace_s,  # type: ignore[arg-type]
+            way_home=lambda control: Homing(control, self._guard_of(control)).approach,
+            state=ControlState(decided=known, armed_seen=facts.armed if known else None, expected_mode=GUIDED),
         )  # fmt: skip
         control = self.control
         control.checked = Checked("", (), Airframe(retraces=retraces), 8.0, retraces)
-        control.decided, control.was_armed, control.modes.expected = True, self.plane.vehicle.armed, GUIDED
-        self.guard = Guard(lambda: situation_of(control, 1_790_000_000.0 + self.plane.now), self.audit)  # type: ignore[arg-type]
+        self.guard = self._guard_of(control)
         homing = Homing(control, self.guard)
-        control.modes.approach = homing.approach
         courses = Courses(control, self.guard)
         transit = TransitFlight(control, self.guard, courses)
         self.tours = Tours(control, self.grants, transit.launch, courses, boarding_s)  # type: ignore[arg-type]
@@ -334,11 +336,15 @@ class World:
         self._tasks = [asyncio.ensure_future(part) for part in (self.plane.run(), self.monitor.run(), self.tours.run())]
         self.events: list[ControlEvent] = []
 
+    def _guard_of(self, control: Control) -> Guard:
+        return Guard(lambda: situation_of(control, 1_790_000_000.0 + self.plane.now), self.audit)  # type: ignore[arg-type]
+
     async def __aenter__(self) -> World:
         await asyncio.sleep(0.2)
         return self
 
     async def __aexit__(self, *_: object) -> None:
+        self.control.close()
         while tasks := [task for task in (*self._tasks, *self.control.tasks._tasks) if not task.done()]:
             for task in tasks:
                 task.cancel()
@@ -351,7 +357,7 @@ class World:
         async def follow() -> None:
             async for event in self.streams.follow(grant):
                 self.events.append(event)
-                if event.state is ControlState.GRANTED:
+                if event.state is StreamState.GRANTED:
                     granted.set()
 
         stream = asyncio.ensure_future(follow())
@@ -369,6 +375,11 @@ class World:
         await self.service.arm(grant)
         await end(self.service.take_off(grant, TakeoffArgs(altitude_m)))
         return stream
+
+    def outcome(self, key: str = "m1") -> str:
+        """How a mission ended, in words; empty while it goes on."""
+        mission = self.control.state.missions.get(key)
+        return str(mission.outcome) if mission is not None and mission.outcome is not None else ""
 
     async def until(self, condition: Callable[[], object], timeout_s: float = 120.0) -> None:
         async with asyncio.timeout(timeout_s):

@@ -16,7 +16,11 @@ from fractus_agent.grants.keeper import (
     stored_form,
 )
 from fractus_core.api.plans import Grant
+from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
+
+COMPLETE = Outcome(OutcomeKind.COMPLETE)
+FAILED = Outcome(OutcomeKind.FAILED, "driver lost")
 
 
 def manifest(name: str = "g1", uid: str = "u1", version: str = "1", **more: Any) -> dict[str, Any]:
@@ -133,7 +137,7 @@ async def test_phases_are_reported_once_and_survive_outages(keeper: GrantKeeper,
     await keeper.report_once()
     await keeper.report_once()
     assert [s["phase"] for _, s in store.statuses] == ["Active"]
-    keeper.missions_changed({"u1": "failed: driver lost"})
+    keeper.missions_changed({"u1": FAILED})
     await keeper.report_once()
     assert store.statuses[-1] == ("g1", {"phase": "Failed", "message": "driver lost", "observedGeneration": 1})
 
@@ -146,7 +150,7 @@ async def test_a_new_agent_does_not_repeat_what_is_reported(keeper: GrantKeeper,
 
 
 async def test_a_grant_made_again_under_its_name_is_reported_again(keeper: GrantKeeper, store: FakeStore) -> None:
-    keeper.missions_changed({"u1": "complete"})
+    keeper.missions_changed({"u1": COMPLETE})
     for uid in ("u1", "u2"):
         keeper.take(Changed(manifest(uid=uid)))
         await keeper.report_once()
@@ -276,7 +280,7 @@ async def test_an_api_server_that_is_gone_for_a_month_takes_no_grant_away(
     doubter.error = UnknownAuthority("there is no ca.crt any more")
     for _ in range(30):
         doubter.now_s += 86_400
-        doubting.missions_changed({"u1": f"failed: {doubter.now_s}"})
+        doubting.missions_changed({"u1": Outcome(OutcomeKind.FAILED, f"{doubter.now_s}")})
         doubting.give_up_unverified()
         doubting.retry_disk()
         doubting.authority_changed()
@@ -288,11 +292,13 @@ async def test_an_api_server_that_is_gone_for_a_month_takes_no_grant_away(
 def test_outcomes() -> None:
     grant = Grant.from_body(manifest())
     assert outcome_of(grant, {}) is None
-    assert outcome_of(grant, {"u1": "complete"}) == ("Complete", "")
-    assert outcome_of(grant, {grant.spec.identity: "revoked: zone closed: now"}) == ("Revoked", "zone closed: now")
-    assert outcome_of(grant, {"u1": "failed: driver lost"}) == ("Failed", "driver lost")
-    assert outcome_of(grant, {"u1": "exploded"}) == ("Failed", "exploded")
-    assert outcome_of(grant, {"u2": "complete"}) is None
+    assert outcome_of(grant, {"u1": COMPLETE}) == ("Complete", "")
+    assert outcome_of(grant, {grant.spec.identity: Outcome(OutcomeKind.REVOKED, "zone closed: now")}) == (
+        "Revoked",
+        "zone closed: now",
+    )
+    assert outcome_of(grant, {"u1": FAILED}) == ("Failed", "driver lost")
+    assert outcome_of(grant, {"u2": COMPLETE}) is None
 
 
 def test_a_reported_end_is_final() -> None:

@@ -18,7 +18,8 @@ from fractus_agent.registration.status import (
 from fractus_agent.telemetry.feed import snapshot
 from fractus_agent.telemetry.snapshot import Snapshot
 from fractus_core.api.nodes import DroneStatus, EdgeNodeStatus
-from fractus_proto.v1.mobility_pb2 import Telemetry
+from fractus_core.control import Outcome, OutcomeKind
+from fractus_proto.v1.mobility_pb2 import MissionOutcome, Telemetry
 from fractus_proto.v1.types_pb2 import AltitudeReference, Position
 
 NOW = datetime(2026, 5, 1, 12, 0, 0, tzinfo=UTC)
@@ -60,9 +61,10 @@ def test_telemetry_becomes_a_valid_drone_status() -> None:
         ),
         battery_remaining=0.834, battery_voltage_v=15.93, battery_current_a=12.14, in_air=True, mode="GUIDED",
         flight_state="flying", controller="spiffe://fractus.dev/ns/a/app/b/component/c/instance/d",
-        autopilot_connected=True, ready=True, missions={"x": "complete"},
+        autopilot_connected=True, ready=True, missions={"x": MissionOutcome(kind=99, reason="new")},
     )  # fmt: skip
     status = node_status(observed(snapshot=snapshot(message)), {}, 3, NOW)
+    assert snapshot(message).missions == {"x": Outcome(OutcomeKind.FAILED, "new")}, "of a kind that is not known"
     parsed = DroneStatus.model_validate(status)
     assert parsed.flight_state == "flying"
     assert parsed.controller == "spiffe://fractus.dev/ns/a/app/b/component/c/instance/d"

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from fractus_core.api.plans import GrantSpec
+from fractus_core.control.events import ArmingRequested
 from fractus_core.policy.values import Airframe, TakeoffArgs
 from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError
@@ -93,7 +94,7 @@ def test_failsafes_that_are_set_anew_meanwhile_forbid_arming(
                 control.checked = found
 
             if during == "choice":
-                control.journal.mission(grant).home = (39.3604, 22.95, 10.0)
+                control.dispatch(ArmingRequested(grant.key, grant.identity, (39.3604, 22.95, 10.0)))
                 plane.write_parameter = chosen  # type: ignore[method-assign]
             elif during == "fence":
                 world.fence.raise_around = raised  # type: ignore[method-assign]
@@ -124,7 +125,7 @@ def test_a_link_that_comes_back_in_flight_leaves_the_way_home_as_chosen(tmp_path
             control.checked = Checked("", (), Airframe(retraces=True, accel_mps2=1.0), 8.0, remembers=True)
             grant = world.grants.put(spec())
             await world.drive(grant)
-            control.journal.mission(grant).home = (39.3604, 22.95, 10.0)
+            control.dispatch(ArmingRequested(grant.key, grant.identity, (39.3604, 22.95, 10.0)))
             await world.service.arm(grant)
             await end(world.service.take_off(grant, TakeoffArgs(10.0)))
             assert plane.parameters["FS_GCS_ENABLE"] == 1.0

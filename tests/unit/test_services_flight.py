@@ -8,11 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from fractus_core.control import Authority, StreamState
+from fractus_core.control.values import FlightMode
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, Verdict
 from fractus_services.errors import AutopilotError, Refused
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.authority.leases import ControlState
-from fractus_services.mobility.mavlink.flight_stack import FlightMode
+from fractus_services.mobility.authority.observer import Observer
 from mobility_world import (
     GUIDED,
     LAND,
@@ -42,7 +43,7 @@ def test_the_transit_flies_around_a_wall_there_and_home(tmp_path: Path) -> None:
             grant = world.grants.put(partial(zone("wall", "ignore", *WALL), corridor=[]))
             stream = await world.drive(grant)
             assert math.dist(world.plane.xy, (0, 70)) < 1.5
-            assert [n.reason for n in world.events if n.state is ControlState.WAITING][
+            assert [n.reason for n in world.events if n.state is StreamState.WAITING][
                 -1
             ] == "the system flies to the control point"
             assert await world.control.give_back(grant)
@@ -79,7 +80,7 @@ def test_a_zone_that_demands_the_drone_ends_the_transit(tmp_path: Path) -> None:
             wall = (-40.0, 40.0, 40.0, 55.0)
             world.grants.put(partial(zone("wall", "revoke", *wall)))
             await world.until(lambda: not world.plane.vehicle.armed)
-            assert world.journal.missions["m1"].outcome.startswith("revoked:")
+            assert world.outcome().startswith("revoked:")
             assert clear_m(world, *wall) > 0.5
             with pytest.raises(Refused, match="about to enter zone wall-zone"):
                 await driving
@@ -103,7 +104,7 @@ def test_a_drone_that_speeds_up_toward_a_new_zone_is_stopped_before_anybody_know
             why = await going
             assert (why.verdict.code, why.verdict.action) == ("ExclusionZoneAhead", "deny")
             await asyncio.sleep(20)
-            assert world.control.authority == "driver", "nothing was in the zone, nor was it going to be"
+            assert world.control.authority is Authority.DRIVER, "nothing was in the zone, nor was it going to be"
             assert clear_m(world, *WALL) > 5
 
     fly(flight)
@@ -116,7 +117,7 @@ def test_no_way_to_the_control_point_is_told(tmp_path: Path) -> None:
             why = await refusal(world.drive(grant))
             assert why.verdict.code == "NoLegalWay"
             assert "around" in str(why)
-            assert world.control.authority == "system"
+            assert world.control.authority is Authority.SYSTEM
 
     fly(flight)
 
@@ -161,7 +162,7 @@ def test_a_removed_grant_keeps_its_fences_on_the_way_home(tmp_path: Path) -> Non
             world.grants.remove(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
             assert clear_m(world, *WALL) > 1.0
-            assert world.journal.missions["m1"].outcome == "revoked: the grant was removed"
+            assert world.outcome() == "revoked: the grant was removed"
 
     fly(flight)
 
@@ -182,7 +183,7 @@ def test_a_lost_driver_is_brought_home_around_the_wall(tmp_path: Path) -> None:
             await world.until(lambda: not world.plane.vehicle.armed)
             assert clear_m(world, *WALL) > 1.0
             assert math.dist(world.plane.xy, (0, 0)) < 1.5
-            assert world.journal.missions["m1"].outcome == "failed: driver lost"
+            assert world.outcome() == "failed: driver lost"
             with pytest.raises(Exception, match="driver"):
                 await flying
 
@@ -220,10 +221,8 @@ def test_a_tour_visits_its_points_and_comes_home(tmp_path: Path) -> None:
             await asyncio.sleep(5)
             assert not world.plane.vehicle.armed
             world.tours.heard(grant)
-            await world.until(
-                lambda: world.journal.missions["m1"].outcome == "complete" if world.journal.missions else 0
-            )
-            assert world.journal.missions["m1"].waypoints == 2
+            await world.until(lambda: world.outcome() == "complete")
+            assert world.control.state.missions["m1"].waypoints == 2
             await world.until(lambda: not world.plane.vehicle.armed)
             assert clear_m(world, *WALL) > 1.0
             for place in ((0, 70), (60, 70)):
@@ -249,14 +248,14 @@ def test_a_pilot_ends_a_tour_and_a_mission_that_ended_is_not_flown_again(tmp_pat
         async with World(tmp_path) as world:
             world.grants.put(touring(tour=((0, 100),)))
             await world.until(lambda: world.plane.xy[1] > 20)
-            world.control.authority = "pilot"
-            world.control.lose("a human pilot took it")
-            world.control.tasks.drop(world.control.system)
+            observer = Observer(world.control)
             world.plane.set_to(LAND)
+            observer.heartbeat()
+            assert world.control.authority is Authority.PILOT
             await world.until(lambda: not world.plane.vehicle.armed)
-            assert world.control.touring is None
-            world.journal.missions["m1"].outcome = "failed: pilot"
-            world.control.authority = "system"
+            observer.heartbeat()
+            assert world.control.state.touring is None
+            assert world.outcome() == "failed: a human pilot took the drone and landed it"
             world.plane.vehicle.mode = GUIDED
             await asyncio.sleep(20)
             assert not world.plane.vehicle.armed
@@ -268,8 +267,8 @@ def test_a_point_out_of_reach_ends_the_tour_and_says_why(tmp_path: Path) -> None
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.grants.put(touring(tour=((0, 30), (0, 500))))
-            await world.until(lambda: any(m.outcome for m in world.journal.missions.values()))
-            assert world.journal.missions["m1"].outcome.startswith("failed: the system cannot fly to")
+            await world.until(world.outcome)
+            assert world.outcome().startswith("failed: the system cannot fly to")
             await world.until(lambda: not world.plane.vehicle.armed)
             assert math.dist(world.plane.xy, (0, 0)) < 1.5
 
@@ -285,7 +284,7 @@ def test_a_tour_goes_on_with_the_service_that_follows(tmp_path: Path) -> None:
         second = World(tmp_path, boarding_s=1000, after=world)
         second.grants.put(touring(tour=((0, 40), (0, 80))))
         async with second:
-            await second.until(lambda: second.journal.missions["m1"].outcome == "complete")
+            await second.until(lambda: second.outcome() == "complete")
             assert min(y for _, y, _ in second.plane.trace[flown:]) > 45, "the first point is not visited again"
             await second.until(lambda: not second.plane.vehicle.armed)
 
@@ -299,9 +298,9 @@ def test_a_tour_waits_while_a_driver_has_the_drone(tmp_path: Path) -> None:
             await world.up(grant)
             world.grants.put(touring(tour=((0, 30),)), "m2")
             await asyncio.sleep(10)
-            assert world.control.controller == grant.identity
+            assert world.control.state.controller == grant.identity
             await world.control.give_back(grant)
-            await world.until(lambda: world.journal.missions.get("m2") and world.journal.missions["m2"].outcome)
+            await world.until(lambda: world.outcome("m2"))
 
     fly(flight)
 
@@ -464,16 +463,16 @@ def test_a_journal_that_fails_in_flight_ends_no_flight(tmp_path: Path) -> None:
 # Nobody's drone
 
 
-def test_an_orphan_is_adopted(tmp_path: Path) -> None:
+def test_a_drone_without_authority_is_taken_by_the_system(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            grant = world.grants.put(spec())
-            await world.up(grant)
-            world.control.lease, world.control.authority = None, "system"  # a fault of ours
-            await world.until(lambda: world.kinds("takeover"))
-            assert world.kinds("takeover")[0]["code"] == "Orphaned"
-            await world.until(lambda: not world.plane.vehicle.armed)
-            assert math.dist(world.plane.xy, (0, 0)) < 1.5
+            await world.up(world.grants.put(spec()))
+        async with World(tmp_path, after=world) as second:  # it knows the armed drone, and no one that commands it
+            second.grants.put(spec())
+            await second.until(lambda: second.kinds("takeover"))
+            assert second.kinds("takeover")[0]["code"] == "NoControlAuthority"
+            await second.until(lambda: not second.plane.vehicle.armed)
+            assert math.dist(second.plane.xy, (0, 0)) < 1.5
 
     fly(flight)
 

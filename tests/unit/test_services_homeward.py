@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 import shapely
+from fractus_core.control.values import FlightMode
 from fractus_core.policy.values import GotoArgs
 from fractus_services.mobility.authority.observer import Observer
-from fractus_services.mobility.mavlink.flight_stack import FlightMode
 from mobility_world import LAND, RTL, SMART_RTL, World, at, end, fly, partial, refusal, spec, touring, zone
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
@@ -229,8 +229,8 @@ def test_a_fault_of_ours_ends_the_mission_once(tmp_path: Path, monkeypatch: pyte
             if who == "driver":
                 why = await refusal(world.drive(grant))
                 assert "has a fault" in str(why)
-            await world.until(lambda: grant.key in world.journal.missions and world.journal.missions["m1"].outcome)
-            assert world.journal.missions["m1"].outcome.startswith("failed: the mobility service has a fault")
+            await world.until(world.outcome)
+            assert world.outcome().startswith("failed: the mobility service has a fault")
             await world.until(lambda: not world.plane.vehicle.armed)
             assert world.plane.commands.count(400) == 1, "not armed again"
             await asyncio.sleep(20)

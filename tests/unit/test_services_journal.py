@@ -5,31 +5,40 @@ from __future__ import annotations
 import asyncio
 import json
 import threading
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
-from fractus_services.mobility.authority.journal import Journal, Mission
+from fractus_core.control import Mission, Outcome, OutcomeKind
+from fractus_services.mobility.authority.journal import Journal, Record
+
+
+def record(**changes: Any) -> Record:
+    """A mission, and that the drone flies for it."""
+    return Record({"k": replace(Mission("k", "id", home=(39.0, 22.0, 10.0)), **changes)}, "k")
 
 
 async def kept(directory: Path) -> Journal:
     journal = Journal(directory)
-    journal.missions["k"] = Mission("k", "id", points_done=1, home=(39.0, 22.0, 10.0))
-    journal.active = "k"
-    await journal.save()
-    journal.missions["k"].points_done = 2
-    await journal.save()
+    await journal.save(record(points_done=1))
+    await journal.save(record(points_done=2))
     return journal
 
 
-@pytest.mark.parametrize("torn", [b"", b"{", b'{"missions": 3}'])
+OLD = b'{"version": 1, "active": "k", "missions": [{"key": "k", "identity": "id", "outcome": "failed: driver lost"}]}'
+"""An outcome that cannot be understood makes the whole file unreadable: a mission that ended must not begin again."""
+
+
+@pytest.mark.parametrize("torn", [b"", b"{", b'{"missions": 3}', OLD])
 async def test_a_torn_journal_leaves_the_copy_before_it(tmp_path: Path, torn: bytes) -> None:
     await kept(tmp_path)
     (tmp_path / "journal.json").write_bytes(torn)
     found = Journal(tmp_path)
-    assert found.active == "k"
-    assert found.missions["k"].points_done == 1
-    assert found.missions["k"].home == (39.0, 22.0, 10.0)
-    await found.save()
+    assert found.record.active == "k"
+    assert found.record.missions["k"].points_done == 1
+    assert found.record.missions["k"].home == (39.0, 22.0, 10.0)
+    await found.save(found.record)
     assert json.loads((tmp_path / "journal.last.json").read_bytes())["active"] == "k", (
         "a torn file replaces no sound one"
     )
@@ -41,7 +50,7 @@ async def test_what_a_newer_release_wrote_is_left_out(tmp_path: Path) -> None:
     stored = json.loads(path.read_bytes())
     stored["missions"][0]["novelty"] = 1
     path.write_text(json.dumps(stored))
-    assert Journal(tmp_path).missions["k"].points_done == 2
+    assert Journal(tmp_path).record.missions["k"].points_done == 2
 
 
 async def test_a_disk_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -52,10 +61,10 @@ async def test_a_disk_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.Mon
             raise OSError(28, "No space left on device")
 
         broken.setattr("fractus_storage.files.os.fsync", fail)
-        await journal.save()
+        await journal.save(journal.record)
         assert "No space left" in journal.failure
     assert not list(tmp_path.glob(".*.tmp"))  # noqa: ASYNC240 - a temporary directory
-    await journal.save()
+    await journal.save(journal.record)
     assert journal.failure == ""
 
 
@@ -72,16 +81,14 @@ async def test_writings_follow_each_other(tmp_path: Path, monkeypatch: pytest.Mo
         inside[0] -= 1
 
     monkeypatch.setattr(journal, "_write", slow)
-    journal.missions["k"] = Mission("k", "id")
-    await journal.save(timeout_s=0.05)
+    await journal.save(record(), timeout_s=0.05)
     assert "not written" in journal.failure
-    caller = asyncio.create_task(journal.save())
+    caller = asyncio.create_task(journal.save(record()))
     await asyncio.sleep(0)
     caller.cancel()
-    journal.missions["k"].outcome = "complete"
-    last = journal.save_soon()
+    last = journal.save_soon(record(outcome=Outcome(OutcomeKind.FAILED, "driver lost: it left")))
     free.set()
     await last
     assert most == [1]
-    assert Journal(tmp_path).outcomes() == {"k": "complete"}
+    assert Journal(tmp_path).record.missions["k"].outcome == Outcome(OutcomeKind.FAILED, "driver lost: it left")
     assert journal.failure == ""

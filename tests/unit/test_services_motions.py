@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fractus_core.control import Authority
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import Call, SetSpeedArgs, VelocityArgs
@@ -208,7 +209,7 @@ def test_a_driver_that_comes_back_has_its_speed_again(tmp_path: Path) -> None:
             stream = await world.up(grant)
             await world.service.set_speed(grant, SetSpeedArgs(2.0))
             stream.cancel()
-            await world.until(lambda: world.control.authority == "system", 10)
+            await world.until(lambda: world.control.authority is Authority.SYSTEM, 10)
             assert world.guard.situation().speed_setpoint_mps == 8.0
             await world.drive(grant)
             assert world.guard.situation().speed_setpoint_mps == 2.0
@@ -375,7 +376,7 @@ def test_a_correction_is_not_undone_by_the_motion_that_it_ends(tmp_path: Path) -
             await world.until(lambda: world.plane.height < 16.0, 8)
             assert 84 not in world.plane.commands[begun:], "nothing stops it on its way down"
             await world.until(lambda: world.control.motion is None, 10)
-            assert world.control.controller == grant.identity
+            assert world.control.state.controller == grant.identity
 
     fly(flight)
 

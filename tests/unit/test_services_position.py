@@ -7,7 +7,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fractus_core.control import ControlState, Outcome, OutcomeKind
 from fractus_mavlink import message
+from fractus_proto.v1.mobility_pb2 import MissionOutcome
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 from fractus_services.mobility.rpc.telemetry import telemetry_of
@@ -43,8 +45,12 @@ def test_an_accuracy_that_is_not_told_any_more_is_not_the_last_one() -> None:
 
 def told(vehicle: Vehicle, now: float, missions: bool = False) -> Any:
     autopilot = SimpleNamespace(vehicle=vehicle, now=now, connected=True)
-    journal = SimpleNamespace(outcomes=lambda: {"uid": "complete"})
-    control: Any = SimpleNamespace(autopilot=autopilot, journal=journal, checked=None, controller="system")
+    control: Any = SimpleNamespace(
+        autopilot=autopilot,
+        checked=None,
+        state=ControlState(),
+        outcomes=lambda: {"uid": Outcome(OutcomeKind.REVOKED, "why")},
+    )
     return telemetry_of(control, 0.0, missions)
 
 
@@ -73,5 +79,6 @@ def test_telemetry_tells_how_old_the_attitude_is() -> None:
 
 
 def test_missions_are_for_the_node_alone() -> None:
-    assert dict(told(Vehicle(ARDUCOPTER), 0.0, missions=True).missions) == {"uid": "complete"}
+    missions = dict(told(Vehicle(ARDUCOPTER), 0.0, missions=True).missions)
+    assert missions == {"uid": MissionOutcome(kind=MissionOutcome.KIND_REVOKED, reason="why")}
     assert not told(Vehicle(ARDUCOPTER), 0.0).missions

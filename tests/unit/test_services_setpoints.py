@@ -26,7 +26,7 @@ def test_a_setpoint_runs_out(tmp_path: Path) -> None:
             assert world.plane.velocity[1] > 1.5
             await world.until(lambda: abs(world.plane.velocity[1]) < 0.1, 10)
             assert world.control.motion is None
-            assert world.control.controller == grant.identity
+            assert world.control.state.controller == grant.identity
             assert world.plane.xy[1] < 15
 
     fly(flight)
@@ -62,7 +62,7 @@ def test_a_setpoint_toward_a_zone_is_not_flown_into_it(tmp_path: Path) -> None:
                 await asyncio.sleep(0.2)
             assert refused > 50
             assert clear_m(world, -50, 30, 50, 60) > 0.5
-            assert world.control.controller == grant.identity
+            assert world.control.state.controller == grant.identity
 
     fly(flight)
 
@@ -95,7 +95,7 @@ def test_a_lost_driver_ends_its_setpoint(tmp_path: Path) -> None:
             await asyncio.sleep(0.5)
             assert set(world.plane.commands[sent:]) <= {84, 176}
             await world.until(lambda: abs(world.plane.velocity[1]) < 0.2, 5)
-            assert world.control.controller == "system"
+            assert world.control.state.controller == "system"
 
     fly(flight)
 

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.plans import Grant
+from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
 from fractus_storage import remove_file, write_file
 
@@ -22,7 +23,11 @@ LOG = logging.getLogger(__name__)
 
 Phase = Literal["Pending", "Active", "Complete", "Revoked", "Failed"]
 ENDED: frozenset[str] = frozenset({"Complete", "Revoked", "Failed"})
-_OUTCOMES: dict[str, Phase] = {"complete": "Complete", "revoked": "Revoked", "failed": "Failed"}
+_OUTCOMES: dict[OutcomeKind, Phase] = {
+    OutcomeKind.COMPLETE: "Complete",
+    OutcomeKind.REVOKED: "Revoked",
+    OutcomeKind.FAILED: "Failed",
+}
 REVIEW_INTERVAL_S = 60.0
 """Seconds after which reports and failed writes are tried again."""
 UNVERIFIED_TIMEOUT_S = 120.0
@@ -80,17 +85,15 @@ def stored_form(grant: Grant) -> bytes:
     return json.dumps(body, sort_keys=True, indent=1).encode() + b"\n"
 
 
-def outcome_of(grant: Grant, missions: Mapping[str, str]) -> tuple[Phase, str] | None:
+def outcome_of(grant: Grant, missions: Mapping[str, Outcome]) -> tuple[Phase, str] | None:
     """How the grant's mission ended, as the mobility service tells; None while it has not."""
     for key in (grant.metadata.uid, grant.spec.identity):
         if key and key in missions:
-            kind, _, message = missions[key].partition(":")
-            phase = _OUTCOMES.get(kind.strip().lower())
-            return (phase, message.strip()) if phase else ("Failed", missions[key])
+            return _OUTCOMES[missions[key].kind], missions[key].reason
     return None
 
 
-def status_of(grant: Grant, missions: Mapping[str, str], problem: str | None) -> dict[str, Any]:
+def status_of(grant: Grant, missions: Mapping[str, Outcome], problem: str | None) -> dict[str, Any]:
     """The status that the agent reports of a grant; an end once reported is never taken back."""
     reported = grant.status
     if reported is not None and reported.phase in ENDED:
@@ -139,11 +142,11 @@ class GrantKeeper:
         self._unstored: dict[str, str] = {}
         self._unremoved: set[str] = set()
         self._reported: dict[str, dict[str, Any]] = {}
-        self._missions: Mapping[str, str] = {}
+        self._missions: Mapping[str, Outcome] = {}
         self._work = asyncio.Event()
         self._reviewed_s = monotonic()
 
-    def missions_changed(self, missions: Mapping[str, str]) -> None:
+    def missions_changed(self, missions: Mapping[str, Outcome]) -> None:
         """Take the outcomes of missions from the mobility service."""
         if dict(missions) != self._missions:
             self._missions = dict(missions)

@@ -10,8 +10,9 @@ from pathlib import Path
 import grpc
 from fractus_core.api.geometry import Reference
 from fractus_core.api.names import node_server_name
+from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.exhaustive import exhaustive
-from fractus_proto.v1.mobility_pb2 import SubscribeTelemetryRequest, Telemetry
+from fractus_proto.v1.mobility_pb2 import MissionOutcome, SubscribeTelemetryRequest, Telemetry
 from fractus_proto.v1.mobility_pb2_grpc import MobilityServiceStub
 from fractus_proto.v1.types_pb2 import AltitudeReference
 from fractus_storage import read_set
@@ -37,6 +38,18 @@ _WIRE: dict[Reference, AltitudeReference] = exhaustive(
 _REFERENCES = {wire: reference for reference, wire in _WIRE.items()}
 
 
+_KINDS = {
+    MissionOutcome.KIND_COMPLETE: OutcomeKind.COMPLETE,
+    MissionOutcome.KIND_REVOKED: OutcomeKind.REVOKED,
+    MissionOutcome.KIND_FAILED: OutcomeKind.FAILED,
+}
+
+
+def outcome(message: MissionOutcome) -> Outcome:
+    """Translate how a mission ended; of a kind that this release does not know, it failed."""
+    return Outcome(_KINDS.get(message.kind, OutcomeKind.FAILED), message.reason)
+
+
 def snapshot(message: Telemetry) -> Snapshot:
     """Translate a telemetry message."""
     position = None
@@ -55,7 +68,7 @@ def snapshot(message: Telemetry) -> Snapshot:
         battery_remaining=min(1.0, max(0.0, message.battery_remaining)),
         battery_voltage_v=message.battery_voltage_v,
         battery_current_a=message.battery_current_a,
-        missions=dict(message.missions),
+        missions={key: outcome(ended) for key, ended in message.missions.items()},
     )
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from fractus_core.control import Outcome
+
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
@@ -21,4 +23,4 @@ class Snapshot:
     battery_remaining: float
     battery_voltage_v: float
     battery_current_a: float
-    missions: Mapping[str, str] = field(default_factory=dict)
+    missions: Mapping[str, Outcome] = field(default_factory=dict)

@@ -33,6 +33,7 @@ from fractus_core.control.values import (
     OutcomeKind,
     StreamState,
     TaskKind,
+    ended_refusal,
 )
 
 CANCELLED_DESCENT_S = 0.3
@@ -74,9 +75,7 @@ def _open(step: Step, event: StreamOpened) -> None:
     """Admit a driver, or refuse it; a second stream of the same instance takes the place of the first."""
     mission = step.mission(event.key, event.identity)
     if mission.outcome is not None:
-        code = "MissionComplete" if mission.outcome.kind is OutcomeKind.COMPLETE else "ControlLost"
-        over = "the mission is complete" if code == "MissionComplete" else f"the mission has ended ({mission.outcome})"
-        step.act(RefuseStream(event.lease_id, code, over))
+        step.act(RefuseStream(event.lease_id, *ended_refusal(mission.outcome)))
         return
     lease = step.state.lease
     if lease is not None and lease.key != event.key and not lease.granted and step.state.flies_for(event.key):

@@ -262,7 +262,6 @@ class TourBegan:
     """The system begins, or goes on with, a mission that has no driver."""
 
     key: str
-    identity: str
 
 
 @dataclass(frozen=True, slots=True)

@@ -180,11 +180,10 @@ def _on_system(step: Step, event: SystemEvent) -> None:
 def _on_tour(step: Step, event: TourBegan | TourInterrupted | TourEnded) -> None:
     """A tour is flown by a task of its own; what it reports counts only while it has the vehicle."""
     match event:
-        case TourBegan(key, identity):
+        case TourBegan(key):
             step.stop_task()
             task = SystemTask(step.state.last_task_id + 1, TaskKind.TOUR, key)
             step.set(grace=None, task=task, last_task_id=task.task_id)
-            step.mission(key, identity)
         case TourInterrupted(key, reason):
             mission = step.state.missions.get(key)
             if mission is not None and _tours(step, key):
@@ -213,10 +212,8 @@ def _task_ended(step: Step, task_id: int, finished: bool) -> None:
     if task is None or task.task_id != task_id:
         return
     step.set(task=None)
-    descended = finished and task.kind in {TaskKind.RETURN, TaskKind.LAND}
-    if descended:
+    if finished and task.kind is not TaskKind.HOVER:
         step.set(returning=False)
-    if descended or task.kind is TaskKind.TOUR:
         step.act(WakeWaiters())
 
 

@@ -134,12 +134,9 @@ class Step:
 
     def stop_task(self) -> None:
         """End what the system does with the vehicle."""
-        task = self.state.task
-        if task is not None:
-            self.act(StopSystemTask(task.task_id))
+        if self.state.task is not None:
+            self.act(StopSystemTask(self.state.task.task_id))
             self.set(task=None)
-            if task.kind is TaskKind.TOUR:
-                self.act(WakeWaiters())
 
     def begin_grace(self, mission: Mission, reason: str) -> None:
         """Give a lost driver its time to come back; on the ground, before any flight, there is nothing to save."""

@@ -36,6 +36,11 @@ class FlightMode:
     kind: ModeKind = ModeKind.OTHER
 
     @property
+    def commanded(self) -> bool:
+        """Whether the vehicle obeys the companion in it."""
+        return self.kind is ModeKind.COMMANDED
+
+    @property
     def comes_down(self) -> bool:
         """Whether the vehicle comes down by itself in it."""
         return self.kind in {ModeKind.RETURNING, ModeKind.LANDING}
@@ -84,6 +89,13 @@ class Outcome:
 
 
 COMPLETE = Outcome(OutcomeKind.COMPLETE)
+
+
+def ended_refusal(outcome: Outcome) -> tuple[str, str]:
+    """Code and reason with which a mission that is over is refused."""
+    if outcome.kind is OutcomeKind.COMPLETE:
+        return "MissionComplete", "the mission is complete"
+    return "ControlLost", f"the mission has ended ({outcome})"
 
 
 @dataclass(frozen=True, slots=True)

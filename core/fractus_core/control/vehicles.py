@@ -81,7 +81,7 @@ def _found(step: Step) -> None:
         if mission is not None and mission.flown and mission.outcome is None:
             step.begin_grace(mission, DRIVER_LOST)
         return
-    commanded, comes_down = vehicle.mode.kind is ModeKind.COMMANDED, vehicle.mode.comes_down
+    commanded, comes_down = vehicle.mode.commanded, vehicle.mode.comes_down
     if not (commanded or comes_down) or (mission is None and not commanded):
         step.give_to_pilot(f"is flying in {vehicle.mode.name}")
     elif mission is None:
@@ -152,7 +152,7 @@ def _foreign_mode(step: Step) -> None:
         step.end_mission(mission, OutcomeKind.FAILED, reason)
         step.lose_lease(reason)
         step.follow_descent(TaskKind.LAND if vehicle.mode.kind is ModeKind.LANDING else TaskKind.RETURN)
-    elif state.authority is Authority.PILOT and vehicle.mode.kind is ModeKind.COMMANDED and mission is not None:
+    elif state.authority is Authority.PILOT and vehicle.mode.commanded and mission is not None:
         step.audit("takeover", TaskKind.HOVER.value, "system", "the pilot handed the drone back")
         step.set(authority=Authority.SYSTEM)
         step.take_back(mission)

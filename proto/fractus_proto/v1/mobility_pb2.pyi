@@ -233,6 +233,24 @@ class SubscribeTelemetryRequest(_message.Message):
     interval_s: float
     def __init__(self, interval_s: _Optional[float] = ...) -> None: ...
 
+class MissionOutcome(_message.Message):
+    __slots__ = ("kind", "reason")
+    class Kind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+        __slots__ = ()
+        KIND_UNSPECIFIED: _ClassVar[MissionOutcome.Kind]
+        KIND_COMPLETE: _ClassVar[MissionOutcome.Kind]
+        KIND_REVOKED: _ClassVar[MissionOutcome.Kind]
+        KIND_FAILED: _ClassVar[MissionOutcome.Kind]
+    KIND_UNSPECIFIED: MissionOutcome.Kind
+    KIND_COMPLETE: MissionOutcome.Kind
+    KIND_REVOKED: MissionOutcome.Kind
+    KIND_FAILED: MissionOutcome.Kind
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    kind: MissionOutcome.Kind
+    reason: str
+    def __init__(self, kind: _Optional[_Union[MissionOutcome.Kind, str]] = ..., reason: _Optional[str] = ...) -> None: ...
+
 class Telemetry(_message.Message):
     __slots__ = ("time", "position", "altitude_amsl_m", "velocity", "yaw_deg", "battery_remaining", "battery_voltage_v", "battery_current_a", "armed", "in_air", "mode", "ready", "home", "flight_state", "controller", "autopilot_connected", "missions", "position_error_m", "attitude", "position_age_s", "attitude_age_s")
     class MissionsEntry(_message.Message):
@@ -240,8 +258,8 @@ class Telemetry(_message.Message):
         KEY_FIELD_NUMBER: _ClassVar[int]
         VALUE_FIELD_NUMBER: _ClassVar[int]
         key: str
-        value: str
-        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
+        value: MissionOutcome
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[_Union[MissionOutcome, _Mapping]] = ...) -> None: ...
     TIME_FIELD_NUMBER: _ClassVar[int]
     POSITION_FIELD_NUMBER: _ClassVar[int]
     ALTITUDE_AMSL_M_FIELD_NUMBER: _ClassVar[int]
@@ -279,9 +297,9 @@ class Telemetry(_message.Message):
     flight_state: str
     controller: str
     autopilot_connected: bool
-    missions: _containers.ScalarMap[str, str]
+    missions: _containers.MessageMap[str, MissionOutcome]
     position_error_m: float
     attitude: _types_pb2.Attitude
     position_age_s: float
     attitude_age_s: float
-    def __init__(self, time: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., position: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., altitude_amsl_m: _Optional[float] = ..., velocity: _Optional[_Union[_types_pb2.Velocity, _Mapping]] = ..., yaw_deg: _Optional[float] = ..., battery_remaining: _Optional[float] = ..., battery_voltage_v: _Optional[float] = ..., battery_current_a: _Optional[float] = ..., armed: bool = ..., in_air: bool = ..., mode: _Optional[str] = ..., ready: bool = ..., home: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., flight_state: _Optional[str] = ..., controller: _Optional[str] = ..., autopilot_connected: bool = ..., missions: _Optional[_Mapping[str, str]] = ..., position_error_m: _Optional[float] = ..., attitude: _Optional[_Union[_types_pb2.Attitude, _Mapping]] = ..., position_age_s: _Optional[float] = ..., attitude_age_s: _Optional[float] = ...) -> None: ...
+    def __init__(self, time: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., position: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., altitude_amsl_m: _Optional[float] = ..., velocity: _Optional[_Union[_types_pb2.Velocity, _Mapping]] = ..., yaw_deg: _Optional[float] = ..., battery_remaining: _Optional[float] = ..., battery_voltage_v: _Optional[float] = ..., battery_current_a: _Optional[float] = ..., armed: bool = ..., in_air: bool = ..., mode: _Optional[str] = ..., ready: bool = ..., home: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., flight_state: _Optional[str] = ..., controller: _Optional[str] = ..., autopilot_connected: bool = ..., missions: _Optional[_Mapping[str, MissionOutcome]] = ..., position_error_m: _Optional[float] = ..., attitude: _Optional[_Union[_types_pb2.Attitude, _Mapping]] = ..., position_age_s: _Optional[float] = ..., attitude_age_s: _Optional[float] = ...) -> None: ...

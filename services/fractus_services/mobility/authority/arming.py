@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import math
 
+from fractus_core.control import Mission
+from fractus_core.control.events import ArmingPrepared, ArmingRequested, MotorStart
 from fractus_core.geo import LocalFrame
 
 from fractus_services.errors import AutopilotError, PreconditionFailed
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.authority.journal import Mission
 from fractus_services.mobility.mavlink.autopilot import Permit
 from fractus_services.mobility.mavlink.failsafes import BEING_SET, Checked, choose_return, learn_return
 
@@ -48,16 +49,14 @@ async def _in_turn(control: Control, grant: ActiveGrant, permit: Permit) -> None
 
 
 async def _arm(control: Control, grant: ActiveGrant, permit: Permit) -> None:
-    modes = control.modes
     _check(control)
-    mission = control.journal.mission(grant)
-    home = mission.home = _home_of(control, grant, mission)
-    control.journal.active = mission.key
-    await control.journal.save(timeout_s=ARMED_S)
-    if control.journal.failure:
-        raise PreconditionFailed("JournalUnavailable", control.journal.failure)
+    home = _home_of(control, grant, control.mission(grant))
+    control.dispatch(ArmingRequested(grant.key, grant.identity, home))
+    failure = await control.save(timeout_s=ARMED_S)
+    if failure:
+        raise PreconditionFailed("JournalUnavailable", failure)
     permit()
-    modes.preparing += 1
+    control.dispatch(ArmingPrepared(begins=True))
     try:
         checked = await _prepare_ways_home(control, grant, home)
 
@@ -68,13 +67,13 @@ async def _arm(control: Control, grant: ActiveGrant, permit: Permit) -> None:
         still()
         await _start(control, home, still)
     finally:
-        modes.preparing -= 1
+        control.dispatch(ArmingPrepared(begins=False))
 
 
 async def _start(control: Control, home: tuple[float, float, float], permit: Permit) -> None:
     """Start the motors; stop them again when anything fails before the drone flies."""
     autopilot, modes = control.autopilot, control.modes
-    modes.arming = True
+    control.dispatch(MotorStart(begins=True))
     try:
         await modes.enter_guided(permit)
         try:
@@ -92,7 +91,7 @@ async def _start(control: Control, home: tuple[float, float, float], permit: Per
                 await control.tasks.attempt(autopilot.disarm)
             raise
     finally:
-        modes.arming = False
+        control.dispatch(MotorStart(begins=False))
 
 
 async def _prepare_ways_home(control: Control, grant: ActiveGrant, home: tuple[float, float, float]) -> Checked:

@@ -1,34 +1,56 @@
-"""Who flies the drone: the driver that holds the lease, the system, or a human pilot (contract of a mission).
+"""Who flies the drone: the driver that holds the lease, the system, or a human pilot.
 
-The system takes the drone whenever nobody else rightly has it, and never lets go of a flying drone before it is home
-or a driver or pilot has it.
+`fractus_core.control` decides; here its one state is held, told of what happens, and what it asks for is carried out.
 """
 
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
-from typing import Literal
+from collections.abc import Callable, Coroutine
+from dataclasses import replace
+from typing import Any
 
+from fractus_core.control import Authority, ControlState, Mission, Outcome, not_ready_reason, transition
+from fractus_core.control.actions import Action, RecordAudit, RefuseStream
+from fractus_core.control.events import (
+    BrakeDemanded,
+    ControlReturned,
+    CruiseSpeedSet,
+    Event,
+    GrantChanged,
+    GrantControl,
+    GrantRef,
+    MotionBegan,
+    MotionCancelled,
+    MotionFailed,
+    MotionFinished,
+    MotionStopped,
+    StreamClosed,
+    StreamOpened,
+    SystemFlightBegan,
+    SystemFlightEnded,
+    TakeoverDemanded,
+    Tick,
+    TourBegan,
+    TransitBegan,
+    WaypointReached,
+)
+from fractus_core.control.values import Readiness, VehicleFacts
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled import CompiledGrant, for_transit
-from fractus_core.policy.values import Takeover, Verdict
+from fractus_core.policy.values import Verdict
 
 from fractus_services.audit import AuditLog
-from fractus_services.background import Background
-from fractus_services.errors import Aborted, AutopilotError, PreconditionFailed, Refused, Unavailable
+from fractus_services.errors import PreconditionFailed, Unavailable
 from fractus_services.grants import ActiveGrant, GrantFiles
-from fractus_services.mobility.authority.journal import Journal, Mission
-from fractus_services.mobility.authority.leases import ControlEvent, ControlState, FlightConstraints, Lease, Motion
-from fractus_services.mobility.mavlink.autopilot import Autopilot, Permit, always
+from fractus_services.mobility.authority.journal import Journal, Record
+from fractus_services.mobility.authority.leases import FlightConstraints, Lease, Motion
+from fractus_services.mobility.authority.performer import Performer
+from fractus_services.mobility.mavlink.autopilot import Autopilot
 from fractus_services.mobility.mavlink.failsafes import Checked
 from fractus_services.mobility.mavlink.fence import MissionFence
-from fractus_services.mobility.mavlink.mode_controller import ModeController
-
-log = logging.getLogger(__name__)
-
-Authority = Literal["driver", "system", "pilot"]
+from fractus_services.mobility.mavlink.mode_controller import Approach, ModeController
 
 CORRECTION = "Correction"
 """What the motions are called with which the monitor leads a driver's drone back."""
@@ -39,7 +61,7 @@ DEFAULT_SPEED_MPS = 5.0
 
 
 class Control:
-    """The state machine of a drone's control.
+    """The one holder of a drone's control state; all others ask it, and tell it what happens.
 
     Args:
         autopilot: the link.
@@ -48,12 +70,11 @@ class Control:
         audit: where takeovers are written.
         fence: the vehicle's own fence.
         grace_s: how long a lost driver may take to come back.
+        way_home: makes what flies the way home; needs this control itself.
+        state: to begin with; by default the missions that the journal remembers, and nothing else.
 
     Attributes:
-        decided: whether it is settled who has the vehicle, since its link came up last.
-        began_at: when the last motion began, by the autopilot's clock.
-        constraints: the fences under which the system flies an application's drone; None while it does not.
-        touring: key of the mission without a driver that the system is flying.
+        checked: the autopilot's failsafes, as they were set and verified last.
     """
 
     def __init__(
@@ -65,53 +86,125 @@ class Control:
         *,
         fence: MissionFence,
         grace_s: float,
+        way_home: Callable[[Control], Approach],
+        state: ControlState | None = None,
     ) -> None:
         self.autopilot = autopilot
         self.fence = fence
-        self.journal = journal
-        self.authority: Authority = "system"
-        self.lease: Lease | None = None
-        self.motion: Motion | None = None
-        self.began_at = -math.inf
-        self.checked: Checked | None = None
-        self.speed_mps: float | None = None
-        self.homeward = False
-        self.constraints: FlightConstraints | None = None
-        self.touring: str | None = None
-        self._grants = grants
         self.audit = audit
-        self._grace_s = grace_s
-        self.modes = ModeController(autopilot, lambda: self.motion is not None)
-        self.decided = False
-        self.was_armed: bool | None = None
-        self.system: asyncio.Task[None] | None = None
-        self._grace: asyncio.Task[None] | None = None
+        self.checked: Checked | None = None
+        self._journal = journal
+        self._grants = grants
+        known = replace(
+            state or ControlState(),
+            grace_s=grace_s,
+            missions=journal.record.missions,
+            active=journal.record.active,
+            grants=frozenset(grant.key for grant in grants.active.values()),
+        )
+        self._state = known
+        self._timer: asyncio.TimerHandle | None = None
+        self._closed = False
+        self._constraints: FlightConstraints | None = None
         self._removed: ActiveGrant | None = None
         self._transit: tuple[ActiveGrant, CompiledGrant] | None = None
-        self.tasks = Background()
-        self._changed = asyncio.Event()
+        self.modes = ModeController(autopilot, lambda: self._state, self.dispatch)
+        self._performer = Performer(self, autopilot, self.modes, way_home(self), audit=audit, journal=journal)
+        self.tasks = self._performer.tasks
         grants.listen(self._grant_changed)
 
+    # The state machine
+
     @property
-    def controller(self) -> str:
-        """Who flies, as telemetry tells it."""
-        if self.authority == "driver" and self.lease is not None:
-            return self.lease.grant.identity
-        return "pilot" if self.authority == "pilot" else "system"
+    def state(self) -> ControlState:
+        """Everything that decides who commands the drone, with the drone as it is now."""
+        self._state = self._state.observed(self._facts())
+        return self._state
+
+    def dispatch(self, event: Event) -> tuple[Action, ...]:
+        """Tell the state machine what happened, and carry out what it asks for.
+
+        Raises:
+            Exception: an action failed; the others were carried out all the same.
+        """
+        self._state, actions = transition(self.state, event, self.autopilot.now)
+        try:
+            self._performer.perform(actions)
+        finally:
+            self._set_timer()
+        return actions
+
+    def _facts(self) -> VehicleFacts:
+        vehicle = self.autopilot.vehicle
+        return VehicleFacts(
+            connected=self.autopilot.connected,
+            armed=vehicle.armed,
+            in_air=vehicle.in_air,
+            mode=vehicle.mode,
+            failsafe=vehicle.failsafe,
+            failsafe_text=vehicle.failsafe_text,
+            failsafe_text_at=vehicle.failsafe_text_at,
+        )
+
+    def close(self) -> None:
+        """Let no deadline act any more: the service ends, and the autopilot's failsafe takes its place."""
+        self._closed = True
+        self._set_timer()
+
+    def _set_timer(self) -> None:
+        """Wake up at the next deadline of the state."""
+        deadline = None if self._closed else self._state.deadline
+        if self._timer is not None and self._timer.when() == deadline and not self._timer.cancelled():
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if deadline is not None:
+            self._timer = asyncio.get_running_loop().call_at(deadline, self._tick)
+
+    def _tick(self) -> None:
+        self._timer = None
+        self.dispatch(Tick())
+
+    # What is known
+
+    @property
+    def authority(self) -> Authority:
+        """Who may command."""
+        return self._state.authority
+
+    @property
+    def lease(self) -> Lease | None:
+        """The lease of the driver that has the drone or waits for it."""
+        lease = self._state.lease
+        return self._performer.leases.get(lease.lease_id) if lease is not None else None
+
+    @property
+    def motion(self) -> Motion | None:
+        """The motion under way."""
+        known, motion = self._state.motion, self._performer.motion
+        return motion if known is not None and motion is not None and motion.motion_id == known.motion_id else None
+
+    @property
+    def constraints(self) -> FlightConstraints | None:
+        """The fences under which the system flies an application's drone; None while it does not."""
+        known, constraints = self._state.flight, self._constraints
+        matches = known is not None and constraints is not None and constraints.flight_id == known.flight_id
+        return constraints if matches else None
 
     @property
     def mission_grant(self) -> ActiveGrant | None:
         """The grant under which the drone is in the air."""
-        if self.lease is not None:
-            return self.lease.grant
-        mission = self.journal.flying
+        lease, mission = self.lease, self._state.mission
+        if lease is not None:
+            return lease.grant
         grant = self._grants.of(mission.identity) if mission is not None else None
         return grant if grant is not None and mission is not None and grant.key == mission.key else None
 
     @property
     def last_grant(self) -> ActiveGrant | None:
         """The grant whose fences hold on the way home: the mission's, or what it was before it was taken away."""
-        return self.mission_grant or self._removed
+        return self.mission_grant or (self._removed if self._state.removed is not None else None)
 
     @property
     def retraces(self) -> bool:
@@ -119,67 +212,72 @@ class Control:
         capable = self.checked is not None and self.checked.airframe.retraces
         return capable and not self.autopilot.vehicle.path_lost
 
-    # Who may have the drone
+    @property
+    def cruise_mps(self) -> float:
+        """The speed of legs that name none: the driver's on what the driver flies, else the vehicle's own."""
+        state = self._state
+        corrects = state.motion is not None and state.motion.kind == CORRECTION
+        if state.speed_mps is not None and state.authority is Authority.DRIVER and not corrects:
+            return state.speed_mps
+        return self.checked.speed_mps if self.checked is not None else DEFAULT_SPEED_MPS
 
-    def flies_for(self, key: str) -> bool:
-        """Whether the drone flies for a mission."""
-        return self.autopilot.vehicle.armed and self.journal.active == key
-
-    def taken(self, key: str) -> bool:
-        """Whether the drone flies for another mission than this."""
-        flying = self.journal.flying
-        return flying is not None and flying.key != key and self.autopilot.vehicle.armed
-
-    def blocked_by(self, key: str) -> str | None:
+    def not_ready_reason(self, key: str) -> str | None:
         """Why the drone cannot fly for a mission now; None when it can."""
         vehicle = self.autopilot.vehicle
-        why = next((t for t in reversed(vehicle.texts) if t.startswith("PreArm")), "")
-        reasons = (
-            (not self.autopilot.connected, "the autopilot is not connected"),
-            (not self.decided, "it is not known yet what the drone does"),
-            (self.taken(key), "another application has the drone"),
-            (self.checked is None, "the autopilot's failsafes are being set"),
-            (self.authority == "pilot", f"a human pilot has the drone ({vehicle.mode.name})"),
-            (self.homeward, "the system brings the drone home"),
-            (not vehicle.armed and not vehicle.ready, f"the autopilot is not ready to arm{': ' if why else ''}{why}"),
-            (vehicle.lat is None or vehicle.home is None, "position and home are not known yet"),
-        )
-        return next((reason for holds, reason in reasons if holds), None)
+        why = next((text for text in reversed(vehicle.texts) if text.startswith("PreArm")), "")
+        located = vehicle.lat is not None and vehicle.home is not None
+        return not_ready_reason(self.state, key, Readiness(self.checked is not None, vehicle.ready, why, located))
 
-    async def wait(self, timeout_s: float) -> None:
-        """Wait until something changed that drivers wait for, or for so long."""
-        try:
-            async with asyncio.timeout(timeout_s):
-                await self._changed.wait()
-        except TimeoutError:
-            return
+    def outcomes(self) -> dict[str, Outcome]:
+        """How missions ended, by key."""
+        return {m.key: m.outcome for m in self._state.missions.values() if m.outcome is not None}
 
-    def wake(self) -> None:
-        """Let who waits look again."""
-        self._changed.set()
-        self._changed = asyncio.Event()
-
-    def hand_over(self, lease: Lease, mission: Mission) -> ControlEvent:
-        """The driver has the drone from now on."""
-        self.stop_system()
-        self.authority = "driver"
-        lease.granted = True
-        self.adopt(mission)
-        self.note("granted", lease.grant.identity, f"control point {mission.points_done}")
-        return ControlEvent(ControlState.GRANTED, mission.points_done, "", mission.waypoints)
-
-    def adopt(self, mission: Mission) -> None:
-        """The drone flies for this mission."""
-        self._removed = None
-        if self.journal.active != mission.key:
-            self.speed_mps = None
-        self.journal.active = mission.key
-        self.journal.save_soon()
+    def mission(self, grant: ActiveGrant) -> Mission:
+        """The mission of a grant; a new one, when nothing is known of it yet."""
+        return self._state.missions.get(grant.key) or Mission(grant.key, grant.identity)
 
     def valid(self, grant: ActiveGrant) -> bool:
         """Whether a grant is still in force."""
         now = self._grants.of(grant.identity)
         return now is not None and now.key == grant.key
+
+    async def wait(self, timeout_s: float) -> None:
+        """Wait until something changed that drivers wait for, or the time is over."""
+        await self._performer.wait(timeout_s)
+
+    def wake(self) -> None:
+        """Let everyone that waits look again."""
+        self._performer.wake()
+
+    def note(self, action: str, reason: str, code: str = "") -> None:
+        """Write down what the system does; authority stays where it is."""
+        self._performer.perform((RecordAudit("control", action, "system", reason, code),))
+
+    # Drivers
+
+    def open_lease(self, grant: ActiveGrant) -> Lease:
+        """A driver asks for control.
+
+        Raises:
+            PreconditionFailed: its mission is over, or another application has the drone.
+        """
+        lease = Lease(grant)
+        self._performer.leases[lease.lease_id] = lease
+        for action in self.dispatch(StreamOpened(lease.lease_id, grant.key, grant.identity)):
+            if isinstance(action, RefuseStream):
+                del self._performer.leases[lease.lease_id]
+                raise PreconditionFailed(action.code, action.reason)
+        return lease
+
+    def grant_control(self, lease: Lease) -> None:
+        """Give the drone to a driver that waits, when there is nothing left to wait for."""
+        if self.lease is lease and self.not_ready_reason(lease.key) is None:
+            self.dispatch(GrantControl(lease.lease_id))
+
+    def close_lease(self, lease: Lease) -> None:
+        """A driver's stream is over."""
+        self.dispatch(StreamClosed(lease.lease_id))
+        self._performer.leases.pop(lease.lease_id, None)
 
     def require(self, grant: ActiveGrant) -> Lease:
         """The lease of a caller that moves the drone.
@@ -187,75 +285,64 @@ class Control:
         Raises:
             Refused: it does not have the drone.
         """
-        lease = self.lease
-        if lease is None or lease.key != grant.key or not self.drives(lease):
-            raise PreconditionFailed(
-                "NotInControl", f"the drone is not yours: {self.controller} has it; use GetControl"
-            )
+        lease, state = self.lease, self._state
+        if lease is None or lease.key != grant.key or not state.drives:
+            reason = f"the drone is not yours: {state.controller} has it; use GetControl"
+            raise PreconditionFailed("NotInControl", reason)
         if not self.autopilot.connected:
             raise Unavailable("AutopilotUnavailable", "the autopilot is not connected")
         return lease
 
-    def drives(self, lease: Lease) -> bool:
-        """Whether the driver of a lease has the drone."""
-        return lease.granted and self.authority == "driver"
-
     async def give_back(self, grant: ActiveGrant) -> bool:
         """A driver returns control at the end of a control point; True when that was the last one."""
-        lease = self.require(grant)
-        mission = self.journal.mission(grant)
-        mission.points_done, mission.waypoints = mission.points_done + 1, 0
-        last = mission.points_done >= len(grant.spec.control_points)
-        self.lease = None
-        self.authority = "system"
-        self.stop_motion(Aborted("ControlReturned", "control was returned"))
-        self.note("returned", grant.identity, "the mission is complete" if last else "")
-        if last:
-            mission.outcome = "complete"
-            lease.tell(ControlEvent(ControlState.COMPLETE, mission.points_done - 1, "every control point is done"))
-            self.start("returnToLaunch")
-        else:
-            lease.tell(None)
-            if self.autopilot.vehicle.armed:
-                self.start("hover")
-            self.begin_grace(mission, "driver did not ask for its next control point")
-        await self.journal.save()
+        self.require(grant)
+        points = len(grant.spec.control_points)
+        self.dispatch(ControlReturned(grant.key, points))
+        last = self.mission(grant).points_done >= points
+        await self.save()
         return last
+
+    async def save(self, timeout_s: float | None = None) -> str:
+        """Write the missions to disk; why that failed, or nothing."""
+        await self._journal.save(Record(self._state.missions, self._state.active), timeout_s)
+        return self._journal.failure
 
     def reached(self, grant: ActiveGrant, lat: float, lon: float) -> None:
         """A goto of the driver is complete: count the waypoint."""
-        mission = self.journal.mission(grant)
-        points = grant.spec.control_points
+        mission, points = self.mission(grant), grant.spec.control_points
         path = points[mission.points_done].path if mission.points_done < len(points) else None
         if path and mission.waypoints < len(path):
             ahead = path[mission.waypoints]
             if math.hypot(*LocalFrame(ahead.lat, ahead.lon).xy(lat, lon)) <= WAYPOINT_M:
-                mission.waypoints += 1
-                self.journal.save_soon()
+                self.dispatch(WaypointReached(grant.key))
 
     # The system flies for an application
 
-    def stop_system(self) -> None:
-        """End what the system does with the drone, and a lost driver's grace."""
-        self.tasks.drop(self._grace)
-        self.tasks.drop(self.system)
-
-    def begin_transit(self, grant: ActiveGrant, mission: Mission) -> FlightConstraints:
+    def begin_transit(self, grant: ActiveGrant) -> FlightConstraints:
         """The system flies for an application, under its fences."""
-        self.stop_system()
-        self.authority = "system"
-        self.adopt(mission)
-        return self.begin_system_flight(grant)
+        constraints = self._constraints_of(grant)
+        self.dispatch(TransitBegan(constraints.flight_id, grant.key, grant.identity))
+        return constraints
 
     def begin_system_flight(self, grant: ActiveGrant) -> FlightConstraints:
         """What the system flies from now on keeps to the fences of a grant, as they are at each moment."""
-        self.constraints = FlightConstraints(grant, self._for_transit(grant))
-        return self.constraints
+        constraints = self._constraints_of(grant)
+        self.dispatch(SystemFlightBegan(constraints.flight_id, grant.key))
+        return constraints
 
     def end_system_flight(self, constraints: FlightConstraints) -> None:
         """The system has stopped flying under these constraints."""
-        if self.constraints is constraints:
-            self.constraints = None
+        self.dispatch(SystemFlightEnded(constraints.flight_id))
+
+    def begin_tour(self, grant: ActiveGrant, work: Coroutine[Any, Any, None]) -> None:
+        """Fly a mission without a driver, by a task that tells control how it ends."""
+        self.dispatch(TourBegan(grant.key))
+        if self._state.task is not None:
+            self._performer.run(self._state.task, work)
+
+    def _constraints_of(self, grant: ActiveGrant) -> FlightConstraints:
+        self._constraints = FlightConstraints(grant, self._for_transit(grant))
+        return self._constraints
 
     def _for_transit(self, grant: ActiveGrant) -> CompiledGrant:
         if self._transit is None or self._transit[0] is not grant:
@@ -264,192 +351,71 @@ class Control:
 
     # Motions
 
-    @property
-    def cruise_mps(self) -> float:
-        """The speed of legs that name none: the driver's on what the driver flies, else the vehicle's own."""
-        corrects = self.motion is not None and self.motion.kind == CORRECTION
-        if self.speed_mps is not None and self.authority == "driver" and not corrects:
-            return self.speed_mps
-        return self.checked.speed_mps if self.checked is not None else DEFAULT_SPEED_MPS
-
     def cruise(self, speed_mps: float, leg_mps: float) -> None:
         """Fly legs with this speed from now on, and the one under way with another: what is allowed all along it."""
-        self.speed_mps = speed_mps
-        if self.motion is not None and self.motion.speed_mps is not None:
-            self.motion.speed_mps = leg_mps
+        self.dispatch(CruiseSpeedSet(speed_mps))
+        motion = self.motion
+        if motion is not None and motion.speed_mps is not None:
+            motion.speed_mps = leg_mps
 
     def begin(self, kind: str) -> Motion:
         """Start a motion; the one under way is replaced."""
-        self.stop_motion(Aborted("Replaced", f"{kind} replaced it"))
-        self.motion, self.began_at = Motion(kind), self.autopilot.now
-        return self.motion
+        motion = Motion(kind)
+        self.dispatch(MotionBegan(motion.motion_id, kind))
+        self._performer.motion = motion
+        return motion
 
     def finish(self, motion: Motion) -> None:
         """A motion is complete, or over."""
-        if self.motion is motion:
-            self.motion = None
+        self.dispatch(MotionFinished(motion.motion_id))
 
     def cancelled(self, motion: Motion) -> None:
         """The caller of a motion gave it up: hover, unless the driver is gone and the drone comes home anyway."""
-        if self.motion is motion:
-            self.tasks.spawn(self._hover_after(motion))
-
-    async def _hover_after(self, motion: Motion) -> None:
-        if motion.kind in {"Land", "ReturnToLaunch"}:
-            await asyncio.sleep(0.3)
-        if self.motion is motion and self.authority == "driver":
-            self.motion = None
-            motion.stop(Aborted("Cancelled", "the call was cancelled"))
-            await self.tasks.attempt(self.hold, self.still)
+        self.dispatch(MotionCancelled(motion.motion_id))
 
     def failed(self, motion: Motion) -> None:
         """A motion ended with an error, and the autopilot may fly on for it: hover."""
-        if self.motion is motion:
-            self.motion = None
-            if self.authority == "driver" and self.autopilot.vehicle.in_air:
-                self.tasks.spawn(self.tasks.attempt(self.hold, self.still))
+        self.dispatch(MotionFailed(motion.motion_id))
 
-    def still(self) -> None:
+    def stop_motion(self, verdict: Verdict) -> None:
+        """End the motion under way, for one that follows it."""
+        self.dispatch(MotionStopped(verdict.code, verdict.reason, verdict.policies))
+
+    async def hold(self, permit: Callable[[], None]) -> None:
+        """Brake and hover."""
+        await self._performer.hold(permit)
+
+    def undisturbed(self) -> None:
         """Permits what a driver's drone does after its motion: nothing else has begun.
 
         Raises:
-            AutopilotError: somebody else flies by now.
+            AutopilotError: something else flies by now.
         """
-        if self.motion is not None or self.authority != "driver":
-            raise AutopilotError("somebody else flies by now")
+        self._performer.undisturbed()
 
-    def stop_motion(self, why: Refused) -> None:
-        """End the motion under way."""
-        if self.motion is not None:
-            self.motion.stop(why)
-            self.motion = None
-
-    async def hold(self, permit: Permit = always) -> None:
-        """Brake and hover."""
-        await self.modes.hold(permit)
-        self.tasks.spawn(self.modes.settle())
-
-    # The system
+    # Policies and grants
 
     def brake(self, verdict: Verdict) -> None:
         """Stop the present motion; the driver keeps the drone."""
-        self.note("brake", self.controller, verdict.reason, verdict.code, policies=verdict.policies)
-        # A position that is not known now may be known in a moment.
-        passing = verdict.code == "PositionUnknown"
-        self.stop_motion(
-            Unavailable("AutopilotUnavailable", verdict.reason)
-            if passing
-            else Aborted(verdict.code, verdict.reason, verdict.policies)
-        )
-        self.autopilot.stop()
-        self.tasks.spawn(self.modes.settle())
+        self.dispatch(BrakeDemanded(verdict.code, verdict.reason, verdict.policies))
 
     def take_over(self, verdict: Verdict) -> None:
         """The system takes the drone from its driver, as a policy or the monitor says."""
-        action: Takeover = verdict.takeover or "hover"
-        outcome = {"revoke": "revoked", "land": "failed", "returnToLaunch": "failed", "hover": ""}[action]
-        self._seize("returnToLaunch" if action == "revoke" else action, verdict, outcome)
-
-    def _seize(self, action: Takeover, verdict: Verdict, outcome: str) -> None:
-        mission = self.journal.flying
-        log.warning("the system takes the drone (%s): %s", action, verdict.reason)
-        self.note(action, "system", verdict.reason, verdict.code, policies=verdict.policies, kind="takeover")
-        self.lose(verdict.reason)
-        self.authority = "system"
-        if mission is not None and outcome and not mission.outcome:
-            mission.outcome = f"{outcome}: {verdict.reason}"
-            self.journal.save_soon()
-        self.start(action)
-        if mission is not None and not mission.outcome:
-            self.begin_grace(mission, verdict.reason)
-
-    def lose(self, reason: str) -> None:
-        """Take the lease from the driver and tell it why."""
-        lease, self.lease = self.lease, None
-        self.stop_motion(PreconditionFailed("ControlLost", reason))
-        self.tasks.drop(self._grace)
-        if lease is not None:
-            lease.tell(ControlEvent(ControlState.LOST, reason=reason))
-        self.wake()
-
-    def start(self, action: Takeover) -> None:
-        """Begin what the system wants of the drone; what it did before ends."""
-        self.tasks.drop(self.system)
-        self.touring = None
-        self.homeward = action != "hover" and self.autopilot.vehicle.armed
-        self.system = self.tasks.spawn(self.act(action))
-
-    async def act(self, action: Takeover) -> None:
-        """Carry out what the system wants, as long as it has the drone."""
-        await self.modes.carry_out(action, lambda: self.authority == "system")
-        if action != "hover":
-            self.homeward = False
-            self.wake()
-
-    @property
-    def graced(self) -> bool:
-        """Whether a lost driver has time left to come back."""
-        return self._grace is not None and not self._grace.done()
-
-    def begin_grace(self, mission: Mission, why: str) -> None:
-        """Give a lost driver its time to come back; then the mission has failed."""
-        self.tasks.drop(self._grace)
-        if mission.flown or self.autopilot.vehicle.armed:
-            self._grace = self.tasks.spawn(self._give_up(mission, why))
-
-    async def _give_up(self, mission: Mission, why: str) -> None:
-        await asyncio.sleep(self._grace_s)
-        if mission.outcome:
-            return
-        mission.outcome = f"failed: {why}"
-        log.warning("mission of %s failed: %s", mission.identity, why)
-        self.note("returnToLaunch", "system", why, "DriverLost", kind="takeover")
-        if self.authority == "system" and not self.homeward:
-            self.start("returnToLaunch")
-        self.journal.save_soon()
-
-    # ControlEvent
-
-    def in_air(self) -> None:
-        """Remember that the mission flies."""
-        mission = self.journal.flying
-        if mission is not None and not mission.flown and self.authority != "pilot":
-            mission.flown = True
-            self.journal.save_soon()
+        self.dispatch(TakeoverDemanded(verdict.takeover or "hover", verdict.code, verdict.reason, verdict.policies))
 
     def _grant_changed(self, old: ActiveGrant | None, new: ActiveGrant | None) -> None:
+        lease, constraints = self.lease, self.constraints
         if old is not None and new is not None and old.key == new.key:
-            if self.lease is not None and self.lease.key == new.key:
-                self.lease.grant = new
-            if self.constraints is not None and self.constraints.grant.key == new.key:
-                self.constraints.grant, self.constraints.compiled = new, self._for_transit(new)
-            return
-        self.wake()
-        if old is None or not (old.spec.class_ == "driver" or old.spec.tour):
-            return
-        mission = self.journal.missions.get(old.key)
-        concerned = (self.lease is not None and self.lease.key == old.key) or self.journal.active == old.key
-        if mission is None or mission.outcome or not concerned:
-            return
-        verdict = Verdict("takeover", None, "GrantRevoked", "the grant was removed", (), "revoke")
-        self.journal.active, self._removed = self.journal.active or old.key, old
-        if self.authority == "pilot":
-            mission.outcome = "revoked: the grant was removed"
-            self.journal.save_soon()
-        else:
-            self._seize("returnToLaunch", verdict, "revoked")
+            if lease is not None and lease.key == new.key:
+                lease.grant = new
+            if constraints is not None and constraints.grant.key == new.key:
+                constraints.grant, constraints.compiled = new, self._for_transit(new)
+        self.dispatch(GrantChanged(_reference(old), _reference(new)))
+        if old is not None and self._state.removed == old.key:
+            self._removed = old
 
-    # Plumbing
 
-    def note(
-        self, what: str, who: str, reason: str, code: str = "", *, policies: tuple[str, ...] = (), kind: str = "control"
-    ) -> None:
-        """Write a change of control to the audit log."""
-        vehicle = self.autopilot.vehicle
-        self.audit.append(
-            kind,
-            {
-                "action": what, "controller": who, "reason": reason, "code": code, "policies": list(policies),
-                "lat": vehicle.lat, "lon": vehicle.lon, "alt": vehicle.altitude_m,
-            },
-        )  # fmt: skip
+def _reference(grant: ActiveGrant | None) -> GrantRef | None:
+    if grant is None:
+        return None
+    return GrantRef(grant.key, leads=grant.spec.class_ == "driver" or bool(grant.spec.tour))

@@ -5,57 +5,52 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+from fractus_core.control import Mission, Outcome, OutcomeKind
 from fractus_storage import write_file
 
-from fractus_services.grants import ActiveGrant
-
 log = logging.getLogger(__name__)
-
-REMEMBERED = 200
-
-
-@dataclass(slots=True)
-class Mission:
-    """One driver's mission.
-
-    Attributes:
-        key: the grant's key.
-        identity: SPIFFE id of the driver.
-        outcome: empty while it goes on; then "complete", "revoked: reason" or "failed: reason".
-        points_done: control points that were returned.
-        waypoints: waypoints of the present control point that were reached.
-        flown: whether the drone has been in the air for it.
-        home: latitude, longitude and altitude above sea level of where it armed first.
-    """
-
-    key: str
-    identity: str
-    outcome: str = ""
-    points_done: int = 0
-    waypoints: int = 0
-    flown: bool = False
-    home: tuple[float, float, float] | None = None
-
 
 _FIELDS = frozenset(field.name for field in fields(Mission))
 
 
+@dataclass(frozen=True, slots=True)
+class Record:
+    """What is remembered.
+
+    Attributes:
+        missions: by key, the oldest first.
+        active: key of the mission that the drone is armed or in the air for.
+    """
+
+    missions: Mapping[str, Mission] = field(default_factory=dict)
+    active: str | None = None
+
+
 def _mission(stored: dict[str, Any]) -> Mission:
     """A stored mission; what a newer release wrote beside it is left out."""
-    found = Mission(**{name: value for name, value in stored.items() if name in _FIELDS})
-    if found.home is not None:
-        lat, lon, amsl_m = found.home
-        found.home = (float(lat), float(lon), float(amsl_m))
-    return found
+    known = {name: value for name, value in stored.items() if name in _FIELDS}
+    if known.get("outcome") is not None:
+        known["outcome"] = Outcome(OutcomeKind(known["outcome"]["kind"]), str(known["outcome"]["reason"]))
+    if known.get("home") is not None:
+        lat, lon, amsl_m = known["home"]
+        known["home"] = (float(lat), float(lon), float(amsl_m))
+    return Mission(**known)
 
 
-def _read(path: Path) -> tuple[dict[str, Mission], str | None]:
+def _stored(mission: Mission) -> dict[str, Any]:
+    outcome = mission.outcome
+    told = None if outcome is None else {"kind": outcome.kind.value, "reason": outcome.reason}
+    return asdict(replace(mission, outcome=None)) | {"outcome": told}
+
+
+def _read(path: Path) -> Record:
     stored = json.loads(path.read_bytes())
-    return {m["key"]: _mission(m) for m in stored["missions"]}, stored["active"]
+    return Record({m["key"]: _mission(m) for m in stored["missions"]}, stored["active"])
 
 
 class Journal:
@@ -65,6 +60,7 @@ class Journal:
         directory: the service's state directory.
 
     Attributes:
+        record: what was read at the beginning, or given to be written last.
         failure: why the last writing failed; empty when it did not.
     """
 
@@ -74,8 +70,7 @@ class Journal:
         self._lock = asyncio.Lock()
         self._queued: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
-        self.missions: dict[str, Mission] = {}
-        self.active: str | None = None
+        self.record = Record()
         self.failure = ""
         directory.mkdir(parents=True, exist_ok=True)
         for left in directory.glob("journal.*.new"):
@@ -85,7 +80,7 @@ class Journal:
     def _load(self) -> None:
         for path in (self._path, self._last):
             try:
-                self.missions, self.active = _read(path)
+                self.record = _read(path)
             except FileNotFoundError:
                 continue
             except (OSError, ValueError, KeyError, TypeError) as error:
@@ -93,38 +88,21 @@ class Journal:
                 continue
             return
 
-    @property
-    def flying(self) -> Mission | None:
-        """The mission that the drone is armed or in the air for."""
-        return self.missions.get(self.active) if self.active else None
-
-    def mission(self, grant: ActiveGrant) -> Mission:
-        """The mission of a grant, begun when it is new."""
-        found = self.missions.get(grant.key)
-        if found is None:
-            found = self.missions[grant.key] = Mission(grant.key, grant.identity)
-            for key in list(self.missions)[: max(len(self.missions) - REMEMBERED, 0)]:
-                del self.missions[key]
-        return found
-
-    def outcomes(self) -> dict[str, str]:
-        """Ended missions by key."""
-        return {m.key: m.outcome for m in self.missions.values() if m.outcome}
-
-    async def save(self, timeout_s: float | None = None) -> None:
+    async def save(self, record: Record, timeout_s: float | None = None) -> None:
         """Write everything; on disk when this returns, unless `failure` says why not.
 
         The writing goes on when the caller gives up.
         """
-        task = self.save_soon()
+        task = self.save_soon(record)
         try:
             async with asyncio.timeout(timeout_s):
                 await asyncio.shield(task)
         except TimeoutError:
             self.failure = f"the journal {self._path} is not written within {timeout_s:g} s"
 
-    def save_soon(self) -> asyncio.Task[None]:
-        """Write in the background; one writing at a time, and at most one waiting."""
+    def save_soon(self, record: Record) -> asyncio.Task[None]:
+        """Write in the background; one writing at a time, and at most one waiting, which writes what was given last."""
+        self.record = record
         if self._queued is None:
             self._queued = asyncio.get_running_loop().create_task(self._save())
             self._tasks.add(self._queued)
@@ -134,7 +112,8 @@ class Journal:
     async def _save(self) -> None:
         async with self._lock:
             self._queued = None
-            stored = {"version": 1, "active": self.active, "missions": [asdict(m) for m in self.missions.values()]}
+            missions = [_stored(mission) for mission in self.record.missions.values()]
+            stored = {"version": 2, "active": self.record.active, "missions": missions}
             try:
                 await asyncio.to_thread(self._write, json.dumps(stored, indent=1).encode())
             except OSError as error:

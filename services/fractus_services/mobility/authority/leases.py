@@ -1,56 +1,33 @@
-"""Who holds the drone: the lease that a driver's stream keeps alive, the motion that runs, the fences it keeps to."""
+"""What callers hold of the drone: the lease of a driver's stream, the motion that runs, the flight constraints of the system."""
 
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
-from enum import Enum
+import itertools
+from dataclasses import dataclass, field
 
+from fractus_core.control import ControlEvent
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.values import GotoArgs
 
 from fractus_services.errors import Refused
 from fractus_services.grants import ActiveGrant
 
-
-class ControlState(Enum):
-    """States of a driver's stream."""
-
-    WAITING = "waiting"
-    GRANTED = "granted"
-    RIDING = "riding"
-    LOST = "lost"
-    COMPLETE = "complete"
-
-
-@dataclass(frozen=True, slots=True)
-class ControlEvent:
-    """One event on a driver's stream."""
-
-    state: ControlState
-    control_point: int = 0
-    reason: str = ""
-    waypoints_reached: int = 0
-
-    @property
-    def final(self) -> bool:
-        """Whether the stream ends after it."""
-        return self.state in {ControlState.LOST, ControlState.COMPLETE}
+_ids = itertools.count(1)
+"""Names what control is told of: the state machine knows leases, motions and flights by their numbers alone."""
 
 
 class Lease:
-    """A driver's hold on the drone.
+    """A driver's stream of GetControl: its grant, and the events that it is still to be told.
 
     Attributes:
-        grant: the grant, as it is now.
-        granted: whether the driver drives, or still waits.
-        transit: whether the system flies, or flew, for the waiting driver.
+        lease_id: by which control knows it.
+        grant: as it is now.
     """
 
     def __init__(self, grant: ActiveGrant) -> None:
+        self.lease_id = next(_ids)
         self.grant = grant
-        self.granted = False
-        self.transit = False
         self._events: asyncio.Queue[ControlEvent | None] = asyncio.Queue()
 
     @property
@@ -78,12 +55,14 @@ class FlightConstraints:
 
     grant: ActiveGrant
     compiled: CompiledGrant
+    flight_id: int = field(default_factory=lambda: next(_ids))
 
 
 class Motion:
-    """A motion call that is being carried out, until it is complete or somebody stops it.
+    """A motion call that is being carried out, until it is complete or it is stopped.
 
     Attributes:
+        motion_id: by which control knows it.
         kind: what it is called.
         braking: whether the drone comes to rest first, so that nothing stops the motion before it begins.
         leg: what it flies at present; None while it flies none.
@@ -91,16 +70,12 @@ class Motion:
     """
 
     def __init__(self, kind: str) -> None:
+        self.motion_id = next(_ids)
         self.kind = kind
         self.braking = False
         self.leg: GotoArgs | None = None
         self.speed_mps: float | None = None
         self._stopped: Refused | None = None
-
-    @property
-    def stopped(self) -> bool:
-        """Whether it was stopped."""
-        return self._stopped is not None
 
     def stop(self, why: Refused) -> None:
         """End it; the caller's stream ends with the reason."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from fractus_core.control import Authority
+
 from fractus_services.errors import PreconditionFailed
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
@@ -33,7 +35,7 @@ def transit_permit(control: Control, lease: Lease, motion: Motion) -> Permit:
 
     def check() -> None:
         motion.check()
-        if control.lease is not lease or control.authority != "system" or not control.valid(lease.grant):
+        if control.lease is not lease or control.authority is not Authority.SYSTEM or not control.valid(lease.grant):
             raise PreconditionFailed("ControlLost", "the driver is gone")
 
     return check
@@ -46,7 +48,7 @@ def tour_permit(control: Control, constraints: FlightConstraints, motion: Motion
         motion.check()
         if (
             control.constraints is not constraints
-            or control.authority != "system"
+            or control.authority is not Authority.SYSTEM
             or not control.valid(constraints.grant)
         ):
             raise PreconditionFailed("ControlLost", "the system does not fly this mission any more")

@@ -7,6 +7,7 @@ from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
 from dataclasses import replace
 
+from fractus_core.control.values import FlightMode
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.motion import height_margin_m, margin_m
 from fractus_core.policy.returning import straight_home_blocked
@@ -26,7 +27,6 @@ from fractus_services.mobility.flight.courses import (
 )
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import REACHED_M, Step, come_to_rest, fly_to
-from fractus_services.mobility.mavlink.flight_stack import FlightMode
 
 log = logging.getLogger(__name__)
 
@@ -75,7 +75,7 @@ class Homing:
             return stack.return_straight
         back = control.retraces and tries <= MAX_TRIES
         how = "goes back the way it came" if back else "flies straight"
-        control.note("returnToLaunch", "system", f"no legal way home is known ({why}); the drone {how}", "NoLegalWay")
+        control.note("returnToLaunch", f"no legal way home is known ({why}); the drone {how}", "NoLegalWay")
         log.error("homing: no legal way home is known, the drone %s (reason=%s)", how, why)
         return stack.return_retracing if back else stack.return_straight
 

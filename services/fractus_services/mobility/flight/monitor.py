@@ -8,6 +8,8 @@ import math
 from dataclasses import replace
 from typing import Any
 
+from fractus_core.control import Authority
+from fractus_core.control.events import Airborne
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Verdict
@@ -59,7 +61,7 @@ class MotionMonitor:
         while True:
             await autopilot.update(TICK_S if autopilot.vehicle.in_air else IDLE_S)
             if autopilot.vehicle.in_air:
-                self._control.in_air()
+                self._control.dispatch(Airborne())
                 try:
                     self.look()
                 except Exception:
@@ -82,8 +84,9 @@ class MotionMonitor:
             if grant is not None
             else None
         )
-        coming = control.homeward and control.constraints is None
-        if compiled is None or control.authority == "pilot" or coming or not control.autopilot.vehicle.mode.commanded:
+        coming = control.state.returning and control.constraints is None
+        piloted = control.authority is Authority.PILOT
+        if compiled is None or piloted or coming or not control.autopilot.vehicle.mode.commanded:
             self._alarm = ""
             return
         verdict, ours = self._judge(compiled)
@@ -107,10 +110,10 @@ class MotionMonitor:
         changed = self._has_changed(
             control.constraints.grant if control.constraints is not None else control.mission_grant
         )
-        if control.homeward:
+        if control.state.returning:
             return monitor(now, compiled, leaving=True, changed=changed), True
         verdict = monitor(now, compiled, changed=changed)
-        if verdict is None or verdict.takeover != "hover" or control.authority == "driver":
+        if verdict is None or verdict.takeover != "hover" or control.authority is Authority.DRIVER:
             return verdict, False
         return monitor(now, compiled, leaving=True, changed=changed), True
 
@@ -120,7 +123,7 @@ class MotionMonitor:
         autopilot, motion = control.autopilot, control.motion
         if grant is not self._grant:
             self._grant, self._changed_at = grant, autopilot.now
-        begins = autopilot.now - control.began_at < BEGINS_S
+        begins = autopilot.now - control.state.motion_began_at < BEGINS_S
         if (motion is None or motion.kind == "Takeoff") and not begins and autopilot.vehicle.keeps_place(autopilot.now):
             # Whatever moves it from here is judged by what holds now, or later.
             self._changed_at = -math.inf
@@ -165,7 +168,7 @@ class MotionMonitor:
         lease, authority = control.lease, control.authority
 
         def check() -> None:
-            if control.lease is not lease or control.authority != authority or control.motion is not motion:
+            if control.lease is not lease or control.authority is not authority or control.motion is not motion:
                 raise Aborted("Replaced", "something else flies by now")
 
         return check
@@ -180,7 +183,7 @@ class MotionMonitor:
     async def _lead_back(self, verdict: Verdict, place: GotoArgs, compiled: CompiledGrant) -> None:
         """Fly to where the limits hold, as a motion that follows the one that left them."""
         control = self._control
-        control.stop_motion(Aborted(verdict.code, verdict.reason, verdict.policies))
+        control.stop_motion(verdict)
         motion = control.begin(CORRECTION)
         speed = limited_mps(control.cruise_mps, place, self._guard.situation(), compiled)
         leg = replace(place, speed_mps=speed)
@@ -211,6 +214,6 @@ def recorded(control: Control) -> dict[str, Any]:
         "speed": round(vehicle.speed_mps, 2),
         "mode": vehicle.mode.name,
         "battery": round(vehicle.battery_remaining, 3) if math.isfinite(vehicle.battery_remaining) else 0.0,
-        "controller": control.controller,
+        "controller": control.state.controller,
         "in_air": vehicle.in_air,
     }

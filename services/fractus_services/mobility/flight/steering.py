@@ -55,4 +55,4 @@ class Steering:
                 self._send(setpoint)
         if control.motion is motion:
             control.finish(motion)
-            await control.tasks.attempt(control.hold, control.still)
+            await control.tasks.attempt(control.hold, control.undisturbed)

@@ -7,11 +7,13 @@ import logging
 from collections.abc import AsyncGenerator, Callable
 
 from fractus_core.api.geometry import Position
+from fractus_core.control import Outcome, OutcomeKind
+from fractus_core.control.events import TourEnded, TourInterrupted, TourPointVisited
+from fractus_core.control.values import COMPLETE
 
 from fractus_services.errors import AutopilotError, Refused, Unavailable
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.authority.journal import Mission
 from fractus_services.mobility.authority.permits import tour_permit
 from fractus_services.mobility.flight.courses import FAULT, Courses, Trip, target_of
 
@@ -62,9 +64,7 @@ class Tours:
         while True:
             grant = self._due()
             if grant is not None:
-                control.stop_system()
-                control.touring = grant.key
-                control.system = control.tasks.spawn(self._fly(grant))
+                control.begin_tour(grant, self._fly(grant))
             await control.wait(CHECK_S)
 
     def _due(self) -> ActiveGrant | None:
@@ -72,77 +72,64 @@ class Tours:
         control = self._control
         touring = [grant for grant in self._grants.active.values() if grant.spec.tour]
         self._since = {grant.key: self._since.get(grant.key, control.autopilot.now) for grant in touring}
-        if control.lease is not None or control.touring is not None:
+        if control.lease is not None or control.state.touring is not None:
             return None
         return next((grant for grant in sorted(touring, key=lambda h: h.key) if self._may_begin(grant)), None)
 
     def _may_begin(self, grant: ActiveGrant) -> bool:
-        control, vehicle = self._control, self._control.autopilot.vehicle
-        mission = control.journal.missions.get(grant.key)
-        if mission is not None and mission.outcome:
+        control, state = self._control, self._control.state
+        mission, other = control.mission(grant), state.mission
+        if mission.outcome is not None:
             return False
-        other = control.journal.flying
-        if other is not None and other.key != grant.key and not other.outcome:
+        if other is not None and other.key != grant.key and other.outcome is None:
             return False
-        if control.blocked_by(grant.key) is not None or (vehicle.armed and not control.flies_for(grant.key)):
+        if control.not_ready_reason(grant.key) is not None or (state.vehicle.armed and not state.flies_for(grant.key)):
             return False
         aboard = grant.spec.application.uid in self._aboard
-        begun = mission is not None and mission.flown
-        return aboard or begun or control.autopilot.now - self._since[grant.key] >= self._boarding_s
+        return aboard or mission.flown or control.autopilot.now - self._since[grant.key] >= self._boarding_s
 
     async def _fly(self, grant: ActiveGrant) -> None:
+        """The system task of a tour. Control counts how it ends only while the tour still has the drone."""
         control = self._control
-        mission = control.journal.mission(grant)
-        control.note("tour", "system", f"{len(grant.spec.tour)} points of interest for {grant.identity}")
+        control.note("tour", f"{len(grant.spec.tour)} points of interest for {grant.identity}")
         try:
-            await self._visit(grant, mission)
-            self._end(mission, "complete")
+            await self._visit(grant)
         except (Refused, AutopilotError) as error:
-            if mission.outcome or control.authority != "system" or control.touring != grant.key:
-                return  # The system lost the drone to a driver or a pilot, which is in the log and the outcome already.
-            if _passing(error) and mission.flown:
+            if _passing(error) and control.mission(grant).flown:
                 log.warning("tours: tour interrupted (identity=%s, error=%s)", grant.identity, error)
-                control.start("hover")
-                control.begin_grace(mission, str(error))
-                return
-            self._end(mission, f"failed: {error}")
+                control.dispatch(TourInterrupted(grant.key, str(error)))
+            else:
+                self._end(grant, Outcome(OutcomeKind.FAILED, str(error)))
         except Exception:
             log.exception("tours: tour failed (identity=%s)", grant.identity)
-            if not mission.outcome and control.authority == "system" and control.touring == grant.key:
-                self._end(mission, f"failed: {FAULT}")
+            self._end(grant, Outcome(OutcomeKind.FAILED, FAULT))
+        else:
+            self._end(grant, COMPLETE)
         finally:
-            if control.touring == grant.key:
-                control.touring = None
             control.wake()
 
-    async def _visit(self, grant: ActiveGrant, mission: Mission) -> None:
+    async def _visit(self, grant: ActiveGrant) -> None:
         """Fly to each point that was not visited yet."""
         control = self._control
-        constraints = control.begin_transit(grant, mission)
+        constraints = control.begin_transit(grant)
         trip = Trip(constraints, "Tour", lambda motion: tour_permit(control, constraints, motion))
         access = grant.spec.points_of_interest
         stay_s = STAY_S if access is not None and access.service_access == "points" else 0.0
-        places = grant.spec.tour
+        places, visited = grant.spec.tour, control.mission(grant).waypoints
         try:
-            async for doing in self._launch(trip, places[min(mission.waypoints, len(places) - 1)]):
+            async for doing in self._launch(trip, places[min(visited, len(places) - 1)]):
                 log.info("tours: %s (identity=%s)", doing, grant.identity)
-            for number in range(mission.waypoints, len(places)):
+            for number in range(visited, len(places)):
                 async for _ in self._courses.fly(trip, target_of(places[number])):
                     pass
-                mission.waypoints = number + 1
-                control.journal.save_soon()
-                control.wake()
+                control.dispatch(TourPointVisited(grant.key, number + 1))
                 await asyncio.sleep(stay_s)
         finally:
             control.end_system_flight(constraints)
 
-    def _end(self, mission: Mission, outcome: str) -> None:
-        control = self._control
-        log.info("tours: tour ended (identity=%s, outcome=%s)", mission.identity, outcome)
-        mission.outcome = outcome
-        control.note("returnToLaunch", "system", outcome, kind="control")
-        control.journal.save_soon()
-        control.start("returnToLaunch")
+    def _end(self, grant: ActiveGrant, outcome: Outcome) -> None:
+        if self._control.dispatch(TourEnded(grant.key, outcome)):
+            log.info("tours: tour ended (identity=%s, outcome=%s)", grant.identity, outcome)
 
 
 def _passing(error: Refused | AutopilotError) -> bool:

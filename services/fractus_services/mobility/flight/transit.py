@@ -7,6 +7,7 @@ from collections.abc import AsyncGenerator
 
 from fractus_core.api.components import ControlPoint
 from fractus_core.api.geometry import Position
+from fractus_core.control.events import TransitFailed
 from fractus_core.geo import middle
 from fractus_core.policy.compiled import height_m
 from fractus_core.policy.values import Call, TakeoffArgs
@@ -14,7 +15,6 @@ from fractus_core.policy.values import Call, TakeoffArgs
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused
 from fractus_services.mobility.authority.arming import arm
 from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.authority.journal import Mission
 from fractus_services.mobility.authority.leases import Lease
 from fractus_services.mobility.authority.permits import transit_permit
 from fractus_services.mobility.flight.courses import FAULT, Courses, Trip, target_of
@@ -47,7 +47,7 @@ class TransitFlight:
         self._guard = guard
         self._courses = courses
 
-    async def bring(self, lease: Lease, mission: Mission) -> AsyncGenerator[str, None]:
+    async def bring(self, lease: Lease) -> AsyncGenerator[str, None]:
         """Fly to the start of the driver's next control point.
 
         Yields:
@@ -58,8 +58,8 @@ class TransitFlight:
             AutopilotError: the autopilot refuses.
         """
         control = self._control
-        start = start_of(lease.grant.spec.control_points[mission.points_done])
-        constraints = control.begin_transit(lease.grant, mission)
+        start = start_of(lease.grant.spec.control_points[control.mission(lease.grant).points_done])
+        constraints = control.begin_transit(lease.grant)
         trip = Trip(constraints, "Transit", lambda motion: transit_permit(control, lease, motion))
         try:
             async for doing in self.launch(trip, start):
@@ -71,20 +71,11 @@ class TransitFlight:
             raise
         except Exception as error:
             log.exception("transit: flight failed (identity=%s)", lease.grant.identity)
-            raise self._give_up(lease, mission) from error
+            # After a fault of ours a retry would fail in the same way: the mission ends, and the drone comes home.
+            control.dispatch(TransitFailed(lease.lease_id, FAULT))
+            raise PreconditionFailed("ControlLost", FAULT) from error
         finally:
             control.end_system_flight(constraints)
-
-    def _give_up(self, lease: Lease, mission: Mission) -> Refused:
-        """End the mission and bring the drone home: after a fault of ours a retry would fail in the same way."""
-        control = self._control
-        if control.lease is lease and control.authority == "system" and not mission.outcome:
-            mission.outcome = f"failed: {FAULT}"
-            control.note("returnToLaunch", "system", FAULT, "InternalError", kind="takeover")
-            control.journal.save_soon()
-            control.lose(FAULT)
-            control.start("returnToLaunch")
-        return PreconditionFailed("ControlLost", FAULT)
 
     async def launch(self, trip: Trip, place: Position) -> AsyncGenerator[str, None]:
         """Arm and take off, unless the drone is in the air, to the altitude of a place.

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from fractus_core.control.values import FlightMode, ModeKind
 from fractus_core.policy.values import Airframe
 from fractus_mavlink.enums import COPTER_MODE, FENCE_TYPE
 
-from fractus_services.mobility.mavlink.flight_stack import FlightMode, ModeKind, ParameterReader, Setting
+from fractus_services.mobility.mavlink.flight_stack import ParameterReader, Setting
 from fractus_services.mobility.mavlink.link import SYSTEM_ID
 
 _KINDS = {

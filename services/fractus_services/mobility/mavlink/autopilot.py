@@ -7,6 +7,7 @@ import logging
 import math
 from collections.abc import Callable
 
+from fractus_core.control.values import FlightMode
 from fractus_mavlink import Message, Value, layout_named, message
 from fractus_mavlink.enums import (
     MAV_CMD,
@@ -19,7 +20,7 @@ from fractus_mavlink.enums import (
 )
 
 from fractus_services.errors import AutopilotError
-from fractus_services.mobility.mavlink.flight_stack import FlightMode, FlightStack
+from fractus_services.mobility.mavlink.flight_stack import FlightStack
 from fractus_services.mobility.mavlink.link import Link
 
 log = logging.getLogger(__name__)

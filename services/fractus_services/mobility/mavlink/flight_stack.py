@@ -8,41 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import Enum
 from typing import Protocol
 
+from fractus_core.control.values import FlightMode
 from fractus_core.policy.values import Airframe
-
-
-class ModeKind(Enum):
-    """What a flight mode of the autopilot means for control, whatever its number is.
-
-    COMMANDED obeys the companion; RETURNING and LANDING bring the vehicle down by themselves; in any OTHER a human pilot
-    flies.
-    """
-
-    COMMANDED = "commanded"
-    RETURNING = "returning"
-    LANDING = "landing"
-    OTHER = "other"
-
-
-@dataclass(frozen=True, slots=True)
-class FlightMode:
-    """A flight mode by the autopilot's name of it."""
-
-    name: str = "UNKNOWN"
-    kind: ModeKind = ModeKind.OTHER
-
-    @property
-    def commanded(self) -> bool:
-        """Whether the vehicle obeys the companion in it."""
-        return self.kind is ModeKind.COMMANDED
-
-    @property
-    def comes_down(self) -> bool:
-        """Whether the vehicle comes down by itself in it."""
-        return self.kind in {ModeKind.RETURNING, ModeKind.LANDING}
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,11 +6,12 @@ import asyncio
 import logging
 from collections.abc import Awaitable, Callable
 
-from fractus_core.policy.values import Takeover
+from fractus_core.control import ControlState
+from fractus_core.control.events import Event, ModeChangeBegan, ModeChangeEnded
+from fractus_core.control.values import FlightMode, TaskKind
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.autopilot import Autopilot, Permit, always
-from fractus_services.mobility.mavlink.flight_stack import FlightMode
 
 log = logging.getLogger(__name__)
 
@@ -22,30 +23,26 @@ BRAKE_S, BRAKE_AGAIN_S = 8.0, 0.1
 STANDING_MPS = 0.2
 
 
+Approach = Callable[[Callable[[], bool], int], Awaitable[FlightMode]]
+"""Flies to where the autopilot's own return is legal, and says in which mode it does the rest; asked with whether the system
+still has the drone, and how often the autopilot refused."""
+
+
 class ModeController:
-    """Changes modes and brakes.
+    """Changes modes and brakes; control is told of each change, so that it is not taken for a pilot's.
 
     Args:
         autopilot: the link.
-        moving: whether a motion is under way, which ends the braking before it.
-
-    Attributes:
-        expected: the mode that the autopilot is in by our doing, or that we know of.
-        changing: how many changes are under way.
-        arming: whether the motors are being started by us.
-        preparing: how many attempts to arm are under way, from the fence that is raised first to running motors.
-        approach: flies to where the autopilot's own return is legal, and says in which mode it does the rest; told how
-            often the autopilot refused.
+        state: of control, at any moment.
+        dispatch: tells control.
     """
 
-    def __init__(self, autopilot: Autopilot, moving: Callable[[], bool]) -> None:
-        self.expected: FlightMode | None = None
-        self.changing = 0
-        self.arming = False
-        self.preparing = 0
-        self.approach: Callable[[Callable[[], bool], int], Awaitable[FlightMode]] = self._straight
+    def __init__(
+        self, autopilot: Autopilot, state: Callable[[], ControlState], dispatch: Callable[[Event], object]
+    ) -> None:
         self._autopilot = autopilot
-        self._moving = moving
+        self._state = state
+        self._dispatch = dispatch
 
     async def change_mode(self, mode: FlightMode, permit: Permit = always) -> None:
         """Change the flight mode.
@@ -54,18 +51,16 @@ class ModeController:
             AutopilotError: it does not.
         """
         permit()
-        if self._autopilot.vehicle.mode == mode and self.expected == mode:
+        before = self._state().expected_mode
+        if self._autopilot.vehicle.mode == mode and before == mode:
             return
-        before, self.expected = self.expected, mode
         done = False
-        self.changing += 1
+        self._dispatch(ModeChangeBegan(mode))
         try:
             await self._autopilot.set_mode(mode, permit)
             done = True
         finally:
-            self.changing -= 1
-            if not done and self.expected == mode and self._autopilot.vehicle.mode != mode:
-                self.expected = before
+            self._dispatch(ModeChangeEnded(mode, before, done))
 
     async def enter_guided(self, permit: Permit = always) -> None:
         """Change to the mode in which the autopilot obeys.
@@ -74,9 +69,6 @@ class ModeController:
             AutopilotError: it does not.
         """
         await self.change_mode(self._autopilot.stack.guided, permit)
-
-    async def _straight(self, _wanted: Callable[[], bool], _tries: int) -> FlightMode:
-        return self._autopilot.stack.return_straight
 
     async def hold(self, permit: Permit = always) -> None:
         """Brake and hover.
@@ -93,7 +85,7 @@ class ModeController:
         """Keep braking until the drone stands: a single velocity setpoint times out in the autopilot."""
         autopilot = self._autopilot
         deadline = autopilot.now + SETTLE_S
-        while not self._moving() and autopilot.vehicle.mode.commanded and autopilot.now < deadline:
+        while self._state().motion is None and autopilot.vehicle.mode.commanded and autopilot.now < deadline:
             known = autopilot.vehicle.position_fresh(autopilot.now)
             if known and autopilot.vehicle.speed_mps < STANDING_MPS and abs(autopilot.vehicle.down_mps) < STANDING_MPS:
                 return
@@ -110,40 +102,41 @@ class ModeController:
             return False
         return True
 
-    async def carry_out(self, action: Takeover, wanted: Callable[[], bool]) -> None:
+    async def carry_out(self, kind: TaskKind, wanted: Callable[[], bool], approach: Approach) -> None:
         """Do what the system wants, however often the link fails: hover, or bring the drone to the ground.
 
         Args:
-            action: what.
+            kind: what.
             wanted: whether the system still has the drone.
+            approach: flies the way home.
         """
         vehicle, tries, refused = self._autopilot.vehicle, 0, False
-        while (vehicle.armed or self.arming) and wanted():
+        while (vehicle.armed or self._state().starting_motors) and wanted():
             try:
-                if self.arming:
+                if self._state().starting_motors:
                     await self._autopilot.update(AGAIN_S)
                     continue
-                if action == "hover":
+                if kind is TaskKind.HOVER:
                     await self._hover()
                     return
                 if (vehicle.standing or not vehicle.in_air) and not refused:
                     refused = not await self.disarm()
                 else:
-                    await self._come_down(action, tries, wanted)
+                    await self._come_down(kind, tries, wanted, approach)
             except AutopilotError as error:
                 tries += 0 if error.link else 1
-                log.warning("cannot %s yet: %s", action, error)
+                log.warning("modes: the autopilot does not follow yet (task=%s, error=%s)", kind.value, error)
             await asyncio.sleep(AGAIN_S)
 
-    async def _come_down(self, action: Takeover, tries: int, wanted: Callable[[], bool]) -> None:
+    async def _come_down(self, kind: TaskKind, tries: int, wanted: Callable[[], bool], approach: Approach) -> None:
         """Land here, or bring the drone home: by the autopilot's own doing, where that has begun, or else by ours first."""
         vehicle = self._autopilot.vehicle
-        returning = action != "land" and vehicle.mode.comes_down and self.expected == vehicle.mode
-        if not returning:
+        expected = self._state().expected_mode == vehicle.mode
+        if kind is TaskKind.LAND or not vehicle.mode.comes_down or not expected:
             await self._brake(wanted)
             mode = self._autopilot.stack.land
-            if action != "land" and tries < RTL_TRIES:
-                mode = await self.approach(wanted, tries)
+            if kind is not TaskKind.LAND and tries < RTL_TRIES:
+                mode = await approach(wanted, tries)
             await self.change_mode(mode, lambda: _check(wanted))
         while vehicle.armed and vehicle.mode.comes_down:
             await self._autopilot.update(1.0)

@@ -6,6 +6,7 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 
+from fractus_core.control.values import FlightMode, ModeKind
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.values import STANDING_MPS, Airframe, Home, Situation
 from fractus_mavlink import Message
@@ -17,7 +18,7 @@ from fractus_mavlink.enums import (
     MAV_SYS_STATUS_SENSOR,
 )
 
-from fractus_services.mobility.mavlink.flight_stack import FlightMode, FlightStack, ModeKind
+from fractus_services.mobility.mavlink.flight_stack import FlightStack
 
 _UNKNOWN_U16 = 0xFFFF
 """What 16 bits say of a value that is not known."""

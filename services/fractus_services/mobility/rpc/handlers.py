@@ -9,6 +9,7 @@ from contextlib import aclosing
 from typing import Any
 
 from fractus_core.api.names import node_identity
+from fractus_core.control import Authority, ControlEvent, StreamState
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, Verdict
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
@@ -18,7 +19,6 @@ from fractus_services.clock import Clock
 from fractus_services.errors import AutopilotError, InvalidRequest, PreconditionFailed, Refused, Unavailable
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.authority.leases import ControlEvent, ControlState
 from fractus_services.mobility.flight.service import MobilityService, Progress
 from fractus_services.mobility.rpc.arguments import call_of, checked, goto_args, velocity_args
 from fractus_services.mobility.rpc.streams import Streams
@@ -30,11 +30,11 @@ JUDGED_S = 0.5
 """A stream is judged again so often: what was revoked ends it within a second."""
 
 _STATES = {
-    ControlState.WAITING: mobility_pb2.ControlEvent.STATE_WAITING,
-    ControlState.RIDING: mobility_pb2.ControlEvent.STATE_RIDING,
-    ControlState.GRANTED: mobility_pb2.ControlEvent.STATE_GRANTED,
-    ControlState.LOST: mobility_pb2.ControlEvent.STATE_LOST,
-    ControlState.COMPLETE: mobility_pb2.ControlEvent.STATE_COMPLETE,
+    StreamState.WAITING: mobility_pb2.ControlEvent.STATE_WAITING,
+    StreamState.RIDING: mobility_pb2.ControlEvent.STATE_RIDING,
+    StreamState.GRANTED: mobility_pb2.ControlEvent.STATE_GRANTED,
+    StreamState.LOST: mobility_pb2.ControlEvent.STATE_LOST,
+    StreamState.COMPLETE: mobility_pb2.ControlEvent.STATE_COMPLETE,
 }
 
 
@@ -78,7 +78,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     def _failed(self, verdict: Verdict) -> None:
         """Something in here broke: hold the drone of a driver where it is."""
-        if self._control.authority == "driver" and self._control.autopilot.vehicle.in_air:
+        if self._control.authority is Authority.DRIVER and self._control.autopilot.vehicle.in_air:
             self._control.brake(verdict)
 
     # Control

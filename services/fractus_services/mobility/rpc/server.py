@@ -72,10 +72,21 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     journal = Journal(options.state)
     autopilot = Autopilot(url, ARDUCOPTER)
     fence = MissionFence(autopilot, options.state)
-    control = Control(autopilot, journal, grants, audit, fence=fence, grace_s=options.driver_grace)
-    guard = Guard(lambda: situation_of(control, clock()), audit)
+
+    def guard_of(control: Control) -> Guard:
+        return Guard(lambda: situation_of(control, clock()), audit)
+
+    control = Control(
+        autopilot,
+        journal,
+        grants,
+        audit,
+        fence=fence,
+        grace_s=options.driver_grace,
+        way_home=lambda control: Homing(control, guard_of(control)).approach,
+    )
+    guard = guard_of(control)
     homing = Homing(control, guard)
-    control.modes.approach = homing.approach
     courses = Courses(control, guard)
     transit = TransitFlight(control, guard, courses)
     tours = Tours(control, grants, transit.launch, courses, options.boarding)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from fractus_core.control import Outcome, OutcomeKind
 from fractus_proto.v1 import mobility_pb2, types_pb2
 
 from fractus_services.mobility.authority.control import Control
@@ -34,6 +35,17 @@ def located(control: Control) -> bool:
     return vehicle.lat is not None and vehicle.position_fresh(control.autopilot.now)
 
 
+_KINDS = {
+    OutcomeKind.COMPLETE: mobility_pb2.MissionOutcome.KIND_COMPLETE,
+    OutcomeKind.REVOKED: mobility_pb2.MissionOutcome.KIND_REVOKED,
+    OutcomeKind.FAILED: mobility_pb2.MissionOutcome.KIND_FAILED,
+}
+
+
+def _ended(outcome: Outcome) -> mobility_pb2.MissionOutcome:
+    return mobility_pb2.MissionOutcome(kind=_KINDS[outcome.kind], reason=outcome.reason)
+
+
 def telemetry_of(control: Control, time_s: float, missions: bool) -> Any:
     """The message that subscribers get.
 
@@ -54,9 +66,9 @@ def telemetry_of(control: Control, time_s: float, missions: bool) -> Any:
         mode=vehicle.mode.name,
         ready=vehicle.ready and control.checked is not None and not control.checked.problem,
         flight_state=vehicle.flight_state,
-        controller=control.controller,
+        controller=control.state.controller,
         autopilot_connected=control.autopilot.connected,
-        missions=control.journal.outcomes() if missions else {},
+        missions={key: _ended(outcome) for key, outcome in control.outcomes().items()} if missions else {},
     )
     message.time.FromNanoseconds(int(time_s * 1e9))
     if located(control):

@@ -1,0 +1,231 @@
+"""Carries out what the state machine of control asks for: streams, motions, system tasks, audit log, journal."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Coroutine, Sequence
+from typing import Any, Protocol, assert_never
+
+from fractus_core.control import Authority, ControlState
+from fractus_core.control.actions import (
+    Action,
+    Brake,
+    EndStream,
+    HoldPosition,
+    RecordAudit,
+    RefuseStream,
+    SaveJournal,
+    SendEvent,
+    SetStreamRates,
+    StartSystemTask,
+    StopKind,
+    StopMotion,
+    StopSystemTask,
+    WakeWaiters,
+)
+from fractus_core.control.events import Event, SystemTaskEnded
+from fractus_core.control.values import SystemTask
+
+from fractus_services.audit import AuditLog
+from fractus_services.background import Background
+from fractus_services.errors import Aborted, AutopilotError, PreconditionFailed, Refused, Unavailable
+from fractus_services.mobility.authority.journal import Journal, Record
+from fractus_services.mobility.authority.leases import Lease, Motion
+from fractus_services.mobility.mavlink.autopilot import Autopilot
+from fractus_services.mobility.mavlink.mode_controller import Approach, ModeController
+
+log = logging.getLogger(__name__)
+
+
+class Machine(Protocol):
+    """The holder of the state."""
+
+    @property
+    def state(self) -> ControlState:
+        """As it is now."""
+
+    def dispatch(self, event: Event) -> Sequence[Action]:
+        """Tell the state machine."""
+
+
+class Performer:
+    """Holds the live things that the state knows by their numbers.
+
+    Args:
+        machine: told when a system task is over.
+        autopilot: the link.
+        modes: brakes, hovers, brings the drone down.
+        approach: flies the way home to where the autopilot does the rest.
+        audit: where changes of control are written.
+        journal: where missions are written.
+
+    Attributes:
+        tasks: what runs beside the calls.
+        leases: streams of drivers by lease, while they are open.
+        motion: the motion that began last.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        autopilot: Autopilot,
+        modes: ModeController,
+        approach: Approach,
+        *,
+        audit: AuditLog,
+        journal: Journal,
+    ) -> None:
+        self.tasks = Background()
+        self.leases: dict[int, Lease] = {}
+        self.motion: Motion | None = None
+        self._machine = machine
+        self._autopilot = autopilot
+        self._modes = modes
+        self._approach = approach
+        self._audit = audit
+        self._journal = journal
+        self._running: dict[int, asyncio.Task[None]] = {}
+        self._changed = asyncio.Event()
+
+    def perform(self, actions: Sequence[Action]) -> None:
+        """Carry out everything, in order.
+
+        The state says already that all of this happens: what fails, an audit log that takes no entry, must not keep the rest
+        from happening, a flight home least of all.
+
+        Raises:
+            Exception: the first failure, when all is done.
+        """
+        failure: Exception | None = None
+        for action in actions:
+            try:
+                self._perform(action)
+            except Exception as error:
+                log.exception("control: an action failed (action=%s)", type(action).__name__)
+                failure = failure or error
+        if failure is not None:
+            raise failure
+
+    def _perform(self, action: Action) -> None:
+        match action:
+            case StopMotion():
+                if self.motion is not None and self.motion.motion_id == action.motion_id:
+                    self.motion.stop(_refusal(action))
+            case SendEvent() | EndStream() | RefuseStream():
+                self._tell(action)
+            case StartSystemTask() | StopSystemTask():
+                self._switch(action)
+            case Brake() | HoldPosition():
+                self._stop(action)
+            case RecordAudit():
+                self._record(action)
+            case SaveJournal():
+                self._journal.save_soon(Record(self._machine.state.missions, self._machine.state.active))
+            case WakeWaiters():
+                self.wake()
+            case SetStreamRates(flying):
+                self.tasks.spawn(self.tasks.attempt(self._autopilot.set_rates, flying=flying))
+            case _:
+                assert_never(action)
+
+    def _tell(self, action: SendEvent | EndStream | RefuseStream) -> None:
+        """Tell a stream; one that is refused learns it from the transition itself."""
+        lease = self.leases.get(action.lease_id)
+        if lease is not None and not isinstance(action, RefuseStream):
+            lease.tell(action.event if isinstance(action, SendEvent) else None)
+
+    def _switch(self, action: StartSystemTask | StopSystemTask) -> None:
+        if isinstance(action, StartSystemTask):
+            self.run(action.task, self._carry_out(action.task))
+        else:
+            self.tasks.drop(self._running.pop(action.task_id, None))
+
+    def _stop(self, action: Brake | HoldPosition) -> None:
+        if isinstance(action, Brake):
+            self._autopilot.stop()
+            self.tasks.spawn(self._modes.settle())
+        else:
+            self.tasks.spawn(self.tasks.attempt(self.hold, self.undisturbed))
+
+    # System tasks
+
+    def run(self, task: SystemTask, work: Coroutine[Any, Any, None]) -> None:
+        """Run a system task; however it ends, control is told, so that no task counts that is dead."""
+        running = self._running[task.task_id] = self.tasks.spawn(work)
+
+        def ended(_done: asyncio.Task[None]) -> None:
+            self._running.pop(task.task_id, None)
+            self._machine.dispatch(SystemTaskEnded(task.task_id, finished=False))
+
+        running.add_done_callback(ended)
+
+    async def _carry_out(self, task: SystemTask) -> None:
+        """What the system wants, as long as it has the drone."""
+        await self._modes.carry_out(task.kind, self._system_commands, self._approach)
+        self._machine.dispatch(SystemTaskEnded(task.task_id, finished=True))
+
+    def _system_commands(self) -> bool:
+        return self._machine.state.authority is Authority.SYSTEM
+
+    # Motions of the driver
+
+    async def hold(self, permit: Callable[[], None]) -> None:
+        """Brake and hover."""
+        await self._modes.hold(permit)
+        self.tasks.spawn(self._modes.settle())
+
+    def undisturbed(self) -> None:
+        """Permits what a driver's drone does after its motion: nothing else has begun.
+
+        Raises:
+            AutopilotError: something else flies by now.
+        """
+        state = self._machine.state
+        if state.motion is not None or state.authority is not Authority.DRIVER:
+            raise AutopilotError("something else flies by now")
+
+    # Waiting
+
+    async def wait(self, timeout_s: float) -> None:
+        """Wait until something changed that is waited for, or the time is over."""
+        try:
+            async with asyncio.timeout(timeout_s):
+                await self._changed.wait()
+        except TimeoutError:
+            return
+
+    def wake(self) -> None:
+        """Let everyone that waits look again."""
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    # The audit log
+
+    def _record(self, entry: RecordAudit) -> None:
+        level = logging.WARNING if entry.kind == "takeover" else logging.INFO
+        log.log(
+            level, "control: %s (kind=%s, controller=%s, code=%s, reason=%s)",
+            entry.action, entry.kind, entry.controller, entry.code or "-", entry.reason or "-",
+        )  # fmt: skip
+        vehicle = self._autopilot.vehicle
+        self._audit.append(
+            entry.kind,
+            {
+                "action": entry.action, "controller": entry.controller, "reason": entry.reason, "code": entry.code,
+                "policies": list(entry.policies), "lat": vehicle.lat, "lon": vehicle.lon, "alt": vehicle.altitude_m,
+            },
+        )  # fmt: skip
+
+
+def _refusal(stop: StopMotion) -> Refused:
+    """What the caller of a stopped motion is told."""
+    match stop.kind:
+        case StopKind.ABORTED:
+            return Aborted(stop.code, stop.reason, stop.policies)
+        case StopKind.LOST:
+            return PreconditionFailed(stop.code, stop.reason)
+        case StopKind.PASSING:
+            return Unavailable("AutopilotUnavailable", stop.reason)
+        case _:
+            assert_never(stop.kind)

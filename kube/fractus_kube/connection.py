@@ -151,11 +151,8 @@ class Connection:
                 yield response
                 return
             finally:
-                if response.content.at_eof():
-                    response.release()
-                else:
-                    # What was not read to its end leaves a connection of no further use.
-                    response.close()
+                # This closes the connection where the answer was not read to its end.
+                response.release()
 
     async def _headers(self, content_type: ContentType) -> dict[str, str]:
         headers = {"Accept": "application/json", "Content-Type": content_type.value}

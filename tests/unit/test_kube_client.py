@@ -205,13 +205,20 @@ async def test_a_request_that_is_given_up_leaves_no_connection() -> None:
         await server.gone.wait()
 
 
-async def test_a_list_that_makes_progress_has_more_time_than_an_object(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_list_that_makes_progress_has_more_time_than_an_object() -> None:
     page = json.dumps({"metadata": {"resourceVersion": "7"}, "items": []}).encode()
     slow = Server(CHUNKED + b"".join(chunk(page[i : i + 1]) for i in range(len(page))) + chunk(b""), delay_s=0.15)
     async with client_of(slow) as client:
         assert (await client.list_page(ZONE, timeout_s=10.0)).resource_version == "7"
         with pytest.raises(KubeError, match=r"no answer in 0\.1 s"):
             await client.request("GET", "/x", timeout_s=0.1)
+
+
+async def test_a_list_that_makes_no_progress_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fractus_kube.connection.REQUEST_TIMEOUT_S", 0.2)
+    async with client_of(Server(CHUNKED + chunk(b'{"items"'))) as client, asyncio.timeout(5.0):
+        with pytest.raises(KubeError, match="no answer"):
+            await client.list(ZONE)
 
 
 async def test_a_write_to_an_api_server_that_stalls_ends_before_another_may_act() -> None:

@@ -16,7 +16,7 @@ from fractus_core.api.names import node_identity
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_proto.v1 import types_pb2
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.autopilot import Autopilot
+from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.itemlists import download
 from mobility_rig import (
     FRAME,
@@ -207,7 +207,7 @@ async def test_the_vehicle_itself_turns_back_at_the_outer_bounds(rig: Rig) -> No
     rig.start_vehicle(2.0)
     driver = Driver(rig)
     await driver.up()
-    pilot = Autopilot(rig.link, ARDUCOPTER)  # speaks as the companion, so that the autopilot does not miss it
+    pilot = MavlinkAutopilot(rig.link, ARDUCOPTER)  # speaks as the companion, so that the autopilot does not miss it
     task = asyncio.create_task(pilot.run())
     async with asyncio.timeout(10):
         while not pilot.connected:
@@ -238,7 +238,7 @@ async def test_the_owners_fence_comes_back_after_the_mission(rig: Rig) -> None:
     await driver.up(4.0)
     await driver.stub.ReturnControl(pb.ReturnControlRequest(), timeout=5)
     await rig.until(lambda t: not t.armed, 90, "landing")
-    owner = Autopilot(rig.link, ARDUCOPTER)
+    owner = MavlinkAutopilot(rig.link, ARDUCOPTER)
     task = asyncio.create_task(owner.run())
     async with asyncio.timeout(20):
         while not owner.connected or await owner.read_parameter("FENCE_ALT_MAX") != 77.0:

@@ -16,7 +16,7 @@ from fractus_mavlink import Endpoint
 from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_COMPONENT, MAV_TYPE
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.autopilot import Autopilot
+from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from mobility_rig import DRIVER, FRAME, Driver, Rig, denied, fence, flown, grant, outcomes, xy
 
 LOST = pb.ControlEvent.STATE_LOST
@@ -111,7 +111,7 @@ async def test_a_service_that_stays_dead_leaves_it_to_the_autopilot(rig: Rig) ->
 
 async def until_mode(link: str, mode: FlightMode) -> None:
     """Listen to the vehicle as a ground station: its heartbeats, of system 255, must not stand for the companion's."""
-    watcher, station = Autopilot(link, ARDUCOPTER), Endpoint(255, MAV_COMPONENT.MISSIONPLANNER)
+    watcher, station = MavlinkAutopilot(link, ARDUCOPTER), Endpoint(255, MAV_COMPONENT.MISSIONPLANNER)
 
     def heartbeat() -> None:
         if watcher._transport is not None:
@@ -203,7 +203,7 @@ async def test_a_pilot_takes_the_drone_and_keeps_it(rig: Rig) -> None:
     driver = await flying(rig)
     going = driver.going(0, 90)
     await rig.until(lambda t: t.velocity.north_mps > 3)
-    pilot = Autopilot(rig.link, ARDUCOPTER)
+    pilot = MavlinkAutopilot(rig.link, ARDUCOPTER)
     task = asyncio.create_task(pilot.run())
     async with asyncio.timeout(5):
         while not pilot.connected:

@@ -16,7 +16,6 @@ from typing import Any
 from fractus_core.control.values import FlightMode
 from fractus_core.policy.values import TakeoffArgs
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.authority.observer import Observer
 from mobility_world import World, fly, goto
 
 BEAT_S = 0.5
@@ -70,7 +69,7 @@ class Flight:
 
         world.plane.set_to = set_to  # type: ignore[method-assign]
         world.plane._obey = heard  # type: ignore[method-assign]
-        self.observer = Observer(world.control)
+        self.observer = world.observer
         return world
 
     # The trace

@@ -21,23 +21,13 @@ from fractus_mavlink import Message, message
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_RESULT
 from fractus_services.errors import Refused
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Journal
-from fractus_services.mobility.authority.situation import situation_of
-from fractus_services.mobility.authority.supervisor import Supervisor
-from fractus_services.mobility.flight.calls import CallJudge
-from fractus_services.mobility.flight.courses import Courses
-from fractus_services.mobility.flight.guard import Guard
-from fractus_services.mobility.flight.homing import Homing
-from fractus_services.mobility.flight.monitor import MotionMonitor
-from fractus_services.mobility.flight.service import MobilityService, Progress
-from fractus_services.mobility.flight.tours import Tours
-from fractus_services.mobility.flight.transit import TransitFlight
+from fractus_services.mobility.autopilot import COURSE_S, Checked
+from fractus_services.mobility.flight.service import Progress
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.autopilot import Autopilot
-from fractus_services.mobility.mavlink.failsafes import Checked
-from fractus_services.mobility.mavlink.vehicle import COURSE_S
-from fractus_services.mobility.rpc.streams import Streams
+from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
+from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
+from fractus_services.mobility.rpc.wiring import assemble
 
 FRAME = LocalFrame(39.36, 22.95)
 BRAKE, GUIDED, LAND, LOITER, RTL, SMART_RTL = (
@@ -100,7 +90,7 @@ def fly(flight: Callable[[], Coroutine[Any, Any, None]]) -> None:
         runner.run(bounded())
 
 
-class Plane(Autopilot):
+class Plane(MavlinkAutopilot):
     """An autopilot of few words: it acknowledges, and moves as ArduCopter does, roughly."""
 
     def __init__(self) -> None:
@@ -317,27 +307,18 @@ class World:
         self.journal._write = lambda _data: None  # type: ignore[method-assign]
         self.fence = Fence()
         facts = self.plane.vehicle
-        self.control = Control(
-            self.plane, self.journal, self.grants, self.audit, fence=self.fence, grace_s=grace_s,  # type: ignore[arg-type]
-            way_home=lambda control: Homing(control, self._guard_of(control)).approach,
+        parts = assemble(
+            self.plane, MavlinkFailsafes(self.plane), self.fence, journal=self.journal, grants=self.grants,  # type: ignore[arg-type]
+            audit=self.audit, clock=lambda: 1_790_000_000.0 + self.plane.now, grace_s=grace_s, boarding_s=boarding_s,  # type: ignore[arg-type]
             state=ControlState(decided=known, armed_seen=facts.armed if known else None, expected_mode=GUIDED),
         )  # fmt: skip
-        control = self.control
-        control.checked = Checked("", (), Airframe(retraces=retraces), 8.0, retraces)
-        self.guard = self._guard_of(control)
-        homing = Homing(control, self.guard)
-        courses = Courses(control, self.guard)
-        transit = TransitFlight(control, self.guard, courses)
-        self.tours = Tours(control, self.grants, transit.launch, courses, boarding_s)  # type: ignore[arg-type]
-        self.service = MobilityService(control, CallJudge(control, self.guard), homing.around)
-        self.streams = Streams(control, transit.bring)
-        self.supervisor = Supervisor(control)
-        self.monitor = MotionMonitor(control, self.guard, self.audit, self.supervisor)  # type: ignore[arg-type]
+        self.control, self.guard, self.service, self.streams = parts.control, parts.guard, parts.service, parts.streams
+        self.tours, self.monitor, self.supervisor, self.observer = (
+            parts.tours, parts.monitor, parts.supervisor, parts.observer,
+        )  # fmt: skip
+        self.control.checked = Checked("", (), Airframe(retraces=retraces), 8.0, retraces)
         self._tasks = [asyncio.ensure_future(part) for part in (self.plane.run(), self.monitor.run(), self.tours.run())]
         self.events: list[ControlEvent] = []
-
-    def _guard_of(self, control: Control) -> Guard:
-        return Guard(lambda: situation_of(control, 1_790_000_000.0 + self.plane.now), self.audit)  # type: ignore[arg-type]
 
     async def __aenter__(self) -> World:
         await asyncio.sleep(0.2)

@@ -12,8 +12,7 @@ from fractus_core.control.events import ArmingRequested
 from fractus_core.policy.values import Airframe, TakeoffArgs
 from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError
-from fractus_services.mobility.authority.observer import Observer
-from fractus_services.mobility.mavlink.failsafes import Checked
+from fractus_services.mobility.autopilot import Checked
 from mobility_world import BRAKE, World, end, fly, refusal, spec
 
 
@@ -129,7 +128,7 @@ def test_a_link_that_comes_back_in_flight_leaves_the_way_home_as_chosen(tmp_path
             await world.service.arm(grant)
             await end(world.service.take_off(grant, TakeoffArgs(10.0)))
             assert plane.parameters["FS_GCS_ENABLE"] == 1.0
-            Observer(control).found()
+            world.observer.found()
             assert control.checked.problem
             assert world.guard.situation().airframe.accel_mps2 == 1.0, "it brakes as it did a moment ago"
             await world.until(lambda: control.checked is not None and not control.checked.problem, 10)

@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 from fractus_core.policy.values import Airframe
+from fractus_services.mobility.autopilot import Checked
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.failsafes import Checked, choose_return, configure, learn_return
+from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.link import SYSTEM_ID
 
 SOUND = {
@@ -36,7 +37,7 @@ class Parameters:
 
 
 def configured(parameters: Any) -> Checked:
-    return asyncio.run(configure(parameters))
+    return asyncio.run(MavlinkFailsafes(parameters).configure())
 
 
 def test_the_companion_is_no_ground_station() -> None:
@@ -101,11 +102,11 @@ def test_a_failsafe_that_stays_straight_retraces_nothing(fixed: str) -> None:
 def test_armed_elsewhere_it_goes_straight_and_from_home_again_on_its_path() -> None:
     async def chosen() -> None:
         vehicle: Any = Parameters(RETRACING)
-        checked = await configure(vehicle)
-        away = await choose_return(vehicle, checked, retrace=False)
+        checked = await MavlinkFailsafes(vehicle).configure()
+        away = await MavlinkFailsafes(vehicle).choose_return(checked, retrace=False)
         assert not away.airframe.retraces
         assert vehicle.values["FS_GCS_ENABLE"] == 1.0
-        again = await choose_return(vehicle, away, retrace=True)
+        again = await MavlinkFailsafes(vehicle).choose_return(away, retrace=True)
         assert again.airframe.retraces
         assert vehicle.values["FS_GCS_ENABLE"] == 3.0
 
@@ -136,14 +137,14 @@ def test_the_vehicles_own_fence_caps_its_way_home() -> None:
 def test_a_fence_raised_later_caps_it_as_well() -> None:
     async def learnt() -> None:
         vehicle: Any = Parameters(RETRACING | {"RTL_ALT": 5000.0})
-        checked = await configure(vehicle)
+        checked = await MavlinkFailsafes(vehicle).configure()
         assert checked.airframe.return_altitude_m == 50.0
         vehicle.values |= {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 5.0, "FENCE_ALT_MAX": 35.0}
-        lower = await learn_return(vehicle, checked)
+        lower = await MavlinkFailsafes(vehicle).learn_return(checked)
         assert lower.airframe.return_altitude_m == 33.0
         assert lower.airframe.retraces
         vehicle.values["FENCE_ALT_MAX"] = math.nan
-        assert "FENCE_ALT_MAX is not a number" in (await learn_return(vehicle, checked)).problem
+        assert "FENCE_ALT_MAX is not a number" in (await MavlinkFailsafes(vehicle).learn_return(checked)).problem
 
     asyncio.run(learnt())
 
@@ -155,14 +156,16 @@ FENCED = {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 5.0, "FENCE_ALT_MAX": 65.0}
 def test_a_return_altitude_that_is_lost_stays_and_forbids_arming(lost: str) -> None:
     async def learnt() -> None:
         vehicle: Any = Parameters(RETRACING | FENCED | {"RTL_ALT": 6000.0})
-        checked = await configure(vehicle)
+        checked = await MavlinkFailsafes(vehicle).configure()
         assert checked.airframe.return_altitude_m == 60.0
         vehicle.values |= {"RTL_ALT": 9000.0}
         del vehicle.values[lost]
-        later = await learn_return(vehicle, checked)
+        later = await MavlinkFailsafes(vehicle).learn_return(checked)
         assert later.airframe.return_altitude_m == 60.0
         assert later.problem == f"{lost} cannot be read any more"
-        assert not (await learn_return(vehicle, await configure(vehicle))).problem, "what never was is not lost"
+        assert not (
+            await MavlinkFailsafes(vehicle).learn_return(await MavlinkFailsafes(vehicle).configure())
+        ).problem, "what never was is not lost"
 
     asyncio.run(learnt())
 
@@ -170,10 +173,10 @@ def test_a_return_altitude_that_is_lost_stays_and_forbids_arming(lost: str) -> N
 def test_a_ceiling_that_cannot_be_read_forbids_arming() -> None:
     async def learnt() -> None:
         vehicle: Any = Parameters(RETRACING | {"RTL_ALT": 6000.0})
-        checked = await configure(vehicle)
+        checked = await MavlinkFailsafes(vehicle).configure()
         vehicle.values |= FENCED
         del vehicle.values["FENCE_ALT_MAX"]
-        assert (await learn_return(vehicle, checked)).problem == "FENCE_ALT_MAX cannot be read"
+        assert (await MavlinkFailsafes(vehicle).learn_return(checked)).problem == "FENCE_ALT_MAX cannot be read"
 
     asyncio.run(learnt())
 
@@ -183,12 +186,14 @@ def test_a_ceiling_that_cannot_be_read_forbids_arming() -> None:
 def test_in_flight_the_way_home_stays_as_it_was_chosen(retrace: bool, known: bool) -> None:
     async def flown() -> None:
         vehicle: Any = Parameters(RETRACING)
-        chosen = await choose_return(vehicle, await configure(vehicle), retrace=retrace)
+        chosen = await MavlinkFailsafes(vehicle).choose_return(
+            await MavlinkFailsafes(vehicle).configure(), retrace=retrace
+        )
         before = vehicle.values["FS_GCS_ENABLE"]
-        again = await configure(vehicle, flying=True, before=chosen if known else None)
+        again = await MavlinkFailsafes(vehicle).configure(flying=True, before=chosen if known else None)
         assert again.airframe.retraces is retrace
         assert vehicle.values["FS_GCS_ENABLE"] == before == (3.0 if retrace else 1.0)
-        landed = await configure(vehicle, before=chosen)
+        landed = await MavlinkFailsafes(vehicle).configure(before=chosen)
         assert landed.airframe.retraces
 
     asyncio.run(flown())
@@ -198,10 +203,10 @@ def test_in_flight_what_cannot_be_read_is_as_it_was() -> None:
     async def flown() -> None:
         moves = {"WPNAV_ACCEL": 100.0, "RTL_ALT": 6000.0, "WPNAV_SPEED": 800.0}
         vehicle: Any = Parameters(RETRACING | moves)
-        before = await configure(vehicle)
+        before = await MavlinkFailsafes(vehicle).configure()
         for name in (*moves, "SRTL_POINTS"):
             del vehicle.values[name]
-        again = await configure(vehicle, flying=True, before=before)
+        again = await MavlinkFailsafes(vehicle).configure(flying=True, before=before)
         assert (again.airframe, again.speed_mps) == (before.airframe, 8.0)
         assert again.airframe.retraces
         assert "WPNAV_ACCEL cannot be read any more" in again.problem

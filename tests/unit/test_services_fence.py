@@ -9,7 +9,7 @@ import pytest
 from fractus_mavlink import message
 from fractus_services.mobility.mavlink import autopilot as module
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.autopilot import Autopilot
+from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 
 
 class Overtaken(Exception):
@@ -17,15 +17,15 @@ class Overtaken(Exception):
 
 
 @pytest.fixture
-def link(monkeypatch: pytest.MonkeyPatch) -> tuple[Autopilot, list[Any]]:
+def link(monkeypatch: pytest.MonkeyPatch) -> tuple[MavlinkAutopilot, list[Any]]:
     monkeypatch.setattr(module, "ACK_TIMEOUT_S", 0.01)
-    autopilot = Autopilot("tcp:127.0.0.1:1", ARDUCOPTER)
+    autopilot = MavlinkAutopilot("tcp:127.0.0.1:1", ARDUCOPTER)
     sent: list[Any] = []
     monkeypatch.setattr(autopilot, "send", sent.append)
     return autopilot, sent
 
 
-async def test_a_command_is_not_sent_again_once_it_is_overtaken(link: tuple[Autopilot, list[Any]]) -> None:
+async def test_a_command_is_not_sent_again_once_it_is_overtaken(link: tuple[MavlinkAutopilot, list[Any]]) -> None:
     autopilot, sent = link
     autopilot._target, autopilot.vehicle.heartbeat_at = (1, 1), asyncio.get_running_loop().time()
 
@@ -38,21 +38,22 @@ async def test_a_command_is_not_sent_again_once_it_is_overtaken(link: tuple[Auto
     assert len(sent) == 1
 
 
-async def test_no_duty_no_heartbeat(link: tuple[Autopilot, list[Any]]) -> None:
-    autopilot, sent = link
-    autopilot.alive = lambda: False
+async def test_no_duty_no_heartbeat(monkeypatch: pytest.MonkeyPatch) -> None:
+    duty, sent = False, list[Any]()
+    autopilot = MavlinkAutopilot("tcp:127.0.0.1:1", ARDUCOPTER, alive=lambda: duty)
+    monkeypatch.setattr(autopilot, "send", sent.append)
     autopilot.beat()
     assert [m.name for m in sent] == ["PARAM_REQUEST_READ"], "it knocks, so that it is answered"
     autopilot._target = (1, 1)
     autopilot.beat()
     assert len(sent) == 1
-    autopilot.alive = lambda: True
+    duty = True
     autopilot.beat()
     assert sent[-1].name == "HEARTBEAT"
 
 
 async def test_two_that_read_one_parameter_both_hear_it(
-    link: tuple[Autopilot, list[Any]], monkeypatch: pytest.MonkeyPatch
+    link: tuple[MavlinkAutopilot, list[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     autopilot, sent = link
     autopilot._target = (1, 1)

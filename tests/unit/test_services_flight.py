@@ -13,7 +13,6 @@ from fractus_core.control.values import FlightMode
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, Verdict
 from fractus_services.errors import AutopilotError, Refused
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.authority.observer import Observer
 from mobility_world import (
     GUIDED,
     LAND,
@@ -248,7 +247,7 @@ def test_a_pilot_ends_a_tour_and_a_mission_that_ended_is_not_flown_again(tmp_pat
         async with World(tmp_path) as world:
             world.grants.put(touring(tour=((0, 100),)))
             await world.until(lambda: world.plane.xy[1] > 20)
-            observer = Observer(world.control)
+            observer = world.observer
             world.plane.set_to(LAND)
             observer.heartbeat()
             assert world.control.authority is Authority.PILOT

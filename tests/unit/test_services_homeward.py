@@ -10,7 +10,6 @@ import pytest
 import shapely
 from fractus_core.control.values import FlightMode
 from fractus_core.policy.values import GotoArgs
-from fractus_services.mobility.authority.observer import Observer
 from mobility_world import LAND, RTL, SMART_RTL, World, at, end, fly, partial, refusal, spec, touring, zone
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
@@ -185,7 +184,7 @@ def test_failsafes_are_set_again_when_a_message_was_lost(tmp_path: Path) -> None
             grant = world.grants.put(spec())
             plane.parameters |= {"SYSID_MYGCS": 244.0}
             lost = plane.parameters.pop("FS_GCS_ENABLE")
-            Observer(control).found()
+            world.observer.found()
             await world.until(lambda: control.checked is not None)
             assert control.checked is not None
             assert "FS_GCS_ENABLE" in control.checked.problem
@@ -210,7 +209,7 @@ def test_failsafes_are_set_again_when_setting_them_broke(tmp_path: Path) -> None
                 return await read(name, attempts)
 
             plane.read_parameter = breaking  # type: ignore[method-assign]
-            Observer(control).found()
+            world.observer.found()
             await world.until(lambda: control.checked is not None and not control.checked.problem, 10)
             assert not broken
 

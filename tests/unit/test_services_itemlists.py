@@ -10,13 +10,14 @@ from fractus_mavlink.enums import MAV_MISSION_TYPE
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink import itemlists
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.autopilot import Autopilot
-from fractus_services.mobility.mavlink.itemlists import Item, NoLists, download, upload
+from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
+from fractus_services.mobility.mavlink.bounds import Item
+from fractus_services.mobility.mavlink.itemlists import NoLists, download, upload
 
 ITEMS = tuple(Item(5001, 3.0, 393600000 + i, 229500000 - i) for i in range(3))
 
 
-class Keeper(Autopilot):
+class Keeper(MavlinkAutopilot):
     """An autopilot that keeps one list; it hears and says every message but those whose number is in `lost`."""
 
     def __init__(self, *lost: int, result: int = 0) -> None:

@@ -15,9 +15,9 @@ from fractus_core.geo import LocalFrame
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink import fence as module
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.bounds import ROOM_M, bounds_of
+from fractus_services.mobility.mavlink.bounds import ROOM_M, Item, bounds_of
 from fractus_services.mobility.mavlink.fence import MissionFence
-from fractus_services.mobility.mavlink.itemlists import Item, NoLists
+from fractus_services.mobility.mavlink.itemlists import NoLists
 
 FRAME = LocalFrame(39.36, 22.95)
 

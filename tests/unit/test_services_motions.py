@@ -328,7 +328,7 @@ def test_a_leg_whose_speed_is_lost_is_stopped_and_begun_once_more(tmp_path: Path
             if arrives:
                 assert await flying == pytest.approx(2.0, abs=0.2)
             else:
-                with pytest.raises(AutopilotError, match="how fast"):
+                with pytest.raises(AutopilotError, match="does not acknowledge the speed"):
                     await flying
                 await world.until(lambda: math.hypot(*plane.velocity) < 0.2, 5)
             assert top < 4.0, "it is not left to fly at its own speed"

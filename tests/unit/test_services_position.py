@@ -25,7 +25,7 @@ def fix(vehicle: Vehicle, fix_type: int, h_acc: int = 600) -> None:
 
 @pytest.mark.parametrize(("fix_type", "h_acc"), [(0, 0), (1, 600), (2, 600), (3, 10_001), (6, 80_000)])
 def test_without_a_good_fix_no_position_is_taken(fix_type: int, h_acc: int) -> None:
-    vehicle = Vehicle(ARDUCOPTER)
+    vehicle = Vehicle(stack=ARDUCOPTER)
     place(vehicle, 39.0, 1.0)
     assert vehicle.lat is None
     fix(vehicle, 3)
@@ -36,7 +36,7 @@ def test_without_a_good_fix_no_position_is_taken(fix_type: int, h_acc: int) -> N
 
 
 def test_an_accuracy_that_is_not_told_any_more_is_not_the_last_one() -> None:
-    vehicle = Vehicle(ARDUCOPTER)
+    vehicle = Vehicle(stack=ARDUCOPTER)
     fix(vehicle, 3, 9_000)
     assert vehicle.position_error_m == 9.0
     fix(vehicle, 3, 0)
@@ -55,7 +55,7 @@ def told(vehicle: Vehicle, now: float, missions: bool = False) -> Any:
 
 
 def test_telemetry_carries_no_stale_position() -> None:
-    vehicle = Vehicle(ARDUCOPTER)
+    vehicle = Vehicle(stack=ARDUCOPTER)
     fix(vehicle, 3)
     place(vehicle, 39.0, 10.0)
     fresh = told(vehicle, 10.5)
@@ -65,11 +65,11 @@ def test_telemetry_carries_no_stale_position() -> None:
     stale = told(vehicle, 11.1)
     assert not stale.HasField("position")
     assert not stale.HasField("velocity")
-    assert not told(Vehicle(ARDUCOPTER), math.inf).HasField("position")
+    assert not told(Vehicle(stack=ARDUCOPTER), math.inf).HasField("position")
 
 
 def test_telemetry_tells_how_old_the_attitude_is() -> None:
-    vehicle = Vehicle(ARDUCOPTER)
+    vehicle = Vehicle(stack=ARDUCOPTER)
     vehicle.take(message("ATTITUDE", roll=0.1, pitch=0.0, yaw=1.0), 10.0)
     fresh = told(vehicle, 10.4)
     assert fresh.attitude_age_s == pytest.approx(0.4)
@@ -79,6 +79,6 @@ def test_telemetry_tells_how_old_the_attitude_is() -> None:
 
 
 def test_missions_are_for_the_node_alone() -> None:
-    missions = dict(told(Vehicle(ARDUCOPTER), 0.0, missions=True).missions)
+    missions = dict(told(Vehicle(stack=ARDUCOPTER), 0.0, missions=True).missions)
     assert missions == {"uid": MissionOutcome(kind=MissionOutcome.KIND_REVOKED, reason="why")}
-    assert not told(Vehicle(ARDUCOPTER), 0.0).missions
+    assert not told(Vehicle(stack=ARDUCOPTER), 0.0).missions

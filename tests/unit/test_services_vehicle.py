@@ -15,7 +15,7 @@ from fractus_services.mobility.mavlink.vehicle import Vehicle
 )  # fmt: skip
 def test_in_doubt_it_flies(landed_state: int, landed_at: float, altitude_m: float, flies: bool) -> None:
     vehicle = Vehicle(
-        ARDUCOPTER, armed=True, heartbeat_at=10.0, position_at=10.0, landed_state=landed_state, landed_at=landed_at,
+        stack=ARDUCOPTER, armed=True, heartbeat_at=10.0, position_at=10.0, landed_state=landed_state, landed_at=landed_at,
         altitude_m=altitude_m,
     )  # fmt: skip
     assert vehicle.in_air is flies
@@ -24,12 +24,12 @@ def test_in_doubt_it_flies(landed_state: int, landed_at: float, altitude_m: floa
 
 
 def test_an_armed_vehicle_whose_place_is_unknown_flies() -> None:
-    assert Vehicle(ARDUCOPTER, armed=True, heartbeat_at=10.0).in_air
+    assert Vehicle(stack=ARDUCOPTER, armed=True, heartbeat_at=10.0).in_air
 
 
 @pytest.mark.parametrize(("vx", "forward_mps2"), [((100, 12), 2.4), ((600, -10), -2.0), ((300, 0), 0.0)])
 def test_it_tells_how_it_speeds_up(vx: tuple[int, int], forward_mps2: float) -> None:
-    vehicle = Vehicle(ARDUCOPTER, located=True)
+    vehicle = Vehicle(stack=ARDUCOPTER, located=True)
     assert vehicle.forward_mps2 is None
     for i in range(12):
         told = message("GLOBAL_POSITION_INT", lat=1, lon=1, vx=vx[0] + i * vx[1])

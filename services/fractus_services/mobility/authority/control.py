@@ -46,11 +46,8 @@ from fractus_services.errors import PreconditionFailed, Unavailable
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.journal import Journal, Record
 from fractus_services.mobility.authority.leases import FlightConstraints, Lease, Motion
-from fractus_services.mobility.authority.performer import Performer
-from fractus_services.mobility.mavlink.autopilot import Autopilot
-from fractus_services.mobility.mavlink.failsafes import Checked
-from fractus_services.mobility.mavlink.fence import MissionFence
-from fractus_services.mobility.mavlink.mode_controller import Approach, ModeController
+from fractus_services.mobility.authority.performer import ModeCommands, Performer
+from fractus_services.mobility.autopilot import Approach, Autopilot, Checked
 
 CORRECTION = "Correction"
 """What the motions are called with which the monitor leads a driver's drone back."""
@@ -65,12 +62,12 @@ class Control:
 
     Args:
         autopilot: the link.
+        modes: changes modes and brakes; it tells this control of each change.
+        approach: flies to where the autopilot's own return is legal.
         journal: what survives a restart.
         grants: grants of this node.
         audit: where takeovers are written.
-        fence: the vehicle's own fence.
         grace_s: how long a lost driver may take to come back.
-        way_home: makes what flies the way home; needs this control itself.
         state: to begin with; by default the missions that the journal remembers, and nothing else.
 
     Attributes:
@@ -84,13 +81,12 @@ class Control:
         grants: GrantFiles,
         audit: AuditLog,
         *,
-        fence: MissionFence,
+        modes: ModeCommands,
+        approach: Approach,
         grace_s: float,
-        way_home: Callable[[Control], Approach],
         state: ControlState | None = None,
     ) -> None:
         self.autopilot = autopilot
-        self.fence = fence
         self.audit = audit
         self.checked: Checked | None = None
         self._journal = journal
@@ -108,8 +104,8 @@ class Control:
         self._constraints: FlightConstraints | None = None
         self._removed: ActiveGrant | None = None
         self._transit: tuple[ActiveGrant, CompiledGrant] | None = None
-        self.modes = ModeController(autopilot, lambda: self._state, self.dispatch)
-        self._performer = Performer(self, autopilot, self.modes, way_home(self), audit=audit, journal=journal)
+        self.modes = modes
+        self._performer = Performer(self, autopilot, modes, approach, audit=audit, journal=journal)
         self.tasks = self._performer.tasks
         grants.listen(self._grant_changed)
 

@@ -10,7 +10,7 @@ from fractus_core.control.events import Heartbeat, VehicleFound
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.mavlink.failsafes import BEING_SET, configure
+from fractus_services.mobility.autopilot import BEING_SET, Failsafes
 
 log = logging.getLogger(__name__)
 
@@ -22,10 +22,12 @@ class Observer:
 
     Args:
         control: decides what they mean.
+        failsafes: set when the autopilot is there.
     """
 
-    def __init__(self, control: Control) -> None:
+    def __init__(self, control: Control, failsafes: Failsafes) -> None:
         self._control = control
+        self._failsafes = failsafes
         self._preparing: asyncio.Task[None] | None = None
 
     def found(self) -> None:
@@ -47,8 +49,8 @@ class Observer:
             if autopilot.connected and self._unverified():
                 try:
                     await autopilot.set_rates(flying=autopilot.vehicle.armed)
-                    self._control.checked = await configure(
-                        autopilot, flying=autopilot.vehicle.armed, before=self._control.checked
+                    self._control.checked = await self._failsafes.configure(
+                        flying=autopilot.vehicle.armed, before=self._control.checked
                     )
                     self._control.wake()
                     if autopilot.vehicle.home is None:

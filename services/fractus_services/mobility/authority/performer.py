@@ -25,15 +25,14 @@ from fractus_core.control.actions import (
     WakeWaiters,
 )
 from fractus_core.control.events import Event, SystemTaskEnded
-from fractus_core.control.values import SystemTask
+from fractus_core.control.values import FlightMode, SystemTask, TaskKind
 
 from fractus_services.audit import AuditLog
 from fractus_services.background import Background
 from fractus_services.errors import Aborted, AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.mobility.authority.journal import Journal, Record
 from fractus_services.mobility.authority.leases import Lease, Motion
-from fractus_services.mobility.mavlink.autopilot import Autopilot
-from fractus_services.mobility.mavlink.mode_controller import Approach, ModeController
+from fractus_services.mobility.autopilot import Approach, Autopilot, Permit
 
 log = logging.getLogger(__name__)
 
@@ -47,6 +46,25 @@ class Machine(Protocol):
 
     def dispatch(self, event: Event) -> Sequence[Action]:
         """Tell the state machine."""
+
+
+class ModeCommands(Protocol):
+    """What `ModeController` does with the drone."""
+
+    async def change_mode(self, mode: FlightMode, permit: Permit = ...) -> None:
+        """Change the flight mode."""
+
+    async def enter_guided(self, permit: Permit = ...) -> None:
+        """Change to the mode in which the autopilot obeys."""
+
+    async def hold(self, permit: Permit = ...) -> None:
+        """Brake and hover."""
+
+    async def settle(self) -> None:
+        """Keep braking until the drone stands."""
+
+    async def carry_out(self, kind: TaskKind, wanted: Callable[[], bool], approach: Approach) -> None:
+        """Do what the system wants, however often the link fails."""
 
 
 class Performer:
@@ -70,7 +88,7 @@ class Performer:
         self,
         machine: Machine,
         autopilot: Autopilot,
-        modes: ModeController,
+        modes: ModeCommands,
         approach: Approach,
         *,
         audit: AuditLog,

@@ -8,7 +8,7 @@ from fractus_services.errors import PreconditionFailed
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import FlightConstraints, Lease, Motion
-from fractus_services.mobility.mavlink.autopilot import Permit
+from fractus_services.mobility.autopilot import Permit
 
 
 def driver_permit(control: Control, grant: ActiveGrant, motion: Motion | None = None) -> Permit:

@@ -9,6 +9,7 @@ import math
 from fractus_core.control.events import Tick
 
 from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.autopilot import Fence
 
 log = logging.getLogger(__name__)
 
@@ -18,13 +19,14 @@ LOWER_AGAIN_S = 10.0
 
 
 class Supervisor:
-    """Runs in every turn of the monitor's loop, and vouches for the service towards the autopilot.
+    """Runs in every turn of the monitor's loop, and tells the autopilot whether it may rely on the service.
 
     The heartbeats that hold off the autopilot's own failsafe are sent only while this is sound.
     """
 
-    def __init__(self, control: Control) -> None:
+    def __init__(self, control: Control, fence: Fence) -> None:
         self._control = control
+        self._fence = fence
         self._ticked_at = -math.inf
         self._lowering: asyncio.Task[None] | None = None
         self._lower_at = -math.inf
@@ -41,7 +43,7 @@ class Supervisor:
         self._ticked_at = now
         if mute and self.alive():
             control.autopilot.beat()
-        if now >= self._lower_at and self._idle() and control.fence.raised:
+        if now >= self._lower_at and self._idle() and self._fence.raised:
             self._lower_at = now + LOWER_AGAIN_S
             if self._lowering is None or self._lowering.done():
                 self._lowering = control.tasks.spawn(self._lower())
@@ -66,4 +68,4 @@ class Supervisor:
         return over and not state.preparing
 
     async def _lower(self) -> None:
-        await self._control.tasks.attempt(self._control.fence.lower, self._idle)
+        await self._control.tasks.attempt(self._fence.lower, self._idle)

@@ -19,9 +19,9 @@ from fractus_services.background import in_slices
 from fractus_services.errors import Aborted, PreconditionFailed, Refused, Unavailable
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import FlightConstraints, Motion
+from fractus_services.mobility.autopilot import Permit
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import REACHED_M, Step, come_to_rest, fly_to
-from fractus_services.mobility.mavlink.autopilot import Permit
 
 log = logging.getLogger(__name__)
 

@@ -20,10 +20,10 @@ from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import CORRECTION, Control
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.authority.supervisor import Supervisor
+from fractus_services.mobility.autopilot import Permit
 from fractus_services.mobility.flight.courses import limited_mps
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import REACHED_M, fly_to
-from fractus_services.mobility.mavlink.autopilot import Permit
 
 log = logging.getLogger(__name__)
 

@@ -11,8 +11,7 @@ from fractus_core.policy.values import GotoArgs
 
 from fractus_services.errors import Aborted, AutopilotError, Unavailable
 from fractus_services.mobility.authority.leases import Motion
-from fractus_services.mobility.mavlink.autopilot import Autopilot, Permit
-from fractus_services.mobility.mavlink.vehicle import Vehicle
+from fractus_services.mobility.autopilot import Autopilot, Permit, VehicleState
 
 REACHED_M = 1.0
 HEIGHT_REACHED_M, HEIGHT_REACHED_MPS = 0.8, 0.6
@@ -166,7 +165,7 @@ async def come_to_rest(autopilot: Autopilot, motion: Motion, permit: Permit) -> 
     motion.check()
 
 
-def _turned(vehicle: Vehicle, yaw_deg: float) -> bool:
+def _turned(vehicle: VehicleState, yaw_deg: float) -> bool:
     return abs((vehicle.yaw_deg - yaw_deg + 180.0) % 360.0 - 180.0) <= TURNED_DEG
 
 

@@ -11,15 +11,15 @@ from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs
 
 from fractus_services.errors import Aborted, PreconditionFailed, Refused
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.authority.arming import arm
+from fractus_services.mobility.authority.arming import Arming
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.authority.permits import driver_permit
+from fractus_services.mobility.autopilot import Autopilot, Permit
 from fractus_services.mobility.flight.calls import CallJudge
 from fractus_services.mobility.flight.courses import Trip
 from fractus_services.mobility.flight.motions import REACHED_M, Step, climb, come_down, come_to_rest, fly_to
 from fractus_services.mobility.flight.steering import Steering
-from fractus_services.mobility.mavlink.autopilot import Autopilot, Permit
 
 MAX_REACHED_M = 50.0
 JUDGE_AGAIN_S = 0.05
@@ -50,15 +50,21 @@ class MobilityService:
 
     Args:
         control: who has the drone.
+        arming: starts the motors.
         calls: gives calls their turn, before they come here, and judges them.
         way_home: flies to where the autopilot's own return is legal.
     """
 
     def __init__(
-        self, control: Control, calls: CallJudge, way_home: Callable[[Trip, Motion], AsyncGenerator[Step, None]]
+        self,
+        control: Control,
+        arming: Arming,
+        calls: CallJudge,
+        way_home: Callable[[Trip, Motion], AsyncGenerator[Step, None]],
     ) -> None:
         self.calls = calls
         self._control = control
+        self._arming = arming
         self._way_home = way_home
         self._steering = Steering(control)
         self._autopilot: Autopilot = control.autopilot
@@ -67,7 +73,7 @@ class MobilityService:
         """Start the motors."""
         verdict = self.calls.allow_motion(Call("Arm"), grant)
         if not self._autopilot.vehicle.armed:
-            await arm(self._control, grant, driver_permit(self._control, grant))
+            await self._arming.arm(grant, driver_permit(self._control, grant))
         return verdict
 
     async def disarm(self, grant: ActiveGrant) -> Verdict:

@@ -10,7 +10,7 @@ from fractus_core.policy.values import VelocityArgs
 from fractus_services.errors import Refused
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import Motion
-from fractus_services.mobility.mavlink.autopilot import Permit
+from fractus_services.mobility.autopilot import Permit
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from fractus_core.policy.compiled import height_m
 from fractus_core.policy.values import Call, TakeoffArgs
 
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused
-from fractus_services.mobility.authority.arming import arm
+from fractus_services.mobility.authority.arming import Arming
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import Lease
 from fractus_services.mobility.authority.permits import transit_permit
@@ -42,8 +42,9 @@ def start_of(point: ControlPoint) -> Position:
 class TransitFlight:
     """Arms, takes off and flies to where the driver takes over; judged by the same policies as a driver."""
 
-    def __init__(self, control: Control, guard: Guard, courses: Courses) -> None:
+    def __init__(self, control: Control, arming: Arming, guard: Guard, courses: Courses) -> None:
         self._control = control
+        self._arming = arming
         self._guard = guard
         self._courses = courses
 
@@ -97,7 +98,7 @@ class TransitFlight:
                 yield "the system arms the drone"
                 self._allow(Call("Arm"), trip)
                 if not vehicle.armed:
-                    await arm(control, trip.constraints.grant, permit)
+                    await self._arming.arm(trip.constraints.grant, permit)
                 climbed = self._allow(Call("Takeoff", TakeoffArgs(self._height_m(place, trip))), trip)
                 yield "the system takes off"
                 await control.modes.enter_guided(permit)

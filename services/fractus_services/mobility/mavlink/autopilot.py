@@ -20,6 +20,7 @@ from fractus_mavlink.enums import (
 )
 
 from fractus_services.errors import AutopilotError
+from fractus_services.mobility.autopilot import Permit, always
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
 from fractus_services.mobility.mavlink.link import Link
 
@@ -55,27 +56,31 @@ _VELOCITY_AND_YAW = (
 )  # fmt: skip
 _VELOCITY_ONLY = _VELOCITY_AND_YAW | _MASK.YAW_IGNORE
 
-Permit = Callable[[], None]
-"""Asked before each sending of a command; raises when it must not be sent any more."""
 
-
-def always() -> None:
-    """The permit of what may be sent at any time."""
-
-
-class Autopilot(Link):
+class MavlinkAutopilot(Link):
     """One vehicle behind one link, and what it can be told.
 
     Args:
         url: the link, see `open_link`.
         stack: the vehicle's firmware.
+        alive: see `Link`.
+        on_found: see `Link`.
+        on_heartbeat: see `Link`.
 
     Attributes:
         starting: held by the one who prepares to start the motors.
     """
 
-    def __init__(self, url: str, stack: FlightStack) -> None:
-        super().__init__(url, stack)
+    def __init__(
+        self,
+        url: str,
+        stack: FlightStack,
+        *,
+        alive: Callable[[], bool] = lambda: True,
+        on_found: Callable[[], None] = lambda: None,
+        on_heartbeat: Callable[[], None] = lambda: None,
+    ) -> None:
+        super().__init__(url, stack, alive=alive, on_found=on_found, on_heartbeat=on_heartbeat)
         self.starting = asyncio.Lock()
         self._locks: dict[int | str, asyncio.Lock] = {}
         self._flying_rates: bool | None = None

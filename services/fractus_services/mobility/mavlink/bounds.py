@@ -9,14 +9,29 @@ from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame, polygon
 from fractus_mavlink.enums import MAV_CMD
 
-from fractus_services.mobility.mavlink.itemlists import Item
-
 ROOM_M = 10.0
 """The fence lies so far outside of what is granted: the service's own monitor acts long before it."""
 
 HEADROOM_M = 5.0
 MOST_VERTICES = 60
 _SIMPLER_M = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One item: a vertex, a circle.
+
+    Attributes:
+        command: MAV_CMD.
+        param1: the first parameter: vertices in the polygon, or a radius in metres.
+        lat_e7: degrees north, times 1e7.
+        lon_e7: degrees east, times 1e7.
+    """
+
+    command: int
+    param1: float
+    lat_e7: int
+    lon_e7: int
 
 
 @dataclass(frozen=True, slots=True)

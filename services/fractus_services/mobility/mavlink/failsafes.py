@@ -4,41 +4,18 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from fractus_core.policy.values import Airframe
 
-from fractus_services.mobility.mavlink.autopilot import ATTEMPTS, Autopilot
+from fractus_services.mobility.autopilot import Checked
+from fractus_services.mobility.mavlink.autopilot import ATTEMPTS, MavlinkAutopilot
 from fractus_services.mobility.mavlink.flight_stack import Names, Setting
 
 log = logging.getLogger(__name__)
 
 
-BEING_SET = "they are being set"
-"""The problem of failsafes that are not read back yet."""
-
 _DEFAULT_SPEED_MPS = 5.0
-
-
-@dataclass(frozen=True, slots=True)
-class Checked:
-    """What the autopilot will do by itself, and what it will not.
-
-    Attributes:
-        problem: why nothing may arm; empty when every needed failsafe was read back.
-        missing: optional ones that the vehicle does not offer.
-        remembers: whether the vehicle can go back the way it came; `airframe.retraces` says that its failsafes will.
-        airframe: how it moves, from its own parameters.
-        speed_mps: the speed it flies legs with.
-        known: parameters of its movements that it has told.
-    """
-
-    problem: str
-    missing: tuple[str, ...]
-    airframe: Airframe
-    speed_mps: float
-    remembers: bool = False
-    known: frozenset[str] = frozenset()
 
 
 class Reader:
@@ -53,7 +30,7 @@ class Reader:
         problems: which are not numbers, or lost.
     """
 
-    def __init__(self, autopilot: Autopilot, known: frozenset[str] = frozenset()) -> None:
+    def __init__(self, autopilot: MavlinkAutopilot, known: frozenset[str] = frozenset()) -> None:
         self._autopilot = autopilot
         self.known = known
         self.problems: list[str] = []
@@ -74,107 +51,112 @@ class Reader:
         return default
 
 
-async def configure(autopilot: Autopilot, *, flying: bool = False, before: Checked | None = None) -> Checked:
-    """Set the failsafes, read each one back, and learn how the vehicle moves.
-
-    In flight the way home stays as it was chosen when the drone was armed, and what cannot be read as it was.
+class MavlinkFailsafes:
+    """Sets and reads the failsafes by their parameters, see `Failsafes`.
 
     Args:
         autopilot: the link.
-        flying: whether the motors run.
-        before: what was known in this flight until now.
-
-    Raises:
-        AutopilotError: the link broke.
     """
-    problems: list[str] = []
-    missing: list[str] = []
-    stack = autopilot.stack
-    for setting in stack.failsafes:
-        name, problem = await _establish(autopilot, setting)
-        if not name:
-            missing.append(setting.names[0])
-        problems.extend(filter(None, [problem]))
-        if name in setting.also:
-            problems.extend(filter(None, [(await _establish(autopilot, setting.also[name]))[1]]))
-    before = before if flying else None
-    parameter, least_points = stack.path_memory
-    points = await autopilot.read_parameter(parameter, attempts=2)
-    remembers = before.remembers if before is not None and points is None else (points or 0.0) >= least_points
-    retrace = remembers and (not flying or await _chosen(autopilot, before))
-    retraces, wrong = await _choose(autopilot, retrace=retrace)
-    reader = Reader(autopilot, before.known if before is not None else frozenset())
-    known, speed = (before.airframe, before.speed_mps) if before is not None else (Airframe(), _DEFAULT_SPEED_MPS)
-    airframe, speed = await stack.airframe(reader, known, speed)
-    problems += wrong + reader.problems
-    airframe = replace(airframe, retraces=retraces)
-    checked = Checked("; ".join(problems), tuple(missing), airframe, speed, remembers, reader.known)
-    if checked.problem:
-        log.error("failsafes are not verified, arming is refused: %s", checked.problem)
-    else:
-        log.info("failsafes are set and read back%s", f"; not offered: {', '.join(missing)}" if missing else "")
-    return checked
 
+    def __init__(self, autopilot: MavlinkAutopilot) -> None:
+        self._autopilot = autopilot
+        self._stack = autopilot.stack
 
-async def choose_return(autopilot: Autopilot, checked: Checked, *, retrace: bool) -> Checked:
-    """Let the failsafes bring the drone home straight, or, where the vehicle can, on the path that it came.
+    async def configure(self, *, flying: bool = False, before: Checked | None = None) -> Checked:
+        """Set the failsafes, read each one back, and learn how the vehicle moves.
 
-    Raises:
-        AutopilotError: the link broke.
-    """
-    retrace = retrace and checked.remembers
-    if retrace == checked.airframe.retraces or checked.problem:
+        In flight the way home stays as it was chosen when the drone was armed, and what cannot be read as it was.
+
+        Args:
+            flying: whether the motors run.
+            before: what was known in this flight until now.
+
+        Raises:
+            AutopilotError: the link broke.
+        """
+        problems: list[str] = []
+        missing: list[str] = []
+        stack = self._stack
+        for setting in stack.failsafes:
+            name, problem = await self._establish(setting)
+            if not name:
+                missing.append(setting.names[0])
+            problems.extend(filter(None, [problem]))
+            if name in setting.also:
+                problems.extend(filter(None, [(await self._establish(setting.also[name]))[1]]))
+        before = before if flying else None
+        parameter, least_points = stack.path_memory
+        points = await self._autopilot.read_parameter(parameter, attempts=2)
+        remembers = before.remembers if before is not None and points is None else (points or 0.0) >= least_points
+        retrace = remembers and (not flying or await self._chosen(before))
+        retraces, wrong = await self._choose(retrace=retrace)
+        reader = Reader(self._autopilot, before.known if before is not None else frozenset())
+        known, speed = (before.airframe, before.speed_mps) if before is not None else (Airframe(), _DEFAULT_SPEED_MPS)
+        airframe, speed = await stack.airframe(reader, known, speed)
+        problems += wrong + reader.problems
+        airframe = replace(airframe, retraces=retraces)
+        checked = Checked("; ".join(problems), tuple(missing), airframe, speed, remembers, reader.known)
+        if checked.problem:
+            log.error("failsafes are not verified, arming is refused: %s", checked.problem)
+        else:
+            log.info("failsafes are set and read back%s", f"; not offered: {', '.join(missing)}" if missing else "")
         return checked
-    retraces, problems = await _choose(autopilot, retrace=retrace)
-    return replace(checked, problem="; ".join(problems), airframe=replace(checked.airframe, retraces=retraces))
 
+    async def choose_return(self, checked: Checked, *, retrace: bool) -> Checked:
+        """Let the failsafes bring the drone home straight, or, where the vehicle can, on the path that it came.
 
-async def learn_return(autopilot: Autopilot, checked: Checked) -> Checked:
-    """Learn at which altitude the autopilot flies home by itself, under the fence that it has by now.
+        Raises:
+            AutopilotError: the link broke.
+        """
+        retrace = retrace and checked.remembers
+        if retrace == checked.airframe.retraces or checked.problem:
+            return checked
+        retraces, problems = await self._choose(retrace=retrace)
+        return replace(checked, problem="; ".join(problems), airframe=replace(checked.airframe, retraces=retraces))
 
-    What was known and cannot be read now stays as it was, and is a problem.
+    async def learn_return(self, checked: Checked) -> Checked:
+        """Learn at which altitude the autopilot flies home by itself, under the fence that it has by now.
 
-    Raises:
-        AutopilotError: the link broke.
-    """
-    reader = Reader(autopilot, checked.known)
-    height_m = await autopilot.stack.return_altitude_m(reader, checked.airframe.return_altitude_m)
-    problem = "; ".join(filter(None, [checked.problem, *reader.problems]))
-    airframe = replace(checked.airframe, return_altitude_m=height_m)
-    return replace(checked, problem=problem, airframe=airframe, known=reader.known)
+        What was known and cannot be read now stays as it was, and is a problem.
 
+        Raises:
+            AutopilotError: the link broke.
+        """
+        reader = Reader(self._autopilot, checked.known)
+        height_m = await self._stack.return_altitude_m(reader, checked.airframe.return_altitude_m)
+        problem = "; ".join(filter(None, [checked.problem, *reader.problems]))
+        airframe = replace(checked.airframe, return_altitude_m=height_m)
+        return replace(checked, problem=problem, airframe=airframe, known=reader.known)
 
-async def _chosen(autopilot: Autopilot, before: Checked | None) -> bool:
-    """Whether the path was chosen as the way home of the flight under way; the vehicle knows when nobody else does."""
-    if before is not None:
-        return before.airframe.retraces
-    companion = autopilot.stack.retracing[0]
-    value = await autopilot.read_parameter(companion.names[0])
-    return value is not None and value in companion.accepted | {companion.value}
+    async def _chosen(self, before: Checked | None) -> bool:
+        """Whether the path was chosen as the way home of the flight under way; the vehicle knows when nobody else does."""
+        if before is not None:
+            return before.airframe.retraces
+        companion = self._stack.retracing[0]
+        value = await self._autopilot.read_parameter(companion.names[0])
+        return value is not None and value in companion.accepted | {companion.value}
 
+    async def _choose(self, *, retrace: bool) -> tuple[bool, list[str]]:
+        """Whether the failsafes retrace the path now, and what does not hold."""
+        stack = self._stack
+        if retrace:
+            problems = [problem for setting in stack.retracing if (problem := (await self._establish(setting))[1])]
+            if not problems:
+                return True, []
+            log.warning("the drone will fly home straight: %s", "; ".join(problems))
+        return False, [problem for setting in stack.straight if (problem := (await self._establish(setting))[1])]
 
-async def _choose(autopilot: Autopilot, *, retrace: bool) -> tuple[bool, list[str]]:
-    """Whether the failsafes retrace the path now, and what does not hold."""
-    stack = autopilot.stack
-    if retrace:
-        problems = [problem for setting in stack.retracing if (problem := (await _establish(autopilot, setting))[1])]
-        if not problems:
-            return True, []
-        log.warning("the drone will fly home straight: %s", "; ".join(problems))
-    return False, [problem for setting in stack.straight if (problem := (await _establish(autopilot, setting))[1])]
-
-
-async def _establish(autopilot: Autopilot, setting: Setting) -> tuple[str, str]:
-    """The name under which the vehicle has the setting, empty when it has none, and a problem when it does not hold."""
-    for name in setting.names:
-        found = await autopilot.read_parameter(name, attempts=3)
-        if found is None:
-            continue
-        if found == setting.value or found in setting.accepted:
-            return name, ""
-        after = await autopilot.write_parameter(name, setting.value)
-        if after is not None and abs(after - setting.value) < 1e-6:
-            log.info("set %s from %g to %g: the autopilot %s", name, found, setting.value, setting.why)
-            return name, ""
-        return name, f"{name} is {found:g} and cannot be set to {setting.value:g} (the autopilot {setting.why})"
-    return "", f"the autopilot has no {' or '.join(setting.names)} ({setting.why})" if setting.needed else ""
+    async def _establish(self, setting: Setting) -> tuple[str, str]:
+        """The name under which the vehicle has the setting, empty when it has none, and a problem when it does not hold."""
+        for name in setting.names:
+            found = await self._autopilot.read_parameter(name, attempts=3)
+            if found is None:
+                continue
+            if found == setting.value or found in setting.accepted:
+                return name, ""
+            after = await self._autopilot.write_parameter(name, setting.value)
+            if after is not None and abs(after - setting.value) < 1e-6:
+                log.info("set %s from %g to %g: the autopilot %s", name, found, setting.value, setting.why)
+                return name, ""
+            return name, f"{name} is {found:g} and cannot be set to {setting.value:g} (the autopilot {setting.why})"
+        return "", f"the autopilot has no {' or '.join(setting.names)} ({setting.why})" if setting.needed else ""

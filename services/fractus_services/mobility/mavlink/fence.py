@@ -13,9 +13,9 @@ from fractus_core.api.plans import GrantSpec
 from fractus_storage import write_file
 
 from fractus_services.errors import AutopilotError
-from fractus_services.mobility.mavlink.autopilot import Autopilot
-from fractus_services.mobility.mavlink.bounds import Bounds, bounds_of
-from fractus_services.mobility.mavlink.itemlists import Item, NoLists, download, upload
+from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
+from fractus_services.mobility.mavlink.bounds import Bounds, Item, bounds_of
+from fractus_services.mobility.mavlink.itemlists import NoLists, download, upload
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ class MissionFence:
         missing: why there is no fence; empty when the autopilot offers one.
     """
 
-    def __init__(self, autopilot: Autopilot, directory: Path) -> None:
+    def __init__(self, autopilot: MavlinkAutopilot, directory: Path) -> None:
         self._autopilot = autopilot
         self._stack = autopilot.stack
         self._path = directory / "fence.json"

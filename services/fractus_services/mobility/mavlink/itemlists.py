@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from fractus_mavlink import Message, message
 from fractus_mavlink.enums import MAV_FRAME, MAV_MISSION_RESULT, MAV_MISSION_TYPE
 
 from fractus_services.errors import AutopilotError
-from fractus_services.mobility.mavlink.autopilot import Autopilot
+from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
+from fractus_services.mobility.mavlink.bounds import Item
 
 ANSWER_S = 1.0
 ATTEMPTS = 4
@@ -30,24 +30,9 @@ class NoLists(AutopilotError):
     """The autopilot keeps no lists of this kind."""
 
 
-@dataclass(frozen=True, slots=True)
-class Item:
-    """One item: a vertex, a circle.
-
-    Attributes:
-        command: MAV_CMD.
-        param1: the first parameter: vertices in the polygon, or a radius in metres.
-        lat_e7: degrees north, times 1e7.
-        lon_e7: degrees east, times 1e7.
-    """
-
-    command: int
-    param1: float
-    lat_e7: int
-    lon_e7: int
-
-
-async def upload(autopilot: Autopilot, items: Sequence[Item], kind: MAV_MISSION_TYPE = MAV_MISSION_TYPE.FENCE) -> None:
+async def upload(
+    autopilot: MavlinkAutopilot, items: Sequence[Item], kind: MAV_MISSION_TYPE = MAV_MISSION_TYPE.FENCE
+) -> None:
     """Replace a list.
 
     Raises:
@@ -72,7 +57,7 @@ async def upload(autopilot: Autopilot, items: Sequence[Item], kind: MAV_MISSION_
                 outgoing = _item(autopilot, items[seq], seq, kind)
 
 
-async def download(autopilot: Autopilot, kind: MAV_MISSION_TYPE = MAV_MISSION_TYPE.FENCE) -> tuple[Item, ...]:
+async def download(autopilot: MavlinkAutopilot, kind: MAV_MISSION_TYPE = MAV_MISSION_TYPE.FENCE) -> tuple[Item, ...]:
     """Read a list.
 
     Raises:
@@ -92,7 +77,7 @@ async def download(autopilot: Autopilot, kind: MAV_MISSION_TYPE = MAV_MISSION_TY
 
 
 async def _asked(
-    autopilot: Autopilot, ask: Message, answers: asyncio.Queue[Message], wanted: str, seq: int | None = None
+    autopilot: MavlinkAutopilot, ask: Message, answers: asyncio.Queue[Message], wanted: str, seq: int | None = None
 ) -> Message:
     for _ in range(ATTEMPTS):
         autopilot.send(ask)
@@ -122,7 +107,7 @@ def _check(result: int) -> None:
         raise AutopilotError(f"the autopilot refused the fence: {_REASONS.get(result, f'result {result}')}")
 
 
-def _item(autopilot: Autopilot, item: Item, seq: int, kind: MAV_MISSION_TYPE) -> Message:
+def _item(autopilot: MavlinkAutopilot, item: Item, seq: int, kind: MAV_MISSION_TYPE) -> Message:
     return message(
         "MISSION_ITEM_INT", seq=seq, frame=MAV_FRAME.GLOBAL, command=item.command, param1=item.param1, x=item.lat_e7, y=item.lon_e7,
         autocontinue=1, mission_type=kind, **autopilot.address(),

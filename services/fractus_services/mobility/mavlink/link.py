@@ -36,21 +36,29 @@ class Link:
     Args:
         url: where the autopilot is, see `open_link`.
         stack: its firmware.
+        alive: whether the companion does its duty; when not, no heartbeat holds off the autopilot's own failsafe.
+        on_found: called when the vehicle is heard first, again after each reconnection.
+        on_heartbeat: called for every heartbeat after the state took it.
 
     Attributes:
         vehicle: the streamed state.
-        on_message: called for every message after the state took it.
-        on_found: called when the vehicle is heard first, again after each reconnection.
-        alive: whether the companion does its duty; when not, no heartbeat holds off the autopilot's own failsafe.
     """
 
-    def __init__(self, url: str, stack: FlightStack) -> None:
+    def __init__(
+        self,
+        url: str,
+        stack: FlightStack,
+        *,
+        alive: Callable[[], bool] = lambda: True,
+        on_found: Callable[[], None] = lambda: None,
+        on_heartbeat: Callable[[], None] = lambda: None,
+    ) -> None:
         self.url = url
         self.stack = stack
-        self.on_message: Callable[[Message], None] = lambda _m: None
-        self.on_found: Callable[[], None] = lambda: None
-        self.alive: Callable[[], bool] = lambda: True
-        self.vehicle = Vehicle(stack)
+        self._alive = alive
+        self._on_found = on_found
+        self._on_heartbeat = on_heartbeat
+        self.vehicle = Vehicle(stack=stack)
         self._endpoint = Endpoint(SYSTEM_ID, COMPONENT_ID)
         self._transport: Transport | None = None
         self._target: tuple[int, int] | None = None
@@ -121,7 +129,7 @@ class Link:
         self._heartbeat()
 
     def _heartbeat(self) -> None:
-        if not self.alive():
+        if not self._alive():
             if not self.found:
                 self._knock()
             return
@@ -161,7 +169,7 @@ class Link:
                     continue
                 self._target = source
                 self.vehicle.take(incoming, self.now)
-                self.on_found()
+                self._on_found()
             if source == self._target:
                 self._take(incoming)
 
@@ -170,7 +178,8 @@ class Link:
         for kinds, queue in self._listeners:
             if incoming.name in kinds:
                 queue.put_nowait(incoming)
-        self.on_message(incoming)
+        if incoming.name == "HEARTBEAT":
+            self._on_heartbeat()
         if incoming.name in {"GLOBAL_POSITION_INT", "HEARTBEAT", "EXTENDED_SYS_STATE"}:
             self._updated.set()
             self._updated = asyncio.Event()

@@ -18,24 +18,13 @@ from fractus_services.clock import Clock
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import GrantFiles
 from fractus_services.hosting import read_description, run_until, serve_grpc
-from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.journal import Journal
-from fractus_services.mobility.authority.observer import Observer
-from fractus_services.mobility.authority.situation import situation_of
-from fractus_services.mobility.authority.supervisor import Supervisor
-from fractus_services.mobility.flight.calls import CallJudge
-from fractus_services.mobility.flight.courses import Courses
-from fractus_services.mobility.flight.guard import Guard
-from fractus_services.mobility.flight.homing import Homing
-from fractus_services.mobility.flight.monitor import MotionMonitor
-from fractus_services.mobility.flight.service import MobilityService
-from fractus_services.mobility.flight.tours import Tours
-from fractus_services.mobility.flight.transit import TransitFlight
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.autopilot import Autopilot
+from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
+from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.fence import MissionFence
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
-from fractus_services.mobility.rpc.streams import Streams
+from fractus_services.mobility.rpc.wiring import assemble
 from fractus_services.options import MobilityOptions
 
 log = logging.getLogger(__name__)
@@ -69,39 +58,32 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     audit = AuditLog(options.audit, clock)
     verifier = GrantVerifier(options.tls, options.grant_memory)
     grants = GrantFiles(options.grants, node, verifier, options.flat_terrain, audit.refused_grant)
-    journal = Journal(options.state)
-    autopilot = Autopilot(url, ARDUCOPTER)
-    fence = MissionFence(autopilot, options.state)
-
-    def guard_of(control: Control) -> Guard:
-        return Guard(lambda: situation_of(control, clock()), audit)
-
-    control = Control(
-        autopilot,
-        journal,
-        grants,
-        audit,
-        fence=fence,
-        grace_s=options.driver_grace,
-        way_home=lambda control: Homing(control, guard_of(control)).approach,
+    autopilot = MavlinkAutopilot(
+        url,
+        ARDUCOPTER,
+        # The parts need the autopilot first: they are looked up when it calls.
+        alive=lambda: parts.supervisor.alive(),  # noqa: PLW0108
+        on_found=lambda: parts.observer.found(),  # noqa: PLW0108
+        on_heartbeat=lambda: parts.observer.heartbeat(),  # noqa: PLW0108
     )
-    guard = guard_of(control)
-    homing = Homing(control, guard)
-    courses = Courses(control, guard)
-    transit = TransitFlight(control, guard, courses)
-    tours = Tours(control, grants, transit.launch, courses, options.boarding)
-    supervisor = Supervisor(control)
-    autopilot.alive = supervisor.alive
-    monitor = MotionMonitor(control, guard, audit, supervisor)
-    observer = Observer(control)
-    autopilot.on_found = observer.found
-    autopilot.on_message = lambda m: observer.heartbeat() if m.name == "HEARTBEAT" else None
+    parts = assemble(
+        autopilot,
+        MavlinkFailsafes(autopilot),
+        MissionFence(autopilot, options.state),
+        journal=Journal(options.state),
+        grants=grants,
+        audit=audit,
+        clock=clock,
+        grace_s=options.driver_grace,
+        boarding_s=options.boarding,
+    )
+    control, monitor, tours = parts.control, parts.monitor, parts.tours
     audit.append("started", {"node": node, "autopilot": url})
     grants.listen(lambda old, new: _record_grant(audit, old, new))
     grants.scan()
-    service = MobilityService(control, CallJudge(control, guard), homing.around)
-    streams = Streams(control, transit.bring)
-    handlers = MobilityHandlers(service, control, streams, grants=grants, node=node, clock=clock, heard=tours.heard)
+    handlers = MobilityHandlers(
+        parts.service, control, parts.streams, grants=grants, node=node, clock=clock, heard=tours.heard
+    )
 
     def register(server: grpc.aio.Server) -> None:
         mobility_pb2_grpc.add_MobilityServiceServicer_to_server(handlers, server)

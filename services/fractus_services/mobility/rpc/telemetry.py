@@ -9,17 +9,17 @@ from fractus_core.control import Outcome, OutcomeKind
 from fractus_proto.v1 import mobility_pb2, types_pb2
 
 from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.mavlink.vehicle import MAX_POSITION_AGE_S, Vehicle
+from fractus_services.mobility.autopilot import MAX_POSITION_AGE_S, VehicleState
 
 
-def position_of(vehicle: Vehicle) -> types_pb2.Position:
+def position_of(vehicle: VehicleState) -> types_pb2.Position:
     """Position above home; zeros while it is unknown."""
     return types_pb2.Position(
         latitude_deg=vehicle.lat or 0.0, longitude_deg=vehicle.lon or 0.0, altitude_m=vehicle.altitude_m
     )
 
 
-def velocity_of(vehicle: Vehicle) -> types_pb2.Velocity:
+def velocity_of(vehicle: VehicleState) -> types_pb2.Velocity:
     """Velocity over ground."""
     return types_pb2.Velocity(north_mps=vehicle.north_mps, east_mps=vehicle.east_mps, down_mps=vehicle.down_mps)
 

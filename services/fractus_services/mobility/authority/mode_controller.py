@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 
 from fractus_core.control import ControlState
 from fractus_core.control.events import Event, ModeChangeBegan, ModeChangeEnded
 from fractus_core.control.values import FlightMode, TaskKind
 
 from fractus_services.errors import AutopilotError
-from fractus_services.mobility.mavlink.autopilot import Autopilot, Permit, always
+from fractus_services.mobility.autopilot import Approach, Autopilot, Permit, always
 
 log = logging.getLogger(__name__)
 
@@ -21,11 +21,6 @@ RTL_TRIES = 6
 SETTLE_S = 10.0
 BRAKE_S, BRAKE_AGAIN_S = 8.0, 0.1
 STANDING_MPS = 0.2
-
-
-Approach = Callable[[Callable[[], bool], int], Awaitable[FlightMode]]
-"""Flies to where the autopilot's own return is legal, and says in which mode it does the rest; asked with whether the system
-still has the drone, and how often the autopilot refused."""
 
 
 class ModeController:

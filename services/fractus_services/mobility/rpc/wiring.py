@@ -1,0 +1,99 @@
+"""How the parts of the mobility service are put together, each complete when it is made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from fractus_core.control import ControlState
+
+from fractus_services.audit import AuditLog
+from fractus_services.grants import GrantFiles
+from fractus_services.mobility.authority.arming import Arming
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.journal import Journal
+from fractus_services.mobility.authority.mode_controller import ModeController
+from fractus_services.mobility.authority.observer import Observer
+from fractus_services.mobility.authority.situation import situation_of
+from fractus_services.mobility.authority.supervisor import Supervisor
+from fractus_services.mobility.autopilot import Autopilot, Failsafes, Fence
+from fractus_services.mobility.flight.calls import CallJudge
+from fractus_services.mobility.flight.courses import Courses
+from fractus_services.mobility.flight.guard import Guard
+from fractus_services.mobility.flight.homing import Homing
+from fractus_services.mobility.flight.monitor import MotionMonitor
+from fractus_services.mobility.flight.service import MobilityService
+from fractus_services.mobility.flight.tours import Tours
+from fractus_services.mobility.flight.transit import TransitFlight
+from fractus_services.mobility.rpc.streams import Streams
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """The parts of one drone's mobility service."""
+
+    control: Control
+    guard: Guard
+    service: MobilityService
+    streams: Streams
+    tours: Tours
+    monitor: MotionMonitor
+    supervisor: Supervisor
+    observer: Observer
+
+
+def assemble(
+    autopilot: Autopilot,
+    failsafes: Failsafes,
+    fence: Fence,
+    *,
+    journal: Journal,
+    grants: GrantFiles,
+    audit: AuditLog,
+    clock: Callable[[], float],
+    grace_s: float,
+    boarding_s: float,
+    state: ControlState | None = None,
+) -> Parts:
+    """Put the parts together.
+
+    Args:
+        autopilot: the link.
+        failsafes: the autopilot's own.
+        fence: the vehicle's own.
+        journal: what survives a restart.
+        grants: grants of this node.
+        audit: where decisions are written.
+        clock: Unix time.
+        grace_s: how long a lost driver may take to come back.
+        boarding_s: how long a tour waits for its passengers.
+        state: of control, to begin with.
+    """
+    # Control asks the mode controller to move the drone and the mode controller tells control, so one of them is looked up
+    # when it is needed: nothing runs before all parts are made.
+    control = Control(
+        autopilot,
+        journal,
+        grants,
+        audit,
+        modes=ModeController(autopilot, lambda: control.state, lambda event: control.dispatch(event)),  # noqa: PLW0108
+        approach=lambda wanted, tries: homing.approach(wanted, tries),  # noqa: PLW0108
+        grace_s=grace_s,
+        state=state,
+    )
+    guard = Guard(lambda: situation_of(control, clock()), audit)
+    homing = Homing(control, guard)
+    arming = Arming(control, failsafes, fence)
+    courses = Courses(control, guard)
+    transit = TransitFlight(control, arming, guard, courses)
+    supervisor = Supervisor(control, fence)
+    return Parts(
+        control,
+        guard,
+        MobilityService(control, arming, CallJudge(control, guard), homing.around),
+        Streams(control, transit.bring),
+        Tours(control, grants, transit.launch, courses, boarding_s),
+        MotionMonitor(control, guard, audit, supervisor),
+        supervisor,
+        Observer(control, failsafes),
+    )

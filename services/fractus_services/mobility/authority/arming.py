@@ -126,7 +126,7 @@ class Arming:
         return checked
 
     def _learnt(self, before: Checked, after: Checked) -> Checked:
-        """Take over what is known about the failsafes by now, unless they were set anew meanwhile."""
+        """Take over what is known about the failsafes by now, unless they were set again meanwhile."""
         if self._control.checked is before:
             self._control.checked = after
         return self._check(after)

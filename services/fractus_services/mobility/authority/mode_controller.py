@@ -15,12 +15,13 @@ from fractus_services.mobility.autopilot import Approach, Autopilot, Permit, alw
 
 log = logging.getLogger(__name__)
 
-AGAIN_S = 0.5
-RTL_TRIES = 6
-"""A drone that does not turn home after so many refusals lands where it is."""
-SETTLE_S = 10.0
-BRAKE_S, BRAKE_AGAIN_S = 8.0, 0.1
-STANDING_MPS = 0.2
+RETRY_S = 0.5
+MAX_RETURN_TRIES = 6
+"""How many times the autopilot may refuse to turn home; after that the drone lands where it is."""
+SETTLE_TIMEOUT_S = 10.0
+BRAKE_TIMEOUT_S, BRAKE_AGAIN_S = 8.0, 0.1
+SETTLED_MPS = 0.2
+"""Well below the speed at which the policy engine takes a drone to stand."""
 
 
 class ModeController:
@@ -79,13 +80,13 @@ class ModeController:
     async def settle(self) -> None:
         """Keep braking until the drone stands: a single velocity setpoint times out in the autopilot."""
         autopilot = self._autopilot
-        deadline = autopilot.now + SETTLE_S
+        deadline = autopilot.now + SETTLE_TIMEOUT_S
         while self._state().motion is None and autopilot.vehicle.mode.commanded and autopilot.now < deadline:
             known = autopilot.vehicle.position_fresh(autopilot.now)
-            if known and autopilot.vehicle.speed_mps < STANDING_MPS and abs(autopilot.vehicle.down_mps) < STANDING_MPS:
+            if known and autopilot.vehicle.speed_mps < SETTLED_MPS and abs(autopilot.vehicle.down_mps) < SETTLED_MPS:
                 return
             autopilot.stop()
-            await asyncio.sleep(AGAIN_S)
+            await asyncio.sleep(RETRY_S)
 
     async def disarm(self) -> bool:
         """Stop the motors; False when the autopilot refuses, as it does in the air."""
@@ -109,7 +110,7 @@ class ModeController:
         while (vehicle.armed or self._state().starting_motors) and wanted():
             try:
                 if self._state().starting_motors:
-                    await self._autopilot.update(AGAIN_S)
+                    await self._autopilot.update(RETRY_S)
                     continue
                 if kind is TaskKind.HOVER:
                     await self._hover()
@@ -121,7 +122,7 @@ class ModeController:
             except AutopilotError as error:
                 tries += 0 if error.link else 1
                 log.warning("modes: the autopilot does not follow yet (task=%s, error=%s)", kind.value, error)
-            await asyncio.sleep(AGAIN_S)
+            await asyncio.sleep(RETRY_S)
 
     async def _come_down(self, kind: TaskKind, tries: int, wanted: Callable[[], bool], approach: Approach) -> None:
         """Land here, or bring the drone home: by the autopilot's own doing, where that has begun, or else by ours first."""
@@ -130,7 +131,7 @@ class ModeController:
         if kind is TaskKind.LAND or not vehicle.mode.comes_down or not expected:
             await self._brake(wanted)
             mode = self._autopilot.stack.land
-            if kind is not TaskKind.LAND and tries < RTL_TRIES:
+            if kind is not TaskKind.LAND and tries < MAX_RETURN_TRIES:
                 mode = await approach(wanted, tries)
             await self.change_mode(mode, lambda: _check(wanted))
         while vehicle.armed and vehicle.mode.comes_down:
@@ -139,7 +140,7 @@ class ModeController:
     async def _brake(self, wanted: Callable[[], bool]) -> None:
         """Bring the drone to rest where that is ours to do, so that it turns home on the spot and not in a wide arc."""
         autopilot, vehicle = self._autopilot, self._autopilot.vehicle
-        deadline = autopilot.now + BRAKE_S
+        deadline = autopilot.now + BRAKE_TIMEOUT_S
         autopilot.stop()
         while wanted() and vehicle.in_air and vehicle.mode.commanded and autopilot.now < deadline:
             if vehicle.at_rest(autopilot.now) or not vehicle.position_fresh(autopilot.now):
@@ -151,7 +152,7 @@ class ModeController:
         """Hold at once, and again when a takeoff under way gets off the ground."""
         await self.hold()
         while self._autopilot.vehicle.armed and not self._autopilot.vehicle.in_air:
-            await self._autopilot.update(AGAIN_S)
+            await self._autopilot.update(RETRY_S)
         if self._autopilot.vehicle.armed:
             await self.hold()
             await self.settle()
@@ -159,4 +160,4 @@ class ModeController:
 
 def _check(wanted: Callable[[], bool]) -> None:
     if not wanted():
-        raise AutopilotError("the system does not have the drone any more")
+        raise AutopilotError("the system has lost the control of the drone")

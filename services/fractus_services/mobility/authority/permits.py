@@ -42,7 +42,7 @@ def transit_permit(control: Control, lease: Lease, motion: Motion) -> Permit:
 
 
 def tour_permit(control: Control, constraints: FlightConstraints, motion: Motion) -> Permit:
-    """What the system flies for passengers goes only while nobody else has the drone."""
+    """What the system flies for passengers goes only while no one else has the drone."""
 
     def check() -> None:
         motion.check()

@@ -55,7 +55,7 @@ class Guard:
         try:
             verdict = judge(call, now, compiled or grant.compiled)
         except Exception:
-            log.exception("the policy engine failed on %s; refused", call.method)
+            log.exception("guard: policy engine failed, call refused (method=%s)", call.method)
             verdict = Verdict(
                 "deny",
                 None,

@@ -33,12 +33,13 @@ TICK_S = 0.1
 IDLE_S = 0.5
 RECORD_S = 0.5
 CORRECT_AGAIN_S = 3.0
+"""How long a correction may take effect before the same alarm asks for it again."""
 
 CHANGED_S = 30.0
-"""So long after its grant changed a drone may still speed up on a way that was judged by the one before."""
+"""How long after its grant changed a drone may still speed up on a leg that was judged by the grant before."""
 
-BEGINS_S = 2.0
-"""So long a drone may stand that has been told to fly."""
+START_S = 2.0
+"""How long a drone may take to move after it was told to fly; one that keeps its place longer flies nothing."""
 
 
 class MotionMonitor:
@@ -65,25 +66,21 @@ class MotionMonitor:
                 try:
                     self.look()
                 except Exception:
-                    log.exception("the motion monitor failed; the drone holds its position")
+                    log.exception("monitor: failed, the drone holds its position")
                     self._control.brake(
                         Verdict("deny", None, "InternalError", "the motion monitor failed", (), "hover")
                     )
             try:
                 self._supervisor.tick()
             except Exception:
-                log.exception("the supervisor failed; the autopilot's own failsafe brings the drone home")
+                # No heartbeat follows a supervisor that fails: within seconds the autopilot takes the drone home.
+                log.exception("monitor: supervisor failed, the autopilot's failsafe brings the drone home")
 
     def look(self) -> None:
         """One check."""
         control, grant = self._control, self._control.mission_grant
-        compiled = (
-            control.constraints.compiled
-            if control.constraints is not None
-            else grant.compiled
-            if grant is not None
-            else None
-        )
+        source = control.constraints or grant
+        compiled = source.compiled if source is not None else None
         coming = control.state.returning and control.constraints is None
         piloted = control.authority is Authority.PILOT
         if compiled is None or piloted or coming or not control.autopilot.vehicle.mode.commanded:
@@ -96,7 +93,7 @@ class MotionMonitor:
         fresh = verdict.code != self._alarm or control.autopilot.now - self._alarm_at > CORRECT_AGAIN_S
         if fresh:
             self._alarm, self._alarm_at = verdict.code, control.autopilot.now
-            log.warning("%s: %s", verdict.code, verdict.reason)
+            log.warning("monitor: alarm (code=%s, reason=%s)", verdict.code, verdict.reason)
         if verdict.action == "takeover" and not ours:
             control.take_over(verdict)
         elif verdict.action in {"takeover", "deny"}:
@@ -105,7 +102,7 @@ class MotionMonitor:
             self._correct(verdict, compiled)
 
     def _judge(self, compiled: CompiledGrant) -> tuple[Verdict | None, bool]:
-        """What is wrong, and whether the system flies the drone already, so that there is nobody to take it from."""
+        """What is wrong, and whether the system flies the drone already, so that there is no driver to take it from."""
         control, now = self._control, self._guard.situation()
         changed = self._has_changed(
             control.constraints.grant if control.constraints is not None else control.mission_grant
@@ -123,7 +120,7 @@ class MotionMonitor:
         autopilot, motion = control.autopilot, control.motion
         if grant is not self._grant:
             self._grant, self._changed_at = grant, autopilot.now
-        begins = autopilot.now - control.state.motion_began_at < BEGINS_S
+        begins = autopilot.now - control.state.motion_began_at < START_S
         if (motion is None or motion.kind == "Takeoff") and not begins and autopilot.vehicle.keeps_place(autopilot.now):
             # Whatever moves it from here is judged by what holds now, or later.
             self._changed_at = -math.inf
@@ -153,14 +150,14 @@ class MotionMonitor:
     async def _carry_out(self, verdict: Verdict, seen: Motion | None, compiled: CompiledGrant) -> None:
         if self._control.motion is not seen:
             self._alarm = ""
-            return  # the monitor looks at what flies now first
+            return  # Another motion has begun: the next look judges that one.
         try:
             if isinstance(verdict.args, SetSpeedArgs):
                 await self._slow_down(verdict.args.speed_mps)
             elif isinstance(verdict.args, GotoArgs):
                 await self._lead_back(verdict, verdict.args, compiled)
         except (AutopilotError, Refused) as error:
-            log.warning("cannot correct the motion: %s", error)
+            log.warning("monitor: correction failed (error=%s)", error)
 
     def _permit(self, motion: Motion | None) -> Permit:
         """What corrects a motion is sent only while no one else flies."""
@@ -174,7 +171,7 @@ class MotionMonitor:
         return check
 
     async def _slow_down(self, speed_mps: float) -> None:
-        """Fly the present leg slower; the next one is judged anew."""
+        """Fly the present leg slower; the next one is judged by itself."""
         motion = self._control.motion
         if motion is not None and motion.speed_mps is not None:
             speed_mps = motion.speed_mps = min(speed_mps, motion.speed_mps)

@@ -1,12 +1,14 @@
-"""Requests as calls of the policy engine, and its verdicts as replies."""
+"""Requests as calls of the policy engine; verdicts, motions and events as replies."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, assert_never
 
 from fractus_core.api.geometry import Reference
 from fractus_core.api.methods import CONTROL_METHODS, MOBILITY_METHODS, Method
+from fractus_core.control import ControlEvent, StreamState
 from fractus_core.exhaustive import exhaustive
 from fractus_core.policy.values import (
     Args,
@@ -22,6 +24,9 @@ from fractus_proto.v1 import mobility_pb2, types_pb2
 from pydantic.alias_generators import to_snake
 
 from fractus_services.errors import InvalidRequest, Refused
+from fractus_services.mobility.autopilot import VehicleState
+from fractus_services.mobility.flight.motions import Step
+from fractus_services.mobility.rpc.telemetry import position_of
 from fractus_services.replies import decision
 
 DEFAULT_HOLD_S = 0.5
@@ -76,6 +81,18 @@ def velocity_args(request: mobility_pb2.SetVelocityRequest) -> VelocityArgs:
     )
 
 
+def acceptance_radius_m(request: mobility_pb2.GotoRequest) -> float:
+    """How near to its target a goto is complete; 0 when the caller leaves it to the service.
+
+    Raises:
+        Refused: it is not a distance.
+    """
+    value = request.acceptance_radius_m
+    if not math.isfinite(value) or value < 0:
+        raise _invalid(f"the acceptance radius must be 0 m or more, not {value:g}")
+    return value
+
+
 def call_of(request: mobility_pb2.CheckCallRequest) -> Call:
     """The call that a client wants to have judged.
 
@@ -110,6 +127,40 @@ def checked(verdict: Verdict) -> mobility_pb2.CheckCallResponse:
     return reply
 
 
+def control_event(event: ControlEvent) -> mobility_pb2.ControlEvent:
+    """An event of a control stream."""
+    return mobility_pb2.ControlEvent(
+        state=_STATES[event.state],
+        control_point=event.control_point,
+        reason=event.reason,
+        waypoints_reached=event.waypoints_reached,
+    )
+
+
+def motion_progress(step: Step, vehicle: VehicleState, verdict: Verdict | None) -> mobility_pb2.MotionProgress:
+    """How far a motion is; with a verdict, what was decided on it and where it goes."""
+    message = mobility_pb2.MotionProgress(
+        position=position_of(vehicle), distance_m=step.distance_m, complete=step.complete
+    )
+    if verdict is not None:
+        message.decision.CopyFrom(decision(verdict))
+        _write_target(message, verdict, vehicle)
+    return message
+
+
+def _write_target(message: mobility_pb2.MotionProgress, verdict: Verdict, vehicle: VehicleState) -> None:
+    """Where the motion goes, after correction."""
+    args = verdict.args
+    if isinstance(args, GotoArgs):
+        message.target.latitude_deg, message.target.longitude_deg = args.lat, args.lon
+        message.target.altitude_m = args.alt if args.alt is not None else vehicle.altitude_m
+    elif isinstance(args, TakeoffArgs):
+        message.target.CopyFrom(position_of(vehicle))
+        message.target.altitude_m = args.altitude_m
+    elif vehicle.home is not None:
+        message.target.latitude_deg, message.target.longitude_deg = vehicle.home.lat, vehicle.home.lon
+
+
 def _write_goto(message: mobility_pb2.GotoRequest, args: GotoArgs) -> None:
     message.target.latitude_deg, message.target.longitude_deg = args.lat, args.lon
     message.target.altitude_m = args.alt or 0.0
@@ -129,6 +180,13 @@ def _invalid(reason: str) -> Refused:
     return InvalidRequest("InvalidArgument", reason)
 
 
+_STATES = {
+    StreamState.WAITING: mobility_pb2.ControlEvent.STATE_WAITING,
+    StreamState.RIDING: mobility_pb2.ControlEvent.STATE_RIDING,
+    StreamState.GRANTED: mobility_pb2.ControlEvent.STATE_GRANTED,
+    StreamState.LOST: mobility_pb2.ControlEvent.STATE_LOST,
+    StreamState.COMPLETE: mobility_pb2.ControlEvent.STATE_COMPLETE,
+}
 _ARGUMENTS: dict[str, Callable[[Any], Args]] = {
     "takeoff": lambda request: TakeoffArgs(request.altitude_m),
     "goto": goto_args,

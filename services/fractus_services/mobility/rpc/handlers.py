@@ -1,4 +1,4 @@
-"""gRPC handlers of the mobility service: requests to values, one call, outcomes to replies."""
+"""gRPC handlers of the mobility service: parse the request, make one call, translate the outcome."""
 
 from __future__ import annotations
 
@@ -9,42 +9,42 @@ from contextlib import aclosing
 from typing import Any
 
 from fractus_core.api.names import node_identity
-from fractus_core.control import Authority, ControlEvent, StreamState
-from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, Verdict
+from fractus_core.control import Authority
+from fractus_core.policy.values import Call, SetSpeedArgs, TakeoffArgs, Verdict
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
 from fractus_services.answering import Reception
 from fractus_services.auth import Caller
 from fractus_services.clock import Clock
-from fractus_services.errors import AutopilotError, InvalidRequest, PreconditionFailed, Refused, Unavailable
+from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.flight.service import MobilityService, Progress
-from fractus_services.mobility.rpc.arguments import call_of, checked, goto_args, velocity_args
+from fractus_services.mobility.rpc.arguments import (
+    acceptance_radius_m,
+    call_of,
+    checked,
+    control_event,
+    goto_args,
+    motion_progress,
+    velocity_args,
+)
 from fractus_services.mobility.rpc.streams import Streams
 from fractus_services.mobility.rpc.telemetry import located, position_of, telemetry_of, velocity_of
 from fractus_services.replies import decision
 
-LEAST_INTERVAL_S, USUAL_INTERVAL_S = 0.05, 0.2
-JUDGED_S = 0.5
-"""A stream is judged again so often: what was revoked ends it within a second."""
-
-_STATES = {
-    StreamState.WAITING: mobility_pb2.ControlEvent.STATE_WAITING,
-    StreamState.RIDING: mobility_pb2.ControlEvent.STATE_RIDING,
-    StreamState.GRANTED: mobility_pb2.ControlEvent.STATE_GRANTED,
-    StreamState.LOST: mobility_pb2.ControlEvent.STATE_LOST,
-    StreamState.COMPLETE: mobility_pb2.ControlEvent.STATE_COMPLETE,
-}
+MIN_INTERVAL_S, DEFAULT_INTERVAL_S = 0.05, 0.2
+JUDGE_INTERVAL_S = 0.5
+"""How often a stream of telemetry is judged again: a grant that is revoked ends it within a second."""
 
 
 class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
-    """The service on the wire.
+    """The service on the wire. A grant is looked up again after each wait: it may have been revoked meanwhile.
 
     Args:
         service: carries out.
         control: who has the drone.
-        streams: of who asks for control.
+        streams: of drivers and passengers.
         grants: grants of this node.
         node: its name.
         clock: Unix time.
@@ -71,13 +71,13 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         self._reception = Reception(grants, clock, _known, self._failed)
 
     def _grant_of(self, caller: Caller) -> ActiveGrant:
-        """The grant of a caller, who thereby shows that it is there."""
+        """The grant of a caller; a call also tells tours that a component of its application is there."""
         grant = self._reception.grant_of(caller)
         self._heard(grant)
         return grant
 
     def _failed(self, verdict: Verdict) -> None:
-        """Something in here broke: hold the drone of a driver where it is."""
+        """An error of ours: hold the drone of a driver where it is."""
         if self._control.authority is Authority.DRIVER and self._control.autopilot.vehicle.in_air:
             self._control.brake(verdict)
 
@@ -89,12 +89,13 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
             grant = self._grant_of(caller)
             self._service.calls.allow(Call("GetControl"), grant)
             try:
+                # A stream lives no longer than the certificate that its connection was authenticated with.
                 async with (
                     asyncio.timeout(max(caller.valid_until_s - self._clock(), 0.0)),
                     aclosing(self._streams.follow(grant)) as events,
                 ):
                     async for event in events:
-                        await context.write(_event(event))
+                        await context.write(control_event(event))
             except TimeoutError:
                 caller.check(self._clock())
 
@@ -179,7 +180,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     async def Goto(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
         async with self._reception.call(context, lasting=True) as caller:
-            args, reached_m = goto_args(request), _finite(request.acceptance_radius_m)
+            args, reached_m = goto_args(request), acceptance_radius_m(request)
             await self._service.calls.turn_to_move(self._grant_of(caller))
             progress = self._service.goto(self._grant_of(caller), args, reached_m)
             await self._report(progress, context)
@@ -199,14 +200,9 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         vehicle = self._control.autopilot.vehicle
         async with aclosing(progress) as steps:
             async for at in steps:
-                message = mobility_pb2.MotionProgress(
-                    position=position_of(vehicle), distance_m=at.step.distance_m, complete=at.step.complete
-                )
-                if first:
-                    first = False
-                    message.decision.CopyFrom(decision(at.verdict))
-                    _target(message, at.verdict, vehicle)
-                await context.write(message)
+                # Clients remember the decision and the target of the first message.
+                await context.write(motion_progress(at.step, vehicle, at.verdict if first else None))
+                first = False
 
     # Telemetry
 
@@ -214,14 +210,12 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         """See mobility.proto."""
         async with self._reception.call(context, lasting=True) as caller:
             node = caller.identity == self._node
-            interval = (
-                request.interval_s if math.isfinite(request.interval_s) and request.interval_s > 0 else USUAL_INTERVAL_S
-            )
-            interval = max(interval, LEAST_INTERVAL_S)
+            wanted = request.interval_s
+            interval = max(wanted, MIN_INTERVAL_S) if math.isfinite(wanted) and wanted > 0 else DEFAULT_INTERVAL_S
             loop = asyncio.get_running_loop()
             judged = due = -math.inf
             while True:
-                if loop.time() - judged >= JUDGED_S:
+                if loop.time() - judged >= JUDGE_INTERVAL_S:
                     judged = loop.time()
                     caller.check(self._clock())
                     if not node:
@@ -229,42 +223,11 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
                 if loop.time() >= due:
                     due = loop.time() + interval
                     await context.write(telemetry_of(self._control, self._clock(), missions=node))
-                await asyncio.sleep(max(min(due - loop.time(), JUDGED_S), 0.0))
+                await asyncio.sleep(max(min(due - loop.time(), JUDGE_INTERVAL_S), 0.0))
 
 
 def _known(error: Exception) -> Refused | None:
     if not isinstance(error, AutopilotError):
         return None
-    return (
-        Unavailable("AutopilotUnavailable", str(error))
-        if error.link
-        else PreconditionFailed("AutopilotRefused", str(error))
-    )
-
-
-def _event(event: ControlEvent) -> Any:
-    return mobility_pb2.ControlEvent(
-        state=_STATES[event.state],
-        control_point=event.control_point,
-        reason=event.reason,
-        waypoints_reached=event.waypoints_reached,
-    )
-
-
-def _finite(value: float) -> float:
-    if not math.isfinite(value) or value < 0:
-        raise InvalidRequest("InvalidArgument", f"the acceptance radius must be 0 m or more, not {value:g}")
-    return value
-
-
-def _target(message: Any, verdict: Verdict, vehicle: Any) -> None:
-    """Where the motion goes, after correction."""
-    args = verdict.args
-    if isinstance(args, GotoArgs):
-        message.target.latitude_deg, message.target.longitude_deg = args.lat, args.lon
-        message.target.altitude_m = args.alt if args.alt is not None else vehicle.altitude_m
-    elif isinstance(args, TakeoffArgs):
-        message.target.CopyFrom(position_of(vehicle))
-        message.target.altitude_m = args.altitude_m
-    elif vehicle.home is not None:
-        message.target.latitude_deg, message.target.longitude_deg = vehicle.home.lat, vehicle.home.lon
+    code = "AutopilotUnavailable" if error.link else "AutopilotRefused"
+    return (Unavailable if error.link else PreconditionFailed)(code, str(error))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Callable
 from dataclasses import fields
 from datetime import datetime
 from typing import Any, get_args
@@ -32,34 +33,6 @@ _NEEDED: dict[str, frozenset[str]] = {
 }
 
 
-class Figures(click.ParamType):  # type: ignore[type-arg]
-    """Numbers with commas between them."""
-
-    name = "figures"
-
-    def __init__(self, *names: str) -> None:
-        self._names = names
-
-    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
-        """How help shows it."""
-        del param, ctx
-        return ",".join(self._names)
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
-        """The numbers, all of them and none too many."""
-        try:
-            found = tuple(float(part) for part in str(value).split(","))
-        except ValueError:
-            found = ()
-        if len(found) != len(self._names) or not all(math.isfinite(figure) for figure in found):
-            self.fail(f"{value!r} is not {','.join(self._names)}: {len(self._names)} numbers with commas", param, ctx)
-        for name, figure in zip(self._names, found, strict=True):
-            lower, upper, unit = _BOUNDS[name]
-            if not lower <= figure <= upper:
-                self.fail(f"{name} must be {lower:g} to {upper:g} {unit}, not {figure:g}", param, ctx)
-        return found
-
-
 _BOUNDS: dict[str, tuple[float, float, str]] = {
     "lat": (-90.0, 90.0, "degrees"),
     "lon": (-180.0, 180.0, "degrees"),
@@ -70,22 +43,44 @@ _BOUNDS: dict[str, tuple[float, float, str]] = {
 }
 
 
-class Time(click.ParamType):  # type: ignore[type-arg]
-    """A moment as RFC 3339 spells it, as Unix time."""
+Parser = Callable[[click.Context, click.Parameter, str | None], Any]
+"""The callback of an option: turns its text into a value."""
 
-    name = "RFC3339"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Seconds since 1970 UTC."""
-        if isinstance(value, float):
-            return value
+def figures(*names: str) -> Parser:
+    """The parser of numbers with commas between them; by their names it knows their bounds."""
+
+    def parse(context: click.Context, option: click.Parameter, text: str | None) -> tuple[float, ...] | None:
+        del context, option
+        if text is None:
+            return None
         try:
-            moment = datetime.fromisoformat(str(value))
+            found = tuple(float(part) for part in text.split(","))
         except ValueError:
-            moment = None
-        if moment is None or moment.tzinfo is None:
-            self.fail(f"{value!r} is no time with its zone, such as 2026-06-01T12:00:00Z", param, ctx)
-        return moment.timestamp()
+            found = ()
+        if len(found) != len(names) or not all(math.isfinite(figure) for figure in found):
+            raise click.BadParameter(f"{text!r} is not {','.join(names)}: {len(names)} numbers with commas")
+        for name, figure in zip(names, found, strict=True):
+            lower, upper, unit = _BOUNDS[name]
+            if not lower <= figure <= upper:
+                raise click.BadParameter(f"{name} must be {lower:g} to {upper:g} {unit}, not {figure:g}")
+        return found
+
+    return parse
+
+
+def parse_time(context: click.Context, option: click.Parameter, text: str | None) -> float | None:
+    """A moment as RFC 3339 spells it, as seconds since 1970 UTC."""
+    del context, option
+    if text is None:
+        return None
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        moment = None
+    if moment is None or moment.tzinfo is None:
+        raise click.BadParameter(f"{text!r} is no time with its zone, such as 2026-06-01T12:00:00Z")
+    return moment.timestamp()
 
 
 def parse_call(method: str, text: str) -> Call:

@@ -22,7 +22,7 @@ from fractus_core.policy.footprint import lens_of
 from fractus_core.policy.grants import compile_grants, refresh
 from fractus_core.policy.values import Airframe, Attitude, Call, Home, Situation, Verdict
 
-from fractus_cli.calls import Figures, Time, parse_call
+from fractus_cli.calls import figures, parse_call, parse_time
 from fractus_cli.manifests import BadManifest, Manifests, read_manifests
 from fractus_cli.plan import plan_all
 
@@ -54,14 +54,25 @@ def policy() -> None:
     "--args", "arguments", default="{}", help='Its arguments, such as {"lat": 39.36, "lon": 22.95, "alt": 10}.'
 )
 @click.option(
-    "--at", "at", type=Figures("lat", "lon", "alt"), required=True, help="The drone: degrees, metres above home."
+    "--at",
+    "at",
+    callback=figures("lat", "lon", "alt"),
+    metavar="lat,lon,alt",
+    required=True,
+    help="The drone: degrees, metres above home.",
 )
-@click.option("--velocity", type=Figures("n", "e", "d"), default="0,0,0", help="Its velocity north, east, down in m/s.")
 @click.option(
-    "--home", type=Figures("lat", "lon", "alt"),
+    "--velocity",
+    callback=figures("n", "e", "d"),
+    metavar="n,e,d",
+    default="0,0,0",
+    help="Its velocity north, east, down in m/s.",
+)
+@click.option(
+    "--home", callback=figures("lat", "lon", "alt"), metavar="lat,lon,alt",
     help="Where it took off: degrees, metres above mean sea level. Else that of its manifest, else below --at at sea level.",
 )  # fmt: skip
-@click.option("--time", "time_s", type=Time(), help="When, with its zone; else now.")
+@click.option("--time", "time_s", callback=parse_time, metavar="RFC3339", help="When, with its zone; else now.")
 @click.option(
     "--way-home", type=click.Choice(["straight", "retraced"]), default="straight", show_default=True,
     help="How the autopilot's failsafe flies home: straight (RTL), or back as it came (SmartRTL).",

@@ -47,7 +47,7 @@ def live() -> Any:
     children: defaultdict[Kind, dict[Key, Body]] = defaultdict(dict)
     return SimpleNamespace(
         children=children,
-        drones={},
+        drone=lambda _name: None,
         fleet=SimpleNamespace(in_flight=lambda _plan: None),
         pods=pods,
         rules_revision=0,

@@ -133,6 +133,10 @@ class LiveInventory:
             locations=self._locations,
         )
 
+    def drone(self, name: str) -> Drone | None:
+        """The Drone of a name, if there is one that can be read."""
+        return self.drones.get(("", name))
+
     def depots_by_name(self) -> Mapping[str, Depot]:
         """The depots."""
         return ByName(self.depots)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, assert_never
 
 from fractus_core.api import API_VERSION, Application, Component, Drone
@@ -20,6 +20,37 @@ COMPONENT_USER = 10001
 TLS_DIR = "/var/run/fractus/tls"
 MOBILITY_PORT = 50051
 CAMERA_PORT = 50052
+
+
+def children(
+    application: Application,
+    plan: DeploymentPlanSpec,
+    grants: Iterable[GrantSpec],
+    pods: Sequence[PodView],
+    drone: Callable[[str], Drone | None],
+) -> dict[Kind, list[Body]]:
+    """The children that a plan asks for, except Secrets: those hold keys, which are made when they are needed.
+
+    Args:
+        application: Whose plan it is.
+        plan: The plan.
+        grants: What its instances may do.
+        pods: The application's pods as they are.
+        drone: The Drone of a name, if there is one.
+    """
+    wanted: dict[Kind, list[Body]] = {kind: [] for kind in kinds.CHILDREN}
+    wanted[kinds.DEPLOYMENT_PLAN] = [deployment_plan(application, plan)]
+    wanted[kinds.GRANT] = [grant(application, spec) for spec in grants]
+    for component in (c for c in application.spec.components if c.container.ports):
+        wanted[kinds.SERVICE].append(service(application, component))
+        if component.placement == "hybrid":
+            bases = {p.instance for p in plan.placements if p.component == component.name and p.role == "cloud"}
+            ready = [pod for pod in pods if pod.instance in bases]
+            wanted[kinds.ENDPOINT_SLICE].append(endpoint_slice(application, component, ready))
+    for placed in plan.placements:
+        node = drone(placed.node) if placed.node is not None else None
+        wanted[kinds.DEPLOYMENT].append(deployment(application, placed, node))
+    return wanted
 
 
 def deployment_plan(application: Application, plan: DeploymentPlanSpec) -> Body:
@@ -313,8 +344,3 @@ def _child(kind: Kind, application: Application, name: str, described: dict[str,
         }
     ]
     return {**body, **content}
-
-
-def base_instances(plan: DeploymentPlanSpec, component: Component) -> Sequence[str]:
-    """The instances of a hybrid component that answer where no nearer one does: those in the cloud."""
-    return [p.instance for p in plan.placements if p.component == component.name and p.role == "cloud"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import assert_never
 
 from fractus_core.api import Grant
 
@@ -27,10 +28,16 @@ def mission_outcome(uid: str | None, grants: Iterable[Grant]) -> Outcome | None:
         leads = spec.class_ == "driver" or spec.tour
         if not leads or spec.application.uid != uid or status is None:
             continue
-        if status.phase == "Complete":
-            return Outcome(True, "MissionComplete", status.message or f"{spec.component} finished its mission")
-        if status.phase == "Failed":
-            return Outcome(False, "MissionFailed", status.message or f"the mission of {spec.component} failed")
-        if status.phase == "Revoked":
-            return Outcome(False, "MissionRevoked", status.message or f"the control of {spec.component} was revoked")
+        match status.phase:
+            case "Complete":
+                return Outcome(True, "MissionComplete", status.message or f"{spec.component} finished its mission")
+            case "Failed":
+                return Outcome(False, "MissionFailed", status.message or f"the mission of {spec.component} failed")
+            case "Revoked":
+                message = status.message or f"the control of {spec.component} was revoked"
+                return Outcome(False, "MissionRevoked", message)
+            case "Pending" | "Active" | None:
+                continue
+            case _:
+                assert_never(status.phase)
     return None

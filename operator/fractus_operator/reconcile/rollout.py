@@ -58,15 +58,15 @@ class Rollout:
             rules: The revision of the rules that the grants are made of; no new one is made once there is a later one.
 
         Returns:
-            Whether that is all; else some grants are left to the next look.
+            Whether that is all; else some grants are left to the next reconcile.
 
         Raises:
             NameTaken: another's object has the name of a child.
             KubeError: the API server refuses one, or cannot be reached.
         """
-        wanted = self._wanted(application, decided, grants, pods)
+        wanted = builders.children(application, decided, grants, pods, self._live.drone)
         secrets = {builders.secret_name(placed.instance): placed for placed in decided.placements}
-        # The plan before all else: it tells, also after a crash, who flies the drone and who comes along.
+        # The plan before all else: it tells, also after a crash, which application flies the drone and which share its flight.
         await self._children.apply(application, {kinds.DEPLOYMENT_PLAN: wanted[kinds.DEPLOYMENT_PLAN]})
         await self._children.prune(application, wanted, keep_secrets=secrets.keys())
         running = [body for body in wanted[kinds.DEPLOYMENT] if not self._is_in_flight(body, decided)]
@@ -98,28 +98,6 @@ class Rollout:
             if isinstance(result, BaseException):
                 raise result
         return results[2] is True
-
-    def _wanted(
-        self,
-        application: Application,
-        decided: DeploymentPlanSpec,
-        grants: Sequence[GrantSpec],
-        pods: Sequence[PodView],
-    ) -> dict[Kind, list[Body]]:
-        """The children that a plan asks for, but Secrets: those hold keys, which are made when they are needed."""
-        wanted: dict[Kind, list[Body]] = {kind: [] for kind in kinds.CHILDREN}
-        wanted[kinds.DEPLOYMENT_PLAN] = [builders.deployment_plan(application, decided)]
-        wanted[kinds.GRANT] = [builders.grant(application, spec) for spec in grants]
-        for component in (c for c in application.spec.components if c.container.ports):
-            wanted[kinds.SERVICE].append(builders.service(application, component))
-            if component.placement == "hybrid":
-                instances = builders.base_instances(decided, component)
-                bases = [pod for pod in pods if pod.instance in instances]
-                wanted[kinds.ENDPOINT_SLICE].append(builders.endpoint_slice(application, component, bases))
-        for placed in decided.placements:
-            drone = self._live.drones.get(("", placed.node)) if placed.node is not None else None
-            wanted[kinds.DEPLOYMENT].append(builders.deployment(application, placed, drone))
-        return wanted
 
     def _is_there(self, kind: Kind, body: Body) -> bool:
         return self._children.get(kind, key_of(body)) is not None

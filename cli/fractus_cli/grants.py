@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
 
 import click
-import yaml
 from fractus_core.api import Grant, InvalidObject
 from fractus_core.identity.authority import BrokenAuthority
 
+from fractus_cli.manifests import BadManifest, documents
 from fractus_cli.standalone import StandalonePki
 
 _DIRECTORY = click.Path(file_okay=False, path_type=Path)
@@ -51,25 +49,15 @@ def sign(files: tuple[Path, ...], tls: Path, to: Path, days: int) -> None:
     try:
         pki = StandalonePki.open(tls, life=timedelta(days=days))
         for file in files:
-            for manifest in _manifests(file):
-                identity = Grant.from_body(manifest).spec.identity
+            manifests = list(documents(file))
+            if not manifests:
+                raise BadManifest(f"{file}: holds no Grant")
+            for manifest in manifests:
+                try:
+                    identity = Grant.from_body(manifest).spec.identity
+                except InvalidObject as error:
+                    raise BadManifest(f"{file}: {error}") from None
                 path = pki.grant(manifest, to)
                 click.echo(f"{path}    FRACTUS_TLS_DIR={pki.component(identity)}")
-    except (BrokenAuthority, InvalidObject) as error:
+    except (BadManifest, BrokenAuthority, InvalidObject) as error:
         raise click.ClickException(str(error)) from None
-
-
-def _manifests(file: Path) -> Iterator[dict[str, Any]]:
-    try:
-        documents = list(yaml.safe_load_all(file.read_text(encoding="utf-8")))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InvalidObject(str(file), f"is neither YAML nor JSON: {error}") from None
-    found = [document for document in documents if document is not None]
-    if not found:
-        raise InvalidObject(str(file), "holds no Grant")
-    for document in found:
-        try:
-            Grant.from_body(document)
-        except InvalidObject as error:
-            raise InvalidObject(str(file), str(error)) from None
-        yield document

@@ -127,7 +127,7 @@ def read_manifests(paths: Iterable[pathlib.Path]) -> Manifests:
     """
     manifests = Manifests()
     for file, strict in _files(paths):
-        for document in _documents(file, strict=strict):
+        for document in documents(file, strict=strict):
             resource = _resource(document, str(file))
             if resource is not None:
                 _add(manifests, resource, str(file))
@@ -146,11 +146,19 @@ def _files(paths: Iterable[pathlib.Path]) -> Iterator[tuple[pathlib.Path, bool]]
             yield path, True
 
 
-def _documents(file: pathlib.Path, *, strict: bool) -> Iterator[dict[str, Any]]:
-    """The objects of a file; what is no Kubernetes object is an error in a file that was named, else passed over."""
+def documents(file: pathlib.Path, *, strict: bool = True) -> Iterator[dict[str, Any]]:
+    """The objects of a file, also those in Lists.
+
+    Args:
+        file: YAML or JSON.
+        strict: whether what is no Kubernetes object is an error, rather than passed over.
+
+    Raises:
+        BadManifest: the file cannot be read or parsed, or, if strict, holds something else.
+    """
     try:
         text = file.read_text(encoding="utf-8-sig")
-        documents = [json.loads(text)] if file.suffix == ".json" else list(yaml.safe_load_all(text))
+        found = [json.loads(text)] if file.suffix == ".json" else list(yaml.safe_load_all(text))
     except OSError as error:
         raise BadManifest(f"{file}: {error.strerror}") from None
     except UnicodeDecodeError:
@@ -163,9 +171,7 @@ def _documents(file: pathlib.Path, *, strict: bool) -> Iterator[dict[str, Any]]:
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark is not None else ""
         raise BadManifest(f"{file}{line}: {getattr(error, 'problem', None) or 'this is no YAML'}") from None
-    for document in documents:
-        if document is None:
-            continue
+    for document in (document for document in found if document is not None):
         if not isinstance(document, dict) or not isinstance(document.get("kind"), str):
             if strict:
                 raise BadManifest(f"{file}: a document has no kind; it is no Kubernetes object")

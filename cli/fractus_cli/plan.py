@@ -98,7 +98,8 @@ def plan(
         decided = plan_all(manifests, settings)
     except BadManifest as error:
         raise click.ClickException(str(error)) from None
-    click.echo(_FORMATS[output](decided, manifests.inventory(), settings), nl=False)
+    text = _FORMATS[output](decided) if output in _FORMATS else _as_geojson(decided, manifests.inventory(), settings)
+    click.echo(text, nl=False)
     for answer in decided:
         if answer.refusal is not None and output != "table":
             click.echo(f"{'/'.join(answer.application.key)}: {answer.refusal.reason}: {answer.refusal}", err=True)
@@ -198,14 +199,12 @@ def _without_placements(answer: Decided) -> DeploymentPlanSpec:
     )
 
 
-def _as_yaml(decided: Sequence[Decided], stock: Inventory, settings: Settings) -> str:
-    del stock, settings
+def _as_yaml(decided: Sequence[Decided]) -> str:
     bodies = _bodies(decided)
     return yaml.safe_dump_all(bodies, sort_keys=False, width=120, explicit_start=len(bodies) > 1)
 
 
-def _as_json(decided: Sequence[Decided], stock: Inventory, settings: Settings) -> str:
-    del stock, settings
+def _as_json(decided: Sequence[Decided]) -> str:
     bodies = _bodies(decided)
     whole = bodies[0] if len(bodies) == 1 else {"apiVersion": "v1", "kind": "List", "items": bodies}
     return json.dumps(whole, indent=2) + "\n"
@@ -216,8 +215,7 @@ def _as_geojson(decided: Sequence[Decided], stock: Inventory, settings: Settings
     return json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"
 
 
-def _as_table(decided: Sequence[Decided], stock: Inventory, settings: Settings) -> str:
-    del stock, settings
+def _as_table(decided: Sequence[Decided]) -> str:
     parts = []
     for answer in decided:
         if answer.plan is not None:
@@ -227,9 +225,4 @@ def _as_table(decided: Sequence[Decided], stock: Inventory, settings: Settings) 
     return "\n".join(parts)
 
 
-_FORMATS: dict[str, Callable[[Sequence[Decided], Inventory, Settings], str]] = {
-    "table": _as_table,
-    "yaml": _as_yaml,
-    "json": _as_json,
-    "geojson": _as_geojson,
-}
+_FORMATS: dict[str, Callable[[Sequence[Decided]], str]] = {"table": _as_table, "yaml": _as_yaml, "json": _as_json}

@@ -53,17 +53,21 @@ class Copies(Protocol[T_co]):
 
 
 @dataclass(frozen=True)
-class Submitted:
-    """An Application as it was submitted: parsed, or with the reason why it cannot be."""
-
+class _Object:
     body: Body
-    application: Application | None
-    error: InvalidObject | None
 
     @property
     def metadata(self) -> Metadata:
         """Its metadata."""
         return Metadata.model_validate(self.body["metadata"])
+
+
+@dataclass(frozen=True)
+class Submitted(_Object):
+    """An Application as it was submitted: parsed, or with the reason why it cannot be."""
+
+    application: Application | None
+    error: InvalidObject | None
 
     @property
     def uid(self) -> str:
@@ -96,16 +100,10 @@ class OwnedPlan:
 
 
 @dataclass(frozen=True)
-class Unreadable:
+class Unreadable(_Object):
     """An object that the API server took and that cannot be read."""
 
-    body: Body
     problem: str
-
-    @property
-    def metadata(self) -> Metadata:
-        """Its metadata."""
-        return Metadata.model_validate(self.body["metadata"])
 
     @property
     def name(self) -> str:

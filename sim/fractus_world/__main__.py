@@ -70,7 +70,7 @@ def _origin(_context: click.Context, _option: click.Parameter, text: str | None)
     "--pose",
     callback=_pose,
     metavar="LAT,LON,HEIGHT[,HEADING[,PITCH[,ROLL]]]",
-    help="A camera that stays where it is, so many metres above the ground; instead of --vehicle.",
+    help="A camera that stays where it is, HEIGHT metres above the ground; instead of --vehicle.",
 )
 @click.option(
     "--ground",
@@ -138,31 +138,31 @@ def _serve(
     crs: str | None,
     photos: Path | None,
 ) -> None:
+    from fractus_world.camera_api import CameraApi  # noqa: PLC0415
     from fractus_world.photos import Photos  # noqa: PLC0415 - the command line stays quick
+    from fractus_world.pose_provider import FixedPose, VehiclePose, parse_address  # noqa: PLC0415
     from fractus_world.raster import read_raster  # noqa: PLC0415
     from fractus_world.server import CameraServer  # noqa: PLC0415
-    from fractus_world.studio import Studio  # noqa: PLC0415
-    from fractus_world.whereabouts import Fixed, Vehicle, parse_address  # noqa: PLC0415
     from fractus_world.world import World, WorldAround  # noqa: PLC0415
 
     try:
         intrinsics = Intrinsics(*resolution, fov_deg)
         mount = Mount(mount_pitch_deg, mount_yaw_deg, stabilised)
-        whereabouts: Vehicle | Fixed = Vehicle(parse_address(vehicle), ground_amsl_m)
+        poses: VehiclePose | FixedPose = VehiclePose(parse_address(vehicle), ground_amsl_m)
         if pose is not None:
-            whereabouts = Fixed(pose, ground_amsl_m or 0.0)
+            poses = FixedPose(pose, ground_amsl_m or 0.0)
         own = None if orthophoto is None else World.on(read_raster(orthophoto, crs, origin), seed)
         album = None if photos is None else Photos.of(photos)
     except ValueError as error:
         raise click.ClickException(str(error)) from error
     world = WorldAround(seed, origin, own)
-    studio = Studio(world, whereabouts, intrinsics, mount, now=time.time, photos=album)
+    api = CameraApi(world, poses, intrinsics, mount, now=time.time, photos=album)
     try:
-        server = CameraServer(listen, studio)
+        server = CameraServer(listen, api)
     except OSError as error:
         raise click.ClickException(f"--listen {listen[0]}:{listen[1]}: {error}") from error
-    if isinstance(whereabouts, Vehicle):
-        whereabouts.start()
+    if isinstance(poses, VehiclePose):
+        poses.start()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: threading.Thread(target=server.shutdown).start())
     click.echo(f"camera world at http://{listen[0]}:{server.port}/", err=True)

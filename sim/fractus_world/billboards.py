@@ -1,4 +1,4 @@
-"""Photographed faces on billboards, upright beside roads or lying on the ground, for whoever has to find or hide them.
+"""Photographed faces on billboards, upright beside roads or lying on the ground, for components that find or hide them.
 
 The photograph is scikit-image's packaged portrait of Eileen Collins, which NASA put into the public domain.
 """
@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fractus_world.blocks import Blocks
-from fractus_world.chance import unit
 from fractus_world.optics import Matrix
+from fractus_world.randomness import unit
 from fractus_world.roads import Road, Roads, centre
 
 Picture = NDArray[np.uint8]
@@ -74,20 +74,20 @@ class Billboard:
         return np.array([base + (u - 0.5) * width * right + (1.0 - v) * self.height_m * up for u, v in shares])
 
     def faces(self, viewer: Matrix) -> bool:
-        """Whether somebody at a point of the world's frame, shape (3,), looks at its front."""
+        """Whether a viewer at a point of the world's frame, shape (3,), looks at its front."""
         corners = self.corners()
         front = np.cross(corners[3] - corners[0], corners[1] - corners[0])
         return bool(front @ (viewer - corners[0]) > 0.0)
 
 
-class Gallery(Protocol):
+class Billboards(Protocol):
     """Tells where billboards are."""
 
     def within(self, box: Matrix) -> list[Billboard]:
         """The billboards in a box ((x0, y0), (x1, y1))."""
 
 
-class AroundOrigin:
+class BillboardsAroundOrigin:
     """Six billboards within a hundred metres of a world's origin; what a picture of the user's gets."""
 
     def __init__(self, seed: int) -> None:
@@ -104,13 +104,13 @@ class AroundOrigin:
         return [board for board in self._boards if _in(board, box)]
 
 
-class Everywhere:
+class LandscapeBillboards:
     """Billboards beside main roads and in parks and meadows of a procedural landscape."""
 
     def __init__(self, roads: Roads, blocks: Blocks) -> None:
         self._roads = roads
         self._blocks = blocks
-        self._near_origin = AroundOrigin(roads.seed)
+        self._near_origin = BillboardsAroundOrigin(roads.seed)
 
     def within(self, box: Matrix) -> list[Billboard]:
         """The billboards in a box."""

@@ -9,9 +9,10 @@ import numpy as np
 from fractus_core.geo import LocalFrame
 from numpy.typing import NDArray
 
-from fractus_world.blocks import Block, Blocks, Kind, Patch, Roof
-from fractus_world.canvas import SUN_SHADOW, Canvas, Colour, Noise
+from fractus_world.block import Block, Kind, Patch, Roof
+from fractus_world.blocks import Blocks
 from fractus_world.roads import Road, Roads, lengthened, strip
+from fractus_world.tile_drawing import SUN_SHADOW, Colour, Noise, TileDrawing
 from fractus_world.tiles import TILE_PX, Picture
 
 Points = NDArray[np.float64]
@@ -54,105 +55,105 @@ class Landscape:
         """Paint one tile."""
         pixel_m = FINEST_M * 2**level
         extent = TILE_PX * pixel_m
-        canvas = Canvas(column * extent, -row * extent, pixel_m, TILE_PX, _GRASS)
-        west, south, east, north = canvas.box
+        drawing = TileDrawing(column * extent, -row * extent, pixel_m, TILE_PX, _GRASS)
+        west, south, east, north = drawing.box
         near = self.blocks.near(west, south, east, north)
         if pixel_m > _DETAIL_DOWN_TO_M:
-            self._from_afar(canvas, near)
-            self._grain(canvas)
+            self._from_afar(drawing, near)
+            self._grain(drawing)
         else:
             blocks = [self.blocks.block(i, j) for i, j in near]
-            blocks = [block for block in blocks if canvas.sees(block.outline, 12.0)]
+            blocks = [block for block in blocks if drawing.sees(block.outline, 12.0)]
             for block in blocks:
-                _patches(canvas, block)
-            self._roads(canvas, near)
-            self._grain(canvas)
-            _stand_up(canvas, blocks)
-        return np.asarray(cv2.LUT(canvas.colour, _LIGHT), np.uint8)
+                _patches(drawing, block)
+            self._roads(drawing, near)
+            self._grain(drawing)
+            _stand_up(drawing, blocks)
+        return np.asarray(cv2.LUT(drawing.colour, _LIGHT), np.uint8)
 
-    def _from_afar(self, canvas: Canvas, near: list[tuple[int, int]]) -> None:
+    def _from_afar(self, drawing: TileDrawing, near: list[tuple[int, int]]) -> None:
         """Only what shows from kilometres away: what each block is used for, with straight borders."""
         vertex = self.roads.vertex
         for i, j in near:
             kind = self.blocks.kind(i, j)
             colour = self.blocks.crop(i, j) if kind == "fields" else _AFAR[kind]
             outline = np.array([vertex(i, j), vertex(i + 1, j), vertex(i + 1, j + 1), vertex(i, j + 1)])
-            canvas.fill(outline, colour, 90)
-        for i, j in near if canvas.pixel_m < 10.0 else ():
+            drawing.fill(outline, colour, 90)
+        for i, j in near if drawing.pixel_m < 10.0 else ():
             for road, corner in ((Road("east", j), (i + 1, j)), (Road("north", i), (i, j + 1))):
                 if road.main:
-                    canvas.line(np.array([vertex(i, j), vertex(*corner)]), _ASPHALT, 9.0)
+                    drawing.line(np.array([vertex(i, j), vertex(*corner)]), _ASPHALT, 9.0)
 
-    def _roads(self, canvas: Canvas, near: list[tuple[int, int]]) -> None:
+    def _roads(self, drawing: TileDrawing, near: list[tuple[int, int]]) -> None:
         pieces = [(road, step) for i, j in near for road, step in ((Road("east", j), i), (Road("north", i), j))]
-        pieces = [piece for piece in pieces if canvas.sees(self.roads.edge(*piece), 8.0)]
+        pieces = [piece for piece in pieces if drawing.sees(self.roads.edge(*piece), 8.0)]
         pieces = sorted(pieces, key=lambda piece: piece[0].main)
         for paved in (False, True):
             for road, step in pieces:
-                self._carriageway(canvas, road, step, paved=paved)
+                self._carriageway(drawing, road, step, paved=paved)
         for road, step in pieces:
             if road.main or self.roads.built_up(road, step):
                 x, y = self.roads.vertex(*road.vertex(step))
-                canvas.disc(x, y, self.roads.width_m(road, step) / 2 + 2.0, _ASPHALT, 36)
+                drawing.disc(x, y, self.roads.width_m(road, step) / 2 + 2.0, _ASPHALT, 36)
         for road, step in pieces:
             if road.main or self.roads.built_up(road, step):
-                _marks(canvas, self.roads.edge(road, step), self.roads.width_m(road, step), road.main)
+                _marks(drawing, self.roads.edge(road, step), self.roads.width_m(road, step), road.main)
 
-    def _carriageway(self, canvas: Canvas, road: Road, step: int, *, paved: bool) -> None:
+    def _carriageway(self, drawing: TileDrawing, road: Road, step: int, *, paved: bool) -> None:
         """One piece of road: first what lies beside it, then, over the verges of its neighbours, its surface."""
         edge, half = lengthened(self.roads.edge(road, step), 2.5), self.roads.width_m(road, step) / 2
         built_up = self.roads.built_up(road, step)
         if not paved:
             if built_up:
-                canvas.fill(strip(edge, half + 2.2, -half - 2.2), _KERB, 40)
-                canvas.fill(strip(edge, half + 0.15, -half - 0.15), (122, 126, 128), 30)
+                drawing.fill(strip(edge, half + 2.2, -half - 2.2), _KERB, 40)
+                drawing.fill(strip(edge, half + 0.15, -half - 0.15), (122, 126, 128), 30)
             elif road.main:
-                canvas.fill(strip(edge, half + 1.6, -half - 1.6), (92, 136, 124), 130)
-                canvas.fill(strip(edge, half + 0.4, -half - 0.4), (112, 128, 134), 70)
+                drawing.fill(strip(edge, half + 1.6, -half - 1.6), (92, 136, 124), 130)
+                drawing.fill(strip(edge, half + 0.4, -half - 0.4), (112, 128, 134), 70)
             else:
-                canvas.fill(strip(edge, half + 1.0, -half - 1.0), (84, 132, 116), 130)
-                canvas.fill(strip(edge, half, -half), _TRACK, 90)
-                canvas.fill(strip(edge, 0.45, -0.45), (96, 134, 128), 140)
+                drawing.fill(strip(edge, half + 1.0, -half - 1.0), (84, 132, 116), 130)
+                drawing.fill(strip(edge, half, -half), _TRACK, 90)
+                drawing.fill(strip(edge, 0.45, -0.45), (96, 134, 128), 140)
         elif built_up or road.main:
-            canvas.fill(strip(edge, half, -half), _ASPHALT, 36)
-            if canvas.pixel_m < 0.3:
+            drawing.fill(strip(edge, half, -half), _ASPHALT, 36)
+            if drawing.pixel_m < 0.3:
                 for wheel in (-0.72, -0.3, 0.3, 0.72):
-                    canvas.line(edge[:, :2] + wheel * half * edge[:, 2:], (98, 98, 100), 0.5)
+                    drawing.line(edge[:, :2] + wheel * half * edge[:, 2:], (98, 98, 100), 0.5)
 
-    def _grain(self, canvas: Canvas) -> None:
+    def _grain(self, drawing: TileDrawing) -> None:
         """Uneven ground: clods, tufts and stains, as rough as each material is."""
-        fine = self._noise.between(0.0, 0.6, canvas) * 6.5 + self._noise.between(1.0, 4.5, canvas) * 5.5
-        shift = fine * (canvas.rough.astype(np.float32) / 128.0)
-        shift += self._noise.between(8.0, 70.0, canvas) * 3.6 + self._noise.between(120.0, 300.0, canvas) * 2.0
+        fine = self._noise.between(0.0, 0.6, drawing) * 6.5 + self._noise.between(1.0, 4.5, drawing) * 5.5
+        shift = fine * (drawing.rough.astype(np.float32) / 128.0)
+        shift += self._noise.between(8.0, 70.0, drawing) * 3.6 + self._noise.between(120.0, 300.0, drawing) * 2.0
         shifts = cv2.merge([shift * part for part in _EARTHY])
-        canvas.colour = np.asarray(cv2.add(canvas.colour, shifts, dtype=cv2.CV_8U), np.uint8)
+        drawing.colour = np.asarray(cv2.add(drawing.colour, shifts, dtype=cv2.CV_8U), np.uint8)
 
 
-def _patches(canvas: Canvas, block: Block) -> None:
-    for index in canvas.within(block.patch_boxes):
+def _patches(drawing: TileDrawing, block: Block) -> None:
+    for index in drawing.within(block.patch_boxes):
         patch = block.patches[index]
-        canvas.fill(patch.outline, patch.colour, patch.rough)
-        if patch.rows_deg is not None and canvas.pixel_m < 1.2:
-            _rows(canvas, patch, patch.rows_deg)
+        drawing.fill(patch.outline, patch.colour, patch.rough)
+        if patch.rows_deg is not None and drawing.pixel_m < 1.2:
+            _rows(drawing, patch, patch.rows_deg)
 
 
-def _rows(canvas: Canvas, patch: Patch, heading_deg: float) -> None:
+def _rows(drawing: TileDrawing, patch: Patch, heading_deg: float) -> None:
     """Rows of a crop, swaths, and the tramlines that a tractor leaves every 18 m."""
-    mask = canvas.mask(patch.outline)
+    mask = drawing.mask(patch.outline)
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if len(rows) == 0:
         return
     y0, y1, x0, x1 = int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
     across = math.radians(heading_deg + 90.0)
-    east = (canvas.left_m + (np.arange(x0, x1) + 0.5) * canvas.pixel_m) * math.sin(across)
-    north = (canvas.top_m - (np.arange(y0, y1) + 0.5) * canvas.pixel_m) * math.cos(across)
+    east = (drawing.left_m + (np.arange(x0, x1) + 0.5) * drawing.pixel_m) * math.sin(across)
+    north = (drawing.top_m - (np.arange(y0, y1) + 0.5) * drawing.pixel_m) * math.cos(across)
     first = float(east.min() + north.min())
-    fine = max(canvas.pixel_m / 2, 0.02)
+    fine = max(drawing.pixel_m / 2, 0.02)
     count = int((float(east.max() + north.max()) - first) / fine) + 2
-    profile = _profile(first + fine * np.arange(count), canvas.pixel_m)
+    profile = _profile(first + fine * np.arange(count), drawing.pixel_m)
     index = ((east[None, :] + north[:, None] - first) / fine).astype(np.int32)
     shift = profile[index] * (mask[y0:y1, x0:x1].astype(np.float32) / 255.0)
-    part = canvas.colour[y0:y1, x0:x1]
+    part = drawing.colour[y0:y1, x0:x1]
     part[:] = np.clip(part + shift[..., None] * _LEAFY, 0, 255).astype(np.uint8)
 
 
@@ -168,9 +169,9 @@ def _profile(across_m: NDArray[np.floating], pixel_m: float) -> NDArray[np.float
     return np.asarray(rows + swath + lines, np.float32)
 
 
-def _marks(canvas: Canvas, edge: Points, width_m: float, main: bool) -> None:
+def _marks(drawing: TileDrawing, edge: Points, width_m: float, main: bool) -> None:
     """Lines along both sides of a main road, dashes in the middle."""
-    if canvas.pixel_m > 0.5:
+    if drawing.pixel_m > 0.5:
         return
     way = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(edge[:, :2], axis=0), axis=1))))
 
@@ -184,32 +185,32 @@ def _marks(canvas: Canvas, edge: Points, width_m: float, main: bool) -> None:
     if main:
         for side in (-1.0, 1.0):
             points = between(_JUNCTION_M, length - _JUNCTION_M, side * (width_m / 2 - 0.35), 48)
-            canvas.line(points, _PAINT, 0.14)
+            drawing.line(points, _PAINT, 0.14)
     at = _JUNCTION_M
     while at + _DASH_M < length - _JUNCTION_M:
         dash = between(at, at + _DASH_M, 0.0, 3)
-        if canvas.sees(dash, 1.0):
-            canvas.line(dash, _PAINT, 0.14)
+        if drawing.sees(dash, 1.0):
+            drawing.line(dash, _PAINT, 0.14)
         at += _DASH_EVERY_M
 
 
-def _stand_up(canvas: Canvas, blocks: list[Block]) -> None:
+def _stand_up(drawing: TileDrawing, blocks: list[Block]) -> None:
     """What is higher than the ground, after its shadow."""
-    roofs = [block.roofs[index] for block in blocks for index in canvas.within(block.roof_boxes, 10.0)]
-    trees = _trees(canvas, blocks) if canvas.pixel_m <= _TREES_DOWN_TO_M else np.empty((0, 4))
+    roofs = [block.roofs[index] for block in blocks for index in drawing.within(block.roof_boxes, 10.0)]
+    trees = _trees(drawing, blocks) if drawing.pixel_m <= _TREES_DOWN_TO_M else np.empty((0, 4))
     for roof in roofs:
-        canvas.shadow(roof.corners, roof.height_m)
+        drawing.shadow(roof.corners, roof.height_m)
     for x, y, radius, _ in trees:
-        canvas.round_shadow(x, y, radius, 1.5 * radius)
-    canvas.cast(_SHADOW_DEPTH)
+        drawing.round_shadow(x, y, radius, 1.5 * radius)
+    drawing.cast(_SHADOW_DEPTH)
     for roof in roofs:
-        _roof(canvas, roof)
+        _roof(drawing, roof)
     for x, y, radius, looks in trees:
-        canvas.crown(x, y, radius, looks)
+        drawing.crown(x, y, radius, looks)
 
 
-def _trees(canvas: Canvas, blocks: list[Block]) -> Points:
-    west, south, east, north = canvas.box
+def _trees(drawing: TileDrawing, blocks: list[Block]) -> Points:
+    west, south, east, north = drawing.box
     margin = 9.0
     found = [block.trees for block in blocks if len(block.trees)]
     if not found:
@@ -217,44 +218,44 @@ def _trees(canvas: Canvas, blocks: list[Block]) -> Points:
     trees = np.vstack(found)
     x, y = trees[:, 0], trees[:, 1]
     keep = (x > west - margin) & (x < east + margin) & (y > south - margin) & (y < north + margin)
-    keep &= trees[:, 2] > 1.1 * canvas.pixel_m
+    keep &= trees[:, 2] > 1.1 * drawing.pixel_m
     return np.asarray(trees[keep])
 
 
-def _roof(canvas: Canvas, roof: Roof) -> None:
+def _roof(drawing: TileDrawing, roof: Roof) -> None:
     a, b, c, d = roof.corners
     if not roof.gabled:
-        canvas.fill(roof.corners, _lit(roof.colour, 1.12), 20)
+        drawing.fill(roof.corners, _lit(roof.colour, 1.12), 20)
         middle = roof.corners.mean(axis=0)
-        canvas.fill(middle + (roof.corners - middle) * 0.95, roof.colour, 30)
+        drawing.fill(middle + (roof.corners - middle) * 0.95, roof.colour, 30)
         for u, v in ((0.3, 0.35), (0.62, 0.6), (0.75, 0.3)):
             at = a + u * (b - a) + v * (d - a)
             box = at + np.array([(-0.9, -0.9), (0.9, -0.9), (0.9, 0.9), (-0.9, 0.9)])
-            canvas.fill(box + np.array(SUN_SHADOW) * 0.8, _lit(roof.colour, 0.62))
-            canvas.fill(box, (178, 178, 176))
+            drawing.fill(box + np.array(SUN_SHADOW) * 0.8, _lit(roof.colour, 0.62))
+            drawing.fill(box, (178, 178, 176))
         return
     start, end = (a + d) / 2, (b + c) / 2
     for near, far in ((a, b), (d, c)):
         outward = (near + far) / 2 - (start + end) / 2
         facing = float(outward @ np.array(SUN_SHADOW)) / float(np.linalg.norm(outward))
         half = np.array([near, far, end, start])
-        canvas.fill(half, _lit(roof.colour, 1.0 - 0.26 * facing))
-        if canvas.pixel_m < 0.07:
-            _courses(canvas, half, _lit(roof.colour, 0.9 - 0.26 * facing))
-    canvas.line(np.array([start, end]), _lit(roof.colour, 0.78), 0.16)
+        drawing.fill(half, _lit(roof.colour, 1.0 - 0.26 * facing))
+        if drawing.pixel_m < 0.07:
+            _courses(drawing, half, _lit(roof.colour, 0.9 - 0.26 * facing))
+    drawing.line(np.array([start, end]), _lit(roof.colour, 0.78), 0.16)
     chimney = start + 0.3 * (end - start) + 0.18 * (d - a)
     box = chimney + np.array([(-0.4, -0.4), (0.4, -0.4), (0.4, 0.4), (-0.4, 0.4)])
-    canvas.fill(np.vstack((box[:2] + np.array(SUN_SHADOW) * 1.2, box[2:])), _lit(roof.colour, 0.6))
-    canvas.fill(box, (92, 96, 112))
+    drawing.fill(np.vstack((box[:2] + np.array(SUN_SHADOW) * 1.2, box[2:])), _lit(roof.colour, 0.6))
+    drawing.fill(box, (92, 96, 112))
 
 
-def _courses(canvas: Canvas, half: Points, colour: Colour) -> None:
+def _courses(drawing: TileDrawing, half: Points, colour: Colour) -> None:
     """The courses of tiles on one side of a roof, parallel to the ridge."""
     near, far, end, start = half
     count = int(np.linalg.norm(start - near) / 0.36)
     for k in range(1, count):
         share = k / count
-        canvas.line(np.array([near + share * (start - near), far + share * (end - far)]), colour, 0.05)
+        drawing.line(np.array([near + share * (start - near), far + share * (end - far)]), colour, 0.05)
 
 
 def _lit(colour: Colour, factor: float) -> Colour:

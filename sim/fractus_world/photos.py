@@ -138,7 +138,7 @@ def _angle(parts: Any, reference: Any, negative: str) -> float:
     return sign * (degrees + minutes / 60.0 + seconds / 3600.0)
 
 
-def developed(photo: Photo, width: int, height: int) -> Picture:
+def resized(photo: Photo, width: int, height: int) -> Picture:
     """A photograph in a size, shape (height, width, 3); what does not fit its shape is cut off at the edges.
 
     Raises:

@@ -8,9 +8,10 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from fractus_world.blocks import Block, Blocks
-from fractus_world.chance import mixed, unit
+from fractus_world.block import Block
+from fractus_world.blocks import Blocks
 from fractus_world.optics import Matrix
+from fractus_world.randomness import mixed, unit
 from fractus_world.roads import SPACING_M, Road, Roads, cell, centre
 
 Kind = Literal["car", "van", "truck", "bus", "person"]
@@ -65,7 +66,7 @@ class Population(Protocol):
         """What stands or moves within a box ((x0, y0), (x1, y1)), metres, at a time."""
 
 
-class Nobody:
+class Unpopulated:
     """An empty world."""
 
     def within(self, box: Matrix, time_s: float) -> list[Thing]:
@@ -74,7 +75,7 @@ class Nobody:
         return []
 
 
-class Townsfolk:
+class TownPopulation:
     """The population of a procedural landscape."""
 
     def __init__(self, roads: Roads, blocks: Blocks) -> None:
@@ -168,7 +169,7 @@ class Townsfolk:
         return things + [self._stroller(i, j, n, time_s) for n in range(_STROLLERS.get(block.kind, 0))]
 
     def _stroller(self, i: int, j: int, n: int, time_s: float) -> Thing:
-        """Somebody who wanders about in the open, on a closed curve."""
+        """A person who wanders about in the open, on a closed curve."""
         draws = [unit(self._seed, 61, i, j, n, k) for k in range(7)]
         x, y = centre(i + 0.5 * (draws[0] - 0.5), j + 0.5 * (draws[1] - 0.5))
         reach = 6.0 + 22.0 * draws[2]
@@ -193,9 +194,9 @@ def _vehicle_kind(looks: int, main: bool) -> Kind:
     return "car"
 
 
-def nearest(things: list[Thing], place: Matrix, most: int) -> list[Thing]:
-    """At most so many things, the nearest to a place, farthest first."""
+def nearest(things: list[Thing], place: Matrix, count: int) -> list[Thing]:
+    """At most `count` things, the nearest to a place, farthest first."""
     if not things:
         return []
     away = np.hypot([t.x - place[0] for t in things], [t.y - place[1] for t in things])
-    return [things[k] for k in np.argsort(away, kind="stable")[:most]][::-1]
+    return [things[k] for k in np.argsort(away, kind="stable")[:count]][::-1]

@@ -9,12 +9,11 @@ import cv2
 import numpy as np
 import tifffile
 from fractus_core.geo import LocalFrame
-from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from fractus_world.georeference import Georeference, GeoreferenceError, from_geotiff, parse_system, read_world_file
 from fractus_world.optics import Matrix
-from fractus_world.tiles import TILE_PX, Picture
+from fractus_world.tiles import TILE_PX, Picture, interpolated
 
 MAX_PIXELS = 400_000_000
 NOTHING = (112, 118, 116)
@@ -58,7 +57,8 @@ class Raster:
         if bool((low >= high).any()):
             return blank
         part = np.ascontiguousarray(source[low[1] : high[1], low[0] : high[0]])
-        maps = [_interpolated(grid[..., axis] - low[axis] - 0.5) for axis in (0, 1)]
+        at = (np.arange(TILE_PX) + 0.5) * (_GRID / TILE_PX)
+        maps = [interpolated(grid[..., axis] - low[axis] - 0.5, at) for axis in (0, 1)]
         border = cv2.BORDER_CONSTANT
         drawn = cv2.remap(part, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=border, borderValue=NOTHING)
         return np.asarray(drawn, np.uint8)
@@ -78,7 +78,7 @@ class Raster:
         return self.frame.latlon(east_m * share, north_m * share)
 
     def _half(self, level: int) -> Picture:
-        """The picture, halved so many times."""
+        """The picture, halved `level` times."""
         while len(self._halved) <= level:
             last = self._halved[-1]
             size = (max(-(-last.shape[1] // 2), 1), max(-(-last.shape[0] // 2), 1))
@@ -88,15 +88,6 @@ class Raster:
             )
             self._halved.append(np.asarray(cv2.resize(even, size, interpolation=cv2.INTER_AREA), np.uint8))
         return self._halved[level]
-
-
-def _interpolated(grid: Matrix) -> NDArray[np.float32]:
-    at = (np.arange(TILE_PX) + 0.5) * (_GRID / TILE_PX)
-    first = np.minimum(at.astype(int), _GRID - 1)
-    weights = np.zeros((TILE_PX, _GRID + 1))
-    weights[np.arange(TILE_PX), first] = 1.0 - (at - first)
-    weights[np.arange(TILE_PX), first + 1] = at - first
-    return np.asarray(weights @ grid @ weights.T, np.float32)
 
 
 def read_raster(path: Path, crs: str | None = None, origin: tuple[float, float] | None = None) -> Raster:

@@ -16,7 +16,7 @@ from fractus_world.tiles import TILE_PX, Picture, TileStore, pixel_m
 Band = Literal["rgb", "ir"]
 
 CELL_PX = 16
-"""Detail and haze are worked out once for a cell of so many pixels."""
+"""Detail and haze are worked out once for a cell of this many pixels."""
 VISIBILITY_M = 9000.0
 FARTHEST_M = 25_000.0
 _SPARE_PX = 5_000_000

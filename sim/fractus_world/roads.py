@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fractus_world.chance import smooth, unit
+from fractus_world.randomness import smooth, unit
 
 Points = NDArray[np.float64]
 Family = Literal["east", "north"]

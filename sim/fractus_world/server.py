@@ -11,7 +11,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
-from fractus_world.studio import Answer, Refused, Studio
+from fractus_world.camera_api import CameraApi, RequestError, Response
 
 log = logging.getLogger(__name__)
 
@@ -29,22 +29,22 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = CLIENT_TIMEOUT_S
 
     def do_GET(self) -> None:
-        if self._deserted():
-            # A connection that breaks off in the middle of a request looks like its end; nobody waits for the picture.
+        if self._client_gone():
+            # A connection that breaks off in the middle of a request looks like its end; no one waits for the picture.
             self.close_connection = True
             return
         parts = urlsplit(self.path)
         try:
-            answer = self.server.studio.answer(parts.path, dict(parse_qsl(parts.query, max_num_fields=16)))
-        except Refused as refusal:
-            self._send(refusal.status, Answer("text/plain; charset=utf-8", f"{refusal}\n".encode()))
+            answer = self.server.api.answer(parts.path, dict(parse_qsl(parts.query, max_num_fields=16)))
+        except RequestError as refusal:
+            self._send(refusal.status, Response("text/plain; charset=utf-8", f"{refusal}\n".encode()))
         except ValueError as error:
-            self._send(HTTPStatus.BAD_REQUEST, Answer("text/plain; charset=utf-8", f"query: {error}\n".encode()))
+            self._send(HTTPStatus.BAD_REQUEST, Response("text/plain; charset=utf-8", f"query: {error}\n".encode()))
         else:
             self._send(HTTPStatus.OK, answer)
 
-    def _deserted(self) -> bool:
-        """Whether nobody is at the other end any more."""
+    def _client_gone(self) -> bool:
+        """Whether the client has gone."""
         self.connection.settimeout(0.0)
         try:
             return not self.connection.recv(1, socket.MSG_PEEK)
@@ -55,7 +55,7 @@ class _Handler(BaseHTTPRequestHandler):
         finally:
             self.connection.settimeout(self.timeout)
 
-    def _send(self, status: HTTPStatus, answer: Answer) -> None:
+    def _send(self, status: HTTPStatus, answer: Response) -> None:
         try:
             self.send_response(status)
             self.send_header("Content-Type", answer.content_type)
@@ -66,7 +66,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.end_headers()
             self.wfile.write(answer.body)
         except OSError as error:
-            log.debug("a client went away: %s", error)
+            log.debug("camera world: client went away (error=%s)", error)
             self.close_connection = True
 
     def log_message(self, format: str, *args: object) -> None:
@@ -74,21 +74,21 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 class CameraServer(ThreadingHTTPServer):
-    """Serves a studio to a limited number of clients, each for a limited time.
+    """Serves the API to a limited number of clients, each for a limited time.
 
     Args:
         address: Host and port to listen on; port 0 takes a free one.
-        studio: Answers the requests.
+        api: Answers requests.
     """
 
     daemon_threads = True
     request_queue_size = 64
     allow_reuse_address = True
 
-    def __init__(self, address: tuple[str, int], studio: Studio) -> None:
+    def __init__(self, address: tuple[str, int], api: CameraApi) -> None:
         if ":" in address[0]:
             self.address_family = socket.AF_INET6
-        self.studio = studio
+        self.api = api
         self._clients: dict[socket.socket, float] = {}
         self._lock = threading.Lock()
         super().__init__(address, _Handler)
@@ -124,8 +124,8 @@ class CameraServer(ThreadingHTTPServer):
             try:
                 client.shutdown(socket.SHUT_RDWR)
             except OSError as error:
-                log.debug("a slow client is gone already: %s", error)
+                log.debug("camera world: slow client had gone (error=%s)", error)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Note what went wrong with one client; the others are not concerned."""
-        log.warning("request of %s failed", client_address, exc_info=True)
+        log.warning("camera world: request failed (client=%s)", client_address, exc_info=True)

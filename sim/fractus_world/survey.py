@@ -8,10 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from fractus_core.geo import LocalFrame
-from numpy.typing import NDArray
 
-from fractus_world.optics import Matrix
-from fractus_world.tiles import Picture, TileStore, pixel_m
+from fractus_world.tiles import Picture, TileStore, interpolated, pixel_m
 
 _METRES_PER_DEGREE = 111_320.0
 _GRID_PX = 64
@@ -70,17 +68,7 @@ def draw_sheet(sheet: Sheet, store: TileStore, frame: LocalFrame) -> Picture:
     low, high = np.floor(source.min(axis=0)).astype(int) - 1, np.ceil(source.max(axis=0)).astype(int) + 2
     picture, left, top = store.mosaic(level, (int(low[0]), int(low[1]), int(high[0]), int(high[1])))
     maps = [
-        _interpolated((source[:, axis] - origin - 0.5).reshape(count, count), sheet.pixels)
+        interpolated((source[:, axis] - origin - 0.5).reshape(count, count), np.arange(sheet.pixels) / _GRID_PX)
         for axis, origin in ((0, left), (1, top))
     ]
     return np.asarray(cv2.remap(picture, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
-
-
-def _interpolated(grid: Matrix, pixels: int) -> NDArray[np.float32]:
-    """Values at every 64th pixel, interpolated at every pixel."""
-    at = np.arange(pixels) / _GRID_PX
-    first = at.astype(int)
-    weights = np.zeros((pixels, len(grid)))
-    weights[np.arange(pixels), first] = 1.0 - (at - first)
-    weights[np.arange(pixels), first + 1] = at - first
-    return np.asarray(weights @ grid @ weights.T, np.float32)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from fractus_core.geo import LocalFrame
@@ -95,6 +95,15 @@ class TileStore:
             while len(self._tiles) > self._limit:
                 self._tiles.popitem(last=False)
         return tile
+
+
+def interpolated(grid: NDArray[np.float64], at: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    """A square grid's values at positions between its points, the same for rows and columns."""
+    first = np.minimum(at.astype(int), len(grid) - 2)
+    weights = np.zeros((len(at), len(grid)))
+    weights[np.arange(len(at)), first] = 1.0 - (at - first)
+    weights[np.arange(len(at)), first + 1] = at - first
+    return np.asarray(weights @ grid @ weights.T, np.float32)
 
 
 def _covers(have: tuple[int, int, int, int], wanted: tuple[int, int, int, int]) -> bool:

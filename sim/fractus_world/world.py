@@ -7,12 +7,12 @@ import threading
 import cv2
 from fractus_core.geo import LocalFrame
 
-from fractus_world.billboards import AroundOrigin, Everywhere
+from fractus_world.billboards import BillboardsAroundOrigin, LandscapeBillboards
 from fractus_world.landscape import Landscape
+from fractus_world.objects import ObjectLayer
 from fractus_world.optics import Intrinsics, Mount, Pose, View
-from fractus_world.population import Nobody, Townsfolk
+from fractus_world.population import TownPopulation, Unpopulated
 from fractus_world.render import Band, render_ground
-from fractus_world.staging import Stage
 from fractus_world.survey import Sheet, draw_sheet
 from fractus_world.thermal import ThermalGround
 from fractus_world.tiles import Ground, Picture, TileStore
@@ -29,9 +29,9 @@ class World:
         stage: What stands and moves on it.
     """
 
-    def __init__(self, ground: Ground, stage: Stage) -> None:
+    def __init__(self, ground: Ground, stage: ObjectLayer) -> None:
         self.ground = ground
-        self._stage = stage
+        self._objects = stage
         self._store = TileStore(ground)
         self._warmth = TileStore(ThermalGround(self._store), 30_000_000)
         self._lock = threading.Lock()
@@ -41,12 +41,14 @@ class World:
     def procedural(cls, lat: float, lon: float, seed: int = 7) -> World:
         """A world made up from a seed, around a place."""
         land = Landscape(LocalFrame(lat, lon), seed)
-        return cls(land, Stage(Townsfolk(land.roads, land.blocks), Everywhere(land.roads, land.blocks)))
+        return cls(
+            land, ObjectLayer(TownPopulation(land.roads, land.blocks), LandscapeBillboards(land.roads, land.blocks))
+        )
 
     @classmethod
     def on(cls, ground: Ground, seed: int = 7) -> World:
-        """A world on a ground of the user's, whose roads nobody knows: billboards with faces near its middle, no traffic."""
-        return cls(ground, Stage(Nobody(), AroundOrigin(seed)))
+        """A world on a ground of the user's, whose roads are unknown: billboards with faces near its middle, no traffic."""
+        return cls(ground, ObjectLayer(Unpopulated(), BillboardsAroundOrigin(seed)))
 
     @property
     def frame(self) -> LocalFrame:
@@ -83,14 +85,14 @@ class World:
         with self._lock:
             view = self.view(pose, intrinsics, mount)
             picture = render_ground(view, self._warmth if band == "ir" else self._store, band)
-            self._stage.draw(picture, view, self._stage.actors(view, time_s, hidden), band)
+            self._objects.draw(picture, view, self._objects.in_sight(view, time_s, hidden), band)
             return picture
 
     def truth(self, pose: Pose, intrinsics: Intrinsics, *, mount: Mount = DEFAULT_MOUNT, time_s: float = 0.0) -> Truth:
         """What the picture of the same arguments shows."""
         with self._lock:
             view = self.view(pose, intrinsics, mount)
-            return Truth(pose, *self._stage.truth(view, self._stage.actors(view, time_s), self.frame))
+            return Truth(pose, *self._objects.truth(view, self._objects.in_sight(view, time_s), self.frame))
 
     def map(self, sheet: Sheet) -> Picture:
         """The ground on a sheet of a map, without what moves, shape (pixels, pixels, 3)."""
@@ -99,7 +101,7 @@ class World:
 
 
 class WorldAround:
-    """A world that is made around the first place from which somebody looks, unless its origin is given.
+    """A world that is made around the first camera pose, unless its origin is given.
 
     Args:
         seed: Of the landscape and of who is where.

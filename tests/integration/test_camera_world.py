@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 from fractus_cluster.ports import free_port
 from fractus_world import server as server_module
+from fractus_world.camera_api import CameraApi
 from fractus_world.optics import Intrinsics, Mount, Pose
+from fractus_world.pose_provider import FixedPose
 from fractus_world.server import CameraServer
-from fractus_world.studio import Studio
-from fractus_world.whereabouts import Fixed
 from fractus_world.world import WorldAround
 from geotagged import save
 from vehicle_process import HOME, Client, running_vehicle
@@ -81,10 +81,10 @@ def running_world(*arguments: str) -> Iterator[int]:
 def served() -> Iterator[CameraServer]:
     """A server in this process, whose camera is on a mast."""
     frame_pose = Pose(50.8637, 4.6785, 40.0, yaw_deg=20.0)
-    studio = Studio(
-        WorldAround(7, (50.8637, 4.6785)), Fixed(frame_pose), Intrinsics(320, 180), Mount(), now=lambda: 1000.0
+    api = CameraApi(
+        WorldAround(7, (50.8637, 4.6785)), FixedPose(frame_pose), Intrinsics(320, 180), Mount(), now=lambda: 1000.0
     )
-    server = CameraServer(("127.0.0.1", 0), studio)
+    server = CameraServer(("127.0.0.1", 0), api)
     thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
     thread.start()
     try:

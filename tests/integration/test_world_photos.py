@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fractus_core.api.geometry import Point
 from fractus_core.geo import geodesic_m
-from fractus_world.photos import Photo, PhotoError, Photos, developed
+from fractus_world.photos import Photo, PhotoError, Photos, resized
 from geotagged import save
 from PIL import Image
 
@@ -85,9 +85,9 @@ def test_pictures_fill_the_size_that_is_wanted(tmp_path: Path) -> None:
     save(tmp_path / "a.png", 50.0, 4.0, 30.0, (200, 20, 20))
     photo, _ = Photos.of(tmp_path).nearest(50.0, 4.0, 30.0, "rgb")
     for width, height in ((80, 60), (320, 180), (60, 80), (31, 17)):
-        picture = developed(photo, width, height)
+        picture = resized(photo, width, height)
         assert picture.shape == (height, width, 3)
         assert tuple(picture[height // 2, width // 2]) == (20, 20, 200), "blue, green, red"
     (tmp_path / "a.png").unlink()
     with pytest.raises(PhotoError, match="cannot be read"):
-        developed(photo, 8, 8)
+        resized(photo, 8, 8)

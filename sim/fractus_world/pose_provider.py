@@ -31,7 +31,7 @@ _STREAMS = {"GLOBAL_POSITION_INT": 20.0, "ATTITUDE": 20.0, "GIMBAL_DEVICE_ATTITU
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
+class CameraPose:
     """Where the camera is now.
 
     Attributes:
@@ -45,23 +45,23 @@ class Sighting:
     mount: Mount | None = None
 
 
-class Whereabouts(Protocol):
+class PoseProvider(Protocol):
     """Tells where the camera is."""
 
-    def now(self) -> Sighting | None:
+    def now(self) -> CameraPose | None:
         """Where it is; None while that is unknown."""
 
 
 @dataclass(frozen=True, slots=True)
-class Fixed:
+class FixedPose:
     """A camera on a mast."""
 
     pose: Pose
     ground_amsl_m: float = 0.0
 
-    def now(self) -> Sighting | None:
+    def now(self) -> CameraPose | None:
         """Always the same."""
-        return Sighting(self.pose, self.ground_amsl_m)
+        return CameraPose(self.pose, self.ground_amsl_m)
 
 
 @dataclass(slots=True)
@@ -74,7 +74,7 @@ class _Heard:
     mount_s: float = -math.inf
 
 
-class Vehicle:
+class VehiclePose:
     """A vehicle's position and attitude, followed in a thread of its own; the link is opened again when it breaks.
 
     Args:
@@ -99,7 +99,7 @@ class Vehicle:
         self._stop.set()
         self._thread.join(CONNECT_TIMEOUT_S + 2 * READ_TIMEOUT_S)
 
-    def now(self) -> Sighting | None:
+    def now(self) -> CameraPose | None:
         """The last position, carried on with its speed; None when it or the attitude is more than two seconds old."""
         with self._lock:
             heard = replace(self._heard)
@@ -112,18 +112,18 @@ class Vehicle:
         ground_m = self._ground_amsl_m
         if ground_m is None:
             ground_m = (heard.position.real("alt") - heard.position.real("relative_alt")) / 1000.0
-        return Sighting(_pose(heard.position, heard.attitude, now_s - heard.position_s, ground_m), ground_m, mount)
+        return CameraPose(_pose(heard.position, heard.attitude, now_s - heard.position_s, ground_m), ground_m, mount)
 
     def _run(self) -> None:
         wait_s = RETRY_S[0]
         while not self._stop.is_set():
             try:
                 with socket.create_connection(self._address, timeout=CONNECT_TIMEOUT_S) as link:
-                    log.info("connected to the vehicle at %s:%d", *self._address)
+                    log.info("camera world: connected to the vehicle (address=%s:%d)", *self._address)
                     if self._follow(link):
                         wait_s = RETRY_S[0]
             except OSError as error:
-                log.info("no vehicle at %s:%d: %s", *self._address, error)
+                log.info("camera world: no vehicle (address=%s:%d, error=%s)", *self._address, error)
             self._stop.wait(wait_s)
             wait_s = min(2 * wait_s, RETRY_S[1])
 

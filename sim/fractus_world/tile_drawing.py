@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fractus_world.chance import mixed
+from fractus_world.randomness import mixed
 
 Points = NDArray[np.float64]
 Colour = tuple[int, int, int]
@@ -33,14 +33,14 @@ class Noise:
         random = np.random.default_rng(mixed(seed, 77))
         self._lattices = [random.standard_normal((_LATTICE, _LATTICE)).astype(np.float32) for _ in range(_OCTAVES)]
 
-    def octave(self, octave: int, canvas: Canvas) -> NDArray[np.float32]:
+    def octave(self, octave: int, drawing: TileDrawing) -> NDArray[np.float32]:
         """One octave over a square tile, standard deviation below 1."""
         cell = _FINEST_OCTAVE_M * 2**octave
         # What is much coarser than a pixel is worked out for every eighth one, with a rim, and enlarged.
-        step = _ENLARGED if cell >= 2 * _ENLARGED * canvas.pixel_m else 1
-        rim, size = (1, canvas.size // step + 2) if step > 1 else (0, canvas.size)
-        scale = step * canvas.pixel_m / cell
-        x, y = (canvas.left_m / cell) % _LATTICE, (-canvas.top_m / cell) % _LATTICE
+        step = _ENLARGED if cell >= 2 * _ENLARGED * drawing.pixel_m else 1
+        rim, size = (1, drawing.size // step + 2) if step > 1 else (0, drawing.size)
+        scale = step * drawing.pixel_m / cell
+        x, y = (drawing.left_m / cell) % _LATTICE, (-drawing.top_m / cell) % _LATTICE
         matrix = np.array([[scale, 0.0, x + (0.5 - rim) * scale], [0.0, scale, y + (0.5 - rim) * scale]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         lattice = self._lattices[octave]
@@ -50,17 +50,17 @@ class Noise:
             drawn = drawn[step:-step, step:-step]
         return np.asarray(drawn, np.float32)
 
-    def between(self, finest_m: float, coarsest_m: float, canvas: Canvas) -> NDArray[np.float32]:
+    def between(self, finest_m: float, coarsest_m: float, drawing: TileDrawing) -> NDArray[np.float32]:
         """The sum over a tile of the octaves from one size of cell to another, those below a pixel left out."""
-        total = np.zeros((canvas.size, canvas.size), np.float32)
+        total = np.zeros((drawing.size, drawing.size), np.float32)
         for octave in range(_OCTAVES):
             cell = _FINEST_OCTAVE_M * 2**octave
-            if max(finest_m, canvas.pixel_m * 0.9) <= cell <= coarsest_m:
-                total += self.octave(octave, canvas)
+            if max(finest_m, drawing.pixel_m * 0.9) <= cell <= coarsest_m:
+                total += self.octave(octave, drawing)
         return total
 
 
-class Canvas:
+class TileDrawing:
     """A square tile.
 
     Args:
@@ -170,7 +170,7 @@ class Canvas:
 
 @lru_cache(maxsize=2048)
 def _crown(kind: int, diameter: int, shade: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """A crown of so many pixels: its colours times its cover, and what shows through."""
+    """A crown, `diameter` pixels wide: its colours times its cover, and what shows through."""
     colour, alpha = _drawn_crown(kind)
     colour = colour * (0.84 + 0.08 * shade)
     size = (diameter, diameter)

@@ -1,4 +1,4 @@
-"""What the server of the simulated world answers: pictures, what they show, and a map; it knows nothing of sockets."""
+"""The API of the simulated camera: pictures, what they show, and a map; no sockets."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from typing import Any
 import cv2
 
 from fractus_world.optics import Intrinsics, Mount, Pose
-from fractus_world.photos import Photos, developed
+from fractus_world.photos import Photos, resized
+from fractus_world.pose_provider import CameraPose, PoseProvider
 from fractus_world.render import Band
 from fractus_world.survey import Sheet
 from fractus_world.tiles import Picture
 from fractus_world.truth import Truth
-from fractus_world.whereabouts import Sighting, Whereabouts
 from fractus_world.world import World, WorldAround
 
 RENDER_WAIT_S = 5.0
@@ -30,7 +30,7 @@ JPEG_QUALITY = 90
 _NO_POSE = "the vehicle has not told its position; is it switched on, and has it a GPS fix?"
 
 
-class Refused(Exception):
+class RequestError(Exception):
     """A request that gets no answer but a reason.
 
     Args:
@@ -57,7 +57,7 @@ class Snapshot:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class Response:
     """A response's body and headers."""
 
     content_type: str
@@ -65,12 +65,12 @@ class Answer:
     headers: tuple[tuple[str, str], ...] = ()
 
 
-class Studio:
+class CameraApi:
     """Answers requests.
 
     Args:
         world: What there is to see.
-        whereabouts: Tells where the camera is.
+        poses: Tells where the camera is.
         intrinsics: The camera's own lens and resolution.
         mount: How it sits on the airframe, unless a gimbal reports.
         now: Unix seconds, for what moves.
@@ -80,7 +80,7 @@ class Studio:
     def __init__(
         self,
         world: WorldAround,
-        whereabouts: Whereabouts,
+        poses: PoseProvider,
         intrinsics: Intrinsics,
         mount: Mount,
         *,
@@ -88,7 +88,7 @@ class Studio:
         photos: Photos | None = None,
     ) -> None:
         self._world = world
-        self._whereabouts = whereabouts
+        self._poses = poses
         self._intrinsics = intrinsics
         self._mount = mount
         self._now = now
@@ -99,13 +99,13 @@ class Studio:
         self._busy = threading.Lock()
         self._waiting = threading.BoundedSemaphore(MAX_WAITING)
 
-    def answer(self, path: str, query: dict[str, str]) -> Answer:
+    def answer(self, path: str, query: dict[str, str]) -> Response:
         """The answer to a GET request.
 
         Raises:
-            Refused: There is no such page, a parameter is wrong, or there is nothing to show now.
+            RequestError: There is no such page, a parameter is wrong, or there is nothing to show now.
         """
-        pages: dict[str, Callable[[dict[str, str]], Answer]] = {
+        pages: dict[str, Callable[[dict[str, str]], Response]] = {
             "/": self._index,
             "/snapshot.jpg": self._snapshot,
             "/truth.json": self._truth,
@@ -114,60 +114,60 @@ class Studio:
         }
         page = pages.get(path)
         if page is None:
-            raise Refused(HTTPStatus.NOT_FOUND, f"there is no {path}; there are {', '.join(pages)}")
+            raise RequestError(HTTPStatus.NOT_FOUND, f"there is no {path}; there are {', '.join(pages)}")
         try:
             return page(query)
         except ValueError as error:
-            raise Refused(HTTPStatus.BAD_REQUEST, str(error)) from error
+            raise RequestError(HTTPStatus.BAD_REQUEST, str(error)) from error
 
-    def _index(self, query: dict[str, str]) -> Answer:
+    def _index(self, query: dict[str, str]) -> Response:
         _only(query)
-        return Answer("text/html; charset=utf-8", resources.files(__package__).joinpath("index.html").read_bytes())
+        return Response("text/html; charset=utf-8", resources.files(__package__).joinpath("index.html").read_bytes())
 
-    def _snapshot(self, query: dict[str, str]) -> Answer:
+    def _snapshot(self, query: dict[str, str]) -> Response:
         _only(query, "width", "height", "band", "time")
         band = query.get("band", "rgb")
         if band not in ("rgb", "ir"):
-            raise Refused(HTTPStatus.BAD_REQUEST, f"band: {band[:20]!r} is neither rgb nor ir")
+            raise RequestError(HTTPStatus.BAD_REQUEST, f"band: {band[:20]!r} is neither rgb nor ir")
         width = _whole(query, "width", self._intrinsics.width)
         height = _whole(query, "height", self._intrinsics.height)
         lens = Intrinsics(width, height, self._intrinsics.horizontal_fov_deg)
         if width * height > MAX_SNAPSHOT_PX:
-            raise Refused(HTTPStatus.BAD_REQUEST, f"width and height: more than {MAX_SNAPSHOT_PX:,} pixels")
+            raise RequestError(HTTPStatus.BAD_REQUEST, f"width and height: more than {MAX_SNAPSHOT_PX:,} pixels")
         time_s = _number(query, "time", self._now())
-        sighting = self._whereabouts.now()
-        if sighting is None:
-            raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, _NO_POSE)
-        snapshot = self._noted(sighting, lens, time_s, "ir" if band == "ir" else "rgb")
-        with _Turn(self._waiting, self._busy):
+        camera_pose = self._poses.now()
+        if camera_pose is None:
+            raise RequestError(HTTPStatus.SERVICE_UNAVAILABLE, _NO_POSE)
+        snapshot = self._noted(camera_pose, lens, time_s, "ir" if band == "ir" else "rgb")
+        with _RenderSlot(self._waiting, self._busy):
             picture = self._taken(snapshot)
         done, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if not done:
-            raise Refused(HTTPStatus.INTERNAL_SERVER_ERROR, "the picture cannot be encoded")
+            raise RequestError(HTTPStatus.INTERNAL_SERVER_ERROR, "the picture cannot be encoded")
         headers = (("X-Fractus-Snapshot", str(snapshot.number)), ("X-Fractus-Time", f"{snapshot.time_s:.3f}"))
-        return Answer("image/jpeg", encoded.tobytes(), headers)
+        return Response("image/jpeg", encoded.tobytes(), headers)
 
     def _taken(self, shot: Snapshot) -> Picture:
         lens = shot.intrinsics
         if self._photos is not None:
             photo, _ = self._photos.nearest(shot.pose.lat, shot.pose.lon, shot.amsl_m, shot.band)
-            return developed(photo, lens.width, lens.height)
+            return resized(photo, lens.width, lens.height)
         world = self._seen(shot.pose)
         return world.render(shot.pose, lens, mount=shot.mount, time_s=shot.time_s, band=shot.band)
 
     def _sighted(self) -> Pose | None:
-        sighting = self._whereabouts.now()
-        return None if sighting is None else sighting.pose
+        camera_pose = self._poses.now()
+        return None if camera_pose is None else camera_pose.pose
 
     def _seen(self, pose: Pose | None) -> World:
         world = self._world.seen_from(pose)
         if world is None:
-            raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, _NO_POSE)
+            raise RequestError(HTTPStatus.SERVICE_UNAVAILABLE, _NO_POSE)
         return world
 
-    def _noted(self, sighting: Sighting, lens: Intrinsics, time_s: float, band: Band) -> Snapshot:
-        pose, mount = sighting.pose, sighting.mount or self._mount
-        amsl_m = sighting.ground_amsl_m + pose.height_m
+    def _noted(self, camera_pose: CameraPose, lens: Intrinsics, time_s: float, band: Band) -> Snapshot:
+        pose, mount = camera_pose.pose, camera_pose.mount or self._mount
+        amsl_m = camera_pose.ground_amsl_m + pose.height_m
         with self._lock:
             self._count += 1
             snapshot = Snapshot(self._count, pose, mount, lens, time_s, band, amsl_m)
@@ -176,15 +176,15 @@ class Studio:
                 self._snapshots.popitem(last=False)
         return snapshot
 
-    def _truth(self, query: dict[str, str]) -> Answer:
+    def _truth(self, query: dict[str, str]) -> Response:
         _only(query, "snapshot")
         with self._lock:
             if not self._snapshots:
-                raise Refused(HTTPStatus.NOT_FOUND, "no picture has been taken; ask for /snapshot.jpg first")
+                raise RequestError(HTTPStatus.NOT_FOUND, "no picture has been taken; ask for /snapshot.jpg first")
             number = _whole(query, "snapshot", next(reversed(self._snapshots)))
             snapshot = self._snapshots.get(number)
         if snapshot is None:
-            raise Refused(HTTPStatus.NOT_FOUND, f"snapshot {number} is not one of the last {KEPT_SNAPSHOTS}")
+            raise RequestError(HTTPStatus.NOT_FOUND, f"snapshot {number} is not one of the last {KEPT_SNAPSHOTS}")
         content: dict[str, Any] = {"snapshot": snapshot.number, "time": snapshot.time_s, "band": snapshot.band}
         pose = snapshot.pose
         if self._photos is not None:
@@ -192,10 +192,10 @@ class Studio:
             place = {"lat": photo.lat, "lon": photo.lon, "amslM": photo.amsl_m, "awayM": round(away_m, 3)}
             content |= {"photo": {"name": photo.path.name, **place}} | Truth(pose, (), ()).as_json()
         else:
-            with _Turn(self._waiting, self._busy):
+            with _RenderSlot(self._waiting, self._busy):
                 truth = self._seen(pose).truth(pose, snapshot.intrinsics, mount=snapshot.mount, time_s=snapshot.time_s)
             content |= truth.as_json()
-        return Answer("application/json", json.dumps(content).encode())
+        return Response("application/json", json.dumps(content).encode())
 
     def _sheet(self, query: dict[str, str]) -> Sheet:
         _only(query, "lat", "lon", "metres", "pixels")
@@ -207,20 +207,20 @@ class Studio:
             _whole(query, "pixels", 1024),
         )
 
-    def _orthophoto(self, query: dict[str, str]) -> Answer:
+    def _orthophoto(self, query: dict[str, str]) -> Response:
         sheet = self._sheet(query)
-        with _Turn(self._waiting, self._busy):
+        with _RenderSlot(self._waiting, self._busy):
             picture = self._seen(None).map(sheet)
         done, encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3])
         if not done:
-            raise Refused(HTTPStatus.INTERNAL_SERVER_ERROR, "the map cannot be encoded")
-        return Answer("image/png", encoded.tobytes())
+            raise RequestError(HTTPStatus.INTERNAL_SERVER_ERROR, "the map cannot be encoded")
+        return Response("image/png", encoded.tobytes())
 
-    def _world_file(self, query: dict[str, str]) -> Answer:
-        return Answer("text/plain; charset=ascii", self._sheet(query).world_file().encode("ascii"))
+    def _world_file(self, query: dict[str, str]) -> Response:
+        return Response("text/plain; charset=ascii", self._sheet(query).world_file().encode("ascii"))
 
 
-class _Turn:
+class _RenderSlot:
     """The right to render: one at a time, few wait, and none for long."""
 
     def __init__(self, waiting: threading.BoundedSemaphore, busy: threading.Lock) -> None:
@@ -228,10 +228,10 @@ class _Turn:
 
     def __enter__(self) -> None:
         if not self._waiting.acquire(blocking=False):
-            raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, "too many pictures are being asked for; try again")
+            raise RequestError(HTTPStatus.SERVICE_UNAVAILABLE, "too many pictures are being asked for; try again")
         if not self._busy.acquire(timeout=RENDER_WAIT_S):
             self._waiting.release()
-            raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, "the pictures before this one take too long; try again")
+            raise RequestError(HTTPStatus.SERVICE_UNAVAILABLE, "the pictures before this one take too long; try again")
 
     def __exit__(self, *_: object) -> None:
         self._busy.release()
@@ -242,7 +242,7 @@ def _only(query: dict[str, str], *known: str) -> None:
     for name in query:
         if name not in known:
             names = ", ".join(known) or "none"
-            raise Refused(HTTPStatus.BAD_REQUEST, f"unknown parameter {name[:40]!r}; known are: {names}")
+            raise RequestError(HTTPStatus.BAD_REQUEST, f"unknown parameter {name[:40]!r}; known are: {names}")
 
 
 def _number(query: dict[str, str], name: str, default: float) -> float:
@@ -250,9 +250,9 @@ def _number(query: dict[str, str], name: str, default: float) -> float:
     try:
         value = default if text is None else float(text)
     except ValueError as error:
-        raise Refused(HTTPStatus.BAD_REQUEST, f"{name}: {text!r} is not a number") from error
+        raise RequestError(HTTPStatus.BAD_REQUEST, f"{name}: {text!r} is not a number") from error
     if not abs(value) < 1e15:
-        raise Refused(HTTPStatus.BAD_REQUEST, f"{name}: {text!r} is not a number that makes sense here")
+        raise RequestError(HTTPStatus.BAD_REQUEST, f"{name}: {text!r} is not a number that makes sense here")
     return value
 
 
@@ -261,5 +261,5 @@ def _whole(query: dict[str, str], name: str, default: int) -> int:
     if text is None:
         return default
     if not text.isascii() or not text.isdigit() or len(text) > 9:
-        raise Refused(HTTPStatus.BAD_REQUEST, f"{name}: {text[:40]!r} is not a whole number")
+        raise RequestError(HTTPStatus.BAD_REQUEST, f"{name}: {text[:40]!r} is not a whole number")
     return int(text)

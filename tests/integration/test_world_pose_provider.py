@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import pytest
 from fractus_mavlink import Parser, encode, layout_named
-from fractus_world import whereabouts
-from fractus_world.whereabouts import Sighting, Vehicle, parse_address
+from fractus_world import pose_provider
+from fractus_world.pose_provider import CameraPose, VehiclePose, parse_address
 
 TIMEOUT_S = 20.0
 
@@ -54,15 +54,15 @@ def autopilot() -> Iterator[Autopilot]:
 
 
 @pytest.fixture
-def follower(autopilot: Autopilot) -> Iterator[Vehicle]:
-    vehicle = Vehicle(autopilot.address)
+def follower(autopilot: Autopilot) -> Iterator[VehiclePose]:
+    vehicle = VehiclePose(autopilot.address)
     vehicle.start()
     autopilot.accept()
     yield vehicle
     vehicle.stop()
 
 
-def sighting(vehicle: Vehicle, wanted: bool = True) -> Sighting | None:
+def camera_pose(vehicle: VehiclePose, wanted: bool = True) -> CameraPose | None:
     end = time.monotonic() + TIMEOUT_S
     while time.monotonic() < end:
         found = vehicle.now()
@@ -72,13 +72,13 @@ def sighting(vehicle: Vehicle, wanted: bool = True) -> Sighting | None:
     raise TimeoutError(f"wanted: {wanted}")
 
 
-def known(vehicle: Vehicle) -> Sighting:
-    found = sighting(vehicle)
+def known(vehicle: VehiclePose) -> CameraPose:
+    found = camera_pose(vehicle)
     assert found is not None
     return found
 
 
-def test_pose_is_what_the_autopilot_says(autopilot: Autopilot, follower: Vehicle) -> None:
+def test_pose_is_what_the_autopilot_says(autopilot: Autopilot, follower: VehiclePose) -> None:
     assert follower.now() is None
     autopilot.fly(yaw_deg=80.0)
     found = known(follower)
@@ -89,7 +89,7 @@ def test_pose_is_what_the_autopilot_says(autopilot: Autopilot, follower: Vehicle
     assert found.mount is None
 
 
-def test_streams_are_asked_for_and_no_heartbeat_is_sent(autopilot: Autopilot, follower: Vehicle) -> None:
+def test_streams_are_asked_for_and_no_heartbeat_is_sent(autopilot: Autopilot, follower: VehiclePose) -> None:
     autopilot.fly()
     parser, asked, end = Parser(), {}, time.monotonic() + TIMEOUT_S
     while len(asked) < 3 and time.monotonic() < end:
@@ -101,7 +101,7 @@ def test_streams_are_asked_for_and_no_heartbeat_is_sent(autopilot: Autopilot, fo
     assert asked == {33: 50_000.0, 30: 50_000.0, 285: 100_000.0}
 
 
-def test_position_goes_on_with_the_speed(autopilot: Autopilot, follower: Vehicle) -> None:
+def test_position_goes_on_with_the_speed(autopilot: Autopilot, follower: VehiclePose) -> None:
     autopilot.fly(vx=1000, vy=0, vz=0)
     first = known(follower)
     time.sleep(0.2)
@@ -111,7 +111,7 @@ def test_position_goes_on_with_the_speed(autopilot: Autopilot, follower: Vehicle
 
 
 @pytest.mark.parametrize(("flags", "yaw"), [(32, 30.0), (16, -50.0), (64, -50.0), (0, 30.0)])
-def test_gimbal_overrides_the_mount(autopilot: Autopilot, follower: Vehicle, flags: int, yaw: float) -> None:
+def test_gimbal_overrides_the_mount(autopilot: Autopilot, follower: VehiclePose, flags: int, yaw: float) -> None:
     """Its yaw is the airframe's, or north's: MAVLink tells by flags."""
     autopilot.fly(yaw_deg=80.0)
     known(follower)
@@ -135,21 +135,21 @@ def test_gimbal_overrides_the_mount(autopilot: Autopilot, follower: Vehicle, fla
     assert found.mount.yaw_deg == pytest.approx(yaw, abs=1e-3)
 
 
-def test_silence_is_unknown(autopilot: Autopilot, follower: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(whereabouts, "STALE_S", 0.3)
+def test_silence_is_unknown(autopilot: Autopilot, follower: VehiclePose, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pose_provider, "STALE_S", 0.3)
     autopilot.fly()
     known(follower)
-    assert sighting(follower, wanted=False) is None
+    assert camera_pose(follower, wanted=False) is None
 
 
-def test_no_fix_is_unknown(autopilot: Autopilot, follower: Vehicle) -> None:
+def test_no_fix_is_unknown(autopilot: Autopilot, follower: VehiclePose) -> None:
     autopilot.fly(lat=0, lon=0)
     autopilot.fly(lat=0, lon=0)
     time.sleep(0.2)
     assert follower.now() is None
 
 
-def test_garbage_and_a_broken_link_are_survived(autopilot: Autopilot, follower: Vehicle) -> None:
+def test_garbage_and_a_broken_link_are_survived(autopilot: Autopilot, follower: VehiclePose) -> None:
     assert autopilot.link is not None
     autopilot.link.sendall(bytes(range(256)) * 40)
     end = time.monotonic() + TIMEOUT_S

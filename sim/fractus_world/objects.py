@@ -11,12 +11,12 @@ import numpy as np
 from fractus_core.geo import LocalFrame
 from numpy.typing import NDArray
 
-from fractus_world.billboards import Billboard, Gallery, portrait
+from fractus_world.billboards import Billboard, Billboards, portrait
 from fractus_world.bodies import Colour, Part, parts_of, silhouette
-from fractus_world.canvas import SUN_SHADOW
 from fractus_world.optics import NEAR_M, Matrix, View
 from fractus_world.population import Population, Thing, nearest
 from fractus_world.render import Band
+from fractus_world.tile_drawing import SUN_SHADOW
 from fractus_world.truth import Box, Seen, SeenFace
 
 Picture = NDArray[np.uint8]
@@ -24,14 +24,14 @@ Labels = NDArray[np.int32]
 Fixed = NDArray[np.int32]
 
 _SHIFT = 4
-_MOST_THINGS = 500
+_MAX_THINGS = 500
 _SMALL_PX = 14.0
 _SILHOUETTE_PX = 7.0
 _SHADELESS_PX = 5.0
 _TINY_PX = 1.2
-_LEAST_BOARD_PX = 6.0
+_MIN_BOARD_PX = 6.0
 _REACH = 0.55
-"""Things are drawn as far away as so many focal lengths in pixels are metres."""
+"""Things are drawn up to this times the focal length in pixels, in metres."""
 _SHADOW = 0.5
 _BOARD_BACK = (96, 100, 104)
 _FRAME_WARMTH = 118
@@ -54,7 +54,7 @@ class _Shape:
 
 
 @dataclass(frozen=True, slots=True)
-class _Actor:
+class _InSight:
     """A thing or billboard in sight.
 
     Attributes:
@@ -72,62 +72,62 @@ class _Actor:
     points: Matrix
 
 
-class Stage:
+class ObjectLayer:
     """What stands and moves on a ground."""
 
-    def __init__(self, population: Population, gallery: Gallery) -> None:
+    def __init__(self, population: Population, gallery: Billboards) -> None:
         self._population = population
         self._gallery = gallery
 
-    def actors(self, view: View, time_s: float, hidden: frozenset[str] = frozenset()) -> list[_Actor]:
+    def in_sight(self, view: View, time_s: float, hidden: frozenset[str] = frozenset()) -> list[_InSight]:
         """What is in sight at a time, the farthest first."""
         box = view.ground_within(_REACH * view.intrinsics.focal_px)
         if box is None:
             return []
         box = box + np.array([[-14.0, -14.0], [14.0, 14.0]])
-        things = nearest(self._population.within(box, time_s), view.place, _MOST_THINGS)
-        actors = _thing_actors(view, [thing for thing in things if thing.id not in hidden])
+        things = nearest(self._population.within(box, time_s), view.place, _MAX_THINGS)
+        in_sight = _thing_actors(view, [thing for thing in things if thing.id not in hidden])
         boards = [_board_actor(view, board) for board in self._gallery.within(box) if board.id not in hidden]
-        actors += [actor for actor in boards if actor is not None]
-        return sorted(actors, key=lambda actor: (-actor.away_m, actor.what.id))
+        in_sight += [item for item in boards if item is not None]
+        return sorted(in_sight, key=lambda item: (-item.away_m, item.what.id))
 
-    def draw(self, picture: Picture, view: View, actors: list[_Actor], band: Band) -> None:
+    def draw(self, picture: Picture, view: View, in_sight: list[_InSight], band: Band) -> None:
         """Draw what is in sight."""
         if band == "rgb":
-            for actor in actors:
-                if actor.shadow is not None:
-                    _darken(picture, actor.shadow)
-        for actor in actors:
-            if isinstance(actor.what, Billboard):
-                _draw_board(picture, view, actor, actor.what, band)
+            for item in in_sight:
+                if item.shadow is not None:
+                    _darken(picture, item.shadow)
+        for item in in_sight:
+            if isinstance(item.what, Billboard):
+                _draw_board(picture, view, item, item.what, band)
             else:
-                for shape in actor.shapes:
+                for shape in item.shapes:
                     _fill(picture, shape, band)
 
     def truth(
-        self, view: View, actors: list[_Actor], frame: LocalFrame
+        self, view: View, in_sight: list[_InSight], frame: LocalFrame
     ) -> tuple[tuple[Seen, ...], tuple[SeenFace, ...]]:
         """What of each can be seen."""
         lens = view.intrinsics
         labels = np.zeros((lens.height, lens.width), np.int32)
-        for number, actor in enumerate(actors, start=1):
-            for shape in actor.shapes:
+        for number, item in enumerate(in_sight, start=1):
+            for shape in item.shapes:
                 cv2.fillConvexPoly(labels, shape.hull, (number,), cv2.LINE_8, _SHIFT)
         objects, faces = [], []
-        for number, actor in enumerate(actors, start=1):
-            if isinstance(actor.what, Billboard):
-                face = _seen_face(view, actor.what, labels, number, frame)
+        for number, item in enumerate(in_sight, start=1):
+            if isinstance(item.what, Billboard):
+                face = _seen_face(view, item.what, labels, number, frame)
                 if face is not None:
                     faces.append(face)
             else:
-                shares = _shares(view, (shape.hull for shape in actor.shapes), labels, number)
-                seen = _seen_thing(view, actor, actor.what, shares, frame)
+                shares = _shares(view, (shape.hull for shape in item.shapes), labels, number)
+                seen = _seen_thing(view, item, item.what, shares, frame)
                 if seen is not None:
                     objects.append(seen)
         return tuple(objects), tuple(faces)
 
 
-def _thing_actors(view: View, things: list[Thing]) -> list[_Actor]:
+def _thing_actors(view: View, things: list[Thing]) -> list[_InSight]:
     """The things that are in sight; their corners are projected all at once."""
     if not things:
         return []
@@ -150,13 +150,13 @@ def _thing_actors(view: View, things: list[Thing]) -> list[_Actor]:
     outside = (high <= 0).any(axis=1) | (low[:, 0] >= lens.width) | (low[:, 1] >= lens.height)
     shadeless = (np.minimum.reduceat(shade_depth, starts) < NEAR_M) | (sizes < _SHADELESS_PX)
     fixed, fixed_shade = _fixed(pixels), _fixed(shade)
-    actors = []
+    in_sight = []
     for k in np.flatnonzero(~near & ~outside & (sizes >= _TINY_PX)):
         span = np.s_[starts[k] : starts[k] + counts[k]]
         shadow = None if shadeless[k] else cv2.convexHull(fixed_shade[span])
         shapes = _shapes(fixed[span], parts[k])
-        actors.append(_Actor(things[k], float(away[k]), shapes, _as_fixed(shadow), pixels[span]))
-    return actors
+        in_sight.append(_InSight(things[k], float(away[k]), shapes, _as_fixed(shadow), pixels[span]))
+    return in_sight
 
 
 def _parts(thing: Thing, size_px: float) -> tuple[Part, ...]:
@@ -189,16 +189,16 @@ def _as_fixed(hull: object) -> Fixed | None:
     return None if hull is None else np.asarray(hull, np.int32)
 
 
-def _board_actor(view: View, board: Billboard) -> _Actor | None:
+def _board_actor(view: View, board: Billboard) -> _InSight | None:
     corners = board.corners()
     pixels, depth = view.project(corners)
     if bool((depth < NEAR_M).any()) or _outside(view, pixels):
         return None
     away = float(np.linalg.norm(corners.mean(axis=0) - [*view.place, view.height_m]))
-    if float(np.ptp(pixels, axis=0).max()) < _LEAST_BOARD_PX:
+    if float(np.ptp(pixels, axis=0).max()) < _MIN_BOARD_PX:
         return None
     shape = _Shape(_hull(pixels), _BOARD_BACK, _FRAME_WARMTH)
-    return _Actor(board, away, (shape,), _shadow(view, corners) if board.standing else None, pixels)
+    return _InSight(board, away, (shape,), _shadow(view, corners) if board.standing else None, pixels)
 
 
 def _outside(view: View, pixels: Matrix) -> bool:
@@ -251,33 +251,33 @@ def _darken(picture: Picture, hull: Fixed) -> None:
     part[:] = cv2.multiply(part, light, scale=1 / 255)
 
 
-def _draw_board(picture: Picture, view: View, actor: _Actor, board: Billboard, band: Band) -> None:
+def _draw_board(picture: Picture, view: View, item: _InSight, board: Billboard, band: Band) -> None:
     viewer = np.array([*view.place, view.height_m])
     if board.standing:
         _draw_posts(picture, view, board, band)
     if not board.faces(viewer):
-        _fill(picture, actor.shapes[0], band)
+        _fill(picture, item.shapes[0], band)
         return
-    found = _clip(actor.points.min(axis=0), actor.points.max(axis=0), picture.shape)
+    found = _clip(item.points.min(axis=0), item.points.max(axis=0), picture.shape)
     if found is None:
         return
     x0, y0, x1, y1 = found
     size_px = max(
-        float(np.linalg.norm(actor.points[3] - actor.points[0])),
-        float(np.linalg.norm(actor.points[2] - actor.points[1])),
+        float(np.linalg.norm(item.points[3] - item.points[0])),
+        float(np.linalg.norm(item.points[2] - item.points[1])),
     )
     source = portrait(board.variation, max(math.floor(math.log2(max(300.0 / max(size_px, 1.0), 1.0))), 0))
     if band == "ir":
         source = np.full_like(source, 112)
     height, width = source.shape[:2]
     corners = np.array([(0, 0), (width, 0), (width, height), (0, height)], np.float32) - 0.5
-    target = (actor.points - [x0, y0] - 0.5).astype(np.float32)
+    target = (item.points - [x0, y0] - 0.5).astype(np.float32)
     matrix = cv2.getPerspectiveTransform(corners, target)
     drawn = cv2.warpPerspective(
         source, matrix, (x1 - x0, y1 - y0), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
     cover = np.zeros((y1 - y0, x1 - x0), np.uint8)
-    cv2.fillConvexPoly(cover, _hull(actor.points - [x0, y0]), (255,), cv2.LINE_AA, _SHIFT)
+    cv2.fillConvexPoly(cover, _hull(item.points - [x0, y0]), (255,), cv2.LINE_AA, _SHIFT)
     weight = cover.astype(np.float32) / 255.0
     part = picture[y0:y1, x0:x1]
     part[:] = cv2.blendLinear(np.asarray(drawn, np.uint8), np.ascontiguousarray(part), weight, 1.0 - weight)
@@ -331,8 +331,10 @@ def _true_heading(view: View, heading_deg: float) -> float:
     return math.degrees(math.atan2(east, north))
 
 
-def _seen_thing(view: View, actor: _Actor, thing: Thing, shares: tuple[float, float], frame: LocalFrame) -> Seen | None:
-    box = _box(actor.points, view)
+def _seen_thing(
+    view: View, item: _InSight, thing: Thing, shares: tuple[float, float], frame: LocalFrame
+) -> Seen | None:
+    box = _box(item.points, view)
     in_frame, visible = shares
     if box is None or in_frame == 0.0:
         return None

@@ -1,0 +1,93 @@
+"""One mesh of the road network and what lies in it: ground, buildings, trees, parked cars."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Points = NDArray[np.float64]
+Kind = Literal["fields", "meadow", "wood", "houses", "works", "park"]
+Colour = tuple[int, int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """A piece of ground of one kind.
+
+    Attributes:
+        outline: Its corners, metres, shape (n, 2).
+        colour: Blue, green, red.
+        rough: How uneven it looks, from 0 to 255.
+        rows_deg: The way that rows of a crop lead, clockwise from north; None where nothing is sown.
+    """
+
+    outline: Points
+    colour: Colour
+    rough: int
+    rows_deg: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Roof:
+    """A building from above.
+
+    Attributes:
+        corners: Four corners; the ridge is parallel to the side from the first to the second.
+        height_m: Above the ground, for its shadow.
+        colour: Blue, green, red.
+        gabled: Whether it has a ridge.
+    """
+
+    corners: Points
+    height_m: float
+    colour: Colour
+    gabled: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Parking:
+    """A place where a car stands."""
+
+    x: float
+    y: float
+    heading_deg: float
+
+
+@dataclass
+class Block:
+    """One mesh of the road network.
+
+    Attributes:
+        kind: What it is used for.
+        outline: The middle lines of the roads around it.
+        patches: Pieces of ground, those that lie above others last.
+        roofs: Buildings.
+        trees: x, y, radius of the crown in metres and a number that picks its looks, shape (n, 4).
+        parked: Parked cars.
+    """
+
+    kind: Kind
+    outline: Points
+    patches: list[Patch] = field(default_factory=list)
+    roofs: list[Roof] = field(default_factory=list)
+    trees: Points = field(default_factory=lambda: np.empty((0, 4)))
+    parked: list[Parking] = field(default_factory=list)
+
+    @cached_property
+    def patch_boxes(self) -> Points:
+        """West, south, east and north edge of each patch, shape (n, 4)."""
+        return _boxes([patch.outline for patch in self.patches])
+
+    @cached_property
+    def roof_boxes(self) -> Points:
+        """The same of each roof."""
+        return _boxes([roof.corners for roof in self.roofs])
+
+
+def _boxes(outlines: list[Points]) -> Points:
+    boxes = [(*outline.min(axis=0), *outline.max(axis=0)) for outline in outlines]
+    return np.array(boxes).reshape(-1, 4)

@@ -1,4 +1,4 @@
-"""Looking at the road: take a picture every so often and hand it to the ImageChecker."""
+"""Looks at the road: takes a picture at intervals and passes it to the ImageChecker."""
 
 from __future__ import annotations
 

@@ -127,7 +127,7 @@ async def test_rotation_to_a_bundle_keeps_the_certificate(bench: Bench) -> None:
     assert bench.files() == before | {"ca.crt": bench.signer.published}
 
 
-async def test_rotation_to_another_authority_asks_anew(bench: Bench) -> None:
+async def test_rotation_to_another_authority_requests_again(bench: Bench) -> None:
     await bench.identity.step()
     bench.signer.ca = TestAuthority("next")
     bench.signer.published = bench.signer.ca.pem
@@ -140,7 +140,7 @@ async def test_rotation_to_another_authority_asks_anew(bench: Bench) -> None:
 @pytest.mark.parametrize(
     "harm", ["no key", "cut certificate", "other key", "empty authority", "dangling", "other node"]
 )
-async def test_a_spoilt_directory_is_mended(bench: Bench, harm: str) -> None:
+async def test_a_damaged_directory_is_repaired(bench: Bench, harm: str) -> None:
     await bench.identity.step()
     files = bench.files()
     if harm == "dangling":

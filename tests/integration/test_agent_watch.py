@@ -26,7 +26,7 @@ from fractus_agent.cluster.store import (
 )
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.xdist_group("agent-watch")]  # they share an API server
-PATIENCE_S = 30.0
+WAIT_TIMEOUT_S = 30.0
 
 
 @pytest.fixture(scope="module")
@@ -64,11 +64,11 @@ async def store(**times: Any) -> AsyncIterator[Store]:
 
 
 async def following(events: AsyncIterator[GrantEvent]) -> GrantEvent:
-    return await asyncio.wait_for(anext(events), PATIENCE_S)
+    return await asyncio.wait_for(anext(events), WAIT_TIMEOUT_S)
 
 
 async def until(events: AsyncIterator[GrantEvent], wanted: type[GrantEvent]) -> GrantEvent:
-    async with asyncio.timeout(PATIENCE_S):
+    async with asyncio.timeout(WAIT_TIMEOUT_S):
         async for event in events:
             if isinstance(event, wanted):
                 return event
@@ -145,7 +145,7 @@ async def test_an_outage_yields_nothing_and_then_a_list(server: ApiServer) -> No
         assert not done
         server.start_apiserver()
         server.delete(f"{FRACTUS}/grants/a")
-        async with asyncio.timeout(PATIENCE_S):
+        async with asyncio.timeout(WAIT_TIMEOUT_S):
             event = await waiting
             while not (isinstance(event, Listed) and names(event) == {"b"}) and event != Deleted("a"):
                 event = await anext(events)
@@ -160,7 +160,7 @@ async def test_a_frozen_server_is_noticed_by_its_silence(server: ApiServer) -> N
             done, _ = await asyncio.wait([waiting], timeout=3.0)
             assert not done
         server.post(f"{FRACTUS}/grants", grant("late"))
-        async with asyncio.timeout(PATIENCE_S):
+        async with asyncio.timeout(WAIT_TIMEOUT_S):
             event = await waiting
             while isinstance(event, Listed) and names(event) != {"late"}:
                 event = await anext(events)
@@ -174,7 +174,7 @@ async def test_a_watch_that_the_server_ends_goes_on_where_it_was(server: ApiServ
         done, _ = await asyncio.wait([waiting], timeout=3.5)
         assert not done, "a clean end is no reason to list again"
         server.post(f"{FRACTUS}/grants", grant("after"))
-        event = await asyncio.wait_for(waiting, PATIENCE_S)
+        event = await asyncio.wait_for(waiting, WAIT_TIMEOUT_S)
         assert isinstance(event, Changed)
 
 

@@ -182,7 +182,7 @@ def test_bad_requests_get_a_sentence(served: CameraServer, path: str, status: in
     assert words in answer[2].decode()
 
 
-def test_idle_slow_and_vanishing_clients_stall_nobody(served: CameraServer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_idle_slow_and_vanishing_clients_stall_no_other(served: CameraServer, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many clients as fit that say nothing; they are thrown out, and a picture is served afterwards: only that one."""
     monkeypatch.setattr(server_module, "CLIENT_LIFE_S", 0.5)
     monkeypatch.setattr(server_module, "MAX_CLIENTS", 8)

@@ -108,7 +108,7 @@ def test_where_a_part_of_the_exposure_was_not_told_it_is_unknown(drone: Drone) -
     for i in range(400):
         drone.tell(102.0 + i / 10)
     assert len(drone.poses) <= 302
-    assert drone.way(101.3)[0].lat is None, "longer ago than anybody remembers"
+    assert drone.way(101.3)[0].lat is None, "longer ago than the history goes"
 
 
 @settings(max_examples=examples(150), deadline=None, derandomize=True)

@@ -121,7 +121,7 @@ def of_data(data: dict[str, str]) -> tuple[ec.EllipticCurvePrivateKey, x509.Cert
         ((SIGNER[0], CA.issue_signer(NOW)[1]), "changed after it was signed"),
     ],
 )
-def test_nobody_else_signs(who: tuple[ec.EllipticCurvePrivateKey, x509.Certificate], why: str) -> None:
+def test_no_one_else_signs(who: tuple[ec.EllipticCurvePrivateKey, x509.Certificate], why: str) -> None:
     with pytest.raises(BadSignature, match=why):
         verify(grant(sign(manifest(), *who, NOW)), CAS)
 

@@ -66,7 +66,7 @@ async def test_a_picture_whose_record_is_damaged_is_removed_and_never_handed_out
     world.shutter.close()
 
 
-async def test_a_picture_of_an_earlier_release_was_taken_nobody_knows_where(tmp_path: Path) -> None:
+async def test_a_picture_of_an_earlier_release_has_an_unknown_place(tmp_path: Path) -> None:
     world = World(tmp_path)
     shot = await world.capture(active_grant())
     record = world.album.path(owner_of(active_grant()), shot.name).with_suffix(".json")

@@ -257,7 +257,7 @@ async def test_no_more_is_kept_than_the_view_that_was_judged(
     world.shutter.close()
 
 
-async def test_without_a_lens_nobody_knows_how_small_faces_are(world: World) -> None:
+async def test_without_a_lens_the_size_of_faces_is_unknown(world: World) -> None:
     world.drone.lens = None
     verdict, _ = await world.camera.capture(active_grant(private("blurFaces")), CaptureArgs())
     assert "unknown how small" in verdict.reason

@@ -124,7 +124,7 @@ def test_what_moves_is_kept_and_the_rest_is_black(photo: Pixels) -> None:
     assert not standing[360, 120]
 
 
-def test_where_nobody_knows_what_moves_nothing_is_shown(photo: Pixels) -> None:
+def test_where_motion_is_unknown_nothing_is_shown(photo: Pixels) -> None:
     other = np.asarray(cv2.rotate(photo[:, ::-1], cv2.ROTATE_90_CLOCKWISE))
     noise = np.random.default_rng(3).integers(0, 256, photo.shape).astype(np.uint8)
     plain = np.full_like(photo, 90)

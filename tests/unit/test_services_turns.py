@@ -49,7 +49,7 @@ class Context:
         return 5.0
 
     async def write(self, message: Any) -> None:
-        """Nobody reads it."""
+        """It is never read."""
 
     async def abort(self, code: grpc.StatusCode, text: str, metadata: Any) -> None:
         status, why = status_pb2.Status(), error_details_pb2.ErrorInfo()

@@ -52,7 +52,7 @@ def on_driver(step: Step, event: DriverEvent) -> None:
             _close(step, event)
         case TransitRequested(lease_id):
             lease = step.state.lease
-            if lease is not None and lease.lease_id == lease_id:
+            if lease is not None and lease.lease_id == lease_id and step.state.authority is not Authority.PILOT:
                 step.set(lease=replace(lease, transit=True))
         case TransitFailed():
             _fail_transit(step, event)

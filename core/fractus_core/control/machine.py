@@ -53,14 +53,18 @@ from fractus_core.control.events import (
 from fractus_core.control.step import DRIVER_LOST, GRANT_REMOVED, Step
 from fractus_core.control.values import Authority, ControlState, OutcomeKind, SystemFlight, SystemTask, TaskKind
 from fractus_core.control.vehicles import on_arming, on_vehicle
+from fractus_core.exhaustive import exhaustive
 from fractus_core.policy.values import Takeover
 
-TAKEOVERS: dict[Takeover, tuple[TaskKind, OutcomeKind | None]] = {
-    "hover": (TaskKind.HOVER, None),
-    "land": (TaskKind.LAND, OutcomeKind.FAILED),
-    "returnToLaunch": (TaskKind.RETURN, OutcomeKind.FAILED),
-    "revoke": (TaskKind.RETURN, OutcomeKind.REVOKED),
-}
+TAKEOVERS: dict[Takeover, tuple[TaskKind, OutcomeKind | None]] = exhaustive(
+    Takeover,
+    {
+        "hover": (TaskKind.HOVER, None),
+        "land": (TaskKind.LAND, OutcomeKind.FAILED),
+        "returnToLaunch": (TaskKind.RETURN, OutcomeKind.FAILED),
+        "revoke": (TaskKind.RETURN, OutcomeKind.REVOKED),
+    },
+)
 """What each takeover that policies name does with the vehicle, and with the mission."""
 
 UNATTENDED = "NoControlAuthority"
@@ -111,7 +115,8 @@ def _on_policy(step: Step, event: PolicyEvent) -> None:
     match event:
         case TakeoverDemanded(takeover, code, reason, policies):
             kind, outcome = TAKEOVERS[takeover]
-            step.seize(kind, code, reason, policies, outcome)
+            if step.state.authority is not Authority.PILOT:  # policies bind applications, never a human pilot
+                step.seize(kind, code, reason, policies, outcome)
         case BrakeDemanded(code, reason, policies):
             step.audit("control", "brake", step.state.controller, reason, code, policies=policies)
             # A position that is not known now may be known in a moment.
@@ -151,6 +156,8 @@ def _grant_changed(step: Step, event: GrantChanged) -> None:
 def _on_system(step: Step, event: SystemEvent) -> None:
     match event:
         case TransitBegan(flight_id, key, identity):
+            if step.state.authority is Authority.PILOT or step.state.drives:
+                return  # the system flies for applications only where no one else has authority
             if step.state.touring != key:  # a tour begins its own transit, and must not end itself
                 step.stop_task()
             step.set(grace=None, authority=Authority.SYSTEM)
@@ -181,6 +188,8 @@ def _on_tour(step: Step, event: TourBegan | TourInterrupted | TourEnded) -> None
     """A tour is flown by a task of its own; what it reports counts only while it has the vehicle."""
     match event:
         case TourBegan(key):
+            if step.state.authority is Authority.PILOT:
+                return
             step.stop_task()
             task = SystemTask(step.state.last_task_id + 1, TaskKind.TOUR, key)
             step.set(grace=None, task=task, last_task_id=task.task_id)

@@ -1,0 +1,194 @@
+"""Pairing: both ends of a direct link prove their node certificates over TLS before any traffic moves, and stay in contact.
+
+The session is a line of JSON objects over TLS 1.3. The drone asks; the peer accepts, or refuses with a reason. After that the
+session carries heartbeats both ways, by which each end notices the loss of the link, and the routes of the other end.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import ssl
+import time
+from collections.abc import Mapping
+from ipaddress import IPv4Address
+from pathlib import Path
+from typing import Any
+
+from fractus_core.api.names import node_identity, node_server_name
+
+PORT = 46811
+HANDSHAKE_TIMEOUT_S = 3.0
+HEARTBEAT_S = 0.1
+LOSS_TIMEOUT_S = 0.4
+"""Without a word for so long the link is lost; a link at the edge of its reach is no use either."""
+
+MAX_LINE_BYTES = 64 * 1024
+SMOOTHING = 0.2
+
+
+class PairingFailed(Exception):
+    """The peer did not answer, is not who it should be, or refused."""
+
+
+class LinkLost(Exception):
+    """The other end has fallen silent, or ended the session."""
+
+
+def client_context(directory: Path) -> ssl.SSLContext:
+    """TLS of the end that asks.
+
+    Raises:
+        OSError: a file is missing.
+        ssl.SSLError: the files do not belong together.
+    """
+    context = ssl.create_default_context(cafile=str(directory / "ca.crt"))
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    context.load_cert_chain(directory / "tls.crt", directory / "tls.key")
+    return context
+
+
+def server_context(directory: Path) -> ssl.SSLContext:
+    """TLS of the end that is asked; it takes no session without a certificate."""
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH, cafile=str(directory / "ca.crt"))
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    context.verify_mode = ssl.CERT_REQUIRED
+    context.load_cert_chain(directory / "tls.crt", directory / "tls.key")
+    return context
+
+
+def proven_node(writer: asyncio.StreamWriter) -> str:
+    """The node that the other end's certificate names.
+
+    Raises:
+        PairingFailed: it names none: components and operators have certificates of the same authority.
+    """
+    certificate: Mapping[str, Any] = writer.get_extra_info("peercert") or {}
+    prefix = node_identity("")
+    for kind, value in certificate.get("subjectAltName", ()):
+        if kind == "URI" and value.startswith(prefix) and len(value) > len(prefix):
+            return str(value[len(prefix) :])
+    raise PairingFailed("the other end's certificate is not a node's")
+
+
+class Session:
+    """An authenticated session with the other end of a direct link.
+
+    Attributes:
+        peer: the node at the other end, as its certificate says.
+        latency_ms: one way, half of the round trip, smoothed; None before the first answer.
+    """
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, peer: str) -> None:
+        self.peer = peer
+        self.latency_ms: float | None = None
+        self._reader = reader
+        self._writer = writer
+        self._heard_at = time.monotonic()
+
+    async def send(self, message: Mapping[str, Any]) -> None:
+        """Send a message.
+
+        Raises:
+            LinkLost: it cannot be sent.
+        """
+        try:
+            self._writer.write(json.dumps(message).encode() + b"\n")
+            async with asyncio.timeout(LOSS_TIMEOUT_S):
+                await self._writer.drain()
+        except (OSError, TimeoutError) as error:
+            raise LinkLost(f"the link to {self.peer} does not take messages ({error or 'time-out'})") from error
+
+    async def receive(self, timeout_s: float) -> dict[str, Any]:
+        """The next message.
+
+        Raises:
+            LinkLost: none came in time, the session ended, or what came is no message.
+        """
+        try:
+            async with asyncio.timeout(timeout_s):
+                line = await self._reader.readline()
+            message = json.loads(line) if line else None
+        except TimeoutError as error:
+            raise LinkLost(f"{self.peer} has been silent for {timeout_s:g} s") from error
+        except (OSError, ValueError) as error:
+            raise LinkLost(f"the session with {self.peer} broke: {error}") from error
+        if not isinstance(message, dict):
+            raise LinkLost(f"{self.peer} ended the session" if message is None else f"{self.peer} sent no message")
+        self._heard_at = time.monotonic()
+        return message
+
+    async def keep(self) -> None:
+        """Exchange heartbeats until the link is lost.
+
+        Raises:
+            LinkLost: always, in the end.
+        """
+        both = [asyncio.create_task(self._beat()), asyncio.create_task(self._listen())]
+        try:
+            await asyncio.gather(*both)
+        finally:
+            for task in both:
+                task.cancel()
+            await asyncio.gather(*both, return_exceptions=True)
+
+    async def _beat(self) -> None:
+        while True:
+            await self.send({"beat": time.monotonic()})
+            await asyncio.sleep(HEARTBEAT_S)
+
+    async def _listen(self) -> None:
+        while True:
+            message = await self.receive(LOSS_TIMEOUT_S)
+            if isinstance(sent := message.get("beat"), int | float):
+                await self.send({"echo": sent})
+            elif isinstance(sent := message.get("echo"), int | float):
+                way_ms = max(time.monotonic() - sent, 0.0) / 2 * 1e3
+                before = self.latency_ms
+                self.latency_ms = way_ms if before is None else before + SMOOTHING * (way_ms - before)
+
+    async def close(self) -> None:
+        """End the session, politely if the link still works."""
+        self._writer.close()
+        try:
+            async with asyncio.timeout(LOSS_TIMEOUT_S):
+                await self._writer.wait_closed()
+        except (OSError, TimeoutError):
+            self._writer.transport.abort()
+
+
+async def ask(node: str, peer: str, address: IPv4Address, directory: Path, link: Mapping[str, Any]) -> Session:
+    """Pair with a peer.
+
+    Args:
+        node: this node.
+        peer: who must answer.
+        address: of the peer on the link.
+        directory: certificate, key and authority of this node.
+        link: what the peer is told of the link.
+
+    Raises:
+        PairingFailed: no answer in time, another node answered, or the peer refused.
+    """
+    try:
+        async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):
+            reader, writer = await asyncio.open_connection(
+                str(address), PORT, ssl=client_context(directory), server_hostname=node_server_name(peer),
+                limit=MAX_LINE_BYTES,
+            )  # fmt: skip
+    except ssl.SSLCertVerificationError as error:
+        raise PairingFailed(f"who answers for {peer} does not have its certificate: {error.verify_message}") from error
+    except (OSError, TimeoutError) as error:
+        raise PairingFailed(f"{peer} does not answer: {error or 'time-out'}") from error
+    session = Session(reader, writer, peer)
+    try:
+        if proven_node(writer) != peer:
+            raise PairingFailed(f"{proven_node(writer)} answers for {peer}")
+        await session.send({"pair": node, "link": dict(link)})
+        answer = await session.receive(HANDSHAKE_TIMEOUT_S)
+        if answer.get("accepted") is not True:
+            raise PairingFailed(f"{peer} refused: {answer.get('reason') or 'without a reason'}")
+    except (LinkLost, PairingFailed) as error:
+        await session.close()
+        raise error if isinstance(error, PairingFailed) else PairingFailed(str(error)) from error
+    return session

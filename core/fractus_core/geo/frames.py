@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import ModuleType
 from typing import TypeVar
 
 import numpy as np
@@ -50,12 +51,19 @@ def distance_m(a: Point, b: Point) -> float:
     return 2 / bend * math.asin(chord * bend / 2)
 
 
-def ecef(lat: float, lon: float) -> tuple[float, float, float]:
-    """Earth-centred, Earth-fixed coordinates in metres of a point on the ellipsoid in degrees."""
-    phi, lam = math.radians(lat), math.radians(lon)
-    n = SEMI_MAJOR_AXIS_M / math.sqrt(1 - _E2 * math.sin(phi) ** 2)
-    ground = n * math.cos(phi)
-    return ground * math.cos(lam), ground * math.sin(lam), n * (1 - _E2) * math.sin(phi)
+def ecef(lat: Metres, lon: Metres, of: ModuleType = math) -> tuple[Metres, Metres, Metres]:
+    """Earth-centred, Earth-fixed coordinates in metres of a point on the ellipsoid in degrees.
+
+    Args:
+        lat: degrees north.
+        lon: degrees east.
+        of: whose functions to use: `math` for one point, `numpy` for arrays of them.
+    """
+    phi, lam = of.radians(lat), of.radians(lon)
+    sin_phi = of.sin(phi)
+    n = SEMI_MAJOR_AXIS_M / of.sqrt(1 - _E2 * sin_phi * sin_phi)
+    ground = n * of.cos(phi)
+    return ground * of.cos(lam), ground * of.sin(lam), n * (1 - _E2) * sin_phi
 
 
 class LocalFrame:
@@ -74,12 +82,7 @@ class LocalFrame:
         phi, lam = math.radians(lat), math.radians(lon)
         self._sin_lat, self._cos_lat = math.sin(phi), math.cos(phi)
         self._sin_lon, self._cos_lon = math.sin(lam), math.cos(lam)
-        n = SEMI_MAJOR_AXIS_M / math.sqrt(1 - _E2 * self._sin_lat**2)
-        self._origin = (
-            n * self._cos_lat * self._cos_lon,
-            n * self._cos_lat * self._sin_lon,
-            n * (1 - _E2) * self._sin_lat,
-        )
+        self._origin = ecef(lat, lon)
         self._up = (self._cos_lat * self._cos_lon, self._cos_lat * self._sin_lon, self._sin_lat)
 
     @classmethod
@@ -89,6 +92,7 @@ class LocalFrame:
 
     def xy(self, lat: float, lon: float) -> tuple[float, float]:
         """Metres east and north of the origin, of a point on the ellipsoid in degrees."""
+        # Written out, and not by `ecef`: every judgement passes here several times.
         phi, lam = math.radians(lat), math.radians(lon)
         sin_phi, cos_phi = math.sin(phi), math.cos(phi)
         n = SEMI_MAJOR_AXIS_M / math.sqrt(1 - _E2 * sin_phi * sin_phi)
@@ -101,12 +105,8 @@ class LocalFrame:
 
     def xy_array(self, lats: Coordinates, lons: Coordinates) -> Coordinates:
         """Metres east and north, shape (n, 2), of points on the ellipsoid in degrees, shapes (n,)."""
-        phi, lam = np.radians(lats), np.radians(lons)
-        sin_phi, cos_phi = np.sin(phi), np.cos(phi)
-        n = SEMI_MAJOR_AXIS_M / np.sqrt(1 - _E2 * sin_phi * sin_phi)
-        dx = n * cos_phi * np.cos(lam) - self._origin[0]
-        dy = n * cos_phi * np.sin(lam) - self._origin[1]
-        dz = n * (1 - _E2) * sin_phi - self._origin[2]
+        x, y, z = ecef(lats, lons, np)
+        dx, dy, dz = x - self._origin[0], y - self._origin[1], z - self._origin[2]
         east = -self._sin_lon * dx + self._cos_lon * dy
         north = -self._sin_lat * (self._cos_lon * dx + self._sin_lon * dy) + self._cos_lat * dz
         return np.column_stack((east, north))

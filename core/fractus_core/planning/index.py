@@ -22,7 +22,6 @@ _Floats = NDArray[np.float64]
 _Slots = NDArray[np.int64]
 
 _B_M = SEMI_MAJOR_AXIS_M * (1 - FLATTENING)
-_E2 = FLATTENING * (2 - FLATTENING)
 _SQUARES = np.array([SEMI_MAJOR_AXIS_M**-2, SEMI_MAJOR_AXIS_M**-2, _B_M**-2])
 _CELLS_M = tuple(128.0 * 2**level for level in range(12))
 """Edges of the cubes of each grid, 128 m to 262 km: a coarser query asks few large cubes instead of many small ones."""
@@ -72,7 +71,7 @@ class SpatialIndex:
         index._slots = {name: slot for slot, name in enumerate(index._names)}
         places = np.array(list(found.values()), dtype=np.float64)
         index._lats, index._lons = places[:, 0].copy(), places[:, 1].copy()
-        index._xyz = _ecef(index._lats, index._lons)
+        index._xyz = np.column_stack(ecef(index._lats, index._lons, np))
         for grid, size in zip(index._grids, _CELLS_M, strict=True):
             cells = np.floor(index._xyz / size).astype(np.int64) + _OFFSET
             keys = (cells[:, 0] << 2 * _BITS) | (cells[:, 1] << _BITS) | cells[:, 2]
@@ -234,13 +233,6 @@ class SpatialIndex:
         millimetres = np.rint(distances * 1000).astype(np.int64).tolist()
         ranked = sorted(zip(millimetres, names, distances.tolist(), strict=True))
         return [(name, distance) for _, name, distance in ranked]
-
-
-def _ecef(lats: _Floats, lons: _Floats) -> _Floats:
-    phi, lam = np.radians(lats), np.radians(lons)
-    n = SEMI_MAJOR_AXIS_M / np.sqrt(1 - _E2 * np.sin(phi) ** 2)
-    ground = n * np.cos(phi)
-    return np.column_stack((ground * np.cos(lam), ground * np.sin(lam), n * (1 - _E2) * np.sin(phi)))
 
 
 def _geodesics(origin: _Floats, points: _Floats) -> _Floats:

@@ -7,7 +7,8 @@ import random
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 import grpc
 import grpc.aio
@@ -198,3 +199,21 @@ class Retries:
                 raise Unavailable(f"{self._method}: the service ended the stream")
             raise translate(error, self._method, self._channel.address) from None
         await asyncio.sleep(delay)
+
+
+class ServiceClient:
+    """A client of one service of one node; `async with` closes it."""
+
+    _channel: ServiceChannel
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Close the connection."""
+        await self._channel.close()

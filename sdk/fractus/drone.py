@@ -6,14 +6,13 @@ import asyncio
 import inspect
 from collections.abc import AsyncGenerator, Awaitable, Callable, Generator
 from contextlib import aclosing
-from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import grpc
 import grpc.aio
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
-from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, Retries, ServiceChannel
+from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, Retries, ServiceChannel, ServiceClient
 from fractus.control import Control
 from fractus.dry_runs import CanI
 from fractus.environment import Endpoint, endpoint
@@ -126,7 +125,7 @@ class Motion:
                     self._control.end(call)
 
 
-class Mobility:
+class Mobility(ServiceClient):
     """The mobility service of the node that this component runs on.
 
     Passengers may ask where the drone is; a driver takes control and then moves it. Every answer tells what policies
@@ -158,19 +157,11 @@ class Mobility:
         self.can_i = CanI(self._check)
         """Dry runs: `await drone.can_i.goto(lat, lon, 20)`."""
 
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        await self.close()
-
     async def close(self) -> None:
         """Close the connection; control that is still held breaks off."""
         if self._control is not None:
             await self._control.abandon()
-        await self._channel.close()
+        await super().close()
 
     def control(self, *, timeout_s: float | None = None) -> Control:
         """Control of the drone for the next control point, as a context manager.

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from types import TracebackType
-from typing import Self
-
 import grpc
 import grpc.aio
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
 
-from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, ServiceChannel
+from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, ServiceChannel, ServiceClient
 from fractus.environment import Endpoint, endpoint
 from fractus.errors import Unavailable, translate
 from fractus.requests import capture_request
@@ -20,7 +17,7 @@ CAPTURE_TIMEOUT_S = 120.0
 """Looking for faces in megapixels takes its time."""
 
 
-class Camera:
+class Camera(ServiceClient):
     """The camera service of this node: pictures are taken, kept on the node, and fetched from there."""
 
     def __init__(
@@ -29,18 +26,6 @@ class Camera:
         self._channel = ServiceChannel(
             endpoint, camera_pb2_grpc.CameraServiceStub, timeout_s=timeout_s, reconnect_timeout_s=reconnect_timeout_s
         )
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        await self.close()
-
-    async def close(self) -> None:
-        """Close the connection."""
-        await self._channel.close()
 
     async def capture(self, width: int = 0, height: int = 0, *, timeout_s: float = CAPTURE_TIMEOUT_S) -> ImageInfo:
         """Take a picture; 0 leaves width and height to the camera.

@@ -139,11 +139,10 @@ class Progress(Result):
     @classmethod
     def from_proto(cls, message: mobility_pb2.MotionProgress, first: Progress | None) -> Progress:
         """Read the wire form; decision and target come in the first message and hold for all."""
-        has_decision = message.HasField("decision") or first is None
-        has_target = message.HasField("target") or first is None
+        given = {field.name for field, _ in message.ListFields()}
         return cls(
-            decision=Decision.from_proto(message.decision) if has_decision else first.decision,  # type: ignore[union-attr]
-            target=Position.from_proto(message.target) if has_target else first.target,  # type: ignore[union-attr]
+            decision=Decision.from_proto(message.decision) if first is None or "decision" in given else first.decision,
+            target=Position.from_proto(message.target) if first is None or "target" in given else first.target,
             position=Position.from_proto(message.position),
             distance_m=message.distance_m,
             complete=message.complete,

@@ -17,7 +17,7 @@ from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.x509.oid import ExtensionOID, ObjectIdentifier
+from cryptography.x509.oid import ObjectIdentifier
 
 from fractus_core.api.model import GROUP
 from fractus_core.api.names import OPERATOR_IDENTITY
@@ -114,7 +114,7 @@ def _signing_key(certificate: x509.Certificate) -> ec.EllipticCurvePublicKey:
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         usage = certificate.extensions.get_extension_for_class(x509.KeyUsage).value
-        purposes = certificate.extensions.get_extension_for_oid(ExtensionOID.EXTENDED_KEY_USAGE).value
+        purposes = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
         limits = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
         identities = [name.value for name in names]
         key = certificate.public_key()
@@ -123,7 +123,7 @@ def _signing_key(certificate: x509.Certificate) -> ec.EllipticCurvePublicKey:
     if identities != [OPERATOR_IDENTITY]:
         raise BadSignature(f"it was signed by {', '.join(map(str, identities))}, and not by the operator")
     alone = usage.content_commitment and not (usage.digital_signature or usage.key_cert_sign)
-    if not alone or list(purposes) != [DOCUMENT_SIGNING] or limits.ca:  # type: ignore[call-overload]
+    if not alone or list(purposes) != [DOCUMENT_SIGNING] or limits.ca:
         raise BadSignature("it was signed with a certificate that is not for signing Grants")
     if not isinstance(key, ec.EllipticCurvePublicKey) or not isinstance(key.curve, ec.SECP256R1):
         raise BadSignature("it was signed with a key that is not P-256")

@@ -18,7 +18,7 @@ def exhaustive(members: Any, table: C) -> C:
         table: its members, or a mapping from them.
 
     Raises:
-        TypeError: a member is missing, or something is no member.
+        TypeError: a member is missing, or something is not a member.
     """
     wrong = set(get_args(members)) ^ set(table)
     if wrong or len(get_args(members)) != len(table):

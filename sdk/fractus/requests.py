@@ -1,4 +1,4 @@
-"""Calls as the wire has them; an argument that is no number ends here, for the wire would take it for zero."""
+"""Calls as the wire has them; an argument that is not a number ends here, for the wire would take it for zero."""
 
 from __future__ import annotations
 

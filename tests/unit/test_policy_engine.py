@@ -255,7 +255,7 @@ def test_a_leg_that_cuts_a_corner_of_the_operation_area_is_refused() -> None:
 def test_the_way_to_the_operation_area_and_home() -> None:
     grant = compiled(operationArea=[box(50, -20, 150, 20)], corridor=[box(-30, -30, 150, 30)])
     assert ask(grant, goto(100, 0), at(0, 0)).action == "allow"
-    assert ask(grant, goto(20, 0), at(0, 0)).code == "OutsideOperationArea", "the way is no place to work"
+    assert ask(grant, goto(20, 0), at(0, 0)).code == "OutsideOperationArea", "the way is not a place to work"
     assert ask(grant, goto(0, 0), at(100, 0)).action == "allow", "home"
     assert ask(grant, Call("Takeoff", TakeoffArgs(10)), at(0, 0, 0)).action == "allow"
     partial = compiled(operationArea=[box(50, -20, 150, 20)], corridor=[box(-30, -30, 150, 30)], control="partial")

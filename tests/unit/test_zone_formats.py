@@ -105,7 +105,7 @@ def test_geojson_of_others():
     assert found.zones[2].spec.area.circle.radius == 20
     assert found.notes == (
         "Old Town: no place for properties owner; left out",
-        "road: a geometry of type LineString is no zone; left out",
+        "road: a geometry of type LineString is not a zone; left out",
     )
 
 
@@ -207,7 +207,11 @@ def test_geojson_tells_of_zones_around_a_pole():
             None,
             "limits in FL are not taken over, M and FT are; the zone has no limits of altitude",
         ),
-        ({"upperLimit": "120"}, None, "upperLimit '120' is no number and not taken over; the zone has no upper limit"),
+        (
+            {"upperLimit": "120"},
+            None,
+            "upperLimit '120' is not a number and not taken over; the zone has no upper limit",
+        ),
         ({"layer": 3}, 120, "no place for layer; left out"),
     ],
 )
@@ -220,8 +224,8 @@ def test_ed269_tells_what_of_a_volume_it_cannot_take(volume, upper, note):
 @pytest.mark.parametrize(
     ("day", "note"),
     [
-        ({"day": ["MON", "HOL"]}, "HOL is no day of the week; the zone is active every day"),
-        ({"day": [{}]}, "{} is no day of the week; the zone is active every day"),
+        ({"day": ["MON", "HOL"]}, "HOL is not a day of the week; the zone is active every day"),
+        ({"day": [{}]}, "{} is not a day of the week; the zone is active every day"),
         ({"day": ["ANY"], "startEvent": "BMCT"}, "no place for startEvent; left out"),
     ],
 )
@@ -248,12 +252,12 @@ def test_geojson_tells_of_heights_and_reference_systems():
 @pytest.mark.parametrize(
     ("read", "text", "sentence"),
     [
-        (formats.read_geojson, "{", "line 1: this is no JSON"),
-        (formats.read_geojson, '{"type": "Topology"}', "type: 'Topology' is no GeoJSON"),
+        (formats.read_geojson, "{", "line 1: this is not JSON"),
+        (formats.read_geojson, '{"type": "Topology"}', "type: 'Topology' is not GeoJSON"),
         (
             formats.read_geojson,
             json.dumps(feature({"type": "Polygon", "coordinates": [[[4, 500], [4, 5], [5, 5]]]})),
-            "features[0].geometry.coordinates[0][0]: 4, 500 is no place on Earth; the order is lon, lat",
+            "features[0].geometry.coordinates[0][0]: 4, 500 is not a place on Earth; the order is lon, lat",
         ),
         (
             formats.read_geojson,
@@ -262,7 +266,7 @@ def test_geojson_tells_of_heights_and_reference_systems():
             ),
             "bow: polygon.exterior: the ring crosses itself",
         ),
-        (formats.read_kml, "<kml", "this is no XML"),
+        (formats.read_kml, "<kml", "this is not XML"),
         (formats.read_kml, '<!DOCTYPE kml [<!ENTITY a "b">]><kml/>', "a KML file must not declare entities"),
         (formats.read_qgc_plan, '{"fileType": "Mission"}', "fileType: must be Plan"),
         (formats.read_qgc_plan, '{"fileType": "Plan", "geoFence": {"version": 1}}', "geoFence.version: must be 2"),
@@ -295,7 +299,7 @@ def test_geojson_tells_of_heights_and_reference_systems():
         (
             formats.read_geojson,
             json.dumps(feature({"type": "Polygon", "coordinates": [[[10**99, 5], [4, 5], [5, 5]]]})),
-            "features[0].geometry.coordinates[0][0]: a number of many digits, 5 is no place on Earth",
+            "features[0].geometry.coordinates[0][0]: a number of many digits, 5 is not a place on Earth",
         ),
         *(
             (
@@ -347,4 +351,4 @@ def test_the_command_imports_and_exports(tmp_path):
     assert "left out" in written.stderr
     wrong = CliRunner().invoke(command, ["import", str(source), "--from", "kml"])
     assert wrong.exit_code == 1
-    assert f"{source}: this is no XML" in wrong.stderr
+    assert f"{source}: this is not XML" in wrong.stderr

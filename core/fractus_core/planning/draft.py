@@ -78,12 +78,12 @@ class Draft:
         )
 
     def reject(self, component: Component, node: str, check: Check, *, far: bool = False) -> None:
-        """Note that a node is no host for a component; `far` says that it was no candidate by place."""
+        """Note that a node is not a host for a component; `far` says that it was not a candidate by place."""
         notes = self._far if far else self._rejected
         notes.setdefault((component.name, node), check.rejection(component, node))
 
     def far_note(self, component: Component, node: str) -> str:
-        """Why a node was no candidate by place; empty if that was not noted."""
+        """Why a node was not a candidate by place; empty if that was not noted."""
         found = self._far.get((component.name, node))
         return found.message if found is not None else ""
 

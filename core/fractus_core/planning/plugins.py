@@ -9,14 +9,14 @@ GROUP = "fractus.planning"
 
 
 class UnknownPlugin(Exception):
-    """There is no plug-in of a name, or it is no function."""
+    """There is no plug-in of a name, or it is not a function."""
 
 
 def load_plugin(name: str | None) -> Any:
     """The plug-in of a name; None when none is asked for.
 
     Raises:
-        UnknownPlugin: there is none, or it is no function.
+        UnknownPlugin: there is none, or it is not a function.
     """
     if not name:
         return None

@@ -11,7 +11,7 @@ def amount_of(text: str | float) -> float:
     """Value of any quantity that the API server may hold, also those that manifests of ours may not use.
 
     Raises:
-        ValueError: it is no quantity.
+        ValueError: it is not a quantity.
     """
     try:
         return quantity(text)

@@ -74,7 +74,7 @@ def _must_brake(call: Call, verdict: Verdict, now: Situation, grant: CompiledGra
 
 
 def _unsound(now: Situation) -> Situation:
-    """A state with a figure that is no number: nothing is known of where the drone is and how it moves.
+    """A state with a figure that is not a number: nothing is known of where the drone is and how it moves.
 
     Raises:
         ValueError: not even the time is known.

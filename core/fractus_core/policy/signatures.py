@@ -59,7 +59,7 @@ def sign(
         issued_at: Of two Grants for one instance the one that was issued later counts.
 
     Raises:
-        InvalidObject: the manifest is no Grant.
+        InvalidObject: the manifest is not a Grant.
     """
     spec = {**body["spec"], "issuedAt": issued_at.astimezone(UTC).isoformat().replace("+00:00", "Z")}
     signature = key.sign(canonical(Grant.from_body({**body, "spec": spec})), ec.ECDSA(hashes.SHA256()))

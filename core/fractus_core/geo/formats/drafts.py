@@ -104,13 +104,13 @@ def parse_json(text: str) -> dict[str, Any]:
     try:
         found = json.loads(text.removeprefix("\ufeff"))
     except json.JSONDecodeError as error:
-        raise InvalidObject(f"line {error.lineno}", f"this is no JSON ({error.msg.lower()})") from None
+        raise InvalidObject(f"line {error.lineno}", f"this is not JSON ({error.msg.lower()})") from None
     except RecursionError:
         raise InvalidObject("", "its lists or objects are nested too deeply") from None
     except ValueError:
         raise InvalidObject("", "a number in it has thousands of digits") from None
     if not isinstance(found, dict):
-        raise InvalidObject("", "this is no JSON object")
+        raise InvalidObject("", "this is not a JSON object")
     return found
 
 
@@ -162,7 +162,9 @@ def place(found: Any, field: str, *, lat_first: bool = False) -> Point:
     lat, lon = (pair[0], pair[1]) if lat_first else (pair[1], pair[0])
     if not (-90 <= lat <= 90 and -180 <= lon <= 180):
         order = "lat, lon" if lat_first else "lon, lat"
-        raise InvalidObject(field, f"{_shown(pair[0])}, {_shown(pair[1])} is no place on Earth; the order is {order}")
+        raise InvalidObject(
+            field, f"{_shown(pair[0])}, {_shown(pair[1])} is not a place on Earth; the order is {order}"
+        )
     return Point(lat=lat, lon=lon)
 
 
@@ -198,7 +200,7 @@ def round_area(centre: Point, radius_m: Any, field: str) -> dict[str, Any]:
     """A circle as an area.
 
     Raises:
-        InvalidObject: the radius is no length.
+        InvalidObject: the radius is not a length.
     """
     if not number(radius_m) or not 0 < radius_m <= MAX_RADIUS_M:
         raise InvalidObject(field, f"must be 0 to {MAX_RADIUS_M:.0f} metres, not {_shown(radius_m)}")

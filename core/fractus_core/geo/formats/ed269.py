@@ -44,11 +44,11 @@ def read_ed269(text: str) -> Imported:
     """Zones from features: identifier, name, message, restriction (told in the description), applicability, geometry.
 
     Raises:
-        InvalidObject: this is no ED-269 file, or a geometry is broken.
+        InvalidObject: this is not an ED-269 file, or a geometry is broken.
     """
     whole = parse_json(text)
     if "features" not in whole:
-        raise InvalidObject("features", "is missing; this is no ED-269 file")
+        raise InvalidObject("features", "is missing; this is not an ED-269 file")
     drafts = Drafts()
     for i, feature in enumerate(objects(whole["features"], "features")):
         _read_feature(drafts, feature, f"features[{i}]")
@@ -107,7 +107,9 @@ def _band(drafts: Drafts, title: str, volume: dict[str, Any]) -> dict[str, Any]:
         if value is None:
             continue
         if not number(value):
-            drafts.note(title, f"{side}Limit {value!r} is no number and not taken over; the zone has no {side} limit")
+            drafts.note(
+                title, f"{side}Limit {value!r} is not a number and not taken over; the zone has no {side} limit"
+            )
             continue
         if side == "lower" and value <= 0 and datum == "AGL":
             continue
@@ -145,7 +147,7 @@ def _daily(drafts: Drafts, title: str, day: dict[str, Any]) -> dict[str, Any]:
     named = [str(d) for d in (given if isinstance(given, list) else [given])]
     unknown = sorted(set(named) - set(_DAYS) - {"ANY"})
     if unknown:
-        drafts.note(title, f"{', '.join(unknown)} is no day of the week; the zone is active every day")
+        drafts.note(title, f"{', '.join(unknown)} is not a day of the week; the zone is active every day")
     days = [_DAYS[d] for d in named if d in _DAYS]
     found: dict[str, Any] = {"days": days} if days and not unknown and "ANY" not in named else {}
     start, end = (_TIME.match(str(day.get(key, ""))) for key in ("startTime", "endTime"))

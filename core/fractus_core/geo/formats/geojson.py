@@ -33,7 +33,7 @@ def read_geojson(text: str) -> Imported:
     """Zones from features; altitude and schedule come from properties of these names, spelt as in a Zone.
 
     Raises:
-        InvalidObject: this is no GeoJSON, or a geometry is broken.
+        InvalidObject: this is not GeoJSON, or a geometry is broken.
     """
     whole = parse_json(text)
     kind = whole.get("type")
@@ -44,7 +44,7 @@ def read_geojson(text: str) -> Imported:
     elif kind in {"Polygon", "MultiPolygon"}:
         features = [{"type": "Feature", "geometry": whole, "properties": {}}]
     else:
-        raise InvalidObject("type", f"{kind!r} is no GeoJSON of zones; expected a FeatureCollection of polygons")
+        raise InvalidObject("type", f"{kind!r} is not GeoJSON of zones; expected a FeatureCollection of polygons")
     drafts = Drafts()
     if whole.get("crs"):
         drafts.note("crs", "is not looked at; coordinates are taken as WGS 84, lon, lat")
@@ -79,7 +79,7 @@ def _read_feature(drafts: Drafts, feature: dict[str, Any], field: str) -> None:
             area = round_area(place(coordinates, where), properties["radius"], f"{field}.properties.radius")
             drafts.add(title, {**spec, "area": area})
         case other:
-            drafts.note(title, f"a geometry of type {other} is no zone; left out")
+            drafts.note(title, f"a geometry of type {other} is not a zone; left out")
 
 
 def _heights(coordinates: Any) -> bool:

@@ -19,14 +19,14 @@ def read_kml(text: str) -> Imported:
     """Zones from the polygons of placemarks; heights and styles are not taken over.
 
     Raises:
-        InvalidObject: this is no KML, or a polygon is broken.
+        InvalidObject: this is not KML, or a polygon is broken.
     """
     if re.search(r"<!(DOCTYPE|ENTITY)", text):
         raise InvalidObject("", "a KML file must not declare entities")
     try:
         root = ElementTree.fromstring(re.sub(r"^\ufeff?\s*<\?xml[^>]*\?>", "", text))  # noqa: S314  (no entities, see above)
     except ElementTree.ParseError as error:
-        raise InvalidObject("", f"this is no XML ({error})") from None
+        raise InvalidObject("", f"this is not XML ({error})") from None
     if _tag(root) != "kml":
         raise InvalidObject("", f"the root element is {_tag(root)}, not kml")
     drafts = Drafts()
@@ -41,7 +41,7 @@ def _read_placemark(drafts: Drafts, mark: ElementTree.Element, count: int) -> No
     polygons = [e for e in mark.iter() if _tag(e) == "Polygon"]
     others = sorted({_tag(e) for e in mark.iter()} & set(_OTHERS) - ({"LinearRing"} if polygons else set()))
     if others:
-        drafts.note(title, f"{', '.join(others)} is no zone; left out")
+        drafts.note(title, f"{', '.join(others)} is not a zone; left out")
     drafts.unmapped(title, map(_tag, mark), _KNOWN | _LOOK | set(_OTHERS))
     for i, shape in enumerate(polygons):
         field = f"{title}: Polygon[{i}]"

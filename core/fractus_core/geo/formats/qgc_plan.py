@@ -27,7 +27,7 @@ def read_qgc_plan(text: str) -> Imported:
     """Zones from the fence's polygons and circles; whether each is for inclusion is told in its description.
 
     Raises:
-        InvalidObject: this is no plan file, or a shape is broken.
+        InvalidObject: this is not a plan file, or a shape is broken.
     """
     whole = parse_json(text)
     if whole.get("fileType") != "Plan":
@@ -50,11 +50,11 @@ def read_qgc_plan(text: str) -> Imported:
         )
         _add(drafts, f"circle {i + 1}", area, inclusion=_inclusion(item, f"geoFence.circles[{i}]"))
     if fields(whole.get("mission"), "mission").get("items"):
-        drafts.note("mission", "its items are no zones; left out")
+        drafts.note("mission", "its items are not zones; left out")
     if fields(whole.get("rallyPoints"), "rallyPoints").get("points"):
-        drafts.note("rallyPoints", "its points are no zones; left out")
+        drafts.note("rallyPoints", "its points are not zones; left out")
     if fence.get("breachReturn"):
-        drafts.note("geoFence.breachReturn", "is no zone; left out")
+        drafts.note("geoFence.breachReturn", "is not a zone; left out")
     return drafts.result()
 
 

@@ -12,8 +12,7 @@ from typing import Any
 import grpc
 import pytest
 from fractus_core.control.values import FlightMode
-from fractus_mavlink import Endpoint
-from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_COMPONENT, MAV_TYPE
+from fractus_mavlink.enums import COPTER_MODE
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
@@ -111,15 +110,7 @@ async def test_a_service_that_stays_dead_leaves_it_to_the_autopilot(rig: Rig) ->
 
 async def until_mode(link: str, mode: FlightMode) -> None:
     """Listen to the vehicle as a ground station: its heartbeats, of system 255, must not stand for the companion's."""
-    watcher, station = MavlinkAutopilot(link, ARDUCOPTER), Endpoint(255, MAV_COMPONENT.MISSIONPLANNER)
-
-    def heartbeat() -> None:
-        if watcher._transport is not None:
-            watcher._transport.write(
-                station.encode("HEARTBEAT", {"type": MAV_TYPE.GCS, "autopilot": MAV_AUTOPILOT.INVALID})
-            )
-
-    watcher._heartbeat = heartbeat  # type: ignore[method-assign]
+    watcher = MavlinkAutopilot(link, ARDUCOPTER, sysid=255)
     task = asyncio.create_task(watcher.run())
     try:
         async with asyncio.timeout(20):

@@ -95,7 +95,7 @@ class Plane(MavlinkAutopilot):
 
     def __init__(self) -> None:
         super().__init__("tcp:nowhere:1", ARDUCOPTER)
-        self._target = (1, 1)
+        self.target = (1, 1)
         self.xy, self.velocity = [0.0, 0.0], [0.0, 0.0]
         self.height, self.climb = 0.0, 0.0
         self.speed_mps = DEFAULT_MPS
@@ -138,7 +138,7 @@ class Plane(MavlinkAutopilot):
             refused = command in self.refuses
             if not refused:
                 self._obey(outgoing)
-            self._take(
+            self.take(
                 message("COMMAND_ACK", command=command, result=MAV_RESULT.FAILED if refused else MAV_RESULT.ACCEPTED)
             )
         elif kind == "SET_POSITION_TARGET_LOCAL_NED" and self.vehicle.mode == GUIDED and self.height > 0.2:
@@ -238,8 +238,7 @@ class Plane(MavlinkAutopilot):
                 vehicle.courses.popleft()
         vehicle.position_at = vehicle.heartbeat_at = vehicle.landed_at = self.now
         vehicle.landed_state = 2 if self.height > 0.2 else 1
-        self._updated.set()
-        self._updated = asyncio.Event()
+        self.notify()
 
 
 class Grants:

@@ -27,7 +27,7 @@ def link(monkeypatch: pytest.MonkeyPatch) -> tuple[MavlinkAutopilot, list[Any]]:
 
 async def test_a_command_is_not_sent_again_once_it_is_overtaken(link: tuple[MavlinkAutopilot, list[Any]]) -> None:
     autopilot, sent = link
-    autopilot._target, autopilot.vehicle.heartbeat_at = (1, 1), asyncio.get_running_loop().time()
+    autopilot.target, autopilot.vehicle.heartbeat_at = (1, 1), asyncio.get_running_loop().time()
 
     def permit() -> None:
         if sent:
@@ -44,7 +44,7 @@ async def test_no_duty_no_heartbeat(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(autopilot, "send", sent.append)
     autopilot.beat()
     assert [m.name for m in sent] == ["PARAM_REQUEST_READ"], "it knocks, so that it is answered"
-    autopilot._target = (1, 1)
+    autopilot.target = (1, 1)
     autopilot.beat()
     assert len(sent) == 1
     duty = True
@@ -56,14 +56,14 @@ async def test_two_that_read_one_parameter_both_hear_it(
     link: tuple[MavlinkAutopilot, list[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     autopilot, sent = link
-    autopilot._target = (1, 1)
+    autopilot.target = (1, 1)
     monkeypatch.setattr(module, "ACK_TIMEOUT_S", 5.0)
     values = [1.0, 2.0]
 
     def answered(outgoing: Any) -> None:
         sent.append(outgoing)
         told = message("PARAM_VALUE", param_id=b"FENCE_TYPE", param_value=values.pop(0))
-        asyncio.get_running_loop().call_soon(autopilot._take, told)
+        asyncio.get_running_loop().call_soon(autopilot.take, told)
 
     monkeypatch.setattr(autopilot, "send", answered)
     both = await asyncio.gather(autopilot.read_parameter("FENCE_TYPE"), autopilot.write_parameter("FENCE_TYPE", 2.0))

@@ -22,7 +22,7 @@ class Keeper(MavlinkAutopilot):
 
     def __init__(self, *lost: int, result: int = 0) -> None:
         super().__init__("tcp:nowhere:1", ARDUCOPTER)
-        self._target = (1, 1)
+        self.target = (1, 1)
         self.vehicle.heartbeat_at = asyncio.get_running_loop().time()
         self.items: list[Message] = []
         self.wanted = 0
@@ -38,8 +38,8 @@ class Keeper(MavlinkAutopilot):
         if self._passes():
             answer = self._answer(outgoing)
             if answer is not None and self._passes():
-                self._take(message("MISSION_ACK", mission_type=MAV_MISSION_TYPE.MISSION))  # of another list: not ours
-                self._take(answer)
+                self.take(message("MISSION_ACK", mission_type=MAV_MISSION_TYPE.MISSION))  # of another list: not ours
+                self.take(answer)
 
     def _answer(self, outgoing: Message) -> Message | None:
         kind = outgoing.name
@@ -62,7 +62,7 @@ class Keeper(MavlinkAutopilot):
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(itemlists, "ANSWER_S", 0.01)
+    monkeypatch.setattr(itemlists, "ANSWER_TIMEOUT_S", 0.01)
 
 
 @pytest.mark.parametrize("lost", [(), (1,), (2,), (3, 4), (6,), (8, 9, 10), (11,)])
@@ -99,6 +99,6 @@ async def test_silence_ends_it() -> None:
 
 async def test_without_a_vehicle_nothing_is_sent() -> None:
     keeper = Keeper()
-    keeper._target = None
+    keeper.target = None
     with pytest.raises(AutopilotError, match="not connected"):
         await download(keeper)

@@ -22,7 +22,7 @@ from fractus_mavlink.enums import (
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.autopilot import Permit, always
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
-from fractus_services.mobility.mavlink.link import Link
+from fractus_services.mobility.mavlink.link import SYSTEM_ID, Link
 
 log = logging.getLogger(__name__)
 
@@ -66,6 +66,7 @@ class MavlinkAutopilot(Link):
         alive: see `Link`.
         on_found: see `Link`.
         on_heartbeat: see `Link`.
+        sysid: see `Link`.
 
     Attributes:
         starting: held by the one who prepares to start the motors.
@@ -79,8 +80,9 @@ class MavlinkAutopilot(Link):
         alive: Callable[[], bool] = lambda: True,
         on_found: Callable[[], None] = lambda: None,
         on_heartbeat: Callable[[], None] = lambda: None,
+        sysid: int = SYSTEM_ID,
     ) -> None:
-        super().__init__(url, stack, alive=alive, on_found=on_found, on_heartbeat=on_heartbeat)
+        super().__init__(url, stack, alive=alive, on_found=on_found, on_heartbeat=on_heartbeat, sysid=sysid)
         self.starting = asyncio.Lock()
         self._locks: dict[int | str, asyncio.Lock] = {}
         self._flying_rates: bool | None = None
@@ -108,8 +110,9 @@ class MavlinkAutopilot(Link):
             attempts: how often to send it.
 
         Raises:
-            AutopilotError: it was refused, or nobody answered.
+            AutopilotError: it was refused, or there was no answer.
         """
+        # An acknowledgement names the command, not the sending: two of one kind at a time would take each other's.
         async with self._locks.setdefault(command, asyncio.Lock()):
             for attempt in range(attempts):
                 permit()
@@ -221,7 +224,7 @@ class MavlinkAutopilot(Link):
                 interval_us = 1e6 / rates[flying]
                 await self.command(MAV_CMD.SET_MESSAGE_INTERVAL, layout_named(name).msgid, interval_us, attempts=2)
             except AutopilotError as error:
-                log.warning("%s comes at its own rate: %s", name, error)
+                log.warning("autopilot: a stream keeps its own rate (message=%s, error=%s)", name, error)
 
     async def ask_home(self) -> None:
         """Ask for the home position now."""
@@ -245,6 +248,7 @@ class MavlinkAutopilot(Link):
         return await self._exchange(name, request, ATTEMPTS)
 
     async def _exchange(self, name: str, request: Message, attempts: int) -> float | None:
+        # PARAM_VALUE answers reading and writing alike, so that one at a time asks for a parameter.
         async with self._locks.setdefault(name, asyncio.Lock()):
             with self.listening("PARAM_VALUE") as answers:
                 for _ in range(attempts):
@@ -272,6 +276,6 @@ def _outgoing(
     values |= {"command": command, **address}
     if place is None:
         return message("COMMAND_LONG", confirmation=confirmation, **values)
-    # COMMAND_INT has room for seven digits of a degree; the floats of COMMAND_LONG are a metre off.
+    # COMMAND_INT has degrees times 1e7; the 32-bit floats of COMMAND_LONG would be metres off.
     values |= {"frame": frame, "x": round(place[0] * 1e7), "y": round(place[1] * 1e7), "z": place[2]}
     return message("COMMAND_INT", **values)

@@ -13,7 +13,7 @@ ROOM_M = 10.0
 """The fence lies so far outside of what is granted: the service's own monitor acts long before it."""
 
 HEADROOM_M = 5.0
-MOST_VERTICES = 60
+MAX_VERTICES = 60
 _SIMPLER_M = 0.5
 
 
@@ -60,9 +60,9 @@ def bounds_of(spec: GrantSpec) -> Bounds | None:
         frame = LocalFrame.at(first.circle.center if first.circle is not None else first.polygon.exterior[0])  # type: ignore[union-attr]
         whole = shapely.union_all([polygon(frame, area) for area in (*spec.operation_area, *spec.corridor)])
         grown = whole.buffer(ROOM_M + _SIMPLER_M, join_style="mitre", mitre_limit=2.0).simplify(_SIMPLER_M)
-        if not isinstance(grown, shapely.Polygon) or len(grown.exterior.coords) > MOST_VERTICES:
+        if not isinstance(grown, shapely.Polygon) or len(grown.exterior.coords) > MAX_VERTICES:
             grown = grown.convex_hull
-        if len(grown.exterior.coords) > MOST_VERTICES:
+        if len(grown.exterior.coords) > MAX_VERTICES:
             grown = grown.envelope
         corners = [frame.latlon(x, y) for x, y in list(grown.exterior.coords)[:-1]]
         count = len(corners)

@@ -14,7 +14,6 @@ from fractus_services.mobility.mavlink.flight_stack import Names, Setting
 
 log = logging.getLogger(__name__)
 
-
 _DEFAULT_SPEED_MPS = 5.0
 
 
@@ -97,9 +96,9 @@ class MavlinkFailsafes:
         airframe = replace(airframe, retraces=retraces)
         checked = Checked("; ".join(problems), tuple(missing), airframe, speed, remembers, reader.known)
         if checked.problem:
-            log.error("failsafes are not verified, arming is refused: %s", checked.problem)
+            log.error("failsafes: not verified, arming is refused (problem=%s)", checked.problem)
         else:
-            log.info("failsafes are set and read back%s", f"; not offered: {', '.join(missing)}" if missing else "")
+            log.info("failsafes: set and read back (not_offered=%s)", ",".join(missing) or "none")
         return checked
 
     async def choose_return(self, checked: Checked, *, retrace: bool) -> Checked:
@@ -129,7 +128,7 @@ class MavlinkFailsafes:
         return replace(checked, problem=problem, airframe=airframe, known=reader.known)
 
     async def _chosen(self, before: Checked | None) -> bool:
-        """Whether the path was chosen as the way home of the flight under way; the vehicle knows when nobody else does."""
+        """Whether the path was chosen as the way home of the flight under way; only the vehicle knows after a restart of the service."""
         if before is not None:
             return before.airframe.retraces
         companion = self._stack.retracing[0]
@@ -143,7 +142,7 @@ class MavlinkFailsafes:
             problems = [problem for setting in stack.retracing if (problem := (await self._establish(setting))[1])]
             if not problems:
                 return True, []
-            log.warning("the drone will fly home straight: %s", "; ".join(problems))
+            log.warning("failsafes: the drone will fly home straight (problems=%s)", "; ".join(problems))
         return False, [problem for setting in stack.straight if (problem := (await self._establish(setting))[1])]
 
     async def _establish(self, setting: Setting) -> tuple[str, str]:
@@ -156,7 +155,9 @@ class MavlinkFailsafes:
                 return name, ""
             after = await self._autopilot.write_parameter(name, setting.value)
             if after is not None and abs(after - setting.value) < 1e-6:
-                log.info("set %s from %g to %g: the autopilot %s", name, found, setting.value, setting.why)
+                log.info(
+                    "failsafes: set %s, the autopilot %s (before=%g, after=%g)", name, setting.why, found, setting.value
+                )
                 return name, ""
             return name, f"{name} is {found:g} and cannot be set to {setting.value:g} (the autopilot {setting.why})"
         return "", f"the autopilot has no {' or '.join(setting.names)} ({setting.why})" if setting.needed else ""

@@ -19,8 +19,9 @@ from fractus_services.mobility.mavlink.itemlists import NoLists, download, uploa
 
 log = logging.getLogger(__name__)
 
-_RESTORE_S = 5.0
+_RESTORE_TIMEOUT_S = 5.0
 _CLOSE_E7 = 2
+"""Autopilots that store floats give positions back a few centimetres off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +113,7 @@ class MissionFence:
 
     def _lacks(self, why: str) -> None:
         self.missing = why
-        log.warning("the vehicle has no fence of its own as a last line: %s", why)
+        log.warning("fence: the vehicle has none of its own as a last line (reason=%s)", why)
 
     async def _raise(self, bounds: Bounds, retraces: bool) -> None:
         owned = await asyncio.to_thread(self._load)
@@ -123,7 +124,7 @@ class MissionFence:
         kept = owned.items if owned.parameters.get(switch, 0.0) else ()
         if self._autopilot.vehicle.armed:
             raise AutopilotError("the motors run; the fence stays as it is")
-        # ArduPilot works out which kinds of fence are in force when a fence is switched on, and not again.
+        # ArduPilot works out which kinds of fence are in force when it is switched on, and not again: so off first.
         try:
             await self._set({switch: 0.0})
             await self._write((*kept, *bounds.items))
@@ -135,22 +136,22 @@ class MissionFence:
         except (AutopilotError, asyncio.CancelledError):
             await self._recover(owned)
             raise
-        log.info("the vehicle's own fence stands: %d vertices, ceiling %s", len(bounds.items), bounds.altitude_m)
+        log.info("fence: raised (vertices=%d, ceiling_m=%s)", len(bounds.items), bounds.altitude_m)
 
     async def _recover(self, owned: Owned) -> None:
         """After a failure, put back what the owner had if that is possible at once; `lower` tries again later."""
         try:
-            async with asyncio.timeout(_RESTORE_S):
+            async with asyncio.timeout(_RESTORE_TIMEOUT_S):
                 await self._put_back(owned)
         except (AutopilotError, OSError) as error:
-            log.warning("the owner's fence is not put back yet: %s", str(error) or "it takes too long")
+            log.warning("fence: the owner's is not put back yet (error=%s)", str(error) or "it takes too long")
 
     async def _put_back(self, owned: Owned) -> None:
         await self._set({self._stack.fence_switch: 0.0})
         await self._write(owned.items)
         await self._set(owned.parameters)
         await asyncio.to_thread(self._path.unlink, True)
-        log.info("the vehicle's own fence is as its owner left it")
+        log.info("fence: as its owner left it")
 
     async def _read(self) -> Owned:
         found = {name: await self._autopilot.read_parameter(name) for name in self._stack.fence_parameters}
@@ -182,7 +183,9 @@ class MissionFence:
         except FileNotFoundError:
             return None
         except (ValueError, KeyError, TypeError) as error:
-            log.critical("%s cannot be read, so the owner's fence is not put back: %s", self._path, error)
+            log.critical(
+                "fence: the owner's is not put back, its file cannot be read (file=%s, error=%s)", self._path, error
+            )
             return None
 
     def _store(self, owned: Owned) -> None:

@@ -12,7 +12,7 @@ from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.bounds import Item
 
-ANSWER_S = 1.0
+ANSWER_TIMEOUT_S = 1.0
 ATTEMPTS = 4
 
 _REASONS: dict[int, str] = {
@@ -52,6 +52,7 @@ async def upload(
             elif answer.name == "MISSION_ACK":
                 _check(answer.integer("type"))
                 return
+            # The vehicle says which item it lacks: one that was lost is asked for again, and so is one whose request was.
             elif (seq := answer.integer("seq")) < len(items):
                 silent = 0
                 outgoing = _item(autopilot, items[seq], seq, kind)
@@ -91,9 +92,10 @@ async def _asked(
 
 async def _answer(answers: asyncio.Queue[Message], kind: int) -> Message | None:
     try:
-        async with asyncio.timeout(ANSWER_S):
+        async with asyncio.timeout(ANSWER_TIMEOUT_S):
             while True:
                 answer = await answers.get()
+                # Mission, fence and rally points share the messages; another station may be reading another list.
                 if answer.integer("mission_type") == kind:
                     return answer
     except TimeoutError:

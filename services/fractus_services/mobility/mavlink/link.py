@@ -39,9 +39,11 @@ class Link:
         alive: whether the companion does its duty; when not, no heartbeat holds off the autopilot's own failsafe.
         on_found: called when the vehicle is heard first, again after each reconnection.
         on_heartbeat: called for every heartbeat after the state took it.
+        sysid: the system that speaks at this end.
 
     Attributes:
         vehicle: the streamed state.
+        target: system and component of the vehicle, from its first heartbeat until the connection breaks.
     """
 
     def __init__(
@@ -52,16 +54,18 @@ class Link:
         alive: Callable[[], bool] = lambda: True,
         on_found: Callable[[], None] = lambda: None,
         on_heartbeat: Callable[[], None] = lambda: None,
+        sysid: int = SYSTEM_ID,
     ) -> None:
         self.url = url
+        self._sysid = sysid
         self.stack = stack
         self._alive = alive
         self._on_found = on_found
         self._on_heartbeat = on_heartbeat
         self.vehicle = Vehicle(stack=stack)
-        self._endpoint = Endpoint(SYSTEM_ID, COMPONENT_ID)
+        self._endpoint = Endpoint(sysid, COMPONENT_ID)
         self._transport: Transport | None = None
-        self._target: tuple[int, int] | None = None
+        self.target: tuple[int, int] | None = None
         self._broken = asyncio.Event()
         self._updated = asyncio.Event()
         self._listeners: list[tuple[frozenset[str], asyncio.Queue[Message]]] = []
@@ -74,12 +78,12 @@ class Link:
     @property
     def found(self) -> bool:
         """Whether the vehicle was heard since the link came up."""
-        return self._target is not None
+        return self.target is not None
 
     @property
     def connected(self) -> bool:
         """Whether the vehicle is heard."""
-        return self._target is not None and self.now - self.vehicle.heartbeat_at < SILENCE_S
+        return self.target is not None and self.now - self.vehicle.heartbeat_at < SILENCE_S
 
     async def run(self) -> None:
         """Keep the link open until cancelled."""
@@ -88,19 +92,22 @@ class Link:
         while True:
             try:
                 self._broken.clear()
-                self._endpoint = Endpoint(SYSTEM_ID, COMPONENT_ID)
+                # Half a frame of the connection that broke must not swallow the beginning of this one.
+                self._endpoint = Endpoint(self._sysid, COMPONENT_ID)
                 self._transport = await open_link(self.url, self._received, self._closed)
             except BadUrl:
                 raise
             except (OSError, TimeoutError) as error:
                 problem = f"{type(error).__name__} {error}".strip()
                 if problem != said:
-                    log.warning("no link to the autopilot at %s yet: %s; trying again", self.url, problem)
+                    log.warning(
+                        "link: no connection to the autopilot yet, trying again (url=%s, error=%s)", self.url, problem
+                    )
                     said = problem
             else:
                 said, delay = "", BACKOFF_S[0]
                 await self._serve()
-                log.warning("the link to the autopilot at %s broke", self.url)
+                log.warning("link: the connection to the autopilot broke (url=%s)", self.url)
             await asyncio.sleep(delay * random.uniform(0.5, 1.0))  # noqa: S311 - jitter
             delay = min(delay * 2, BACKOFF_S[1])
 
@@ -109,26 +116,23 @@ class Link:
         opened = self.now
         try:
             while not self._broken.is_set():
-                self._heartbeat()
+                self.beat()
                 try:
                     async with asyncio.timeout(HEARTBEAT_S):
                         await self._broken.wait()
                 except TimeoutError:
                     if self.now - max(opened, self.vehicle.heartbeat_at) > RECONNECT_AFTER_S:
-                        log.warning("the autopilot is silent; opening the link again")
+                        log.warning("link: the autopilot is silent, connecting again (url=%s)", self.url)
                         break
         finally:
             if self._transport is not None:
                 self._transport.close()
             self._transport = None
-            self._target = None
+            self.target = None
             self._lost()
 
     def beat(self) -> None:
         """Send a heartbeat now, if the companion does its duty."""
-        self._heartbeat()
-
-    def _heartbeat(self) -> None:
         if not self._alive():
             if not self.found:
                 self._knock()
@@ -144,7 +148,7 @@ class Link:
         )
 
     def _knock(self) -> None:
-        """Speak without a heartbeat: an autopilot behind a datagram link answers to whom it has heard."""
+        """Speak without a heartbeat: an autopilot behind UDP answers only those it has heard."""
         self.send(message("PARAM_REQUEST_READ", param_index=-1, param_id=self.stack.witness.encode()))
 
     def _lost(self) -> None:
@@ -157,23 +161,24 @@ class Link:
 
     def _closed(self, error: Exception | None) -> None:
         if error is not None:
-            log.warning("autopilot link: %s", error)
+            log.warning("link: the connection failed (url=%s, error=%s)", self.url, error)
         self._broken.set()
 
     def _received(self, data: bytes) -> None:
         for incoming in self._endpoint.decode(data):
             source = (incoming.sysid, incoming.compid)
-            if self._target is None:
+            if self.target is None:
                 # Cameras, gimbals and ground stations have heartbeats, too, and no autopilot.
                 if incoming.name != "HEARTBEAT" or incoming.integer("autopilot") == MAV_AUTOPILOT.INVALID:
                     continue
-                self._target = source
+                self.target = source
                 self.vehicle.take(incoming, self.now)
                 self._on_found()
-            if source == self._target:
-                self._take(incoming)
+            if source == self.target:
+                self.take(incoming)
 
-    def _take(self, incoming: Message) -> None:
+    def take(self, incoming: Message) -> None:
+        """Hand on a message of the vehicle."""
         self.vehicle.take(incoming, self.now)
         for kinds, queue in self._listeners:
             if incoming.name in kinds:
@@ -181,8 +186,12 @@ class Link:
         if incoming.name == "HEARTBEAT":
             self._on_heartbeat()
         if incoming.name in {"GLOBAL_POSITION_INT", "HEARTBEAT", "EXTENDED_SYS_STATE"}:
-            self._updated.set()
-            self._updated = asyncio.Event()
+            self.notify()
+
+    def notify(self) -> None:
+        """Wake those that wait for an update of the vehicle's state."""
+        self._updated.set()
+        self._updated = asyncio.Event()
 
     async def update(self, timeout_s: float) -> bool:
         """Wait for a message of the vehicle; False when none came in time."""
@@ -210,9 +219,9 @@ class Link:
         Raises:
             AutopilotError: it was not heard since the link came up.
         """
-        if self._target is None:
+        if self.target is None:
             raise AutopilotError("the autopilot is not connected", link=True)
-        return {"target_system": self._target[0], "target_component": self._target[1]}
+        return {"target_system": self.target[0], "target_component": self.target[1]}
 
     def address(self) -> dict[str, int]:
         """The vehicle, as messages name their target.

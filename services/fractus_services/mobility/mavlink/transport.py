@@ -55,13 +55,13 @@ class _Stream(asyncio.Protocol):
 class _Datagrams(asyncio.DatagramProtocol):
     """A UDP link.
 
-    One that listens belongs to whoever sent an autopilot's first heartbeat: others are neither heard nor spoken to until
-    that one has been silent for a while.
+    One that listens belongs to the sender of the first heartbeat of an autopilot: others are neither heard nor spoken to
+    until that one has been silent for a while.
 
     Args:
         receive: takes what arrives.
         closed: called once when the link breaks.
-        connected: whether the socket has its peer already, and hears nobody else.
+        connected: whether the socket has its peer already, and hears no other.
     """
 
     def __init__(self, receive: Receive, closed: Closed, connected: bool) -> None:
@@ -87,7 +87,7 @@ class _Datagrams(asyncio.DatagramProtocol):
                 return False
             if not _from_autopilot(data):
                 return False
-            log.info("the autopilot speaks from %s port %s", addr[0], addr[1])
+            log.info("link: heard an autopilot (host=%s, port=%s)", addr[0], addr[1])
             self._peer = addr
         self._heard_at = now
         return True
@@ -175,7 +175,7 @@ class _Serial:
 
 
 def _configure(fd: int, speed: int) -> None:
-    """Raw bytes at a speed, without modem lines, and for nobody else: an autopilot has one owner."""
+    """Raw bytes at a speed, without modem lines, and for no other process: an autopilot has one owner."""
     tty.setraw(fd)
     settings = termios.tcgetattr(fd)
     settings[2] = (settings[2] | termios.CLOCAL | termios.CREAD) & ~termios.CRTSCTS

@@ -35,7 +35,7 @@ CAMERA = ["CaptureImage", "RetrieveImage", "ListImages"]
 
 
 def at(north_m: float, east_m: float, **more: float) -> Body:
-    """A place so many metres from the depot (flat, good to a centimetre here)."""
+    """A place at an offset in metres from the depot (flat, good to a centimetre here)."""
     return {"lat": LAT + north_m / 111_030, "lon": LON + east_m / 86_200, **more}
 
 

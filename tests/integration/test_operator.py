@@ -337,7 +337,7 @@ def test_a_grant_does_not_outlive_an_application_whose_finalizer_was_taken_off(
     wait_for(lambda: not world.grants(namespace), "orphaned grants to go")
 
 
-def test_deleted_and_made_anew_it_gets_a_plan_of_its_own(
+def test_deleted_and_created_again_it_gets_a_plan_of_its_own(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
     running(world, namespace)
@@ -358,7 +358,7 @@ def test_deleted_and_made_anew_it_gets_a_plan_of_its_own(
     assert old not in {g["spec"]["application"]["uid"] for g in world.grants(namespace)}
 
 
-def test_somebody_elses_object_is_not_taken(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_the_object_of_another_is_not_taken(world: World, operator: OperatorProcess, namespace: str) -> None:
     theirs = {"apiVersion": "v1", "kind": "Service", "metadata": {"name": "traffic-data-store", "namespace": namespace},
               "spec": {"ports": [{"port": 1}]}}  # fmt: skip
     world.api.apply(f"/api/v1/namespaces/{namespace}/services/traffic-data-store", theirs)
@@ -398,7 +398,7 @@ def test_a_new_policy_reaches_the_grants_of_a_running_application(
     assert world.status(namespace)["phase"] == "Running"
 
 
-def test_grants_are_signed_and_a_signature_that_is_touched_is_made_anew(
+def test_grants_are_signed_and_a_signature_that_is_changed_is_made_again(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
     def sound() -> bool:
@@ -427,7 +427,7 @@ def test_grants_are_signed_and_a_signature_that_is_touched_is_made_anew(
     assert second > first
     world.api.merge(path, {"spec": {"limits": {"maxSpeed": 300}}})
     wait_for(lambda: issued() > second and sound(), "what was granted")
-    assert seen[-1]["spec"]["limits"]["maxSpeed"] < 300, "what somebody else wrote is never signed"
+    assert seen[-1]["spec"]["limits"]["maxSpeed"] < 300, "what another wrote is never signed"
 
 
 def test_nodes_get_location_labels(world: World, operator: OperatorProcess) -> None:

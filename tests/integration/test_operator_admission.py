@@ -1,4 +1,4 @@
-"""What the API server and the operator let nobody do: bad manifests, foreign certificates, foreign nodes."""
+"""What the API server and the operator allow no one: bad manifests, foreign certificates, foreign nodes."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_a_crossing_zone_and_an_unknown_zone_are_not_ready(world: World, operato
     assert (knot["status"], knot["reason"]) == ("False", "ZoneInvalid")
 
 
-def test_a_mended_application_is_deployed(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_a_corrected_application_is_deployed(world: World, operator: OperatorProcess, namespace: str) -> None:
     manifest = traffic(namespace, "traffic", navigator(), component("DataStore", "cloud"))
     manifest["spec"]["components"][0]["controlPoints"][0]["point"] = {"depot": "late"}
     world.put(manifest)
@@ -353,7 +353,7 @@ def test_an_agent_gets_no_other_certificate(
     assert [(c["type"], c["reason"]) for c in status["conditions"]] == [("Denied", reason)]
 
 
-def test_nobody_else_gets_a_certificate_of_a_node(
+def test_no_other_gets_a_certificate_of_a_node(
     world: World, operator: OperatorProcess, agents: dict[str, BlockingClient]
 ) -> None:
     body = signing_request("drone-1")

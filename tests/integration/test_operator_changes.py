@@ -1,4 +1,4 @@
-"""What changes around a plan: nodes that come, go or are cordoned, drones that take others along, releases that spell anew."""
+"""What changes around a plan: nodes that come, go or are cordoned, shared flights, releases that serialize differently."""
 
 from __future__ import annotations
 

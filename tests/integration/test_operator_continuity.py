@@ -89,7 +89,7 @@ def test_a_broken_policy_stays_as_granted_and_blocks_no_other(
     world.put(ours("Policy", "slow", {"type": "LimitControl", "kind": "speed", "upperLimit": 3}))
     wait_for(lambda: granted(world, namespace) == ["fence", "odd", "slow"], "the third policy beside the broken ones")
     assert world.status(namespace)["phase"] == "Running"
-    # What is new is granted nothing while nobody knows for whom that policy holds.
+    # What is new is granted nothing while it is unknown for which grants that policy holds.
     world.add_drone("drone-2")
     world.put(traffic(namespace, "second"))
     assert "Policy odd" in reason(world, namespace, "PolicyInvalid", "second")["message"]
@@ -118,7 +118,7 @@ def test_a_drone_on_its_way_home_is_nobodys(world: World, operator: OperatorProc
     world.phase(namespace, "Deploying")
 
 
-def test_made_anew_it_waits_for_the_old_ones_drone(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_created_again_it_waits_for_the_old_ones_drone(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     world.drone_status("drone-1", "flying")
     world.api.delete(world.path(traffic(namespace)))
@@ -155,7 +155,7 @@ def test_of_two_plans_with_one_drone_the_one_with_the_older_grant_stands(
 
 
 def reconciled(world: World, namespace: str) -> None:
-    """Wait for the end of a whole reconcile: what was changed by hand is mended by its last step."""
+    """Wait for the end of a whole reconcile: what was changed by hand is corrected by its last step."""
     path = f"/apis/apps/v1/namespaces/{namespace}/deployments/traffic-data-store"
     world.api.merge(path, {"spec": {"replicas": 3}})
     wait_for(lambda: (world.api.get(path) or {})["spec"]["replicas"] == 1, "the number of replicas")

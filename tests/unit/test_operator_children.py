@@ -55,7 +55,7 @@ class Webhooks:
 
     async def create(self, kind: Kind, body: Body) -> Body:
         if (kind, body["metadata"]["name"]) in self.there:
-            self.said.append(f"create {kind.name} in vain")
+            self.said.append(f"create {kind.name} refused")
             raise Conflict(409, "AlreadyExists", "it is there")
         return await self.written("create", kind, body)
 
@@ -111,14 +111,14 @@ def standing(kind: Kind, **metadata: Any) -> Body:
 
 
 async def test_what_is_in_the_way_is_met_once_and_then_looked_for() -> None:
-    """Each creation in vain counts against the namespace's quota."""
+    """Each creation refused counts against the namespace's quota."""
     store = Webhooks(None)
     store.there[kinds.SERVICE, "one"] = standing(kinds.SERVICE)
     children = made_on(store)
     for _ in range(2):
         with pytest.raises(NameTaken):
             await children.apply(APPLICATION, {kinds.SERVICE: [kinds.SERVICE.header("one", "city")]})
-    assert store.said == ["create Service in vain", "get Service", "get Service"]
+    assert store.said == ["create Service refused", "get Service", "get Service"]
     store.there.clear()
     await children.apply(APPLICATION, {kinds.SERVICE: [kinds.SERVICE.header("one", "city")]})
     assert store.said[3:] == ["get Service", "create Service"]
@@ -142,7 +142,7 @@ async def test_a_grant_that_is_there_is_rewritten_unless_its_node_changes(node: 
     store.there[kinds.GRANT, "one"] = {**kinds.GRANT.header("one", uid="1"), "spec": {"application": of, "node": "n1"}}
     wanted = {**kinds.GRANT.header("one", labels={}), "spec": {"application": of, "node": node}}
     await made_on(store).apply(APPLICATION, {kinds.GRANT: [wanted]})
-    assert store.said == ["create Grant in vain", "get Grant", *then]
+    assert store.said == ["create Grant refused", "get Grant", *then]
 
 
 async def test_the_grant_of_another_application_is_left_alone() -> None:
@@ -151,4 +151,4 @@ async def test_the_grant_of_another_application_is_left_alone() -> None:
     store.there[kinds.GRANT, "one"] = {**kinds.GRANT.header("one", uid="1"), "spec": spec}
     with pytest.raises(NameTaken):
         await made_on(store).apply(APPLICATION, {kinds.GRANT: [{**kinds.GRANT.header("one", labels={}), "spec": spec}]})
-    assert store.said == ["create Grant in vain", "get Grant"]
+    assert store.said == ["create Grant refused", "get Grant"]

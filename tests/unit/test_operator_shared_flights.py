@@ -87,7 +87,7 @@ def test_a_guest_claims_nothing_however_old_its_grant_is() -> None:
     plans = {("default", "guest"): OwnedPlan("g", RIDE), ("default", "traffic"): OwnedPlan("t", OWN)}
     old, new = grant("guest", "g", "2026-01-01T00:00:00Z"), grant("traffic", "t", "2026-01-02T00:00:00Z")
     assert claims(plans, [old, new])["d"].uid == "t"
-    # Without any plan nobody knows who was the guest.
+    # Without any plan it is not known which application shared the flight.
     assert claims({}, [old, new])["d"].uid == "g"
 
 
@@ -100,7 +100,7 @@ def test_what_a_guest_leaves_behind_takes_no_drone_from_who_flies_it(left_by: st
     left, flown_by = grant("guest", "g", "2026-01-01T00:00:00Z"), grant("traffic", "t", "2026-01-02T00:00:00Z")
     for grants in ([left, flown_by], [flown_by, left]):
         assert claims(plans, grants)["d"].uid == "t"
-    # Nobody flies by a plan alone where somebody may still be flying by a grant.
+    # A plan alone is no claim where another application may still fly by a grant.
     assert claims(plans, [left])["d"].uid == "g"
 
 
@@ -115,11 +115,11 @@ def test_grants_share_the_areas_they_have_in_common() -> None:
     ring = [{"lat": 0.0, "lon": 0.0}, {"lat": 0.0, "lon": 1.0}, {"lat": 1.0, "lon": 0.0}]
     area = [{"polygon": {"exterior": ring}}]
     spec = grant("a", "a", "2026-01-01T00:00:00Z").spec.to_dict()
-    makes = PartPool(parts=2)
-    read = [makes.grant(manifest("Grant", name, {**spec, "operationArea": area, "corridor": area})) for name in "ab"]
+    pool = PartPool(parts=2)
+    read = [pool.grant(manifest("Grant", name, {**spec, "operationArea": area, "corridor": area})) for name in "ab"]
     first, second = (found.spec for found in read if found is not None)
     assert first.operation_area is first.corridor is second.operation_area is second.corridor
-    assert makes.grant(manifest("Grant", "odd", {"node": 1})) is None
+    assert pool.grant(manifest("Grant", "odd", {"node": 1})) is None
 
 
 # -- bookings --

@@ -20,7 +20,7 @@ THEIRS = {"manager": "kube-controller-manager", "operation": "Update", "fieldsV1
 
 
 class Server:
-    """Answers with one object; refuses so many patches as made on an older one."""
+    """Answers with one object; refuses the first patches as made on an older one."""
 
     def __init__(self, *entries: Body, there: bool = True, refusals: int = 0) -> None:
         self.metadata: Body = {"name": KEY[1], "namespace": KEY[0], "uid": "u1", "resourceVersion": "7"}

@@ -1,0 +1,71 @@
+"""Which plan the operator deploys: the one in force while it fits, and no other without need."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.planning import Infeasible, Inventory, Settings
+from fractus_operator.reconcile.replanning import Choice, choose_plan
+from test_planning import PATH, STORE, VIEWER, application, drone, host, inventory, navigator
+
+APPLICATION = application(navigator(PATH), VIEWER | {"egress": ["DataStore"]}, STORE)
+TWO = inventory([drone("one"), drone("two", battery=0.9)])
+STUCK: dict[str, str] = {}
+
+
+def choose(
+    previous: DeploymentPlanSpec | None,
+    stock: Inventory,
+    *,
+    stuck: dict[str, str] = STUCK,
+    in_flight: str | None = None,
+) -> Choice:
+    settings = replace(Settings(), excluded=stuck)
+    return choose_plan(APPLICATION, previous, stock, settings, stuck=stuck, in_flight=in_flight)
+
+
+@pytest.fixture
+def plan() -> DeploymentPlanSpec:
+    first = choose(None, TWO)
+    assert first.reason == "NoPlanYet"
+    assert first.plan.drone is not None
+    assert first.plan.drone.node == "one"
+    return first.plan
+
+
+def without(name: str) -> Inventory:
+    hosts = {other: found for other, found in TWO.hosts.items() if other != name}
+    drones = {other: found for other, found in TWO.drones.items() if other != name}
+    return inventory(drones.values(), hosts=hosts.values())
+
+
+def test_a_plan_that_fits_is_kept(plan: DeploymentPlanSpec) -> None:
+    assert choose(plan, TWO) == Choice(plan, fits=True)
+
+
+def test_a_drone_that_is_gone_is_replaced_unless_it_flies(plan: DeploymentPlanSpec) -> None:
+    replaced = choose(plan, without("one"))
+    assert replaced.reason == "NodeGone"
+    assert replaced.plan.drone is not None
+    assert replaced.plan.drone.node == "two"
+    assert choose(plan, without("one"), in_flight="one").plan is plan
+
+
+def test_a_cordoned_node_is_left_only_for_another(plan: DeploymentPlanSpec) -> None:
+    cordoned = host("one", "drone", schedulable=False)
+    others = [found for name, found in TWO.hosts.items() if name != "one"]
+    left = choose(plan, inventory(TWO.drones.values(), hosts=[cordoned, *others]))
+    assert left.reason == "NodeCordoned"
+    alone = inventory([drone("one")], hosts=[cordoned, *(h for h in others if h.name != "two")])
+    assert choose(plan, alone) == Choice(plan)
+
+
+def test_a_node_that_the_scheduler_refuses_is_not_chosen_again(plan: DeploymentPlanSpec) -> None:
+    other = choose(plan, TWO, stuck={"one": "no cpu"})
+    assert other.reason == "NodeUnusable"
+    assert other.plan.drone is not None
+    assert other.plan.drone.node == "two"
+    with pytest.raises(Infeasible, match="no cpu"):
+        choose(plan, TWO, stuck={"one": "no cpu", "two": "no cpu"})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from datetime import datetime
-from typing import Any
 
 from fractus_core.api import Condition, InvalidObject, Policy, Zone
 from fractus_core.validation import check_policy, check_zone
@@ -14,6 +13,7 @@ from fractus_operator.cluster.reading import Unreadable
 from fractus_operator.cluster.store import Conflict, NotFound, Store
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile.conditions import ConditionUpdate, merge
+from fractus_operator.reconcile.reporting import record_events
 
 
 class Readiness:
@@ -81,18 +81,8 @@ class Readiness:
             await self._store.apply(kind, body, subresource="status")
         except (Conflict, NotFound):
             return
-        for item in transitions:
-            if item.warning:
-                await self._warn(kind, resource, item, now)
-
-    async def _warn(
-        self, kind: Kind, resource: Zone | Policy | Unreadable, update: ConditionUpdate, now: datetime
-    ) -> None:
-        regarding: dict[str, Any] = kind.header(resource.name, uid=resource.metadata.uid)
-        name = f"{resource.name}.{int(now.timestamp() * 1000):x}"
-        await self._store.record_event(
-            regarding, reason=update.reason, message=update.message, warning=True, name=name, now=now
-        )
+        regarding = kind.header(resource.name, uid=resource.metadata.uid)
+        await record_events(self._store, regarding, (update for update in transitions if update.warning), now)
 
 
 def _conditions(resource: Zone | Policy | Unreadable) -> tuple[Condition, ...]:

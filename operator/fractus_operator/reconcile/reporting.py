@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import datetime
 
 from fractus_core.api import Condition
@@ -64,27 +64,25 @@ class StatusReporter:
             return
         self._applications.note(key_of(applied), applied)
         self._written[submitted.key] = (submitted.uid, status)
-        await self._announce(submitted, transitions, now)
+        await record_events(self._store, submitted.body, _announced(transitions), now)
 
-    async def _announce(self, submitted: Submitted, transitions: Sequence[ConditionUpdate], now: datetime) -> None:
-        name = submitted.key[1]
-        for update in _announced(transitions):
-            try:
-                await self._store.record_event(
-                    submitted.body,
-                    reason=update.reason,
-                    message=update.message,
-                    warning=update.warning,
-                    name=f"{name}.{int(now.timestamp()):x}.{update.reason.lower()}",
-                    now=now,
-                )
-            except KubeError as error:
-                logger.warning(
-                    "reporting: Event not written (application=%s/%s reason=%s): %s",
-                    *submitted.key,
-                    update.reason,
-                    error,
-                )
+
+async def record_events(store: Store, regarding: Body, updates: Iterable[ConditionUpdate], now: datetime) -> None:
+    """Post an Event about an object for each update; one that is refused is logged, for the conditions say the same."""
+    namespace, name = key_of(regarding)
+    for update in updates:
+        try:
+            await store.record_event(
+                regarding,
+                reason=update.reason,
+                message=update.message,
+                warning=update.warning,
+                name=f"{name}.{int(now.timestamp()):x}.{update.reason.lower()}",
+                now=now,
+            )
+        except KubeError as error:
+            where = (regarding["kind"], namespace, name, update.reason)
+            logger.warning("reporting: Event not written (kind=%s namespace=%s name=%s reason=%s): %s", *where, error)
 
 
 def _announced(transitions: Sequence[ConditionUpdate]) -> Iterator[ConditionUpdate]:

@@ -12,54 +12,28 @@ import click
 from fractus_services.launch import DIRECTORY, FILE, address, until_signalled
 from fractus_services.options import CameraOptions, MobilityOptions
 
+_DESCRIPTION = click.Path(path_type=Path)
+_COUNT = click.IntRange(min=1)
+_SECONDS = click.FloatRange(min=0)
+
+
+def _option(
+    name: str, default: object, text: str, kind: click.ParamType[Any] | None = None, **more: Any
+) -> Callable[[Any], Any]:
+    return click.option(name, type=kind, default=default, show_default=True, help=text, **more)
+
 
 def _service_options(service: str, port: int, kinds: str, state: str) -> Callable[[Any], Any]:
     """The options that both services take."""
     options = (
-        click.option(
-            "--grants",
-            type=DIRECTORY,
-            default="/var/lib/fractus/grants",
-            show_default=True,
-            help="Directory of Grant manifests (JSON).",
-        ),
-        click.option(
-            "--tls",
-            type=DIRECTORY,
-            default="/var/lib/fractus/tls",
-            show_default=True,
-            help="Directory of tls.crt, tls.key and ca.crt.",
-        ),
-        click.option(
-            "--state",
-            type=DIRECTORY,
-            default=f"/var/lib/fractus/{service}",
-            show_default=True,
-            help=f"Directory of {state}.",
-        ),
-        click.option(
-            "--audit",
-            type=FILE,
-            default=f"/var/lib/fractus/audit/{service}.jsonl",
-            show_default=True,
-            help="Audit log.",
-        ),
+        _option("--grants", "/var/lib/fractus/grants", "Directory of Grant manifests (JSON).", DIRECTORY),
+        _option("--tls", "/var/lib/fractus/tls", "Directory of tls.crt, tls.key and ca.crt.", DIRECTORY),
+        _option("--state", f"/var/lib/fractus/{service}", f"Directory of {state}.", DIRECTORY),
+        _option("--audit", f"/var/lib/fractus/audit/{service}.jsonl", "Audit log.", FILE),
+        _option("--description", "/etc/fractus/node.yaml", f"{kinds} manifest of this node.", _DESCRIPTION),
+        _option("--listen", f"[::]:{port}", "Address of the gRPC server.", callback=address),
         click.option(
             "--node", envvar="FRACTUS_NODE", help="Name of this node; by default the description's, else the host's."
-        ),
-        click.option(
-            "--description",
-            type=click.Path(path_type=Path),
-            default="/etc/fractus/node.yaml",
-            show_default=True,
-            help=f"{kinds} manifest of this node.",
-        ),
-        click.option(
-            "--listen",
-            callback=address,
-            default=f"[::]:{port}",
-            show_default=True,
-            help="Address of the gRPC server.",
         ),
     )
 
@@ -80,26 +54,15 @@ def mobility() -> None:
 @_service_options("mobility", 50051, "Optional: Drone", "what survives a restart")
 @click.option(
     "--autopilot",
-    help="Link to the autopilot: tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD; by default the description's, else tcp:127.0.0.1:5760.",
+    help="Link to the autopilot: tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD; by default the"
+    " description's, else tcp:127.0.0.1:5760.",
 )
-@click.option(
-    "--driver-grace",
-    type=click.FloatRange(min=0),
-    default=15.0,
-    show_default=True,
-    help="Seconds a lost driver may take to come back.",
-)
-@click.option(
-    "--boarding",
-    type=click.FloatRange(min=0),
-    default=60.0,
-    show_default=True,
-    help="Seconds a drone without a driver waits for the first call of its passengers.",
-)
+@_option("--driver-grace", 15.0, "Seconds that a lost driver may take to come back.", _SECONDS)
+@_option("--boarding", 60.0, "Seconds a drone without a driver waits for the first call of its passengers.", _SECONDS)
 @click.option(
     "--flat-terrain",
     is_flag=True,
-    help="Take the ground everywhere for as high as home; otherwise limits above terrain refuse.",
+    help="Assume that the ground is level with home everywhere; otherwise limits above terrain refuse.",
 )
 @click.option("--verbose", "-v", is_flag=True, help="Log more.")
 def serve_mobility(verbose: bool, **given: Any) -> None:
@@ -116,49 +79,32 @@ def camera() -> None:
 
 @camera.command("serve")
 @_service_options("camera", 50052, "Drone or EdgeNode", "the pictures")
-@click.option(
-    "--mobility", default="127.0.0.1:50051", show_default=True, help="Mobility service that tells a drone's position."
-)
-@click.option(
-    "--keep",
-    type=click.IntRange(min=1),
-    default=200,
-    show_default=True,
-    help="Pictures kept for each component instance.",
-)
-@click.option(
-    "--keep-mb",
-    type=click.IntRange(min=1),
-    default=200,
-    show_default=True,
-    help="Megabytes of pictures kept for each component instance.",
-)
-@click.option(
+@_option("--mobility", "127.0.0.1:50051", "Mobility service that reports a drone's position.")
+@_option("--keep", 200, "Pictures kept for each component instance.", _COUNT)
+@_option("--keep-mb", 200, "Megabytes of pictures kept for each component instance.", _COUNT)
+@_option(
     "--keep-total-mb",
-    type=click.IntRange(min=1),
-    default=2000,
-    show_default=True,
-    help="Megabytes of pictures kept altogether; those of components that are gone make room.",
+    2000,
+    "Megabytes of pictures kept altogether; those of components that are gone are removed first.",
+    _COUNT,
 )
 @click.option(
     "--camera",
     help="Where pictures come from: http://HOST/snapshot.jpg, v4l2:/dev/video0, picamera2:0, directory:/PATH or test:;"
-    " by default what the description says.",
+    " by default the description's.",
 )
 @click.option("--face-model", type=FILE, help="Face detector (YuNet, ONNX) to use instead of OpenCV's cascades.")
-@click.option(
+@_option(
     "--face-px",
-    type=click.FloatRange(min=12, max=1000),
-    default=48,
-    show_default=True,
-    help="Width in pixels from which on faces are found reliably; where they may be smaller, a policy's fallback applies.",
+    48,
+    "Width in pixels from which on faces are found reliably; where they may be smaller, a policy's fallback applies.",
+    click.FloatRange(min=12, max=1000),
 )
-@click.option(
+@_option(
     "--relief",
-    type=click.FloatRange(min=0, max=5000),
-    default=0.0,
-    show_default=True,
-    help="How many metres the ground around may lie below home; pictures are judged by what they may show of it.",
+    0.0,
+    "How many metres the ground around may lie below home; pictures are judged by what they may show of it.",
+    click.FloatRange(min=0, max=5000),
 )
 def serve_camera(**given: Any) -> None:
     """Serve until stopped; waits for certificates."""

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import grpc
-import yaml
-from fractus_core.api.model import InvalidObject
+from fractus_core.api.descriptions import InvalidDescription, parse_description
 from fractus_core.api.nodes import Drone, EdgeNode
 
 from fractus_services.auth import KEEPALIVE, TlsFiles
@@ -28,25 +27,16 @@ def read_description(path: Path, *kinds: type[Drone | EdgeNode]) -> Drone | Edge
         CannotServe: the file is not a valid manifest of one of these kinds.
     """
     try:
-        body: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+        description = parse_description(path.read_text(encoding="utf-8"), *kinds)
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
-        body = None
+        description = None
     except (OSError, UnicodeDecodeError) as error:
         raise CannotServe(f"--description {path}: cannot be read: {error}") from None
-    except yaml.YAMLError as error:
-        raise CannotServe(f"--description {path}: is not YAML: {' '.join(str(error).split())}") from None
-    if body is None:
-        log.warning("service: this node has no description, using defaults (file=%s)", path)
-        return None
-    found = body.get("kind") if isinstance(body, dict) else None
-    kind = next((kind for kind in kinds if found == kind.KIND), None)
-    if kind is None:
-        wanted = " or ".join(kind.KIND for kind in kinds)
-        raise CannotServe(f"--description {path}: must hold one manifest of kind {wanted}")
-    try:
-        return kind.from_body(body)
-    except InvalidObject as error:
+    except InvalidDescription as error:
         raise CannotServe(f"--description {path}: {error}") from None
+    if description is None:
+        log.warning("service: this node has no description, using defaults (file=%s)", path)
+    return description
 
 
 async def serve_grpc(name: str, listen: str, tls: TlsFiles, register: Callable[[grpc.aio.Server], None]) -> None:

@@ -9,11 +9,11 @@ import yaml
 from fractus_agent.cluster.store import Invalid
 from fractus_agent.registration.registration import (
     HASH_ANNOTATION,
-    InvalidDescription,
     Registration,
     description_hash,
-    parse_description,
+    own_description,
 )
+from fractus_core.api.descriptions import InvalidDescription
 
 MANIFEST: dict[str, Any] = {
     "apiVersion": "fractus.dev/v1alpha1",
@@ -204,11 +204,11 @@ async def test_a_description_of_the_other_class_is_refused(path: Path) -> None:
 )
 def test_bad_descriptions(text: str, says: str) -> None:
     with pytest.raises(InvalidDescription, match=says):
-        parse_description(text, "drone-1")
+        own_description(text, "drone-1")
 
 
 def test_hash_is_of_what_is_said() -> None:
-    first = parse_description(yaml.safe_dump(MANIFEST), "drone-1")
-    again = parse_description("# x\n" + yaml.safe_dump(MANIFEST, sort_keys=False, default_flow_style=True), "drone-1")
-    other = parse_description(edited(depot="x"), "drone-1")
+    first = own_description(yaml.safe_dump(MANIFEST), "drone-1")
+    again = own_description("# x\n" + yaml.safe_dump(MANIFEST, sort_keys=False, default_flow_style=True), "drone-1")
+    other = own_description(edited(depot="x"), "drone-1")
     assert description_hash(first) == description_hash(again) != description_hash(other)

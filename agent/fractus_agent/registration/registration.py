@@ -9,7 +9,7 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 
-import yaml
+from fractus_core.api.descriptions import InvalidDescription, parse_description
 from fractus_core.api.model import GROUP, InvalidObject
 from fractus_core.api.nodes import Drone, EdgeNode
 
@@ -29,27 +29,15 @@ _KINDS: dict[str, type[Drone] | type[EdgeNode]] = {"Drone": Drone, "EdgeNode": E
 _KIND_OF_CLASS = {"drone": "Drone", "edge": "EdgeNode"}
 
 
-class InvalidDescription(Exception):
-    """The description on the node cannot be used; the message says what to fix."""
-
-
-def parse_description(text: str, node: str) -> Drone | EdgeNode:
+def own_description(text: str, node: str) -> Drone | EdgeNode:
     """The Drone or EdgeNode that a manifest describes.
 
     Raises:
         InvalidDescription: it is not one, or another node's.
     """
-    try:
-        body = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise InvalidDescription(f"is not YAML: {error}") from error
-    kind = _KINDS.get(body.get("kind", "")) if isinstance(body, dict) else None
-    if kind is None:
-        raise InvalidDescription("kind: must be Drone or EdgeNode")
-    try:
-        described = kind.from_body(body)
-    except InvalidObject as error:
-        raise InvalidDescription(str(error)) from error
+    described = parse_description(text, Drone, EdgeNode)
+    if described is None:
+        raise InvalidDescription("is empty; put this node's Drone or EdgeNode manifest there")
     if described.name != node:
         raise InvalidDescription(f"metadata.name: is {described.name}, but this node is {node}")
     return described
@@ -185,7 +173,7 @@ class Registration:
 
     def _description(self) -> Drone | EdgeNode | None:
         try:
-            described = parse_description(self._path.read_text(encoding="utf-8"), self._node)
+            described = own_description(self._path.read_text(encoding="utf-8"), self._node)
         except FileNotFoundError:
             self.described = None
             return None

@@ -92,22 +92,19 @@ class CascadeDetector:
         """See `Detector`."""
         cv2 = opencv()
         self._load()
-        scale = min(_WINDOW_PX / max(smallest_px, _WINDOW_PX), 1.0)
-        gray = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-        if scale < 1:
-            gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        gray, scale = _reduced(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), smallest_px)
         found: list[Box] = []
         for degrees in _PLAIN_UPRIGHT if upright else _PLAIN:
             turned, back = _turned(gray, degrees)
             for cascade in self._frontal if degrees % 90 == 0 else self._frontal[:1]:
-                found += [_place(box, back) for box in _run(cascade, turned, _STEP)]
+                found += [_place(box, back, scale) for box in _run(cascade, turned, _STEP)]
             if degrees % 90 == 0:
-                found += [_place(box, back) for box in self._profiles(turned)]
+                found += [_place(box, back, scale) for box in self._profiles(turned)]
         even = cv2.createCLAHE(3.0, (8, 8)).apply(gray)
         for degrees in _EQUALISED_UPRIGHT if upright else _EQUALISED:
             turned, back = _turned(even, degrees)
-            found += [_place(box, back) for box in _run(self._frontal[0], turned, _STEP)]
-        return [tuple(round(v / scale) for v in box) for box in found]  # type: ignore[misc]
+            found += [_place(box, back, scale) for box in _run(self._frontal[0], turned, _STEP)]
+        return found
 
     def _load(self) -> None:
         if self._profile is not None:
@@ -162,19 +159,25 @@ class ModelDetector:
 
     def find(self, picture: Pixels, smallest_px: float, *, upright: bool) -> list[Box]:
         """See `Detector`."""
-        cv2 = opencv()
-        scale = min(_WINDOW_PX / max(smallest_px, _WINDOW_PX), 1.0)
-        small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else picture
+        small, scale = _reduced(picture, smallest_px)
         found: list[Box] = []
         for degrees in _PLAIN_UPRIGHT if upright else _PLAIN:
             turned, back = _turned(small, degrees)
-            found += [_place(box, back) for box in self._detect(turned)]
-        return [tuple(round(v / scale) for v in box) for box in found]  # type: ignore[misc]
+            found += [_place(box, back, scale) for box in self._detect(turned)]
+        return found
 
     def _detect(self, picture: Pixels) -> list[Box]:
         self._network.setInputSize((picture.shape[1], picture.shape[0]))
         _, faces = self._network.detect(picture)
-        return [] if faces is None else [tuple(int(v) for v in face[:4]) for face in faces]  # type: ignore[misc]
+        return [] if faces is None else [(int(x), int(y), int(w), int(h)) for x, y, w, h in faces[:, :4]]
+
+
+def _reduced(picture: Pixels, smallest_px: float) -> tuple[Pixels, float]:
+    """The picture with its smallest face reduced to `_WINDOW_PX`, and the scale of that."""
+    cv2 = opencv()
+    scale = min(_WINDOW_PX / max(smallest_px, _WINDOW_PX), 1.0)
+    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else picture
+    return small, scale
 
 
 def _turned(picture: npt.NDArray[np.uint8], degrees: int) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float64]]:
@@ -191,9 +194,11 @@ def _turned(picture: npt.NDArray[np.uint8], degrees: int) -> tuple[npt.NDArray[n
     return turned, cv2.invertAffineTransform(matrix)
 
 
-def _place(box: Sequence[int], back: npt.NDArray[np.float64]) -> Box:
-    """The upright box around a box of a turned picture."""
+def _place(box: Sequence[int], back: npt.NDArray[np.float64], scale: float) -> Box:
+    """The upright box, in the original picture, around a box of a reduced and turned one."""
     left, top, width, height = box
     corners = np.array([(x, y, 1.0) for x in (left, left + width) for y in (top, top + height)]) @ back.T
     low, high = corners.min(axis=0), corners.max(axis=0)
-    return int(low[0]), int(low[1]), math.ceil(high[0] - low[0]), math.ceil(high[1] - low[1])
+    upright = (int(low[0]), int(low[1]), math.ceil(high[0] - low[0]), math.ceil(high[1] - low[1]))
+    x, y, w, h = (round(value / scale) for value in upright)
+    return x, y, w, h

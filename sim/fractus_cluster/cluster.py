@@ -2,49 +2,36 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from fractus_kube import BlockingClient, Conflict, KubeError
+from fractus_kube import KubeError
 
 from fractus_cluster import machine, manifests, network
 from fractus_cluster.addressing import Addressing
-from fractus_cluster.apiclient import administrating, answers_ready, wait_ready
-from fractus_cluster.binaries import Binaries, ensure_binaries
-from fractus_cluster.cgroups import Branch, cluster_branch
+from fractus_cluster.apiclient import wait_ready
+from fractus_cluster.binaries import ensure_binaries
+from fractus_cluster.cgroups import cluster_branch
 from fractus_cluster.commands import run
-from fractus_cluster.controlplane import (
-    CONTROL_PLANE_PROGRAMS,
-    DNS_READY_PORT,
-    ControlPlaneFiles,
-    administrator,
-    control_plane_units,
-    let_dns_start,
-    server_url,
-    write_control_plane,
-)
 from fractus_cluster.errors import ClusterError
-from fractus_cluster.images.layout import Image
 from fractus_cluster.images.store import ImageStore
-from fractus_cluster.images.template import has_storage
 from fractus_cluster.locking import locked
-from fractus_cluster.node import Node, init_command
+from fractus_cluster.node import Node
 from fractus_cluster.nodeconfig import shortfalls
-from fractus_cluster.pki import Authority, write_private
+from fractus_cluster.pki import Authority
 from fractus_cluster.prerequisites import check_prerequisites, check_root
 from fractus_cluster.prerequisites import machine as describe_machine
-from fractus_cluster.processes import kill, read_record, spawn, write_record
+from fractus_cluster.processes import running
 from fractus_cluster.spec import ClusterSpec, load_spec
+from fractus_cluster.startup import CONTROL_PLANE, Startup
 from fractus_cluster.state import Memory, StateDirectory, only_cluster, state_of
 
 _LOCK_TIMEOUT_S = 300.0
@@ -54,12 +41,6 @@ _DNS_TIMEOUT_S = 90.0
 _POLL_S = 0.1
 _CONFLICTS = 5
 _CONTROL_PLANE = "control-plane"
-_ENVIRONMENT = {
-    "PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
-    "HOME": "/root",
-    "LANG": "C.UTF-8",
-}
-
 Report = Callable[[str], None]
 
 
@@ -212,24 +193,24 @@ class Cluster:
         with self._locked():
             memory = self._claim()
             self._state.write_spec(self.spec)
-            authority = Authority(self._state.pki)
-            self._start_control_plane(binaries, authority, memory)
+            startup = self._startup(memory)
+            startup.start_control_plane(binaries)
             nodes = self.nodes
             store = ImageStore.default(report=self._report)
             wanted = store.fetch(images)
-            self._place_nodes(nodes, binaries, authority, store, wanted)
-            with self._api(authority, memory) as api:
+            startup.place_nodes(nodes, binaries, store, wanted)
+            with startup.api() as api:
                 wait_ready(api, _API_TIMEOUT_S)
-                self._apply_objects(api, nodes, memory)
-                let_dns_start(self._wiring(memory).addressing, self._files())
+                startup.apply_objects(api, nodes)
+                startup.let_dns_start()
                 since = datetime.now(UTC).replace(microsecond=0)
                 started_nodes = {node.name for node in nodes if node.power_on()}
                 for node in nodes:
                     node.start_hardware()
-                self._write_kubeconfig(authority, memory)
-                self._wait_nodes(api, [(node, since if node.name in started_nodes else None) for node in nodes])
-            self._wait_dns(memory)
-            self._check_hardware(nodes)
+                startup.write_kubeconfig()
+                startup.wait_nodes(api, [(node, since if node.name in started_nodes else None) for node in nodes])
+            startup.wait_dns()
+            startup.check_hardware(nodes)
             store.deliver(wanted, nodes)
         self._report(f"cluster {self.name} is up: {len(nodes)} nodes, {time.monotonic() - started:.1f} s")
 
@@ -286,8 +267,7 @@ class Cluster:
     @property
     def running(self) -> bool:
         """Whether the control plane's programs run."""
-        record = read_record(self._state.process(_CONTROL_PLANE))
-        return record is not None and record.alive
+        return running(self._state.process(CONTROL_PLANE)) is not None
 
     def load_images(self, images: Sequence[str]) -> dict[str, int]:
         """Deliver images to all nodes that are on.
@@ -334,8 +314,8 @@ class Cluster:
     def _wiring(self, memory: Memory) -> network.Wiring:
         return network.Wiring(self.name, Addressing(memory.block), self._state.marks)
 
-    def _branch(self) -> Branch:
-        return cluster_branch(self.name)
+    def _startup(self, memory: Memory) -> Startup:
+        return Startup(self.name, self._state, self._wiring(memory), Authority(self._state.pki))
 
     def _claim(self) -> Memory:
         """Claim addresses, and remove the nodes that the description has no more."""
@@ -349,124 +329,15 @@ class Cluster:
             for spec in gone:
                 self._report(f"removing node {spec.name}")
                 index = remembered.indexes[spec.name]
-                Node(spec, index, self._wiring(remembered), self._state, self._branch()).remove()
+                Node(spec, index, self._wiring(remembered), self._state, cluster_branch(self.name)).remove()
         if memory != remembered:
             self._state.write_memory(memory)
         return memory
 
-    def _files(self) -> ControlPlaneFiles:
-        return ControlPlaneFiles(self._state.control_plane, self._state.logs / _CONTROL_PLANE)
-
-    def _start_control_plane(self, binaries: Binaries, authority: Authority, memory: Memory) -> None:
-        wiring, files = self._wiring(memory), self._files()
-        network.wire_control_plane(wiring)
-        units = control_plane_units(binaries, authority, wiring.addressing, files)
-        view: dict[str, object] = {"hostname": None, "files": "", "logs": "", "programs": {}, "sysctls": {}}
-        config = json.dumps(
-            {"view": view, "units": units, "builds": binaries.builds(*CONTROL_PLANE_PROGRAMS)}, indent=1
-        )
-        path = files.directory / "init.json"
-        if self.running and path.exists() and path.read_text() == config:
-            return
-        self._stop_control_plane()
-        files.directory.mkdir(parents=True, exist_ok=True)
-        write_control_plane(authority, wiring.addressing, files, cluster=self.name)
-        write_private(path, config)
-        record = spawn(
-            init_command(path, wiring.namespace_path()),
-            log=files.logs / "init.log",
-            cgroup_files=self._branch().below(_CONTROL_PLANE).create(),
-            env=_ENVIRONMENT,
-        )
-        write_record(self._state.process(_CONTROL_PLANE), record)
-
-    def _stop_control_plane(self) -> None:
-        record = read_record(self._state.process(_CONTROL_PLANE))
-        if record is not None:
-            kill(record)
-        self._branch().below(_CONTROL_PLANE).kill_all()
-
-    def _place_nodes(
-        self, nodes: list[Node], binaries: Binaries, authority: Authority, store: ImageStore, images: Sequence[Image]
-    ) -> None:
-        """Wire the nodes and write their files; new ones get their images on disk before they ever start."""
-        for node in nodes:
-            network.wire_node(node.wiring, node.name, node.index)
-            node.write_files(node.files(binaries, authority))
-        fresh = [node for node in nodes if not has_storage(node)]
-        if fresh:
-            template = store.template(images, binaries["pause"])
-            with ThreadPoolExecutor(max_workers=2) as pool:
-                list(pool.map(template.furnish, fresh))
-
-    def _api(self, authority: Authority, memory: Memory) -> AbstractContextManager[BlockingClient]:
-        server = server_url(Addressing(memory.block))
-        return administrating(server, authority.credential.certificate, administrator(authority))
-
-    def _apply_objects(self, api: BlockingClient, nodes: list[Node], memory: Memory) -> None:
-        place = Addressing(memory.block)
-        names = {node.name for node in nodes}
-        for present in api.list("/api/v1/nodes"):
-            name = present["metadata"]["name"]
-            if name not in names and "fractus-sim" in str(present["metadata"].get("managedFields")):
-                api.call("DELETE", f"/api/v1/nodes/{name}")
-        for node in nodes:
-            # Before its kubelet starts, so that no pod is there before labels and taints are.
-            _apply_node(api, node, place)
-        for path, body in manifests.dns_objects(place.control_plane):
-            api.apply(path, body)
-
-    def _write_kubeconfig(self, authority: Authority, memory: Memory) -> None:
-        text = authority.kubeconfig(
-            administrator(authority), server=server_url(Addressing(memory.block)), cluster=f"fractus-{self.name}"
-        )
-        if not self.kubeconfig.exists() or self.kubeconfig.read_text() != text:
-            write_private(self.kubeconfig, text)
-
-    def _wait_nodes(self, api: BlockingClient, nodes: Sequence[tuple[Node, datetime | None]]) -> None:
-        """Wait until every node is Ready, by its word since the given time, and offers its extended resources."""
-        deadline = time.monotonic() + _READY_TIMEOUT_S
-        waiting = {node.name: (node, since) for node, since in nodes}
-        while True:
-            for item in api.list("/api/v1/nodes"):
-                name = item["metadata"]["name"]
-                if name in waiting and manifests.is_ready(item, since=waiting[name][1]):
-                    patch = manifests.extended_resources_patch(waiting[name][0].spec, item)
-                    if patch:
-                        api.merge(*patch)
-                    else:
-                        del waiting[name]
-            if not waiting:
-                return
-            for node, _ in waiting.values():
-                if not node.powered:
-                    raise ClusterError(f"node {node.name} did not start; see {self.logs / node.name / 'init.log'}")
-            if time.monotonic() > deadline:
-                names = ", ".join(waiting)
-                raise ClusterError(f"not Ready within {_READY_TIMEOUT_S:.0f} s: {names}; see the logs in {self.logs}")
-            time.sleep(_POLL_S)
-
-    def _check_hardware(self, nodes: Sequence[Node]) -> None:
-        for node in nodes:
-            for name, runs in (("vehicle", node.vehicle_running), ("camera", node.camera_running)):
-                if runs is False:
-                    log = self.logs / node.name / f"{name}.log"
-                    last = log.read_text(errors="replace").splitlines()[-1:] if log.exists() else []
-                    raise ClusterError(f"the {name} of node {node.name} ended at once: {' '.join(last)} (see {log})")
-
-    def _wait_dns(self, memory: Memory) -> None:
-        address = str(Addressing(memory.block).control_plane)
-        deadline = time.monotonic() + _DNS_TIMEOUT_S
-        while not answers_ready(address, DNS_READY_PORT):
-            if time.monotonic() > deadline:
-                log = self.logs / _CONTROL_PLANE / "coredns.log"
-                raise ClusterError(f"the cluster's DNS was not ready within {_DNS_TIMEOUT_S:.0f} s; see {log}")
-            time.sleep(_POLL_S)
-
     def _ready_nodes(self, memory: Memory) -> dict[str, bool] | None:
         if not self.running:
             return None
-        with self._api(Authority(self._state.pki), memory) as api:
+        with self._startup(memory).api() as api:
             try:
                 items = api.list("/api/v1/nodes")
             except KubeError as error:
@@ -474,20 +345,6 @@ class Cluster:
                     raise
                 return None
         return {item["metadata"]["name"]: manifests.is_ready(item) for item in items}
-
-
-def _apply_node(api: BlockingClient, node: Node, place: Addressing) -> None:
-    for tries_left in reversed(range(_CONFLICTS)):
-        present = api.apply(*manifests.node_object(node.spec, node.index, place))
-        patch = manifests.taints_patch(node.spec, present)
-        if patch is None:
-            return
-        try:
-            api.merge(*patch)
-        except Conflict:
-            # The node controller has set a taint of its own meanwhile.
-            if not tries_left:
-                raise
 
 
 def print_report(message: str) -> None:

@@ -23,13 +23,13 @@ from fractus_cluster.errors import ClusterError
 from fractus_cluster.hardware import hardware_commands, hardware_environment
 from fractus_cluster.pki import Authority, write_private
 from fractus_cluster.prerequisites import machine, plugin_directory
-from fractus_cluster.processes import kill, read_record, spawn, write_record
+from fractus_cluster.processes import kill_recorded, running, spawn, write_record
 from fractus_cluster.spec import NodeSpec, Place
 from fractus_cluster.state import StateDirectory
 
 _PROGRAMS = ("kubelet", "kube-proxy")
 _FOLDERS = ("etc", "etc-work", "var-lib", "var-log", "config")
-_ENVIRONMENT = {
+ENVIRONMENT = {
     "PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
     "HOME": "/root",
     "LANG": "C.UTF-8",
@@ -46,7 +46,7 @@ def init_command(config: Path, namespace: Path) -> list[str]:
         f"--net={namespace}",
         "unshare",
         *("--mount", "--uts", "--ipc", "--pid", "--fork", "--kill-child", "--mount-proc"),
-        *(sys.executable, "-E", "-s", "-m", "fractus_cluster.nodeinit", str(config)),
+        *(sys.executable, "-E", "-s", "-m", "fractus_cluster.node_init", str(config)),
     ]
 
 
@@ -88,8 +88,7 @@ class Node:
     @property
     def powered(self) -> bool:
         """Whether the node runs."""
-        record = read_record(self.state.process(f"node.{self.name}"))
-        return record is not None and record.alive
+        return running(self.state.process(f"node.{self.name}")) is not None
 
     @property
     def vehicle_running(self) -> bool | None:
@@ -102,8 +101,7 @@ class Node:
         return None if self.spec.hardware.camera is None else self._runs("camera")
 
     def _runs(self, hardware: str) -> bool:
-        record = read_record(self.state.process(f"{hardware}.{self.name}"))
-        return record is not None and record.alive
+        return running(self.state.process(f"{hardware}.{self.name}")) is not None
 
     @property
     def _cgroup(self) -> Branch:
@@ -119,8 +117,8 @@ class Node:
         Raises:
             ClusterError: The node is off.
         """
-        record = read_record(self.state.process(f"node.{self.name}"))
-        if record is not None and record.alive:
+        record = running(self.state.process(f"node.{self.name}"))
+        if record is not None:
             children = Path(f"/proc/{record.pid}/task/{record.pid}/children").read_text().split()
             if children:
                 return int(children[0])
@@ -143,7 +141,7 @@ class Node:
         Raises:
             ClusterError: The node is off, or the program failed (with `check`) or took too long.
         """
-        return run(self.exec_command(argv), input_text=input_text, timeout_s=timeout_s, check=check, env=_ENVIRONMENT)
+        return run(self.exec_command(argv), input_text=input_text, timeout_s=timeout_s, check=check, env=ENVIRONMENT)
 
     def cut_link(self) -> None:
         """Cut the node's uplink; the node goes on without the rest of the cluster."""
@@ -156,9 +154,7 @@ class Node:
     def power_off(self) -> None:
         """Pull the node's power: all its processes die at once, its vehicle does not."""
         record_path = self.state.process(f"node.{self.name}")
-        record = read_record(record_path)
-        if record is not None:
-            kill(record)
+        kill_recorded(record_path)
         self._cgroup.kill_all()
         record_path.unlink(missing_ok=True)
         # Groups of pods that are no more would make the next kubelet slow.
@@ -178,7 +174,7 @@ class Node:
             init_command(self.directory / "config" / "init.json", self.wiring.namespace_path(self.name)),
             log=self.state.logs / self.name / "init.log",
             cgroup_files=self._cgroup.create(),
-            env=_ENVIRONMENT,
+            env=ENVIRONMENT,
         )
         write_record(self.state.process(f"node.{self.name}"), record)
         return True
@@ -204,9 +200,7 @@ class Node:
         """Take the node's vehicle and camera away."""
         for name in ("vehicle", "camera"):
             path = self.state.process(f"{name}.{self.name}")
-            record = read_record(path)
-            if record is not None:
-                kill(record)
+            kill_recorded(path)
             path.unlink(missing_ok=True)
         self._hardware_cgroup.kill_all()
         self._hardware_cgroup.remove()

@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from fractus_cluster.addressing import DNS_SERVICE, Addressing
-from fractus_cluster.nodeinit import RUN
+from fractus_cluster.node_init import RUN
 from fractus_cluster.spec import NodeSpec, parse_quantity
 
 SANDBOX_IMAGE = "localhost/fractus/pause:1"

@@ -152,3 +152,20 @@ def read_record(path: Path) -> ProcessRecord | None:
         return ProcessRecord(**json.loads(path.read_text()))
     except (FileNotFoundError, json.JSONDecodeError, TypeError):
         return None
+
+
+def running(path: Path) -> ProcessRecord | None:
+    """Read the record of a process that still runs; None when it does not."""
+    record = read_record(path)
+    return record if record is not None and record.alive else None
+
+
+def kill_recorded(path: Path) -> None:
+    """Kill the process of a stored record, if there is one.
+
+    Raises:
+        ClusterError: It does not end.
+    """
+    record = read_record(path)
+    if record is not None:
+        kill(record)

@@ -1,4 +1,4 @@
-"""Experiments played: what they find, what they leave, and that two runs of one seed are the same to the byte."""
+"""Experiments: what they find, what they leave, and that two runs of one seed are the same to the byte."""
 
 from __future__ import annotations
 

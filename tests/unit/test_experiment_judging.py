@@ -10,7 +10,7 @@ from fractus_sim.experiment import parse
 from fractus_sim.experiment.detections import Score, Seen, read_detections, score
 from fractus_sim.experiment.injection import Occurrence
 from fractus_sim.experiment.judging import Evidence, judge
-from fractus_sim.experiment.logbook import Flight, Text
+from fractus_sim.experiment.recording import Flight, Text
 from fractus_sim.report.track import Place, Sample
 from fractus_vehicle import earth
 

@@ -7,6 +7,7 @@ assert outcome.holds
 
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.model import Experiment, load, parse
-from fractus_sim.experiment.runner import Outcome, Progress, run
+from fractus_sim.experiment.outcome import Outcome
+from fractus_sim.experiment.runner import Progress, run
 
 __all__ = ["Experiment", "ExperimentError", "Outcome", "Progress", "load", "parse", "run"]

@@ -1,4 +1,4 @@
-"""`fractus experiment`: play experiments, and print what their files may say."""
+"""`fractus experiment`: run experiments, and print what their files may say."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from rich.table import Table
 
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.model import Experiment, load, parse
-from fractus_sim.experiment.runner import Outcome, Progress, run
+from fractus_sim.experiment.outcome import Outcome
+from fractus_sim.experiment.runner import Progress, run
 from fractus_sim.interruption import break_off_on_signals
 
 _FAILED = 2
@@ -23,7 +24,7 @@ _BAD_INPUT = 1
 
 @click.group()
 def experiment() -> None:
-    """Play experiments: vehicles, services or a whole cluster, faults in time, checks, and a report."""
+    """Run experiments: vehicles, services or a whole cluster, faults in time, checks, and a report."""
 
 
 @experiment.command(name="run")
@@ -33,7 +34,7 @@ def experiment() -> None:
 @click.option("--speedup", type=click.FloatRange(0, 100), help="Another pace than the file's; 0: lockstep.")
 @click.option("--quiet", is_flag=True, help="Say only what came of the checks.")
 def run_(file: Path, out: Path | None, seed: int | None, speedup: float | None, quiet: bool) -> None:
-    """Play the experiment in FILE; exit code 0 if all checks hold, 2 if one failed, 1 for bad input."""
+    """Run the experiment in FILE; exit code 0 if all checks hold, 2 if one failed, 1 for bad input."""
     console = Console(highlight=False)
     break_off_on_signals()
     try:
@@ -57,7 +58,7 @@ def run_(file: Path, out: Path | None, seed: int | None, speedup: float | None, 
 @experiment.command()
 @click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
 def check(file: Path) -> None:
-    """Check FILE without playing it."""
+    """Check FILE without running it."""
     try:
         found = load(file)
     except InvalidObject as error:
@@ -106,5 +107,5 @@ def _tell_outcome(console: Console, outcome: Outcome) -> None:
     if outcome.verdicts:
         console.print(shown)
     if outcome.problem:
-        console.print(f"[red]not played to its end:[/red] {escape(outcome.problem)}", soft_wrap=True)
+        console.print(f"[red]did not run to its end:[/red] {escape(outcome.problem)}", soft_wrap=True)
     console.print(f"report: {outcome.folder}/summary.md", soft_wrap=True)

@@ -23,8 +23,8 @@ from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.linktap import LinkTap
 from fractus_sim.experiment.model import ClusterPart, Experiment, VehicleSetup
 from fractus_sim.experiment.netns import connect_in, listen_in
-from fractus_sim.experiment.stage import Moment, Stage
 from fractus_sim.experiment.station import OBSERVER_ID, Station, TcpLink
+from fractus_sim.experiment.testbed import Moment, Testbed
 from fractus_sim.experiment.tlog import TlogWriter
 from fractus_sim.interruption import uninterrupted
 
@@ -40,7 +40,7 @@ MAX_NAME = 30
 AUDIT_LOGS = ("mobility.jsonl", "camera.jsonl")
 
 
-class ClusterStage(Stage):
+class ClusterTestbed(Testbed):
     """A cluster of the experiment's own, of its name; taken down at the end unless it ran before."""
 
     def __init__(self, experiment: Experiment, folder: Path, base: Path, tell: Callable[[str], None]) -> None:

@@ -15,7 +15,7 @@ ATTEMPTS = 5
 
 
 class Breaker(Protocol):
-    """What can be cut on a stage besides parameters."""
+    """What can be cut on a testbed besides parameters."""
 
     def cut_link(self, vehicle: str) -> None:
         """Let nothing pass on the vehicle's link of this mode."""

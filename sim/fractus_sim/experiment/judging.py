@@ -17,8 +17,8 @@ from fractus_vehicle.earth import Place
 from fractus_sim.experiment import checks as kinds
 from fractus_sim.experiment.detections import Seen, score
 from fractus_sim.experiment.injection import Occurrence
-from fractus_sim.experiment.logbook import Flight
 from fractus_sim.experiment.model import NamedZone
+from fractus_sim.experiment.recording import Flight
 from fractus_sim.report.track import Sample
 
 MATCH_S = 0.2

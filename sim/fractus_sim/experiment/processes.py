@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from fractus_sim.experiment.errors import ExperimentError
-from fractus_sim.experiment.lifeline import Lifeline
+from fractus_sim.experiment.reaper import Reaper
 from fractus_sim.interruption import uninterrupted
 
 POLL_S = 0.05
@@ -32,7 +32,7 @@ class Processes:
     def __init__(self, logs: Path) -> None:
         self._logs = logs
         self._running: dict[str, subprocess.Popen[bytes]] = {}
-        self._lifeline = Lifeline()
+        self._reaper = Reaper()
 
     def start(self, name: str, argv: Sequence[str], environment: Mapping[str, str], folder: Path | None = None) -> None:
         """Start a process; its output is appended to `NAME.log`.
@@ -58,7 +58,7 @@ class Processes:
                 raise ExperimentError(f"{name}: cannot start {argv[0]}: {error.strerror}") from None
             self._running.pop(name, None)
             self._running[name] = process
-            self._lifeline.hold(process.pid)
+            self._reaper.hold(process.pid)
 
     def log(self, name: str) -> Path:
         """The file with what a process writes."""
@@ -126,20 +126,20 @@ class Processes:
             self._wait_ended(chosen)
 
     def stop_all(self, *stages: Callable[[str], bool]) -> None:
-        """End everything: first all processes that the first stage's predicate names, and so on, then the rest.
+        """End everything: first all processes that the first testbed's predicate names, and so on, then the rest.
 
         Interrupted, it kills what is left and is done at once.
         """
         names = list(reversed(self._running))
         try:
-            for stage in stages:
-                chosen = [name for name in names if stage(name)]
+            for testbed in stages:
+                chosen = [name for name in names if testbed(name)]
                 self.stop(*chosen)
                 names = [name for name in names if name not in chosen]
             self.stop(*names)
         finally:
             self.stop(*self._running, kill=True)
-            self._lifeline.close()
+            self._reaper.close()
 
     def _wait_ended(self, processes: Sequence[subprocess.Popen[bytes]]) -> None:
         deadline = time.monotonic() + GRACE_S
@@ -151,7 +151,7 @@ class Processes:
         if process.returncode is None and _has_ended(process.pid):
             # Not waited for yet, so the number is still its own, as its group's.
             _kill_group(process.pid)
-            self._lifeline.let_go(process.pid)
+            self._reaper.let_go(process.pid)
         return process.poll()
 
 

@@ -7,11 +7,13 @@ import json
 import string
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fractus_core.geo import LocalFrame, geojson, polygon
 
 from fractus_sim.experiment.checks import AltitudeBand, SpeedLimit
+from fractus_sim.experiment.injection import Occurrence
+from fractus_sim.experiment.outcome import Outcome
 from fractus_sim.report.drawing import save
 from fractus_sim.report.flightmap import draw_map
 from fractus_sim.report.geojson import feature, lonlat, path, point
@@ -21,10 +23,6 @@ from fractus_sim.report.profile import Limit, Profile, Span, draw_profile
 from fractus_sim.report.scene import DrawnZone, Mark, Scene
 from fractus_sim.report.summary import judged
 from fractus_sim.report.track import Sample, Track
-
-if TYPE_CHECKING:
-    from fractus_sim.experiment.injection import Occurrence
-    from fractus_sim.experiment.runner import Outcome
 
 _CLOCK_MODES = ("vehicles",)
 _PAGE_EVENTS = 40
@@ -210,9 +208,9 @@ def _sample_at(track: Track, time_s: float) -> Sample | None:
 def _headline(outcome: Outcome) -> str:
     failed = [verdict for verdict in outcome.verdicts if not verdict.holds]
     if outcome.problem:
-        word = f"**Not played to its end: {outcome.problem}.**"
+        word = f"**Did not run to its end: {outcome.problem}.**"
     elif not outcome.verdicts:
-        word = "**Played to its end.** It has no checks."
+        word = "**Ran to its end.** It has no checks."
     elif len(outcome.verdicts) == 1:
         word = "**The check failed.**" if failed else "**The check holds.**"
     elif failed:

@@ -1,4 +1,4 @@
-"""Plays an experiment from its file to its verdicts."""
+"""Runs an experiment from its file to its verdicts."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from pathlib import Path
 
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.flying import TaskFailed, fly
-from fractus_sim.experiment.injection import Injector, Occurrence
+from fractus_sim.experiment.injection import Injector
 from fractus_sim.experiment.judging import Evidence, Verdict, judge
-from fractus_sim.experiment.logbook import Flight, McapLog, Recorder
 from fractus_sim.experiment.model import Experiment, VehicleSetup
-from fractus_sim.experiment.stage import Findings, Moment, Stage
-from fractus_sim.experiment.vehicles import VehicleStage
+from fractus_sim.experiment.outcome import Outcome
+from fractus_sim.experiment.recording import Flight, McapLog, Recorder
+from fractus_sim.experiment.testbed import Moment, Testbed
+from fractus_sim.experiment.vehicles import VehicleTestbed
 from fractus_sim.report.record import Judgement, judgements_of
 
 READY_S = 90.0
@@ -41,42 +42,12 @@ class Progress:
     show: Callable[[str], None] = _silent
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What came of an experiment; seconds of the experiment.
-
-    Attributes:
-        problem: why it could not be played to its end; empty when it could.
-        duration_s: how long it took, in the vehicles' time.
-        wall_s: how long it took here.
-        events: (seconds, vehicle or empty, text) of tasks and faults.
-        judgements: what policies corrected or refused.
-    """
-
-    experiment: Experiment
-    folder: Path
-    flights: dict[str, Flight]
-    occurrences: tuple[Occurrence, ...]
-    verdicts: tuple[Verdict, ...]
-    findings: Findings
-    events: tuple[tuple[float, str, str], ...]
-    judgements: tuple[Judgement, ...]
-    duration_s: float
-    wall_s: float
-    problem: str = ""
-
-    @property
-    def holds(self) -> bool:
-        """Whether it was played to its end and every check holds."""
-        return not self.problem and all(verdict.holds for verdict in self.verdicts)
-
-
 @dataclass
-class _Play:
+class _Session:
     """One run under way."""
 
     experiment: Experiment
-    stage: Stage
+    testbed: Testbed
     flights: dict[str, Flight]
     recorders: dict[str, Recorder]
     log: McapLog
@@ -102,10 +73,10 @@ class _Play:
 
     def poll(self) -> None:
         """Let a little time pass, and take in what vehicles say."""
-        self.moment = self.stage.tick()
-        for station in self.stage.pilots.values():
+        self.moment = self.testbed.tick()
+        for station in self.testbed.pilots.values():
             station.poll(self.now_s, self.moment.unix_us)
-        for name, observer in self.stage.observers.items():
+        for name, observer in self.testbed.observers.items():
             messages = observer.poll(self.now_s, self.moment.unix_us)
             if self.begun:
                 self.recorders[name].take(observer, messages, self.now_s, self.moment.unix_us)
@@ -115,7 +86,7 @@ class _Play:
         for name, task in self.tasks.items():
             if self.flights[name].task:
                 continue
-            state = self.stage.observers[name].state
+            state = self.testbed.observers[name].state
             if state.armed or state.flying or name not in self.injector.takeoffs_s:
                 self.down_since_s.pop(name, None)
             elif self.now_s - self.down_since_s.setdefault(name, self.now_s) > DOWN_S:
@@ -133,12 +104,12 @@ class _Play:
 
     def over(self) -> bool:
         """Whether all is done and has been calm for as long as it should."""
-        states = {name: observer.state for name, observer in self.stage.observers.items()}
+        states = {name: observer.state for name, observer in self.testbed.observers.items()}
         flown = self.injector.takeoffs_s
         waiting = any(not self.flights[name].task for name in self.tasks)
-        idle = self.stage.flies and not any(name in flown for name in self.stage.flies)
+        idle = self.testbed.flies and not any(name in flown for name in self.testbed.flies)
         moving = any(state.armed or state.flying for state in states.values())
-        if waiting or idle or moving or self.stage.busy or self.injector.pending:
+        if waiting or idle or moving or self.testbed.busy or self.injector.pending:
             self.calm_since_s = None
             return False
         self.calm_since_s = self.now_s if self.calm_since_s is None else self.calm_since_s
@@ -146,10 +117,10 @@ class _Play:
 
 
 def run(experiment: Experiment, out: Path, *, base: Path | None = None, progress: Progress | None = None) -> Outcome:
-    """Play an experiment and leave logs, tracks, pictures and report in a folder.
+    """Run an experiment and leave logs, tracks, pictures and report in a folder.
 
     Args:
-        experiment: What to play; `fractus_sim.experiment.model.load` reads a file.
+        experiment: What to run; `fractus_sim.experiment.model.load` reads a file.
         out: The folder; what an earlier run left there is overwritten.
         base: What relative paths in the experiment are relative to; by default the working directory.
         progress: Told what happens.
@@ -166,109 +137,111 @@ def run(experiment: Experiment, out: Path, *, base: Path | None = None, progress
     remove_report(out)
     began_s = time.monotonic()
     with (
-        closing(_stage(experiment, out, base or Path.cwd(), progress)) as stage,
+        closing(_testbed(experiment, out, base or Path.cwd(), progress)) as testbed,
         closing(McapLog(out / "logs" / f"{experiment.name}.mcap")) as log,
     ):
         flights = {setup.name: Flight(setup.name) for setup in experiment.setups()}
-        play = _Play(experiment, stage, flights, {n: Recorder(f, log) for n, f in flights.items()}, log, progress)
-        problem = _play(play)
-    outcome = _outcome(play, out, problem, time.monotonic() - began_s)
+        session = _Session(
+            experiment, testbed, flights, {n: Recorder(f, log) for n, f in flights.items()}, log, progress
+        )
+        problem = _run_session(session)
+    outcome = _outcome(session, out, problem, time.monotonic() - began_s)
     write_outcome(outcome)
     return outcome
 
 
-def _stage(experiment: Experiment, out: Path, base: Path, progress: Progress) -> Stage:
+def _testbed(experiment: Experiment, out: Path, base: Path, progress: Progress) -> Testbed:
     if experiment.mode == "vehicles":
-        return VehicleStage(experiment, out, base, progress.tell)
+        return VehicleTestbed(experiment, out, base, progress.tell)
     if experiment.mode == "standalone":
-        from fractus_sim.experiment.services import ServiceStage  # noqa: PLC0415 - imports most of Fractus
+        from fractus_sim.experiment.services import ServiceTestbed  # noqa: PLC0415 - imports most of Fractus
 
-        return ServiceStage(experiment, out, base, progress.tell)
-    from fractus_sim.experiment.clustered import ClusterStage  # noqa: PLC0415 - imports the embedded cluster
+        return ServiceTestbed(experiment, out, base, progress.tell)
+    from fractus_sim.experiment.clustered import ClusterTestbed  # noqa: PLC0415 - imports the embedded cluster
 
-    return ClusterStage(experiment, out, base, progress.tell)
+    return ClusterTestbed(experiment, out, base, progress.tell)
 
 
-def _play(play: _Play) -> str:
-    """Set up, wait until vehicles are ready, and play; returns why it did not end as it should, or nothing.
+def _run_session(session: _Session) -> str:
+    """Set up, wait until vehicles are ready, and fly; returns why it did not end as it should, or nothing.
 
     Raises:
         ExperimentError: it could not be set up.
     """
-    stage, experiment, progress = play.stage, play.experiment, play.progress
-    stage.set_up()
-    for name, endpoint in stage.endpoints.items():
+    testbed, experiment, progress = session.testbed, session.experiment, session.progress
+    testbed.set_up()
+    for name, endpoint in testbed.endpoints.items():
         progress.tell(f"{name}: QGroundControl, Mission Planner or MAVProxy can attach to {endpoint}")
-    _wait_ready(play)
-    play.start, play.begun = play.moment, True
-    play.injector = Injector(experiment.faults, stage.observers, stage, lambda text: _tell_fault(play, text))
+    _wait_ready(session)
+    session.start, session.begun = session.moment, True
+    session.injector = Injector(experiment.faults, testbed.observers, testbed, lambda text: _tell_fault(session, text))
     for setup in experiment.setups():
         if setup.entry.task:
-            play.tasks[setup.name] = fly(stage.pilots[setup.name], setup.entry.task, _teller(play, setup))
-    play.tell("", "vehicles are ready")
+            session.tasks[setup.name] = fly(testbed.pilots[setup.name], setup.entry.task, _teller(session, setup))
+    session.tell("", "vehicles are ready")
     try:
-        stage.begin()
-        problem = _until_over(play)
+        testbed.begin()
+        problem = _until_over(session)
     except ExperimentError as error:
         problem = str(error)
-        play.tell("", problem)
-    for vehicle, title in play.injector.missed:
-        play.tell(vehicle, f"{title}: it was over before")
-    stage.collect()
+        session.tell("", problem)
+    for vehicle, title in session.injector.missed:
+        session.tell(vehicle, f"{title}: it was over before")
+    testbed.collect()
     return problem
 
 
-def _wait_ready(play: _Play) -> None:
-    slowest_s = max(setup.entry.ready_after for setup in play.experiment.setups())
+def _wait_ready(session: _Session) -> None:
+    slowest_s = max(setup.entry.ready_after for setup in session.experiment.setups())
     deadline_s = READY_S + slowest_s
     while True:
-        play.poll()
-        waiting = [name for name, observer in play.stage.observers.items() if not observer.state.ready]
+        session.poll()
+        waiting = [name for name, observer in session.testbed.observers.items() if not observer.state.ready]
         if not waiting:
             return
-        if play.moment.time_s > deadline_s:
-            texts = play.stage.observers[waiting[0]].state.texts
+        if session.moment.time_s > deadline_s:
+            texts = session.testbed.observers[waiting[0]].state.texts
             said = texts[-1][2] if texts else "it says nothing"
             raise ExperimentError(f"{waiting[0]} was not ready to arm within {deadline_s:.0f} s: {said}")
 
 
-def _until_over(play: _Play) -> str:
+def _until_over(session: _Session) -> str:
     shown_s = 0.0
-    while play.now_s < play.experiment.timeout:
-        play.poll()
-        play.injector.step(play.now_s)
-        play.step_tasks()
-        if play.over():
+    while session.now_s < session.experiment.timeout:
+        session.poll()
+        session.injector.step(session.now_s)
+        session.step_tasks()
+        if session.over():
             return ""
         if time.monotonic() - shown_s > SHOW_EVERY_S:
             shown_s = time.monotonic()
-            play.progress.show(_status(play))
-    return f"it was not over after {play.experiment.timeout:g} s"
+            session.progress.show(_status(session))
+    return f"it was not over after {session.experiment.timeout:g} s"
 
 
-def _status(play: _Play) -> str:
-    words = [f"{play.now_s:5.0f} s"]
-    for name, observer in list(play.stage.observers.items())[:4]:
+def _status(session: _Session) -> str:
+    words = [f"{session.now_s:5.0f} s"]
+    for name, observer in list(session.testbed.observers.items())[:4]:
         state = observer.state
         words.append(f"{name} {state.mode} {state.alt_m:.0f} m {state.speed_mps:.0f} m/s {state.battery:.0%}")
-    more = len(play.stage.observers) - 4
+    more = len(session.testbed.observers) - 4
     return "   ".join([*words, *([f"and {more} more"] if more > 0 else [])])
 
 
-def _teller(play: _Play, setup: VehicleSetup) -> Callable[[str], None]:
-    return lambda text: play.tell(setup.name, text)
+def _teller(session: _Session, setup: VehicleSetup) -> Callable[[str], None]:
+    return lambda text: session.tell(setup.name, text)
 
 
-def _tell_fault(play: _Play, text: str) -> None:
+def _tell_fault(session: _Session, text: str) -> None:
     vehicle, _, words = text.partition(": ")
-    play.tell("" if vehicle == "cluster" else vehicle, words)
+    session.tell("" if vehicle == "cluster" else vehicle, words)
 
 
-def _outcome(play: _Play, out: Path, problem: str, wall_s: float) -> Outcome:
-    findings, experiment = play.stage.findings, play.experiment
+def _outcome(session: _Session, out: Path, problem: str, wall_s: float) -> Outcome:
+    findings, experiment = session.testbed.findings, session.experiment
     evidence = Evidence(
-        play.flights,
-        play.injector.occurrences,
+        session.flights,
+        session.injector.occurrences,
         {zone.name: zone for zone in experiment.zones},
         findings.programs,
         findings.calls,
@@ -281,18 +254,18 @@ def _outcome(play: _Play, out: Path, problem: str, wall_s: float) -> Outcome:
     return Outcome(
         experiment,
         out,
-        play.flights,
-        tuple(play.injector.occurrences),
+        session.flights,
+        tuple(session.injector.occurrences),
         tuple(verdicts),
         findings,
-        tuple(play.events),
-        tuple(_since_start(judged, play) for judged in judgements_of(findings.calls)),
-        play.now_s,
+        tuple(session.events),
+        tuple(_since_start(judged, session) for judged in judgements_of(findings.calls)),
+        session.now_s,
         wall_s,
         problem,
     )
 
 
-def _since_start(judged: Judgement, play: _Play) -> Judgement:
+def _since_start(judged: Judgement, session: _Session) -> Judgement:
     """A judgement with its time on the experiment's clock."""
-    return replace(judged, time_s=(judged.time_s - play.start.unix_us / 1e6) * (play.experiment.pace or 1.0))
+    return replace(judged, time_s=(judged.time_s - session.start.unix_us / 1e6) * (session.experiment.pace or 1.0))

@@ -19,9 +19,10 @@ from fractus_sim.experiment.audits import read_audit
 from fractus_sim.experiment.detections import FILE, VARIABLE, TruthWatch, read_detections
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.model import Experiment, Program, VehicleSetup
-from fractus_sim.experiment.stage import Moment, Stage
-from fractus_sim.experiment.standalone import CameraSetup, DroneSetup, Standalone
+from fractus_sim.experiment.standalone import Standalone
+from fractus_sim.experiment.standalone_drone import CameraSetup, DroneSetup
 from fractus_sim.experiment.station import OBSERVER_ID, Station, TcpLink
+from fractus_sim.experiment.testbed import Moment, Testbed
 from fractus_sim.experiment.tlog import TlogWriter
 from fractus_sim.experiment.vehicles import command_of
 
@@ -29,7 +30,7 @@ TICK_S = 0.02
 CONNECT_S = 10.0
 
 
-class ServiceStage(Stage):
+class ServiceTestbed(Testbed):
     """Drones with their services; programs run as the components that they are in the manifests."""
 
     def __init__(self, experiment: Experiment, folder: Path, base: Path, tell: Callable[[str], None]) -> None:

@@ -19,8 +19,8 @@ from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.linktap import LinkTap
 from fractus_sim.experiment.model import Experiment, Program, VehicleSetup
 from fractus_sim.experiment.processes import Processes
-from fractus_sim.experiment.stage import Moment, Stage
 from fractus_sim.experiment.station import OBSERVER_ID, ChannelLink, Link, Station, TcpLink
+from fractus_sim.experiment.testbed import Moment, Testbed
 from fractus_sim.experiment.tlog import TlogWriter
 
 STEPS_PER_TICK = 2
@@ -28,7 +28,7 @@ MAX_BEHIND_S = 1.0
 CONNECT_S = 20.0
 
 
-class VehicleStage(Stage):
+class VehicleTestbed(Testbed):
     """Vehicles alone."""
 
     def __init__(self, experiment: Experiment, folder: Path, base: Path, tell: Callable[[str], None]) -> None:

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from fractus_sim.experiment.errors import ExperimentError
-from fractus_sim.experiment.standalone import CameraSetup, DroneSetup, RunningDrone, Standalone
+from fractus_sim.experiment.standalone import Standalone
+from fractus_sim.experiment.standalone_drone import CameraSetup, DroneSetup, RunningDrone
 from fractus_sim.scenarios.field.evidence import Evidence, read_evidence
 from fractus_sim.scenarios.field.place import DRONE, EXAMPLE, NAVIGATOR, VIEWER, ZIGZAG, Field, as_text
 

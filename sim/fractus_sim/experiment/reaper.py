@@ -12,7 +12,7 @@ from collections.abc import Iterable
 _CLOSE_S = 5.0
 
 
-class Lifeline:
+class Reaper:
     """A guard beside us that is told which process groups are ours, and kills them when our end of its pipe closes."""
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""An experiment's stage and runner end what they have started, whatever goes wrong."""
+"""An experiment's testbed and runner end what they have started, whatever goes wrong."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 from fractus_sim.experiment import cli, lifeline, reporting, runner
-from fractus_sim.experiment.logbook import Flight
 from fractus_sim.experiment.model import Experiment, parse
-from fractus_sim.experiment.stage import Findings, Moment, Stage
+from fractus_sim.experiment.recording import Flight
+from fractus_sim.experiment.testbed import Findings, Moment, Testbed
 from fractus_sim.interruption import uninterrupted
 from fractus_sim.report.page import write_page
 from fractus_sim.report.track import Place, Sample
 
 
 class Thing:
-    """Something that a stage has started."""
+    """Something that a testbed has started."""
 
     def __init__(self, error: BaseException | None = None) -> None:
         self.closed = False
@@ -33,8 +33,8 @@ class Thing:
             raise self._error
 
 
-class Empty(Stage):
-    """A stage on which nothing stands."""
+class Empty(Testbed):
+    """A testbed on which nothing stands."""
 
     def set_up(self) -> None:
         """Nothing to set up."""
@@ -61,29 +61,29 @@ def experiment() -> Experiment:
 
 
 @pytest.fixture
-def stage(experiment: Experiment, tmp_path: Path) -> Empty:
+def testbed(experiment: Experiment, tmp_path: Path) -> Empty:
     return Empty(experiment, tmp_path, tmp_path, print)
 
 
 @pytest.mark.parametrize("error", [full(), KeyboardInterrupt()], ids=["disk full", "Ctrl-C"])
-def test_what_cannot_be_closed_keeps_nothing_else_open(stage: Empty, error: BaseException) -> None:
-    first, last, order = stage.keep(Thing()), Thing(error), list[str]()
-    stage.at_end(lambda: order.append("done"))
-    stage.keep(last)
+def test_what_cannot_be_closed_keeps_nothing_else_open(testbed: Empty, error: BaseException) -> None:
+    first, last, order = testbed.keep(Thing()), Thing(error), list[str]()
+    testbed.at_end(lambda: order.append("done"))
+    testbed.keep(last)
     with pytest.raises(type(error)):
-        stage.close()
+        testbed.close()
     assert (first.closed, last.closed, order) == (True, True, ["done"])
 
 
 def test_a_full_disk_at_the_start_closes_the_stage_and_leaves_no_report_of_another_run(
-    experiment: Experiment, stage: Empty, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    experiment: Experiment, testbed: Empty, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    thing = stage.keep(Thing())
+    thing = testbed.keep(Thing())
 
     def no_log(_path: Path) -> None:
         raise full()
 
-    monkeypatch.setattr(runner, "_stage", lambda *_: stage)
+    monkeypatch.setattr(runner, "_testbed", lambda *_: testbed)
     monkeypatch.setattr(runner, "McapLog", no_log)
     (tmp_path / "summary.md").write_text("All checks hold.")
     with pytest.raises(OSError, match="No space left"):
@@ -93,11 +93,11 @@ def test_a_full_disk_at_the_start_closes_the_stage_and_leaves_no_report_of_anoth
 
 
 def test_a_full_disk_at_the_end_closes_the_stage(
-    experiment: Experiment, stage: Empty, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    experiment: Experiment, testbed: Empty, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    thing = stage.keep(Thing())
-    monkeypatch.setattr(runner, "_stage", lambda *_: stage)
-    monkeypatch.setattr(runner, "_play", lambda _: "")
+    thing = testbed.keep(Thing())
+    monkeypatch.setattr(runner, "_testbed", lambda *_: testbed)
+    monkeypatch.setattr(runner, "_run", lambda _: "")
     monkeypatch.setattr(runner, "McapLog", lambda _: Thing(full()))
     with pytest.raises(OSError, match="No space left"):
         runner.run(experiment, tmp_path)

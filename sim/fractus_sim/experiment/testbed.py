@@ -1,4 +1,4 @@
-"""Where an experiment is played: the three modes, behind one interface."""
+"""Where an experiment runs: the three modes, behind one interface."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fractus_sim.experiment.station import Station
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """Seconds since the stage was set, on its own clock, and the time of day in microseconds."""
+    """Seconds since the testbed was set, on its own clock, and the time of day in microseconds."""
 
     time_s: float
     unix_us: int
@@ -24,7 +24,7 @@ class Moment:
 
 @dataclass
 class Findings:
-    """What only the stage knows, for checks and report.
+    """What only the testbed knows, for checks and report.
 
     Attributes:
         programs: exit codes; None for one that had to be stopped.
@@ -53,7 +53,7 @@ class Closable(Protocol):
 _Kept = TypeVar("_Kept", bound=Closable)
 
 
-class Stage(ABC):
+class Testbed(ABC):
     """The vehicles of an experiment and what stands around them.
 
     Attributes:
@@ -71,12 +71,12 @@ class Stage(ABC):
         self._kept = ExitStack()
 
     def keep(self, resource: _Kept) -> _Kept:
-        """Have something closed with the stage; say so as soon as it is made."""
+        """Have something closed with the testbed; say so as soon as it is made."""
         self._kept.callback(resource.close)
         return resource
 
     def at_end(self, action: Callable[[], object]) -> None:
-        """Have something done when the stage is closed."""
+        """Have something done when the testbed is closed."""
         self._kept.callback(action)
 
     def close(self) -> None:

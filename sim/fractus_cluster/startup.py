@@ -1,0 +1,199 @@
+"""The steps that bring a cluster up; each changes nothing where all is as it should be."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from datetime import datetime
+
+from fractus_kube import BlockingClient, Conflict
+
+from fractus_cluster import manifests, network
+from fractus_cluster.addressing import Addressing
+from fractus_cluster.apiclient import administrating, answers_ready
+from fractus_cluster.binaries import Binaries
+from fractus_cluster.cgroups import cluster_branch
+from fractus_cluster.controlplane import (
+    CONTROL_PLANE_PROGRAMS,
+    DNS_READY_PORT,
+    ControlPlaneFiles,
+    administrator,
+    control_plane_units,
+    let_dns_start,
+    server_url,
+    write_control_plane,
+)
+from fractus_cluster.errors import ClusterError
+from fractus_cluster.images.layout import Image
+from fractus_cluster.images.store import ImageStore
+from fractus_cluster.images.template import has_storage
+from fractus_cluster.node import ENVIRONMENT, Node, init_command
+from fractus_cluster.pki import Authority, write_private
+from fractus_cluster.processes import kill_recorded, running, spawn, write_record
+from fractus_cluster.state import StateDirectory
+
+_READY_TIMEOUT_S = 90.0
+_DNS_TIMEOUT_S = 90.0
+_POLL_S = 0.1
+_CONFLICTS = 5
+CONTROL_PLANE = "control-plane"
+
+
+@dataclass(frozen=True, slots=True)
+class Startup:
+    """Brings up the parts of one cluster.
+
+    Attributes:
+        cluster: Its name.
+        state: Its state directory.
+        wiring: Its network.
+        authority: Its certificate authority.
+    """
+
+    cluster: str
+    state: StateDirectory
+    wiring: network.Wiring
+    authority: Authority
+
+    def start_control_plane(self, binaries: Binaries) -> None:
+        """Run etcd, the API server, its controllers, the scheduler and DNS as described; restart all when it changed."""
+        wiring, files, record_path = self.wiring, self._files(), self.state.process(CONTROL_PLANE)
+        network.wire_control_plane(wiring)
+        units = control_plane_units(binaries, self.authority, wiring.addressing, files)
+        view: dict[str, object] = {"hostname": None, "files": "", "logs": "", "programs": {}, "sysctls": {}}
+        config = json.dumps(
+            {"view": view, "units": units, "builds": binaries.builds(*CONTROL_PLANE_PROGRAMS)}, indent=1
+        )
+        path = files.directory / "init.json"
+        if running(record_path) and path.exists() and path.read_text() == config:
+            return
+        kill_recorded(record_path)
+        cgroup = cluster_branch(self.cluster).below(CONTROL_PLANE)
+        cgroup.kill_all()
+        files.directory.mkdir(parents=True, exist_ok=True)
+        write_control_plane(self.authority, wiring.addressing, files, cluster=self.cluster)
+        write_private(path, config)
+        record = spawn(
+            init_command(path, wiring.namespace_path()),
+            log=files.logs / "init.log",
+            cgroup_files=cgroup.create(),
+            env=ENVIRONMENT,
+        )
+        write_record(record_path, record)
+
+    def place_nodes(self, nodes: list[Node], binaries: Binaries, store: ImageStore, images: Sequence[Image]) -> None:
+        """Wire the nodes and write their files; new ones get their images on disk before they ever start."""
+        for node in nodes:
+            network.wire_node(node.wiring, node.name, node.index)
+            node.write_files(node.files(binaries, self.authority))
+        fresh = [node for node in nodes if not has_storage(node)]
+        if fresh:
+            template = store.template(images, binaries["pause"])
+            with ThreadPoolExecutor(max_workers=2) as pool:
+                list(pool.map(template.furnish, fresh))
+
+    def api(self) -> AbstractContextManager[BlockingClient]:
+        """The API server as administrator."""
+        server = server_url(self.wiring.addressing)
+        return administrating(server, self.authority.credential.certificate, administrator(self.authority))
+
+    def apply_objects(self, api: BlockingClient, nodes: list[Node]) -> None:
+        """Make the Node objects and those of DNS as described, and delete Nodes of ours that are not described."""
+        place = self.wiring.addressing
+        names = {node.name for node in nodes}
+        for present in api.list("/api/v1/nodes"):
+            name = present["metadata"]["name"]
+            if name not in names and "fractus-sim" in str(present["metadata"].get("managedFields")):
+                api.call("DELETE", f"/api/v1/nodes/{name}")
+        for node in nodes:
+            # Before its kubelet starts, so that no pod is there before labels and taints are.
+            _apply_node(api, node, place)
+        for path, body in manifests.dns_objects(place.control_plane):
+            api.apply(path, body)
+
+    def write_kubeconfig(self) -> None:
+        """Write the administrator's kubeconfig where it differs."""
+        text = self.authority.kubeconfig(
+            administrator(self.authority), server=server_url(self.wiring.addressing), cluster=f"fractus-{self.cluster}"
+        )
+        if not self.state.kubeconfig.exists() or self.state.kubeconfig.read_text() != text:
+            write_private(self.state.kubeconfig, text)
+
+    def wait_nodes(self, api: BlockingClient, nodes: Sequence[tuple[Node, datetime | None]]) -> None:
+        """Wait until every node is Ready, by its word since the given time, and offers its extended resources."""
+        deadline = time.monotonic() + _READY_TIMEOUT_S
+        waiting = {node.name: (node, since) for node, since in nodes}
+        while True:
+            for item in api.list("/api/v1/nodes"):
+                name = item["metadata"]["name"]
+                if name in waiting and manifests.is_ready(item, since=waiting[name][1]):
+                    patch = manifests.extended_resources_patch(waiting[name][0].spec, item)
+                    if patch:
+                        api.merge(*patch)
+                    else:
+                        del waiting[name]
+            if not waiting:
+                return
+            for node, _ in waiting.values():
+                if not node.powered:
+                    raise ClusterError(
+                        f"node {node.name} did not start; see {self.state.logs / node.name / 'init.log'}"
+                    )
+            if time.monotonic() > deadline:
+                names = ", ".join(waiting)
+                raise ClusterError(
+                    f"not Ready within {_READY_TIMEOUT_S:.0f} s: {names}; see the logs in {self.state.logs}"
+                )
+            time.sleep(_POLL_S)
+
+    def check_hardware(self, nodes: Sequence[Node]) -> None:
+        """Make sure that vehicles and cameras run.
+
+        Raises:
+            ClusterError: One ended at once.
+        """
+        for node in nodes:
+            for name, runs in (("vehicle", node.vehicle_running), ("camera", node.camera_running)):
+                if runs is False:
+                    log = self.state.logs / node.name / f"{name}.log"
+                    last = log.read_text(errors="replace").splitlines()[-1:] if log.exists() else []
+                    raise ClusterError(f"the {name} of node {node.name} ended at once: {' '.join(last)} (see {log})")
+
+    def let_dns_start(self) -> None:
+        """Let DNS start, which needs the objects that it answers from."""
+        let_dns_start(self.wiring.addressing, self._files())
+
+    def wait_dns(self) -> None:
+        """Wait until DNS answers.
+
+        Raises:
+            ClusterError: It was not in time.
+        """
+        address = str(self.wiring.addressing.control_plane)
+        deadline = time.monotonic() + _DNS_TIMEOUT_S
+        while not answers_ready(address, DNS_READY_PORT):
+            if time.monotonic() > deadline:
+                log = self.state.logs / CONTROL_PLANE / "coredns.log"
+                raise ClusterError(f"the cluster's DNS was not ready within {_DNS_TIMEOUT_S:.0f} s; see {log}")
+            time.sleep(_POLL_S)
+
+    def _files(self) -> ControlPlaneFiles:
+        return ControlPlaneFiles(self.state.control_plane, self.state.logs / CONTROL_PLANE)
+
+
+def _apply_node(api: BlockingClient, node: Node, place: Addressing) -> None:
+    for tries_left in reversed(range(_CONFLICTS)):
+        present = api.apply(*manifests.node_object(node.spec, node.index, place))
+        patch = manifests.taints_patch(node.spec, present)
+        if patch is None:
+            return
+        try:
+            api.merge(*patch)
+        except Conflict:
+            # The node controller has set a taint of its own meanwhile.
+            if not tries_left:
+                raise

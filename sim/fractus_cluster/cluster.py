@@ -16,7 +16,6 @@ from pathlib import Path
 from fractus_kube import KubeError
 
 from fractus_cluster import machine, manifests, network
-from fractus_cluster.addressing import Addressing
 from fractus_cluster.apiclient import wait_ready
 from fractus_cluster.binaries import ensure_binaries
 from fractus_cluster.cgroups import cluster_branch
@@ -31,7 +30,7 @@ from fractus_cluster.prerequisites import check_prerequisites, check_root
 from fractus_cluster.prerequisites import machine as describe_machine
 from fractus_cluster.processes import running
 from fractus_cluster.spec import ClusterSpec, load_spec
-from fractus_cluster.startup import CONTROL_PLANE, Startup
+from fractus_cluster.startup import CONTROL_PLANE, Startup, claim, wiring_of
 from fractus_cluster.state import Memory, StateDirectory, only_cluster, state_of
 
 _LOCK_TIMEOUT_S = 300.0
@@ -191,7 +190,7 @@ class Cluster:
         for sentence in (text for node in self.spec.nodes for text in shortfalls(node, describe_machine())):
             self._report(f"note: {sentence}")
         with self._locked():
-            memory = self._claim()
+            memory = claim(self.spec, self._state, self._report)
             self._state.write_spec(self.spec)
             startup = self._startup(memory)
             startup.start_control_plane(binaries)
@@ -312,27 +311,10 @@ class Cluster:
         return memory
 
     def _wiring(self, memory: Memory) -> network.Wiring:
-        return network.Wiring(self.name, Addressing(memory.block), self._state.marks)
+        return wiring_of(self.name, self._state, memory)
 
     def _startup(self, memory: Memory) -> Startup:
         return Startup(self.name, self._state, self._wiring(memory), Authority(self._state.pki))
-
-    def _claim(self) -> Memory:
-        """Claim addresses, and remove the nodes that the description has no more."""
-        remembered = self._state.read_memory()
-        names = [node.name for node in self.spec.nodes]
-        block = machine.claim(self.name, self._state.path, remembered.block if remembered else None)
-        memory = (remembered or Memory(block, {})).with_nodes(names)
-        old_spec = self._state.read_spec()
-        if remembered is not None and old_spec is not None:
-            gone = [spec for spec in old_spec.nodes if spec.name in remembered.indexes and spec.name not in names]
-            for spec in gone:
-                self._report(f"removing node {spec.name}")
-                index = remembered.indexes[spec.name]
-                Node(spec, index, self._wiring(remembered), self._state, cluster_branch(self.name)).remove()
-        if memory != remembered:
-            self._state.write_memory(memory)
-        return memory
 
     def _ready_nodes(self, memory: Memory) -> dict[str, bool] | None:
         if not self.running:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from datetime import datetime
 
 from fractus_kube import BlockingClient, Conflict
 
-from fractus_cluster import manifests, network
+from fractus_cluster import machine, manifests, network
 from fractus_cluster.addressing import Addressing
 from fractus_cluster.apiclient import administrating, answers_ready
 from fractus_cluster.binaries import Binaries
@@ -34,13 +34,16 @@ from fractus_cluster.images.template import has_storage
 from fractus_cluster.node import ENVIRONMENT, Node, init_command
 from fractus_cluster.pki import Authority, write_private
 from fractus_cluster.processes import kill_recorded, running, spawn, write_record
-from fractus_cluster.state import StateDirectory
+from fractus_cluster.spec import ClusterSpec
+from fractus_cluster.state import Memory, StateDirectory
 
 _READY_TIMEOUT_S = 90.0
 _DNS_TIMEOUT_S = 90.0
 _POLL_S = 0.1
 _CONFLICTS = 5
 CONTROL_PLANE = "control-plane"
+
+Report = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,6 +186,29 @@ class Startup:
 
     def _files(self) -> ControlPlaneFiles:
         return ControlPlaneFiles(self.state.control_plane, self.state.logs / CONTROL_PLANE)
+
+
+def wiring_of(cluster: str, state: StateDirectory, memory: Memory) -> network.Wiring:
+    """The network of a cluster whose addresses are known."""
+    return network.Wiring(cluster, Addressing(memory.block), state.marks)
+
+
+def claim(spec: ClusterSpec, state: StateDirectory, report: Report) -> Memory:
+    """Claim addresses, and remove the nodes that the description has no more."""
+    remembered = state.read_memory()
+    names = [node.name for node in spec.nodes]
+    block = machine.claim(spec.name, state.path, remembered.block if remembered else None)
+    memory = (remembered or Memory(block, {})).with_nodes(names)
+    old_spec = state.read_spec()
+    if remembered is not None and old_spec is not None:
+        gone = [node for node in old_spec.nodes if node.name in remembered.indexes and node.name not in names]
+        for node in gone:
+            report(f"removing node {node.name}")
+            index = remembered.indexes[node.name]
+            Node(node, index, wiring_of(spec.name, state, remembered), state, cluster_branch(spec.name)).remove()
+    if memory != remembered:
+        state.write_memory(memory)
+    return memory
 
 
 def _apply_node(api: BlockingClient, node: Node, place: Addressing) -> None:

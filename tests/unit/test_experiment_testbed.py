@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from fractus_sim.experiment import cli, lifeline, reporting, runner
+from fractus_sim.experiment import cli, reaper, reporting, runner
 from fractus_sim.experiment.model import Experiment, parse
 from fractus_sim.experiment.recording import Flight
 from fractus_sim.experiment.testbed import Findings, Moment, Testbed
@@ -75,7 +75,7 @@ def test_what_cannot_be_closed_keeps_nothing_else_open(testbed: Empty, error: Ba
     assert (first.closed, last.closed, order) == (True, True, ["done"])
 
 
-def test_a_full_disk_at_the_start_closes_the_stage_and_leaves_no_report_of_another_run(
+def test_a_full_disk_at_the_start_closes_the_testbed_and_leaves_no_report_of_another_run(
     experiment: Experiment, testbed: Empty, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     thing = testbed.keep(Thing())
@@ -92,7 +92,7 @@ def test_a_full_disk_at_the_start_closes_the_stage_and_leaves_no_report_of_anoth
     assert not (tmp_path / "summary.md").exists()
 
 
-def test_a_full_disk_at_the_end_closes_the_stage(
+def test_a_full_disk_at_the_end_closes_the_testbed(
     experiment: Experiment, testbed: Empty, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     thing = testbed.keep(Thing())
@@ -126,8 +126,8 @@ def test_signals_wait_until_the_block_is_over() -> None:
 
 def test_the_guard_kills_what_it_was_not_told_to_leave_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     killed: list[int] = []
-    monkeypatch.setattr(lifeline.os, "killpg", lambda group, _signal: killed.append(group))
-    lifeline.guard(io.StringIO("41\n42\n43\n-42\n"))
+    monkeypatch.setattr(reaper.os, "killpg", lambda group, _signal: killed.append(group))
+    reaper.guard(io.StringIO("41\n42\n43\n-42\n"))
     assert killed == [41, 43]
 
 

@@ -289,6 +289,14 @@ def test_a_lost_driver_has_its_grace_and_then_the_vehicle_comes_home() -> None:
     assert home.missions["a"].outcome == Outcome(OutcomeKind.FAILED, "driver lost")
 
 
+def test_a_second_stream_that_leaves_while_it_waits_leaves_no_authority_behind() -> None:
+    second = (told.StreamOpened(2, "a", "A"), told.StreamClosed(2))
+    state, _ = told_of(*ASKS, *second)
+    assert state.authority is Authority.SYSTEM
+    armed, _ = told_of(told.VehicleObserved(ARMED), told.Heartbeat(), state=state)
+    assert armed.authority is Authority.PILOT, "who arms it is no driver"
+
+
 def test_a_cancelled_motion_hovers_for_a_driver_that_is_still_there() -> None:
     state, _ = told_of(*FLIES, told.MotionBegan(7, "Land"), told.MotionCancelled(7))
     assert state.motion == ActiveMotion(7, "Land", hover_at=0.3)

@@ -139,7 +139,7 @@ def _close(step: Step, event: StreamClosed) -> None:
     lease, motion = step.state.lease, step.state.motion
     if lease is None or lease.lease_id != event.lease_id:
         return
-    step.set(lease=None)
+    step.drop_lease()
     mission = step.state.missions.get(lease.key)
     if mission is None or not (lease.granted or lease.transit):
         return

@@ -114,10 +114,21 @@ class Step:
         """Take the vehicle from the driver, or from who waits for it, and say why; a grace is over."""
         lease = self.state.lease
         self.stop_motion(StopKind.LOST, "ControlLost", reason)
-        self.set(lease=None, grace=None)
+        self.drop_lease()
+        self.set(grace=None)
         if lease is not None:
             self.act(SendEvent(lease.lease_id, ControlEvent(StreamState.LOST, reason=reason)))
         self.act(WakeWaiters())
+
+    def drop_lease(self) -> None:
+        """No driver has or waits for the vehicle any more.
+
+        A driver whose second stream waits has authority without a granted lease: with that stream its authority ends too, or
+        a pilot who arms the vehicle would be taken for the driver.
+        """
+        self.set(lease=None)
+        if self.state.authority is Authority.DRIVER:
+            self.set(authority=Authority.SYSTEM)
 
     # The system
 

@@ -245,7 +245,7 @@ def test_a_service_that_is_killed_is_found_again_by_the_navigator(slow: Stage) -
     slow.start_service()
     slow.wait("return", lambda: "control returned" in slow.log("navigator"))
     log = slow.log("navigator")
-    assert "the mobility service is away" in log
+    assert "lost the connection to the mobility service" in log
     assert log.count("in control") == 1, "the same process, under the same control"
     assert "waypoint 2/2 reached" in log
 

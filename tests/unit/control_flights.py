@@ -16,6 +16,7 @@ from typing import Any
 from fractus_core.control.values import FlightMode
 from fractus_core.policy.values import TakeoffArgs
 from fractus_services.grants import ActiveGrant
+from fractus_services.mobility.authority import drivers
 from mobility_world import World, fly, goto
 
 BEAT_S = 0.5
@@ -168,7 +169,7 @@ class Flight:
         return self.call("Goto", lambda: self.world.service.goto(held, goto(x, y), 0))
 
     async def give_back(self, held: ActiveGrant) -> None:
-        await self.do("ReturnControl", lambda: self.world.control.give_back(held))
+        await self.do("ReturnControl", lambda: drivers.give_back(self.world.control, held))
 
     def failsafe(self, mode: FlightMode) -> None:
         """The autopilot's own failsafe acts."""

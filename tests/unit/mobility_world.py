@@ -315,7 +315,7 @@ class World:
         self.tours, self.monitor, self.supervisor, self.observer = (
             parts.tours, parts.monitor, parts.supervisor, parts.observer,
         )  # fmt: skip
-        self.control.checked = Checked("", (), Airframe(retraces=retraces), 8.0, retraces)
+        self.control.set_checked(Checked("", (), Airframe(retraces=retraces), 8.0, retraces))
         self._tasks = [asyncio.ensure_future(part) for part in (self.plane.run(), self.monitor.run(), self.tours.run())]
         self.events: list[ControlEvent] = []
 

@@ -12,6 +12,7 @@ from fractus_core.control.events import ArmingRequested
 from fractus_core.policy.values import Airframe, TakeoffArgs
 from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError
+from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.autopilot import Checked
 from mobility_world import BRAKE, World, end, fly, refusal, spec
 
@@ -55,7 +56,7 @@ def test_who_waits_to_arm_must_still_be_allowed_to(tmp_path: Path) -> None:
             slow = world.fence.raise_around = Slow(world)
             calls = [asyncio.ensure_future(world.service.arm(grant)) for _ in range(2)]
             await asyncio.sleep(1)
-            await world.control.give_back(grant)
+            await drivers.give_back(world.control, grant)
             for call in calls:
                 await refusal(call)
             assert slow.began_armed == [False]
@@ -81,16 +82,16 @@ def test_failsafes_that_are_set_anew_meanwhile_forbid_arming(
             write, set_mode, raise_around = plane.write_parameter, plane.set_mode, world.fence.raise_around
 
             async def chosen(name: str, value: float) -> float | None:
-                control.checked = found
+                control.set_checked(found)
                 return await write(name, value)
 
             async def raised(grant: GrantSpec, *, retraces: bool) -> None:
-                control.checked = found
+                control.set_checked(found)
                 await raise_around(grant, retraces=retraces)
 
             async def changed(mode: Any, *_: object) -> None:
                 await set_mode(mode)
-                control.checked = found
+                control.set_checked(found)
 
             if during == "choice":
                 control.dispatch(ArmingRequested(grant.key, grant.identity, (39.3604, 22.95, 10.0)))
@@ -121,7 +122,7 @@ def test_a_link_that_comes_back_in_flight_leaves_the_way_home_as_chosen(tmp_path
         async with World(tmp_path, retraces=True) as world:
             control, plane = world.control, world.plane
             plane.parameters |= {"SRTL_POINTS": 300.0, "SYSID_MYGCS": 244.0, "WPNAV_ACCEL": 100.0}
-            control.checked = Checked("", (), Airframe(retraces=True, accel_mps2=1.0), 8.0, remembers=True)
+            control.set_checked(Checked("", (), Airframe(retraces=True, accel_mps2=1.0), 8.0, remembers=True))
             grant = world.grants.put(spec())
             await world.drive(grant)
             control.dispatch(ArmingRequested(grant.key, grant.identity, (39.3604, 22.95, 10.0)))

@@ -10,6 +10,7 @@ import pytest
 import shapely
 from fractus_core.control.values import FlightMode
 from fractus_core.policy.values import GotoArgs
+from fractus_services.mobility.authority import drivers
 from mobility_world import LAND, RTL, SMART_RTL, World, at, end, fly, partial, refusal, spec, touring, zone
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
@@ -26,7 +27,7 @@ async def beyond_the_wall(world: World) -> None:
     await world.up(grant)
     for x, y in ((60, 30), (60, 70), (0, 70)):
         await end(world.service.goto(grant, GotoArgs(*at(x, y), 10.0), 0))
-    await world.control.give_back(grant)
+    await drivers.give_back(world.control, grant)
 
 
 def test_a_driver_turns_home_from_standstill(tmp_path: Path) -> None:
@@ -102,7 +103,7 @@ def test_an_autopilot_that_refuses_again_and_again_brings_the_drone_home_itself(
                 await world.up(grant)
                 await end(world.service.goto(grant, GotoArgs(*at(0, 70), 10.0), 0))
                 world.grants.put(spec(zone("wall", "ignore", *WALL)))
-                await world.control.give_back(grant)
+                await drivers.give_back(world.control, grant)
             plane.commands.clear()
             plane.refuses.add(REPOSITION)
             await world.until(lambda: plane.vehicle.mode in {RTL, SMART_RTL, LAND})
@@ -136,7 +137,7 @@ def test_no_fence_outlives_its_mission(tmp_path: Path, how: str) -> None:
                 await asyncio.sleep(15)
                 assert world.fence.raised, "the driver may take off again"
                 if how == "returned":
-                    await world.control.give_back(grant)
+                    await drivers.give_back(world.control, grant)
                 elif how == "grace":
                     stream.cancel()
                 else:

@@ -14,6 +14,7 @@ from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import Call, SetSpeedArgs, VelocityArgs
 from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError, Refused
+from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.flight import monitor as monitoring
 from mobility_world import GUIDED, World, area, clear_m, end, fly, goto, partial, refusal, spec, zone
 
@@ -165,7 +166,7 @@ def test_the_next_driver_does_not_inherit_a_speed(tmp_path: Path) -> None:
             await world.up(grant)
             await world.service.set_speed(grant, SetSpeedArgs(2.0))
             assert world.guard.situation().speed_setpoint_mps == 2.0
-            await world.control.give_back(grant)
+            await drivers.give_back(world.control, grant)
             await world.until(lambda: not world.plane.vehicle.armed)
             grant = world.grants.put(spec(), "m2")
             await world.up(grant)
@@ -188,7 +189,7 @@ def test_the_system_flies_home_at_the_speed_of_the_vehicle_within_limits(
             await world.service.set_speed(grant, SetSpeedArgs(driven_mps))
             if limited:
                 world.grants.put(spec(wall, limit("speed", 3.0)))
-            await world.control.give_back(grant)
+            await drivers.give_back(world.control, grant)
             await world.until(lambda: world.control.motion is not None and world.control.motion.speed_mps is not None)
             told = 3.0 if limited else 8.0
             assert world.guard.situation().speed_setpoint_mps == 8.0
@@ -390,7 +391,7 @@ async def homeward(world: World) -> bool:
     await world.up(grant)
     for x, y in ((60, 30), (60, 70), (0, 70)):
         await end(world.service.goto(grant, goto(x, y), 0))
-    await world.control.give_back(grant)
+    await drivers.give_back(world.control, grant)
     await world.until(lambda: abs(world.plane.velocity[0]) > 3)
     return world.plane.velocity[0] > 0
 

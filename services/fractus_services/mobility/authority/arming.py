@@ -128,7 +128,7 @@ class Arming:
     def _learnt(self, before: Checked, after: Checked) -> Checked:
         """Take over what is known about the failsafes by now, unless they were set again meanwhile."""
         if self._control.checked is before:
-            self._control.checked = after
+            self._control.set_checked(after)
         return self._check(after)
 
     def _check(self, chosen: Checked | None = None) -> Checked:

@@ -5,54 +5,44 @@
 
 from __future__ import annotations
 
-import asyncio
-import math
-from collections.abc import Callable, Coroutine
+from collections.abc import Coroutine
 from dataclasses import replace
 from typing import Any
 
-from fractus_core.control import Authority, ControlState, Mission, Outcome, not_ready_reason, transition
-from fractus_core.control.actions import Action, RecordAudit, RefuseStream
+from fractus_core.control import Authority, ControlState, Mission, Outcome, not_ready_reason
+from fractus_core.control.actions import Action, RecordAudit
 from fractus_core.control.events import (
     BrakeDemanded,
-    ControlReturned,
     CruiseSpeedSet,
     Event,
     GrantChanged,
-    GrantControl,
     GrantRef,
     MotionBegan,
     MotionCancelled,
     MotionFailed,
     MotionFinished,
     MotionStopped,
-    StreamClosed,
-    StreamOpened,
     SystemFlightBegan,
     SystemFlightEnded,
     TakeoverDemanded,
-    Tick,
     TourBegan,
     TransitBegan,
-    WaypointReached,
 )
-from fractus_core.control.values import Readiness, VehicleFacts
-from fractus_core.geo import LocalFrame
+from fractus_core.control.values import Readiness
 from fractus_core.policy.compiled import CompiledGrant, for_transit
 from fractus_core.policy.values import Verdict
 
 from fractus_services.audit import AuditLog
-from fractus_services.errors import PreconditionFailed, Unavailable
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.journal import Journal, Record
 from fractus_services.mobility.authority.leases import FlightConstraints, Lease, Motion
-from fractus_services.mobility.authority.performer import ModeCommands, Performer
+from fractus_services.mobility.authority.machine import Machine
+from fractus_services.mobility.authority.performer import ModeCommands
 from fractus_services.mobility.autopilot import Approach, Autopilot, Checked
 
 CORRECTION = "Correction"
 """What the motions are called with which the monitor leads a driver's drone back."""
 
-WAYPOINT_M = 5.0
 DEFAULT_SPEED_MPS = 5.0
 """Legs are taken to be flown so fast while the vehicle's parameters are not known."""
 
@@ -71,7 +61,12 @@ class Control:
         state: to begin with; by default the missions that the journal remembers, and nothing else.
 
     Attributes:
-        checked: the autopilot's failsafes, as they were set and verified last.
+        leases: streams of drivers by lease, while they are open.
+        tasks: what runs beside the calls.
+        wait: waits until something changed that drivers wait for, or the time is over.
+        wake: lets everyone that waits look again.
+        hold: brakes and hovers.
+        undisturbed: permits what a driver's drone does after its motion: nothing else has begun.
     """
 
     def __init__(
@@ -88,7 +83,7 @@ class Control:
     ) -> None:
         self.autopilot = autopilot
         self.audit = audit
-        self.checked: Checked | None = None
+        self._checked: Checked | None = None
         self._journal = journal
         self._grants = grants
         known = replace(
@@ -98,15 +93,15 @@ class Control:
             active=journal.record.active,
             grants=frozenset(grant.key for grant in grants.active.values()),
         )
-        self._state = known
-        self._timer: asyncio.TimerHandle | None = None
-        self._closed = False
         self._constraints: FlightConstraints | None = None
         self._removed: ActiveGrant | None = None
         self._transit: tuple[ActiveGrant, CompiledGrant] | None = None
         self.modes = modes
-        self._performer = Performer(self, autopilot, modes, approach, audit=audit, journal=journal)
-        self.tasks = self._performer.tasks
+        self._machine = Machine(autopilot, known, modes, approach, audit=audit, journal=journal)
+        self._performer = self._machine.performer
+        self.tasks, self.leases = self._performer.tasks, self._performer.leases
+        self.wait, self.wake = self._performer.wait, self._performer.wake
+        self.hold, self.undisturbed = self._performer.hold, self._performer.undisturbed
         grants.listen(self._grant_changed)
 
     # The state machine
@@ -114,8 +109,7 @@ class Control:
     @property
     def state(self) -> ControlState:
         """Everything that decides who commands the drone, with the drone as it is now."""
-        self._state = self._state.observed(self._facts())
-        return self._state
+        return self._machine.state
 
     def dispatch(self, event: Event) -> tuple[Action, ...]:
         """Tell the state machine what happened, and carry out what it asks for.
@@ -123,75 +117,42 @@ class Control:
         Raises:
             Exception: an action failed; the others were carried out all the same.
         """
-        self._state, actions = transition(self.state, event, self.autopilot.now)
-        try:
-            self._performer.perform(actions)
-        finally:
-            self._set_timer()
-        return actions
-
-    def _facts(self) -> VehicleFacts:
-        vehicle = self.autopilot.vehicle
-        return VehicleFacts(
-            connected=self.autopilot.connected,
-            armed=vehicle.armed,
-            in_air=vehicle.in_air,
-            mode=vehicle.mode,
-            failsafe=vehicle.failsafe,
-            failsafe_text=vehicle.failsafe_text,
-            failsafe_text_at=vehicle.failsafe_text_at,
-        )
+        return self._machine.dispatch(event)
 
     def close(self) -> None:
         """Let no deadline act any more: the service ends, and the autopilot's failsafe takes its place."""
-        self._closed = True
-        self._set_timer()
-
-    def _set_timer(self) -> None:
-        """Wake up at the next deadline of the state."""
-        deadline = None if self._closed else self._state.deadline
-        if self._timer is not None and self._timer.when() == deadline and not self._timer.cancelled():
-            return
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-        if deadline is not None:
-            self._timer = asyncio.get_running_loop().call_at(deadline, self._tick)
-
-    def _tick(self) -> None:
-        self._timer = None
-        self.dispatch(Tick())
+        self._machine.close()
 
     # What is known
 
     @property
     def authority(self) -> Authority:
         """Who may command."""
-        return self._state.authority
+        return self._machine.known.authority
 
     @property
     def lease(self) -> Lease | None:
         """The lease of the driver that has the drone or waits for it."""
-        lease = self._state.lease
+        lease = self._machine.known.lease
         return self._performer.leases.get(lease.lease_id) if lease is not None else None
 
     @property
     def motion(self) -> Motion | None:
         """The motion under way."""
-        known, motion = self._state.motion, self._performer.motion
+        known, motion = self._machine.known.motion, self._performer.motion
         return motion if known is not None and motion is not None and motion.motion_id == known.motion_id else None
 
     @property
     def constraints(self) -> FlightConstraints | None:
         """The fences under which the system flies an application's drone; None while it does not."""
-        known, constraints = self._state.flight, self._constraints
+        known, constraints = self._machine.known.flight, self._constraints
         matches = known is not None and constraints is not None and constraints.flight_id == known.flight_id
         return constraints if matches else None
 
     @property
     def mission_grant(self) -> ActiveGrant | None:
         """The grant under which the drone is in the air."""
-        lease, mission = self.lease, self._state.mission
+        lease, mission = self.lease, self._machine.known.mission
         if lease is not None:
             return lease.grant
         grant = self._grants.of(mission.identity) if mission is not None else None
@@ -200,117 +161,62 @@ class Control:
     @property
     def last_grant(self) -> ActiveGrant | None:
         """The grant whose fences hold on the way home: the mission's, or what it was before it was taken away."""
-        return self.mission_grant or (self._removed if self._state.removed is not None else None)
+        return self.mission_grant or (self._removed if self._machine.known.removed is not None else None)
+
+    @property
+    def checked(self) -> Checked | None:
+        """The autopilot's failsafes, as they were set and verified last; None while they are not."""
+        return self._checked
+
+    def set_checked(self, checked: Checked | None) -> None:
+        """The failsafes were set or verified, or what is known of them does not hold any more."""
+        self._checked = checked
 
     @property
     def retraces(self) -> bool:
         """Whether the autopilot can fly home on the path that it came."""
-        capable = self.checked is not None and self.checked.airframe.retraces
+        capable = self._checked is not None and self._checked.airframe.retraces
         return capable and not self.autopilot.vehicle.path_lost
 
     @property
     def cruise_mps(self) -> float:
         """The speed of legs that name none: the driver's on what the driver flies, else the vehicle's own."""
-        state = self._state
+        state = self._machine.known
         corrects = state.motion is not None and state.motion.kind == CORRECTION
         if state.speed_mps is not None and state.authority is Authority.DRIVER and not corrects:
             return state.speed_mps
-        return self.checked.speed_mps if self.checked is not None else DEFAULT_SPEED_MPS
+        return self._checked.speed_mps if self._checked is not None else DEFAULT_SPEED_MPS
 
     def not_ready_reason(self, key: str) -> str | None:
         """Why the drone cannot fly for a mission now; None when it can."""
         vehicle = self.autopilot.vehicle
         why = next((text for text in reversed(vehicle.texts) if text.startswith("PreArm")), "")
         located = vehicle.lat is not None and vehicle.home is not None
-        return not_ready_reason(self.state, key, Readiness(self.checked is not None, vehicle.ready, why, located))
+        return not_ready_reason(self.state, key, Readiness(self._checked is not None, vehicle.ready, why, located))
 
     def outcomes(self) -> dict[str, Outcome]:
         """How missions ended, by key."""
-        return {m.key: m.outcome for m in self._state.missions.values() if m.outcome is not None}
+        return {m.key: m.outcome for m in self._machine.known.missions.values() if m.outcome is not None}
 
     def mission(self, grant: ActiveGrant) -> Mission:
         """The mission of a grant; a new one, when nothing is known of it yet."""
-        return self._state.missions.get(grant.key) or Mission(grant.key, grant.identity)
+        return self._machine.known.missions.get(grant.key) or Mission(grant.key, grant.identity)
 
     def valid(self, grant: ActiveGrant) -> bool:
         """Whether a grant is still in force."""
         now = self._grants.of(grant.identity)
         return now is not None and now.key == grant.key
 
-    async def wait(self, timeout_s: float) -> None:
-        """Wait until something changed that drivers wait for, or the time is over."""
-        await self._performer.wait(timeout_s)
-
-    def wake(self) -> None:
-        """Let everyone that waits look again."""
-        self._performer.wake()
-
     def note(self, action: str, reason: str, code: str = "") -> None:
         """Write down what the system does; authority stays where it is."""
         self._performer.perform((RecordAudit("control", action, "system", reason, code),))
 
-    # Drivers
-
-    def open_lease(self, grant: ActiveGrant) -> Lease:
-        """A driver asks for control.
-
-        Raises:
-            PreconditionFailed: its mission is over, or another application has the drone.
-        """
-        lease = Lease(grant)
-        self._performer.leases[lease.lease_id] = lease
-        for action in self.dispatch(StreamOpened(lease.lease_id, grant.key, grant.identity)):
-            if isinstance(action, RefuseStream):
-                del self._performer.leases[lease.lease_id]
-                raise PreconditionFailed(action.code, action.reason)
-        return lease
-
-    def grant_control(self, lease: Lease) -> None:
-        """Give the drone to a driver that waits, when there is nothing left to wait for."""
-        if self.lease is lease and self.not_ready_reason(lease.key) is None:
-            self.dispatch(GrantControl(lease.lease_id))
-
-    def close_lease(self, lease: Lease) -> None:
-        """A driver's stream is over."""
-        self.dispatch(StreamClosed(lease.lease_id))
-        self._performer.leases.pop(lease.lease_id, None)
-
-    def require(self, grant: ActiveGrant) -> Lease:
-        """The lease of a caller that moves the drone.
-
-        Raises:
-            Refused: it does not have the drone.
-        """
-        lease, state = self.lease, self._state
-        if lease is None or lease.key != grant.key or not state.drives:
-            reason = f"the drone is not yours: {state.controller} has it; use GetControl"
-            raise PreconditionFailed("NotInControl", reason)
-        if not self.autopilot.connected:
-            raise Unavailable("AutopilotUnavailable", "the autopilot is not connected")
-        return lease
-
-    async def give_back(self, grant: ActiveGrant) -> bool:
-        """A driver returns control at the end of a control point; True when that was the last one."""
-        self.require(grant)
-        points = len(grant.spec.control_points)
-        self.dispatch(ControlReturned(grant.key, points))
-        last = self.mission(grant).points_done >= points
-        await self.save()
-        return last
+    # What survives a restart
 
     async def save(self, timeout_s: float | None = None) -> str:
         """Write the missions to disk; why that failed, or nothing."""
-        await self._journal.save(Record(self._state.missions, self._state.active), timeout_s)
+        await self._journal.save(Record(self._machine.known.missions, self._machine.known.active), timeout_s)
         return self._journal.failure
-
-    def reached(self, grant: ActiveGrant, lat: float, lon: float) -> None:
-        """A goto of the driver is complete: count the waypoint."""
-        mission, points = self.mission(grant), grant.spec.control_points
-        path = points[mission.points_done].path if mission.points_done < len(points) else None
-        if path and mission.waypoints < len(path):
-            ahead = path[mission.waypoints]
-            if math.hypot(*LocalFrame(ahead.lat, ahead.lon).xy(lat, lon)) <= WAYPOINT_M:
-                self.dispatch(WaypointReached(grant.key))
 
     # The system flies for an application
 
@@ -333,8 +239,8 @@ class Control:
     def begin_tour(self, grant: ActiveGrant, work: Coroutine[Any, Any, None]) -> None:
         """Fly a mission without a driver, by a task that tells control how it ends."""
         self.dispatch(TourBegan(grant.key))
-        if self._state.task is not None:
-            self._performer.run(self._state.task, work)
+        if self._machine.known.task is not None:
+            self._performer.run(self._machine.known.task, work)
 
     def _constraints_of(self, grant: ActiveGrant) -> FlightConstraints:
         self._constraints = FlightConstraints(grant, self._for_transit(grant))
@@ -377,18 +283,6 @@ class Control:
         """End the motion under way, for one that follows it."""
         self.dispatch(MotionStopped(verdict.code, verdict.reason, verdict.policies))
 
-    async def hold(self, permit: Callable[[], None]) -> None:
-        """Brake and hover."""
-        await self._performer.hold(permit)
-
-    def undisturbed(self) -> None:
-        """Permits what a driver's drone does after its motion: nothing else has begun.
-
-        Raises:
-            AutopilotError: something else flies by now.
-        """
-        self._performer.undisturbed()
-
     # Policies and grants
 
     def brake(self, verdict: Verdict) -> None:
@@ -407,7 +301,7 @@ class Control:
             if constraints is not None and constraints.grant.key == new.key:
                 constraints.grant, constraints.compiled = new, self._for_transit(new)
         self.dispatch(GrantChanged(_reference(old), _reference(new)))
-        if old is not None and self._state.removed == old.key:
+        if old is not None and self._machine.known.removed == old.key:
             self._removed = old
 
 

@@ -33,7 +33,7 @@ class Observer:
     def found(self) -> None:
         """The autopilot is there, for the first time or again."""
         checked, flying = self._control.checked, self._control.autopilot.vehicle.armed
-        self._control.checked = replace(checked, problem=BEING_SET) if flying and checked is not None else None
+        self._control.set_checked(replace(checked, problem=BEING_SET) if flying and checked is not None else None)
         self._control.dispatch(VehicleFound())
         self._control.tasks.drop(self._preparing)
         self._preparing = self._control.tasks.spawn(self._prepare())
@@ -49,8 +49,9 @@ class Observer:
             if autopilot.connected and self._unverified():
                 try:
                     await autopilot.set_rates(flying=autopilot.vehicle.armed)
-                    self._control.checked = await self._failsafes.configure(
-                        flying=autopilot.vehicle.armed, before=self._control.checked
+                    before = self._control.checked
+                    self._control.set_checked(
+                        await self._failsafes.configure(flying=autopilot.vehicle.armed, before=before)
                     )
                     self._control.wake()
                     if autopilot.vehicle.home is None:

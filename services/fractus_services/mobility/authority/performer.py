@@ -37,7 +37,7 @@ from fractus_services.mobility.autopilot import Approach, Autopilot, Permit
 log = logging.getLogger(__name__)
 
 
-class Machine(Protocol):
+class Holder(Protocol):
     """The holder of the state."""
 
     @property
@@ -86,7 +86,7 @@ class Performer:
 
     def __init__(
         self,
-        machine: Machine,
+        machine: Holder,
         autopilot: Autopilot,
         modes: ModeCommands,
         approach: Approach,

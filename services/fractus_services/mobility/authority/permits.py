@@ -6,6 +6,7 @@ from fractus_core.control import Authority
 
 from fractus_services.errors import PreconditionFailed
 from fractus_services.grants import ActiveGrant
+from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import FlightConstraints, Lease, Motion
 from fractus_services.mobility.autopilot import Permit
@@ -24,7 +25,7 @@ def driver_permit(control: Control, grant: ActiveGrant, motion: Motion | None = 
     def check() -> None:
         if motion is not None:
             motion.check()
-        if control.require(grant) is not lease or not control.valid(grant):
+        if drivers.require(control, grant) is not lease or not control.valid(grant):
             raise PreconditionFailed("ControlLost", "the drone is not yours any more")
 
     return check

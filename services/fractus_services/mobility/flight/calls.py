@@ -9,6 +9,7 @@ from fractus_core.policy.values import Call, Verdict
 
 from fractus_services.errors import Aborted, denied
 from fractus_services.grants import ActiveGrant
+from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.flight.guard import Guard
 
@@ -97,7 +98,7 @@ class CallJudge:
             raise denied(verdict)
         # Before the verdict has consequences: a call of a driver that waits for the drone must neither brake it nor take
         # it from the one that has it.
-        self._control.require(grant)
+        drivers.require(self._control, grant)
         if verdict.action == "takeover":
             self._control.take_over(verdict)
             raise denied(verdict)

@@ -11,6 +11,7 @@ from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs
 
 from fractus_services.errors import Aborted, PreconditionFailed, Refused
 from fractus_services.grants import ActiveGrant
+from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.arming import Arming
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import Motion
@@ -148,7 +149,7 @@ class MobilityService:
                     async with aclosing(fly_to(self._autopilot, motion, leg, radius, permit, judged=judged)) as flying:
                         async for step in flying:
                             if step.complete:
-                                self._control.reached(grant, args.lat, args.lon)
+                                drivers.reached(self._control, grant, args.lat, args.lon)
                             yield Progress(final, step)
                 except _Outdated as outdated:
                     final = outdated.verdict
@@ -173,7 +174,7 @@ class MobilityService:
             if self._autopilot.now - judged_at <= JUDGE_AGAIN_S:
                 return
             judged_at = self._autopilot.now
-            again = self.calls.allow_motion(call, self._control.require(grant).grant, verdict)
+            again = self.calls.allow_motion(call, drivers.require(self._control, grant).grant, verdict)
             if again.brake_first or again.args != verdict.args:
                 raise _Outdated(again)
 
@@ -197,7 +198,7 @@ class MobilityService:
             elif self._autopilot.now - begun <= JUDGE_AGAIN_S:
                 return verdict
             permit()
-            verdict = self.calls.allow_motion(call, self._control.require(grant).grant, verdict)
+            verdict = self.calls.allow_motion(call, drivers.require(self._control, grant).grant, verdict)
         raise Aborted("NotStopping", "the drone does not come to rest, and could not begin its leg otherwise")
 
     async def set_velocity(self, grant: ActiveGrant, args: VelocityArgs) -> tuple[Verdict, VelocityArgs]:
@@ -239,7 +240,7 @@ class MobilityService:
         async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
             control = self._control
             permit = driver_permit(control, grant, motion)
-            constraints = control.begin_system_flight(control.require(grant).grant)
+            constraints = control.begin_system_flight(drivers.require(control, grant).grant)
             try:
                 await control.modes.enter_guided(permit)
                 trip = Trip(constraints, motion.kind, lambda _motion: permit)
@@ -266,7 +267,7 @@ class MobilityService:
         """
         if grant.spec.class_ != "driver" or call.method not in grant.compiled.methods:
             return
-        self._control.require(grant)
+        drivers.require(self._control, grant)
         if not self._autopilot.vehicle.armed:
             raise PreconditionFailed("NotArmed", "the motors are off; arm first")
         if self._autopilot.vehicle.in_air and not self._autopilot.vehicle.standing:

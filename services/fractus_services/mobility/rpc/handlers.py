@@ -18,6 +18,7 @@ from fractus_services.auth import Caller
 from fractus_services.clock import Clock
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.grants import ActiveGrant, GrantFiles
+from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.flight.service import MobilityService, Progress
 from fractus_services.mobility.rpc.arguments import (
@@ -105,7 +106,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
             grant = self._grant_of(caller)
             self._service.calls.supersede(grant)
             self._service.calls.allow(Call("ReturnControl"), grant)
-            last = await self._control.give_back(grant)
+            last = await drivers.give_back(self._control, grant)
             return mobility_pb2.ReturnControlResponse(mission_complete=last)
 
     # Calls that answer at once

@@ -11,6 +11,7 @@ from fractus_core.control.values import ended_refusal
 
 from fractus_services.errors import PolicyDenied, PreconditionFailed
 from fractus_services.grants import ActiveGrant
+from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import Lease
 
@@ -48,13 +49,13 @@ class Streams:
         control = self._control
         if grant.spec.class_ != "driver":
             raise PolicyDenied("NotADriver", "only a driver gets control; passengers ride along")
-        lease = control.open_lease(grant)
+        lease = drivers.open_lease(control, grant)
         try:
             while control.lease is lease and not control.state.granted:
                 async with aclosing(self._until_ready(lease)) as waiting:
                     async for reason in waiting:
                         yield ControlEvent(StreamState.WAITING, control.mission(grant).points_done, reason)
-                control.grant_control(lease)
+                drivers.grant_control(control, lease)
             while True:
                 try:
                     event = await lease.next(TOLD_S)
@@ -66,7 +67,7 @@ class Streams:
                 if event.final:
                     return
         finally:
-            control.close_lease(lease)
+            drivers.close_lease(control, lease)
 
     async def _until_ready(self, lease: Lease) -> AsyncGenerator[str, None]:
         control, said = self._control, ""

@@ -1,0 +1,79 @@
+"""What drivers do with their lease: they ask for it, command with it, return it, or lose it with their stream."""
+
+from __future__ import annotations
+
+import math
+
+from fractus_core.control.actions import RefuseStream
+from fractus_core.control.events import ControlReturned, GrantControl, StreamClosed, StreamOpened, WaypointReached
+from fractus_core.geo import LocalFrame
+
+from fractus_services.errors import PreconditionFailed, Unavailable
+from fractus_services.grants import ActiveGrant
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.leases import Lease
+
+WAYPOINT_M = 5.0
+"""How near a leg must end to a waypoint of the driver's path to count as it."""
+
+
+def open_lease(control: Control, grant: ActiveGrant) -> Lease:
+    """A driver asks for control.
+
+    Raises:
+        PreconditionFailed: its mission is over, or another application has the drone.
+    """
+    lease = Lease(grant)
+    control.leases[lease.lease_id] = lease
+    for action in control.dispatch(StreamOpened(lease.lease_id, grant.key, grant.identity)):
+        if isinstance(action, RefuseStream):
+            del control.leases[lease.lease_id]
+            raise PreconditionFailed(action.code, action.reason)
+    return lease
+
+
+def grant_control(control: Control, lease: Lease) -> None:
+    """Give the drone to a driver that waits, when there is nothing left to wait for."""
+    if control.lease is lease and control.not_ready_reason(lease.key) is None:
+        control.dispatch(GrantControl(lease.lease_id))
+
+
+def close_lease(control: Control, lease: Lease) -> None:
+    """A driver's stream is over."""
+    control.dispatch(StreamClosed(lease.lease_id))
+    control.leases.pop(lease.lease_id, None)
+
+
+def require(control: Control, grant: ActiveGrant) -> Lease:
+    """The lease of a caller that moves the drone.
+
+    Raises:
+        Refused: it does not have the drone.
+    """
+    lease, state = control.lease, control.state
+    if lease is None or lease.key != grant.key or not state.drives:
+        reason = f"the drone is not yours: {state.controller} has it; use GetControl"
+        raise PreconditionFailed("NotInControl", reason)
+    if not control.autopilot.connected:
+        raise Unavailable("AutopilotUnavailable", "the autopilot is not connected")
+    return lease
+
+
+async def give_back(control: Control, grant: ActiveGrant) -> bool:
+    """A driver returns control at the end of a control point; True when that was the last one."""
+    require(control, grant)
+    points = len(grant.spec.control_points)
+    control.dispatch(ControlReturned(grant.key, points))
+    last = control.mission(grant).points_done >= points
+    await control.save()
+    return last
+
+
+def reached(control: Control, grant: ActiveGrant, lat: float, lon: float) -> None:
+    """A goto of the driver is complete: count the waypoint."""
+    mission, points = control.mission(grant), grant.spec.control_points
+    path = points[mission.points_done].path if mission.points_done < len(points) else None
+    if path and mission.waypoints < len(path):
+        ahead = path[mission.waypoints]
+        if math.hypot(*LocalFrame(ahead.lat, ahead.lon).xy(lat, lon)) <= WAYPOINT_M:
+            control.dispatch(WaypointReached(grant.key))

@@ -7,7 +7,7 @@ import pytest
 from depth import examples
 from fractus_core.api.geometry import Position
 from fractus_core.planning import Flight, Settings, flight_of, operation_area
-from fractus_core.planning.flight import Mission, first_missed, transit_legs
+from fractus_core.planning.flight import MissionEstimator, first_missed, transit_legs
 from fractus_core.planning.tour import short_tour
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
@@ -126,7 +126,9 @@ def test_time_of_a_mission_by_hand():
     app = application(navigator([at(300, 0, 30), at(300, 400, 30)]))
     depots = inventory().depots
     area = operation_area(app.spec, depots, 7)
-    found = Mission(app.spec, area, Settings(cruise_speed_mps=5, climb_speed_mps=1.5)).estimate(HOME, drone("d"))
+    found = MissionEstimator(app.spec, area, Settings(cruise_speed_mps=5, climb_speed_mps=1.5)).estimate(
+        HOME, drone("d")
+    )
     assert found.distance_m == pytest.approx(300 + 400 + 500, rel=1e-4)
     assert found.needed_min == pytest.approx((1200 / 5 + 60 / 1.5) / 60, rel=1e-4)
     assert found.available_min == pytest.approx(15 - 0.2 * 15)
@@ -139,7 +141,9 @@ def test_stay_in_a_region_counts():
         navigator(PATH) | {"controlPoints": [{"navigation": "regionBased", "region": region, "duration": 9}]}
     )
     area = operation_area(app.spec, {}, 7)
-    assert Mission(app.spec, area, Settings()).estimate(HOME, drone("d")).needed_min == pytest.approx(9 + 2, rel=1e-3)
+    assert MissionEstimator(app.spec, area, Settings()).estimate(HOME, drone("d")).needed_min == pytest.approx(
+        9 + 2, rel=1e-3
+    )
 
 
 def test_the_system_flies_to_between_and_from_control_points():

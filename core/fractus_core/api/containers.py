@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Iterable
 from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
@@ -101,23 +102,28 @@ class Container(Model):
     volumes: tuple[Volume, ...] = Field(default=(), max_length=16)
 
     @model_validator(mode="after")
-    def _distinct_variables_and_ports(self) -> Self:
-        for i, variable in enumerate(self.env):
-            if any(v.name == variable.name for v in self.env[:i]):
-                raise InvalidObject(f"env[{i}].name", f"{variable.name} is there twice; remove one of them")
-        for i, port in enumerate(self.ports):
-            if any((p.port, p.protocol) == (port.port, port.protocol) for p in self.ports[:i]):
-                raise InvalidObject(f"ports[{i}].port", f"{port.port} is there twice; remove one of them")
-            if port.name is not None and any(p.name == port.name for p in self.ports[:i]):
-                raise InvalidObject(f"ports[{i}].name", f"{port.name} is taken; choose another name")
+    def _distinct_names(self) -> Self:
+        for i in _repeated(v.name for v in self.env):
+            raise InvalidObject(f"env[{i}].name", f"{self.env[i].name} is there twice; remove one of them")
+        for i in _repeated((p.port, p.protocol) for p in self.ports):
+            raise InvalidObject(f"ports[{i}].port", f"{self.ports[i].port} is there twice; remove one of them")
+        for i in _repeated(p.name for p in self.ports):
+            raise InvalidObject(f"ports[{i}].name", f"{self.ports[i].name} is taken; choose another name")
+        # The pod has volumes of its own, of these names.
+        for i in _repeated((v.name for v in self.volumes), taken=("tls", "tmp")):
+            raise InvalidObject(f"volumes[{i}].name", f"{self.volumes[i].name} is taken; choose another name")
+        for i in _repeated(v.mount_path for v in self.volumes):
+            raise InvalidObject(
+                f"volumes[{i}].mountPath", f"{self.volumes[i].mount_path} is taken; choose another path"
+            )
         return self
 
-    @model_validator(mode="after")
-    def _distinct_volumes(self) -> Self:
-        for i, volume in enumerate(self.volumes):
-            others = self.volumes[:i]
-            if volume.name in {"tls", "tmp"} or any(v.name == volume.name for v in others):
-                raise InvalidObject(f"volumes[{i}].name", f"{volume.name} is taken; choose another name")
-            if any(v.mount_path == volume.mount_path for v in others):
-                raise InvalidObject(f"volumes[{i}].mountPath", f"{volume.mount_path} is taken; choose another path")
-        return self
+
+def _repeated(keys: Iterable[Hashable | None], taken: Iterable[Hashable] = ()) -> list[int]:
+    """Where keys are that are taken, or came before; None is no key."""
+    seen, found = set(taken), []
+    for i, key in enumerate(keys):
+        if key is not None and key in seen:
+            found.append(i)
+        seen.add(key)
+    return found

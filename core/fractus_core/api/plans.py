@@ -31,8 +31,8 @@ class Alternative(Model):
     score: float = Field(description="Higher is better; comparable within one plan only.")
 
 
-class Leg(Model):
-    """A straight piece of flight."""
+class TransitLeg(Model):
+    """A straight piece of a transit, that is of flight by the system."""
 
     start: Position
     end: Position
@@ -55,7 +55,7 @@ class DroneChoice(Model):
         default=None, description="namespace/name of the application that flies the drone; this one comes along."
     )
     mission: Mission | None = Field(default=None, description="Unset when the application comes along.")
-    transit: tuple[Leg, ...] = Field(default=(), description="The legs that the system flies, in order.")
+    transit: tuple[TransitLeg, ...] = Field(default=(), description="The legs that the system flies, in order.")
     alternatives: tuple[Alternative, ...] = ()
 
 

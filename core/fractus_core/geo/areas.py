@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -144,11 +144,7 @@ def geojson(frame: LocalFrame, shape: BaseGeometry) -> dict[str, Any]:
         reference = rings[0][0][0]
         rings = [[(_near(lon, reference), lat) for lon, lat in ring] for ring in rings]
         whole = shapely.Polygon(rings[0], rings[1:])
-        for shift in (0.0, 360.0, -360.0):
-            window = shapely.box(-180.0, -90.0, 180.0, 90.0)
-            moved = shapely.transform(whole, lambda c, s=shift: c + np.array([s, 0.0]))
-            inside = moved.intersection(window)
-            polygons += [p for p in shapely.get_parts(inside) if isinstance(p, shapely.Polygon) and p.area > 0]
+        polygons += [p for p in _cut(whole) if isinstance(p, shapely.Polygon) and p.area > 0]
     coordinates = [
         [[[round(x, 7), round(y, 7)] for x, y in ring.coords] for ring in (p.exterior, *p.interiors)]
         for p in (shapely.orient_polygons(q) for q in polygons)
@@ -161,14 +157,16 @@ def geojson_line(points: Sequence[Point]) -> dict[str, Any]:
     unwrapped: list[tuple[float, float]] = []
     for p in points:
         unwrapped.append((_near(p.lon, unwrapped[-1][0]) if unwrapped else p.lon, p.lat))
-    whole = shapely.LineString(unwrapped)
-    lines = []
-    for shift in (0.0, 360.0, -360.0):
-        moved = shapely.transform(whole, lambda c, s=shift: c + np.array([s, 0.0]))
-        inside = moved.intersection(shapely.box(-180.0, -90.0, 180.0, 90.0))
-        lines += [part for part in shapely.get_parts(inside) if part.length > 0]
+    lines = [part for part in _cut(shapely.LineString(unwrapped)) if part.length > 0]
     coordinates = [[[round(x, 7), round(y, 7)] for x, y in line.coords] for line in lines]
     return {"type": "MultiLineString", "coordinates": coordinates}
+
+
+def _cut(whole: BaseGeometry) -> Iterator[BaseGeometry]:
+    """The parts of what crosses the antimeridian, each with longitudes from -180 to 180."""
+    for shift in (0.0, 360.0, -360.0):
+        moved = shapely.transform(whole, lambda c, s=shift: c + np.array([s, 0.0]))
+        yield from shapely.get_parts(moved.intersection(shapely.box(-180.0, -90.0, 180.0, 90.0)))
 
 
 def _unwrapped(frame: LocalFrame, ring: BaseGeometry) -> list[tuple[float, float]]:

@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from fractus_core.api.components import Component
 from fractus_core.api.geometry import Point, Position
 from fractus_core.api.nodes import Drone
-from fractus_core.api.plans import Alternative, DroneChoice
-from fractus_core.api.plans import Mission as PlannedMission
+from fractus_core.api.plans import Alternative, DroneChoice, Mission
 from fractus_core.geo import ground
 from fractus_core.planning.area import OperationArea, start_of
 from fractus_core.planning.candidates import SUITABLE, Check, check_host, check_resources, check_services
 from fractus_core.planning.draft import Draft
-from fractus_core.planning.flight import Estimate, Mission, first_missed, remaining_minutes, transit_legs
+from fractus_core.planning.flight import Estimate, MissionEstimator, first_missed, remaining_minutes, transit_legs
 from fractus_core.planning.index import Near
 from fractus_core.planning.inventory import DroneFacts
 
@@ -71,7 +70,7 @@ def choose_drone(draft: Draft, area: OperationArea, candidates: DroneCandidates)
     """
     components = list(draft.spec.on("drone"))
     leader = draft.spec.driver or components[0]
-    mission = Mission(draft.spec, area, draft.settings)
+    mission = MissionEstimator(draft.spec, area, draft.settings)
     ranked = [
         found
         for drones, used in ((candidates.flying, True), (candidates.idle, False))
@@ -165,7 +164,9 @@ def _flying_by(draft: Draft, leader: Component) -> list[str]:
 # -- by what it is and has --
 
 
-def _judge(draft: Draft, asked: Mission, drone: Drone, components: list[Component], *, used: bool) -> _Ranked | None:
+def _judge(
+    draft: Draft, asked: MissionEstimator, drone: Drone, components: list[Component], *, used: bool
+) -> _Ranked | None:
     """The drone with its score, or None with the first rule it fails noted."""
     leader = draft.spec.driver or components[0]
     kept = draft.flew(drone.name, shared=used)
@@ -236,8 +237,8 @@ def _too_long(drone: Drone, mission: Estimate, available_min: float, when: str) 
     )
 
 
-def _mission(found: Estimate) -> PlannedMission:
-    return PlannedMission(
+def _mission(found: Estimate) -> Mission:
+    return Mission(
         distance=round(found.distance_m, 1),
         duration=round(found.needed_min, 3),
         available=round(found.available_min, 3),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fractus_core.api.applications import Application, ApplicationSpec
 from fractus_core.api.geometry import Point, Position, Reference
 from fractus_core.api.nodes import Depot, Drone
-from fractus_core.api.plans import Leg
+from fractus_core.api.plans import TransitLeg
 from fractus_core.exhaustive import exhaustive
 from fractus_core.geo import LocalFrame, distance_m, middle_of
 from fractus_core.planning.area import OperationArea, control_routes
@@ -39,7 +39,7 @@ class Estimate:
     available_min: float
 
 
-class Mission:
+class MissionEstimator:
     """What an application asks of a drone; what does not depend on the drone is found once."""
 
     def __init__(self, spec: ApplicationSpec, area: OperationArea, settings: Settings) -> None:
@@ -103,7 +103,9 @@ def remaining_minutes(drone: Drone) -> float:
     return mobility.max_flight_time * (battery.remaining if battery else 1.0)
 
 
-def transit_legs(spec: ApplicationSpec, area: OperationArea, home: Position, depots: Mapping[str, Depot]) -> list[Leg]:
+def transit_legs(
+    spec: ApplicationSpec, area: OperationArea, home: Position, depots: Mapping[str, Depot]
+) -> list[TransitLeg]:
     """The legs that the system flies itself.
 
     To and between the control points of a driver with partial control, through all points of interest of an
@@ -120,7 +122,7 @@ def transit_legs(spec: ApplicationSpec, area: OperationArea, home: Position, dep
         entries = [*(route[0] for route in routes), home]
         exits = [home, *(route[-1] for route in routes)]
         pairs = list(zip(exits, entries, strict=True))
-    return [Leg(start=a, end=b) for a, b in pairs if (a.lat, a.lon) != (b.lat, b.lon)]
+    return [TransitLeg(start=a, end=b) for a, b in pairs if (a.lat, a.lon) != (b.lat, b.lon)]
 
 
 def flight_of(application: Application, depots: Mapping[str, Depot], reached: int = 0) -> Flight:

@@ -11,10 +11,7 @@ from dataclasses import dataclass
 
 import click
 
-EXIT_OK = 0
-EXIT_BAD_INPUT = 1
-EXIT_INFEASIBLE = 2
-EXIT_INTERRUPTED = 130
+from fractus_cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK
 
 _MARKERS = {"core": "shapely", "operator": "cryptography", "services": "cv2", "sim": "matplotlib"}
 """A module that tells whether an extra is installed: looking for it takes a millisecond, importing a command a second."""

@@ -2,43 +2,29 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import pathlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import click
 import yaml
-from fractus_core.api import API_VERSION, GROUP, Application, DeploymentPlan, InvalidObject
+from fractus_core.api import API_VERSION, GROUP, DeploymentPlan
 from fractus_core.api.plans import DeploymentPlanSpec
-from fractus_core.planning import Flight, Host, Infeasible, Inventory, Settings, flight_of
-from fractus_core.planning import plan as decide
-from fractus_core.planning.candidates import requests
+from fractus_core.planning import Inventory, Settings
 from fractus_core.planning.plugins import GROUP as PLUGINS
 from fractus_core.planning.plugins import UnknownPlugin, load_plugin
-from fractus_core.policy.grants import compile_grants
-from fractus_core.validation import check_application
 
-from fractus_cli.main import EXIT_INFEASIBLE
-from fractus_cli.manifests import BadManifest, Manifests, read_manifests
+from fractus_cli import EXIT_INFEASIBLE
+from fractus_cli.manifests import BadManifest, read_manifests
 from fractus_cli.plan_map import plan_map
 from fractus_cli.plan_table import infeasible_table, plan_table
+from fractus_cli.planning import Decided, plan_all
 
 _DEFAULTS = Settings()
 
 INFEASIBLE_ANNOTATION = f"{GROUP}/infeasible"
 """On what is printed of an application that no plan fits: REASON: MESSAGE."""
-
-
-@dataclass(frozen=True)
-class Decided:
-    """The answer for one application: a plan, or why there is none."""
-
-    application: Application
-    plan: DeploymentPlanSpec | None
-    refusal: Infeasible | None = None
 
 
 _PATH = click.Path(exists=True, path_type=pathlib.Path)
@@ -105,63 +91,6 @@ def plan(
             click.echo(f"{'/'.join(answer.application.key)}: {answer.refusal.reason}: {answer.refusal}", err=True)
     if any(answer.refusal is not None for answer in decided):
         context.exit(EXIT_INFEASIBLE)
-
-
-def plan_all(manifests: Manifests, settings: Settings) -> list[Decided]:
-    """Plan every application on what those before it leave.
-
-    Raises:
-        BadManifest: there is no application, or one names what does not exist.
-    """
-    stock = manifests.inventory()
-    decided = []
-    in_force = {}
-    applications = manifests.applications()
-    if not applications:
-        raise BadManifest("there is no Application in the manifests; name a file that has one")
-    for application in applications:
-        before = manifests.previous(application)
-        if before is not None:
-            in_force[application.key] = (application, before.spec)
-    for application in applications:
-        previous = in_force.pop(application.key, (application, None))[1]
-        left = stock
-        for other, its_plan in in_force.values():
-            left = _taken(left, other, its_plan)
-        try:
-            check_application(application, stock.depots)
-            found = decide(application, left, settings, previous)
-            compile_grants(application, found, stock, settings)
-        except InvalidObject as error:
-            origin = manifests.origin(application)
-            raise BadManifest(f"{origin}: Application {application.name}: {error}") from None
-        except Infeasible as refusal:
-            decided.append(Decided(application, None, refusal))
-        else:
-            decided.append(Decided(application, found))
-            stock = _taken(stock, application, found)
-    return decided
-
-
-def _taken(stock: Inventory, application: Application, found: DeploymentPlanSpec) -> Inventory:
-    """What is left for the next application: the drone is claimed, resources are booked."""
-    hosts: dict[str, Host] = dict(stock.hosts)
-    components = {component.name: component for component in application.spec.components}
-    for placed in found.placements:
-        if placed.node not in hosts or placed.component not in components:
-            continue
-        host = hosts[placed.node]
-        booked = dict(host.requested)
-        for resource, amount in requests(components[placed.component]).items():
-            booked[resource] = booked.get(resource, 0.0) + amount
-        hosts[placed.node] = replace(host, requested=booked)
-    claimed: dict[str, tuple[str, str]] = dict(stock.claimed)
-    flights: dict[str, Flight] = dict(stock.flights)
-    if found.drone is not None and found.drone.shared_with is None:
-        claimed[found.drone.node] = application.key
-        with contextlib.suppress(InvalidObject):
-            flights[found.drone.node] = flight_of(application, stock.depots)
-    return replace(stock, hosts=hosts, claimed=claimed, flights=flights, locations=stock.located())
 
 
 def _plugin(name: str | None, option: str) -> Any:

@@ -24,7 +24,7 @@ from fractus_core.policy.values import Airframe, Attitude, Call, Home, Situation
 
 from fractus_cli.calls import figures, parse_call, parse_time
 from fractus_cli.manifests import BadManifest, Manifests, read_manifests
-from fractus_cli.plan import plan_all
+from fractus_cli.planning import plan_all
 
 R = TypeVar("R", bound=Resource)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 from fractus_cli.manifests import BadManifest, read_manifests
-from fractus_cli.plan import plan_all
+from fractus_cli.planning import plan_all
 from fractus_core.api import API_VERSION, Application, Drone, Policy, Zone
 from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame, polygon

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fractus_cluster.ports import free_port
-from fractus_mavlink import Parser, encode, layout_named
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD
+from fractus_mavlink import Endpoint
+from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_COMPONENT, MAV_MODE_FLAG
 from fractus_vehicle.earth import Place
 from fractus_vehicle.pilot import Pilot
 from fractus_vehicle.readiness import arming_refusal
@@ -140,9 +140,12 @@ def speed(flight_s: float) -> list[Claim]:
             pilot.channel.streams.clear()
         simulation.advance(2.5)
         for pilot in pilots:
-            pilot.send("COMMAND_LONG", _order(pilot, 176, 1.0, 4.0))
-            pilot.send("COMMAND_LONG", _order(pilot, 400, 1.0))
-            pilot.send("COMMAND_LONG", _order(pilot, 22, 0, 0, 0, 0, 0, 0, 10.0))
+            pilot.send(
+                "COMMAND_LONG",
+                _order(pilot, MAV_CMD.DO_SET_MODE, MAV_MODE_FLAG.CUSTOM_MODE_ENABLED, COPTER_MODE.GUIDED),
+            )
+            pilot.send("COMMAND_LONG", _order(pilot, MAV_CMD.COMPONENT_ARM_DISARM, 1.0))
+            pilot.send("COMMAND_LONG", _order(pilot, MAV_CMD.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 10.0))
             pilot.channel.take()
         simulation.advance(6.0)
         begun = time.process_time()
@@ -173,12 +176,12 @@ class Link:
 
     def __init__(self, port: int) -> None:
         self.socket = socket.create_connection(("127.0.0.1", port), timeout=5.0)
-        self.parser = Parser()
+        self.endpoint = Endpoint(255, MAV_COMPONENT.MISSIONPLANNER)
 
     def send(self, name: str, **values: float) -> None:
         """Send one message to the vehicle."""
         target: dict[str, float] = {"target_system": 1, "target_component": 1}
-        self.socket.sendall(encode(layout_named(name), target | values, sequence=0, sysid=255, compid=190))
+        self.socket.sendall(self.endpoint.encode(name, target | values))
 
     def read(self, duration_s: float, until: str = "") -> int:
         """Read for a time, or until a message of that name; returns how many came."""
@@ -186,7 +189,7 @@ class Link:
         while time.monotonic() < end:
             if not select.select([self.socket], [], [], max(0.0, end - time.monotonic()))[0]:
                 break
-            messages = self.parser.feed(self.socket.recv(65536))
+            messages = self.endpoint.decode(self.socket.recv(65536))
             count += len(messages)
             if any(message.name == until for message in messages):
                 break
@@ -208,9 +211,9 @@ def process(duration_s: float) -> list[Claim]:
         idle = (_cpu_s(child.pid) - before) / duration_s * 100.0
         link.send("REQUEST_DATA_STREAM", req_message_rate=4, start_stop=1)
         for values in (
-            {"command": 176, "param1": 1, "param2": 4},
-            {"command": 400, "param1": 1},
-            {"command": 22, "param7": 20},
+            {"command": MAV_CMD.DO_SET_MODE, "param1": MAV_MODE_FLAG.CUSTOM_MODE_ENABLED, "param2": COPTER_MODE.GUIDED},
+            {"command": MAV_CMD.COMPONENT_ARM_DISARM, "param1": 1},
+            {"command": MAV_CMD.NAV_TAKEOFF, "param7": 20},
         ):
             link.send("COMMAND_LONG", **values)
             link.read(1.0, until="COMMAND_ACK")
@@ -222,7 +225,7 @@ def process(duration_s: float) -> list[Claim]:
         for at in range(100):
             link.read(0.0037 * (1 + at % 5))
             begun = time.perf_counter()
-            link.send("COMMAND_LONG", command=520, param1=1)
+            link.send("COMMAND_LONG", command=MAV_CMD.REQUEST_AUTOPILOT_CAPABILITIES, param1=1)
             link.read(1.0, until="COMMAND_ACK")
             waits.append((time.perf_counter() - begun) * 1000.0)
         return [

@@ -172,8 +172,7 @@ class _TcpServer:
         if len(self._clients) >= MAX_CLIENTS:
             connection.close()
             return
-        client = _TcpClient(self._hub, connection, self._craft, self._port)
-        client.gone = self._clients.discard
+        client = _TcpClient(self._hub, connection, self._craft, self._port, gone=self._clients.discard)
         self._clients.add(client)
 
     def _close(self) -> None:
@@ -183,11 +182,13 @@ class _TcpServer:
 
 
 class _TcpClient:
-    def __init__(self, hub: Hub, connection: socket.socket, craft: Craft, port: int) -> None:
+    def __init__(
+        self, hub: Hub, connection: socket.socket, craft: Craft, port: int, *, gone: Callable[[_TcpClient], None]
+    ) -> None:
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._hub, self._socket, self._craft = hub, connection, craft
-        self.gone: Callable[[_TcpClient], None] = lambda _client: None
+        self._gone = gone
         self._channel = craft.open("tcp", port)
         self._unsent = b""
         hub.watch(connection.fileno(), self._read)
@@ -229,7 +230,7 @@ class _TcpClient:
         self._hub.not_at_flush(self._flush)
         self._craft.close(self._channel)
         self._socket.close()
-        self.gone(self)
+        self._gone(self)
 
 
 class _Udp:
@@ -238,8 +239,8 @@ class _Udp:
         family = socket.AF_INET6 if ":" in spec.host else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
-        self._channels: dict[object, Channel] = {}
-        self._peers: dict[object, object] = {}
+        # By the peer's address; the one channel of a connected socket has none.
+        self._channels: dict[tuple[str, int] | None, Channel] = {}
         try:
             if spec.kind == "udpin":
                 self._socket.bind((spec.host, spec.port))
@@ -278,7 +279,7 @@ class _Udp:
                     if key is None:
                         self._socket.send(datagram)
                     else:
-                        self._socket.sendto(datagram, key)  # type: ignore[call-overload]
+                        self._socket.sendto(datagram, key)
                 except (BlockingIOError, ConnectionError):
                     break
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import shapely
 from fractus_core.api.plans import GrantSpec
-from fractus_core.geo import LocalFrame, polygon
+from fractus_core.geo import LocalFrame, middle, polygon
 from fractus_mavlink.enums import MAV_CMD
 
 ROOM_M = 10.0
@@ -56,8 +56,7 @@ def bounds_of(spec: GrantSpec) -> Bounds | None:
     altitude = spec.limits.max_altitude + HEADROOM_M if spec.limits is not None else None
     items: tuple[Item, ...] = ()
     if spec.operation_area:
-        first = spec.operation_area[0]
-        frame = LocalFrame.at(first.circle.center if first.circle is not None else first.polygon.exterior[0])  # type: ignore[union-attr]
+        frame = LocalFrame.at(middle(spec.operation_area[0]))
         whole = shapely.union_all([polygon(frame, area) for area in (*spec.operation_area, *spec.corridor)])
         grown = whole.buffer(ROOM_M + _SIMPLER_M, join_style="mitre", mitre_limit=2.0).simplify(_SIMPLER_M)
         if not isinstance(grown, shapely.Polygon) or len(grown.exterior.coords) > MAX_VERTICES:

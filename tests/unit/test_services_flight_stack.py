@@ -1,0 +1,72 @@
+"""What is a firmware's own: ArduCopter's modes and texts, and that another firmware's modes need nothing but its stack."""
+
+from __future__ import annotations
+
+import pytest
+from fractus_core.control.values import FlightMode, ModeKind
+from fractus_mavlink import Message, message
+from fractus_mavlink.enums import COPTER_MODE, MAV_CMD
+from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER, ArduCopter
+from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
+
+
+def test_each_mode_means_what_the_vehicle_does_in_it() -> None:
+    kinds = {mode: ARDUCOPTER.mode(mode).kind for mode in COPTER_MODE}
+    assert kinds.pop(COPTER_MODE.GUIDED) is ModeKind.COMMANDED
+    assert kinds.pop(COPTER_MODE.LAND) is ModeKind.LANDING
+    for mode in (COPTER_MODE.RTL, COPTER_MODE.SMART_RTL, COPTER_MODE.AUTO_RTL):
+        assert kinds.pop(mode) is ModeKind.RETURNING
+    assert set(kinds.values()) == {ModeKind.OTHER}, "in every other mode a pilot flies"
+
+
+def test_modes_are_asked_for_by_their_numbers() -> None:
+    for mode in COPTER_MODE:
+        assert ARDUCOPTER.mode_parameters(ARDUCOPTER.mode(mode)) == (float(mode),)
+    assert ARDUCOPTER.mode(99) == FlightMode("MODE99"), "a later release's: a pilot's until it is known"
+
+
+@pytest.mark.parametrize(
+    ("text", "tells"),
+    [
+        ("GCS Failsafe", True),
+        ("Battery 1 is low 10.32V used 1200 mAh", False),
+        ("Battery Failsafe", True),
+        ("Polygon fence breached", True),
+        ("GCS Failsafe Cleared", False),
+        ("EKF Failsafe: changed to LAND Mode", True),
+        ("Mission: 3 WP", False),
+    ],
+)
+def test_texts_of_failsafes_are_told_from_others(text: str, tells: bool) -> None:
+    assert ARDUCOPTER.tells_failsafe(text) is tells
+
+
+class TwoNumbers(ArduCopter):
+    """A firmware whose modes have a main and a sub mode, as PX4's, packed into one number."""
+
+    land = FlightMode("AUTO.LAND", ModeKind.LANDING)
+
+    def mode(self, custom_mode: int) -> FlightMode:
+        return self.land if custom_mode == 4 << 16 | 6 << 24 else FlightMode()
+
+    def mode_parameters(self, mode: FlightMode) -> tuple[float, ...]:
+        return (4.0, 6.0)
+
+
+async def test_another_firmware_needs_only_its_own_stack() -> None:
+    sent: list[Message] = []
+
+    class Vehicle(MavlinkAutopilot):
+        def send(self, outgoing: Message) -> None:
+            sent.append(outgoing)
+            self.take(message("COMMAND_ACK", command=outgoing.integer("command")))
+            self.take(message("HEARTBEAT", custom_mode=4 << 16 | 6 << 24))
+
+    stack = TwoNumbers()
+    vehicle = Vehicle("tcp:nowhere:1", stack)
+    vehicle.target, vehicle.vehicle.heartbeat_at = (1, 1), vehicle.now
+    await vehicle.set_mode(stack.land)
+    assert vehicle.vehicle.mode == stack.land
+    (order,) = sent
+    assert order.integer("command") == MAV_CMD.DO_SET_MODE
+    assert [order.real(f"param{at}") for at in (1, 2, 3, 4)] == [1.0, 4.0, 6.0, 0.0]

@@ -27,7 +27,7 @@ from fractus_services.mobility.flight.service import Progress
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
-from fractus_services.mobility.rpc.wiring import assemble
+from fractus_services.mobility.rpc.wiring import Parts
 
 FRAME = LocalFrame(39.36, 22.95)
 BRAKE, GUIDED, LAND, LOITER, RTL, SMART_RTL = (
@@ -306,7 +306,7 @@ class World:
         self.journal._write = lambda _data: None  # type: ignore[method-assign]
         self.fence = Fence()
         facts = self.plane.vehicle
-        parts = assemble(
+        parts = Parts(
             self.plane, MavlinkFailsafes(self.plane), self.fence, journal=self.journal, grants=self.grants,  # type: ignore[arg-type]
             audit=self.audit, clock=lambda: 1_790_000_000.0 + self.plane.now, grace_s=grace_s, boarding_s=boarding_s,  # type: ignore[arg-type]
             state=ControlState(decided=known, armed_seen=facts.armed if known else None, expected_mode=GUIDED),

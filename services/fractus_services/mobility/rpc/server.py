@@ -24,7 +24,7 @@ from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.fence import MissionFence
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
-from fractus_services.mobility.rpc.wiring import assemble
+from fractus_services.mobility.rpc.wiring import Parts
 from fractus_services.options import MobilityOptions
 
 log = logging.getLogger(__name__)
@@ -66,7 +66,7 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
         on_found=lambda: parts.observer.found(),  # noqa: PLW0108
         on_heartbeat=lambda: parts.observer.heartbeat(),  # noqa: PLW0108
     )
-    parts = assemble(
+    parts = Parts(
         autopilot,
         MavlinkFailsafes(autopilot),
         MissionFence(autopilot, options.state),

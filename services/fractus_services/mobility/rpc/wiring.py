@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from fractus_core.control import ControlState
 
@@ -28,34 +27,8 @@ from fractus_services.mobility.flight.transit import TransitFlight
 from fractus_services.mobility.rpc.streams import Streams
 
 
-@dataclass(frozen=True, slots=True)
 class Parts:
-    """The parts of one drone's mobility service."""
-
-    control: Control
-    guard: Guard
-    service: MobilityService
-    streams: Streams
-    tours: Tours
-    monitor: MotionMonitor
-    supervisor: Supervisor
-    observer: Observer
-
-
-def assemble(
-    autopilot: Autopilot,
-    failsafes: Failsafes,
-    fence: Fence,
-    *,
-    journal: Journal,
-    grants: GrantFiles,
-    audit: AuditLog,
-    clock: Callable[[], float],
-    grace_s: float,
-    boarding_s: float,
-    state: ControlState | None = None,
-) -> Parts:
-    """Put the parts together.
+    """The parts of one drone's mobility service.
 
     Args:
         autopilot: the link.
@@ -69,31 +42,40 @@ def assemble(
         boarding_s: how long a tour waits for its passengers.
         state: of control, to begin with.
     """
-    # Control asks the mode controller to move the drone and the mode controller tells control, so one of them is looked up
-    # when it is needed: nothing runs before all parts are made.
-    control = Control(
-        autopilot,
-        journal,
-        grants,
-        audit,
-        modes=ModeController(autopilot, lambda: control.state, lambda event: control.dispatch(event)),  # noqa: PLW0108
-        approach=lambda wanted, tries: homing.approach(wanted, tries),  # noqa: PLW0108
-        grace_s=grace_s,
-        state=state,
-    )
-    guard = Guard(lambda: situation_of(control, clock()), audit)
-    homing = Homing(control, guard)
-    arming = Arming(control, failsafes, fence)
-    courses = Courses(control, guard)
-    transit = TransitFlight(control, arming, guard, courses)
-    supervisor = Supervisor(control, fence)
-    return Parts(
-        control,
-        guard,
-        MobilityService(control, arming, CallJudge(control, guard), homing.around),
-        Streams(control, transit.bring),
-        Tours(control, grants, transit.launch, courses, boarding_s),
-        MotionMonitor(control, guard, audit, supervisor),
-        supervisor,
-        Observer(control, failsafes),
-    )
+
+    def __init__(
+        self,
+        autopilot: Autopilot,
+        failsafes: Failsafes,
+        fence: Fence,
+        *,
+        journal: Journal,
+        grants: GrantFiles,
+        audit: AuditLog,
+        clock: Callable[[], float],
+        grace_s: float,
+        boarding_s: float,
+        state: ControlState | None = None,
+    ) -> None:
+        # Control asks the mode controller to move the drone, and that tells control of each change; control asks for the way
+        # home, which is flown under control. So these are looked up when they are called, which is after all are made.
+        control = self.control = Control(
+            autopilot,
+            journal,
+            grants,
+            audit,
+            modes=ModeController(autopilot, lambda: control.state, lambda event: control.dispatch(event)),  # noqa: PLW0108
+            approach=lambda wanted, tries: homing.approach(wanted, tries),  # noqa: PLW0108
+            grace_s=grace_s,
+            state=state,
+        )
+        guard = self.guard = Guard(lambda: situation_of(control, clock()), audit)
+        homing, courses = Homing(control, guard), Courses(control, guard)
+        arming = Arming(control, failsafes, fence)
+        transit = TransitFlight(control, arming, guard, courses)
+        self.service = MobilityService(control, arming, CallJudge(control, guard), homing.around)
+        self.streams = Streams(control, transit.bring)
+        self.tours = Tours(control, grants, transit.launch, courses, boarding_s)
+        self.supervisor = Supervisor(control, fence)
+        self.monitor = MotionMonitor(control, guard, audit, self.supervisor)
+        self.observer = Observer(control, failsafes)

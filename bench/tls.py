@@ -31,7 +31,7 @@ from fractus_cluster.ports import free_port
 from fractus_core.api import Grant
 from fractus_core.api.names import node_server_name
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
-from fractus_services import answering
+from fractus_services import admission
 from fractus_services.auth import Caller
 from fractus_services.commands import camera
 from skimage.data import astronaut
@@ -100,7 +100,7 @@ def serve_plainly(arguments: list[str]) -> None:
         return made
 
     grpc.aio.server = server
-    answering.caller_of = lambda _context, _time_s: Caller(IDENTITY, 0.0, math.inf)
+    admission.caller_of = lambda _context, _time_s: Caller(IDENTITY, 0.0, math.inf)
     camera(arguments)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from fractus_core.policy.values import Moment, earliest
-from fractus_services.answering import Allowance
+from fractus_services.admission import Allowance
 from fractus_services.auth import Caller, caller_of
 from fractus_services.clock import TRUST_AFTER_S, Clock
 from fractus_services.errors import NotAuthenticated

@@ -13,7 +13,7 @@ import grpc
 import pytest
 from fractus_core.policy.values import Call, TakeoffArgs, Verdict
 from fractus_proto.v1 import mobility_pb2
-from fractus_services import answering, background
+from fractus_services import admission, background
 from fractus_services.auth import Caller
 from fractus_services.background import in_slices
 from fractus_services.grants import ActiveGrant
@@ -62,7 +62,7 @@ class Context:
 
 @pytest.fixture
 def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], World]:
-    monkeypatch.setattr(answering, "caller_of", lambda grant, _time: Caller(grant.identity, 0.0, 1e12))
+    monkeypatch.setattr(admission, "caller_of", lambda grant, _time: Caller(grant.identity, 0.0, 1e12))
     return lambda: World(tmp_path)
 
 

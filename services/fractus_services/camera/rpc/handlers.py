@@ -11,7 +11,7 @@ from typing import Any
 from fractus_core.policy.values import CaptureArgs
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
 
-from fractus_services.answering import Reception
+from fractus_services.admission import CallAdmission
 from fractus_services.auth import Caller
 from fractus_services.camera.album.album import NoSuchImage
 from fractus_services.camera.album.shots import Shot
@@ -27,14 +27,14 @@ READ_BYTES = 4 * CHUNK_BYTES
 class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
     """The service on the wire."""
 
-    def __init__(self, capture: PictureCapture, library: PictureLibrary, reception: Reception) -> None:
+    def __init__(self, capture: PictureCapture, library: PictureLibrary, calls: CallAdmission) -> None:
         self._capture = capture
         self._library = library
-        self._reception = reception
+        self._admission = calls
 
     @asynccontextmanager
     async def _call(self, context: Any) -> AsyncIterator[Caller]:
-        async with self._reception.call(context) as caller:
+        async with self._admission.call(context) as caller:
             try:
                 yield caller
             except OSError as error:
@@ -43,17 +43,17 @@ class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
     async def CaptureImage(self, request: Any, context: Any) -> Any:  # noqa: N802 - the protocol's name
         """See camera.proto."""
         async with self._call(context) as caller:
-            grant = self._reception.grant_of(caller)
+            grant = self._admission.grant_of(caller)
             args = CaptureArgs(request.width, request.height)
-            verdict, shot = await self._capture.capture(grant, args, lambda: self._reception.grant_of(caller))
+            verdict, shot = await self._capture.capture(grant, args, lambda: self._admission.grant_of(caller))
             return camera_pb2.CaptureImageResponse(decision=decision(verdict), image=_info(shot))
 
     async def RetrieveImage(self, request: Any, context: Any) -> None:  # noqa: N802
         """See camera.proto."""
         async with self._call(context) as caller:
-            grant = self._reception.grant_of(caller)
+            grant = self._admission.grant_of(caller)
             verdict, shot, source = await self._library.retrieve(
-                grant, request.name, lambda: self._reception.grant_of(caller)
+                grant, request.name, lambda: self._admission.grant_of(caller)
             )
             head: dict[str, Any] = {"decision": decision(verdict), "image": _info(shot)}
             async for piece in _pieces(source, request.name):
@@ -64,13 +64,13 @@ class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
     async def ListImages(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See camera.proto."""
         async with self._call(context) as caller:
-            verdict, shots = await self._library.list(self._reception.grant_of(caller))
+            verdict, shots = await self._library.list(self._admission.grant_of(caller))
             return camera_pb2.ListImagesResponse(decision=decision(verdict), images=[_info(shot) for shot in shots])
 
     async def DeleteImage(self, request: Any, context: Any) -> Any:  # noqa: N802
         """See camera.proto."""
         async with self._call(context) as caller:
-            verdict = await self._library.delete(self._reception.grant_of(caller), request.name)
+            verdict = await self._library.delete(self._admission.grant_of(caller), request.name)
             return camera_pb2.DeleteImageResponse(decision=decision(verdict))
 
 

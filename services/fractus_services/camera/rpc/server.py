@@ -11,7 +11,7 @@ from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_core.policy.footprint import lens_of
 from fractus_proto.v1 import camera_pb2_grpc
 
-from fractus_services.answering import Reception
+from fractus_services.admission import CallAdmission
 from fractus_services.audit import AuditLog
 from fractus_services.auth import TlsFiles
 from fractus_services.camera.album.album import Album, owner_of
@@ -87,7 +87,7 @@ async def run(options: CameraOptions, stop: asyncio.Event) -> None:
     handlers = CameraHandlers(
         PictureCapture(poses, shutter, camera, filtering=filtering, album=album, judge=judge, clock=clock),
         PictureLibrary(poses, filtering, album, judge, clock),
-        Reception(grants, clock),
+        CallAdmission(grants, clock),
     )
 
     def register(server: grpc.aio.Server) -> None:

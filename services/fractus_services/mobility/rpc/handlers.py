@@ -13,7 +13,7 @@ from fractus_core.control import Authority
 from fractus_core.policy.values import Call, SetSpeedArgs, TakeoffArgs, Verdict
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
-from fractus_services.answering import Reception
+from fractus_services.admission import CallAdmission
 from fractus_services.auth import Caller
 from fractus_services.clock import Clock
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
@@ -69,11 +69,11 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         self._heard = heard
         self._node = node_identity(node)
         self._clock = clock
-        self._reception = Reception(grants, clock, _known, self._failed)
+        self._admission = CallAdmission(grants, clock, _known, self._failed)
 
     def _grant_of(self, caller: Caller) -> ActiveGrant:
         """The grant of a caller; a call also tells tours that a component of its application is there."""
-        grant = self._reception.grant_of(caller)
+        grant = self._admission.grant_of(caller)
         self._heard(grant)
         return grant
 
@@ -86,7 +86,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def GetControl(self, _request: Any, context: Any) -> None:  # noqa: N802 - the protocol's name
         """See mobility.proto."""
-        async with self._reception.call(context, lasting=True) as caller:
+        async with self._admission.call(context, lasting=True) as caller:
             grant = self._grant_of(caller)
             self._service.calls.allow(Call("GetControl"), grant)
             try:
@@ -102,7 +102,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def ReturnControl(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context, urgent=True) as caller:
+        async with self._admission.call(context, urgent=True) as caller:
             grant = self._grant_of(caller)
             self._service.calls.supersede(grant)
             self._service.calls.allow(Call("ReturnControl"), grant)
@@ -113,36 +113,36 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def Arm(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context) as caller:
+        async with self._admission.call(context) as caller:
             return mobility_pb2.ArmResponse(decision=decision(await self._service.arm(self._grant_of(caller))))
 
     async def Disarm(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context) as caller:
+        async with self._admission.call(context) as caller:
             return mobility_pb2.DisarmResponse(decision=decision(await self._service.disarm(self._grant_of(caller))))
 
     async def Hover(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context, urgent=True) as caller:
+        async with self._admission.call(context, urgent=True) as caller:
             return mobility_pb2.HoverResponse(decision=decision(await self._service.hover(self._grant_of(caller))))
 
     async def SetSpeed(self, request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context) as caller:
+        async with self._admission.call(context) as caller:
             await self._service.calls.turn(self._grant_of(caller))
             verdict, speed = await self._service.set_speed(self._grant_of(caller), SetSpeedArgs(request.speed_mps))
             return mobility_pb2.SetSpeedResponse(decision=decision(verdict), speed_mps=speed)
 
     async def GetSpeed(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context) as caller:
+        async with self._admission.call(context) as caller:
             verdict = self._service.calls.allow(Call("GetSpeed"), self._grant_of(caller))
             speed = self._control.autopilot.vehicle.speed_mps
             return mobility_pb2.GetSpeedResponse(decision=decision(verdict), speed_mps=speed)
 
     async def SetVelocity(self, request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context) as caller:
+        async with self._admission.call(context) as caller:
             args = velocity_args(request)
             await self._service.calls.turn_to_move(self._grant_of(caller))
             verdict, flown = await self._service.set_velocity(self._grant_of(caller), args)
@@ -153,14 +153,14 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def CheckCall(self, request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context) as caller:
+        async with self._admission.call(context) as caller:
             call = call_of(request)
             await self._service.calls.turn(self._grant_of(caller))
             return checked(self._service.calls.check(call, self._grant_of(caller)))
 
     async def GetPosition(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context) as caller:
+        async with self._admission.call(context) as caller:
             verdict = self._service.calls.allow(Call("GetPosition"), self._grant_of(caller))
             vehicle = self._control.autopilot.vehicle
             if not located(self._control):
@@ -173,14 +173,14 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def Takeoff(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context, lasting=True) as caller:
+        async with self._admission.call(context, lasting=True) as caller:
             await self._service.calls.turn_to_move(self._grant_of(caller))
             progress = self._service.take_off(self._grant_of(caller), TakeoffArgs(request.altitude_m))
             await self._report(progress, context)
 
     async def Goto(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context, lasting=True) as caller:
+        async with self._admission.call(context, lasting=True) as caller:
             args, reached_m = goto_args(request), acceptance_radius_m(request)
             await self._service.calls.turn_to_move(self._grant_of(caller))
             progress = self._service.goto(self._grant_of(caller), args, reached_m)
@@ -188,12 +188,12 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def Land(self, _request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context, urgent=True) as caller:
+        async with self._admission.call(context, urgent=True) as caller:
             await self._report(self._service.land(self._grant_of(caller)), context)
 
     async def ReturnToLaunch(self, _request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context, urgent=True) as caller:
+        async with self._admission.call(context, urgent=True) as caller:
             await self._report(self._service.return_to_launch(self._grant_of(caller)), context)
 
     async def _report(self, progress: AsyncGenerator[Progress, None], context: Any) -> None:
@@ -209,7 +209,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def SubscribeTelemetry(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._reception.call(context, lasting=True) as caller:
+        async with self._admission.call(context, lasting=True) as caller:
             node = caller.identity == self._node
             wanted = request.interval_s
             interval = max(wanted, MIN_INTERVAL_S) if math.isfinite(wanted) and wanted > 0 else DEFAULT_INTERVAL_S

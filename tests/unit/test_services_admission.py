@@ -9,8 +9,8 @@ from typing import Any, cast
 import grpc
 import pytest
 from fractus_proto.v1 import types_pb2
-from fractus_services import answering
-from fractus_services.answering import BURST, MAX_OPEN_CALLS, URGENT_BURST, Reception
+from fractus_services import admission
+from fractus_services.admission import BURST, MAX_OPEN_CALLS, URGENT_BURST, CallAdmission
 from fractus_services.auth import Caller
 from google.protobuf import any_pb2
 from google.rpc import error_details_pb2, status_pb2
@@ -52,52 +52,52 @@ class Context:
 
 
 @pytest.fixture
-def reception(monkeypatch: pytest.MonkeyPatch) -> Reception:
-    monkeypatch.setattr(answering, "caller_of", lambda _context, _time: Caller("spiffe://fractus.dev/a", 0.0, 1e12))
-    monkeypatch.setattr(answering.time, "monotonic", lambda: 1.0)
-    return Reception(cast("Any", None), lambda: 0.0)
+def calls(monkeypatch: pytest.MonkeyPatch) -> CallAdmission:
+    monkeypatch.setattr(admission, "caller_of", lambda _context, _time: Caller("spiffe://fractus.dev/a", 0.0, 1e12))
+    monkeypatch.setattr(admission.time, "monotonic", lambda: 1.0)
+    return CallAdmission(cast("Any", None), lambda: 0.0)
 
 
-async def test_an_urgent_call_is_let_through_a_flood_and_no_flood_of_its_own(reception: Reception) -> None:
+async def test_an_urgent_call_is_let_through_a_flood_and_no_flood_of_its_own(calls: CallAdmission) -> None:
     for _ in range(int(BURST)):
-        async with reception.call(Context()):
+        async with calls.call(Context()):
             pass
     with pytest.raises(Aborted, match="RESOURCE_EXHAUSTED: more than 50 calls a second") as refusal:
-        async with reception.call(Context()):
+        async with calls.call(Context()):
             pass
     assert refusal.value.find(error_details_pb2.RetryInfo).retry_delay.nanos == 20_000_000
     assert refusal.value.find(error_details_pb2.ErrorInfo).reason == "TooManyCalls"
     assert refusal.value.find(types_pb2.Decision).action == types_pb2.Decision.ACTION_DENY
     for _ in range(int(URGENT_BURST)):
-        async with reception.call(Context(), urgent=True) as caller:
+        async with calls.call(Context(), urgent=True) as caller:
             assert caller.identity == "spiffe://fractus.dev/a"
     with pytest.raises(Aborted, match="RESOURCE_EXHAUSTED: more than 20 calls a second"):
-        async with reception.call(Context(), urgent=True):
+        async with calls.call(Context(), urgent=True):
             pass
 
 
-async def test_only_so_many_calls_at_a_time(reception: Reception) -> None:
+async def test_only_so_many_calls_at_a_time(calls: CallAdmission) -> None:
     async with AsyncExitStack() as stack:
         for _ in range(MAX_OPEN_CALLS):
-            await stack.enter_async_context(reception.call(Context(), lasting=True))
+            await stack.enter_async_context(calls.call(Context(), lasting=True))
         with pytest.raises(Aborted, match=f"RESOURCE_EXHAUSTED: {MAX_OPEN_CALLS} calls are under way"):
-            async with reception.call(Context()):
+            async with calls.call(Context()):
                 pass
-        async with reception.call(Context(), urgent=True):
+        async with calls.call(Context(), urgent=True):
             pass
-    async with reception.call(Context()):
+    async with calls.call(Context()):
         pass
-    assert not reception._open
+    assert not calls._open
 
 
 @pytest.mark.parametrize(("urgent", "lasting"), [(True, False), (False, True)])
-async def test_a_call_needs_a_deadline(reception: Reception, urgent: bool, lasting: bool) -> None:
+async def test_a_call_needs_a_deadline(calls: CallAdmission, urgent: bool, lasting: bool) -> None:
     with pytest.raises(Aborted, match="INVALID_ARGUMENT: the call has no deadline; set a timeout") as refusal:
-        async with reception.call(Context(None)):
+        async with calls.call(Context(None)):
             pass
     assert refusal.value.find(error_details_pb2.ErrorInfo).reason == "DeadlineMissing"
     assert refusal.value.find(error_details_pb2.RetryInfo) is None
-    async with reception.call(Context(None), urgent, lasting):
+    async with calls.call(Context(None), urgent, lasting):
         pass
 
 
@@ -105,11 +105,11 @@ async def test_a_call_needs_a_deadline(reception: Reception, urgent: bool, lasti
 async def test_whatever_breaks_refuses_and_is_told(
     error: Callable[[], Exception], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(answering, "caller_of", lambda _context, _time: Caller("a", 0.0, 1e12))
+    monkeypatch.setattr(admission, "caller_of", lambda _context, _time: Caller("a", 0.0, 1e12))
     told: list[str] = []
-    reception = Reception(cast("Any", None), lambda: 0.0, failed=lambda verdict: told.append(verdict.code))
+    calls = CallAdmission(cast("Any", None), lambda: 0.0, failed=lambda verdict: told.append(verdict.code))
     with pytest.raises(Aborted, match="INTERNAL: the service failed; nothing was done"):
-        async with reception.call(Context()):
+        async with calls.call(Context()):
             raise error()
     assert told == ["InternalError"]
-    assert not reception._open
+    assert not calls._open

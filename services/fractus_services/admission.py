@@ -55,8 +55,8 @@ class Allowance:
         return 0.0
 
 
-class Reception:
-    """Receives the calls of one service.
+class CallAdmission:
+    """Lets calls of one service in, and ends them with a status.
 
     Args:
         grants: grants of this node.

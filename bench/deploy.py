@@ -36,11 +36,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import yaml
-from fractus_cluster.loopback import LoopbackCluster, simulated_node, wait_until
 from fractus_cluster.ports import free_port
 from fractus_core.api import KINDS
 from fractus_core.api.crd import crd
 from fractus_kube import BlockingClient, Client, Kind, KubeError, with_certificate
+from loopback import LoopbackCluster, simulated_node, wait_until
 
 EXAMPLE = pathlib.Path(__file__).parents[1] / "examples" / "traffic-monitoring"
 API = "/apis/fractus.dev/v1alpha1"
@@ -256,8 +256,12 @@ class Bench:
     def _kinds_served(self) -> bool:
         try:
             return all(self._api.get(f"{API}/{kind.PLURAL}?limit=1") is not None for kind in KINDS)
-        except RuntimeError:
+        except KubeError:
             return False
+
+    def close(self) -> None:
+        self.operator.stop()
+        self._api.close()
 
     def measure(self, nodes: int, times: int) -> Measured:
         """Measure at so many nodes."""
@@ -521,7 +525,7 @@ def main() -> int:
         stack.callback(cluster.stop)
         cluster.start()
         bench = Bench(cluster, directory)
-        stack.callback(bench.operator.stop)
+        stack.callback(bench.close)
         rows = []
         for size in sizes:
             rows.append(bench.measure(size, times))

@@ -11,7 +11,7 @@ from typing import Any, Self, TypeVar
 from fractus_kube.access import Access
 from fractus_kube.client import LIST_TIMEOUT_S, Client
 from fractus_kube.connection import REQUEST_TIMEOUT_S, ContentType
-from fractus_kube.errors import NotFound
+from fractus_kube.errors import NotFound, unreachable
 from fractus_kube.objects import Body
 
 T = TypeVar("T")
@@ -96,14 +96,17 @@ class BlockingClient:
         """Whether the API server says that it is ready."""
         return self._run(self._client.ready())
 
-    def wait_ready(self, timeout_s: float) -> bool:
-        """Wait until the API server is ready; False when it was not in time."""
+    def wait_ready(self, timeout_s: float) -> None:
+        """Wait until the API server is ready.
+
+        Raises:
+            KubeError: it was not in time.
+        """
         deadline = time.monotonic() + timeout_s
         while not self.ready():
             if time.monotonic() > deadline:
-                return False
+                raise unreachable(f"not ready within {timeout_s:.0f} s")
             time.sleep(_POLL_S)
-        return True
 
     def _run(self, request: Coroutine[Any, Any, T]) -> T:
         return asyncio.run_coroutine_threadsafe(request, self._loop).result()

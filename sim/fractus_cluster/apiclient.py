@@ -30,16 +30,6 @@ def administrating(server: str, ca: Path, credential: Credential) -> Iterator[Bl
         raise ClusterError(f"the API server: {error}") from error
 
 
-def wait_ready(api: BlockingClient, timeout_s: float) -> None:
-    """Wait until the API server is ready.
-
-    Raises:
-        ClusterError: It was not in time.
-    """
-    if not api.wait_ready(timeout_s):
-        raise ClusterError(f"the API server was not ready within {timeout_s:.0f} s")
-
-
 def answers_ready(host: str, port: int) -> bool:
     """Whether a server answers `GET /ready` (over plain HTTP) with success."""
     connection = http.client.HTTPConnection(host, port, timeout=_REQUEST_TIMEOUT_S)

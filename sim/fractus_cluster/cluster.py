@@ -16,7 +16,6 @@ from pathlib import Path
 from fractus_kube import KubeError
 
 from fractus_cluster import machine, manifests, network
-from fractus_cluster.apiclient import wait_ready
 from fractus_cluster.binaries import ensure_binaries
 from fractus_cluster.cgroups import cluster_branch
 from fractus_cluster.commands import run
@@ -199,7 +198,7 @@ class Cluster:
             wanted = store.fetch(images)
             startup.place_nodes(nodes, binaries, store, wanted)
             with startup.api() as api:
-                wait_ready(api, _API_TIMEOUT_S)
+                api.wait_ready(_API_TIMEOUT_S)
                 startup.apply_objects(api, nodes)
                 startup.let_dns_start()
                 since = datetime.now(UTC).replace(microsecond=0)

@@ -1,6 +1,6 @@
 """A control plane on loopback with as many simulated nodes (kwok) as wanted: for measuring; pods are bound, nothing runs.
 
-Beside the real cluster of this package it needs neither root nor Linux, and no node of it costs more than a few objects.
+Unlike the embedded cluster (`fractus_cluster`) it needs neither root nor Linux, and no node of it costs more than a few objects.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-
-from fractus_cluster.apiclient import administrating, wait_ready
+from fractus_cluster.apiclient import administrating
 from fractus_cluster.binaries import Binaries, ensure_binaries
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.pki import Authority, Credential, write_private
@@ -77,7 +76,7 @@ class LoopbackCluster:
         self._run("etcd", *self._etcd())
         self._run("kube-apiserver", *self._api_server())
         with administrating(self.server, self.ca, Credential(*self.credential)) as api:
-            wait_ready(api, _START_TIMEOUT_S)
+            api.wait_ready(_START_TIMEOUT_S)
         config = f"--kubeconfig={self.kubeconfig}"
         accounts = self._authority.service_account_key()
         self._run(

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from fractus_core.control import ControlState, Outcome, OutcomeKind
+from fractus_core.control import ControlState, Mission, Outcome, OutcomeKind
 from fractus_mavlink import message
 from fractus_proto.v1.mobility_pb2 import MissionOutcome
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
@@ -45,12 +45,9 @@ def test_an_accuracy_that_is_not_told_any_more_is_not_the_last_one() -> None:
 
 def told(vehicle: Vehicle, now: float, missions: bool = False) -> Any:
     autopilot = SimpleNamespace(vehicle=vehicle, now=now, connected=True)
-    control: Any = SimpleNamespace(
-        autopilot=autopilot,
-        checked=None,
-        state=ControlState(),
-        outcomes=lambda: {"uid": Outcome(OutcomeKind.REVOKED, "why")},
-    )
+    ended = Mission("uid", "identity", outcome=Outcome(OutcomeKind.REVOKED, "why"))
+    state = ControlState(missions={"uid": ended, "other": Mission("other", "identity")})
+    control: Any = SimpleNamespace(autopilot=autopilot, checked=None, state=state)
     return telemetry_of(control, 0.0, missions)
 
 

@@ -281,6 +281,11 @@ class ControlState:
         return self.missions.get(self.active) if self.active is not None else None
 
     @property
+    def outcomes(self) -> dict[str, Outcome]:
+        """How missions ended, by key."""
+        return {mission.key: mission.outcome for mission in self.missions.values() if mission.outcome is not None}
+
+    @property
     def controller(self) -> str:
         """Who commands: the driver's identity, "pilot" or "system"."""
         if self.authority is Authority.DRIVER and self.lease is not None:

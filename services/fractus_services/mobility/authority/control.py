@@ -9,7 +9,7 @@ from collections.abc import Coroutine
 from dataclasses import replace
 from typing import Any
 
-from fractus_core.control import Authority, ControlState, Mission, Outcome, not_ready_reason
+from fractus_core.control import Authority, ControlState, Mission, not_ready_reason
 from fractus_core.control.actions import Action, RecordAudit
 from fractus_core.control.events import (
     BrakeDemanded,
@@ -112,11 +112,7 @@ class Control:
         return self._machine.state
 
     def dispatch(self, event: Event) -> tuple[Action, ...]:
-        """Tell the state machine what happened, and carry out what it asks for.
-
-        Raises:
-            Exception: an action failed; the others were carried out all the same.
-        """
+        """Tell the state machine what happened, see `Machine`."""
         return self._machine.dispatch(event)
 
     def close(self) -> None:
@@ -193,10 +189,6 @@ class Control:
         why = next((text for text in reversed(vehicle.texts) if text.startswith("PreArm")), "")
         located = vehicle.lat is not None and vehicle.home is not None
         return not_ready_reason(self.state, key, Readiness(self._checked is not None, vehicle.ready, why, located))
-
-    def outcomes(self) -> dict[str, Outcome]:
-        """How missions ended, by key."""
-        return {m.key: m.outcome for m in self._machine.known.missions.values() if m.outcome is not None}
 
     def mission(self, grant: ActiveGrant) -> Mission:
         """The mission of a grant; a new one, when nothing is known of it yet."""

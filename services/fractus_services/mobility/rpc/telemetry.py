@@ -68,7 +68,7 @@ def telemetry_of(control: Control, time_s: float, missions: bool) -> Any:
         flight_state=vehicle.flight_state,
         controller=control.state.controller,
         autopilot_connected=control.autopilot.connected,
-        missions={key: _ended(outcome) for key, outcome in control.outcomes().items()} if missions else {},
+        missions={key: _ended(outcome) for key, outcome in control.state.outcomes.items()} if missions else {},
     )
     message.time.FromNanoseconds(int(time_s * 1e9))
     if located(control):

@@ -97,7 +97,7 @@ def test_a_full_disk_at_the_end_closes_the_testbed(
 ) -> None:
     thing = testbed.keep(Thing())
     monkeypatch.setattr(runner, "_testbed", lambda *_: testbed)
-    monkeypatch.setattr(runner, "_run", lambda _: "")
+    monkeypatch.setattr(runner, "_run_session", lambda _: "")
     monkeypatch.setattr(runner, "McapLog", lambda _: Thing(full()))
     with pytest.raises(OSError, match="No space left"):
         runner.run(experiment, tmp_path)

@@ -58,7 +58,7 @@ class LoopbackCluster:
 
     @property
     def ca(self) -> Path:
-        """The certificate that vouches for the API server."""
+        """The CA certificate of the API server."""
         return self._authority.credential.certificate
 
     @property
@@ -196,7 +196,7 @@ def wait_until(question: Callable[[], bool], what: str, *, timeout_s: float, pau
     deadline = time.monotonic() + timeout_s
     while not question():
         if time.monotonic() > deadline:
-            raise ClusterError(f"waited {timeout_s:.0f} s in vain for {what}")
+            raise ClusterError(f"waited {timeout_s:.0f} s without success for {what}")
         time.sleep(pause_s)
 
 

@@ -35,7 +35,7 @@ def locked(
         path: The lock file; created when missing.
         timeout_s: How long to wait for the present holder.
         what: What the holder does, for messages ("another process is building binaries").
-        report: Told once when there is somebody to wait for.
+        report: Told once when the lock is held by another process.
         remove: Delete the file before the lock is given up.
 
     Raises:

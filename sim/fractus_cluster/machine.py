@@ -140,7 +140,7 @@ def _raise_sysctls(ledger: _Ledger) -> None:
 def _restore(ledger: _Ledger) -> None:
     for name, value in ledger.sysctls.items():
         path = _sysctl(name)
-        if path.read_text().strip() == str(_RAISED_SYSCTLS.get(name)):  # else somebody set it meanwhile
+        if path.read_text().strip() == str(_RAISED_SYSCTLS.get(name)):  # else it was set by another meanwhile
             path.write_text(value)
     # `ip netns add` mounts the directory on itself the first time.
     if NETNS_DIRECTORY.is_dir() and not any(NETNS_DIRECTORY.iterdir()):

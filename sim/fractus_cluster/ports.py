@@ -18,7 +18,7 @@ _reservations: deque[socket.socket] = deque()
 
 
 def free_port() -> int:
-    """Reserve a port, TCP and UDP, on which nobody listens at 127.0.0.1 and which nobody else gets from here.
+    """Reserve a port, TCP and UDP, on which no process listens at 127.0.0.1 and which is given to no other caller.
 
     The port stays reserved, also among processes, until this process ends or has asked for 512 more: a program that
     listens there may end and start again. Elsewhere than on Linux, ports are only looked for and not reserved.

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 _BACKOFF_FIRST_S = 0.2
-_BACKOFF_MOST_S = 10.0
+_MAX_BACKOFF_S = 10.0
 _STEADY_AFTER_S = 30.0
 _LOG_LIMIT_BYTES = 20_000_000
 _LOG_CHECK_S = 600.0
@@ -83,7 +83,7 @@ class Unit:
         if now_s - self.started_s > _STEADY_AFTER_S:
             self.backoff_s = _BACKOFF_FIRST_S
         self.due_s = now_s + self.backoff_s
-        self.backoff_s = min(2 * self.backoff_s, _BACKOFF_MOST_S)
+        self.backoff_s = min(2 * self.backoff_s, _MAX_BACKOFF_S)
 
     def trim_log(self) -> None:
         """Empty a log that has grown too long; what was in it stays in one older file."""

@@ -13,7 +13,7 @@ import click
 
 from fractus_vehicle.earth import Place
 from fractus_vehicle.links import Hub, LinkError, LinkSpec
-from fractus_vehicle.lockstep import Conductor, conduct
+from fractus_vehicle.lockstep import LockstepServer, run_lockstep
 from fractus_vehicle.params import ParameterValueError, UnknownParameterError
 from fractus_vehicle.simulation import Simulation, formation
 from fractus_vehicle.state import CONTROL_STEP_S, REPEATABLE_EPOCH_US, VehicleConfig
@@ -39,7 +39,7 @@ class _Stop:
 def run(simulation: Simulation, hub: Hub, speedup: float, stop: _Stop, until_s: float | None = None) -> None:
     """Keep simulated time at `speedup` times real time (0: as fast as possible) until stopped.
 
-    Waking costs more than a step. Nobody sees the steps between two messages, so they are made up for together: the loop
+    Waking costs more than a step. The steps between two messages are not observable, so they are made up for together: the loop
     sleeps until a message is due (`MAX_NAP` steps at most) or one arrives. That is heard at once, counts from the step it
     arrived in, and is answered at the next one as ever.
     """
@@ -166,7 +166,7 @@ def _parameters(_context: click.Context, _option: click.Parameter, texts: tuple[
     metavar="HOST:PORT",
     help="Advance only as a driver connected here asks: it writes a number of 10 ms steps a line, and reads the total.",
 )
-@click.option("--duration", type=float, callback=_finite, help="End after so many simulated seconds.")
+@click.option("--duration", type=float, callback=_finite, help="End after this many simulated seconds.")
 def vehicle(
     *,
     links: tuple[str, ...],
@@ -212,14 +212,14 @@ def vehicle(
                 if tlog is not None:
                     name = tlog if count == 1 else tlog.with_stem(f"{tlog.stem}-{craft.config.sysid}")
                     craft.record(stack.enter_context(name.open("wb")))
-            conductor = None if lockstep is None else Conductor(hub, *_address(lockstep))
+            lockstep_server = None if lockstep is None else LockstepServer(hub, *_address(lockstep))
         except (LinkError, ParameterValueError, OSError) as error:
             raise click.ClickException(str(error)) from error
         except UnknownParameterError as error:
             raise click.ClickException(f"unknown parameter {error.args[0]}") from error
         click.echo(f"vehicle {sysid} ready for connections on {' '.join(links or (DEFAULT_LISTEN,))}", err=True)
-        if conductor is not None:
-            conduct(simulation, hub, conductor, lambda: stop.wanted)
+        if lockstep_server is not None:
+            run_lockstep(simulation, hub, lockstep_server, lambda: stop.wanted)
         else:
             run(simulation, hub, speedup, stop, duration)
 

@@ -1,6 +1,6 @@
 """The path that the vehicle has flown since it was armed, kept short enough to be flown back: SmartRTL's memory.
 
-The method is ArduPilot's (AP_SmartRTL), written anew: a point is dropped each SRTL_ACCURACY metres; points that lie
+The method is ArduPilot's (AP_SmartRTL), written again: a point is dropped each SRTL_ACCURACY metres; points that lie
 within half of that of the line between their neighbours are removed (Ramer-Douglas-Peucker), and a loop is cut where
 two stretches of the path come closer than SRTL_ACCURACY. What does not fit into SRTL_POINTS ends it for the flight.
 """

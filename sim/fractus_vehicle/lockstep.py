@@ -17,7 +17,7 @@ MAX_STEPS = 1_000_000
 POLL_S = 0.2
 
 
-class Conductor:
+class LockstepServer:
     """Listens for the driver and keeps what it asked for."""
 
     def __init__(self, hub: Hub, host: str, port: int) -> None:
@@ -91,11 +91,13 @@ class Conductor:
         self._listener.close()
 
 
-def conduct(simulation: Simulation, hub: Hub, conductor: Conductor, stopped: Callable[[], bool]) -> None:
+def run_lockstep(
+    simulation: Simulation, hub: Hub, lockstep_server: LockstepServer, stopped: Callable[[], bool]
+) -> None:
     """Advance as the driver asks until stopped."""
     while not stopped():
         hub.poll(POLL_S)
-        steps = conductor.take()
+        steps = lockstep_server.take()
         if not steps:
             hub.flush()
             continue
@@ -104,4 +106,4 @@ def conduct(simulation: Simulation, hub: Hub, conductor: Conductor, stopped: Cal
         for _ in range(steps):
             simulation.step()
             hub.flush()
-        conductor.answer(simulation.ticks)
+        lockstep_server.answer(simulation.ticks)

@@ -74,7 +74,7 @@ class ParameterValueError(ValueError):
 
 
 def _stored(path: Path) -> Iterator[tuple[str, float]]:
-    """The lines of a file of changed parameters; one that is none of them is somebody else's, and must not be replaced."""
+    """The lines of a file of changed parameters; one that is none of them is another program's, and must not be replaced."""
     try:
         lines = path.read_text(encoding="ascii").splitlines()
     except UnicodeDecodeError as error:

@@ -46,7 +46,7 @@ class Battery:
         return round(self.left * 100.0)
 
     def _rest_voltage(self) -> float:
-        """Voltage without load; looked up anew for each thousandth of the charge."""
+        """Voltage without load; looked up again for each thousandth of the charge."""
         left = round(self.left, 3)
         if self._rest_for != (left, self.full_v):
             self._rest_for = (left, self.full_v)

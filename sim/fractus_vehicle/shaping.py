@@ -1,6 +1,6 @@
 """Motion shaping: how fast a target may be approached under speed, acceleration and jerk limits.
 
-The square-root controller and the kinematic shaping are ArduPilot's (AP_Math/control.cpp), written anew for
+The square-root controller and the kinematic shaping are ArduPilot's (AP_Math/control.cpp), written again for
 scalars and pairs of floats, because they decide the figures a user sees: time to target and peak speed.
 """
 

@@ -15,8 +15,8 @@ from collections.abc import Iterator
 
 import pytest
 import yaml
-from fractus_cluster import Cluster
 from fractus_cluster.binaries import ensure_binaries
+from fractus_cluster.cluster import Cluster
 from fractus_cluster.images.build import build_images
 from kubectl import Kube, Object, condition
 

@@ -18,11 +18,12 @@ from typing import Any
 
 import pytest
 import yaml
-from fractus_cluster import Cluster, ClusterError, ClusterSpec
+from fractus_cluster.cluster import Cluster
+from fractus_cluster.errors import ClusterError
 from fractus_cluster.images.build import build_images
 from fractus_cluster.network import host_link
 from fractus_cluster.processes import kill, read_record
-from fractus_cluster.spec import load_spec, parse_spec
+from fractus_cluster.spec import ClusterSpec, load_spec, parse_spec
 from fractus_cluster.state import state_of
 
 pytestmark = [

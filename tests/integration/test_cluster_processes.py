@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 from cryptography import x509
-from fractus_cluster import ClusterError
+from fractus_cluster.errors import ClusterError
 from fractus_cluster.locking import locked
 from fractus_cluster.pki import Authority
 from fractus_cluster.processes import ProcessRecord, kill, read_record, record_of, spawn, write_record

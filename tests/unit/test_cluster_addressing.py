@@ -5,8 +5,8 @@ from __future__ import annotations
 from ipaddress import IPv4Network
 
 import pytest
-from fractus_cluster import ClusterError
 from fractus_cluster.addressing import MAX_NODES, SERVICE_NETWORK, Addressing, choose_block
+from fractus_cluster.errors import ClusterError
 from fractus_cluster.state import Memory
 from hypothesis import given
 from hypothesis import strategies as st

@@ -7,10 +7,11 @@ from importlib import resources
 from pathlib import Path
 
 import pytest
-from fractus_cluster import ClusterError, PrerequisiteError, prerequisites
+from fractus_cluster import prerequisites
 from fractus_cluster.binaries import CLUSTER_PROGRAMS, KUBERNETES_VERSION, PROGRAMS, ensure_binaries
 from fractus_cluster.binaries import build as build_module
 from fractus_cluster.binaries.catalog import MODULES
+from fractus_cluster.errors import ClusterError, PrerequisiteError
 from fractus_cluster.prerequisites import check_root
 
 GOMOD = resources.files("fractus_cluster.binaries") / "gomod"

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 import yaml
-from fractus_cluster import PrerequisiteError
 from fractus_cluster.addressing import Addressing
 from fractus_cluster.cgroups import find_hierarchies
 from fractus_cluster.controlplane import corefile
+from fractus_cluster.errors import PrerequisiteError
 from fractus_cluster.manifests import dns_objects, extended_resources_patch, is_ready, node_object, taints_patch
 from fractus_cluster.network import host_link
 from fractus_cluster.nodeconfig import Machine, cni_config, kubelet_config, node_units, shortfalls

@@ -10,7 +10,7 @@ import tarfile
 from pathlib import Path
 
 import pytest
-from fractus_cluster import ClusterError
+from fractus_cluster.errors import ClusterError
 from fractus_cluster.images.build import TARGETS, build_images, find_source, image_name, source_digest
 from fractus_cluster.images.layout import Layout
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 import yaml
-from fractus_cluster import ClusterError, load_spec
-from fractus_cluster.spec import ClusterSpec, parse_quantity, parse_spec
+from fractus_cluster.errors import ClusterError
+from fractus_cluster.spec import ClusterSpec, load_spec, parse_quantity, parse_spec
 
 DEMO = Path(__file__).parents[2] / "examples" / "clusters" / "demo.yaml"
 

@@ -124,4 +124,4 @@ CLUSTER_PROGRAMS = (
     "pause",
     "helm",
 )
-"""What `fractus cluster up` needs; the other programs are built when somebody asks for them."""
+"""What `fractus cluster up` needs; the other programs are built on request."""

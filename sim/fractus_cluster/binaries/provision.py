@@ -39,7 +39,7 @@ class Binaries:
             raise ClusterError(f"{name} was not provided; run `fractus cluster binaries --with {name}`") from None
 
     def builds(self, *names: str) -> dict[str, int]:
-        """Return what changes when one of these programs is built anew: when its file was written, nanoseconds."""
+        """Return what changes when one of these programs is built again: when its file was written, nanoseconds."""
         return {name: self[name].stat().st_mtime_ns for name in names}
 
 

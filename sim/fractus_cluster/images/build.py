@@ -163,7 +163,7 @@ def _remove_replaced(identities: Iterable[str]) -> None:
 def _build(source: Path, target: str, tag: str) -> None:
     argv = ["buildah", "build", "--quiet", "--layers", "--timestamp", "0", "--build-arg", f"BASE={BASE_IMAGE}"]
     if _HOST_CA.is_file():
-        # Package indexes may be behind a proxy that only this machine's CA bundle vouches for; nothing of it is kept.
+        # Package indexes may be behind a proxy whose certificate only this machine's CA bundle confirms; nothing of it is kept.
         argv += ["--volume", f"{_HOST_CA}:{_CA_IN_BUILD}:ro"]
         argv += ["--build-arg", f"SSL_CERT_FILE={_CA_IN_BUILD}", "--build-arg", f"PIP_CERT={_CA_IN_BUILD}"]
     argv += ["--target", target, "--tag", image_name(target, tag), str(source)]

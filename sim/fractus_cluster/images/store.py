@@ -109,7 +109,7 @@ class ImageStore:
 def image_ids() -> dict[str, str]:
     """Return the ids of all images in buildah's storage, by name.
 
-    The listing fails when somebody else removes an image meanwhile, so it is asked for again a few times.
+    The listing fails when another process removes an image meanwhile, so it is asked for again a few times.
     """
     argv = ["buildah", "images", "--no-trunc", "--format", "{{.Name}}:{{.Tag}} {{.ID}}"]
     for _ in range(_LISTINGS):

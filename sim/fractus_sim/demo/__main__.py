@@ -44,7 +44,7 @@ def _assignments(_context: click.Context, _option: click.Parameter, texts: tuple
     help="With --cluster current: which node stands for drone-1, edge-1, ..., cloud-1; repeat.",
 )  # fmt: skip
 @click.option("--timeout", "timeout_s", default=480.0, show_default=True, help="Seconds the mission may take.")
-@click.option("--report-only", is_flag=True, help="Write the report in OUT anew from what an earlier run recorded.")
+@click.option("--report-only", is_flag=True, help="Write the report in OUT again from what an earlier run recorded.")
 def demo(
     *, cluster: str, out: Path, keep: bool, assign: Mapping[str, str], timeout_s: float, report_only: bool
 ) -> None:

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Protocol
 
 import yaml
-from fractus_cluster import Cluster
 from fractus_cluster.binaries import ensure_binaries
+from fractus_cluster.cluster import Cluster
 from fractus_cluster.images.build import build_images
 
 from fractus_sim.demo.kube import DemoError, Kube, Object
@@ -41,7 +41,7 @@ class Place(Protocol):
     """A cluster that the demo can use.
 
     Attributes:
-        disposable: nobody else uses it: pods may be restarted, and it goes away with all that is on it.
+        disposable: no one else uses it: pods may be restarted, and it goes away with all that is on it.
     """
 
     disposable: bool
@@ -101,7 +101,7 @@ class Current:
     _assigned: Mapping[str, str] = field(default_factory=dict)
 
     def images(self) -> None:
-        """Nothing: they are loaded by whoever runs the cluster."""
+        """Nothing: they are loaded by the cluster's operator."""
         self.say(f"expecting images localhost/fractus/{{{','.join((*TARGETS, 'sim'))}}}:dev on the nodes")
 
     def up(self) -> Kube:

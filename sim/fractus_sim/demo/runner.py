@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from fractus_cluster import ClusterError
+from fractus_cluster.errors import ClusterError
 from rich.console import Console
 
 from fractus_sim.demo.collect import collect, fetch_pictures
@@ -203,7 +203,7 @@ def _as_promised(record: Record, tell: Teller) -> bool:
 
 
 def report_again(out: Path) -> None:
-    """Write the report of an earlier run anew from what it recorded.
+    """Write the report of an earlier run again from what it recorded.
 
     Raises:
         DemoError: nothing was recorded there.

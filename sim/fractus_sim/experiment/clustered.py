@@ -10,8 +10,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from fractus_cluster import Cluster, ClusterError
 from fractus_cluster.binaries import ensure_binaries
+from fractus_cluster.cluster import Cluster
+from fractus_cluster.errors import ClusterError
 from fractus_cluster.images.build import build_images
 from fractus_cluster.spec import ClusterSpec, NodeSpec, VehicleHardware, load_spec
 
@@ -138,7 +139,7 @@ class ClusterTestbed(Testbed):
                 self._kube.delete(self._applications, DRONE_READY_S)
 
     def _attach(self, setup: VehicleSetup) -> None:
-        """Put a tap between the vehicle and whoever flies it, and attach to the vehicle."""
+        """Put a tap between the vehicle and its clients, and attach to the vehicle."""
         node = self._cluster.node(setup.name)
         namespace = node.wiring.namespace_path(setup.name)
         logs = self.folder / "logs"

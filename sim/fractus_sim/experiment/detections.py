@@ -80,7 +80,7 @@ def read_detections(lines: Iterable[str]) -> list[Seen]:
             entry = json.loads(line)
             found.append(Seen(str(entry["class"]), float(entry["lat"]), float(entry["lon"])))
         except (ValueError, KeyError, TypeError) as error:
-            log.warning("line %d of %s is no detection: %s", number, FILE, error)
+            log.warning("experiment: no detection in a line (file=%s, line=%d, error=%s)", FILE, number, error)
     return found
 
 
@@ -118,7 +118,7 @@ class TruthWatch:
                 content: Mapping[str, Any] = json.load(answer)
                 return content
         except (OSError, ValueError, urllib.error.URLError) as error:
-            log.debug("no truth from %s: %s", self._url, error)
+            log.debug("experiment: no truth (url=%s, error=%s)", self._url, error)
             return None
 
 

@@ -141,7 +141,7 @@ class Injector:
         while self._now_s < begin_s + fault.duration:
             yield
         if isinstance(fault, LinkLoss | NodePowerOff):
-            self._mend(fault, running.vehicle)
+            self._repair(fault, running.vehicle)
         for name, value in before.items():
             yield from self._set(running.vehicle, name, value)
         found = self.occurrences[running.index]
@@ -154,7 +154,7 @@ class Injector:
         else:
             self._breaker.power_off(fault.node or vehicle)
 
-    def _mend(self, fault: LinkLoss | NodePowerOff, vehicle: str) -> None:
+    def _repair(self, fault: LinkLoss | NodePowerOff, vehicle: str) -> None:
         if isinstance(fault, LinkLoss):
             self._breaker.heal_link(vehicle)
         else:

@@ -19,7 +19,7 @@ def connect_in(namespace: Path, port: int, timeout_s: float) -> socket.socket:
     """Connect to a port of a namespace's loopback device.
 
     Raises:
-        ExperimentError: the namespace cannot be entered, or nobody listens.
+        ExperimentError: the namespace cannot be entered, or no process listens.
     """
     return _inside(namespace, lambda: socket.create_connection(("127.0.0.1", port), timeout_s))
 

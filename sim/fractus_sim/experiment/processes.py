@@ -18,7 +18,7 @@ from fractus_sim.interruption import uninterrupted
 POLL_S = 0.05
 STOP_POLL_S = 0.01
 GRACE_S = 5.0
-_LAST_WORDS = 600
+_TAIL_BYTES = 600
 
 
 class Processes:
@@ -86,14 +86,14 @@ class Processes:
         """Wait until a condition holds while a process must run.
 
         Raises:
-            ExperimentError: the process ended, or the time is over; the message ends with its last words.
+            ExperimentError: the process ended, or the time is over; the message ends with the tail of its log.
         """
         deadline = time.monotonic() + timeout_s
         while not condition():
             if not self.running(name):
-                raise ExperimentError(f"{name} ended with {self.exit_code(name)}: {self.last_words(name)}")
+                raise ExperimentError(f"{name} ended with {self.exit_code(name)}: {self.log_tail(name)}")
             if time.monotonic() > deadline:
-                raise ExperimentError(f"{name} was not ready within {timeout_s:.0f} s: {self.last_words(name)}")
+                raise ExperimentError(f"{name} was not ready within {timeout_s:.0f} s: {self.log_tail(name)}")
             time.sleep(POLL_S)
 
     def wait_end(self, name: str, timeout_s: float) -> int | None:
@@ -103,10 +103,10 @@ class Processes:
             time.sleep(POLL_S)
         return code
 
-    def last_words(self, name: str) -> str:
+    def log_tail(self, name: str) -> str:
         """The end of a process' log, as one line."""
         path = self.log(name)
-        text = path.read_bytes()[-_LAST_WORDS:].decode("utf-8", "replace") if path.exists() else ""
+        text = path.read_bytes()[-_TAIL_BYTES:].decode("utf-8", "replace") if path.exists() else ""
         return " | ".join(line.strip() for line in text.splitlines()[-4:] if line.strip()) or "it said nothing"
 
     def stop(self, *names: str, kill: bool = False) -> None:
@@ -168,7 +168,7 @@ def _kill_group(group: int) -> None:
 
 
 def listening(port: int) -> bool:
-    """Whether somebody accepts connections on a port of the loopback device."""
+    """Whether a process accepts connections on a port of the loopback device."""
     with socket.socket() as probe:
         probe.settimeout(1.0)
         return probe.connect_ex(("127.0.0.1", port)) == 0

@@ -1,4 +1,4 @@
-"""Ends process groups when whoever started them is gone, however it went: even SIGKILL leaves none behind."""
+"""Ends process groups when the process that started them is gone, even after SIGKILL."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Reaper:
         self._say(group)
 
     def let_go(self, group: int) -> None:
-        """Leave a group alone that is no more; its number may soon be somebody else's."""
+        """Leave a group alone that is no more; its number may soon be another's."""
         self._say(-group)
 
     def close(self) -> None:
@@ -54,7 +54,7 @@ class Reaper:
 
     def _say(self, number: int) -> None:
         if self._guard is not None:
-            with contextlib.suppress(BrokenPipeError):  # somebody killed the guard; we end our processes ourselves
+            with contextlib.suppress(BrokenPipeError):  # the guard was killed; we end our processes ourselves
                 os.write(self._pipe, b"%d\n" % number)
 
 

@@ -225,11 +225,11 @@ class Standalone:
         """Make sure that vehicles and services run.
 
         Raises:
-            ExperimentError: one has ended; the message ends with its last words.
+            ExperimentError: one has ended; the message ends with the tail of its log.
         """
         for name, code in self.processes.dead().items():
             if name not in self._programs and not any(name.startswith(f"{node}-") for node in self._off):
-                raise ExperimentError(f"{name} ended with {code}: {self.processes.last_words(name)}")
+                raise ExperimentError(f"{name} ended with {code}: {self.processes.log_tail(name)}")
 
     def stop_services(self) -> None:
         """End programs and services in good order, so that their logs are complete; vehicles go on."""

@@ -94,7 +94,7 @@ class TcpLink:
         """Connect, trying again until the time is over.
 
         Raises:
-            ExperimentError: nobody answered.
+            ExperimentError: no autopilot answered.
         """
         deadline = time.monotonic() + timeout_s
         while True:

@@ -103,7 +103,7 @@ def _setup(field: Field, autopilot: Autopilot) -> DroneSetup:
         speedup=autopilot.speedup,
         parameters=PARAMETERS,
         description=field.drone.spec.to_dict(),
-        # A camera world follows the drone over a link of its own, which somebody else's autopilot may not have.
+        # A camera world follows the drone over a link of its own, which an autopilot that runs already may not have.
         camera=CameraSetup(("--seed", "3")) if simulated else CameraSetup(None),
         vehicle_arguments=("--wind", WIND),
         autopilot=autopilot.link,
@@ -128,7 +128,7 @@ def _wait_home(ground: Standalone, drone: RunningDrone, autopilot: Autopilot, te
         waited_s = time.monotonic() - began_s
         if not flown and waited_s > READY_TIMEOUT_S:
             raise ExperimentError(
-                f"the drone did not take off within {READY_TIMEOUT_S:.0f} s: {ground.processes.last_words('navigator')}"
+                f"the drone did not take off within {READY_TIMEOUT_S:.0f} s: {ground.processes.log_tail('navigator')}"
             )
         if waited_s > READY_TIMEOUT_S + FLIGHT_TIMEOUT_S / autopilot.speedup:
             raise ExperimentError(f"the drone was not home within {waited_s:.0f} s; its last word: {entries[-1:]}")

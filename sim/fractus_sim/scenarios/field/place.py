@@ -26,7 +26,7 @@ EXAMPLE = Path("examples/field")
 NAVIGATOR, VIEWER = "Navigator", "AerialViewer"
 DRONE = "drone-1"
 ZIGZAG = "ZIGZAG"
-# Without policies the Grants end here, metres from home: nowhere that anybody flies to.
+# Without policies the Grants end here, metres from home: farther than any run flies.
 EVERYWHERE_M = 1000.0
 # Metres east and north of home of what the violating program asks for.
 ASKED_OUTSIDE = {"WP-E1": (62.0, 130.0), "WP-E2": (226.0, 60.0)}

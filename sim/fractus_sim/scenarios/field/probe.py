@@ -20,7 +20,7 @@ POLL_S = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class ParkedVehicle:
     """Where an autopilot stands: latitude, longitude, and altitude above mean sea level."""
 
     system_id: int
@@ -40,11 +40,11 @@ def parse_link(text: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def look(link: str, tell: Callable[[str], None]) -> Standing:
+def look(link: str, tell: Callable[[str], None]) -> ParkedVehicle:
     """Wait until an ArduPilot vehicle on the ground knows where it is, and leave the link again.
 
     Raises:
-        ExperimentError: nobody answers, it is no ArduPilot, it flies, or it has no position in time.
+        ExperimentError: no autopilot answers, it is no ArduPilot, it flies, or it has no position in time.
     """
     host, port = parse_link(link)
     visitor = _Visitor(TcpLink.connect(host, port, CONNECT_S))
@@ -69,7 +69,7 @@ def look(link: str, tell: Callable[[str], None]) -> Standing:
     finally:
         visitor.close()
     place = (home.integer("latitude") / 1e7, home.integer("longitude") / 1e7, home.integer("altitude") / 1000.0)
-    return Standing(heartbeat.sysid, place)
+    return ParkedVehicle(heartbeat.sysid, place)
 
 
 class _Visitor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from fractus_core.api.geometry import Latitude, Longitude
 from fractus_core.api.model import InvalidObject, Model
@@ -35,65 +35,56 @@ class Place(Model):
         return f"{self.north:g} m north, {self.east:g} m east"
 
 
-class Takeoff(Model):
-    """Arm in GUIDED and climb."""
+class TaskStep(Model):
+    """One thing to do."""
 
-    do: Literal["takeoff"]
-    alt: Altitude
+    TITLE: ClassVar[str]
 
     @property
     def title(self) -> str:
         """The step in a few words."""
-        return f"takeoff to {self.alt:g} m"
+        return self.TITLE.format(step=self)
 
 
-class Goto(Place):
+class Takeoff(TaskStep):
+    """Arm in GUIDED and climb."""
+
+    TITLE = "takeoff to {step.alt:g} m"
+    do: Literal["takeoff"]
+    alt: Altitude
+
+
+class Goto(Place, TaskStep):
     """Fly there and stop."""
 
+    TITLE = "goto {step.words} at {step.alt:g} m"
     do: Literal["goto"]
     alt: Altitude
     within: float = Field(default=1.5, gt=0, le=100, description="Metres that count as there.")
 
-    @property
-    def title(self) -> str:
-        """The step in a few words."""
-        return f"goto {self.words} at {self.alt:g} m"
 
-
-class Speed(Model):
+class Speed(TaskStep):
     """Fly at this speed from now on."""
 
+    TITLE = "speed {step.speed:g} m/s"
     do: Literal["speed"]
     speed: float = Field(gt=0, le=50, description="Metres per second.")
 
-    @property
-    def title(self) -> str:
-        """The step in a few words."""
-        return f"speed {self.speed:g} m/s"
 
-
-class Hold(Model):
+class Hold(TaskStep):
     """Stay for a while."""
 
+    TITLE = "hold {step.seconds:g} s"
     do: Literal["hold"]
     seconds: float = Field(gt=0, le=3600)
 
-    @property
-    def title(self) -> str:
-        """The step in a few words."""
-        return f"hold {self.seconds:g} s"
 
-
-class SetMode(Model):
+class SetMode(TaskStep):
     """Change the flight mode."""
 
+    TITLE = "mode {step.mode}"
     do: Literal["mode"]
     mode: ModeName
-
-    @property
-    def title(self) -> str:
-        """The step in a few words."""
-        return f"mode {self.mode}"
 
 
 class Waypoint(Place):
@@ -103,7 +94,7 @@ class Waypoint(Place):
     hold: float = Field(default=0, ge=0, le=3600, description="Seconds to stay.")
 
 
-class FlyMission(Model):
+class FlyMission(TaskStep):
     """Upload a mission, take off, and fly it in AUTO to its end."""
 
     do: Literal["mission"]
@@ -117,26 +108,18 @@ class FlyMission(Model):
         return f"mission of {len(self.waypoints)} waypoints"
 
 
-class ReturnToLaunch(Model):
+class ReturnToLaunch(TaskStep):
     """Fly home and land."""
 
+    TITLE = "return to launch"
     do: Literal["returnToLaunch"]
 
-    @property
-    def title(self) -> str:
-        """The step in a few words."""
-        return "return to launch"
 
-
-class Land(Model):
+class Land(TaskStep):
     """Land here."""
 
+    TITLE = "land"
     do: Literal["land"]
-
-    @property
-    def title(self) -> str:
-        """The step in a few words."""
-        return "land"
 
 
 Step = Annotated[

@@ -283,11 +283,7 @@ def _merged(judged: Iterable[Judgement]) -> tuple[Judgement, ...]:
         key = (one.component, one.method, one.action, one.code, one.detail, *one.policies)
         index, time_s = last.get(key, (-1, -math.inf))
         if index >= 0 and one.time_s - time_s < 60.0:
-            before = kept[index]
-            kept[index] = Judgement(
-                **{name: getattr(before, name) for name in Judgement.__slots__ if name != "count"},
-                count=before.count + 1,
-            )
+            kept[index] = replace(kept[index], count=kept[index].count + 1)
         else:
             index = len(kept)
             kept.append(one)

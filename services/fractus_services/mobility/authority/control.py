@@ -37,7 +37,7 @@ from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.journal import Journal, Record
 from fractus_services.mobility.authority.leases import FlightConstraints, Lease, Motion
 from fractus_services.mobility.authority.machine import Machine
-from fractus_services.mobility.authority.performer import ModeCommands
+from fractus_services.mobility.authority.performer import ModeCommands, Performer
 from fractus_services.mobility.autopilot import Approach, Autopilot, Checked
 
 CORRECTION = "Correction"
@@ -97,8 +97,9 @@ class Control:
         self._removed: ActiveGrant | None = None
         self._transit: tuple[ActiveGrant, CompiledGrant] | None = None
         self.modes = modes
-        self._machine = Machine(autopilot, known, modes, approach, audit=audit, journal=journal)
-        self._performer = self._machine.performer
+        # Each needs the other, so one is looked up when it is called.
+        self._machine = Machine(autopilot, known, lambda actions: self._performer.perform(actions))  # noqa: PLW0108
+        self._performer = Performer(self._machine, autopilot, modes, approach, audit=audit, journal=journal)
         self.tasks, self.leases = self._performer.tasks, self._performer.leases
         self.wait, self.wake = self._performer.wait, self._performer.wake
         self.hold, self.undisturbed = self._performer.hold, self._performer.undisturbed

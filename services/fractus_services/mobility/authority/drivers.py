@@ -11,7 +11,8 @@ from fractus_core.geo import LocalFrame
 from fractus_services.errors import PreconditionFailed, Unavailable
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.authority.leases import Lease
+from fractus_services.mobility.authority.leases import Lease, Motion
+from fractus_services.mobility.autopilot import Permit
 
 WAYPOINT_M = 5.0
 """How near a leg must end to a waypoint of the driver's path to count as it."""
@@ -57,6 +58,25 @@ def require(control: Control, grant: ActiveGrant) -> Lease:
     if not control.autopilot.connected:
         raise Unavailable("AutopilotUnavailable", "the autopilot is not connected")
     return lease
+
+
+def driver_permit(control: Control, grant: ActiveGrant, motion: Motion | None = None) -> Permit:
+    """A driver's commands go only while it may still move the drone.
+
+    Args:
+        control: who has the drone.
+        grant: the driver's grant.
+        motion: the motion that commands; none for calls that are no motions.
+    """
+    lease = control.lease
+
+    def check() -> None:
+        if motion is not None:
+            motion.check()
+        if require(control, grant) is not lease or not control.valid(grant):
+            raise PreconditionFailed("ControlLost", "the drone is not yours any more")
+
+    return check
 
 
 async def give_back(control: Control, grant: ActiveGrant) -> bool:

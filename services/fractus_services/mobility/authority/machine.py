@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable, Sequence
 
 from fractus_core.control import ControlState, transition
 from fractus_core.control.actions import Action
 from fractus_core.control.events import Event, Tick
 from fractus_core.control.values import VehicleFacts
 
-from fractus_services.audit import AuditLog
-from fractus_services.mobility.authority.journal import Journal
-from fractus_services.mobility.authority.performer import ModeCommands, Performer
-from fractus_services.mobility.autopilot import Approach, Autopilot
+from fractus_services.mobility.autopilot import Autopilot
 
 
 class Machine:
@@ -21,30 +19,20 @@ class Machine:
     Args:
         autopilot: the link, whose clock counts.
         state: to begin with.
-        modes: changes modes and brakes.
-        approach: flies to where the autopilot's own return is legal.
-        audit: where changes of control are written.
-        journal: where missions are written.
-
-    Attributes:
-        performer: carries out the actions.
+        perform: carries out the actions.
     """
 
     def __init__(
         self,
         autopilot: Autopilot,
         state: ControlState,
-        modes: ModeCommands,
-        approach: Approach,
-        *,
-        audit: AuditLog,
-        journal: Journal,
+        perform: Callable[[Sequence[Action]], None],
     ) -> None:
         self._autopilot = autopilot
         self._state = state
         self._timer: asyncio.TimerHandle | None = None
         self._closed = False
-        self.performer = Performer(self, autopilot, modes, approach, audit=audit, journal=journal)
+        self._perform = perform
 
     @property
     def known(self) -> ControlState:
@@ -65,7 +53,7 @@ class Machine:
         """
         self._state, actions = transition(self.state, event, self._autopilot.now)
         try:
-            self.performer.perform(actions)
+            self._perform(actions)
         finally:
             self._set_timer()
         return actions

@@ -1,34 +1,13 @@
-"""What commands are asked for before each sending, so that nothing stale reaches the autopilot."""
+"""Permits of what the system flies: checked before each command is sent, so that nothing stale reaches the autopilot."""
 
 from __future__ import annotations
 
 from fractus_core.control import Authority
 
 from fractus_services.errors import PreconditionFailed
-from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import FlightConstraints, Lease, Motion
 from fractus_services.mobility.autopilot import Permit
-
-
-def driver_permit(control: Control, grant: ActiveGrant, motion: Motion | None = None) -> Permit:
-    """A driver's commands go only while it may still move the drone.
-
-    Args:
-        control: who has the drone.
-        grant: the driver's grant.
-        motion: the motion that commands; none for calls that are no motions.
-    """
-    lease = control.lease
-
-    def check() -> None:
-        if motion is not None:
-            motion.check()
-        if drivers.require(control, grant) is not lease or not control.valid(grant):
-            raise PreconditionFailed("ControlLost", "the drone is not yours any more")
-
-    return check
 
 
 def transit_permit(control: Control, lease: Lease, motion: Motion) -> Permit:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import Callable
 
 from fractus_core.policy.values import Call, Verdict
 
 from fractus_services.errors import Aborted, denied
 from fractus_services.grants import ActiveGrant
-from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.flight.guard import Guard
 
@@ -29,11 +29,13 @@ class CallJudge:
     Args:
         control: who has the drone; takeovers that a verdict asks for happen there.
         guard: asks the policy engine.
+        require: refuses a caller that does not have the drone.
     """
 
-    def __init__(self, control: Control, guard: Guard) -> None:
+    def __init__(self, control: Control, guard: Guard, require: Callable[[ActiveGrant], object]) -> None:
         self._control = control
         self._guard = guard
+        self._require = require
         self._free_at = {True: 0.0, False: 0.0}
         self._motions = 0
 
@@ -98,7 +100,7 @@ class CallJudge:
             raise denied(verdict)
         # Before the verdict has consequences: a call of a driver that waits for the drone must neither brake it nor take
         # it from the one that has it.
-        drivers.require(self._control, grant)
+        self._require(grant)
         if verdict.action == "takeover":
             self._control.take_over(verdict)
             raise denied(verdict)

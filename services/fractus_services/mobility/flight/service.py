@@ -14,8 +14,8 @@ from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.arming import Arming
 from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.drivers import driver_permit
 from fractus_services.mobility.authority.leases import Motion
-from fractus_services.mobility.authority.permits import driver_permit
 from fractus_services.mobility.autopilot import Autopilot, Permit
 from fractus_services.mobility.flight.calls import CallJudge
 from fractus_services.mobility.flight.courses import Trip

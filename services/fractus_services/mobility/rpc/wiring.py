@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from fractus_core.control import ControlState
 
@@ -10,6 +11,7 @@ from fractus_services.audit import AuditLog
 from fractus_services.grants import GrantFiles
 from fractus_services.mobility.authority.arming import Arming
 from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.drivers import require
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.authority.mode_controller import ModeController
 from fractus_services.mobility.authority.observer import Observer
@@ -73,7 +75,9 @@ class Parts:
         homing, courses = Homing(control, guard), Courses(control, guard)
         arming = Arming(control, failsafes, fence)
         transit = TransitFlight(control, arming, guard, courses)
-        self.service = MobilityService(control, arming, CallJudge(control, guard), homing.around)
+        self.service = MobilityService(
+            control, arming, CallJudge(control, guard, partial(require, control)), homing.around
+        )
         self.streams = Streams(control, transit.bring)
         self.tours = Tours(control, grants, transit.launch, courses, boarding_s)
         self.supervisor = Supervisor(control, fence)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import random
 from collections.abc import Iterator
 from typing import Any
 
@@ -179,3 +180,114 @@ def test_unknown_fields_are_refused(control_plane: ControlPlane) -> None:
     """As kubectl does by default: --validate=strict."""
     with pytest.raises(KubeError, match="unknown field"):
         control_plane.admin.call("POST", f"{API}/zones", zone(colour="red"), params={"fieldValidation": "Strict"})
+
+
+GOOD = [
+    app(DRIVER | {"egress": ["Checker"]}, PASSENGER, EDGE, HYBRID | {"ingress": ["Navigator"]}, CLOUD | {"replicas": 2}),
+    app(GUIDED, HYBRID | {"hybridTo": ["Viewer"], "heuristic": {"kind": "max", "metric": "ingress-bandwidth"}}),
+    driver(path=[HERE], point={"depot": "base"}),
+    app(DRIVER | {"controlPoints": [{"navigation": "regionBased", "region": DISC, "duration": 5}]}),
+    volume(secret="key"),
+    policy("AccessControl", "denial", methods=["Arm"], validFrom="2026-01-01T00:00:00Z", validUntil="2026-02-01T00:00:00Z"),
+    policy("LimitControl", "altitude", lowerLimit=1, upperLimit=2, action="refuse"),
+    policy("GeofenceControl", "exclusion", selector={"zones": ["z"]}, action="land"),
+    policy("PrivacyControl", "camera", action="blurFaces", faces="gaussian", fallback="black"),
+    selecting({"key": "mtom", "operator": "Gt", "values": ["1.5"]}, {"key": "class", "operator": "Exists"}),
+    zone(altitude={"lower": 1, "upper": 2}, schedule=[{"start": "08:00", "end": "17:00", "days": ["Mon"]}]),
+]  # fmt: skip
+
+CHOICES: dict[str, list[Any]] = {
+    "placement": ["drone", "edge", "hybrid", "cloud"],
+    "class": ["driver", "passenger"],
+    "navigation": ["pathBased", "regionBased"],
+    "service": ["mobility", "camera"],
+    "methods": [["Goto"], ["CaptureImage"], ["Arm", "ListImages"], []],
+    "type": ["AccessControl", "LimitControl", "GeofenceControl", "PrivacyControl"],
+    "kind": ["grant", "speed", "inclusion", "camera", "max", "min", "preferDirect"],
+    "action": ["refuse", "land", "blurFaces", "black", "enforce"],
+    "operator": ["In", "Exists", "Gt"],
+    "values": [["1"], ["1", "2"], ["much"], ["+.5"], ["1e3"], []],
+    "hybridTo": [["Ground"], ["Store"], ["Navigator"], ["Checker"], []],
+    "egress": [["Store"], ["Mute"], ["Nobody"], []],
+    "ingress": [["Store"], ["Navigator"], ["Nobody"]],
+    "instances": [0, 1, 10000, 10001, "*", "many"],
+    "lower": [1, 5], "upper": [1, 5], "lowerLimit": [1, 5], "upperLimit": [1, 5],
+    "validFrom": ["2026-01-01T00:00:00Z", "2026-03-01T00:00:00Z"],
+    "validUntil": ["2026-02-01T00:00:00Z"],
+    "start": ["08:00", "25:00"], "end": ["09:00"],
+    "path": [[HERE], []], "region": [DISC], "duration": [5], "depot": ["base"], "position": [HERE],
+    "replicas": [1], "heuristic": [{"kind": "max"}, {"kind": "preferDirect"}],
+    "controlPoints": [[PATH], []], "pointsOfInterest": [{"points": [HERE]}],
+    "locations": [[{"center": HERE, "radius": 5}], []],
+    "services": [[MOBILITY], [CAMERA], [MOBILITY, CAMERA], [CAMERA, CAMERA], []],
+    "faces": ["pixelate"], "fallback": ["black"], "zones": [["z"], []],
+    "secret": ["key", "viewer-tls"], "claim": ["c"], "circle": [DISC["circle"]], "polygon": [RING],
+}  # fmt: skip
+"""What a field may become: allowed or not, alone or with what is beside it."""
+
+
+def objects(value: Any) -> Iterator[Body]:
+    """Every object below a value."""
+    for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        yield from ([inner] if isinstance(inner, dict) else [])
+        yield from objects(inner)
+
+
+def mutated(rng: random.Random, manifest: Body) -> Body:
+    """A manifest with one to three fields taken out, changed, or put in."""
+    changed = copy.deepcopy(manifest)
+    for _ in range(rng.randint(1, 3)):
+        place = rng.choice([changed["spec"], *objects(changed["spec"])])
+        schema = schema_of(place)
+        if place and rng.random() < 0.4:
+            place.pop(rng.choice(sorted(place)))
+        elif known := sorted(schema & CHOICES.keys()):
+            field = rng.choice(known)
+            place[field] = copy.deepcopy(rng.choice(CHOICES[field]))
+    return changed
+
+
+def schema_of(place: Body) -> set[str]:
+    """The fields of the kinds of object that this one may be: those that have all that it has."""
+    found: set[str] = set()
+    for fields in SHAPES:
+        if place.keys() <= fields:
+            found |= fields
+    return found
+
+
+def shapes(schema: Body) -> Iterator[set[str]]:
+    """The sets of fields of all objects in a schema."""
+    if "properties" in schema:
+        yield set(schema["properties"])
+    for inner in (*schema.get("properties", {}).values(), schema.get("items")):
+        if isinstance(inner, dict):
+            yield from shapes(inner)
+
+
+SHAPES = [
+    fields
+    for kind in ("Application", "Policy", "Zone")
+    for fields in shapes(crd(MODELS[kind])["spec"]["versions"][0]["schema"]["openAPIV3Schema"]["properties"]["spec"])
+]
+
+
+@pytest.mark.parametrize("seed", range(len(GOOD)))
+def test_the_api_server_and_the_models_refuse_the_same_manifests(control_plane: ControlPlane, seed: int) -> None:
+    """Of manifests changed at random, so that both forms of every rule are evaluated over the same objects."""
+    rng, refused = random.Random(seed), 0
+    model = MODELS[GOOD[seed]["kind"]]
+    place = f"{API}/namespaces/default/{model.PLURAL}" if model.NAMESPACED else f"{API}/{model.PLURAL}"
+    for manifest in [GOOD[seed], *(mutated(rng, GOOD[seed]) for _ in range(150))]:
+        ours = theirs = ""
+        try:
+            model.from_body(manifest)
+        except InvalidObject as error:
+            ours = str(error)
+        try:
+            control_plane.admin.call("POST", place, manifest, params={"dryRun": "All", "fieldValidation": "Strict"})
+        except KubeError as error:
+            theirs = str(error)
+        assert bool(ours) == bool(theirs), (manifest, ours, theirs)
+        refused += bool(ours)
+    assert 10 < refused < 151

@@ -47,7 +47,7 @@ def main(environment: Mapping[str, str] = os.environ) -> int:
     try:
         asyncio.run(serve(settings))
     except Unconfigured as error:
-        LOG.error("%s", error)  # noqa: TRY400 (one line is enough)
+        LOG.error("agent: %s", error)  # noqa: TRY400 (one line is enough)
         return 1
     return 0
 

@@ -20,8 +20,8 @@ from fractus_services.camera.capture.properties import CameraProperties
 from fractus_services.camera.capture.shutter import Shutter
 from fractus_services.camera.imaging.faces import Box
 from fractus_services.camera.imaging.pixels import Pixels, decoded
-from fractus_services.camera.pictures.capture import PictureCapture
-from fractus_services.camera.pictures.filtering import Filtering
+from fractus_services.camera.pictures.capture import MAX_FILTERING, PictureCapture
+from fractus_services.camera.pictures.fair_queue import MAX_PER_OWNER, FairQueue
 from fractus_services.camera.pictures.judge import PictureJudge
 from fractus_services.camera.pictures.library import PictureLibrary
 from fractus_services.errors import Refused
@@ -112,13 +112,14 @@ class World:
         self.shutter = Shutter(self.scene, timeout_s=5.0)
         self.audit = AuditLog(directory / "audit.jsonl", lambda: NOW)
         self.album = Album(self.directory, keep, 10**9)
-        judge = PictureJudge(self.audit)
-        filtering = Filtering(self.finder, judge)
+        judge, queue = PictureJudge(self.audit, self.finder), FairQueue(MAX_PER_OWNER, MAX_FILTERING)
         self.camera = PictureCapture(
-            self.drone, self.shutter, CameraProperties(resolution), filtering=filtering, album=self.album, judge=judge,
-            clock=lambda: NOW,
+            self.drone, self.shutter, CameraProperties(resolution), detector=self.finder, filter_queue=queue,
+            album=self.album, judge=judge, clock=lambda: NOW,
         )  # fmt: skip
-        self.library = PictureLibrary(self.drone, filtering, self.album, judge, lambda: NOW)
+        self.library = PictureLibrary(
+            self.drone, self.album, detector=self.finder, filter_queue=queue, judge=judge, clock=lambda: NOW
+        )
 
     async def capture(self, grant: ActiveGrant, **size: int) -> Shot:
         return (await self.camera.capture(grant, CaptureArgs(**size)))[1]

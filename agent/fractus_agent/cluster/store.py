@@ -191,7 +191,7 @@ class Store:
             try:
                 grants, version = await self._list_grants()
                 if backoff.attempts > 1:
-                    LOG.info("the API server is back after %d attempts", backoff.attempts)
+                    LOG.info("grants: the API server is back (attempts=%d)", backoff.attempts)
                 yield Listed(grants)
                 async with contextlib.aclosing(self._watch_grants(version)) as events:
                     async for event in events:

@@ -102,7 +102,11 @@ def status_of(grant: Grant, missions: Mapping[str, Outcome], problem: str | None
         phase, message = "Pending", problem
     else:
         phase, message = outcome_of(grant, missions) or ("Active", "")
-    return {"phase": phase, "message": message, "observedGeneration": grant.metadata.generation or 0}
+    return _status(phase, message, grant.metadata.generation)
+
+
+def _status(phase: Phase, message: str, generation: int | None) -> dict[str, Any]:
+    return {"phase": phase, "message": message, "observedGeneration": generation or 0}
 
 
 class GrantKeeper:
@@ -138,7 +142,7 @@ class GrantKeeper:
         self._monotonic = monotonic
         self._unverified: dict[str, tuple[Object, float]] = {}
         self._grants: dict[str, Grant] = {}
-        self._unreadable: dict[str, dict[str, Any]] = {}
+        self._unusable: dict[str, dict[str, Any]] = {}
         self._unstored: dict[str, str] = {}
         self._unremoved: set[str] = set()
         self._reported: dict[str, dict[str, Any]] = {}
@@ -169,7 +173,7 @@ class GrantKeeper:
         match event:
             case Listed(grants):
                 names = {body["metadata"]["name"] for body in grants}
-                known = self._directory.names().union(self._grants, self._unreadable, self._unverified)
+                known = self._directory.names().union(self._grants, self._unusable, self._unverified)
                 for gone in known - names:
                     self._remove(gone)
                 for body in grants:
@@ -196,7 +200,7 @@ class GrantKeeper:
         wanted = {
             name: status_of(grant, self._missions, self._unstored.get(name)) for name, grant in self._grants.items()
         }
-        for name, status in (wanted | self._unreadable).items():
+        for name, status in (wanted | self._unusable).items():
             if self._reported.get(name) == status:
                 continue
             await self._store.apply_status("Grant", name, status)
@@ -211,11 +215,7 @@ class GrantKeeper:
             # What it forbids is unknown, so nothing of it is stored: without a grant the services bring the drone home.
             LOG.error("grants: cannot be read, nothing is granted (grant=%s): %s", name, error)  # noqa: TRY400
             self._remove(name)
-            self._unreadable[name] = {
-                "phase": "Failed",
-                "message": f"The agent of {self._node} cannot read the grant: {error}",
-                "observedGeneration": body["metadata"].get("generation", 0),
-            }
+            self._report_unusable(body, "Failed", f"The agent of {self._node} cannot read the grant: {error}")
             return
         if grant.metadata.deletion_timestamp is not None or grant.spec.node != self._node:
             self._remove(name)
@@ -230,21 +230,18 @@ class GrantKeeper:
         except BadSignature as problem:
             LOG.error("grants: not stored (grant=%s): %s", name, problem)  # noqa: TRY400
             self._remove(name)
-            self._wait(body, str(problem))
+            self._report_unusable(body, "Pending", self._waits(problem))
             return
         self._unverified.pop(name, None)
-        self._unreadable.pop(name, None)
+        self._unusable.pop(name, None)
         self._unremoved.discard(name)
         old = self._grants.get(name)
         if old is None or old.metadata.uid != grant.metadata.uid:
             self._reported.pop(name, None)
         self._grants[name] = grant
         if grant.status is not None:
-            self._reported[name] = {
-                "phase": grant.status.phase,
-                "message": grant.status.message or "",
-                "observedGeneration": grant.status.observed_generation or 0,
-            }
+            known = grant.status
+            self._reported[name] = _status(known.phase, known.message or "", known.observed_generation)
         self._write(grant)
 
     def _stored(self, grant: Grant) -> bool:
@@ -260,7 +257,7 @@ class GrantKeeper:
             LOG.warning("grants: not stored yet (grant=%s): %s", name, why)
         self._unverified[name] = (body, self._unverified.get(name, (body, self._monotonic()))[1])
         if name not in self._grants:
-            self._wait(body, why)
+            self._report_unusable(body, "Pending", self._waits(why))
         self._refresh_authority()
 
     def give_up_unverified(self) -> None:
@@ -271,12 +268,12 @@ class GrantKeeper:
                 self._remove(name)
                 self._hold(body, "it is of an authority that this node does not know")
 
-    def _wait(self, body: Object, why: str) -> None:
-        self._unreadable[body["metadata"]["name"]] = {
-            "phase": "Pending",
-            "message": f"The agent of {self._node} waits for the operator's signature: {why}",
-            "observedGeneration": body["metadata"].get("generation", 0),
-        }
+    def _waits(self, why: object) -> str:
+        return f"The agent of {self._node} waits for the operator's signature: {why}"
+
+    def _report_unusable(self, body: Object, phase: Phase, message: str) -> None:
+        metadata = body["metadata"]
+        self._unusable[metadata["name"]] = _status(phase, message, metadata.get("generation"))
 
     def _write(self, grant: Grant) -> None:
         try:
@@ -296,7 +293,7 @@ class GrantKeeper:
             self._remove(name)
 
     def _remove(self, name: str) -> None:
-        for record in (self._grants, self._unreadable, self._unstored, self._reported, self._unverified):
+        for record in (self._grants, self._unusable, self._unstored, self._reported, self._unverified):
             record.pop(name, None)
         self._unremoved.discard(name)
         try:

@@ -206,4 +206,4 @@ def _sizes(paths: Iterable[Path]) -> list[int]:
 
 
 def _missing(name: str) -> NoSuchImage:
-    return NoSuchImage(f"there is no picture {name[:64]!r} of this component; ListImages tells which there are")
+    return NoSuchImage(f"there is no picture {name[:64]!r} of this component; ListImages lists those that exist")

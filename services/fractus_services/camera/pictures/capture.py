@@ -20,19 +20,21 @@ from fractus_services.camera.album.shots import Shot
 from fractus_services.camera.capture.driver import Wanted
 from fractus_services.camera.capture.properties import CameraProperties
 from fractus_services.camera.capture.shutter import Shutter
-from fractus_services.camera.imaging.faces import smallest_face_px
+from fractus_services.camera.imaging.faces import Detector, smallest_face_px
 from fractus_services.camera.imaging.filters import MOTION_PX
 from fractus_services.camera.imaging.metadata import with_metadata
+from fractus_services.camera.imaging.pipeline import apply_filters
 from fractus_services.camera.imaging.pixels import Pixels, cropped, encoded, fitted
 from fractus_services.camera.pictures.fair_queue import MAX_PER_OWNER, FairQueue
-from fractus_services.camera.pictures.filtering import Filtering
 from fractus_services.camera.pictures.judge import PictureJudge, combined
-from fractus_services.camera.pose.pose import Pose
+from fractus_services.camera.pose.pose import Pose, is_upright
 from fractus_services.camera.pose.provider import PoseProvider
 from fractus_services.grants import ActiveGrant
 
 MAX_EXPOSURES = 8
 """Pictures of all components that are being taken or wait for the shutter."""
+MAX_FILTERING = 8
+"""Pictures that are being filtered or wait for it; each takes tens of megabytes of memory."""
 FRAME_INTERVAL_S = 0.25
 """Between the frames that show what moves."""
 
@@ -67,7 +69,8 @@ class PictureCapture:
         poses: where the camera is.
         shutter: the camera.
         camera: its properties.
-        filtering: filters pictures.
+        detector: finds faces.
+        filter_queue: who may filter a picture next.
         album: where pictures are stored.
         judge: judges and records.
         clock: Unix time.
@@ -79,7 +82,8 @@ class PictureCapture:
         shutter: Shutter,
         camera: CameraProperties,
         *,
-        filtering: Filtering,
+        detector: Detector,
+        filter_queue: FairQueue,
         album: Album,
         judge: PictureJudge,
         clock: Callable[[], float],
@@ -87,7 +91,8 @@ class PictureCapture:
         self._poses = poses
         self._shutter = shutter
         self._camera = camera
-        self._filtering = filtering
+        self._detector = detector
+        self._filter_queue = filter_queue
         self._album = album
         self._judge = judge
         self._clock = clock
@@ -121,10 +126,10 @@ class PictureCapture:
             exposure = await self._expose(owner, args, current_grant)
             if not exposure.verdict.filters:
                 return await self._store(args, exposure)
-            async with self._filtering.turn(owner):
+            async with self._filter_queue.turn(owner):
                 return await self._store(args, exposure)
         # The picture must not wait in memory for its filters, so the turn for these comes first.
-        async with self._filtering.turn(owner):
+        async with self._filter_queue.turn(owner):
             return await self._store(args, await self._expose(owner, args, current_grant))
 
     async def _expose(self, owner: str, args: CaptureArgs, current_grant: Callable[[], ActiveGrant]) -> _Exposure:
@@ -180,22 +185,20 @@ class PictureCapture:
         view = seen_from(after.exposure, grant.compiled.frame)
         farthest_m = view.farthest_m if view is not None else math.inf
         face_px = smallest_face_px(after.lens, farthest_m, exposure.view_width_px)
-        call, filters = Call("CaptureImage", args), exposure.verdict.filters
-        plan, verdict = self._filtering.plan(
-            call, grant, exposure.verdict, required=filters, face_px=face_px, seen=after
-        )
+        call, camera = Call("CaptureImage", args), self._camera
+        plan, verdict = self._judge.plan(call, grant, exposure.verdict, after, face_px=face_px)
         poses, moment_s = tuple(Pose.of(one) for one in after.exposure), float(after.time_s)
-        source_width_px = self._camera.source_size(args.width, args.height)[0]
+        source_width_px = camera.source_size(args.width, args.height)[0]
 
         def work() -> bytes:
             sized = _sized(frames, args)
             frames.clear()
-            data = encoded(self._filtering.apply(sized, plan, face_px, poses))
-            if filters:
+            upright = is_upright(poses)
+            data = encoded(apply_filters(sized, plan, self._detector, face_px, upright=upright, fixed=camera.fixed))
+            if verdict.filters:
                 # A filtered picture tells nothing of where it was taken.
                 return data
-            model = self._camera.model
-            return with_metadata(data, poses[-1], time_s=moment_s, camera=model, view_width_px=source_width_px)
+            return with_metadata(data, poses[-1], time_s=moment_s, camera=camera.model, view_width_px=source_width_px)
 
         data = await asyncio.to_thread(work)
         shot = Shot(exposure.name, moment_s, args.width, args.height, len(data), poses, face_px, plan.filters)

@@ -11,6 +11,8 @@ from fractus_core.policy.privacy import compose, judge_privacy
 from fractus_core.policy.values import Call, Situation, Verdict
 
 from fractus_services.audit import AuditLog
+from fractus_services.camera.imaging.faces import Detector
+from fractus_services.camera.imaging.pipeline import FacesNotReliable, FilterPlan, plan_filters
 from fractus_services.camera.pose.pose import Pose
 from fractus_services.errors import denied
 from fractus_services.grants import ActiveGrant
@@ -19,10 +21,16 @@ log = logging.getLogger(__name__)
 
 
 class PictureJudge:
-    """The policy engine as the camera service asks it: a denial is an exception."""
+    """The policy engine as the camera service asks it: a denial is an exception.
 
-    def __init__(self, audit: AuditLog) -> None:
+    Args:
+        audit: where decisions are recorded.
+        detector: finds faces; where it cannot be trusted, policies may deny.
+    """
+
+    def __init__(self, audit: AuditLog, detector: Detector) -> None:
         self._audit = audit
+        self._detector = detector
 
     def judge(self, call: Call, grant: ActiveGrant, now: Situation, *, record: bool = True) -> Verdict:
         """The verdict on a call, which permits it.
@@ -60,6 +68,29 @@ class PictureJudge:
             Refused: no picture of that place may be returned.
         """
         return combined([verdict, self.judge_view(call, grant, taken_at(poses, now))])
+
+    def plan(
+        self, call: Call, grant: ActiveGrant, verdict: Verdict, seen: Situation, *, face_px: float
+    ) -> tuple[FilterPlan, Verdict]:
+        """The filters that a verdict requires of a picture, and the verdict that names a fallback among them.
+
+        Args:
+            call: method and arguments.
+            grant: the caller's.
+            verdict: with the required filters.
+            seen: where the picture was taken.
+            face_px: width of the smallest face that the picture may show; 0 when it is unknown.
+
+        Raises:
+            Refused: faces cannot be hidden reliably, and a policy allows no picture then.
+        """
+        try:
+            plan = plan_filters(verdict.filters, face_px, self._detector)
+        except FacesNotReliable as error:
+            refusal = Verdict("deny", None, "FacesNotFound", f"{verdict.reason}; {error}", verdict.policies)
+            self.require(call, grant, refusal, seen)
+            raise AssertionError("a denial always raises") from error
+        return plan, replace(verdict, reason=f"{verdict.reason}; {plan.note}") if plan.note else verdict
 
     def require(
         self, call: Call, grant: ActiveGrant, verdict: Verdict, now: Situation, *, record: bool = False

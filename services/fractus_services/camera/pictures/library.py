@@ -13,10 +13,12 @@ from fractus_core.policy.values import Call, Filter, Situation, Verdict
 from fractus_services.background import Background
 from fractus_services.camera.album.album import Album, owner_of
 from fractus_services.camera.album.shots import Shot
-from fractus_services.camera.imaging.pipeline import FilterPlan
+from fractus_services.camera.imaging.faces import Detector
+from fractus_services.camera.imaging.pipeline import FilterPlan, apply_filters
 from fractus_services.camera.imaging.pixels import decoded, encoded
-from fractus_services.camera.pictures.filtering import Filtering
+from fractus_services.camera.pictures.fair_queue import FairQueue
 from fractus_services.camera.pictures.judge import PictureJudge, taken_at
+from fractus_services.camera.pose.pose import is_upright
 from fractus_services.camera.pose.provider import PoseProvider
 from fractus_services.grants import ActiveGrant
 
@@ -26,17 +28,26 @@ class PictureLibrary:
 
     Args:
         poses: where the camera is.
-        filtering: filters pictures.
+        detector: finds faces.
+        filter_queue: who may filter a picture next.
         album: where pictures are stored.
         judge: judges and records.
         clock: Unix time.
     """
 
     def __init__(
-        self, poses: PoseProvider, filtering: Filtering, album: Album, judge: PictureJudge, clock: Callable[[], float]
+        self,
+        poses: PoseProvider,
+        album: Album,
+        *,
+        detector: Detector,
+        filter_queue: FairQueue,
+        judge: PictureJudge,
+        clock: Callable[[], float],
     ) -> None:
         self._poses = poses
-        self._filtering = filtering
+        self._detector = detector
+        self._filter_queue = filter_queue
         self._album = album
         self._judge = judge
         self._clock = clock
@@ -65,13 +76,13 @@ class PictureLibrary:
             return verdict, shot, path
         # In a picture that was filtered before it is unknown which faces are still found.
         face_px = 0.0 if shot.filters else shot.face_px
-        plan, noted = self._filtering.plan(
-            call, grant, verdict, required=missing, face_px=face_px, seen=taken_at(shot.poses, now)
+        plan, noted = self._judge.plan(
+            call, grant, replace(verdict, filters=missing), taken_at(shot.poses, now), face_px=face_px
         )
         data = await self._tasks.complete(self._filtered(owner, path, plan, replace(shot, face_px=face_px)))
         done = (*shot.filters, *plan.filters)
         self._check_again(call, current_grant() if current_grant else grant, shot, done)
-        return noted, replace(shot, size_bytes=len(data), filters=done), data
+        return replace(verdict, reason=noted.reason), replace(shot, size_bytes=len(data), filters=done), data
 
     def _check_again(self, call: Call, grant: ActiveGrant, shot: Shot, done: tuple[Filter, ...]) -> None:
         """Refuse a stored picture that by now needs more filters than it got."""
@@ -85,9 +96,10 @@ class PictureLibrary:
 
     async def _filtered(self, owner: str, path: Path, plan: FilterPlan, shot: Shot) -> bytes:
         def work() -> bytes:
-            return encoded(self._filtering.apply([decoded(path.read_bytes())], plan, shot.face_px, shot.poses))
+            picture, upright = decoded(path.read_bytes()), is_upright(shot.poses)
+            return encoded(apply_filters([picture], plan, self._detector, shot.face_px, upright=upright))
 
-        async with self._filtering.turn(owner):
+        async with self._filter_queue.turn(owner):
             return await asyncio.to_thread(work)
 
     async def list(self, grant: ActiveGrant) -> tuple[Verdict, tuple[Shot, ...]]:

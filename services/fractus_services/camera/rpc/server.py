@@ -19,8 +19,8 @@ from fractus_services.camera.capture.connection import driver_for
 from fractus_services.camera.capture.properties import CameraProperties
 from fractus_services.camera.capture.shutter import Shutter
 from fractus_services.camera.imaging.faces import BadModel, CascadeDetector, Detector, ModelDetector
-from fractus_services.camera.pictures.capture import PictureCapture
-from fractus_services.camera.pictures.filtering import Filtering
+from fractus_services.camera.pictures.capture import MAX_FILTERING, PictureCapture
+from fractus_services.camera.pictures.fair_queue import MAX_PER_OWNER, FairQueue
 from fractus_services.camera.pictures.judge import PictureJudge
 from fractus_services.camera.pictures.library import PictureLibrary
 from fractus_services.camera.pose.history import PoseHistory
@@ -74,8 +74,9 @@ async def run(options: CameraOptions, stop: asyncio.Event) -> None:
         options.keep_total_mb * 1_000_000,
         lambda: [owner_of(grant) for grant in grants.active.values()],
     )
-    judge = PictureJudge(audit)
-    filtering = Filtering(detector_of(options), judge, fixed=camera.fixed)
+    detector = detector_of(options)
+    judge = PictureJudge(audit, detector)
+    queue = FairQueue(MAX_PER_OWNER, MAX_FILTERING)
     parts = [grants.run()]
     poses: PoseProvider
     if isinstance(description, EdgeNode):
@@ -85,8 +86,10 @@ async def run(options: CameraOptions, stop: asyncio.Event) -> None:
         poses = history = PoseHistory(time.monotonic, lens=lens, relief_m=options.relief)
         parts.append(follow_telemetry(options.mobility, node, tls, history.add))
     handlers = CameraHandlers(
-        PictureCapture(poses, shutter, camera, filtering=filtering, album=album, judge=judge, clock=clock),
-        PictureLibrary(poses, filtering, album, judge, clock),
+        PictureCapture(
+            poses, shutter, camera, detector=detector, filter_queue=queue, album=album, judge=judge, clock=clock
+        ),
+        PictureLibrary(poses, album, detector=detector, filter_queue=queue, judge=judge, clock=clock),
         CallAdmission(grants, clock),
     )
 

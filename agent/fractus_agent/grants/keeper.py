@@ -105,7 +105,7 @@ def status_of(grant: Grant, missions: Mapping[str, Outcome], problem: str | None
     return _status(phase, message, grant.metadata.generation)
 
 
-def _status(phase: Phase, message: str, generation: int | None) -> dict[str, Any]:
+def _status(phase: Phase | None, message: str, generation: int | None) -> dict[str, Any]:
     return {"phase": phase, "message": message, "observedGeneration": generation or 0}
 
 

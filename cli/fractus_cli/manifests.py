@@ -25,8 +25,9 @@ from fractus_core.api import (
     Resource,
     Zone,
 )
+from fractus_core.api.names import CLASS_LABEL
 from fractus_core.api.nodes import DroneStatus
-from fractus_core.planning import CLASS_LABEL, Host, Inventory
+from fractus_core.planning import Host, Inventory
 from fractus_core.planning.quantities import amount_of
 from fractus_core.validation import check_policy, check_zone
 

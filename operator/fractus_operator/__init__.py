@@ -1,1 +1,1 @@
-"""The kopf operator: thin handlers, services, one store."""
+"""The operator: plans Applications, compiles their grants, and keeps the cluster as both ask for."""

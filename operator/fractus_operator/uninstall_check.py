@@ -6,11 +6,11 @@ import asyncio
 import sys
 from collections.abc import Sequence
 
+from fractus_core.api.nodes import GROUNDED
+
 from fractus_operator.cluster.kinds import APPLICATION, DRONE, Body, key_of
 from fractus_operator.cluster.labels import FINALIZER
 from fractus_operator.cluster.store import KubeError, Store, Unconfigured
-
-_ON_THE_GROUND = {"inactive", "charging"}
 
 
 def objection(applications: Sequence[Body], drones: Sequence[Body]) -> str:
@@ -27,7 +27,7 @@ def objection(applications: Sequence[Body], drones: Sequence[Body]) -> str:
             "(kubectl delete applications.fractus.dev --all -A), then uninstall"
         )
     states = {body["metadata"]["name"]: body.get("status", {}).get("flightState") for body in drones}
-    flying = [f"{name} ({state})" for name, state in states.items() if state and state not in _ON_THE_GROUND]
+    flying = [f"{name} ({state})" for name, state in states.items() if state and state not in GROUNDED]
     if flying:
         return (
             f"Fractus still flies {_listed(flying)}: wait until kubectl get drones.fractus.dev says inactive or charging, "

@@ -6,13 +6,14 @@ from datetime import datetime
 from ipaddress import IPv4Address
 from typing import Any
 
+from fractus_core.api.names import CLASS_LABEL
+
 from fractus_cluster.addressing import DNS_SERVICE, Addressing
 from fractus_cluster.spec import NodeSpec
 
 Json = dict[str, Any]
 
 DNS_USER = "fractus-sim:dns"
-CLASS_LABEL = "fractus.dev/class"
 
 
 def node_object(node: NodeSpec, index: int, addressing: Addressing) -> tuple[str, Json]:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from fractus_core.api import Drone, EdgeNode, Grant
 from fractus_core.api.model import API_VERSION, GROUP
+from fractus_core.api.names import NODE_SIGNER
 from fractus_kube import (
     Backoff,
     Body,
@@ -38,7 +39,6 @@ Object = Body
 
 FIELD_MANAGER = "fractus-agent"
 SYSTEM_NAMESPACE = "fractus-system"
-SIGNER = f"{GROUP}/node"
 NODE_LABEL = f"{GROUP}/node"
 CALL_TIMEOUT_S = 20.0
 
@@ -159,7 +159,7 @@ class Store:
             **_SIGNING_REQUEST.header(name, labels={NODE_LABEL: self._node}),
             "spec": {
                 "request": base64.b64encode(request_pem).decode(),
-                "signerName": SIGNER,
+                "signerName": NODE_SIGNER,
                 "expirationSeconds": life_s,
                 "usages": ["digital signature", "server auth", "client auth"],
             },

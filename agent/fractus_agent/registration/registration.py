@@ -11,6 +11,7 @@ from pathlib import Path
 
 from fractus_core.api.descriptions import InvalidDescription, parse_description
 from fractus_core.api.model import GROUP, InvalidObject
+from fractus_core.api.names import CLASS_LABEL
 from fractus_core.api.nodes import Drone, EdgeNode
 
 from fractus_agent.cluster.store import Invalid, KubeError, Object, Store
@@ -20,7 +21,6 @@ from fractus_agent.supervisor import repeat
 LOG = logging.getLogger(__name__)
 
 HASH_ANNOTATION = f"{GROUP}/description-hash"
-CLASS_LABEL = f"{GROUP}/class"
 CHECK_INTERVAL_S = 10.0
 """Seconds between checks of the description on the node."""
 RESYNC_INTERVAL_S = 300.0

@@ -12,6 +12,12 @@ from pydantic import Field
 TRUST_DOMAIN = "fractus.dev"
 SPIFFE_SCHEME = "spiffe://"
 
+CLASS_LABEL = f"{TRUST_DOMAIN}/class"
+"""On Nodes, and the key of their taint: drone, edge or cloud."""
+
+NODE_SIGNER = f"{TRUST_DOMAIN}/node"
+"""The signer that agents ask for the certificates of their nodes."""
+
 DNS_LABEL = r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$"
 Name = Annotated[str, Field(min_length=1, max_length=63, pattern=DNS_LABEL)]
 """A DNS label (RFC 1123), as Kubernetes names objects."""

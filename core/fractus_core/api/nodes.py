@@ -14,6 +14,8 @@ from fractus_core.api.names import Name
 
 Technology = Literal["Ethernet", "4G", "5G", "WiFi", "BLE"]
 FlightState = Literal["inactive", "charging", "takingOff", "flying", "landing"]
+GROUNDED: frozenset[FlightState] = frozenset({"inactive", "charging"})
+"""Flight states of a drone on the ground."""
 
 
 class Pairing(Model):

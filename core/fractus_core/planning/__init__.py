@@ -4,7 +4,6 @@ from fractus_core.planning.area import OperationArea as OperationArea
 from fractus_core.planning.area import operation_area as operation_area
 from fractus_core.planning.flight import flight_of as flight_of
 from fractus_core.planning.index import SpatialIndex as SpatialIndex
-from fractus_core.planning.inventory import CLASS_LABEL as CLASS_LABEL
 from fractus_core.planning.inventory import Flight as Flight
 from fractus_core.planning.inventory import Host as Host
 from fractus_core.planning.inventory import Inventory as Inventory

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field
 
 from fractus_core.api.geometry import Position
 from fractus_core.api.model import InvalidObject
+from fractus_core.api.names import CLASS_LABEL
 from fractus_core.api.nodes import Depot, Drone, EdgeNode
 from fractus_core.api.policies import Policy, Zone
 from fractus_core.planning.coverage import CoverStrategy
 from fractus_core.planning.locations import NodeLocations
-
-CLASS_LABEL = "fractus.dev/class"
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,6 @@ CAUSE_ANNOTATION = f"{GROUP}/cause"
 """On Deployments: DIGEST@NODE, of what the manifest says of the component, and the node that it is made for."""
 
 FINALIZER = f"{GROUP}/teardown"
-CLASS_LABEL = f"{GROUP}/class"
 DEPOT_LABEL = f"{GROUP}/depot"
 GEOHASH_LABEL = f"{GROUP}/geohash"
 INTERFACE_LABEL = f"{GROUP}/interface-"

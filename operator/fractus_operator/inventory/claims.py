@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
 from fractus_core.api import Application, Drone, Grant
+from fractus_core.api.nodes import GROUNDED
 from fractus_core.api.plans import DeploymentPlanSpec
 
 from fractus_operator.cluster.kinds import Key
@@ -142,4 +143,4 @@ class Fleet:
 
 def is_flying(drone: Drone) -> bool:
     """Whether the drone is on its way."""
-    return drone.status is not None and drone.status.flight_state not in {"inactive", "charging"}
+    return drone.status is not None and drone.status.flight_state not in GROUNDED

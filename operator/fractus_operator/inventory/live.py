@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from fractus_core.api import DeploymentPlan, Depot, Drone, EdgeNode, Grant, Policy, Zone
+from fractus_core.api.names import NODE_SIGNER
 from fractus_core.planning.inventory import Flight, Host, Inventory
 from fractus_core.planning.locations import NodeLocations
 
@@ -20,8 +21,6 @@ from fractus_operator.inventory.claims import Claim, Fleet, is_flying
 from fractus_operator.inventory.observed import Observed
 from fractus_operator.inventory.plans import Plans
 from fractus_operator.inventory.subscriptions import Subscriptions
-
-SIGNER = "fractus.dev/node"
 
 
 class LiveInventory:
@@ -42,7 +41,7 @@ class LiveInventory:
             kinds.SIGNING_REQUEST,
             _as_is,
             lambda key, _old, _new: self._report(kinds.SIGNING_REQUEST, key),
-            selectors={"fieldSelector": f"spec.signerName={SIGNER}"},
+            selectors={"fieldSelector": f"spec.signerName={NODE_SIGNER}"},
         )
         self.children: dict[Kind, Reflector[Body]] = {
             kind: Reflector(

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, assert_never
 
 from fractus_core.api import API_VERSION, Application, Component, Drone
-from fractus_core.api.names import address_variable
+from fractus_core.api.names import CLASS_LABEL, address_variable
 from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec, PlannedInstance
 
 from fractus_operator.cluster import kinds, labels
@@ -294,7 +294,7 @@ def _affinity(placed: PlannedInstance) -> Body:
     if placed.node is not None:
         term = {"matchFields": [{"key": "metadata.name", "operator": "In", "values": [placed.node]}]}
     else:
-        term = {"matchExpressions": [{"key": labels.CLASS_LABEL, "operator": "In", "values": ["cloud"]}]}
+        term = {"matchExpressions": [{"key": CLASS_LABEL, "operator": "In", "values": ["cloud"]}]}
     return {"requiredDuringSchedulingIgnoredDuringExecution": {"nodeSelectorTerms": [term]}}
 
 
@@ -305,7 +305,7 @@ def _tolerations(placed: PlannedInstance, drone: Drone | None) -> list[Body]:
     autonomy = drone.spec.autonomy if drone is not None else None
     bound: Body = {} if autonomy is None else {"tolerationSeconds": autonomy}
     return [
-        {"key": labels.CLASS_LABEL, "operator": "Exists"},
+        {"key": CLASS_LABEL, "operator": "Exists"},
         {"key": "node.kubernetes.io/not-ready", "operator": "Exists", "effect": "NoExecute", **bound},
         {"key": "node.kubernetes.io/unreachable", "operator": "Exists", "effect": "NoExecute", **bound},
     ]

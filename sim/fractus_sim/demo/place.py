@@ -14,13 +14,13 @@ import yaml
 from fractus_cluster.binaries import ensure_binaries
 from fractus_cluster.cluster import Cluster
 from fractus_cluster.images.build import build_images
+from fractus_core.api.names import CLASS_LABEL
 
 from fractus_sim.demo.kube import DemoError, Kube, Object
 
 ROOT = Path(__file__).parents[3]
 EXAMPLE = ROOT / "examples" / "traffic-monitoring"
 TARGETS = ("operator", "agent", "services", "example-traffic-monitoring")
-CLASS_LABEL = "fractus.dev/class"
 GPU = "fractus.dev/gpu"
 Say = Callable[[str], None]
 

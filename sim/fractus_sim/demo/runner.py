@@ -11,12 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fractus_cluster.errors import ClusterError
+from fractus_core.api.nodes import GROUNDED
 from rich.console import Console
 
 from fractus_sim.demo.collect import collect, fetch_pictures
 from fractus_sim.demo.kube import SYSTEM, DemoError, Kube, Object
 from fractus_sim.demo.place import EXAMPLE, ROOT, Place, documents
-from fractus_sim.demo.watch import GROUNDED, Mission, follow, wait_ready
+from fractus_sim.demo.watch import Mission, follow, wait_ready
 from fractus_sim.interruption import uninterrupted
 from fractus_sim.report import Record, write_report
 from fractus_sim.report.page import PAGE

@@ -9,11 +9,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from fractus_core.api.nodes import GROUNDED
+
 from fractus_sim.demo.kube import NAMESPACE, SYSTEM, DemoError, Kube, Object
 
 POLL_S = 0.5
 LANDING_TIMEOUT_S = 180.0
-GROUNDED = {"inactive", "charging"}
 Say = Callable[[str], None]
 _LOG_LINE = re.compile(rb"\[pod/(?P<pod>[^/]+)/(?P<container>[^\]]+)\] (?P<text>.*)")
 

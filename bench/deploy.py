@@ -105,7 +105,7 @@ class Scene:
         self._add([("edge", e["metadata"]["name"], e["spec"]) for e in self._edges])
 
     def grow(self, nodes: int) -> None:
-        """So many nodes in all: up to 40 drones in the example's depot, and the rest elsewhere, one drone for five."""
+        """Grow to N nodes in all: up to 40 drones in the example's depot, and the rest elsewhere, one drone for five."""
         made = []
         for i in range(self.nodes, nodes):
             if i % 6 == 0:
@@ -264,7 +264,7 @@ class Bench:
         self._api.close()
 
     def measure(self, nodes: int, times: int) -> Measured:
-        """Measure at so many nodes."""
+        """Measure at N nodes."""
         self.scene.grow(nodes)
         found = Measured(self.scene.nodes)
         # Once, so that nodes have their location labels, as they have where the operator is only started again.

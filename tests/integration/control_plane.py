@@ -47,7 +47,9 @@ def wait_for(question: Callable[[], T | None], what: str | Callable[[], str], ti
         if answer:
             return answer
         if time.monotonic() > end:
-            raise AssertionError(f"waited {timeout_s:.0f} s in vain: {what if isinstance(what, str) else what()}")
+            raise AssertionError(
+                f"waited {timeout_s:.0f} s without success: {what if isinstance(what, str) else what()}"
+            )
         # Nothing can be awaited on a remote condition: ask again shortly.
         select_pause(0.05)
 

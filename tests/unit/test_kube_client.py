@@ -237,7 +237,7 @@ async def test_a_write_to_an_api_server_that_stalls_ends_before_another_may_act(
 
 
 class Guarded(Server):
-    """Answers whoever has the token, and 401 all others."""
+    """Answers who has the token, and 401 all others."""
 
     def __init__(self, token: str) -> None:
         self.token = token
@@ -306,7 +306,7 @@ async def test_a_credential_plugin_is_asked_again_when_its_token_is_refused(tmp_
         assert await client.get(ZONE, "a") == OBJECT
 
 
-async def test_a_certificate_that_no_one_vouches_for_is_one_sentence(tmp_path: Path) -> None:
+async def test_a_certificate_of_an_unknown_authority_is_one_sentence(tmp_path: Path) -> None:
     for name in ("theirs", "ours"):
         (tmp_path / name).mkdir()
     credential = Authority(tmp_path / "theirs").issue("server", common_name="s", alternative_names=("localhost",))

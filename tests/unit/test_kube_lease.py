@@ -45,7 +45,7 @@ class Shelf:
 
     def _reach(self) -> None:
         if not self.reachable:
-            raise KubeError(0, "Unreachable", "nobody answers")
+            raise KubeError(0, "Unreachable", "no answer")
 
     def _put(self, body: Body) -> Body:
         assert key_of(body) == ("system", "fractus-operator")
@@ -114,7 +114,7 @@ async def test_who_renews_goes_on_and_keeps_others_out() -> None:
         clock.now += 0.2 * DURATION_S
 
 
-async def test_a_frozen_holder_knows_that_it_must_begin_anew() -> None:
+async def test_a_frozen_holder_knows_that_it_must_start_again() -> None:
     shelf, clock = Shelf(), Clock()
     first, second = lease(shelf, clock, "first"), lease(shelf, clock, "second")
     await step(first, second)

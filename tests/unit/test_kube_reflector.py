@@ -1,4 +1,4 @@
-"""The reflector and the worklist against a scripted API server: breaks, expiry, retries; no network."""
+"""The reflector against a scripted API server: breaks, expiry, retries; no network."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
-from fractus_kube import Expired, KubeError, Page, Reflector
+from fractus_kube import Body, Expired, Key, Kind, KubeError, Page, Reflector
 from fractus_kube import reflector as reflector_module
-from fractus_operator.cluster.kinds import POLICY, ZONE, Body, Key
-from fractus_operator.reconcile import worklist as worklist_module
-from fractus_operator.reconcile.worklist import Worklist
+
+POLICY = Kind("fractus.dev/v1alpha1", "Policy", "policies", namespaced=False)
+ZONE = Kind("fractus.dev/v1alpha1", "Zone", "zones", namespaced=False)
 
 
 def zone(name: str, version: int, value: int = 0) -> Body:
@@ -20,7 +20,7 @@ def zone(name: str, version: int, value: int = 0) -> Body:
 
 
 class Script:
-    """Gives lists and watches in the order written; then waits for ever."""
+    """Gives lists and watches in the order written; then waits indefinitely."""
 
     def __init__(self, *steps: Any) -> None:
         self.steps = list(steps)
@@ -110,7 +110,7 @@ async def test_a_broken_connection_is_taken_up_again(monkeypatch: pytest.MonkeyP
     assert script.calls == ["list", "list", "watch 5", "watch 6", "watch 7"]
 
 
-async def test_an_unchanged_view_wakes_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_an_unchanged_view_wakes_no_one(monkeypatch: pytest.MonkeyPatch) -> None:
     script = Script(page(5, zone("a", 1, 1)), [("MODIFIED", zone("a", 6, 1))])
     _, changes = await follow(script, monkeypatch)
     assert changes == [(("", "a"), None, 1)]
@@ -189,98 +189,6 @@ async def test_an_answer_between_two_pages_is_no_newer_than_the_list() -> None:
         await script.done.wait()
     assert dict(reflector.items()) == {("", "a"): 2, ("", "b"): 2}
     task.cancel()
-
-
-# -- worklist --
-
-
-async def test_an_unforeseen_failure_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worklist_module, "_BACKOFF_S", (0.001, 0.01))
-    attempts: list[Key] = []
-    done = asyncio.Event()
-
-    async def reconcile(key: Key) -> None:
-        attempts.append(key)
-        if key == ("", "bad") and attempts.count(key) == 1:
-            raise KeyError("spec")
-        if ("", "good") in attempts and attempts.count(("", "bad")) == 2:
-            done.set()
-
-    worklist = Worklist("test", reconcile)
-    worklist.add(("", "bad"))
-    worklist.add(("", "good"))
-    task = asyncio.create_task(worklist.run())
-    async with asyncio.timeout(5):
-        await done.wait()
-    task.cancel()
-
-
-async def test_a_key_is_reconciled_once_for_many_changes() -> None:
-    seen: list[Key] = []
-    done = asyncio.Event()
-
-    async def reconcile(key: Key) -> None:
-        seen.append(key)
-        if key == ("", "last"):
-            done.set()
-
-    worklist = Worklist("test", reconcile)
-    for _ in range(5):
-        worklist.add(("", "a"))
-    worklist.add(("", "last"))
-    task = asyncio.create_task(worklist.run())
-    async with asyncio.timeout(5):
-        await done.wait()
-    task.cancel()
-    assert seen == [("", "a"), ("", "last")]
-
-
-async def test_a_change_during_a_reconcile_is_not_lost() -> None:
-    seen: list[int] = []
-    done = asyncio.Event()
-    value = 1
-
-    async def reconcile(key: Key) -> None:
-        nonlocal value
-        seen.append(value)
-        if value == 1:
-            value = 2
-            worklist.add(key)
-            await asyncio.sleep(0)
-        else:
-            done.set()
-
-    worklist = Worklist("test", reconcile)
-    worklist.add(("", "a"))
-    task = asyncio.create_task(worklist.run())
-    async with asyncio.timeout(5):
-        await done.wait()
-    task.cancel()
-    assert seen == [1, 2]
-
-
-async def test_a_failure_is_tried_again_and_holds_up_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worklist_module, "_BACKOFF_S", (0.001, 0.01))
-    attempts: dict[Key, int] = {}
-    done = asyncio.Event()
-
-    async def reconcile(key: Key) -> None:
-        attempts[key] = attempts.get(key, 0) + 1
-        if key == ("", "bad") and attempts[key] < 4:
-            raise KubeError(500, "InternalError", "not now")
-        if key == ("", "bad"):
-            done.set()
-
-    worklist = Worklist("test", reconcile)
-    worklist.add(("", "bad"))
-    worklist.add(("", "good"))
-    task = asyncio.create_task(worklist.run())
-    async with asyncio.timeout(5):
-        await done.wait()
-        await asyncio.sleep(0)
-    task.cancel()
-    assert attempts == {("", "bad"): 4, ("", "good"): 1}
-    assert worklist.failures == {}
 
 
 def test_paths_of_objects() -> None:

@@ -1,0 +1,100 @@
+"""The worklist: each key once, failures again later."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+from fractus_kube import KubeError
+from fractus_operator.cluster.kinds import Key
+from fractus_operator.reconcile import worklist as worklist_module
+from fractus_operator.reconcile.worklist import Worklist
+
+
+async def test_an_unforeseen_failure_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worklist_module, "_BACKOFF_S", (0.001, 0.01))
+    attempts: list[Key] = []
+    done = asyncio.Event()
+
+    async def reconcile(key: Key) -> None:
+        attempts.append(key)
+        if key == ("", "bad") and attempts.count(key) == 1:
+            raise KeyError("spec")
+        if ("", "good") in attempts and attempts.count(("", "bad")) == 2:
+            done.set()
+
+    worklist = Worklist("test", reconcile)
+    worklist.add(("", "bad"))
+    worklist.add(("", "good"))
+    task = asyncio.create_task(worklist.run())
+    async with asyncio.timeout(5):
+        await done.wait()
+    task.cancel()
+
+
+async def test_a_key_is_reconciled_once_for_many_changes() -> None:
+    seen: list[Key] = []
+    done = asyncio.Event()
+
+    async def reconcile(key: Key) -> None:
+        seen.append(key)
+        if key == ("", "last"):
+            done.set()
+
+    worklist = Worklist("test", reconcile)
+    for _ in range(5):
+        worklist.add(("", "a"))
+    worklist.add(("", "last"))
+    task = asyncio.create_task(worklist.run())
+    async with asyncio.timeout(5):
+        await done.wait()
+    task.cancel()
+    assert seen == [("", "a"), ("", "last")]
+
+
+async def test_a_change_during_a_reconcile_is_not_lost() -> None:
+    seen: list[int] = []
+    done = asyncio.Event()
+    value = 1
+
+    async def reconcile(key: Key) -> None:
+        nonlocal value
+        seen.append(value)
+        if value == 1:
+            value = 2
+            worklist.add(key)
+            await asyncio.sleep(0)
+        else:
+            done.set()
+
+    worklist = Worklist("test", reconcile)
+    worklist.add(("", "a"))
+    task = asyncio.create_task(worklist.run())
+    async with asyncio.timeout(5):
+        await done.wait()
+    task.cancel()
+    assert seen == [1, 2]
+
+
+async def test_a_failure_is_tried_again_and_holds_up_no_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worklist_module, "_BACKOFF_S", (0.001, 0.01))
+    attempts: dict[Key, int] = {}
+    done = asyncio.Event()
+
+    async def reconcile(key: Key) -> None:
+        attempts[key] = attempts.get(key, 0) + 1
+        if key == ("", "bad") and attempts[key] < 4:
+            raise KubeError(500, "InternalError", "not now")
+        if key == ("", "bad"):
+            done.set()
+
+    worklist = Worklist("test", reconcile)
+    worklist.add(("", "bad"))
+    worklist.add(("", "good"))
+    task = asyncio.create_task(worklist.run())
+    async with asyncio.timeout(5):
+        await done.wait()
+        await asyncio.sleep(0)
+    task.cancel()
+    assert attempts == {("", "bad"): 4, ("", "good"): 1}
+    assert worklist.failures == {}

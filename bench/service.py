@@ -117,7 +117,7 @@ def side_by_side(folder: Path, seconds: float, stream_rate: int) -> dict[str, tu
             ),
         }  # fmt: skip
         wait_for(lambda: "mobility: serving" in processes.log("service"), "the service")
-        wait_for(lambda: "failsafes are set" in processes.log("service"), "the service's link")
+        wait_for(lambda: "failsafes: set" in processes.log("service"), "the service's link")
         wait_for(lambda: "Detected vehicle" in processes.log("mavproxy"), "MAVProxy")
         time.sleep(15.0)
         processes.check()

@@ -15,7 +15,7 @@ from typing import Protocol
 from fractus_core.api.plans import GrantSpec
 from fractus_core.control.values import FlightMode, ModeKind
 from fractus_core.geo import LocalFrame
-from fractus_core.policy.values import STANDING_MPS, Airframe, Home, Situation
+from fractus_core.policy.values import STANDING_MPS, Airframe, Home
 from fractus_mavlink.enums import GPS_FIX_TYPE, MAV_LANDED_STATE
 
 Permit = Callable[[], None]
@@ -148,26 +148,6 @@ class VehicleState:
             return "takingOff"
         landing = self.landed_state == MAV_LANDED_STATE.LANDING or self.mode.kind is ModeKind.LANDING
         return "landing" if landing else "flying"
-
-    def situation(self, time_s: float, airframe: Airframe, speed_mps: float, vertical: bool) -> Situation:
-        """The state as the engine judges it."""
-        return Situation(
-            time_s=time_s,
-            lat=self.lat,
-            lon=self.lon,
-            altitude_m=self.altitude_m,
-            north_mps=self.north_mps,
-            east_mps=self.east_mps,
-            down_mps=self.down_mps,
-            home=self.home,
-            armed=self.armed,
-            in_air=self.in_air,
-            position_error_m=self.position_error_m,
-            speed_setpoint_mps=speed_mps,
-            forward_mps2=self.forward_mps2,
-            vertical=vertical,
-            airframe=airframe,
-        )
 
 
 @dataclass(frozen=True, slots=True)

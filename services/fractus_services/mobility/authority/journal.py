@@ -84,7 +84,7 @@ class Journal:
             except FileNotFoundError:
                 continue
             except (OSError, ValueError, KeyError, TypeError) as error:
-                log.critical("the journal %s cannot be read: %s", path, error)
+                log.critical("journal: cannot be read (path=%s, error=%s)", path, error)
                 continue
             return
 
@@ -118,7 +118,7 @@ class Journal:
                 await asyncio.to_thread(self._write, json.dumps(stored, indent=1).encode())
             except OSError as error:
                 self.failure = f"cannot write the journal {self._path}: {error}"
-                log.critical("%s", self.failure)
+                log.critical("journal: %s", self.failure)
             else:
                 self.failure = ""
 

@@ -16,20 +16,29 @@ def situation_of(control: Control, time_s: float) -> Situation:
         control: the drone.
         time_s: Unix time, by which policies have schedules; positions age by the monotonic clock.
     """
-    autopilot, motion = control.autopilot, control.motion
+    autopilot, vehicle, motion = control.autopilot, control.autopilot.vehicle, control.motion
     airframe = control.checked.airframe if control.checked is not None else Airframe()
     if airframe.retraces and not control.retraces:
         airframe = replace(airframe, retraces=False)
-    vertical = motion is not None and motion.kind in {"Takeoff", "Land", "ReturnToLaunch"}
-    now = autopilot.vehicle.situation(time_s, airframe, control.cruise_mps, vertical)
-    if autopilot.vehicle.position_fresh(autopilot.now):
-        return now
-    return Situation(
-        time_s=now.time_s,
-        home=now.home,
-        armed=now.armed,
-        in_air=now.in_air,
+    unlocated = Situation(
+        time_s=time_s,
+        home=vehicle.home,
+        armed=vehicle.armed,
+        in_air=vehicle.in_air,
         airframe=airframe,
-        altitude_m=now.altitude_m,
-        speed_setpoint_mps=now.speed_setpoint_mps,
+        altitude_m=vehicle.altitude_m,
+        speed_setpoint_mps=control.cruise_mps,
+    )
+    if not vehicle.position_fresh(autopilot.now):
+        return unlocated
+    return replace(
+        unlocated,
+        lat=vehicle.lat,
+        lon=vehicle.lon,
+        north_mps=vehicle.north_mps,
+        east_mps=vehicle.east_mps,
+        down_mps=vehicle.down_mps,
+        position_error_m=vehicle.position_error_m,
+        forward_mps2=vehicle.forward_mps2,
+        vertical=motion is not None and motion.kind in {"Takeoff", "Land", "ReturnToLaunch"},
     )

@@ -8,12 +8,12 @@ from contextlib import aclosing
 from dataclasses import dataclass, replace
 
 import shapely
-from fractus_core.api.geometry import Position
+from fractus_core.api.geometry import Position, Reference
 from fractus_core.policy.compiled import Air, CompiledGrant, height_m
 from fractus_core.policy.limits import speed_bounds
 from fractus_core.policy.motion import margin_m
 from fractus_core.policy.routes import searching
-from fractus_core.policy.values import Call, GotoArgs, Situation
+from fractus_core.policy.values import Call, GotoArgs, Home, Situation
 
 from fractus_services.background import in_slices
 from fractus_services.errors import Aborted, PreconditionFailed, Refused, Unavailable
@@ -61,6 +61,20 @@ class Trip:
 def target_of(place: Position) -> GotoArgs:
     """A place as the engine takes it."""
     return GotoArgs(place.lat, place.lon, place.alt, place.altitude_reference)
+
+
+def above_home_m(altitude_m: float, reference: Reference, home: Home | None, grant: CompiledGrant) -> float:
+    """An altitude as metres above home.
+
+    Raises:
+        Refused: it is given above terrain, which is not known.
+    """
+    height = height_m(altitude_m, reference, home, grant.flat_terrain)
+    if height is None:
+        raise PreconditionFailed(
+            "TerrainUnknown", "the altitude is given above terrain, and no terrain model is loaded"
+        )
+    return height
 
 
 def stopped_by_monitor(refusal: Refused) -> bool:
@@ -178,14 +192,7 @@ class Courses:
         now, grant = self._guard.situation(), trip.constraints.compiled
         if now.lat is None or now.lon is None:
             raise Unavailable("AutopilotUnavailable", "the drone's position is not known")
-        wanted = now.altitude_m
-        if target.alt is not None:
-            known = height_m(target.alt, target.reference, now.home, grant.flat_terrain)
-            if known is None:
-                raise PreconditionFailed(
-                    "TerrainUnknown", "the altitude is given above terrain, and no terrain model is loaded"
-                )
-            wanted = known
+        wanted = now.altitude_m if target.alt is None else above_home_m(target.alt, target.reference, now.home, grant)
         found = await first_leg((target.lat, target.lon), (wanted, now.altitude_m), now, trip)
         if found is None:
             raise self._unreachable(trip, target)

@@ -9,7 +9,6 @@ from fractus_core.api.components import ControlPoint
 from fractus_core.api.geometry import Position
 from fractus_core.control.events import TransitFailed
 from fractus_core.geo import middle
-from fractus_core.policy.compiled import height_m
 from fractus_core.policy.values import Call, TakeoffArgs
 
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused
@@ -17,7 +16,7 @@ from fractus_services.mobility.authority.arming import Arming
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import Lease
 from fractus_services.mobility.authority.permits import transit_permit
-from fractus_services.mobility.flight.courses import FAULT, Courses, Trip, target_of
+from fractus_services.mobility.flight.courses import FAULT, Courses, Trip, above_home_m, target_of
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import climb
 
@@ -112,13 +111,8 @@ class TransitFlight:
     def _height_m(self, place: Position, trip: Trip) -> float:
         if place.alt is None:
             return DEFAULT_ALTITUDE_M
-        home, flat = self._control.autopilot.vehicle.home, trip.constraints.compiled.flat_terrain
-        height = height_m(place.alt, place.altitude_reference, home, flat)
-        if height is None:
-            raise PreconditionFailed(
-                "TerrainUnknown", "the altitude is given above terrain, and no terrain model is loaded"
-            )
-        return height
+        home = self._control.autopilot.vehicle.home
+        return above_home_m(place.alt, place.altitude_reference, home, trip.constraints.compiled)
 
     def _allow(self, call: Call, trip: Trip) -> object:
         verdict = self._guard.judge(call, trip.constraints.grant, trip.constraints.compiled)

@@ -11,28 +11,14 @@ from typing import assert_never
 from fractus_core.control.actions import Action, Brake, SaveJournal, StopKind, WakeWaiters
 from fractus_core.control.drivers import hover_after_cancelled, on_driver, on_motion
 from fractus_core.control.events import (
-    Airborne,
-    ArmingPrepared,
-    ArmingRequested,
+    ArmingEvent,
     BrakeDemanded,
-    ControlReturned,
-    CruiseSpeedSet,
+    DriverEvent,
     Event,
     GrantChanged,
-    GrantControl,
-    Heartbeat,
-    ModeChangeBegan,
-    ModeChangeEnded,
-    MotionBegan,
-    MotionCancelled,
-    MotionFailed,
-    MotionFinished,
-    MotionStopped,
-    MotorStart,
+    MotionEvent,
     PassengerBoarded,
     PolicyEvent,
-    StreamClosed,
-    StreamOpened,
     SystemEvent,
     SystemFlightBegan,
     SystemFlightEnded,
@@ -44,11 +30,7 @@ from fractus_core.control.events import (
     TourInterrupted,
     TourPointVisited,
     TransitBegan,
-    TransitFailed,
-    TransitRequested,
-    VehicleFound,
-    VehicleObserved,
-    WaypointReached,
+    VehicleEvent,
 )
 from fractus_core.control.step import DRIVER_LOST, GRANT_REMOVED, Step
 from fractus_core.control.values import Authority, ControlState, OutcomeKind, SystemFlight, SystemTask, TaskKind
@@ -82,29 +64,22 @@ def transition(state: ControlState, event: Event, now: float) -> tuple[ControlSt
         now: monotonic seconds; never earlier than in the events before.
     """
     step = Step(state, now)
-    match event:
-        case (
-            StreamOpened() | StreamClosed() | TransitRequested() | TransitFailed() | GrantControl() | ControlReturned()
-            | WaypointReached() | CruiseSpeedSet()
-        ):  # fmt: skip
-            on_driver(step, event)
-        case MotionBegan() | MotionFinished() | MotionFailed() | MotionCancelled() | MotionStopped():
-            on_motion(step, event)
-        case TakeoverDemanded() | BrakeDemanded() | GrantChanged():
-            _on_policy(step, event)
-        case VehicleObserved() | VehicleFound() | Heartbeat() | Airborne() | ModeChangeBegan() | ModeChangeEnded():
-            on_vehicle(step, event)
-        case ArmingRequested() | ArmingPrepared() | MotorStart():
-            on_arming(step, event)
-        case (
-            TransitBegan() | SystemFlightBegan() | SystemFlightEnded() | TourBegan() | TourPointVisited()
-            | TourInterrupted() | TourEnded() | SystemTaskEnded() | PassengerBoarded()
-        ):  # fmt: skip
-            _on_system(step, event)
-        case Tick():
-            _on_tick(step)
-        case _:
-            assert_never(event)
+    if isinstance(event, DriverEvent):
+        on_driver(step, event)
+    elif isinstance(event, MotionEvent):
+        on_motion(step, event)
+    elif isinstance(event, PolicyEvent):
+        _on_policy(step, event)
+    elif isinstance(event, VehicleEvent):
+        on_vehicle(step, event)
+    elif isinstance(event, ArmingEvent):
+        on_arming(step, event)
+    elif isinstance(event, SystemEvent):
+        _on_system(step, event)
+    elif isinstance(event, Tick):
+        _on_tick(step)
+    else:
+        assert_never(event)
     return step.state, tuple(step.actions)
 
 

@@ -89,7 +89,7 @@ def test_a_zone_that_demands_the_drone_ends_the_transit(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("measured", [True, False])
-def test_a_drone_that_speeds_up_toward_a_new_zone_is_stopped_before_anybody_knows_that_it_will_enter(
+def test_a_drone_that_speeds_up_toward_a_new_zone_is_stopped_before_it_is_known_that_it_will_enter(
     tmp_path: Path, measured: bool
 ) -> None:
     async def flight() -> None:
@@ -460,7 +460,7 @@ def test_a_journal_that_fails_in_flight_ends_no_flight(tmp_path: Path) -> None:
     fly(flight)
 
 
-# Nobody's drone
+# A drone without authority
 
 
 def test_a_drone_without_authority_is_taken_by_the_system(tmp_path: Path) -> None:

@@ -14,9 +14,9 @@ from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.autopilot import BEING_SET, Checked, Failsafes, Fence, Permit
 
-ARMED_S = 3.0
+ARMING_TIMEOUT_S = 3.0
 WAIT_S = 0.5
-FENCE_S = 15.0
+FENCE_TIMEOUT_S = 15.0
 HOME_M = 5.0
 STRAY_M = 50.0
 """A drone that stands further than this from the home of its grant would be brought to the wrong place."""
@@ -62,7 +62,7 @@ class Arming:
         self._check()
         home = self._home_of(grant, self._control.mission(grant))
         self._control.dispatch(ArmingRequested(grant.key, grant.identity, home))
-        failure = await self._control.save(timeout_s=ARMED_S)
+        failure = await self._control.save(timeout_s=ARMING_TIMEOUT_S)
         if failure:
             raise PreconditionFailed("JournalUnavailable", failure)
         permit()
@@ -87,7 +87,7 @@ class Arming:
             await modes.enter_guided(permit)
             try:
                 await autopilot.arm(permit)
-                deadline = autopilot.now + ARMED_S
+                deadline = autopilot.now + ARMING_TIMEOUT_S
                 while not autopilot.vehicle.armed:
                     if autopilot.now > deadline:
                         raise AutopilotError("the autopilot accepted to arm and did not")
@@ -114,10 +114,10 @@ class Arming:
         checked = self._check()
         checked = self._learnt(checked, await self._failsafes.choose_return(checked, retrace=at_home))
         try:
-            async with asyncio.timeout(FENCE_S):
+            async with asyncio.timeout(FENCE_TIMEOUT_S):
                 await self._fence.raise_around(grant.spec, retraces=self._control.retraces)
         except (AutopilotError, OSError) as error:
-            said = str(error) or f"it takes longer than {FENCE_S:.0f} s"
+            said = str(error) or f"it takes longer than {FENCE_TIMEOUT_S:.0f} s"
             why = f"the vehicle's own fence cannot be raised around the operation area: {said}"
             raise PreconditionFailed("FenceNotRaised", why) from error
         self._check(checked)

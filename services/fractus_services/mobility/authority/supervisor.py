@@ -13,8 +13,12 @@ from fractus_services.mobility.autopilot import Fence
 
 log = logging.getLogger(__name__)
 
-TICKED_S = 1.0
-UNATTENDED_S = 3.0
+TICK_TIMEOUT_S = 1.0
+"""A loop that has not looked for this long may hang: the autopilot must not rely on it."""
+
+UNATTENDED_TIMEOUT_S = 3.0
+"""How long an armed drone may be without authority though control tries to take it: then its own failsafe brings it home."""
+
 LOWER_AGAIN_S = 10.0
 
 
@@ -55,8 +59,8 @@ class Supervisor:
         return (
             autopilot.found
             and state.decided
-            and autopilot.now - self._ticked_at <= TICKED_S
-            and (since is None or autopilot.now - since < UNATTENDED_S)
+            and autopilot.now - self._ticked_at <= TICK_TIMEOUT_S
+            and (since is None or autopilot.now - since < UNATTENDED_TIMEOUT_S)
         )
 
     def _idle(self) -> bool:

@@ -10,7 +10,8 @@ from fractus_core.geo import polygon
 from fractus_core.planning import flight_of, plan
 from fractus_core.planning.area import operation_area
 from fractus_core.policy import grants
-from fractus_core.policy.grants import compile_grants, matches, node_attributes, refresh
+from fractus_core.policy.grants import compile_grants, refresh
+from fractus_core.policy.selectors import matches, node_attributes
 from test_planning import FRAME, PATH, VIEWER, application, at, drone, edge, inventory, manifest, navigator
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
-from typing import Any, assert_never
+from typing import Any
 
 import shapely
 from shapely.geometry.base import BaseGeometry
@@ -13,17 +13,16 @@ from fractus_core.api import Application, Component, Drone, EdgeNode, InvalidObj
 from fractus_core.api.geometry import MAX_HOLES, MAX_RING_POINTS, Area, Circle, Point, Position
 from fractus_core.api.plans import (
     DeploymentPlanSpec,
-    GrantApplication,
     GrantedLimits,
     GrantedPolicy,
     GrantedZone,
     GrantSpec,
     PlannedInstance,
 )
-from fractus_core.api.policies import NodeExpression, PolicySpec
 from fractus_core.geo import LocalFrame, area_of, ground, middle, polygon
 from fractus_core.planning.area import OperationArea, operation_area
 from fractus_core.planning.inventory import Inventory, Settings
+from fractus_core.policy.selectors import holds, node_attributes, owner_of
 
 ROUNDING_M = 0.01
 """How far the outline of a granted area may be from the planned one: a third of the points do."""
@@ -121,7 +120,7 @@ def _drone_grant(
     way = shapely.union(shape, polygon(area.frame, stand)).convex_hull
     return GrantSpec(
         node=drone.name,
-        application=_owner(application),
+        application=owner_of(application),
         component=component.name,
         instance=placed.instance,
         operation_area=area_of(area.frame, shape),
@@ -197,17 +196,12 @@ def _edge_grant(
     node = inventory.edge_nodes[placed.node or ""]
     return GrantSpec(
         node=node.name,
-        application=_owner(application),
+        application=owner_of(application),
         component=component.name,
         instance=placed.instance,
         services=component.services,
         home=node.spec.location,
     )
-
-
-def _owner(application: Application) -> GrantApplication:
-    namespace, name = application.key
-    return GrantApplication(namespace=namespace, name=name, uid=application.metadata.uid or "")
 
 
 def _policies(
@@ -231,7 +225,7 @@ def _policies(
     for name, policy in inventory.policies.items():
         # The attributes of a node without a description are unknown: what held for it goes on.
         known = node is not None or name not in kept or not policy.spec.selector.nodes
-        if known and not _holds(policy.spec, grant.application, grant.component, attributes):
+        if known and not holds(policy.spec, grant.application, grant.component, attributes):
             continue
         try:
             found = _granted(policy, inventory, bounds)
@@ -309,73 +303,3 @@ def _distance_m(area: Area, base: Point) -> float:
     frame, outline = _outline(area)
     x, y = frame.xy(base.lat, base.lon)
     return float(outline.distance(shapely.Point(x, y)))
-
-
-def selects(
-    policy: PolicySpec, application: Application, component: Component, attributes: Mapping[str, object]
-) -> bool:
-    """Whether a policy holds for a component of an application on a node (its zones are judged in flight)."""
-    return _holds(policy, _owner(application), component.name, attributes)
-
-
-def _holds(policy: PolicySpec, owner: GrantApplication, component: str, attributes: Mapping[str, object]) -> bool:
-    wanted = policy.selector.applications
-    unknown = policy.kind != "grant"
-    if wanted is not None:
-        if wanted.namespaces and owner.namespace not in wanted.namespaces:
-            return False
-        if wanted.names and owner.name not in wanted.names:
-            return False
-        if wanted.components and component not in wanted.components:
-            return False
-    return all(matches(expression, attributes, unknown=unknown) for expression in policy.selector.nodes)
-
-
-def matches(expression: NodeExpression, attributes: Mapping[str, object], *, unknown: bool) -> bool:
-    """Whether a node's attributes satisfy an expression; `unknown` is the answer for an attribute not stated.
-
-    A restriction holds for a node that does not say whether it is concerned (a drone of unknown mass is a heavy one);
-    a permission does not.
-    """
-    value = attributes.get(expression.key)
-    if expression.operator == "Exists":
-        return value is not None
-    if value is None:
-        return unknown
-    match expression.operator:
-        case "In":
-            return str(value) in expression.values
-        case "NotIn":
-            return str(value) not in expression.values
-        case "Gt" | "Lt":
-            try:
-                figure = float(str(value))
-            except ValueError:
-                return unknown
-            bound = float(expression.values[0])
-            return figure > bound if expression.operator == "Gt" else figure < bound
-        case _:
-            assert_never(expression.operator)
-
-
-def node_attributes(node: Drone | EdgeNode) -> dict[str, object]:
-    """Attributes of a node for selectors: dotted paths of its spec, and the last part alone where that is unique.
-
-    So `physicalFeatures.mtom` is also `mtom`; `name` and `kind` come from the object.
-    """
-    flat = dict(_flatten("", node.spec.to_dict()))
-    short: dict[str, list[object]] = {}
-    for path, value in flat.items():
-        short.setdefault(path.rsplit(".", 1)[-1], []).append(value)
-    attributes: dict[str, object] = {key: values[0] for key, values in short.items() if len(values) == 1}
-    attributes.update(flat)
-    attributes.update({f"labels.{k}": v for k, v in node.metadata.labels.items()})
-    return {**attributes, "name": node.name, "kind": node.KIND}
-
-
-def _flatten(prefix: str, value: object) -> Iterable[tuple[str, object]]:
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            yield from _flatten(f"{prefix}.{key}" if prefix else key, inner)
-    elif not isinstance(value, list):
-        yield prefix, value

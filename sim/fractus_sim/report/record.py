@@ -13,7 +13,7 @@ from typing import Any
 from fractus_core.api import Application, DeploymentPlan, Depot, Drone, EdgeNode, Policy, Resource, Zone
 from fractus_core.api.geometry import Point
 from fractus_core.geo import LocalFrame
-from fractus_core.policy.grants import node_attributes, selects
+from fractus_core.policy.selectors import node_attributes, selects
 
 from fractus_sim.report.track import Place, Sample, Track
 

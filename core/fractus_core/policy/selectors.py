@@ -1,0 +1,87 @@
+"""For which nodes, applications and components a policy holds (thesis Table 8.1, Listing 11)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import assert_never
+
+from fractus_core.api import Application, Component, Drone, EdgeNode
+from fractus_core.api.plans import GrantApplication
+from fractus_core.api.policies import NodeExpression, PolicySpec
+
+
+def selects(
+    policy: PolicySpec, application: Application, component: Component, attributes: Mapping[str, object]
+) -> bool:
+    """Whether a policy holds for a component of an application on a node (its zones are judged in flight)."""
+    return holds(policy, owner_of(application), component.name, attributes)
+
+
+def holds(policy: PolicySpec, owner: GrantApplication, component: str, attributes: Mapping[str, object]) -> bool:
+    """As `selects`, by what a grant keeps of its application and component."""
+    wanted = policy.selector.applications
+    unknown = policy.kind != "grant"
+    if wanted is not None:
+        if wanted.namespaces and owner.namespace not in wanted.namespaces:
+            return False
+        if wanted.names and owner.name not in wanted.names:
+            return False
+        if wanted.components and component not in wanted.components:
+            return False
+    return all(matches(expression, attributes, unknown=unknown) for expression in policy.selector.nodes)
+
+
+def matches(expression: NodeExpression, attributes: Mapping[str, object], *, unknown: bool) -> bool:
+    """Whether a node's attributes satisfy an expression; `unknown` is the answer for an attribute not stated.
+
+    A restriction holds for a node that does not say whether it is concerned (a drone of unknown mass is a heavy one);
+    a permission does not.
+    """
+    value = attributes.get(expression.key)
+    if expression.operator == "Exists":
+        return value is not None
+    if value is None:
+        return unknown
+    match expression.operator:
+        case "In":
+            return str(value) in expression.values
+        case "NotIn":
+            return str(value) not in expression.values
+        case "Gt" | "Lt":
+            try:
+                figure = float(str(value))
+            except ValueError:
+                return unknown
+            bound = float(expression.values[0])
+            return figure > bound if expression.operator == "Gt" else figure < bound
+        case _:
+            assert_never(expression.operator)
+
+
+def node_attributes(node: Drone | EdgeNode) -> dict[str, object]:
+    """Attributes of a node for selectors: dotted paths of its spec, and the last part alone where that is unique.
+
+    So `physicalFeatures.mtom` is also `mtom`; `name` and `kind` come from the object.
+    """
+    flat = dict(_flatten("", node.spec.to_dict()))
+    short: dict[str, list[object]] = {}
+    for path, value in flat.items():
+        short.setdefault(path.rsplit(".", 1)[-1], []).append(value)
+    attributes: dict[str, object] = {key: values[0] for key, values in short.items() if len(values) == 1}
+    attributes.update(flat)
+    attributes.update({f"labels.{k}": v for k, v in node.metadata.labels.items()})
+    return {**attributes, "name": node.name, "kind": node.KIND}
+
+
+def _flatten(prefix: str, value: object) -> Iterable[tuple[str, object]]:
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from _flatten(f"{prefix}.{key}" if prefix else key, inner)
+    elif not isinstance(value, list):
+        yield prefix, value
+
+
+def owner_of(application: Application) -> GrantApplication:
+    """The application as its grants name it."""
+    namespace, name = application.key
+    return GrantApplication(namespace=namespace, name=name, uid=application.metadata.uid or "")

@@ -6,28 +6,19 @@ import heapq
 import itertools
 import math
 from collections.abc import Generator
-from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely.geometry.base import BaseGeometry
 
-from fractus_core.policy.compiled import Air, CompiledGrant, PolicyZone
-from fractus_core.policy.fences import breaches
-from fractus_core.policy.limits import forbids_height
-from fractus_core.policy.motion import XY, Leg, height_margin_m, margin_m
-from fractus_core.policy.returning import straight_home_blocked
+from fractus_core.policy.compiled import CompiledGrant, PolicyZone
+from fractus_core.policy.motion import XY
+from fractus_core.policy.spaces import Floats, Space
 from fractus_core.policy.values import Situation
-
-Floats = NDArray[np.float64]
 
 CLEARANCES_M = (1.5, 0.25)
 """What legs keep beyond the engine's margin, where there is room, and else: a drone that reached a waypoint within a metre
 finds the next leg legal."""
-
-CORNER_M = 0.1
-"""Waypoints lie this much further out than their legs must, so that rounding costs no leg."""
 
 MAX_LEGS_TESTED = 3000
 """A search gives up after this many legs, half a second's work or so."""
@@ -38,9 +29,6 @@ MAX_EXCESS = 1.2
 QUICK_MAX_LEGS_TESTED, QUICK_MAX_EXCESS = 250, 5.0
 """The same where it only matters whether there is a way, and a caller waits for the answer: some 25 ms."""
 
-_SIMPLER_M = 0.2
-_MAX_PLAIN_CORNERS = 24
-_SEGMENTS = 3
 _MAX_DETOUR = 1.2
 _MAX_ROUNDING_M = 1.5
 _ROUNDING = 1e-6
@@ -94,7 +82,7 @@ def searching(
     if now.home is None or not now.sound or not all(math.isfinite(figure) for figure in figures):
         return None
     low, high = sorted(figures[-2:])
-    roomy, narrow = (_Search(start, target, _Space.around(now, grant, low, high, room_m)) for room_m in CLEARANCES_M)
+    roomy, narrow = (_Search(start, target, Space.around(now, grant, low, high, room_m)) for room_m in CLEARANCES_M)
     found = yield from roomy.steps()
     if found is not None and _length_m(start, found) <= _MAX_DETOUR * math.dist(start, target):
         return (yield from roomy.rounded(found))
@@ -108,7 +96,7 @@ def leads(start: XY, target: XY, now: Situation, grant: CompiledGrant, altitude_
     """Whether a short search, of `QUICK_MAX_LEGS_TESTED` legs, finds any legal way from one place to another; see `route`."""
     if now.home is None or not now.sound:
         return False
-    space = _Space.around(now, grant, altitude_m, altitude_m, CLEARANCES_M[1])
+    space = Space.around(now, grant, altitude_m, altitude_m, CLEARANCES_M[1])
     return (
         _finished(_Search(start, target, space, max_excess=QUICK_MAX_EXCESS, max_legs=QUICK_MAX_LEGS_TESTED).steps())
         is not None
@@ -128,110 +116,6 @@ def _length_m(start: XY, way: tuple[XY, ...]) -> float:
     return sum(math.dist(a, b) for a, b in itertools.pairwise((start, *way)))
 
 
-@dataclass(frozen=True, slots=True)
-class _Space:
-    """Where a way may lead: the air between two altitudes, and the fences in it."""
-
-    now: Situation
-    grant: CompiledGrant
-    lower_m: float
-    upper_m: float
-    margin_m: float
-    height_margin_m: float
-    kept_in: tuple[tuple[BaseGeometry, BaseGeometry], ...]
-
-    @classmethod
-    def around(cls, now: Situation, grant: CompiledGrant, lower_m: float, upper_m: float, room_m: float) -> _Space:
-        """The space that a grant leaves, with so much room beyond the engine's margin."""
-        moving = replace(grant, operation=grant.passage, operation_border=grant.passage_border)
-        slack = height_margin_m(now)
-        kept_in = [
-            fence.at(lower_m - slack, upper_m + slack, now, grant.flat_terrain)
-            for fence in grant.inclusions
-            if fence.rule.in_force(now.time_s)
-        ]
-        if grant.passage is not None and grant.passage_border is not None:
-            kept_in.append((grant.passage, grant.passage_border))
-        return cls(now, moving, lower_m, upper_m, margin_m(now) + room_m, slack, tuple(kept_in))
-
-    def blockers(self, line: BaseGeometry) -> list[PolicyZone | int]:
-        """What stands in the way of a line: zones to keep out of, and numbers of areas to stay in."""
-        slack, flat = self.height_margin_m, self.grant.flat_terrain
-        air = Air(line, self.margin_m, self.lower_m - slack, self.upper_m + slack)
-        found: list[PolicyZone | int] = list(self.grant.exclusions.near(air, self.now, flat))
-        if self.grant.altitude_limits.zones:
-            low, high = self.lower_m, self.upper_m
-            limiting = self.grant.altitude_limits.near(air, self.now, flat)
-            found += [zone for zone in limiting if forbids_height(zone, low, high, self.now, flat)]
-        for i, (shape, border) in enumerate(self.kept_in):
-            if not shape.covers(line) or border.dwithin(line, self.margin_m):
-                found.append(i)
-        return found
-
-    def permits(self, start: XY, end: XY) -> bool:
-        """Whether a leg from or to an end of the way is legal, which may lie too close to a fence or at home."""
-        leg = Leg(start, start, start, end, self.lower_m, self.upper_m)
-        if breaches(leg, self.now, self.grant, self.margin_m, self.height_margin_m):
-            return False
-        air = Air(leg.ground, self.margin_m, self.lower_m, self.upper_m)
-        limiting = self.grant.altitude_limits.near(air, self.now, self.grant.flat_terrain)
-        return not any(
-            forbids_height(zone, self.lower_m, self.upper_m, self.now, self.grant.flat_terrain) for zone in limiting
-        )
-
-    def returns(self, place: XY) -> bool:
-        """Whether the autopilot's own way home from a place is legal."""
-        if self.now.airframe.retraces:
-            return True
-        margin, slack = self.margin_m, self.height_margin_m
-        return straight_home_blocked(place, self.upper_m, self.now, self.grant, margin=margin, slack=slack) is None
-
-    def corners(self, obstacle: PolicyZone | int) -> Floats:
-        """Where ways may turn around an obstacle: rows of x, y of a corner, the one before it and the one after."""
-        away = self.margin_m + CORNER_M
-        if isinstance(obstacle, PolicyZone):
-            return _corners(_outline(obstacle.shape, away), 1.0)
-        return _corners(_outline(self.kept_in[obstacle][0], -away), -1.0)
-
-    def way_out(self, obstacle: PolicyZone | int, begin: shapely.Point) -> Floats:
-        """The nearest place that an obstacle leaves free, as a corner without neighbours; none may be left."""
-        away = self.margin_m + CORNER_M
-        outline = (
-            _outline(obstacle.shape, away)
-            if isinstance(obstacle, PolicyZone)
-            else _outline(self.kept_in[obstacle][0], -away)
-        )
-        if outline.is_empty:
-            return np.empty((0, 6))
-        near = shapely.get_coordinates(shapely.shortest_line(begin, outline.boundary))[-1]
-        return np.tile(near, (1, 3))
-
-
-def _outline(shape: BaseGeometry, away_m: float) -> BaseGeometry:
-    """A shape grown or shrunk, with few corners, none nearer than that."""
-    # GEOS rounds the number of pieces, so one may span half as much again as a quarter circle's share.
-    away_m /= math.cos(0.75 * math.pi / 2 / _SEGMENTS)
-    if shapely.get_num_coordinates(shape) > _MAX_PLAIN_CORNERS:
-        return shape.buffer(away_m + math.copysign(_SIMPLER_M, away_m), quad_segs=_SEGMENTS).simplify(_SIMPLER_M)
-    return shape.buffer(away_m, quad_segs=_SEGMENTS)
-
-
-def _corners(shape: BaseGeometry, turning: float) -> Floats:
-    """Corners that turn one way (1: left, with the shape on the left), each with its neighbours, shape (n, 6)."""
-    found = [np.empty((0, 6))]
-    for part in shapely.get_parts(shape):
-        if not isinstance(part, shapely.Polygon) or part.is_empty:
-            continue
-        whole = shapely.orient_polygons(part)
-        for ring in (whole.exterior, *whole.interiors):
-            points = shapely.get_coordinates(ring)[:-1]
-            before, after = np.roll(points, 1, axis=0), np.roll(points, -1, axis=0)
-            there, away = points - before, after - points
-            turn = there[:, 0] * away[:, 1] - there[:, 1] * away[:, 0]
-            found.append(np.hstack((points, before, after))[turn * turning > 0])
-    return np.vstack(found)
-
-
 def _meeting(before: XY, first: XY, second: XY, after: XY) -> XY | None:
     """Where two legs meet when both go on; None when that is far off or behind."""
     ux, uy, vx, vy = first[0] - before[0], first[1] - before[1], second[0] - after[0], second[1] - after[1]
@@ -248,7 +132,7 @@ class _Search:
     """A* from start to target over tangents between corners; obstacles are found on the way."""
 
     def __init__(
-        self, start: XY, target: XY, space: _Space, *, max_excess: float = MAX_EXCESS, max_legs: int = MAX_LEGS_TESTED
+        self, start: XY, target: XY, space: Space, *, max_excess: float = MAX_EXCESS, max_legs: int = MAX_LEGS_TESTED
     ) -> None:
         self._space = space
         self._max_excess = max_excess

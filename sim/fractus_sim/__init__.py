@@ -1,1 +1,1 @@
-"""The simulated world: vehicle, embedded cluster."""
+"""Experiments, scenarios, the demo and their reports, on the simulated vehicle, camera world and embedded cluster."""

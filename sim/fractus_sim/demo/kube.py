@@ -25,10 +25,10 @@ class DemoError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Kube:
-    """One cluster and the programs that speak to it."""
+    """One cluster and the programs that speak to it; the release tool is helm."""
 
     kubectl: Path
-    helm_path: Path
+    release_tool: Path
     kubeconfig: Path
 
     def run(self, *arguments: str, stdin: str | None = None, timeout_s: float = 60.0) -> str:
@@ -73,14 +73,14 @@ class Kube:
 
     def install(self, release: str, chart: Path) -> bool:
         """Install or upgrade a chart; True when it was not there before."""
-        listed = self._run(self.helm_path, ["list", "-n", SYSTEM, "-q", "-f", f"^{release}$"], None, 60.0)
+        listed = self._run(self.release_tool, ["list", "-n", SYSTEM, "-q", "-f", f"^{release}$"], None, 60.0)
         arguments = ["upgrade", "--install", release, str(chart), "-n", SYSTEM, "--create-namespace"]
-        self._run(self.helm_path, arguments, None, 120.0)
+        self._run(self.release_tool, arguments, None, 120.0)
         return not listed.strip()
 
     def uninstall(self, release: str) -> None:
         """Take a release away."""
-        self._run(self.helm_path, ["uninstall", release, "-n", SYSTEM, "--ignore-not-found", "--wait"], None, 180.0)
+        self._run(self.release_tool, ["uninstall", release, "-n", SYSTEM, "--ignore-not-found", "--wait"], None, 180.0)
 
     def follow(self, arguments: Sequence[str], out: IO[bytes]) -> subprocess.Popen[bytes]:
         """Start a kubectl that writes until it is ended."""

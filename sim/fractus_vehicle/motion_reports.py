@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 
+from fractus_mavlink import Value
 from fractus_mavlink.enums import COPTER_MODE, MAV_FRAME
 
 from fractus_vehicle.control import Axis
 from fractus_vehicle.copter import POSITION_ONLY, VELOCITY_ONLY
+from fractus_vehicle.earth import Place
 from fractus_vehicle.report_units import UNKNOWN_U16, Values, boot_ms, boot_us, centi
 from fractus_vehicle.state import VehicleState
 
@@ -40,34 +42,20 @@ def local_position_ned(v: VehicleState) -> Values | None:
     return {"time_boot_ms": boot_ms(v), "x": e.north, "y": e.east, "z": e.down, "vx": e.vn, "vy": e.ve, "vz": e.vd}
 
 
+def _rates(v: VehicleState) -> dict[str, Value]:
+    return {"rollspeed": v.est.p, "pitchspeed": v.est.q, "yawspeed": v.est.r}
+
+
 def attitude(v: VehicleState) -> Values:
     """ATTITUDE."""
     e = v.est
-    return {
-        "time_boot_ms": boot_ms(v),
-        "roll": e.roll,
-        "pitch": e.pitch,
-        "yaw": e.yaw,
-        "rollspeed": e.p,
-        "pitchspeed": e.q,
-        "yawspeed": e.r,
-    }
+    return {"time_boot_ms": boot_ms(v), "roll": e.roll, "pitch": e.pitch, "yaw": e.yaw, **_rates(v)}
 
 
 def attitude_quaternion(v: VehicleState) -> Values:
     """ATTITUDE_QUATERNION."""
     w, x, y, z = v.est.quaternion
-    e = v.est
-    return {
-        "time_boot_ms": boot_ms(v),
-        "q1": w,
-        "q2": x,
-        "q3": y,
-        "q4": z,
-        "rollspeed": e.p,
-        "pitchspeed": e.q,
-        "yawspeed": e.r,
-    }
+    return {"time_boot_ms": boot_ms(v), "q1": w, "q2": x, "q3": y, "q4": z, **_rates(v)}
 
 
 def attitude_target(v: VehicleState) -> Values:
@@ -124,38 +112,30 @@ def position_target_global_int(v: VehicleState) -> Values | None:
         or v.landed
     ):
         return None
-    c = v.control
-    place = v.origin.offset(c.target[0], c.target[1], c.target_down)
-    moving = c.horizontal is Axis.VELOCITY
-    return {
-        "time_boot_ms": boot_ms(v),
-        "coordinate_frame": MAV_FRAME.GLOBAL_INT,
-        "type_mask": VELOCITY_ONLY if moving else POSITION_ONLY,
-        "lat_int": 0 if moving else place.lat_e7,
-        "lon_int": 0 if moving else place.lon_e7,
-        "alt": 0.0 if moving else place.alt_m,
-        "vx": c.target_velocity[0],
-        "vy": c.target_velocity[1],
-        "vz": c.target_vd,
-    }
+    place = v.origin.offset(*v.control.target, v.control.target_down)
+    return _target(v, MAV_FRAME.GLOBAL_INT, {"lat_int": place.lat_e7, "lon_int": place.lon_e7, "alt": place.alt_m})
 
 
 def position_target_local_ned(v: VehicleState) -> Values | None:
     """POSITION_TARGET_LOCAL_NED while in GUIDED."""
     if v.origin is None or v.mode is not COPTER_MODE.GUIDED or v.landed:
         return None
+    north, east = v.control.target
+    return _target(v, MAV_FRAME.LOCAL_NED, {"x": north, "y": east, "z": v.control.target_down})
+
+
+def _target(v: VehicleState, frame: MAV_FRAME, position: Values) -> Values:
+    """Position and velocity; of a target that is only a velocity, the position stays zero."""
     c = v.control
     moving = c.horizontal is Axis.VELOCITY
     return {
         "time_boot_ms": boot_ms(v),
-        "coordinate_frame": MAV_FRAME.LOCAL_NED,
+        "coordinate_frame": frame,
         "type_mask": VELOCITY_ONLY if moving else POSITION_ONLY,
-        "x": 0.0 if moving else c.target[0],
-        "y": 0.0 if moving else c.target[1],
-        "z": 0.0 if moving else c.target_down,
         "vx": c.target_velocity[0],
         "vy": c.target_velocity[1],
         "vz": c.target_vd,
+        **({} if moving else position),
     }
 
 
@@ -165,9 +145,7 @@ def home_position(v: VehicleState) -> Values | None:
         return None
     north, east, down = v.origin.vector_to(v.home)
     return {
-        "latitude": v.home.lat_e7,
-        "longitude": v.home.lon_e7,
-        "altitude": round(v.home.alt_m * 1000.0),
+        **_degrees(v.home),
         "x": north,
         "y": east,
         "z": down,
@@ -180,12 +158,11 @@ def gps_global_origin(v: VehicleState) -> Values | None:
     """GPS_GLOBAL_ORIGIN: where the local frame begins."""
     if v.origin is None:
         return None
-    return {
-        "latitude": v.origin.lat_e7,
-        "longitude": v.origin.lon_e7,
-        "altitude": round(v.origin.alt_m * 1000.0),
-        "time_usec": boot_us(v),
-    }
+    return {**_degrees(v.origin), "time_usec": boot_us(v)}
+
+
+def _degrees(place: Place) -> dict[str, Value]:
+    return {"latitude": place.lat_e7, "longitude": place.lon_e7, "altitude": round(place.alt_m * 1000.0)}
 
 
 def altitude(v: VehicleState) -> Values:

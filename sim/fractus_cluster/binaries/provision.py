@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from fractus_storage import write_file
-
 from fractus_cluster.binaries.build import build, module_digest, reported_version
 from fractus_cluster.binaries.catalog import CLUSTER_PROGRAMS, KUBERNETES_VERSION, MODULES, PROGRAMS, Program
 from fractus_cluster.errors import ClusterError
+from fractus_cluster.ledger import read_ledger, write_ledger
 from fractus_cluster.locking import locked
 
 _LOCK_TIMEOUT_S = 3600.0
@@ -89,7 +87,7 @@ def _program(name: str) -> Program:
 
 def _present(wanted: Iterable[Program], directory: Path) -> dict[str, Path]:
     assets = os.environ.get("KUBEBUILDER_ASSETS")
-    stamps = _read(directory / "built.json")
+    stamps = read_ledger(directory / "built.json")
     versions = _Versions(directory / "found.json")
     paths: dict[str, Path] = {}
     for program in wanted:
@@ -106,9 +104,9 @@ def _present(wanted: Iterable[Program], directory: Path) -> dict[str, Path]:
 
 
 def _stamp(programs: Iterable[Program], directory: Path) -> None:
-    stamps = _read(directory / "built.json")
+    stamps = read_ledger(directory / "built.json")
     stamps.update({program.name: module_digest(MODULES[program.module]) for program in programs})
-    _write(directory / "built.json", stamps)
+    write_ledger(directory / "built.json", stamps)
 
 
 class _Versions:
@@ -116,7 +114,7 @@ class _Versions:
 
     def __init__(self, memo: Path) -> None:
         self._memo = memo
-        self._known = _read(memo)
+        self._known = read_ledger(memo)
         self._changed = False
 
     def acceptable(self, path: Path, program: Program) -> bool:
@@ -131,17 +129,4 @@ class _Versions:
 
     def save(self) -> None:
         if self._changed:
-            _write(self._memo, self._known)
-
-
-def _read(path: Path) -> dict[str, str]:
-    try:
-        content = json.loads(path.read_text())
-    except (FileNotFoundError, json.JSONDecodeError):
-        return {}
-    return content if isinstance(content, dict) else {}
-
-
-def _write(path: Path, content: Mapping[str, str]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_file(path, json.dumps(content, indent=1, sort_keys=True).encode(), 0o644, durable=False)
+            write_ledger(self._memo, self._known)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import shutil
 import tempfile
@@ -13,12 +12,11 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import MappingProxyType
 
-from fractus_storage import write_file
-
 from fractus_cluster.binaries import cache_directory
 from fractus_cluster.commands import run
 from fractus_cluster.errors import ClusterError, PrerequisiteError
 from fractus_cluster.images.store import image_ids
+from fractus_cluster.ledger import read_ledger, write_ledger
 from fractus_cluster.locking import locked
 from fractus_cluster.prerequisites import check_root
 
@@ -102,7 +100,7 @@ def build_images(
         report=report,
     ):
         digests = {image_name(target, tag): source_digest(source, target) for target in targets}
-        built = _read(ledger)
+        built = read_ledger(ledger)
         present = image_ids()
         stale = [
             target
@@ -115,7 +113,7 @@ def build_images(
             before, present = present, image_ids()
             _remove_replaced(before[name] for name in names if name in before and before[name] != present[name])
             built.update({name: f"{digests[name]} {present[name]}" for name in names})
-            _write(ledger, built)
+            write_ledger(ledger, built)
     return names
 
 
@@ -192,15 +190,3 @@ def ensure_base(*, report: Report) -> None:
         finally:
             run(["buildah", "rm", container], check=False)
     report(f"made the Debian base image in {time.monotonic() - started:.0f} s")
-
-
-def _read(path: Path) -> dict[str, str]:
-    try:
-        content = json.loads(path.read_text())
-    except (FileNotFoundError, json.JSONDecodeError):
-        return {}
-    return content if isinstance(content, dict) else {}
-
-
-def _write(path: Path, content: Mapping[str, str]) -> None:
-    write_file(path, json.dumps(content, indent=1, sort_keys=True).encode(), 0o644, durable=False)

@@ -236,10 +236,6 @@ class Station:
         values: dict[str, Value] = {f"param{at}": float(value) for at, value in enumerate(params, start=1)}
         self.tell("COMMAND_LONG", {**values, "command": command})
 
-    def ask_mode(self, mode: COPTER_MODE) -> None:
-        """Ask for a flight mode; the answer will be in `acks`."""
-        self.command(MAV_CMD.DO_SET_MODE, MAV_MODE_FLAG.CUSTOM_MODE_ENABLED, mode)
-
     def read_parameter(self, name: str) -> None:
         """Ask for a parameter; it will be in `parameters`."""
         self.parameters.pop(name, None)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import struct
 import threading
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from fractus_mavlink import Parser
 
@@ -30,14 +28,6 @@ class TlogWriter:
         """Close the file."""
         with self._lock:
             self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 class Framer:

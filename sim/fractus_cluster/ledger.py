@@ -1,0 +1,24 @@
+"""Small JSON files that remember what was built from what."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+from fractus_storage import write_file
+
+
+def read_ledger(path: Path) -> dict[str, str]:
+    """What a ledger remembers; nothing when it is missing or broken, so that all is built again."""
+    try:
+        content = json.loads(path.read_text())
+    except (FileNotFoundError, json.JSONDecodeError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def write_ledger(path: Path, content: Mapping[str, str]) -> None:
+    """Remember."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, json.dumps(content, indent=1, sort_keys=True).encode(), 0o644, durable=False)

@@ -121,9 +121,14 @@ class StandalonePki:
             grants: The services' --grants.
 
         Raises:
-            InvalidObject: the manifest is no Grant.
+            InvalidObject: the manifest is no Grant, bounds no drone, or is for a node without a certificate.
         """
-        name = Grant.from_body(manifest).name
+        wanted = Grant.from_body(manifest)
+        name = wanted.name
+        if not (self._directory / "nodes" / wanted.spec.node / "tls.crt").is_file():
+            raise InvalidObject(
+                "spec.node", f"{wanted.spec.node} has no certificate here; make one with: fractus grants init --node"
+            )
         if "/" in name or name.startswith("."):
             raise InvalidObject("metadata.name", f"{name!r} is no name of a file")
         path = grants / f"{name}.json"

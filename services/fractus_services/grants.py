@@ -28,7 +28,7 @@ class ActiveGrant:
     """A grant that is in force on this node.
 
     Attributes:
-        key: names the mission: the uid of the Grant object, or the identity where it has none.
+        key: tells the mission from all others; made of what is signed.
         digest: of the grant with its signature.
     """
 
@@ -191,7 +191,7 @@ class GrantFiles:
             return None
         digest = self._verifier.verify(grant)
         compiled = compile_grant(grant.spec, flat_terrain=self._flat_terrain)
-        return ActiveGrant(grant.metadata.uid or grant.spec.identity, grant.name, grant.spec, compiled, digest)
+        return ActiveGrant(grant.spec.mission_key, grant.name, grant.spec, compiled, digest)
 
     def _revoke(self, grant: ActiveGrant | None) -> None:
         if grant is not None:

@@ -53,6 +53,13 @@ def altitude_limit(lower: float, upper: float) -> dict[str, Any]:
     return {"name": "altitudes", "spec": spec}
 
 
+NAVIGATOR_MISSION = (
+    "spiffe://fractus.dev/ns/default/app/app/component/Navigator/instance/app-navigator#uid-app-navigator"
+)
+VIEWER_MISSION = (
+    "spiffe://fractus.dev/ns/default/app/app/component/AerialViewer/instance/app-aerial-viewer#uid-app-aerial-viewer"
+)
+
 ALL = [
     "Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "SetVelocity", "Goto", "Hover", "GetPosition",
     "ReturnToLaunch",
@@ -157,7 +164,8 @@ class Authority:
             self._signer = issue_signer(self.certificate, self._key)
         now = datetime.datetime.now(datetime.UTC)
         self._issued = max(now, self._issued + datetime.timedelta(microseconds=1))
-        return sign(body, *self._signer, self._issued)
+        named = {**body, "spec": {"mission": body["metadata"]["uid"], **body["spec"]}}
+        return sign(named, *self._signer, self._issued)
 
 
 def issue_signer(

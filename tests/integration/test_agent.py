@@ -218,7 +218,7 @@ def test_a_drones_life(server: ApiServer, drone: Node) -> None:
     drone.mobility.now.flight_state = "flying"
     drone.mobility.now.in_air = True
     ended = MissionOutcome(kind=MissionOutcome.KIND_FAILED, reason="driver lost")
-    drone.mobility.now.missions[uid].CopyFrom(ended)
+    drone.mobility.now.missions[stored.spec.mission_key].CopyFrom(ended)
     wait_for(lambda: (drone.object() or {})["status"]["flightState"] == "flying", "flying", timeout_s=10)
     wait_for(lambda: phase(server, "mine") == "Failed", "failed grant", timeout_s=10)
     grant = server.get(f"{FRACTUS}/grants/mine")

@@ -16,6 +16,7 @@ from fractus_proto.v1 import types_pb2
 from fractus_services.chain import verify
 from mobility_rig import (
     DRIVER,
+    NAVIGATOR_MISSION,
     NODE,
     PASSENGER,
     Driver,
@@ -95,7 +96,7 @@ async def _return_and_land(rig: Rig, driver: Driver) -> None:
     await driver.next(pb.ControlEvent.STATE_COMPLETE)
     landed = await rig.until(lambda t: not t.armed, 90, "landing")
     assert math.dist(xy(landed.position), (0, 0)) < 2.0
-    assert outcomes(landed) == {"uid-app-navigator": "complete"}
+    assert outcomes(landed) == {NAVIGATOR_MISSION: "complete"}
 
     code, why = await denied(_first_event(Driver(rig)))
     assert (code, why.code) == (grpc.StatusCode.FAILED_PRECONDITION, "MissionComplete")

@@ -20,8 +20,10 @@ from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.itemlists import download
 from mobility_rig import (
     FRAME,
+    NAVIGATOR_MISSION,
     NODE,
     PASSENGER,
+    VIEWER_MISSION,
     Driver,
     Rig,
     altitude_limit,
@@ -102,7 +104,7 @@ async def test_the_transit_flies_around_zones_to_the_control_point_and_home(rig:
     assert math.dist(xy(landed.position), (0, 0)) < 2.0
     assert trace.distance_m(*WALL) > 1.0
     assert trace.attitudes > 0.9 * len(trace.points)
-    assert outcomes(landed) == {"uid-app-navigator": "complete"}
+    assert outcomes(landed) == {NAVIGATOR_MISSION: "complete"}
     assert not rig.log("service").count("Traceback")
 
 
@@ -132,7 +134,7 @@ async def test_passengers_without_a_driver_are_flown_through_their_points(rig: R
     assert pb.ControlEvent.STATE_RIDING in {e.state for e in events}
     landed = await rig.until(lambda t: not t.armed, 90, "landing")
     assert math.dist(xy(landed.position), (0, 0)) < 2.0
-    assert outcomes(landed) == {"uid-app-aerial-viewer": "complete"}
+    assert outcomes(landed) == {VIEWER_MISSION: "complete"}
 
 
 def setpoint(north: float, east: float = 0.0, down: float = 0.0, hold_s: float = 0.0) -> pb.SetVelocityRequest:

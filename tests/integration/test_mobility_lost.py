@@ -16,7 +16,7 @@ from fractus_mavlink.enums import COPTER_MODE
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
-from mobility_rig import DRIVER, FRAME, Driver, Rig, denied, fence, flown, grant, outcomes, xy
+from mobility_rig import DRIVER, FRAME, NAVIGATOR_MISSION, Driver, Rig, denied, fence, flown, grant, outcomes, xy
 
 LOST = pb.ControlEvent.STATE_LOST
 
@@ -40,7 +40,7 @@ async def flying(rig: Rig, *policies: dict[str, Any], speedup: float = 3.0, **ch
 
 
 def outcome(telemetry: pb.Telemetry) -> str:
-    return outcomes(telemetry).get("uid-app-navigator", "")
+    return outcomes(telemetry).get(NAVIGATOR_MISSION, "")
 
 
 def speed(telemetry: pb.Telemetry) -> float:

@@ -15,7 +15,19 @@ from fractus.drone import Mobility
 from fractus.environment import Endpoint
 from fractus.errors import ControlLost, InvalidRequest, MissionComplete, PolicyDenied
 from fractus_core.api.names import node_server_name
-from mobility_rig import DRIVER, FRAME, NODE, PASSENGER, Rig, altitude_limit, fence, grant, outcomes, passenger_grant
+from mobility_rig import (
+    DRIVER,
+    FRAME,
+    NAVIGATOR_MISSION,
+    NODE,
+    PASSENGER,
+    Rig,
+    altitude_limit,
+    fence,
+    grant,
+    outcomes,
+    passenger_grant,
+)
 
 
 @pytest.fixture
@@ -77,8 +89,8 @@ async def test_a_mission_through_the_sdk(rig: Rig) -> None:
                     await drone.goto(*FRAME.latlon(40, 40), 7)
                 assert taken.value.decision.action.name == "TAKEOVER"
                 await drone.goto(*FRAME.latlon(0, 0), 7)
-    state = await rig.until(lambda t: "uid-app-navigator" in t.missions, 30, "the outcome")
-    assert outcomes(state)["uid-app-navigator"].startswith("revoked:")
+    state = await rig.until(lambda t: NAVIGATOR_MISSION in t.missions, 30, "the outcome")
+    assert outcomes(state)[NAVIGATOR_MISSION].startswith("revoked:")
 
 
 async def test_control_returned_through_the_sdk(rig: Rig) -> None:

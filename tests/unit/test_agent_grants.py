@@ -21,6 +21,7 @@ from fractus_core.policy.trust import BadSignature, UnknownAuthority
 
 COMPLETE = Outcome(OutcomeKind.COMPLETE)
 FAILED = Outcome(OutcomeKind.FAILED, "driver lost")
+KEY = "spiffe://fractus.dev/ns/default/app/app/component/Navigator/instance/app-navigator#u1"
 
 
 def manifest(name: str = "g1", uid: str = "u1", version: str = "1", **more: Any) -> dict[str, Any]:
@@ -33,6 +34,7 @@ def manifest(name: str = "g1", uid: str = "u1", version: str = "1", **more: Any)
             "application": {"namespace": "default", "name": "app", "uid": "a"},
             "component": "Navigator",
             "instance": "app-navigator",
+            "mission": uid,
         }
         | more.pop("spec", {}),
         **more,
@@ -137,7 +139,7 @@ async def test_phases_are_reported_once_and_survive_outages(keeper: GrantKeeper,
     await keeper.report_once()
     await keeper.report_once()
     assert [s["phase"] for _, s in store.statuses] == ["Active"]
-    keeper.missions_changed({"u1": FAILED})
+    keeper.missions_changed({KEY: FAILED})
     await keeper.report_once()
     assert store.statuses[-1] == ("g1", {"phase": "Failed", "message": "driver lost", "observedGeneration": 1})
 
@@ -150,7 +152,7 @@ async def test_a_new_agent_does_not_repeat_what_is_reported(keeper: GrantKeeper,
 
 
 async def test_a_grant_made_again_under_its_name_is_reported_again(keeper: GrantKeeper, store: FakeStore) -> None:
-    keeper.missions_changed({"u1": COMPLETE})
+    keeper.missions_changed({KEY: COMPLETE})
     for uid in ("u1", "u2"):
         keeper.take(Changed(manifest(uid=uid)))
         await keeper.report_once()
@@ -280,7 +282,7 @@ async def test_an_api_server_that_is_gone_for_a_month_takes_no_grant_away(
     doubter.error = UnknownAuthority("there is no ca.crt any more")
     for _ in range(30):
         doubter.now_s += 86_400
-        doubting.missions_changed({"u1": Outcome(OutcomeKind.FAILED, f"{doubter.now_s}")})
+        doubting.missions_changed({KEY: Outcome(OutcomeKind.FAILED, f"{doubter.now_s}")})
         doubting.give_up_unverified()
         doubting.retry_disk()
         doubting.authority_changed()
@@ -292,19 +294,19 @@ async def test_an_api_server_that_is_gone_for_a_month_takes_no_grant_away(
 def test_outcomes() -> None:
     grant = Grant.from_body(manifest())
     assert outcome_of(grant, {}) is None
-    assert outcome_of(grant, {"u1": COMPLETE}) == ("Complete", "")
-    assert outcome_of(grant, {grant.spec.identity: Outcome(OutcomeKind.REVOKED, "zone closed: now")}) == (
+    assert outcome_of(grant, {KEY: COMPLETE}) == ("Complete", "")
+    assert outcome_of(grant, {KEY: Outcome(OutcomeKind.REVOKED, "zone closed: now")}) == (
         "Revoked",
         "zone closed: now",
     )
-    assert outcome_of(grant, {"u1": FAILED}) == ("Failed", "driver lost")
-    assert outcome_of(grant, {"u2": COMPLETE}) is None
+    assert outcome_of(grant, {KEY: FAILED}) == ("Failed", "driver lost")
+    assert outcome_of(grant, {KEY.replace("#u1", "#u2"): COMPLETE, "u1": COMPLETE}) is None
 
 
 def test_a_reported_end_is_final() -> None:
     grant = Grant.from_body(manifest(status={"phase": "Complete", "message": "done"}))
     assert status_of(grant, {}, None)["phase"] == "Complete"
-    assert status_of(grant, {"u1": "failed: x"}, "disk full")["phase"] == "Complete"
+    assert status_of(grant, {KEY: "failed: x"}, "disk full")["phase"] == "Complete"
 
 
 def test_the_stored_form_is_stable() -> None:

@@ -380,3 +380,50 @@ def test_a_directory_of_keys_is_made_once(tmp_path: Path) -> None:
     names = x509.load_pem_x509_certificate((two.node("d") / "tls.crt").read_bytes()).extensions
     uris = names.get_extension_for_class(x509.SubjectAlternativeName).value
     assert node_identity("d") in uris.get_values_for_type(x509.UniformResourceIdentifier)
+
+
+def test_the_mission_is_signed_and_kept_while_the_grant_is() -> None:
+    signer = GrantSigner(CA, lambda: NOW)
+    first = signer.sign(manifest())
+    assert grant(first).spec.mission == "u1"
+    unnamed = {**manifest(), "metadata": {"name": "g"}}
+    created = signer.sign(unnamed)
+    assert len(created["spec"]["mission"]) == 36
+    again = signer.sign(unnamed, grant(created))
+    assert again["spec"]["mission"] == created["spec"]["mission"]
+    assert signer.sign(unnamed)["spec"]["mission"] != created["spec"]["mission"]
+    forged = {**first, "spec": {**first["spec"], "mission": "u2"}}
+    with pytest.raises(BadSignature, match="changed"):
+        verify(grant(forged), CAS)
+
+
+def test_no_grant_takes_the_mission_of_another_instance(node: Node) -> None:
+    own = signed()
+    other = signed(instance="app-b", component="B", mission="u1")
+    other["metadata"]["uid"] = own["metadata"]["uid"] = "u1"
+    assert grant(other).spec.mission_key != grant(own).spec.mission_key
+
+
+@pytest.mark.parametrize("who", ["driver", "passenger"])
+def test_a_drone_without_an_area_is_neither_signed_for_nor_believed(who: str) -> None:
+    with pytest.raises(InvalidObject, match=f"a {who} needs operationArea"):
+        signed(operationArea=[], **{"class": who})
+    body = signed()
+    body["spec"].pop("operationArea")
+    with pytest.raises(BadSignature, match="bounds no drone"):
+        verify(grant(body), CAS)
+
+
+def test_a_zone_without_its_area_is_refused() -> None:
+    fence = {"name": "pool", "spec": {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["pool"]}}}
+    for zones in ([], [{"name": "pol", "area": {"circle": {"center": {"lat": 39.36, "lon": 22.95}, "radius": 20}}}]):
+        with pytest.raises(InvalidObject, match="policy pool selects pool; give the area"):
+            signed(policies=[{**fence, "zones": zones}])
+
+
+def test_a_grant_for_a_node_without_a_certificate_is_not_signed(tmp_path: Path) -> None:
+    pki = StandalonePki.create(tmp_path / "pki")
+    with pytest.raises(InvalidObject, match="drone-1 has no certificate here"):
+        pki.grant(manifest(), tmp_path / "grants")
+    pki.node("drone-1")
+    assert pki.grant(manifest(), tmp_path / "grants").is_file()

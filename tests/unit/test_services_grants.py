@@ -41,7 +41,7 @@ def grant_files(directory: Path, refused: Any = lambda _name, _why: None) -> Gra
 def test_files_come_change_and_go(tmp_path: Path) -> None:
     seen: list[tuple[str | None, str | None]] = []
     files = grant_files(tmp_path)
-    files.listen(lambda old, new: seen.append((old and old.key, new and new.key)))
+    files.listen(lambda old, new: seen.append((old and old.spec.mission, new and new.spec.mission)))
     path = tmp_path / "g.json"
     path.write_text(body())
     files.scan()
@@ -82,7 +82,7 @@ def test_two_files_for_one_instance(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(body(uid="second"))
     files = grant_files(tmp_path)
     files.scan()
-    assert [grant.key for grant in files.active.values()] == ["second"], "the later one counts"
+    assert [grant.spec.mission for grant in files.active.values()] == ["second"], "the later one counts"
     (tmp_path / "a.json").unlink()
     files.scan()
     assert not files.active, "the earlier one does not come back"
@@ -147,7 +147,7 @@ def test_an_odd_file_does_not_stop_the_others(tmp_path: Path, odd: bytes) -> Non
     (tmp_path / "loop.json").symlink_to("loop.json")
     files = grant_files(tmp_path)
     files.scan()
-    assert [grant.key for grant in files.active.values()] == ["sound"]
+    assert [grant.spec.mission for grant in files.active.values()] == ["sound"]
 
 
 def test_whatever_a_file_breaks_it_grants_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -171,7 +171,7 @@ def test_a_listener_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
     told: list[str] = []
     files = grant_files(tmp_path)
     files.listen(broken)
-    files.listen(lambda _old, new: told.append(new.key if new else ""))
+    files.listen(lambda _old, new: told.append((new.spec.mission if new else None) or ""))
     (tmp_path / "a.json").write_text(body())
     files.scan()
     assert told == ["u1"]

@@ -87,10 +87,8 @@ def stored_form(grant: Grant) -> bytes:
 
 def outcome_of(grant: Grant, missions: Mapping[str, Outcome]) -> tuple[Phase, str] | None:
     """How the grant's mission ended, as the mobility service tells; None while it has not."""
-    for key in (grant.metadata.uid, grant.spec.identity):
-        if key and key in missions:
-            return _OUTCOMES[missions[key].kind], missions[key].reason
-    return None
+    outcome = missions.get(grant.spec.mission_key)
+    return (_OUTCOMES[outcome.kind], outcome.reason) if outcome is not None else None
 
 
 def status_of(grant: Grant, missions: Mapping[str, Outcome], problem: str | None) -> dict[str, Any]:

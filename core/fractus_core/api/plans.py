@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, WithJsonSchema
+from pydantic import Field, WithJsonSchema, model_validator
 
 from fractus_core.api.components import (
     ComponentClass,
@@ -16,7 +16,7 @@ from fractus_core.api.components import (
     ServiceRequest,
 )
 from fractus_core.api.geometry import Area, Point, Position
-from fractus_core.api.model import AGE, Condition, Model, OpenModel, Resource
+from fractus_core.api.model import AGE, Condition, InvalidObject, Model, OpenModel, Resource
 from fractus_core.api.names import component_identity
 from fractus_core.api.policies import PolicySpec, ZoneShape
 
@@ -129,7 +129,20 @@ class GrantedPolicy(Model):
 
     name: str
     spec: PolicySpec
-    zones: tuple[GrantedZone, ...] = Field(default=(), description="Empty: everywhere.")
+    zones: tuple[GrantedZone, ...] = Field(
+        default=(),
+        description="Those of spec.selector.zones with their areas; empty where that names none: everywhere.",
+    )
+
+    @model_validator(mode="after")
+    def _resolved(self) -> Self:
+        """A zone without its area would restrict nothing: such a grant must not be flown under."""
+        missing = sorted(set(self.spec.selector.zones) - {zone.name for zone in self.zones})
+        if missing:
+            raise InvalidObject(
+                "zones", f"policy {self.name} selects {', '.join(missing)}; give the area of each zone that it selects"
+            )
+        return self
 
 
 class GrantApplication(Model):
@@ -165,7 +178,7 @@ class GrantSpec(Model):
     )
     services: tuple[ServiceRequest, ...] = ()
     operation_area: tuple[Area, ...] = Field(
-        default=(), description="Where services may be used; empty: anywhere (for fixed nodes)."
+        default=(), description="Where services may be used; needed on a drone. Empty: anywhere (fixed nodes)."
     )
     corridor: tuple[Area, ...] = Field(
         default=(), description="Where the drone may be to get from its depot to the operation area and back."
@@ -174,6 +187,12 @@ class GrantSpec(Model):
     home: Position | None = None
     limits: GrantedLimits | None = None
     policies: tuple[GrantedPolicy, ...] = ()
+    mission: str | None = Field(
+        default=None,
+        max_length=253,
+        description="Set when it is signed: names the mission. A drone remembers which missions are over; another one begins"
+        " with another name.",
+    )
     issued_at: datetime | None = Field(
         default=None, description="Set when it is signed; of two Grants for one instance the later one counts."
     )
@@ -182,6 +201,24 @@ class GrantSpec(Model):
     def identity(self) -> str:
         """The SPIFFE id of the instance that the grant is for."""
         return component_identity(self.application.namespace, self.application.name, self.component, self.instance)
+
+    @property
+    def unsigned(self) -> Self:
+        """The same without what signing adds."""
+        return self.model_copy(update={"mission": None, "issued_at": None})
+
+    @property
+    def mission_key(self) -> str:
+        """Tells the mission from all others: by what is signed, so that no grant can take another instance's drone."""
+        return f"{self.identity}#{self.mission or ''}"
+
+    @property
+    def unbounded(self) -> str:
+        """Why no drone may be flown under it; empty when it has bounds.
+
+        An area that was left out by mistake must not let a drone fly anywhere: "everywhere" is said by an area that large.
+        """
+        return f"a {self.class_} needs operationArea" if self.class_ is not None and not self.operation_area else ""
 
     def methods(self, service: str) -> frozenset[str]:
         """The methods granted on a service; a driver may always get and return control."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import uuid
 from collections.abc import Callable
 from datetime import datetime, timedelta
 from typing import Any
@@ -50,7 +51,8 @@ class GrantSigner:
             self._last_issued = max(self._last_issued, before)
         # Strictly later also when the clock stands still or went back: nodes keep the Grant that was issued last.
         self._last_issued = issued_at = max(now, self._last_issued + _TICK)
-        return sign(body, key, certificate, issued_at)
+        named = {**body, "spec": {**body["spec"], "mission": _mission(body, replaces)}}
+        return sign(named, key, certificate, issued_at)
 
     def problem(self, grant: Grant) -> str | None:
         """Why a Grant, as it is, is not valid; None if the operator of this system signed it."""
@@ -76,3 +78,14 @@ class GrantSigner:
         if self._signer is None or now >= renewal_time(self._signer[1]):
             self._signer = self._authority.issue_signer(now)
         return self._signer
+
+
+def _mission(body: dict[str, Any], replaces: Grant | None) -> str:
+    """The mission of a Grant: the one that it names, or else that of the same object before, or else a new one.
+
+    `metadata.uid` names the mission where no API server gives objects their uid.
+    """
+    uid = (body.get("metadata") or {}).get("uid")
+    same = replaces is not None and uid in {None, replaces.metadata.uid}
+    kept = replaces.spec.mission if replaces is not None and same else None
+    return str(body["spec"].get("mission") or kept or uid or uuid.uuid4())

@@ -246,7 +246,8 @@ def _granted(policy: Policy, inventory: Inventory, bounds: tuple[Point, float] |
     Raises:
         InvalidObject: a zone does not exist, or is broken.
     """
-    zones = [_zone(policy, i, name, inventory) for i, name in enumerate(policy.spec.selector.zones)]
+    named = dict.fromkeys(policy.spec.selector.zones)
+    zones = [_zone(policy, i, name, inventory) for i, name in enumerate(named)]
     # An inclusion zone out of reach still forbids everything else.
     if bounds is None or policy.spec.kind == "inclusion":
         near = zones
@@ -254,7 +255,11 @@ def _granted(policy: Policy, inventory: Inventory, bounds: tuple[Point, float] |
         near = [zone for zone in zones if _distance_m(zone.area, bounds[0]) <= bounds[1]]
     if zones and not near:
         return None
-    return GrantedPolicy(name=policy.name, spec=policy.spec, zones=tuple(near))
+    # What is left out is not selected either, so that a node can tell a zone that is far from one that is missing.
+    selector = policy.spec.selector.model_copy(update={"zones": tuple(zone.name for zone in near)})
+    return GrantedPolicy(
+        name=policy.name, spec=policy.spec.model_copy(update={"selector": selector}), zones=tuple(near)
+    )
 
 
 def _bounds(grant: GrantSpec, node: Drone | EdgeNode | None, inventory: Inventory) -> tuple[Point, float] | None:

@@ -19,7 +19,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ObjectIdentifier
 
-from fractus_core.api.model import GROUP
+from fractus_core.api.model import GROUP, InvalidObject
 from fractus_core.api.names import OPERATOR_IDENTITY
 from fractus_core.api.plans import Grant
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
@@ -59,10 +59,13 @@ def sign(
         issued_at: Of two Grants for one instance the one that was issued later counts.
 
     Raises:
-        InvalidObject: the manifest is not a Grant.
+        InvalidObject: the manifest is not a Grant, or bounds no drone.
     """
     spec = {**body["spec"], "issuedAt": issued_at.astimezone(UTC).isoformat().replace("+00:00", "Z")}
-    signature = key.sign(canonical(Grant.from_body({**body, "spec": spec})), ec.ECDSA(hashes.SHA256()))
+    grant = Grant.from_body({**body, "spec": spec})
+    if grant.spec.unbounded:
+        raise InvalidObject("spec.operationArea", f"{grant.spec.unbounded}; say where its drone may be")
+    signature = key.sign(canonical(grant), ec.ECDSA(hashes.SHA256()))
     signer = certificate.public_bytes(serialization.Encoding.DER)
     metadata = dict(body["metadata"])
     metadata["annotations"] = {
@@ -100,6 +103,8 @@ def verify(grant: Grant, authorities: Sequence[x509.Certificate]) -> datetime:
     issued_at = grant.spec.issued_at
     if issued_at is None or issued_at.tzinfo is None:
         raise BadSignature("spec.issuedAt must be a time with its zone")
+    if grant.spec.unbounded:
+        raise BadSignature(f"it bounds no drone ({grant.spec.unbounded})")
     key = _signing_key(signer)
     _check_time(issued_at, signer, _issuer(signer, authorities))
     try:

@@ -90,7 +90,7 @@ def regranted(observed: Body, spec: GrantSpec) -> Body:
 
 def _unsigned(spec: GrantSpec) -> Body:
     """The spec without what is added when it is signed, so that what was signed before compares with it."""
-    unsigned = spec.model_copy(update={"issued_at": None})
+    unsigned = spec.unsigned
     # Without defaults: a field that a later release adds changes no Grant that does not use it, and services of the
     # release before can still read those.
     return unsigned.model_dump(mode="json", by_alias=True, exclude_defaults=True)

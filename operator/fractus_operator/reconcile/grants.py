@@ -83,7 +83,7 @@ class ApplicationGrants:
         known = self._compiled.get(seen.key)
         if known is not None and known.inputs == inputs and known.plan is plan:
             return known.grants
-        present = {grant.spec.instance: grant.spec.model_copy(update={"issued_at": None}) for grant in valid}
+        present = {grant.spec.instance: grant.spec.unsigned for grant in valid}
         compiled = compile_grants(application, plan, inventory, self._settings, [grant.spec for grant in valid])
         # Areas have many points: a grant that equals the present one is that one, and not kept twice.
         grants = tuple(same if (same := present.get(spec.instance)) == spec else spec for spec in compiled)

@@ -50,7 +50,7 @@ def test_a_listening_link_belongs_to_the_first_autopilot(monkeypatch: pytest.Mon
     made, socket, heard = link(connected=False)
     made.datagram_received(b"x", STRANGER)
     made.datagram_received(heartbeat(MAV_AUTOPILOT.INVALID), STRANGER)
-    made.write(b"nobody")
+    made.write(b"lost")
     assert not heard
     assert not socket.sent
     made.datagram_received(heartbeat(), AUTOPILOT)
@@ -122,7 +122,7 @@ async def test_a_serial_line_that_is_unplugged_breaks_once() -> None:
     assert len(line.closed) == 1
 
 
-async def test_a_serial_line_that_takes_nothing_holds_nobody_up() -> None:
+async def test_a_serial_line_that_takes_nothing_blocks_no_writer() -> None:
     line = Line()
     link = await line.open()
     for _ in range(100):

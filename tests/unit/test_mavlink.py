@@ -30,7 +30,15 @@ IDS = sorted(number for number in dialect.mavlink_map if number >= 0)
 BEYOND = {80: ("COMMAND_CANCEL", 14), 336: ("CELLULAR_CONFIG", 245), 420: ("RADIO_RC_CHANNELS", 20)}
 """Messages of upstream MAVLink that ArduPilot does not define, with the CRC seeds that others publish."""
 
-UPSTREAM = {"MAV_RESULT": {6: "MAV_RESULT_CANCELLED", 9: "MAV_RESULT_COMMAND_UNSUPPORTED_MAV_FRAME"}}
+UPSTREAM = {
+    "MAV_RESULT": {6: "MAV_RESULT_CANCELLED", 9: "MAV_RESULT_COMMAND_UNSUPPORTED_MAV_FRAME"},
+    "MAV_CMD": {
+        610: "MAV_CMD_DO_SET_SYS_CMP_ID",
+        611: "MAV_CMD_DO_SET_GLOBAL_ORIGIN",
+        2020: "MAV_CMD_CAMERA_START_MTI",
+        5005: "MAV_CMD_NAV_FENCE_HOME_CIRCLE_INCLUSION",
+    },
+}
 
 POLICED = (
     0, 2, 5, 7, 11, 23, 33, 38, 39, 41, 44, 45, 48, 50, 54, 66, 69, 70, 73, 75, 76, 80, 81, 82, 84, 86, 90, 91, 92, 93, 100,

@@ -1,4 +1,4 @@
-"""The streams of GetControl: drivers wait for the drone, drive it and leave; passengers ride along."""
+"""The streams of GetControl: drivers wait for the drone, command it and leave; passengers ride along."""
 
 from __future__ import annotations
 
@@ -15,15 +15,17 @@ from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import Lease
 
-WAIT_S = 0.5
-TOLD_S = 5.0
+CHECK_S = 0.5
+"""How often a waiting caller looks whether it can go on when nothing wakes it: the autopilot's readiness wakes no one."""
+
+EVENT_TIMEOUT_S = 5.0
 
 
 class Streams:
     """Who asks for control, and what it is told.
 
     Args:
-        control: the state machine of the drone.
+        control: who has the drone.
         bring: flies the drone to where a driver with partial control takes over, and says what it does meanwhile.
     """
 
@@ -31,16 +33,13 @@ class Streams:
         self._control = control
         self._bring = bring
 
-    async def follow(self, grant: ActiveGrant) -> AsyncGenerator[ControlEvent, None]:
+    def follow(self, grant: ActiveGrant) -> AsyncGenerator[ControlEvent, None]:
         """The events of a caller's stream.
 
         Raises:
             Refused: this caller gets neither the drone nor a ride.
         """
-        events = self._ride(grant) if grant.spec.tour else self._drive(grant)
-        async with aclosing(events) as running:
-            async for event in running:
-                yield event
+        return self._ride(grant) if grant.spec.tour else self._drive(grant)
 
     # Drivers
 
@@ -58,7 +57,7 @@ class Streams:
                 drivers.grant_control(control, lease)
             while True:
                 try:
-                    event = await lease.next(TOLD_S)
+                    event = await lease.next(EVENT_TIMEOUT_S)
                 except TimeoutError:
                     continue
                 if event is None:
@@ -86,7 +85,7 @@ class Streams:
             if reason != said:
                 said = reason
                 yield reason
-            await control.wait(WAIT_S)
+            await control.wait(CHECK_S)
 
     # Passengers
 
@@ -105,7 +104,7 @@ class Streams:
                 yield event
             if event.final:
                 return
-            await control.wait(WAIT_S)
+            await control.wait(CHECK_S)
 
     def _ridden(self, grant: ActiveGrant) -> ControlEvent:
         mission = self._control.mission(grant)

@@ -13,14 +13,23 @@ class Refused(Exception):
         reason: a sentence for people.
         policies: names of those that decided.
         retry_after_s: when the caller may try again; 0: trying again as such does not help.
+        verdict: of the engine, where that refuses.
 
     Attributes:
         verdict: the same as clients find it in the status details.
     """
 
-    def __init__(self, code: str, reason: str, policies: tuple[str, ...] = (), *, retry_after_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        code: str,
+        reason: str,
+        policies: tuple[str, ...] = (),
+        *,
+        retry_after_s: float = 0.0,
+        verdict: Verdict | None = None,
+    ) -> None:
         super().__init__(reason)
-        self.verdict = Verdict("deny", None, code, reason, policies)
+        self.verdict = verdict or Verdict("deny", None, code, reason, policies)
         self.retry_after_s = retry_after_s
 
 
@@ -66,9 +75,7 @@ class InternalError(Refused):
 def denied(verdict: Verdict) -> Refused:
     """The refusal that a verdict of the engine stands for, which clients get as it is."""
     kind = InvalidRequest if verdict.code == "InvalidArgument" else PolicyDenied
-    refusal = kind(verdict.code, verdict.reason, verdict.policies)
-    refusal.verdict = verdict
-    return refusal
+    return kind(verdict.code, verdict.reason, verdict=verdict)
 
 
 class AutopilotError(Exception):

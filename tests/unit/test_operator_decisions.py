@@ -8,6 +8,7 @@ from datetime import UTC, datetime, timedelta
 import pytest
 from fractus_core.api import Application, Drone, EdgeNode, Grant
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
+from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.planning.inventory import Host, Inventory
 from fractus_core.planning.quantities import amount_of
 from fractus_operator.cluster.pods import PodView, read_host, read_pod
@@ -173,12 +174,18 @@ def grant(phase: str | None, uid: str = "u1", class_: str = "driver") -> Grant:
 def test_only_the_driver_of_this_application_ends_the_mission() -> None:
     assert mission_outcome("u1", [grant(None), grant("Active"), grant("Pending")]) is None
     assert mission_outcome("u1", [grant("Complete", uid="u0"), grant("Failed", class_="passenger")]) is None
-    complete = mission_outcome("u1", [grant("Complete")])
-    assert complete is not None
-    assert (complete.complete, complete.message) == (True, "because")
-    failed = mission_outcome("u1", [grant("Failed")])
-    assert failed is not None
-    assert not failed.complete
+    assert mission_outcome("u1", [grant("Complete")]) == Outcome(OutcomeKind.COMPLETE, "because")
+    assert mission_outcome("u1", [grant("Failed")]) == Outcome(OutcomeKind.FAILED, "because")
+    assert mission_outcome("u1", [grant("Revoked")]) == Outcome(OutcomeKind.REVOKED, "because")
+
+
+@pytest.mark.parametrize("kind", OutcomeKind)
+def test_every_outcome_is_reported(kind: OutcomeKind) -> None:
+    update = status.finished(Outcome(kind, "because"), None)
+    complete = kind is OutcomeKind.COMPLETE
+    assert (update.phase, update.message) == ("Completed" if complete else "Failed", "because")
+    assert [c.status for c in update.conditions] == ["False", "True" if complete else "False"]
+    assert update.conditions[0].warning is not complete
 
 
 def test_what_blocks_is_reported_at_its_stage() -> None:

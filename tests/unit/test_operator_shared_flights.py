@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from fractus_core.api import Drone, Grant
 from fractus_core.api.plans import DeploymentPlanSpec, DroneChoice
+from fractus_core.control import OutcomeKind
 from fractus_core.planning import flight_of, plan
 from fractus_core.planning.flight import Flight
 from fractus_operator.cluster.pods import PodView
@@ -60,7 +61,7 @@ def test_a_host_whose_manifest_was_changed_is_not_offered() -> None:
 )
 def test_a_guest_is_done_when_its_host_has_completed(phase: str, host_plan: Any, done: bool) -> None:
     outcome = shared_flight_outcome(RIDE, submitted(phase), host_plan)
-    assert (outcome is not None and outcome.complete) is done
+    assert (outcome is not None and outcome.kind is OutcomeKind.COMPLETE) is done
     assert shared_flight_outcome(OWN, submitted("Completed"), None) is None
 
 

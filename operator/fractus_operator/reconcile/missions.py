@@ -3,19 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import assert_never
 
 from fractus_core.api import Grant
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """How a mission ended."""
-
-    complete: bool
-    reason: str
-    message: str
+from fractus_core.control import Outcome, OutcomeKind
 
 
 def mission_outcome(uid: str | None, grants: Iterable[Grant]) -> Outcome | None:
@@ -30,12 +21,12 @@ def mission_outcome(uid: str | None, grants: Iterable[Grant]) -> Outcome | None:
             continue
         match status.phase:
             case "Complete":
-                return Outcome(True, "MissionComplete", status.message or f"{spec.component} finished its mission")
+                return Outcome(OutcomeKind.COMPLETE, status.message or f"{spec.component} finished its mission")
             case "Failed":
-                return Outcome(False, "MissionFailed", status.message or f"the mission of {spec.component} failed")
+                return Outcome(OutcomeKind.FAILED, status.message or f"the mission of {spec.component} failed")
             case "Revoked":
                 message = status.message or f"the control of {spec.component} was revoked"
-                return Outcome(False, "MissionRevoked", message)
+                return Outcome(OutcomeKind.REVOKED, message)
             case "Pending" | "Active" | None:
                 continue
             case _:

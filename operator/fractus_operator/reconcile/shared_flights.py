@@ -6,12 +6,12 @@ from collections.abc import Iterable, Mapping
 
 from fractus_core.api import Application, Depot, InvalidObject
 from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.planning.flight import ahead, flight_of, misses
 from fractus_core.planning.inventory import Flight
 
 from fractus_operator.cluster.reading import Submitted
 from fractus_operator.inventory.claims import Flown
-from fractus_operator.reconcile.missions import Outcome
 
 
 def may_share(application: Application | None) -> bool:
@@ -68,7 +68,7 @@ def shared_flight_outcome(
     if host is None or host_plan is not None or host.phase != "Completed":
         return None
     name = plan.drone.shared_with
-    return Outcome(True, "MissionComplete", f"{name} has flown {plan.drone.node} past all points of interest")
+    return Outcome(OutcomeKind.COMPLETE, f"{name} has flown {plan.drone.node} past all points of interest")
 
 
 def shared_flight_lost(

@@ -7,11 +7,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.control import Outcome, OutcomeKind
 
 from fractus_operator.cluster.pods import PodView
 from fractus_operator.reconcile.conditions import ConditionUpdate
-from fractus_operator.reconcile.missions import Outcome
 
+_REASONS = {
+    OutcomeKind.COMPLETE: "MissionComplete",
+    OutcomeKind.REVOKED: "MissionRevoked",
+    OutcomeKind.FAILED: "MissionFailed",
+}
 _STAGES = ("Planned", "Granted", "Deployed")
 _NAMED = 3
 """Instances that a message names; the others are counted."""
@@ -95,12 +100,13 @@ def _plan_sentence(plan: DeploymentPlanSpec) -> str:
 
 def finished(outcome: Outcome, present: StatusUpdate | None) -> StatusUpdate:
     """The status of an application whose mission is over."""
-    reason, message = outcome.reason, outcome.message
+    complete = outcome.kind is OutcomeKind.COMPLETE
+    reason, message = _REASONS[outcome.kind], outcome.reason
     conditions = (
-        ConditionUpdate("Ready", "False", reason, message, progress=outcome.complete),
-        ConditionUpdate("MissionComplete", "True" if outcome.complete else "False", reason, message),
+        ConditionUpdate("Ready", "False", reason, message, progress=complete),
+        ConditionUpdate("MissionComplete", "True" if complete else "False", reason, message),
     )
-    phase: Phase = "Completed" if outcome.complete else "Failed"
+    phase: Phase = "Completed" if complete else "Failed"
     return StatusUpdate(phase, message, conditions, drone=present.drone if present is not None else None)
 
 

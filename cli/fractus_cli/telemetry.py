@@ -35,7 +35,7 @@ def telemetry(*, node: str, address: str, tls: Path, interval_s: float, count: i
 
     Needs the certificate of a component that may call GetPosition, or the node's own.
     """
-    endpoint = Endpoint(address, f"{node}.node.fractus.dev", tls)
+    endpoint = Endpoint.on_node(node, address, tls)
     asyncio.run(_follow(endpoint, interval_s, count, output))
 
 

@@ -31,6 +31,11 @@ class Endpoint:
     server_name: str
     tls_dir: Path
 
+    @classmethod
+    def on_node(cls, node: str, address: str, tls_dir: Path) -> Endpoint:
+        """A service of a node, whose certificate carries the node's name whatever address is dialled."""
+        return cls(address, f"{node}.node.fractus.dev", tls_dir)
+
 
 def endpoint(service: str, env: Mapping[str, str] | None = None) -> Endpoint:
     """The endpoint of `mobility` or `camera` on the node that this pod runs on.
@@ -44,7 +49,7 @@ def endpoint(service: str, env: Mapping[str, str] | None = None) -> Endpoint:
     if not address:
         port = {"mobility": MOBILITY_PORT, "camera": CAMERA_PORT}[service]
         address = f"{_needed(values, 'FRACTUS_HOST_IP')}:{port}"
-    return Endpoint(address, f"{node}.node.fractus.dev", Path(values.get("FRACTUS_TLS_DIR", DEFAULT_TLS_DIR)))
+    return Endpoint.on_node(node, address, Path(values.get("FRACTUS_TLS_DIR", DEFAULT_TLS_DIR)))
 
 
 def egress(component: str, env: Mapping[str, str] | None = None) -> str:

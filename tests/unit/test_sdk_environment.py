@@ -7,6 +7,7 @@ import json
 import fractus
 import pytest
 from fractus.environment import control_points, egress, endpoint
+from fractus_core.api.names import address_variable, node_server_name
 
 POD = {
     "FRACTUS_NODE": "drone-1",
@@ -73,3 +74,10 @@ def test_control_points_are_read_as_the_manifest_spells_them() -> None:
 def test_control_points_that_are_not_ours_are_refused(text: str) -> None:
     with pytest.raises(fractus.NotConfigured, match="FRACTUS_CONTROL_POINTS"):
         control_points({"FRACTUS_CONTROL_POINTS": text})
+
+
+@pytest.mark.parametrize("component", ["ImageChecker", "Viewer2D", "data-store", "A"])
+def test_names_are_those_of_the_operator(component: str) -> None:
+    assert egress(component, {address_variable(component): "a:1"}) == "a:1"
+    found = endpoint("mobility", {"FRACTUS_NODE": "drone-1", "FRACTUS_HOST_IP": "10.0.0.1"})
+    assert found.server_name == node_server_name("drone-1")

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from fractus_sim.experiment import parse
 from fractus_sim.experiment.detections import Score, Seen, read_detections, score
+from fractus_sim.experiment.findings import Findings
 from fractus_sim.experiment.injection import Occurrence
 from fractus_sim.experiment.judging import Evidence, judge
 from fractus_sim.experiment.recording import Flight, Text
@@ -56,7 +57,9 @@ def verdict(
             "checks": [check],
         }
     )
-    evidence = Evidence({f.name: f for f in flights}, (FAULT,), {zone.name: zone for zone in experiment.zones}, **more)
+    evidence = Evidence(
+        {f.name: f for f in flights}, (FAULT,), {zone.name: zone for zone in experiment.zones}, Findings(**more)
+    )
     found = judge(experiment.checks[0], evidence)
     return all(one.holds for one in found), "; ".join(one.found for one in found)
 
@@ -150,7 +153,7 @@ CALL = {"kind": "call", "caller": "spiffe://x/component/Navigator/instance/n", "
 def service(check: dict[str, Any], **more: Any) -> bool:
     mode = {"mode": "cluster", "cluster": {"file": "c", "apply": ["a"]}}
     experiment = parse({"name": "x", "vehicles": [{"name": "d"}], "checks": [check], **mode})
-    return judge(experiment.checks[0], Evidence({}, **more))[0].holds
+    return judge(experiment.checks[0], Evidence({}, findings=Findings(**more)))[0].holds
 
 
 def test_calls_are_found_in_audit_logs() -> None:

@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 from fractus_sim.experiment import cli, reaper, reporting, runner
+from fractus_sim.experiment.findings import Findings
 from fractus_sim.experiment.model import Experiment, parse
 from fractus_sim.experiment.recording import Flight
-from fractus_sim.experiment.testbed import Findings, Moment, Testbed
+from fractus_sim.experiment.testbed import Moment, Testbed
 from fractus_sim.interruption import uninterrupted
 from fractus_sim.report.page import write_page
 from fractus_sim.report.track import Place, Sample

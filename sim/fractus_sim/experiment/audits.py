@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fractus_services.chain import lines_of, logs, verify
 
-from fractus_sim.experiment.testbed import Findings
+from fractus_sim.experiment.findings import Findings
 
 JUDGED = frozenset({"call", "monitor", "takeover"})
 

@@ -15,7 +15,8 @@ from fractus_core.geo import LocalFrame, polygon
 from fractus_vehicle.earth import Place
 
 from fractus_sim.experiment import checks as kinds
-from fractus_sim.experiment.detections import Seen, score
+from fractus_sim.experiment.detections import score
+from fractus_sim.experiment.findings import Findings
 from fractus_sim.experiment.injection import Occurrence
 from fractus_sim.experiment.model import NamedZone
 from fractus_sim.experiment.recording import Flight
@@ -30,23 +31,13 @@ class Evidence:
 
     Attributes:
         flights: by vehicle.
-        programs: exit codes by program; None for one that had to be stopped.
-        calls: entries of the audit logs of kind call, monitor and takeover.
-        audit_problems: what is wrong with audit logs, by log; empty text for one that verifies.
-        phases: the phases each Application was seen in.
-        detections: what programs detected.
-        truths: what camera worlds had in view at each snapshot.
+        zones: by name.
     """
 
     flights: Mapping[str, Flight]
     occurrences: Sequence[Occurrence] = ()
     zones: Mapping[str, NamedZone] = field(default_factory=dict)
-    programs: Mapping[str, int | None] = field(default_factory=dict)
-    calls: Sequence[Mapping[str, Any]] = ()
-    audit_problems: Mapping[str, str] = field(default_factory=dict)
-    phases: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    detections: Sequence[Seen] = ()
-    truths: Sequence[Seen] = ()
+    findings: Findings = field(default_factory=Findings)
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,7 +233,7 @@ def _pairs(ones: Sequence[Sample], others: Sequence[Sample]) -> Iterable[tuple[S
 
 
 def _program(check: kinds.ProgramEnded, evidence: Evidence) -> tuple[bool, str]:
-    code = evidence.programs.get(check.program)
+    code = evidence.findings.programs.get(check.program)
     return code == check.exit_code, "it had to be stopped" if code is None else f"exit code {code}"
 
 
@@ -257,27 +248,27 @@ def _call(check: kinds.CallJudged, evidence: Evidence) -> tuple[bool, str]:
             and (check.code is None or entry.get("code") == check.code)
         )
 
-    hits = [entry for entry in evidence.calls if fits(entry)]
+    hits = [entry for entry in evidence.findings.calls if fits(entry)]
     if not hits:
-        return check.absent, f"none among {len(evidence.calls)} entries"
+        return check.absent, f"none among {len(evidence.findings.calls)} entries"
     return not check.absent, f"{len(hits)}, such as: {hits[0].get('reason') or hits[0].get('method', '')}"
 
 
 def _audit(_check: kinds.AuditSound, evidence: Evidence) -> tuple[bool, str]:
-    broken = [f"{log}: {problem}" for log, problem in evidence.audit_problems.items() if problem]
-    if not evidence.audit_problems:
+    broken = [f"{log}: {problem}" for log, problem in evidence.findings.audit_problems.items() if problem]
+    if not evidence.findings.audit_problems:
         return False, "there is no audit log"
-    count = len(evidence.audit_problems)
+    count = len(evidence.findings.audit_problems)
     return not broken, "; ".join(broken) or ("the log verifies" if count == 1 else f"{count} logs verify")
 
 
 def _phase(check: kinds.ApplicationPhase, evidence: Evidence) -> tuple[bool, str]:
-    seen = evidence.phases.get(check.application, ())
+    seen = evidence.findings.phases.get(check.application, ())
     return check.phase in seen, f"it was {', '.join(seen)}" if seen else "it was never seen"
 
 
 def _detections(check: kinds.Detections, evidence: Evidence) -> tuple[bool, str]:
-    found = score(evidence.detections, evidence.truths, check.kind, check.radius)
+    found = score(evidence.findings.detections, evidence.findings.truths, check.kind, check.radius)
     said = (
         f"precision {found.precision:.2f} ({found.right} of {found.detections}),"
         f" recall {found.recall:.2f} ({found.found} of {found.objects})"

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from fractus_sim.experiment.findings import Findings
 from fractus_sim.experiment.injection import Occurrence
 from fractus_sim.experiment.judging import Verdict
 from fractus_sim.experiment.model import Experiment
 from fractus_sim.experiment.recording import Flight
-from fractus_sim.experiment.testbed import Findings
 from fractus_sim.report.record import Judgement
 
 

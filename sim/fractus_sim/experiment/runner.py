@@ -243,12 +243,7 @@ def _outcome(session: _Session, out: Path, problem: str, wall_s: float) -> Outco
         session.flights,
         session.injector.occurrences,
         {zone.name: zone for zone in experiment.zones},
-        findings.programs,
-        findings.calls,
-        findings.audit_problems,
-        findings.phases,
-        findings.detections,
-        findings.truths,
+        findings,
     )
     verdicts: Sequence[Verdict] = [verdict for check in experiment.checks for verdict in judge(check, evidence)]
     return Outcome(

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
-from fractus_sim.experiment.detections import Seen
+from fractus_sim.experiment.findings import Findings
 from fractus_sim.experiment.model import Experiment
 from fractus_sim.experiment.station import Station
 
@@ -20,27 +20,6 @@ class Moment:
 
     time_s: float
     unix_us: int
-
-
-@dataclass
-class Findings:
-    """What only the testbed knows, for checks and report.
-
-    Attributes:
-        programs: exit codes; None for one that had to be stopped.
-        calls: entries of the audit logs that are judgements.
-        audit_problems: by log; empty text for one that verifies.
-        phases: of each Application, in the order seen.
-        detections: what programs detected.
-        truths: what camera worlds had in view.
-    """
-
-    programs: dict[str, int | None] = field(default_factory=dict)
-    calls: list[Mapping[str, Any]] = field(default_factory=list)
-    audit_problems: dict[str, str] = field(default_factory=dict)
-    phases: dict[str, list[str]] = field(default_factory=dict)
-    detections: list[Seen] = field(default_factory=list)
-    truths: list[Seen] = field(default_factory=list)
 
 
 class Closable(Protocol):

@@ -32,7 +32,7 @@ class Usage:
     Attributes:
         cpu_s: in user and kernel mode.
         resident_mb: resident memory.
-        own_mb: of that, what it shares with nobody.
+        own_mb: of that, what it shares with no one.
         threads: how many it has.
     """
 
@@ -89,7 +89,7 @@ def wait_for(condition: Any, what: str, timeout_s: float = 60.0) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition():
         if time.monotonic() > deadline:
-            raise SystemExit(f"waited {timeout_s:.0f} s in vain for {what}")
+            raise SystemExit(f"waited {timeout_s:.0f} s without success for {what}")
         time.sleep(0.2)
 
 

@@ -117,7 +117,7 @@ def speed(world: World, repeats: int) -> list[Claim]:
 
 
 def flight(frames: int) -> list[Claim]:
-    """A flight over new ground at 10 m/s, five pictures a second: what the tiles cost that nobody has seen before."""
+    """A flight over new ground at 10 m/s, five pictures a second: what the tiles cost that no one has seen before."""
     world = World.procedural(LAT, LON, 11)
     begun = time.process_time()
     world.render(pose(world, 0.0, 0.0, 100.0), LENS)
@@ -177,7 +177,7 @@ def likeness(world: World) -> Claim:
 
 
 def tiles(world: World) -> list[Claim]:
-    """What a tile costs that nobody has seen before."""
+    """What a tile costs that no one has seen before."""
     claims = []
     for level in (0, 2, 4):
         numbers = iter(range(-6, 7))

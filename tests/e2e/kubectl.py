@@ -85,7 +85,7 @@ class Kube:
         raise AssertionError(f"waited {timeout_s:.0f} s for: {what}{told}\n{self.state()}")
 
     def state(self) -> str:
-        """How everything stands, for the report of a test that waited in vain."""
+        """How everything stands, for the report of a test that failed."""
         looks = (
             ("get", "applications.fractus.dev,deploymentplans.fractus.dev,grants.fractus.dev,drones.fractus.dev", "-A"),
             ("get", "applications.fractus.dev", "-A", "-o", 'jsonpath={range .items[*]}{.status}{"\\n"}{end}'),

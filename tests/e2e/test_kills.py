@@ -1,4 +1,4 @@
-"""Kill -9, in flight, of each part: the mission goes on or the system brings the drone home; nobody flies unsupervised."""
+"""Kill -9, in flight, of each part: the mission goes on or the system brings the drone home; no one flies unsupervised."""
 
 from __future__ import annotations
 

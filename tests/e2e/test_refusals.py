@@ -22,7 +22,7 @@ def part(app: Object, name: str) -> Object:
 
 def unknown_egress() -> Object:
     app = application()
-    part(app, "AerialViewer")["egress"] = ["Nobody"]
+    part(app, "AerialViewer")["egress"] = ["Stranger"]
     return app
 
 
@@ -64,7 +64,7 @@ def unknown_zone() -> Object:
         "spec": {
             "type": "GeofenceControl",
             "kind": "exclusion",
-            "selector": {"zones": ["atlantis"], "applications": {"names": ["nobody"]}},
+            "selector": {"zones": ["atlantis"], "applications": {"names": ["no one"]}},
         },
     }
 

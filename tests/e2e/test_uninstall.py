@@ -1,4 +1,4 @@
-"""Fractus is not uninstalled while somebody needs it."""
+"""Fractus is not uninstalled while someone needs it."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
 
 LONG = ("test_scenario_field", "test_sdk_flight", "test_mobility_sdk", "test_mobility_lost")
-"""Modules whose flights take longest: what begins first lets nobody wait for it at the end."""
+"""Modules whose flights take longest: what begins first lets no one wait for it at the end."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -432,7 +432,7 @@ def xy(position: types_pb2.Position) -> tuple[float, float]:
 
 
 def _drive(address: str, files: str) -> None:
-    """The driver process: take off, then hover for ever."""
+    """The driver process: take off, then hover indefinitely."""
     ca, key, certificate = (Path(f"{files}.{name}").read_bytes() for name in ("ca", "key", "crt"))
     credentials = grpc.ssl_channel_credentials(ca, key, certificate)
     options = [("grpc.ssl_target_name_override", node_server_name(NODE))]

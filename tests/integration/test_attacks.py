@@ -193,7 +193,7 @@ async def test_a_clock_that_is_set_back_revives_no_certificate(rig: Rig, monkeyp
 # Methods
 
 
-async def test_nobody_calls_anothers_methods(rig: Rig) -> None:
+async def test_no_one_calls_anothers_methods(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.write_grant(passenger_grant(services=[{"service": "camera", "methods": ["ListImages"]}]))
     rig.start_service()
@@ -320,7 +320,7 @@ async def test_a_flood_of_one_leaves_the_others_served(rig: Rig) -> None:
     ended = told["ended"]
     assert set(ended) <= {"OK", "RESOURCE_EXHAUSTED", "SHED"}
     assert sum(ended.values()) == told["sent"]
-    assert 0 < ended["OK"] <= BURST + CALLS_PER_S * told["seconds"] + 1, "as many as anybody gets in this time, no more"
+    assert 0 < ended["OK"] <= BURST + CALLS_PER_S * told["seconds"] + 1, "as many as anyone gets in this time, no more"
     assert told["hints"] == ended["RESOURCE_EXHAUSTED"] > 0, "each that the service refuses is told when to try again"
     assert len(answers) > 10
 

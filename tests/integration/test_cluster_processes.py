@@ -172,14 +172,14 @@ def test_lock_is_held_by_one_and_freed_by_death(tmp_path: Path) -> None:
         assert holder.stdout.readline() == "held\n"
         said: list[str] = []
         with (
-            pytest.raises(ClusterError, match="somebody builds"),
-            locked(path, timeout_s=0.3, what="somebody builds", report=said.append),
+            pytest.raises(ClusterError, match="someone builds"),
+            locked(path, timeout_s=0.3, what="someone builds", report=said.append),
         ):
             pytest.fail("two hold the lock")
-        assert said == ["waiting: somebody builds"]
+        assert said == ["waiting: someone builds"]
         holder.kill()
         holder.wait(timeout=10)
-    with locked(path, timeout_s=5, what="nobody", remove=True):
+    with locked(path, timeout_s=5, what="no one", remove=True):
         assert path.exists()
     assert not path.exists()
 

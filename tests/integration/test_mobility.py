@@ -199,7 +199,7 @@ async def test_cancelling_a_motion_stops_the_drone(rig: Rig) -> None:
     assert xy(still.position)[1] < 70
 
 
-async def test_a_flood_of_calls_harms_nobody_else(rig: Rig) -> None:
+async def test_a_flood_of_calls_harms_no_one_else(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.write_grant(passenger_grant())
     rig.start_service()

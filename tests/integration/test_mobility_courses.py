@@ -117,7 +117,7 @@ async def test_passengers_without_a_driver_are_flown_through_their_points(rig: R
     rig.start_vehicle(3.0)
     await rig.until(lambda t: t.ready, 30)
     await asyncio.sleep(0)
-    assert not (await rig.telemetry()).armed, "nobody is aboard yet"
+    assert not (await rig.telemetry()).armed, "no one is aboard yet"
     stub = rig.stub(PASSENGER)
 
     async def ride() -> list[Any]:

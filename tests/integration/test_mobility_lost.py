@@ -268,7 +268,7 @@ async def told(driver: Driver, reason: str) -> None:
             pass
 
 
-async def test_a_driver_lost_during_the_transits_takeoff_strands_nobody(rig: Rig) -> None:
+async def test_a_driver_lost_during_the_transits_takeoff_strands_no_one(rig: Rig) -> None:
     rig.write_grant(partial())
     rig.start_service()
     rig.start_vehicle()

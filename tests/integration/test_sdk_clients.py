@@ -198,7 +198,7 @@ async def test_a_finished_mission_says_so(stage: Stage) -> None:
     async with stage.client() as drone:
         with pytest.raises(fractus.MissionComplete):
             async with drone.control():
-                pytest.fail("nobody drives after the mission")
+                pytest.fail("no one drives after the mission")
 
 
 async def test_a_flight_survives_a_restart_of_the_service(stage: Stage) -> None:

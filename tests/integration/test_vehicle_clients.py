@@ -1,4 +1,4 @@
-"""Clients that nobody here wrote fly the vehicle: MAVProxy, DroneKit, MAVSDK, and plans of QGroundControl.
+"""Clients that no one here wrote fly the vehicle: MAVProxy, DroneKit, MAVSDK, and plans of QGroundControl.
 
 They are development dependencies, so CI has them; FRACTUS_CLIENTS_PYTHON names another interpreter to run them in.
 """

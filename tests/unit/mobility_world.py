@@ -162,7 +162,7 @@ class Plane(MavlinkAutopilot):
             self.speed_mps = outgoing.real("param2")
         elif number == MAV_CMD.DO_REPOSITION:
             if not self.positions:
-                self.positions, self.speed_mps = True, DEFAULT_MPS  # its position controller begins anew
+                self.positions, self.speed_mps = True, DEFAULT_MPS  # its position controller begins again
             self.goal = FRAME.xy(outgoing.integer("x") / 1e7, outgoing.integer("y") / 1e7)
             self.goal_height, self.wanted = outgoing.real("z"), None
         elif number == MAV_CMD.CONDITION_YAW:

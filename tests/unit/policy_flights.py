@@ -361,7 +361,7 @@ def flights(seed: int, count: int, shared: int = 8, requests: int = 3) -> Tally:
                 break
             found = fleet.trespassing() & ~pardoned
             for i in np.flatnonzero(found.any(axis=1)):
-                # Where wind takes a drone that nothing was permitted to is nobody's doing.
+                # Where wind takes a drone that nothing was permitted to is no one's doing.
                 if not told[i]:
                     continue
                 tally.wrong.append(f"seed {seed}, drone {i}, turn {turn}, {fleet.time_s:.2f} s: {told[i]}")

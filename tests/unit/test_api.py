@@ -58,7 +58,7 @@ def test_sentences_of_bad_applications():
         ([edge_component(locations=[{"center": plain, "radius": -1}])], "spec.components[0].locations[0].radius: input should be greater than 0, not -1"),
         ([edge_component(locations=[{"center": plain, "radius": 1, "instances": 0}])], "spec.components[0].locations[0].instances: instances is a whole number of 1 to 10000, or"),
         ([edge_component(locations=[])], "spec.components[0].locations: locations are needed for placement edge"),
-        ([STORE | {"egress": ["Nobody"]}], "spec.components[0].egress[0]: egress names a component that the application does not have (Nobody)"),
+        ([STORE | {"egress": ["Stranger"]}], "spec.components[0].egress[0]: egress names a component that the application does not have (Stranger)"),
         ([STORE | {"egress": ["DataStore"]}], "spec.components[0].egress[0]: egress names the component itself; remove it (DataStore)"),
         ([edge_component(services=[{"service": "camera", "methods": ["Fly"]}])], "spec.components[0].services[0].methods[0]: input should be 'Arm'"),
         ([edge_component(services=[{"service": "camera", "methods": ["Goto"]}])], "spec.components[0].services[0].methods[0]: the camera service has CaptureImage, DeleteImage"),

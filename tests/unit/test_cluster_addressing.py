@@ -1,4 +1,4 @@
-"""Addresses of clusters: free, disjoint, and the same for a node for ever."""
+"""Addresses of clusters: free, disjoint, and the same for a node indefinitely."""
 
 from __future__ import annotations
 

@@ -161,9 +161,9 @@ def test_a_mission_that_never_flew_is_reported_too(tmp_path: Path) -> None:
 
 
 def test_a_drone_still_in_the_air_has_not_landed(record: Record) -> None:
-    aloft = replace(record, samples=record.samples[:100])
-    assert aloft.landing_s is None
-    assert "is still in the air" in summary(aloft)
+    flying = replace(record, samples=record.samples[:100])
+    assert flying.landing_s is None
+    assert "is still in the air" in summary(flying)
 
 
 def test_a_record_is_read_from_the_files_of_the_demo(tmp_path: Path, record: Record) -> None:

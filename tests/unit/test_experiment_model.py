@@ -65,7 +65,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "no such check": ({"checks": [{"check": "x"}]}, "checks[0].check: there is no x; there are landed, neverFlew"),
     "no fault named": ({"faults": [{"at": 1}]}, "faults[0].fault: is missing"),
     "fault without time": ({"faults": [{"fault": "gpsLoss"}]}, "at"),
-    "fault for nobody": ({"faults": [{**GUST, "vehicles": ["e"]}]}, "faults[0].vehicles: there is no vehicle e"),
+    "fault for no one": ({"faults": [{**GUST, "vehicles": ["e"]}]}, "faults[0].vehicles: there is no vehicle e"),
     "link of another mode": ({"faults": [{"fault": "linkLoss", "at": 1, "link": "uplink"}]}, "use groundStation"),
     "no node to power off": ({"faults": [{"fault": "nodePowerOff", "at": 1}]}, "mode standalone or cluster"),
     "half a place": (

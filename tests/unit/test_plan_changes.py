@@ -68,7 +68,7 @@ def test_what_runs_gives_way_where_there_is_no_other_plan():
     assert set(map(where, after.placements)) == {("First", "e1")}
 
 
-def test_a_drone_that_took_someone_along_is_judged_anew_when_it_is_to_fly_for_him():
+def test_a_drone_that_took_someone_along_is_judged_again_when_it_is_to_fly_for_him():
     app = passenger([at(120, 0), at(250, 3)])
     along = plan(app, shared([drone("b", battery=0.21)], {"b": flown_by_other()}))
     with pytest.raises(Infeasible) as caught:

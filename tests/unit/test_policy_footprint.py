@@ -211,7 +211,7 @@ def test_policies_name_their_filters() -> None:
 def test_descriptions_tell_the_lens() -> None:
     fields = {"methods": ["CaptureImage"], "resolution": "1600x900", "horizontalFieldOfView": 90}
     assert lens_of(None) is None
-    assert lens_of(CameraFeatures.model_validate(fields)) is None, "nobody knows where it looks"
+    assert lens_of(CameraFeatures.model_validate(fields)) is None, "no one knows where it looks"
     lens = lens_of(CameraFeatures.model_validate({**fields, "mount": {"pitch": -60, "stabilised": True}}))
     assert lens is not None
     assert (lens.pitch_deg, lens.stabilised) == (-60, True)

@@ -179,7 +179,7 @@ def test_datums_of_bands() -> None:
     sunk = replace(high, home=Home(39.36, 22.95, 80.0))
     assert ask(amsl, push, sunk).action == "deny", "home lies lower, and so does the drone"
     terrain = exclusion(box(50, -20, 80, 20), lower=0, upper=15, reference="terrain")
-    assert ask(compiled(terrain, services=SERVICES), push, high).action == "deny", "nobody knows the terrain"
+    assert ask(compiled(terrain, services=SERVICES), push, high).action == "deny", "no one knows the terrain"
     assert ask(compiled(terrain, services=SERVICES, flat_terrain=True), push, high).action == "allow"
 
 

@@ -84,7 +84,7 @@ def test_bands_and_limits_of_altitude() -> None:
     above_terrain = free(
         altitude(zones=[zone("low", box(-100, 40, 30, 50))], upperLimit=15, altitudeReference="terrain")
     )
-    assert len(find(above_terrain, (0, 0), (0, 100)) or ()) == 3, "nobody knows how high that is"
+    assert len(find(above_terrain, (0, 0), (0, 100)) or ()) == 3, "no one knows how high that is"
 
 
 def test_inside_an_inclusion_zone() -> None:

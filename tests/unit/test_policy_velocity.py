@@ -45,7 +45,7 @@ def test_impossible_velocities(args: VelocityArgs | None) -> None:
     assert ask(compiled(), Call("SetVelocity", args)).code == "InvalidArgument"
 
 
-def test_nobody_flies_blind() -> None:
+def test_no_one_flies_blind() -> None:
     from fractus_core.policy.values import Situation
 
     assert ask(compiled(operationArea=[]), fly(1), Situation(time_s=0)).code == "PositionUnknown"
@@ -152,7 +152,7 @@ def test_a_drone_beyond_its_limits_is_led_back() -> None:
     assert (low.code, flown(low).down_mps) == ("AltitudeBelowLimit", -1.0)
 
 
-def test_nobody_flies_into_the_ground() -> None:
+def test_no_one_flies_into_the_ground() -> None:
     verdict = ask(compiled(), fly(0, 0, 3, hold=2.0), at(alt=5))
     assert verdict.code == "AltitudeBelowLimit"
     assert 0 < flown(verdict).down_mps < 1.5

@@ -1,4 +1,4 @@
-"""Ports for programs that are told where to listen: nobody else gets them, not even between two starts."""
+"""Ports for programs that are told where to listen: no one else gets them, not even between two starts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ while True:
 
 @pytest.fixture
 def ten(monkeypatch: pytest.MonkeyPatch) -> Iterator[range]:
-    """The only ten ports there are: nobody has one, and no other run of these tests has them meanwhile."""
+    """The only ten ports there are: no one has one, and no other run of these tests has them meanwhile."""
     own: deque[socket.socket] = deque()
     with ExitStack() as claims:
         first = next(first for first in range(19_000, 20_000, 10) if claimed(claims, first))
@@ -61,7 +61,7 @@ def test_no_other_process_gets_our_ports_and_theirs_are_free_when_they_end(ten: 
     assert given_to_another_process(ten) == theirs
 
 
-def test_a_port_where_somebody_listens_is_not_given(ten: range) -> None:
+def test_a_port_where_another_listens_is_not_given(ten: range) -> None:
     free = given_to_another_process(ten)
     with socket.socket() as taken, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
         taken.bind(("0.0.0.0", min(free)))
@@ -82,5 +82,5 @@ def test_the_oldest_reservations_end_first(ten: range, monkeypatch: pytest.Monke
     assert given_to_another_process(ten) == set(ten) - set(given[-2:])
 
 
-def test_ports_lie_below_what_linux_and_kubernetes_give_to_anybody_and_above_what_is_usual_for_mavlink() -> None:
+def test_ports_lie_below_what_linux_and_kubernetes_give_to_anyone_and_above_what_is_usual_for_mavlink() -> None:
     assert all(18_570 < ports.free_port() < 30_000 for _ in range(50))

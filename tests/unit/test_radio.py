@@ -94,7 +94,7 @@ def test_frames_arrive_in_order_and_once() -> None:
             found += [arrival.frame for arrival in medium.advance(now)]
     assert len(found) == len(set(found))
     assert found == sorted(found)
-    assert len(found) < len(sent)  # after so many attempts a frame is given up
+    assert len(found) < len(sent)  # after the last attempt a frame is given up
 
 
 def test_only_stations_of_a_network_in_reach_hear_each_other() -> None:

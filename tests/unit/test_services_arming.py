@@ -71,7 +71,7 @@ FRESH = Checked("", (), Airframe(retraces=True), 8.0, remembers=True)
 
 @pytest.mark.parametrize("found", [None, FRESH])
 @pytest.mark.parametrize("during", ["choice", "fence", "mode"])
-def test_failsafes_that_are_set_anew_meanwhile_forbid_arming(
+def test_failsafes_that_are_set_again_meanwhile_forbid_arming(
     tmp_path: Path, during: str, found: Checked | None
 ) -> None:
     async def flight() -> None:

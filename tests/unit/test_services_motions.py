@@ -1,4 +1,4 @@
-"""Motions that meet: one begins while another ends, and nobody loses sight of the drone in between."""
+"""Motions that meet: one begins while another ends, and no one loses sight of the drone in between."""
 
 from __future__ import annotations
 

@@ -126,7 +126,7 @@ def test_a_second_stream_of_the_driver_ends_the_setpoint_of_the_first(tmp_path: 
             await world.service.set_velocity(grant, VelocityArgs(4.0, 0.0, hold_s=2.0))
             await world.drive(grant)
             await asyncio.sleep(0.3)
-            assert world.plane.wanted == (0.0, 0.0, 0.0), "nobody watches it but us"
+            assert world.plane.wanted == (0.0, 0.0, 0.0), "no one watches it but us"
             assert world.control.motion is None
             await world.service.set_velocity(grant, VelocityArgs(0.0, 2.0, hold_s=0.5))
             assert world.plane.wanted == (2.0, 0.0, 0.0)

@@ -75,7 +75,7 @@ operations = st.lists(
 
 @given(places, operations)
 @settings(deadline=None)
-def test_an_index_that_followed_every_change_equals_one_made_anew(centre, changes):
+def test_an_index_that_followed_every_change_equals_one_made_again(centre, changes):
     index, points = SpatialIndex(), {}
     for name, target in changes:
         if target is None:

@@ -56,7 +56,7 @@ def test_values_that_do_not_fit_are_the_nearest_that_do():
         Parameters({"WPNAV_SPEED": math.nan})
 
 
-@pytest.mark.parametrize("content", [b"a letter to somebody\n", b"WPNAV_SPEED,fast\n", b"\xff\xfe"])
+@pytest.mark.parametrize("content", [b"a letter to someone\n", b"WPNAV_SPEED,fast\n", b"\xff\xfe"])
 def test_a_file_that_holds_no_parameters_is_neither_read_nor_replaced(content: bytes, tmp_path: Path):
     store = tmp_path / "store"
     store.write_bytes(content)

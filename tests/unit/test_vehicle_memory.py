@@ -88,7 +88,7 @@ def test_it_does_not_reboot_in_the_air():
     assert pilot.craft.vehicle.state is vehicle
 
 
-def test_signing_shuts_out_whoever_has_no_key():
+def test_signing_shuts_out_clients_without_a_key():
     _, pilot = alone()
     key = hashlib.sha256(b"secret").digest()
     target = {"target_system": 1, "target_component": 1}

@@ -1,4 +1,4 @@
-"""The loop that keeps a vehicle in real time: how often it wakes, and that nobody on a link can tell."""
+"""The loop that keeps a vehicle in real time: how often it wakes, and that no one on a link can tell."""
 
 from __future__ import annotations
 

@@ -157,7 +157,7 @@ def test_standing_face_is_hidden_from_behind(world: World) -> None:
 
 
 def test_every_variation_shows_its_face_where_it_says() -> None:
-    """A face detector that nobody here wrote finds it there."""
+    """A face detector that no one here wrote finds it there."""
     cascade = pytest.importorskip("skimage.feature").Cascade
     from skimage import data
 

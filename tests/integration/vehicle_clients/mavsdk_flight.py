@@ -118,7 +118,7 @@ async def missions(missions: mission.MissionAsync, raw: mission_raw.MissionRawAs
         )
         for north, east, altitude in ((10, 0, 10.0), (10, 10, 12.0), (0, 10, 10.0))
     ]
-    # MAVSDK fills the parameters of its own return with NaN, which ArduPilot refuses; so must whoever claims to be one.
+    # MAVSDK fills the parameters of its own return with NaN, which ArduPilot refuses; so must a client that claims to be one.
     await missions.set_return_to_launch_after_mission(True)
     try:
         await missions.upload_mission(MissionPlan(items))

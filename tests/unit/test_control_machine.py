@@ -14,6 +14,7 @@ from fractus_core.control import events as told
 from fractus_core.control.actions import (
     Action,
     EndStream,
+    RecordAudit,
     RefuseStream,
     SaveJournal,
     SendEvent,
@@ -284,7 +285,10 @@ def test_a_lost_driver_has_its_grace_and_then_the_vehicle_comes_home() -> None:
     assert state.task == SystemTask(1, TaskKind.HOVER)
     assert state.grace == Grace(5.0, "a", "driver lost")
     assert transition(state, told.Tick(), 4.9)[0].task == state.task
-    home, _ = transition(state, told.Tick(), 5.0)
+    home, actions = transition(state, told.Tick(), 5.0)
+    assert [action.code for action in actions if isinstance(action, RecordAudit)] == ["DriverLost"], (
+        "by the deadline alone"
+    )
     assert home.task == SystemTask(2, TaskKind.RETURN)
     assert home.missions["a"].outcome == Outcome(OutcomeKind.FAILED, "driver lost")
 
@@ -305,6 +309,14 @@ def test_a_cancelled_motion_hovers_for_a_driver_that_is_still_there() -> None:
     assert gone.motion is None
     _, actions = transition(state, told.Tick(), 0.3)
     assert [type(action).__name__ for action in actions] == ["StopMotion", "HoldPosition"]
+
+
+def test_a_vehicle_that_a_pilot_hands_back_waits_for_its_driver() -> None:
+    loiter, guided = (told.VehicleObserved(replace(FLYING, mode=mode)) for mode in (LOITER, GUIDED))
+    state, _ = told_of(*FLIES, loiter, told.Heartbeat(), guided, told.Heartbeat())
+    assert state.authority is Authority.SYSTEM
+    assert state.task == SystemTask(1, TaskKind.HOVER)
+    assert state.grace == Grace(5.0, "a", "driver lost")
 
 
 def test_a_mode_that_the_system_did_not_ask_for_is_a_pilots() -> None:

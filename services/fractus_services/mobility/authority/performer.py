@@ -179,12 +179,14 @@ class Performer:
         running.add_done_callback(ended)
 
     async def _carry_out(self, task: SystemTask) -> None:
-        """What the system wants, as long as it has the drone."""
-        await self._modes.carry_out(task.kind, self._system_commands, self._approach)
+        """What the system wants, as long as it has the drone and wants this."""
+        await self._modes.carry_out(task.kind, lambda: self._counts(task), self._approach)
         self._machine.dispatch(SystemTaskEnded(task.task_id, finished=True))
 
-    def _system_commands(self) -> bool:
-        return self._machine.state.authority is Authority.SYSTEM
+    def _counts(self, task: SystemTask) -> bool:
+        """Whether a task may still command: one that stopped itself, or is not cancelled yet, must not fly against the next."""
+        state = self._machine.state
+        return state.task == task and state.authority is Authority.SYSTEM
 
     # Motions of the driver
 

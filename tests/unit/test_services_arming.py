@@ -42,7 +42,7 @@ def test_who_asks_twice_arms_once(tmp_path: Path) -> None:
             await end(world.service.take_off(grant, TakeoffArgs(10.0)))
             await second
             assert slow.began_armed == [False], "nothing is prepared under a drone that flies"
-            assert world.plane.commands.count(400) == 1
+            assert world.plane.commands.count(MAV_CMD.COMPONENT_ARM_DISARM) == 1
             assert world.plane.vehicle.armed
 
     fly(flight)
@@ -60,7 +60,7 @@ def test_who_waits_to_arm_must_still_be_allowed_to(tmp_path: Path) -> None:
             for call in calls:
                 await refusal(call)
             assert slow.began_armed == [False]
-            assert 400 not in world.plane.commands
+            assert MAV_CMD.COMPONENT_ARM_DISARM not in world.plane.commands
 
     fly(flight)
 
@@ -149,7 +149,7 @@ def test_nothing_arms_without_its_fence(tmp_path: Path) -> None:
             why = await refusal(world.service.arm(grant))
             assert why.verdict.code == "FenceNotRaised"
             assert "no space" in str(why)
-            assert 400 not in world.plane.commands
+            assert MAV_CMD.COMPONENT_ARM_DISARM not in world.plane.commands
             world.fence.problem = None
             await world.service.arm(grant)
 
@@ -166,7 +166,7 @@ def test_nothing_arms_far_from_the_home_of_its_grant(tmp_path: Path) -> None:
             why = await refusal(world.service.arm(grant))
             assert why.verdict.code == "NotAtHome"
             assert "60 m away" in str(why)
-            assert 400 not in world.plane.commands
+            assert MAV_CMD.COMPONENT_ARM_DISARM not in world.plane.commands
 
     fly(flight)
 
@@ -188,6 +188,6 @@ def test_nothing_arms_that_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.M
             why = await refusal(world.service.arm(grant))
             assert why.verdict.code in {"JournalUnavailable", "AuditUnavailable"}
             assert "No space left" in str(why)
-            assert 400 not in world.plane.commands
+            assert MAV_CMD.COMPONENT_ARM_DISARM not in world.plane.commands
 
     fly(flight)

@@ -11,6 +11,7 @@ import pytest
 from fractus_core.control import Authority, StreamState
 from fractus_core.control.values import FlightMode
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, Verdict
+from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError, Refused
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority import drivers
@@ -367,7 +368,7 @@ def test_a_command_that_waits_is_not_sent_once_it_is_stale(tmp_path: Path, event
             world.plane.deaf = False
             why = await asking
             assert why.verdict.code in {"NotInControl", "ControlLost"}
-            assert 178 not in world.plane.commands, "the retry was dropped"
+            assert MAV_CMD.DO_CHANGE_SPEED not in world.plane.commands, "the retry was dropped"
             await world.until(lambda: not world.plane.vehicle.armed)
 
     fly(flight)
@@ -415,7 +416,7 @@ def test_a_leg_with_a_heading_waits_for_the_nose(tmp_path: Path) -> None:
             await world.up(grant)
             await end(world.service.goto(grant, goto(0, 30, yaw_deg=90.0), 0))
             assert world.plane.heading == 90.0
-            world.plane.refuses.add(115)
+            world.plane.refuses.add(MAV_CMD.CONDITION_YAW)
             with pytest.raises(AutopilotError, match="failed command CONDITION_YAW"):
                 await end(world.service.goto(grant, goto(0, 40, yaw_deg=180.0), 0))
 

@@ -10,6 +10,7 @@ import pytest
 import shapely
 from fractus_core.control.values import FlightMode
 from fractus_core.policy.values import GotoArgs
+from fractus_mavlink.enums import MAV_CMD
 from fractus_services.mobility.authority import drivers
 from mobility_world import LAND, RTL, SMART_RTL, World, at, end, fly, partial, refusal, spec, touring, zone
 
@@ -122,7 +123,7 @@ def test_no_fence_outlives_its_mission(tmp_path: Path, how: str) -> None:
             grant = world.grants.put(spec())
             if how in {"refused", "unused"}:
                 await world.drive(grant)
-                world.plane.refuses |= {400} if how == "refused" else set()
+                world.plane.refuses |= {MAV_CMD.COMPONENT_ARM_DISARM} if how == "refused" else set()
                 arming = asyncio.ensure_future(world.service.arm(grant))
                 await world.until(lambda: world.fence.raised)
                 await asyncio.wait([arming])
@@ -232,8 +233,8 @@ def test_a_fault_of_ours_ends_the_mission_once(tmp_path: Path, monkeypatch: pyte
             await world.until(world.outcome)
             assert world.outcome().startswith("failed: the mobility service has a fault")
             await world.until(lambda: not world.plane.vehicle.armed)
-            assert world.plane.commands.count(400) == 1, "not armed again"
+            assert world.plane.commands.count(MAV_CMD.COMPONENT_ARM_DISARM) == 1, "not armed again"
             await asyncio.sleep(20)
-            assert world.plane.commands.count(400) == 1
+            assert world.plane.commands.count(MAV_CMD.COMPONENT_ARM_DISARM) == 1
 
     fly(flight)

@@ -115,13 +115,7 @@ def _origin(_context: click.Context, _option: click.Parameter, text: str | None)
     type=click.Path(path_type=Path, file_okay=False),
     help="Geotagged pictures instead of a world: the one taken nearest is served; thermal ones in ir/ or named *_ir.",
 )
-def camera_world(**given: object) -> None:
-    """Serve what a camera above a simulated world sees: /snapshot.jpg, /truth.json, /orthophoto.png."""
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    _serve(**given)  # type: ignore[arg-type]
-
-
-def _serve(
+def camera_world(
     *,
     listen: tuple[str, int],
     vehicle: str,
@@ -138,6 +132,8 @@ def _serve(
     crs: str | None,
     photos: Path | None,
 ) -> None:
+    """Serve what a camera above a simulated world sees: /snapshot.jpg, /truth.json, /orthophoto.png."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     from fractus_world.camera_api import CameraApi  # noqa: PLC0415
     from fractus_world.photos import Photos  # noqa: PLC0415 - the command line stays quick
     from fractus_world.pose_provider import FixedPose, VehiclePose, parse_address  # noqa: PLC0415

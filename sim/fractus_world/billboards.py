@@ -163,7 +163,7 @@ def _portrait(variation: int) -> Picture:
     from skimage import data  # noqa: PLC0415 - only worlds with faces in sight pay for it
 
     left, top, right, bottom = _CROP
-    picture = np.asarray(data.astronaut()[top:bottom, left:right, ::-1], np.float64)  # type: ignore[no-untyped-call]
+    picture = np.asarray(data.astronaut()[top:bottom, left:right, ::-1], np.float64)  # type: ignore[no-untyped-call]  # the package has no types
     picture = picture / 255.0
     if variation % 2:
         picture = picture[:, ::-1]

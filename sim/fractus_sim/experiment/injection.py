@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -50,7 +50,7 @@ class Occurrence:
 class _Running:
     fault: Fault
     vehicle: str
-    steps: Generator[None, None, None]
+    steps: Iterator[None]
     index: int | None = None
     over: bool = False
 
@@ -108,7 +108,7 @@ class Injector:
         return fault.vehicles or tuple(self._observers)
 
     def _prepare(self, fault: Fault, vehicle: str) -> _Running:
-        running = _Running(fault, vehicle, iter(()))  # type: ignore[arg-type]
+        running = _Running(fault, vehicle, iter(()))
         running.steps = self._happen(running)
         return running
 

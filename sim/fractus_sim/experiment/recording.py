@@ -69,7 +69,7 @@ class McapLog:
 
     def close(self) -> None:
         """Write the index and close the file."""
-        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._writer.finish()  # type: ignore[no-untyped-call]  # the package has no types
         self._file.close()
 
 

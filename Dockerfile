@@ -87,11 +87,11 @@ RUN python3 -m pip install --quiet --no-cache-dir --break-system-packages --root
 COPY . /build/
 RUN uv build --quiet --wheel --no-build-isolation --out-dir /wheel \
  && uv pip install --quiet --no-deps --target /code /wheel/*.whl \
- && rm -rf /code/bin /code/.lock /code/fractus-*.dist-info/RECORD \
+ && rm -rf /code/bin /code/.lock /code/fractus_drones-*.dist-info/RECORD \
  && python3 -m compileall -q --invalidation-mode unchecked-hash -s /code -p /usr/local/lib/python3.11/dist-packages /code \
  && assemble() { target=$1; shift; mkdir -p /images/$target; \
       for name in fractus_proto "$@"; do cp -a /code/$name /images/$target/; done; \
-      cp -a /code/fractus-*.dist-info /images/$target/; } \
+      cp -a /code/fractus_drones-*.dist-info /images/$target/; } \
  && assemble component fractus fractus_cli \
  && assemble operator fractus_core fractus_kube fractus_operator \
  && assemble agent fractus_core fractus_kube fractus_storage fractus_agent \

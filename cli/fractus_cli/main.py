@@ -100,14 +100,14 @@ def _missing(name: str, entry: Entry, error: ImportError) -> click.Command:
     @click.argument("rest", nargs=-1, type=click.UNPROCESSED)
     def hint(rest: tuple[str, ...]) -> None:
         del rest
-        wanted = f"fractus[{entry.extra}]" if entry.extra else "fractus"
+        wanted = f"fractus-drones[{entry.extra}]" if entry.extra else "fractus-drones"
         raise click.ClickException(f"`fractus {name}` needs {lacking}; install it with: pip install '{wanted}'")
 
     return hint
 
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(package_name="fractus", prog_name="fractus", message="%(prog)s %(version)s")
+@click.version_option(package_name="fractus-drones", prog_name="fractus", message="%(prog)s %(version)s")
 def fractus() -> None:
     """Run, check and watch Fractus: drones, edge and cloud under stakeholders' policies."""
 

@@ -123,3 +123,12 @@ def test_documents_name_files_that_exist(document: Path) -> None:
     text = document.read_text()
     named = [ROOT / name for name in FILE.findall(text)] + [document.parent / name for name in LINK.findall(text)]
     assert [str(path) for path in named if "NNNN" not in path.name and not path.exists()] == []
+
+
+def test_no_document_installs_another_projects_distribution() -> None:
+    """`fractus` on PyPI is not ours: a reader who copied such a command would run foreign code."""
+    told = [path for pattern in ("*.md", "*.py", "*.toml", "Dockerfile") for path in ROOT.rglob(pattern)]
+    ours = [path for path in told if not re.search(r"/(\.[a-z_]+|out|dist)/", str(path.relative_to(ROOT.parent)))]
+    foreign = re.compile(r"(pip install|uv add|uv pip install)[^\n]*\bfractus(?!-drones|_)\b|[\"']fractus\[")
+    assert ours
+    assert [str(path) for path in ours if path != Path(__file__) and foreign.search(path.read_text())] == []

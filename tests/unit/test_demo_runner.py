@@ -13,9 +13,9 @@ import yaml
 from click.testing import CliRunner
 from fractus_sim.demo import collect, watch
 from fractus_sim.demo.__main__ import demo
+from fractus_sim.demo.clusters import ROOT, assign
 from fractus_sim.demo.collect import fetch_logs, spread
 from fractus_sim.demo.kube import DemoError, Kube
-from fractus_sim.demo.place import ROOT, assign
 from fractus_sim.demo.watch import Mission
 from fractus_sim.report.record import Record, of_mission, taken_s
 

@@ -10,8 +10,8 @@ import click
 from rich.console import Console
 from rich.markdown import Markdown
 
+from fractus_sim.demo.clusters import CurrentCluster, EmbeddedCluster
 from fractus_sim.demo.kube import DemoError
-from fractus_sim.demo.place import Current, Embedded
 from fractus_sim.demo.runner import ClusterError, Demo, Teller, report_again
 from fractus_sim.interruption import break_off_on_signals
 
@@ -57,8 +57,8 @@ def demo(
             fine = True
         else:
             tell = Teller(console)
-            place = Embedded(tell) if cluster == "embedded" else Current(tell, assign)
-            fine = Demo(place, out, keep, timeout_s, tell).run()
+            chosen = EmbeddedCluster(tell) if cluster == "embedded" else CurrentCluster(tell, assign)
+            fine = Demo(chosen, out, keep, timeout_s, tell).run()
     except (DemoError, ClusterError) as error:
         click.echo(f"demo: {error}", err=True)
         sys.exit(1)

@@ -14,9 +14,9 @@ from fractus_cluster.errors import ClusterError
 from fractus_core.api.nodes import GROUNDED
 from rich.console import Console
 
+from fractus_sim.demo.clusters import EXAMPLE, ROOT, DemoCluster, documents
 from fractus_sim.demo.collect import collect, fetch_pictures
 from fractus_sim.demo.kube import SYSTEM, DemoError, Kube, Object
-from fractus_sim.demo.place import EXAMPLE, ROOT, Place, documents
 from fractus_sim.demo.watch import Mission, follow, wait_ready
 from fractus_sim.interruption import uninterrupted
 from fractus_sim.report import Record, write_report
@@ -73,13 +73,13 @@ class Demo:
     """One run.
 
     Attributes:
-        place: the cluster.
+        cluster: where it runs.
         out: folder of the report.
         keep: leave cluster, Fractus and objects as they are at the end.
         timeout_s: how long the mission may take.
     """
 
-    place: Place
+    cluster: DemoCluster
     out: Path
     keep: bool
     timeout_s: float
@@ -104,9 +104,9 @@ class Demo:
         installed: list[str] = []
         try:
             with self.tell.step("images"):
-                self.place.images()
+                self.cluster.images()
             with self.tell.step("cluster"):
-                kube = self.place.up()
+                kube = self.cluster.up()
             with self.tell.step("what an earlier run left"):
                 self._remove_application(kube)
             with self.tell.step("Fractus"):
@@ -119,11 +119,11 @@ class Demo:
 
     def _install(self, kube: Kube, installed: list[str]) -> None:
         installed.extend(release for release in RELEASES if kube.install(release, ROOT / "charts" / release))
-        if self.place.disposable and "fractus" not in installed:  # images of the same name may have new content
+        if self.cluster.disposable and "fractus" not in installed:  # images of the same name may have new content
             kube.run(
                 "delete", "pods", "-n", SYSTEM, "-l", "app.kubernetes.io/name=fractus", "--timeout=60s", timeout_s=90
             )
-        hardware = self.place.hardware(kube)
+        hardware = self.cluster.hardware(kube)
         if hardware:
             kube.apply(hardware)
         kube.apply(self._surroundings())
@@ -155,13 +155,13 @@ class Demo:
             self.tell(f"no pictures of the flight: {error}")
 
     def _clean_up(self, kube: Kube | None, installed: list[str]) -> None:
-        if kube is not None and not self.place.disposable:
+        if kube is not None and not self.cluster.disposable:
             try:
                 self._remove(kube, installed)
             except DemoError as error:
                 self.tell(f"not removed: {error}")
         with uninterrupted():
-            self.place.down()
+            self.cluster.down()
 
     def _remove_application(self, kube: Kube) -> None:
         """Delete the application and wait until no drone is in the air."""
@@ -180,7 +180,7 @@ class Demo:
     def _remove(self, kube: Kube, installed: list[str]) -> None:
         self._remove_application(kube)
         if "fractus" in installed:
-            kube.delete([*self._surroundings(), *self.place.hardware(kube)], 60.0)
+            kube.delete([*self._surroundings(), *self.cluster.hardware(kube)], 60.0)
         for release in reversed(installed):
             kube.uninstall(release)
 

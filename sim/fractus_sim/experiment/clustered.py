@@ -16,8 +16,8 @@ from fractus_cluster.errors import ClusterError
 from fractus_cluster.images.build import build_images
 from fractus_cluster.spec import ClusterSpec, NodeSpec, VehicleHardware, load_spec
 
+from fractus_sim.demo.clusters import ROOT, documents
 from fractus_sim.demo.kube import DemoError, Kube
-from fractus_sim.demo.place import ROOT, documents
 from fractus_sim.demo.watch import wait_ready
 from fractus_sim.experiment.audits import read_audit
 from fractus_sim.experiment.errors import ExperimentError

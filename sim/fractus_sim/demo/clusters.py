@@ -37,7 +37,7 @@ def documents(path: Path) -> list[Object]:
         raise DemoError(f"cannot read {path}: {error.strerror}; run this in a checkout of Fractus") from None
 
 
-class Place(Protocol):
+class DemoCluster(Protocol):
     """A cluster that the demo can use.
 
     Attributes:
@@ -60,7 +60,7 @@ class Place(Protocol):
 
 
 @dataclass
-class Embedded:
+class EmbeddedCluster:
     """A cluster on this machine; taken down again unless it ran before."""
 
     say: Say
@@ -92,7 +92,7 @@ class Embedded:
 
 
 @dataclass
-class Current:
+class CurrentCluster:
     """The cluster of KUBECONFIG; images are there, and the example's nodes are assigned to its nodes."""
 
     say: Say

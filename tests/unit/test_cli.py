@@ -94,7 +94,7 @@ def test_a_command_whose_extra_is_missing_is_hidden_and_says_what_to_install(
 
 def test_version_and_bare_command(fractus: Callable[..., tuple[int, str, str]]) -> None:
     code, out, _ = fractus("--version")
-    assert (code, out) == (0, f"fractus {importlib.metadata.version('fractus')}\n")
+    assert (code, out) == (0, f"fractus {importlib.metadata.version('fractus-drones')}\n")
     code, out, _ = fractus()
     assert code == 0
     assert out.startswith("Usage: fractus")

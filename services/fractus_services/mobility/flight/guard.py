@@ -56,14 +56,8 @@ class Guard:
             verdict = judge(call, now, compiled or grant.compiled)
         except Exception:
             log.exception("guard: policy engine failed, call refused (method=%s)", call.method)
-            verdict = Verdict(
-                "deny",
-                None,
-                "InternalError",
-                f"the policy engine failed on {call.method}; nothing was done",
-                (),
-                "hover",
-            )
+            reason = f"the policy engine failed on {call.method}; nothing was done"
+            verdict = Verdict("deny", None, "InternalError", reason, (), "hover")
         if verdict != known and (call.method not in QUIET or not verdict.permits):
             self.record(call, grant.identity, verdict, now, kind=kind)
         return verdict

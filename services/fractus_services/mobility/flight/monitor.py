@@ -67,9 +67,8 @@ class MotionMonitor:
                     self.look()
                 except Exception:
                     log.exception("monitor: failed, the drone holds its position")
-                    self._control.brake(
-                        Verdict("deny", None, "InternalError", "the motion monitor failed", (), "hover")
-                    )
+                    reason = "the motion monitor failed"
+                    self._control.brake(Verdict("deny", None, "InternalError", reason, (), "hover"))
             try:
                 self._supervisor.tick()
             except Exception:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import json
+import os
+import stat
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -83,6 +85,43 @@ async def test_a_picture_of_an_earlier_release_has_an_unknown_place(tmp_path: Pa
     verdict, _, _ = await world.library.retrieve(active_grant(private("black")), shot.name)
     assert verdict.policies == ("p",)
     world.shutter.close()
+
+
+def modes(directory: Path) -> dict[str, set[int]]:
+    """Permissions of the folders and files of an album."""
+    found = [(path.is_dir(), stat.S_IMODE(path.stat().st_mode)) for path in directory.rglob("*")]
+    return {
+        "folders": {mode for is_dir, mode in found if is_dir},
+        "files": {mode for is_dir, mode in found if not is_dir},
+    }
+
+
+async def test_only_the_service_reads_pictures(world: World) -> None:
+    before = os.umask(0)
+    try:
+        plain = await world.capture(active_grant(private("black")))
+        world.drone.y = 0.0
+        filtered = await world.capture(active_grant(private("black")))
+    finally:
+        os.umask(before)
+    assert (bool(plain.filters), bool(filtered.filters)) == (False, True)
+    assert modes(world.directory) == {"folders": {0o700}, "files": {0o600}}
+
+
+async def test_pictures_of_an_earlier_release_are_closed_to_others(world: World) -> None:
+    shot = await world.capture(active_grant())
+    for path in world.directory.rglob("*"):
+        path.chmod(0o755 if path.is_dir() else 0o644)
+    foreign = world.directory.parent / "foreign"
+    foreign.write_bytes(b"not a picture")
+    foreign.chmod(0o644)
+    (folder,) = (path for path in world.directory.iterdir() if path.is_dir())
+    (folder / "20260101000000000-0001.json").symlink_to(foreign)
+    album = Album(world.directory, 50, 10**9)
+    (folder / "20260101000000000-0001.json").unlink(missing_ok=True)
+    assert modes(world.directory) == {"folders": {0o700}, "files": {0o600}}
+    assert stat.S_IMODE(foreign.stat().st_mode) == 0o644, "a link leads to no other file"
+    assert album.find(owner_of(active_grant()), shot.name) == shot
 
 
 async def test_a_full_disk_is_said_and_leaves_nothing_behind(world: World, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ import json
 import logging
 import re
 import shutil
+import stat
 import threading
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -20,7 +21,11 @@ from fractus_services.grants import ActiveGrant
 
 log = logging.getLogger(__name__)
 
+FOLDER_MODE, FILE_MODE = 0o700, 0o600
+"""No other user of the node reads pictures or their records, filtered or not: both tell where someone was."""
+
 _NAME = re.compile(r"[0-9]{17}-[0-9]{4}\.jpg")
+_FOLDER = re.compile(r"[0-9a-f]{32}")
 
 
 class AlbumFull(ResourceExhausted):
@@ -67,6 +72,7 @@ class Album:
         self._keep_total_bytes = keep_total_bytes
         self._owners = owners
         self._lock = threading.Lock()
+        self._close_to_others()
         self._tidy()
 
     def _folder(self, owner: str) -> Path:
@@ -111,11 +117,11 @@ class Album:
             if problem:
                 raise AlbumFull(problem)
             folder = self._folder(owner)
-            folder.mkdir(parents=True, exist_ok=True)
+            folder.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
             picture = folder / shot.name
             try:
-                write_file(picture, data, 0o644)
-                write_file(picture.with_suffix(".json"), json.dumps(shot.to_json()).encode(), 0o644)
+                write_file(picture, data, FILE_MODE)
+                write_file(picture.with_suffix(".json"), json.dumps(shot.to_json()).encode(), FILE_MODE)
             except OSError:
                 picture.unlink(missing_ok=True)
                 raise
@@ -174,6 +180,22 @@ class Album:
             if self._total() < self._keep_total_bytes:
                 return True
         return False
+
+    def _close_to_others(self) -> None:
+        """Give folders and pictures of an earlier release, which others could read, the modes of this one."""
+        # The state directory may hold folders of others beside those of owners.
+        folders = [path for path in self._directory.glob("*") if _FOLDER.fullmatch(path.name)]
+        for path in (inner for folder in folders for inner in (folder, *folder.glob("*"))):
+            try:
+                found = path.lstat().st_mode
+                wanted = FOLDER_MODE if stat.S_ISDIR(found) else FILE_MODE
+                # A symbolic link is none of the album's: chmod would follow it to a file elsewhere.
+                if not stat.S_ISLNK(found) and stat.S_IMODE(found) != wanted:
+                    path.chmod(wanted)
+            except OSError as error:
+                log.critical(
+                    "album: other users of the node may read this, chmod it by hand (path=%s): %s", path, error
+                )
 
     def _tidy(self) -> None:
         """Remove what can never be returned: unfinished files, and pictures without a readable record.

@@ -134,10 +134,9 @@ def camera_world(
 ) -> None:
     """Serve what a camera above a simulated world sees: /snapshot.jpg, /truth.json, /orthophoto.png."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    from fractus_world.camera_api import CameraApi  # noqa: PLC0415
-    from fractus_world.photos import Photos  # noqa: PLC0415 - the command line stays quick
+    from fractus_world.camera_api import CameraApi  # noqa: PLC0415 - the command line stays quick
+    from fractus_world.photos import Photos  # noqa: PLC0415
     from fractus_world.pose_provider import FixedPose, VehiclePose, parse_address  # noqa: PLC0415
-    from fractus_world.raster import read_raster  # noqa: PLC0415
     from fractus_world.server import CameraServer  # noqa: PLC0415
     from fractus_world.world import World, WorldAround  # noqa: PLC0415
 
@@ -147,7 +146,11 @@ def camera_world(
         poses: VehiclePose | FixedPose = VehiclePose(parse_address(vehicle), ground_amsl_m)
         if pose is not None:
             poses = FixedPose(pose, ground_amsl_m or 0.0)
-        own = None if orthophoto is None else World.on(read_raster(orthophoto, crs, origin), seed)
+        own = None
+        if orthophoto is not None:
+            from fractus_world.raster import read_raster  # noqa: PLC0415 - PROJ takes a second to load
+
+            own = World.on(read_raster(orthophoto, crs, origin), seed)
         album = None if photos is None else Photos.of(photos)
     except ValueError as error:
         raise click.ClickException(str(error)) from error

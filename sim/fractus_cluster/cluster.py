@@ -13,9 +13,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from fractus_kube import KubeError
-
-from fractus_cluster import machine, manifests, network
+from fractus_cluster import machine, network
 from fractus_cluster.binaries import ensure_binaries
 from fractus_cluster.cgroups import cluster_branch
 from fractus_cluster.commands import run
@@ -237,7 +235,7 @@ class Cluster:
         """Return how each node is."""
         memory = self._memory()
         cut = network.links_cut(self._wiring(memory))
-        ready = self._ready_nodes(memory)
+        ready = self._startup(memory).ready_nodes()
         return [
             NodeStatus(
                 node.name,
@@ -314,18 +312,6 @@ class Cluster:
 
     def _startup(self, memory: Memory) -> Startup:
         return Startup(self.name, self._state, self._wiring(memory), Authority(self._state.pki))
-
-    def _ready_nodes(self, memory: Memory) -> dict[str, bool] | None:
-        if not self.running:
-            return None
-        with self._startup(memory).api() as api:
-            try:
-                items = api.list("/api/v1/nodes")
-            except KubeError as error:
-                if error.status:
-                    raise
-                return None
-        return {item["metadata"]["name"]: manifests.is_ready(item) for item in items}
 
 
 def print_report(message: str) -> None:

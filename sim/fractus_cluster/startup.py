@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import datetime
 
-from fractus_kube import BlockingClient, Conflict
+from fractus_kube import BlockingClient, Conflict, KubeError
 
 from fractus_cluster import machine, manifests, network
 from fractus_cluster.addressing import Addressing
@@ -183,6 +183,19 @@ class Startup:
                 log = self.state.logs / CONTROL_PLANE / "coredns.log"
                 raise ClusterError(f"the cluster's DNS was not ready within {_DNS_TIMEOUT_S:.0f} s; see {log}")
             time.sleep(_POLL_S)
+
+    def ready_nodes(self) -> dict[str, bool] | None:
+        """Whether each node is Ready; None when the API server cannot be asked."""
+        if running(self.state.process(CONTROL_PLANE)) is None:
+            return None
+        with self.api() as api:
+            try:
+                items = api.list("/api/v1/nodes")
+            except KubeError as error:
+                if error.status:
+                    raise
+                return None
+        return {item["metadata"]["name"]: manifests.is_ready(item) for item in items}
 
     def _files(self) -> ControlPlaneFiles:
         return ControlPlaneFiles(self.state.control_plane, self.state.logs / CONTROL_PLANE)

@@ -199,7 +199,10 @@ async def test_asking_does_nothing(rig: Rig) -> None:
     state = await rig.telemetry()
     assert state.controller.startswith("spiffe://"), "the driver has the drone as before"
     assert math.dist(xy(state.position), (0, 0)) < 2.0
-    assert {e["action"] for e in rig.entries("check")} >= {"correct", "takeover", "deny"}
+    # The log is written by a thread, in order: what was written by now comes before this state.
+    await rig.until(
+        lambda _: {e["action"] for e in rig.entries("check")} >= {"correct", "takeover", "deny"}, 20, "the audit log"
+    )
     assert not rig.entries("takeover")
 
 

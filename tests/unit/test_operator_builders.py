@@ -10,7 +10,6 @@ import pytest
 import yaml
 from fractus_core.api import Application, Drone
 from fractus_core.api.plans import DeploymentPlanSpec, GrantApplication, GrantSpec
-from fractus_operator.cluster.labels import grant_name, label_value, object_name
 from fractus_operator.cluster.pods import PodView
 from fractus_operator.reconcile import builders
 
@@ -103,12 +102,3 @@ def test_an_unlimited_drone_keeps_its_pods_for_ever() -> None:
     tolerations = builders.deployment(APPLICATION, placed, bare)["spec"]["template"]["spec"]["tolerations"]
     assert all("tolerationSeconds" not in t for t in tolerations)
     assert {t["key"] for t in tolerations} >= {"node.kubernetes.io/unreachable", "node.kubernetes.io/not-ready"}
-
-
-def test_names_fit_and_differ() -> None:
-    long = "a" * 60
-    one, two = object_name(f"{long}-viewer-x"), object_name(f"{long}-viewer-y")
-    assert one != two
-    assert max(len(one), len(two), len(object_name("1st")), len(label_value("v" * 200))) <= 63
-    assert object_name("1st")[0].isalpha()
-    assert grant_name("a", "b-c") != grant_name("a-b", "c")

@@ -35,10 +35,56 @@ def is_subdomain(text: str) -> bool:
 
 
 def shortened(text: str, limit: int, *, digits: int = 8) -> str:
-    """The text with at most `limit` characters: a longer one ends in a hash of all of it."""
-    if len(text) <= limit:
+    """The text with at most `limit` characters, another one for every text: a longer one ends in a hash of all of it."""
+    if len(text) < limit or (len(text) == limit and not _ends_in_hash(text, digits)):
         return text
-    return text[: limit - digits - 1].rstrip("-._") + "-" + hashlib.sha256(text.encode()).hexdigest()[:digits]
+    return f"{text[: limit - digits - 1]}-{_hash(text, digits)}"
+
+
+def object_name(application: str, component: str, node: str | None = None, *, limit: int = 63) -> str:
+    """Name of what is made for a component of an application, on one node or on any: another one for every three.
+
+    It is a DNS label that begins with a letter, as Services need. The parts are joined by hyphens where the name can be
+    read back; all else ends in a hash of the parts, since hyphens within them do not tell where one part ends.
+
+    Args:
+        application: Its name.
+        component: The component's kebab-case name (`slug`).
+        node: The node; None: the one object of the component that no node shares in.
+        limit: How many characters it may have.
+    """
+    plain = "-".join(filter(None, (application, component, node)))
+    if len(plain) <= limit and _read(plain) == (application, component, node):
+        return plain
+    text = re.sub(r"[^a-z0-9]+", "-", plain.lower()).strip("-")
+    text = text if text[:1].isalpha() else f"a-{text}"
+    # No part has a slash, in what Kubernetes takes for a name.
+    unique = _hash("/".join((application, component, node or "")), _NAME_DIGITS)
+    return f"{text[: limit - _NAME_DIGITS - 1].rstrip('-')}-{unique}"
+
+
+_NAME_DIGITS = 10
+_READABLE = re.compile(
+    r"(?P<application>[a-z][a-z0-9]*)"
+    r"-(?P<component>[a-z][a-z0-9]*(-[a-z0-9]+)*?)"
+    r"(-(?P<node>[a-z]+-?[0-9]+))?"
+)
+"""How a joined name is read: an application without hyphens, and at the end, if it looks like one, a node such as edge-1."""
+
+
+def _read(name: str) -> tuple[str, str, str | None] | None:
+    found = _READABLE.fullmatch(name)
+    if found is None or _ends_in_hash(name, _NAME_DIGITS):
+        return None
+    return found["application"], found["component"], found["node"]
+
+
+def _hash(text: str, digits: int) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:digits]
+
+
+def _ends_in_hash(text: str, digits: int) -> bool:
+    return re.search(rf"-[0-9a-f]{{{digits}}}\Z", text) is not None
 
 
 def slug(component: str) -> str:

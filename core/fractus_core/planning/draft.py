@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 
 from fractus_core.api.applications import Application
 from fractus_core.api.components import Component
-from fractus_core.api.names import shortened
+from fractus_core.api.names import object_name
 from fractus_core.api.nodes import EdgeNode
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance, Rejection, Role, Serves
 from fractus_core.planning.candidates import Check, Ledger, check_host, check_resources, check_services
@@ -28,8 +28,8 @@ class Infeasible(Exception):
 
 
 def instance_name(application: str, component: Component, node: str | None = None) -> str:
-    """Name of an instance: a DNS label; a long one ends in a hash."""
-    return shortened("-".join(filter(None, (application, component.slug, node))).replace(".", "-"), _MAX_INSTANCE_NAME)
+    """Name of an instance, unique in the namespace: a DNS label with room for a suffix."""
+    return object_name(application, component.slug, node, limit=_MAX_INSTANCE_NAME)
 
 
 class Draft:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fractus_core.api import GROUP, Component
-from fractus_core.api.names import shortened
+from fractus_core.api.names import object_name, shortened
 
 APPLICATION_LABEL = f"{GROUP}/application"
 COMPONENT_LABEL = f"{GROUP}/component"
@@ -28,14 +28,9 @@ GEOHASH_LABEL = f"{GROUP}/geohash"
 INTERFACE_LABEL = f"{GROUP}/interface-"
 
 
-def object_name(text: str) -> str:
-    """A DNS label of at most 63 characters that begins with a letter, as Services need; long names end in a hash."""
-    return shortened(text if text[:1].isalpha() else f"a-{text}", 63)
-
-
 def service_name(application: str, component: Component) -> str:
     """Name of the Service of a component."""
-    return object_name(f"{application}-{component.slug}")
+    return object_name(application, component.slug)
 
 
 def grant_name(namespace: str, instance: str) -> str:
@@ -44,7 +39,7 @@ def grant_name(namespace: str, instance: str) -> str:
 
 
 def label_value(text: str) -> str:
-    """The text as a label value, which has at most 63 characters."""
+    """The text as a label value, which has at most 63 characters; another one for every text."""
     return shortened(text, 63)
 
 

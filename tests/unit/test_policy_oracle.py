@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from depth import examples
 from fractus_core.policy import legs, velocities
+from fractus_core.policy.engine import MIN_TAKEOFF_ALTITUDE_M
 from fractus_core.policy.limits import MIN_LEG_ALTITUDE_M
 from fractus_core.policy.values import Call, GotoArgs, TakeoffArgs
 from hypothesis import given, settings
@@ -189,6 +190,8 @@ def test_altitudes_against_a_plain_reading_of_the_rules(
             assert verdict.action == "deny"
         elif low and call.method == "Goto":
             assert verdict.code == "AltitudeTooLow"
+        elif call.method == "Takeoff" and want < MIN_TAKEOFF_ALTITUDE_M:
+            assert verdict.code == "ConflictingLimits", "no takeoff goes that low"
         else:
             assert verdict.permits
             flown = verdict.args.alt if isinstance(verdict.args, GotoArgs) else verdict.args.altitude_m  # type: ignore[union-attr]

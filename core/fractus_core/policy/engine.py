@@ -13,6 +13,7 @@ from fractus_core.api.methods import CONTROL_METHODS, Method
 from fractus_core.exhaustive import exhaustive
 from fractus_core.policy.access import judge_access
 from fractus_core.policy.compiled import CompiledGrant
+from fractus_core.policy.corrections import settled
 from fractus_core.policy.legs import judge_goto
 from fractus_core.policy.monitoring import must_rest
 from fractus_core.policy.motion import moving
@@ -55,13 +56,20 @@ def judge(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     """
     if not now.sound:
         now = _unsound(now)
+    verdict = _judge_once(call, now, grant)
+    if verdict.action == "correct" and call.method in _ARGS:
+        verdict = settled(call, verdict, lambda again: _judge_once(again, now, grant))
+    return replace(verdict, brake_first=True) if _must_brake(call, verdict, now, grant) else verdict
+
+
+def _judge_once(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
+    """The verdict on a call; what it corrects is not judged again."""
     problem = _check_arguments(call) or judge_access(call, now, grant)
     if problem is not None:
         return problem
     if call.method not in _RULES:
         return deny("MethodUnknown", f"the policy engine has no rule for {call.method}")
-    verdict = _RULES[call.method](call, now, grant)
-    return replace(verdict, brake_first=True) if _must_brake(call, verdict, now, grant) else verdict
+    return _RULES[call.method](call, now, grant)
 
 
 def _must_brake(call: Call, verdict: Verdict, now: Situation, grant: CompiledGrant) -> bool:
@@ -132,6 +140,7 @@ def _figures(call: Call) -> tuple[_Figure, ...]:
 _COURSES = frozenset({"Goto", "SetVelocity"})
 """Methods that give a flying drone another course."""
 
+# What of a picture is corrected is the picture, not the call.
 _ARGS: dict[str, type] = {
     "Takeoff": TakeoffArgs,
     "Goto": GotoArgs,

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import shapely
 
 from fractus_core.policy.compiled import Air, CompiledGrant, height_m
+from fractus_core.policy.corrections import caused
 from fractus_core.policy.fences import breaches, broken, last_legal
 from fractus_core.policy.limits import (
     MIN_LEG_ALTITUDE_M,
@@ -142,14 +143,24 @@ def _fly_leg(request: _Request, aim: _Aim, notes: list[Clamped], adjusting: bool
         return within
     leg = _leg(request.at, aim.target, now, within.altitude_m)
     found = breaches(leg, now, grant, margin_m(now), height_margin_m(now))
-    if not found:
-        return way_home_blocked(aim.target, within.altitude_m, now, grant) or within
-    shorter = last_legal(leg, found) if adjusting and all(b.action == "adjust" for b in found) else None
+    adjustable = adjusting and bool(found) and all(b.action == "adjust" for b in found)
+    shorter = last_legal(leg, found) if adjustable else None
     if shorter is None:
-        return broken(found)
+        problem = broken(found) if found else way_home_blocked(aim.target, within.altitude_m, now, grant)
+        if problem is None or within.altitude_m == aim.altitude_m:
+            return problem or within
+        return caused(problem, _objection(request, aim), corrected(None, notes))
     names = distinct(b.policy for b in found)
     notes.append(Clamped(0.0, "LegShortened", f"{found[0].reason}; the leg ends at the last legal point", names))
     return _fly_leg(request, replace(within, target=shorter), notes, adjusting=False)
+
+
+def _objection(request: _Request, aim: _Aim) -> Verdict | None:
+    """What fences and the way home have against a leg, its limits left aside."""
+    now, grant = request.now, request.grant
+    leg = _leg(request.at, aim.target, now, aim.altitude_m)
+    found = breaches(leg, now, grant, margin_m(now), height_margin_m(now))
+    return broken(found) if found else way_home_blocked(aim.target, aim.altitude_m, now, grant)
 
 
 def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Clamped]) -> _Aim | Verdict:

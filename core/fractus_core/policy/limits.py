@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -130,11 +131,12 @@ def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Clampe
         bounds: the limits in force.
 
     Returns:
-        The nearest value that every limit allows, or the denial of a limit that refuses, or of limits that contradict
-        each other.
+        The nearest value that every limit allows, or the denial of a limit that refuses, or that leaves no value, or of
+        limits that contradict each other.
     """
-    above = sorted((b for b in bounds if b.upper is not None and value > b.upper + SLACK), key=_strictest_upper)
-    below = sorted((b for b in bounds if b.lower is not None and value < b.lower - SLACK), key=_strictest_lower)
+    # Not `>` and `<`: a limit that is not a number would never be broken.
+    above = sorted((b for b in bounds if b.upper is not None and not value <= b.upper + SLACK), key=_strictest_upper)
+    below = sorted((b for b in bounds if b.lower is not None and not value >= b.lower - SLACK), key=_strictest_lower)
     if not above and not below:
         return Clamped(value)
     violated, side = (above, "Above") if above else (below, "Below")
@@ -150,6 +152,11 @@ def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Clampe
             f"{quantity.lower()} {value:.1f} {unit} breaks the limit of {limit:.1f} {unit} of {_source(bound)}, which refuses it",
             distinct(b.name for b in refusing),
         )
+    for bound in (*above, *below):
+        limit = bound.upper if bound in above else bound.lower
+        if not can_be_kept(quantity, limit):
+            reason = f"{quantity.lower()} {value:.1f} {unit} breaks the limit of {limit} {unit} of {_source(bound)}"
+            return deny(code, f"{reason}, which no motion can keep; correct the limit", distinct((bound.name,)))
     problem = conflict(quantity, unit, bounds)
     if problem is not None:
         return problem
@@ -164,16 +171,23 @@ def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Clampe
     )
 
 
+def can_be_kept(quantity: str, limit: float | None) -> bool:
+    """Whether a value may be corrected to a limit: any altitude that is a number, and any speed that moves a drone."""
+    return limit is not None and math.isfinite(limit) and (quantity != "Speed" or limit > 0)
+
+
 def conflict(quantity: str, unit: str, bounds: list[Bound]) -> Verdict | None:
     """The denial of any value, where limits contradict each other."""
     highest, lowest = _highest(bounds), _lowest(bounds)
     if lowest <= highest + SLACK:
         return None
-    every = distinct(b.name for b in bounds if b.upper == highest or b.lower == lowest)
+    high = [b for b in bounds if b.upper == highest]
+    low = [b for b in bounds if b.lower == lowest]
     return deny(
         "ConflictingLimits",
-        f"no {quantity.lower()} is at least {lowest:.1f} and at most {highest:.1f} {unit}; ask for another place",
-        every,
+        f"no {quantity.lower()} is at least {lowest:.1f} (as {_sources(low)} asks) and at most {highest:.1f} {unit}"
+        f" (as {_sources(high)} asks); ask for another place",
+        distinct(b.name for b in bounds if b in low or b in high),
     )
 
 
@@ -227,6 +241,10 @@ def _strictest_upper(bound: Bound) -> tuple[float, int, str]:
 
 def _strictest_lower(bound: Bound) -> tuple[float, int, str]:
     return (-(bound.lower if bound.lower is not None else float("-inf")), -bound.priority, bound.name)
+
+
+def _sources(bounds: list[Bound]) -> str:
+    return " and ".join(dict.fromkeys(_source(bound) for bound in bounds))
 
 
 def _source(bound: Bound) -> str:

@@ -11,7 +11,7 @@ from shapely.geometry.base import BaseGeometry
 from fractus_core.api.policies import GeofenceAction
 from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, PolicyZone
 from fractus_core.policy.fences import SEVERITY, TAKEOVERS, breaches, signed_depth_m
-from fractus_core.policy.limits import Bound, altitude_bounds, speed_bounds, strictest
+from fractus_core.policy.limits import Bound, altitude_bounds, can_be_kept, speed_bounds, strictest
 from fractus_core.policy.motion import XY, margin_m, moving, standing, stop_altitude_m, stop_point
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Situation, Verdict
 
@@ -247,4 +247,7 @@ def _speeds(now: Situation, grant: CompiledGrant, start: XY) -> Verdict | None:
     if over is None or over.upper is None or speed <= over.upper * 1.1 + 1.0:
         return None
     reason = f"the drone flies at {speed:.1f} m/s, above the limit of {over.upper:.1f} m/s"
-    return Verdict("correct", SetSpeedArgs(over.upper), "SpeedAboveLimit", reason, (over.name,) if over.name else ())
+    names = (over.name,) if over.name else ()
+    if not can_be_kept("Speed", over.upper):
+        return Verdict("deny", None, "SpeedAboveLimit", f"{reason}; the motion is stopped", names, "hover")
+    return Verdict("correct", SetSpeedArgs(over.upper), "SpeedAboveLimit", reason, names)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import shapely
 
 from fractus_core.policy.compiled import Air, CompiledGrant
+from fractus_core.policy.corrections import caused
 from fractus_core.policy.fences import Breach, breaches, broken
 from fractus_core.policy.legs import way_home_blocked
 from fractus_core.policy.limits import (
@@ -100,13 +101,25 @@ def judge_velocity(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     if at is None:
         return POSITION_UNKNOWN
     setpoint = _Setpoint(args, now, grant, at)
-    problem = _within_speed(setpoint) or _within_heights(setpoint) or _within_fences(setpoint)
-    if problem is None:
-        leg = setpoint.leg
-        problem = way_home_blocked(leg.target, leg.upper_m, now, grant)
+    problem = _within_speed(setpoint) or _within_heights(setpoint)
     if problem is not None:
         return problem
-    return corrected(setpoint.args, setpoint.notes)
+    limits = len(setpoint.notes)
+    problem = _within_fences(setpoint) or _way_home_blocked(setpoint)
+    if problem is None:
+        return corrected(setpoint.args, setpoint.notes)
+    if not limits:
+        return problem
+    setpoint.args = args
+    found = _breached(setpoint, args)
+    return caused(
+        problem, broken(found) if found else _way_home_blocked(setpoint), corrected(None, setpoint.notes[:limits])
+    )
+
+
+def _way_home_blocked(setpoint: _Setpoint) -> Verdict | None:
+    leg = setpoint.leg
+    return way_home_blocked(leg.target, leg.upper_m, setpoint.now, setpoint.grant)
 
 
 def _within_speed(setpoint: _Setpoint) -> Verdict | None:

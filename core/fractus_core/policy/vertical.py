@@ -5,6 +5,7 @@ from __future__ import annotations
 import shapely
 
 from fractus_core.policy.compiled import Air, CompiledGrant
+from fractus_core.policy.corrections import caused
 from fractus_core.policy.fences import breaches
 from fractus_core.policy.legs import way_home_blocked
 from fractus_core.policy.limits import altitude_bounds, clamp, corrected
@@ -22,8 +23,16 @@ def judge_takeoff(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     clamped = bounds if isinstance(bounds, Verdict) else clamp("Altitude", "m above home", args.altitude_m, bounds)
     if isinstance(clamped, Verdict):
         return clamped
-    problem = _column(at, now, grant, now.altitude_m, clamped.value) or way_home_blocked(at, clamped.value, now, grant)
-    return problem or corrected(TakeoffArgs(clamped.value), [clamped])
+    correction = corrected(TakeoffArgs(clamped.value), [clamped])
+    problem = _climb(at, now, grant, clamped.value)
+    if problem is None or not clamped.code:
+        return problem or correction
+    return caused(problem, _climb(at, now, grant, args.altitude_m), correction)
+
+
+def _climb(at: XY, now: Situation, grant: CompiledGrant, altitude_m: float) -> Verdict | None:
+    """What fences and the way home have against a climb."""
+    return _column(at, now, grant, now.altitude_m, altitude_m) or way_home_blocked(at, altitude_m, now, grant)
 
 
 def judge_arm(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:

@@ -11,6 +11,7 @@ import click
 
 from fractus_services.launch import DIRECTORY, FILE, address, until_signalled
 from fractus_services.options import CameraOptions, MobilityOptions
+from fractus_services.service_lock import DEFAULT_LOCK_TIMEOUT_S
 
 _DESCRIPTION = click.Path(path_type=Path)
 _COUNT = click.IntRange(min=1)
@@ -32,6 +33,12 @@ def _service_options(service: str, port: int, kinds: str, state: str) -> Callabl
         _option("--audit", f"/var/lib/fractus/audit/{service}.jsonl", "Audit log.", FILE),
         _option("--description", "/etc/fractus/node.yaml", f"{kinds} manifest of this node.", _DESCRIPTION),
         _option("--listen", f"[::]:{port}", "Address of the gRPC server.", callback=address),
+        _option(
+            "--lock-timeout",
+            DEFAULT_LOCK_TIMEOUT_S,
+            "Seconds to wait for another process with the same --state or --audit to end.",
+            _SECONDS,
+        ),
         click.option(
             "--node", envvar="FRACTUS_NODE", help="Name of this node; by default the description's, else the host's."
         ),
@@ -69,7 +76,7 @@ def serve_mobility(verbose: bool, **given: Any) -> None:
     """Serve until stopped; waits for certificates and for the autopilot."""
     from fractus_services.mobility.rpc.server import run  # noqa: PLC0415 - the command line stays quick
 
-    until_signalled(run, MobilityOptions(**given), logging.DEBUG if verbose else logging.INFO)
+    until_signalled("mobility", run, MobilityOptions(**given), logging.DEBUG if verbose else logging.INFO)
 
 
 @click.group()
@@ -110,4 +117,4 @@ def serve_camera(**given: Any) -> None:
     """Serve until stopped; waits for certificates."""
     from fractus_services.camera.rpc.server import run  # noqa: PLC0415 - the command line stays quick
 
-    until_signalled(run, CameraOptions(**given))
+    until_signalled("camera", run, CameraOptions(**given))

@@ -12,8 +12,10 @@ from typing import Any, TypeVar
 import click
 
 from fractus_services.errors import CannotServe
+from fractus_services.options import ServiceOptions
+from fractus_services.service_lock import ServiceLock
 
-_Options = TypeVar("_Options")
+_Options = TypeVar("_Options", bound=ServiceOptions)
 
 _MAX_PORT = 65535
 _UNIX_SOCKETS = ("unix:", "unix-abstract:")
@@ -35,12 +37,16 @@ def address(_context: click.Context, _parameter: click.Parameter, value: str) ->
 
 
 def until_signalled(
-    run: Callable[[_Options, asyncio.Event], Coroutine[Any, Any, None]], options: _Options, level: int = logging.INFO
+    service: str,
+    run: Callable[[_Options, asyncio.Event], Coroutine[Any, Any, None]],
+    options: _Options,
+    level: int = logging.INFO,
 ) -> None:
-    """Run a service until SIGTERM or SIGINT.
+    """Run a service until SIGTERM or SIGINT, once no other process runs it on this state directory.
 
     Args:
-        run: serves until the event is set.
+        service: its name.
+        run: serves until the event is set; opens all that only one process may have open.
         options: of the command line.
         level: of the log.
 
@@ -53,7 +59,10 @@ def until_signalled(
         stop = asyncio.Event()
         for number in (signal.SIGTERM, signal.SIGINT):
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
-        await run(options, stop)
+        lock = ServiceLock(service, options.state, options.audit)
+        if await lock.acquire(options.lock_timeout, stop):
+            with lock.watched():
+                await run(options, stop)
 
     try:
         asyncio.run(main())

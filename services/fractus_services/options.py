@@ -17,6 +17,7 @@ class ServiceOptions:
     node: str | None
     description: Path
     listen: str
+    lock_timeout: float
 
     @property
     def grant_memory(self) -> Path:

@@ -236,9 +236,9 @@ class Rig:
             "--ready-after", "2", *more,
         )  # fmt: skip
 
-    def start_service(self, *more: str, link: str = "") -> None:
+    def start_service(self, *more: str, link: str = "", name: str = "service") -> None:
         self._start(
-            "service", "-m", "fractus_services.mobility", "serve", "--grants", str(self.grants), "--tls", str(self.tls),
+            name, "-m", "fractus_services.mobility", "serve", "--grants", str(self.grants), "--tls", str(self.tls),
             "--state", str(self.directory / "state"), "--audit", str(self.audit), "--node", NODE, "--autopilot", link or self.link,
             "--listen", self.address, "--description", str(self.directory / "none.yaml"), "--driver-grace", "3", *more,
         )  # fmt: skip
@@ -252,14 +252,14 @@ class Rig:
                 env={**os.environ, "MALLOC_ARENA_MAX": "2"},
             )
 
-    def start_camera(self, *more: str, description: str = "") -> str:
+    def start_camera(self, *more: str, description: str = "", name: str = "camera") -> str:
         """The camera service; returns its address."""
         address = f"127.0.0.1:{free_port()}"
         path = self.directory / "node.yaml"
         if description:
             path.write_text(description)
         self._start(
-            "camera", "-m", "fractus_services.camera", "serve", "--grants", str(self.grants), "--tls", str(self.tls),
+            name, "-m", "fractus_services.camera", "serve", "--grants", str(self.grants), "--tls", str(self.tls),
             "--state", str(self.directory / "pictures"), "--audit", str(self.directory / "camera.jsonl"), "--node", NODE,
             "--description", str(path), "--mobility", self.address, "--listen", address, *more,
         )  # fmt: skip
@@ -279,6 +279,17 @@ class Rig:
         process = self._processes[name]
         process.send_signal(how)
         process.wait(10)
+
+    async def ended(self, name: str, timeout_s: float = 20.0) -> int:
+        """The exit status of a process that ends by itself."""
+        return await asyncio.to_thread(self._processes[name].wait, timeout_s)
+
+    async def until_logged(self, name: str, text: str, timeout_s: float = 20.0) -> None:
+        """Wait until a process says something."""
+        async with asyncio.timeout(timeout_s):
+            while text not in self.log(name):
+                assert self._processes[name].poll() is None, self.log(name)
+                await asyncio.sleep(0.05)
 
     def pid(self, name: str) -> int:
         return self._processes[name].pid

@@ -1,0 +1,136 @@
+"""Two processes of one service on one node: only one at a time writes to the autopilot, the state and the audit log."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import pytest
+from fractus_services.chain import verify
+from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
+from mobility_rig import Driver, Rig, grant, passenger_grant
+from test_camera import CAMERA, EDGE, capture, stub
+from test_mobility_lost import until_mode
+
+
+@pytest.fixture
+async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
+    rig = Rig(tmp_path)
+    try:
+        yield rig
+    finally:
+        await rig.close()
+
+
+def opened(rig: Rig, name: str) -> set[str]:
+    """Files and sockets that a process has open."""
+    found = set()
+    for entry in Path(f"/proc/{rig.pid(name)}/fd").iterdir():
+        try:
+            found.add(str(entry.readlink()))
+        except FileNotFoundError:
+            continue
+    return found
+
+
+def speaks_to_autopilot(rig: Rig, name: str) -> bool:
+    """Whether a process has a connection to the vehicle."""
+    port = f":{int(rig.link.rpartition(':')[2]):04X}"
+    lines = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    return not opened(rig, name).isdisjoint(f"socket:[{line[9]}]" for line in lines if line[2].endswith(port))
+
+
+def sound(path: Path) -> bool:
+    with path.open("rb") as log:
+        return not verify(log).problem
+
+
+async def flying(rig: Rig, speedup: float) -> None:
+    rig.write_grant(grant())
+    rig.start_service()
+    rig.start_vehicle(speedup)
+    await Driver(rig).up()
+
+
+async def test_a_second_service_waits_until_the_first_is_dead_and_takes_its_drone(rig: Rig) -> None:
+    await flying(rig, speedup=1.0)
+    assert speaks_to_autopilot(rig, "service")
+    rig.start_service("--driver-grace", "1", name="second")
+    await rig.until_logged("second", f"mobility: waiting for {rig.directory / 'state' / 'mobility.lock'}, held by pid")
+    assert f"held by pid {rig.pid('service')} on " in rig.log("second")
+    assert not speaks_to_autopilot(rig, "second")
+    assert not any(path.startswith(str(rig.directory / "state")) for path in opened(rig, "second"))
+    assert (await rig.telemetry()).in_air
+    assert len(rig.entries("started")) == 1
+
+    rig.kill("service")
+    await rig.until(lambda t: t.armed and t.controller == "system", 20, "takeover by the second")
+    assert speaks_to_autopilot(rig, "second")
+    rig.kill("second", signal.SIGTERM)
+    assert len(rig.entries("started")) == 2
+    assert sound(rig.audit)
+
+
+async def test_a_second_service_gives_up_with_one_sentence(rig: Rig) -> None:
+    rig.start_service()
+    await rig.until_logged("service", "mobility: serving")
+    rig.start_service("--lock-timeout", "1", name="second")
+    assert await rig.ended("second") == 1
+    said = rig.log("second").splitlines()
+    assert said[-1].startswith(
+        f"Error: {rig.directory / 'state' / 'mobility.lock'} is still held by pid {rig.pid('service')} on "
+    )
+    assert said[-1].endswith("end that process, and start again")
+    assert "Traceback" not in rig.log("second")
+    rig.start_service("--lock-timeout", "1", "--state", str(rig.directory / "other"), name="third")
+    assert await rig.ended("third") == 1
+    assert f"Error: {rig.audit}.lock is still held by pid {rig.pid('service')} on " in rig.log("third")
+    rig.start_service(name="fourth")
+    await rig.until_logged("fourth", "waiting for")
+    rig.kill("fourth", signal.SIGTERM)
+    assert rig.log("fourth").count("\n") == 1, "who waits ends at once"
+    assert len(rig.entries("started")) == 1
+
+
+def _lock_file_replaced(rig: Rig) -> None:
+    fresh = rig.directory / "fresh.lock"
+    fresh.touch()
+    fresh.replace(rig.directory / "state" / "mobility.lock")
+
+
+def _state_gone(rig: Rig) -> None:
+    (rig.directory / "state").rename(rig.directory / "another-mount")
+
+
+@pytest.mark.parametrize("lose", [_lock_file_replaced, _state_gone])
+async def test_a_service_whose_lock_is_lost_falls_silent(rig: Rig, lose: Callable[[Rig], None]) -> None:
+    await flying(rig, speedup=2.0)
+    entries = len(rig.entries())
+    lose(rig)
+    assert await rig.ended("service", 3) == 1
+    assert "mobility: another process may serve by now" in rig.log("service")
+    written = [entry["kind"] for entry in rig.entries()[entries:]]
+    assert set(written) <= {"state"}, "nothing more than the flight recorder's entries until then"
+    await until_mode(rig.link, ARDUCOPTER.return_retracing)
+    rig.start_service()
+    await rig.until(lambda t: t.autopilot_connected, 20, "a later service")
+    rig.kill("service", signal.SIGTERM)
+    assert sound(rig.audit)
+
+
+async def test_a_second_camera_service_waits_too(rig: Rig) -> None:
+    rig.write_grant(passenger_grant(services=CAMERA, operationArea=[], **{"class": None}))
+    first = rig.start_camera(description=EDGE)
+    await capture(stub(rig, first), width=64, height=64)
+    second = rig.start_camera(description=EDGE, name="second")
+    await rig.until_logged("second", f"camera: waiting for {rig.directory / 'pictures' / 'camera.lock'}, held by pid")
+    rig.kill("camera")
+    taken = await capture(stub(rig, second), width=64, height=64)
+    assert taken.image.name
+    rig.kill("second", signal.SIGTERM)
+    assert sound(rig.directory / "camera.jsonl")
+    third = rig.start_camera(description=EDGE, name="third")
+    await capture(stub(rig, third), width=64, height=64)
+    (rig.directory / "pictures" / "camera.lock").unlink()
+    assert await rig.ended("third", 3) == 1

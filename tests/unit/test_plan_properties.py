@@ -220,6 +220,68 @@ def test_drones_without_a_home_stand_in_their_depot_once_there_is_one():
     assert plan(application(navigator(PATH)), inventory([kept])).drone.node == "d"
 
 
+# -- what fits together --
+
+
+def asking(name, placement, milli, **more):
+    made = component(name, placement, **more)
+    return made | {"container": made["container"] | {"resources": {"requests": {"cpu": f"{milli}m"}}}}
+
+
+millis = st.integers(1, 12).map(lambda tenths: 100 * tenths)
+
+
+@given(millis, st.lists(millis, max_size=3), millis)
+@settings(max_examples=examples(60), deadline=None)
+def test_a_drone_flies_what_fits_on_it_together(driver, passengers, free):
+    aboard = [navigator(PATH) | {"container": asking("Navigator", "drone", driver)["container"]}]
+    aboard += [
+        asking(f"P{i}", "drone", milli, services=VIEWER["services"], **{"class": "passenger"})
+        for i, milli in enumerate(passengers)
+    ]
+    stock = inventory([drone("d")], hosts=[host("d", "drone", cpu=free / 1000)])
+    try:
+        flown = plan(application(*aboard), stock).drone.node
+    except Infeasible as error:
+        flown = None
+        assert [r.reason for r in error.rejected] == ["InsufficientResources"]
+    assert flown == ("d" if driver + sum(passengers) <= free else None)
+
+
+def test_two_components_that_fit_one_by_one_but_not_together_are_named():
+    aboard = [navigator(PATH) | {"container": asking("x", "drone", 600)["container"]}]
+    aboard.append(asking("P", "drone", 600, services=VIEWER["services"], **{"class": "passenger"}))
+    stock = inventory([drone("d")], hosts=[host("d", "drone", cpu=1.0)])
+    with pytest.raises(Infeasible, match=r"Navigator, P do not fit together \(cpu: 1\.2 asked, 1 free\)"):
+        plan(application(*aboard), stock)
+
+
+@given(st.lists(st.tuples(millis, st.booleans()), min_size=1, max_size=4), st.lists(millis, min_size=1, max_size=4))
+@settings(max_examples=examples(60), deadline=None)
+def test_no_edge_node_gets_more_than_it_has_and_none_is_refused_that_has_room(wanted, rooms):
+    statics = [(f"S{i}", milli) for i, (milli, _) in enumerate(wanted)]
+    hybrids = [(f"H{i}", 200, f"S{i}") for i, (_, beside) in enumerate(wanted) if beside]
+    where_to = {"locations": [{"center": at(0, 0), "radius": 50, "instances": "*"}]}
+    spec = [asking(name, "edge", milli, **where_to) for name, milli in statics]
+    spec += [asking(name, "hybrid", milli, hybridTo=[other]) for name, milli, other in hybrids]
+    edges = [edge(f"e{i}", (i, 0)) for i in range(len(rooms))]
+    hosts = [host(f"e{i}", "edge", cpu=milli / 1000) for i, milli in enumerate(rooms)]
+    result = plan(application(*spec), inventory(edges=edges, hosts=hosts))
+    asked = dict(statics) | {name: milli for name, milli, _ in hybrids}
+    left = {f"e{i}": milli for i, milli in enumerate(rooms)}
+    for placed in result.placements:
+        if placed.node is not None:
+            left[placed.node] -= asked[placed.component]
+    assert min(left.values()) >= 0
+    for r in result.rejected:
+        assert r.reason == "InsufficientResources"
+        assert asked[r.component] > left[r.node]
+    # Each component is asked for on every node: what has room at the end had room then.
+    placed = {(p.component, p.node) for p in result.placements}
+    for name, milli in statics:
+        assert all((name, node) in placed or milli > room for node, room in left.items())
+
+
 # -- sharing a flying drone --
 
 OTHER = ("default", "other")

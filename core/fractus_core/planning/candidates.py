@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 from fractus_core.api.components import Component
@@ -26,16 +26,22 @@ class Ledger:
         for component, node in kept:
             self._kept.setdefault(node, {})[component.name] = requests(component)
 
-    def shortage(self, node: str, component: Component) -> str | None:
-        """The first resource that does not suffice, with figures; None when the component fits."""
+    def shortage(self, node: str, wanted: Mapping[str, float], asking: Collection[str]) -> str | None:
+        """The first resource of which there is too little, with figures; None when all of it is there.
+
+        Args:
+            node: Name of the host.
+            wanted: What is asked for in all, resource name to quantity.
+            asking: Names of the components that ask: what is kept for them is theirs.
+        """
         host = self._hosts[node]
         placed = self._placed.get(node, {})
-        kept = [amounts for name, amounts in self._kept.get(node, {}).items() if name != component.name]
-        for resource, wanted in requests(component).items():
+        kept = [amounts for name, amounts in self._kept.get(node, {}).items() if name not in asking]
+        for resource, amount in wanted.items():
             free = host.allocatable.get(resource, 0.0) - host.requested.get(resource, 0.0) - placed.get(resource, 0.0)
             free -= sum(amounts.get(resource, 0.0) for amounts in kept)
-            if wanted > free + 1e-9:
-                return f"{resource}: {wanted:g} asked, {max(free, 0.0):g} free"
+            if amount > free + 1e-9:
+                return f"{resource}: {amount:g} asked, {max(free, 0.0):g} free"
         return None
 
     def take(self, node: str, component: Component) -> None:
@@ -106,11 +112,17 @@ def check_services(offered: NodeServices, components: Iterable[Component]) -> Ch
 
 
 def check_resources(ledger: Ledger, node: str, components: Iterable[Component]) -> Check:
-    """Whether each of the components fits into what the node has left."""
+    """Whether the components fit, all of them together, into what the node has left."""
+    wanted: dict[str, float] = {}
+    asking: list[str] = []
     for component in components:
-        shortage = ledger.shortage(node, component)
+        asking.append(component.name)
+        for resource, amount in requests(component).items():
+            wanted[resource] = wanted.get(resource, 0.0) + amount
+        shortage = ledger.shortage(node, wanted, asking)
         if shortage is not None:
-            return Check("InsufficientResources", f"{component.name} does not fit ({shortage})")
+            fit = "does not fit" if len(asking) == 1 else "do not fit together"
+            return Check("InsufficientResources", f"{', '.join(asking)} {fit} ({shortage})")
     return SUITABLE
 
 

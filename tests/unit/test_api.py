@@ -129,6 +129,22 @@ def test_area_of_continental_size_is_refused():
             "spec.lowerLimit: lowerLimit must not be above upperLimit",
         ),
         (
+            {"type": "LimitControl", "kind": "speed", "upperLimit": -5},
+            "spec.upperLimit: a speed has an upperLimit above 0 and a lowerLimit of at least 0 m/s, an altitude above terrain an upperLimit above 0 m",
+        ),
+        (
+            {"type": "LimitControl", "kind": "speed", "upperLimit": 0},
+            "spec.upperLimit: a speed has an upperLimit above 0 and a lowerLimit of at least 0 m/s, an altitude above terrain an upperLimit above 0 m",
+        ),
+        (
+            {"type": "LimitControl", "kind": "speed", "lowerLimit": -0.5, "upperLimit": 5},
+            "spec.lowerLimit: a speed has an upperLimit above 0 and a lowerLimit of at least 0 m/s, an altitude above terrain an upperLimit above 0 m",
+        ),
+        (
+            {"type": "LimitControl", "kind": "altitude", "upperLimit": 0, "altitudeReference": "terrain"},
+            "spec.upperLimit: a speed has an upperLimit above 0 and a lowerLimit of at least 0 m/s, an altitude above terrain an upperLimit above 0 m",
+        ),
+        (
             {"type": "GeofenceControl", "kind": "exclusion"},
             "spec.selector.zones: GeofenceControl takes kind inclusion or exclusion, and selector.zones",
         ),
@@ -150,6 +166,28 @@ def test_sentences_of_bad_policies(spec, sentence):
     with pytest.raises(InvalidObject) as caught:
         Policy.from_body(manifest("Policy", "p", spec))
     assert str(caught.value).startswith(sentence)
+
+
+@pytest.mark.parametrize(
+    "limit",
+    [
+        {"kind": "speed", "upperLimit": 0.1},
+        {"kind": "speed", "lowerLimit": 0},
+        {"kind": "altitude", "upperLimit": -50, "lowerLimit": -80},
+        {"kind": "altitude", "upperLimit": -400, "altitudeReference": "amsl"},
+        {"kind": "altitude", "upperLimit": 20_000},
+        {"kind": "altitude", "upperLimit": 1, "lowerLimit": -10, "altitudeReference": "terrain"},
+    ],
+)
+def test_limits_that_can_be_kept(limit):
+    assert Policy.from_body(manifest("Policy", "p", {"type": "LimitControl", **limit})).spec.kind == limit["kind"]
+
+
+@pytest.mark.parametrize("limit", [-1001, 20_001, float("nan"), float("inf")])
+def test_limits_beyond_anything_that_flies(limit):
+    spec = {"type": "LimitControl", "kind": "altitude", "upperLimit": limit}
+    with pytest.raises(InvalidObject, match=r"spec\.upperLimit"):
+        Policy.from_body(manifest("Policy", "p", spec))
 
 
 def test_policy_with_an_unknown_zone_names_it():

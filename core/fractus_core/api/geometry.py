@@ -12,7 +12,8 @@ from fractus_core.api.rules import Broken, one_of, rule
 Latitude = Annotated[float, Field(ge=-90, le=90, description="Degrees north, WGS 84, -90 to 90.")]
 Longitude = Annotated[float, Field(ge=-180, le=180, description="Degrees east, WGS 84, -180 to 180.")]
 Altitude = Annotated[float, Field(ge=-1000, le=20000)]
-"""Metres, within anything that flies."""
+"""Metres in any datum: no ground lies further below its surroundings, home on a mountain or mean sea level (the lowest dry
+land is at -430 m), than 1000 m; controlled airspace, and what flies in it, ends at 20 km (flight level 660)."""
 Reference = Literal["home", "amsl", "terrain"]
 
 

@@ -275,6 +275,27 @@ class PolicySpec(Validity):
         return "kind" if self.kind not in get_args(LimitKind) else "upperLimit" if unlimited else None
 
     @rule(
+        # An upper limit of 0 m/s would hold a drone where it is, and one below 0 flies it backwards; lower ones may be 0,
+        # which limits nothing. Below terrain no drone flies; below home and mean sea level it may, down to what
+        # `Altitude` bounds.
+        _for(
+            "LimitControl",
+            "(!has(self.upperLimit) || self.upperLimit > 0.0 || (self.kind != 'speed'"
+            " && !(has(self.altitudeReference) && self.altitudeReference == 'terrain')))"
+            " && (self.kind != 'speed' || !has(self.lowerLimit) || self.lowerLimit >= 0.0)",
+        ),
+        "a speed has an upperLimit above 0 and a lowerLimit of at least 0 m/s,"
+        " an altitude above terrain an upperLimit above 0 m",
+    )
+    def _limits_keepable(self) -> Broken:
+        speed, lower, upper = self.kind == "speed", self.lower_limit, self.upper_limit
+        if self.type != "LimitControl":
+            return None
+        if upper is not None and upper <= 0 and (speed or self.altitude_reference == "terrain"):
+            return "upperLimit"
+        return "lowerLimit" if speed and lower is not None and lower < 0 else None
+
+    @rule(
         _for("LimitControl", f"!has(self.action) || {_among('action', LimitAction)}"),
         f"LimitControl takes action {_listed(LimitAction)}",
     )

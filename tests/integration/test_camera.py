@@ -97,7 +97,7 @@ async def retrieve(camera: Any, name: str, action: Any = types_pb2.Decision.ACTI
 async def test_pictures_of_an_edge_node(rig: Rig) -> None:
     viewer = passenger_grant(services=CAMERA, operationArea=[], **{"class": None})
     rig.write_grant(viewer)
-    other = grant(services=CAMERA, operationArea=[])
+    other = grant(services=CAMERA, operationArea=[], **{"class": None})
     rig.write_grant(other)
     address = rig.start_camera("--keep", "2", description=EDGE)
     camera = stub(rig, address)
@@ -243,7 +243,7 @@ async def test_a_face_in_the_simulated_world_is_hidden_and_the_rest_stays(rig: R
         },
     }  # fmt: skip
     faces = {"name": "faces", "spec": {"type": "PrivacyControl", "kind": "camera", "action": "blurFaces"}}
-    rig.write_grant(grant(services=CAMERA, operationArea=[]))
+    rig.write_grant(grant(services=CAMERA, operationArea=[], **{"class": None}))
     rig.write_grant(passenger_grant(faces, services=CAMERA, operationArea=[], **{"class": None}))
     address = rig.start_camera("--face-px", "12", description=yaml.safe_dump(node))
 

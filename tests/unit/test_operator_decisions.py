@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from typing import Any, cast
 
 import pytest
 from fractus_core.api import Application, Drone, EdgeNode, Grant
@@ -12,6 +13,8 @@ from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.planning.inventory import Host, Inventory
 from fractus_core.planning.quantities import amount_of
 from fractus_operator.cluster.pods import PodView, read_host, read_pod
+from fractus_operator.cluster.store import Store
+from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile import status
 from fractus_operator.reconcile.conditions import ConditionUpdate, merge
 from fractus_operator.reconcile.difference import contains, is_current, stamped
@@ -282,3 +285,24 @@ def test_settings_come_from_the_environment() -> None:
 def test_a_bad_setting_is_named(environment: dict[str, str]) -> None:
     with pytest.raises(BadSetting, match=next(iter(environment))):
         Settings.from_environment(environment)
+
+
+# -- waking --
+
+
+def edge_body(version: int, ready: str) -> dict[str, Any]:
+    condition = {"type": "Ready", "status": ready, "reason": "R", "lastTransitionTime": "2026-01-01T00:00:00Z"}
+    status = {"conditions": [condition], "lastSeen": f"2026-01-01T00:00:{version:02d}Z"}
+    metadata = {"name": "e", "resourceVersion": str(version)}
+    spec = {"location": {"lat": 0, "lon": 0}}
+    return {"apiVersion": V1, "kind": "EdgeNode", "metadata": metadata, "spec": spec, "status": status}
+
+
+async def test_an_edge_node_that_becomes_ready_wakes_applications_and_one_that_stays_so_does_not() -> None:
+    live = LiveInventory(cast(Store, None))
+    live.edge_nodes.note(("", "e"), edge_body(1, "False"))
+    with live.subscriptions.subscribe(("default", "app")) as inputs:
+        live.edge_nodes.note(("", "e"), edge_body(2, "False"))
+        assert not await inputs.changed(0)
+        live.edge_nodes.note(("", "e"), edge_body(3, "True"))
+        assert await inputs.changed(1)

@@ -154,6 +154,35 @@ def test_unsuitable_drone_is_named_with_its_reason(fleet, reason):
     assert caught.value.component == "Navigator"
 
 
+def test_a_drone_that_cannot_be_flown_is_not_said_to_fly_too_short():
+    spec = drone("d").spec.to_dict()
+    camera_only = Drone.from_body(manifest("Drone", "d", spec | {"services": {"camera": {"methods": CAMERA}}}))
+    camera_only = camera_only.model_copy(update={"status": drone("d").status})
+    tour = VIEWER | {"egress": [], "pointsOfInterest": {"points": [at(100, 0)]}}
+    with pytest.raises(Infeasible, match="it has no mobility service, which every flight needs") as caught:
+        plan(application(tour), inventory([camera_only]))
+    assert [r.reason for r in caught.value.rejected] == ["ServiceMissing"]
+
+
+def unready(node, status="False", message="no certificate"):
+    condition = {"type": "Ready", "status": status, "reason": "NoCertificate", "message": message}
+    condition["lastTransitionTime"] = "2026-01-01T00:00:00Z"
+    return EdgeNode.from_body(manifest("EdgeNode", node.name, node.spec.to_dict(), status={"conditions": [condition]}))
+
+
+def test_edge_nodes_that_are_not_ready_get_nothing_new_and_keep_what_they_host():
+    ground_viewer = component("GroundViewer", "edge", locations=[{"center": at(0, 0), "radius": 100, "instances": "*"}])
+    app = application(ground_viewer)
+    good, bad = edge("e1", (0, 0)), edge("e2", (10, 0))
+    result = plan(app, inventory(edges=[good, unready(bad)]))
+    assert nodes_of(result, "GroundViewer") == ["e1"]
+    assert [(r.node, r.reason, r.message) for r in result.rejected] == [("e2", "EdgeNodeNotReady", "no certificate")]
+    assert nodes_of(plan(app, inventory(edges=[good, unready(bad, "True")])), "GroundViewer") == ["e1", "e2"]
+    before = plan(app, inventory(edges=[good, bad]))
+    after = plan(app, inventory(edges=[good, unready(bad)]), previous=before)
+    assert nodes_of(after, "GroundViewer") == ["e1", "e2"]
+
+
 def test_no_drone_at_all_says_so():
     with pytest.raises(Infeasible, match="there is no drone"):
         plan(application(navigator(PATH)), inventory())

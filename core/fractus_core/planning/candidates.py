@@ -6,8 +6,8 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 from fractus_core.api.components import Component
-from fractus_core.api.model import quantity
-from fractus_core.api.nodes import Interface, NodeServices
+from fractus_core.api.model import Condition, quantity
+from fractus_core.api.nodes import DroneStatus, EdgeNodeStatus, Interface, NodeServices
 from fractus_core.api.plans import Rejection
 from fractus_core.planning.inventory import Host, Settings
 
@@ -93,6 +93,11 @@ def check_host(hosts: Mapping[str, Host], node: str, settings: Settings, *, kept
     if not host.schedulable:
         return Check("NodeUnschedulable", f"the Kubernetes Node {node} is cordoned")
     return SUITABLE
+
+
+def readiness(status: DroneStatus | EdgeNodeStatus | None) -> Condition | None:
+    """The Ready condition that a node's agent reports; None while it has reported none."""
+    return next((c for c in status.conditions if c.type == "Ready"), None) if status is not None else None
 
 
 def check_services(offered: NodeServices, components: Iterable[Component]) -> Check:

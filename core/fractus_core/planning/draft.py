@@ -9,7 +9,15 @@ from fractus_core.api.components import Component
 from fractus_core.api.names import object_name
 from fractus_core.api.nodes import EdgeNode
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance, Rejection, Role, Serves
-from fractus_core.planning.candidates import Check, Ledger, check_host, check_resources, check_services
+from fractus_core.planning.candidates import (
+    SUITABLE,
+    Check,
+    Ledger,
+    check_host,
+    check_resources,
+    check_services,
+    readiness,
+)
 from fractus_core.planning.inventory import Inventory, Settings
 
 _MAX_INSTANCE_NAME = 57
@@ -71,8 +79,10 @@ class Draft:
 
     def check_edge(self, node: EdgeNode, component: Component) -> Check:
         """Whether an edge node can host the component, or the first rule it fails."""
+        kept = self.had(component, node.name)
         return (
-            check_host(self.inventory.hosts, node.name, self.settings, kept=self.had(component, node.name))
+            check_host(self.inventory.hosts, node.name, self.settings, kept=kept)
+            and (SUITABLE if kept else _check_state(node))
             and check_services(node.spec.services, [component])
             and check_resources(self.ledger, node.name, [component])
         )
@@ -146,6 +156,14 @@ class Draft:
         order = {c.name: i for i, c in enumerate(self.spec.components)}
         kept.sort(key=lambda r: (order[r.component], r.node))
         return tuple(kept), len(wanted) - len(kept)
+
+
+def _check_state(node: EdgeNode) -> Check:
+    """Whether an edge node is Ready, as far as its agent says: one without an agent that reports takes pods all the same."""
+    ready = readiness(node.status)
+    if ready is not None and ready.status != "True":
+        return Check("EdgeNodeNotReady", ready.message or f"{node.name} is not Ready ({ready.reason})")
+    return SUITABLE
 
 
 def _shares(plan: DeploymentPlanSpec) -> bool:

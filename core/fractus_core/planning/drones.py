@@ -11,7 +11,7 @@ from fractus_core.api.nodes import Drone
 from fractus_core.api.plans import Alternative, DroneChoice, Mission
 from fractus_core.geo import ground
 from fractus_core.planning.area import OperationArea, start_of
-from fractus_core.planning.candidates import SUITABLE, Check, check_host, check_resources, check_services
+from fractus_core.planning.candidates import SUITABLE, Check, check_host, check_resources, check_services, readiness
 from fractus_core.planning.draft import Draft
 from fractus_core.planning.flight import Estimate, MissionEstimator, first_missed, remaining_minutes, transit_legs
 from fractus_core.planning.index import Near
@@ -194,8 +194,11 @@ def _lasting(draft: Draft, drone: Drone, components: list[Component], mission: E
     """The rules that waiting does not change: services, altitude, a flight too long for a full battery."""
     check = check_services(drone.spec.services, components)
     mobility = drone.spec.services.mobility
-    if not check or mobility is None or mission is None:
+    if not check or mission is None:
         return check
+    if mobility is None:
+        # No component need ask for it: passengers alone have the system fly the drone.
+        return SUITABLE if kept else Check("ServiceMissing", "it has no mobility service, which every flight needs")
     if mission.top_m > mobility.max_altitude:
         message = f"{drone.name} climbs to {mobility.max_altitude:g} m; the path goes up to {mission.top_m:g} m"
         return Check("TooHigh", message)
@@ -253,8 +256,7 @@ def _home(draft: Draft, drone: Drone) -> Position | None:
 
 
 def _check_state(drone: Drone) -> Check:
-    status = drone.status
-    ready = next((c for c in status.conditions if c.type == "Ready"), None) if status else None
+    ready = readiness(drone.status)
     if ready is None:
         return Check("DroneUnknown", f"{drone.name} has not reported yet")
     if ready.status != "True":

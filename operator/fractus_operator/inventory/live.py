@@ -7,6 +7,7 @@ from typing import Any
 
 from fractus_core.api import DeploymentPlan, Depot, Drone, EdgeNode, Grant, Policy, Zone
 from fractus_core.api.names import NODE_SIGNER
+from fractus_core.planning.candidates import readiness
 from fractus_core.planning.inventory import Flight, Host, Inventory
 from fractus_core.planning.locations import NodeLocations
 
@@ -204,6 +205,8 @@ class LiveInventory:
             self._locations.upsert_edge_node(new)
         if _rules_differ(old, new):
             self._rules_changed()
+        elif old is not None and new is not None and _ready(old) != _ready(new):
+            self.subscriptions.wake_all()
 
     def _depot_changed(self, key: Key, old: Depot | None, new: Depot | None) -> None:
         if new is None:
@@ -264,8 +267,12 @@ def _rules_differ(old: Drone | EdgeNode | None, new: Drone | EdgeNode | None) ->
 
 def _planning_view(drone: Drone) -> tuple[object, ...]:
     """What of a drone's status decides over plans; its position does not."""
-    conditions = drone.status.conditions if drone.status is not None else ()
-    return is_flying(drone), next((c.status for c in conditions if c.type == "Ready"), None)
+    return is_flying(drone), _ready(drone)
+
+
+def _ready(node: Drone | EdgeNode) -> str | None:
+    condition = readiness(node.status)
+    return condition.status if condition is not None else None
 
 
 def _without_status(body: Body) -> Body:

@@ -275,6 +275,32 @@ def test_exclusion_zones() -> None:
     assert ask(grant, goto(47, 0), at(position_error_m=3)).code == "TooCloseToExclusionZone"
 
 
+def test_distances_that_round_to_nothing_are_told_as_such() -> None:
+    zone_at = exclusion(box(50, -20, 80, 20))
+    told = [
+        ask(compiled(exclusion(ring([(50, 0.01), (40, -20), (60, -20)]))), goto(100, 0)),
+        ask(compiled(zone_at), goto(50.01, 0)),
+        ask(compiled(zone_at), goto(49.99, 0)),
+        ask(compiled(inclusion(box(-50, -50, 50, 50))), goto(50.01, 0)),
+        ask(compiled(inclusion(box(-50, -50, 50, 50))), goto(49.99, 0)),
+        ask(compiled(), goto(0, 199.99)),
+        ask(compiled(), goto(0, 200.01)),
+        ask(compiled(), Call("CaptureImage"), at(0, 200.01)),
+    ]
+    for verdict in told:
+        assert not verdict.permits
+        assert " 0.0 m" not in verdict.reason, verdict
+    assert "touches zone no-fly-zone" in told[0].reason
+    assert "less than 0.1 m inside zone no-fly-zone" in told[1].reason
+    assert "comes within 0.1 m of zone no-fly-zone" in told[2].reason
+
+
+def test_a_turn_that_sweeps_a_zone_beside_the_leg_is_told_apart() -> None:
+    verdict = ask(compiled(exclusion(box(1, 5, 3, 9))), goto(0, 60), at(east_mps=5.0, north_mps=0.0))
+    assert verdict.code == "LegThroughExclusionZone"
+    assert "turn onto the leg touches zone no-fly-zone" in verdict.reason
+
+
 def test_a_zone_in_a_band_of_altitudes_may_be_overflown() -> None:
     grant = compiled(exclusion(box(50, -20, 80, 20), upper=20))
     assert ask(grant, goto(150, 0, 30), at(alt=30)).action == "allow"

@@ -8,7 +8,7 @@ import shapely
 
 from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, PolicyIndex, Rule
 from fractus_core.policy.privacy import names, ordered, seen
-from fractus_core.policy.values import Call, Situation, Verdict, deny, earliest
+from fractus_core.policy.values import Call, Situation, Verdict, deny, earliest, metres
 
 IN_OPERATION_AREA = frozenset({"CaptureImage", "RetrieveImage"})
 """Methods that are used only while the drone is where the application works; motion is judged by its leg."""
@@ -47,7 +47,7 @@ def _outside_operation_area(method: str, now: Situation, grant: CompiledGrant) -
     away_m = grant.operation.distance(here)
     return deny(
         "OutsideOperationArea",
-        f"{method} is granted inside the operation area, which is {away_m:.1f} m away",
+        f"{method} is granted inside the operation area, which is {metres(away_m)} away",
         (OPERATION_AREA,),
     )
 

@@ -13,7 +13,7 @@ from fractus_core.api.policies import GeofenceAction
 from fractus_core.exhaustive import exhaustive
 from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Inclusion, PolicyZone, band_meets
 from fractus_core.policy.motion import XY, Leg, stop_altitude_m, stop_point
-from fractus_core.policy.values import Situation, Takeover, Verdict, deny, distinct
+from fractus_core.policy.values import Situation, Takeover, Verdict, deny, distinct, metres
 
 SEVERITY: dict[GeofenceAction, int] = exhaustive(
     GeofenceAction, {"adjust": 0, "ignore": 1, "hover": 2, "returnToLaunch": 3, "land": 4, "revoke": 5}
@@ -115,9 +115,9 @@ def _operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: fl
         inside = operation.covers(target)
         away_m = border.distance(target)
         reason = (
-            f"the target is {away_m:.1f} m from the border of the operation area; keep {margin_m:.1f} m inside it"
+            f"the target is {metres(away_m)} from the border of the operation area; keep {margin_m:.1f} m inside it"
             if inside
-            else f"the target is {away_m:.1f} m outside the operation area"
+            else f"the target is {metres(away_m)} outside the operation area"
         )
         yield _area_breach(reason, not inside)
         return
@@ -192,14 +192,13 @@ def _exclusion_breach(zone: PolicyZone, leg: Leg, margin_m: float, enters: bool)
     target = shapely.points(leg.target)
     if shape.intersects(target):
         depth_m = shape.boundary.distance(target)
-        code, reason = "InsideExclusionZone", f"the target is {depth_m:.1f} m inside zone {zone.name}"
+        code, reason = "InsideExclusionZone", f"the target is {metres(depth_m)} inside zone {zone.name}"
     elif shape.intersects(leg.ground):
-        inside_m = shape.intersection(leg.line).length
-        code, reason = "LegThroughExclusionZone", f"the leg crosses zone {zone.name} for {inside_m:.1f} m"
+        code, reason = "LegThroughExclusionZone", _crossing(zone, leg)
     else:
         away_m = shape.distance(leg.ground)
         code = "TooCloseToExclusionZone"
-        reason = f"the leg comes within {away_m:.1f} m of zone {zone.name}; keep {margin_m:.1f} m away"
+        reason = f"the leg comes within {max(away_m, 0.1):.1f} m of zone {zone.name}; keep {margin_m:.1f} m away"
     return Breach(
         name,
         zone.rule.spec.priority,
@@ -209,6 +208,14 @@ def _exclusion_breach(zone: PolicyZone, leg: Leg, margin_m: float, enters: bool)
         enters,
         lambda: leg.line.difference(shape.buffer(margin_m + INSIDE_M)),
     )
+
+
+def _crossing(zone: PolicyZone, leg: Leg) -> str:
+    inside_m = zone.shape.intersection(leg.line).length
+    if inside_m >= 0.05:
+        return f"the leg crosses zone {zone.name} for {inside_m:.1f} m"
+    # What a moving drone sweeps is wider than the line from where it could rest.
+    return f"the {'leg' if zone.shape.intersects(leg.line) else 'turn onto the leg'} touches zone {zone.name}"
 
 
 def _inclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Iterator[Breach]:
@@ -241,13 +248,13 @@ def _inclusion_breach(fence: Inclusion, shape: BaseGeometry, border: BaseGeometr
     if shape.is_empty:
         code, reason = "OutsideInclusionZone", f"none of {zones} allows this altitude"
     elif not shape.covers(target):
-        code, reason = "OutsideInclusionZone", f"the target is {shape.distance(target):.1f} m outside {zones}"
+        code, reason = "OutsideInclusionZone", f"the target is {metres(shape.distance(target))} outside {zones}"
     elif not shape.covers(leg.ground):
         code, reason = "LegOutsideInclusionZone", f"the leg leaves {zones}"
     else:
         away_m = border.distance(leg.ground)
         code = "TooCloseToInclusionBorder"
-        reason = f"the leg comes within {away_m:.1f} m of the border of {zones}; keep {margin_m:.1f} m inside"
+        reason = f"the leg comes within {max(away_m, 0.1):.1f} m of the border of {zones}; keep {margin_m:.1f} m inside"
     enters = shape.covers(leg.unavoidable) and not shape.covers(leg.ground)
     return Breach(
         name,

@@ -324,6 +324,11 @@ def distinct(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for name in names if name))
 
 
+def metres(distance_m: float) -> str:
+    """A distance for people, who would read "0.0 m" as none at all."""
+    return "less than 0.1 m" if distance_m < 0.05 else f"{distance_m:.1f} m"
+
+
 def deny(code: str, reason: str, policies: tuple[str, ...] = ()) -> Verdict:
     """A refusal."""
     return Verdict("deny", None, code, reason, policies)

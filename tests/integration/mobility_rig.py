@@ -295,7 +295,12 @@ class Rig:
         return self._processes[name].pid
 
     def channel(
-        self, identity: str, authority: Authority | None = None, address: str = "", **how: Any
+        self,
+        identity: str,
+        authority: Authority | None = None,
+        address: str = "",
+        options: tuple[tuple[str, Any], ...] = (),
+        **how: Any,
     ) -> grpc.aio.Channel:
         key, certificate = (authority or self.authority).issue(identity, **how)
         credentials = grpc.ssl_channel_credentials(self.authority.pem, key, certificate)
@@ -307,6 +312,7 @@ class Rig:
                 ("grpc.initial_reconnect_backoff_ms", 100),
                 ("grpc.max_reconnect_backoff_ms", 300),
                 ("grpc.use_local_subchannel_pool", 1),
+                *options,
             ],
         )
         self._channels.append(channel)

@@ -8,7 +8,7 @@ import io
 import json
 import threading
 import urllib.request
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -170,6 +170,70 @@ async def test_policies_that_come_later_hold_for_pictures_from_before(rig: Rig) 
     assert (status, why.code) == (grpc.StatusCode.PERMISSION_DENIED, "PrivacyZone")
     status, why = await denied(capture(camera))
     assert (status, why.code, list(why.policies)) == (grpc.StatusCode.PERMISSION_DENIED, "PrivacyZone", ["privacy"])
+
+
+@pytest.fixture
+def noise_url() -> Iterator[str]:
+    """A camera whose pictures cannot be compressed."""
+    picture = np.random.default_rng(1).integers(0, 256, (1800, 2400, 3), np.uint8)
+    data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 0])[1].tobytes()
+
+    class Snapshots(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(data)
+
+        def log_message(self, *_: Any) -> None:
+            """Tests are quiet."""
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Snapshots)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_address[1]}/"
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [("removed", "NoGrant"), ("refuses", "PrivacyZone"), ("filters", "PrivacyZone"), ("permits", "")],
+)
+async def test_a_grant_that_changes_ends_a_picture_under_way(rig: Rig, noise_url: str, change: str, code: str) -> None:
+    def write(*policies: dict[str, Any]) -> Path:
+        return rig.write_grant(passenger_grant(*policies, services=CAMERA, operationArea=[], **{"class": None}))
+
+    path = write()
+    address = rig.start_camera("--camera", noise_url, description=EDGE)
+    # A client's gRPC library reads megabytes ahead of the program on a fast link, unless told not to.
+    camera = camera_pb2_grpc.CameraServiceStub(
+        rig.channel(PASSENGER, address=address, options=(("grpc.http2.bdp_probe", 0),))
+    )
+    size = (await capture(camera, width=2400, height=1800)).image.size_bytes
+    assert size > 3_000_000
+    (name,) = (one.name for one in (await camera.ListImages(camera_pb2.ListImagesRequest(), timeout=5)).images)
+    stream = camera.RetrieveImage(camera_pb2.RetrieveImageRequest(name=name), timeout=30)
+    received = len((await stream.read()).data)
+    if change == "removed":
+        path.unlink()
+    elif change == "permits":
+        write(privacy("refuse", 500, 500, 510, 510))
+    else:
+        write(privacy({"refuses": "refuse", "filters": "black"}[change], -20, -20, 20, 20))
+    await rig.until_logged("camera", f"grants: {'removed' if change == 'removed' else 'changed'}")
+
+    async def rest() -> None:
+        nonlocal received
+        while (chunk := await stream.read()) is not grpc.aio.EOF:
+            received += len(chunk.data)
+        assert await stream.code() == grpc.StatusCode.OK
+
+    if not code:
+        await rest()
+        assert received == size
+        return
+    status, why = await denied(rest())
+    assert (status, why.code) == (grpc.StatusCode.PERMISSION_DENIED, code)
+    assert received < 1_000_000, "what was in buffers when the grant changed, and no more"
 
 
 async def test_an_ip_camera_that_breaks_and_comes_back(rig: Rig) -> None:

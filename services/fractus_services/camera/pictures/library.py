@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fractus_core.policy.privacy import remaining
-from fractus_core.policy.values import Call, Filter, Situation, Verdict
+from fractus_core.policy.values import Call, Situation, Verdict
 
 from fractus_services.background import Background
 from fractus_services.camera.album.album import Album, owner_of
@@ -20,6 +20,7 @@ from fractus_services.camera.pictures.fair_queue import FairQueue
 from fractus_services.camera.pictures.judge import PictureJudge, taken_at
 from fractus_services.camera.pose.pose import is_upright
 from fractus_services.camera.pose.provider import PoseProvider
+from fractus_services.errors import PolicyDenied
 from fractus_services.grants import ActiveGrant
 
 
@@ -80,16 +81,29 @@ class PictureLibrary:
             call, grant, replace(verdict, filters=missing), taken_at(shot.poses, now), face_px=face_px
         )
         data = await self._tasks.complete(self._filtered(owner, path, plan, replace(shot, face_px=face_px)))
-        done = (*shot.filters, *plan.filters)
-        self._check_again(call, current_grant() if current_grant else grant, shot, done)
-        return replace(verdict, reason=noted.reason), replace(shot, size_bytes=len(data), filters=done), data
+        shot = replace(shot, size_bytes=len(data), filters=(*shot.filters, *plan.filters))
+        self.judge_again(current_grant() if current_grant else grant, owner, shot)
+        return replace(verdict, reason=noted.reason), shot, data
 
-    def _check_again(self, call: Call, grant: ActiveGrant, shot: Shot, done: tuple[Filter, ...]) -> None:
-        """Refuse a stored picture that by now needs more filters than it got."""
-        now = self._now()
+    def judge_again(self, grant: ActiveGrant, owner: str, shot: Shot) -> None:
+        """Judge a picture whose retrieval was permitted by the policies of this moment: before each part of it is sent.
+
+        Args:
+            grant: the caller's by now.
+            owner: whose picture it is.
+            shot: the picture as `retrieve` returned it, with the filters that it got.
+
+        Raises:
+            Refused: it may not be returned any more, or needs more filters than it got.
+        """
+        if owner_of(grant) != owner:
+            raise PolicyDenied(
+                "NoGrant", "the application was replaced by one of the same name; this picture is not its own"
+            )
+        call, now = Call("RetrieveImage"), self._now()
         verdict = self._judge.judge(call, grant, now, record=False)
         verdict = self._judge.judge_stored(call, grant, shot.poses, verdict, now)
-        if remaining(verdict.filters, done):
+        if remaining(verdict.filters, shot.filters):
             reason = f"{verdict.reason}, which it did not when this picture was asked for; ask again"
             refusal = Verdict("deny", None, "PrivacyZone", reason, verdict.policies)
             self._judge.require(call, grant, refusal, now)

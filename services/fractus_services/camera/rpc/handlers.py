@@ -13,7 +13,7 @@ from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
 
 from fractus_services.admission import CallAdmission
 from fractus_services.auth import Caller
-from fractus_services.camera.album.album import NoSuchImage
+from fractus_services.camera.album.album import NoSuchImage, owner_of
 from fractus_services.camera.album.shots import Shot
 from fractus_services.camera.pictures.capture import PictureCapture
 from fractus_services.camera.pictures.library import PictureLibrary
@@ -58,6 +58,8 @@ class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
             head: dict[str, Any] = {"decision": decision(verdict), "image": _info(shot)}
             async for piece in _pieces(source, request.name):
                 for at in range(0, len(piece), CHUNK_BYTES):
+                    # A reader sets the pace, and a deadline may be far away: what was permitted may not be any more.
+                    self._library.judge_again(self._admission.grant_of(caller), owner_of(grant), shot)
                     await context.write(camera_pb2.ImageChunk(data=piece[at : at + CHUNK_BYTES], **head))
                     head = {}
 

@@ -27,7 +27,7 @@ CHECK_INTERVAL_S = 0.2
 """How often the holder looks whether its lock file is still the one that others would lock."""
 
 SETTLE_S = 1.0
-"""How long the first holder of a new lock file waits: whoever holds the file that was there before has noticed by then."""
+"""How long the first holder of a new lock file waits: a holder of the file that was there before has noticed by then."""
 
 POLL_INTERVAL_S = 0.1
 

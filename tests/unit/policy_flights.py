@@ -407,6 +407,10 @@ def _request(rng: np.random.Generator) -> Call:
 def _odd(verdict: Verdict, now: Situation, place: Scene) -> Iterator[str]:
     """What is wrong with the arguments that come back, flown or not."""
     args = verdict.args
+    if verdict.action == "correct":
+        again = judge(Call("Goto" if isinstance(args, GotoArgs) else "SetVelocity", args), now, place.grant)
+        if (again.action, again.args) != ("allow", args):
+            yield "corrected to what is not allowed as it is"
     if isinstance(args, VelocityArgs) and math.hypot(args.north_mps, args.east_mps) > place.top_mps + 1e-6:
         yield "too fast"
     if not isinstance(args, GotoArgs):

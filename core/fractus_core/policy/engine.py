@@ -58,8 +58,13 @@ def judge(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
         now = _unsound(now)
     verdict = _judge_once(call, now, grant)
     if verdict.action == "correct" and call.method in _ARGS:
-        verdict = settled(call, verdict, lambda again: _judge_once(again, now, grant))
+        verdict = _settle(call, verdict, now, grant)
     return replace(verdict, brake_first=True) if _must_brake(call, verdict, now, grant) else verdict
+
+
+def _settle(call: Call, correction: Verdict, now: Situation, grant: CompiledGrant) -> Verdict:
+    """A correction that holds; apart from `judge`, which a closure would have to allocate for on every call."""
+    return settled(call, correction, lambda again: _judge_once(again, now, grant))
 
 
 def _judge_once(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:

@@ -64,7 +64,7 @@ def unknown_zone() -> Object:
         "spec": {
             "type": "GeofenceControl",
             "kind": "exclusion",
-            "selector": {"zones": ["atlantis"], "applications": {"names": ["no one"]}},
+            "selector": {"zones": ["atlantis"], "applications": {"names": ["stranger"]}},
         },
     }
 

@@ -9,7 +9,7 @@ import shapely
 from fractus_core.api import InvalidObject
 from fractus_core.api.geometry import Area, Circle, Point, Polygon
 from fractus_core.geo import LocalFrame, area_of, corridor, geodesic_m, geojson, middle_of, polygon
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 latitudes = st.floats(-89.9, 89.9)
@@ -96,6 +96,27 @@ def test_polygon_across_the_antimeridian_is_small():
     collection = geojson(LocalFrame(10, 180), shape)
     assert len(collection["coordinates"]) == 2
     assert all(-180 <= lon <= 180 for part in collection["coordinates"] for lon, _ in part[0])
+
+
+@given(
+    st.sampled_from([90.0, -90.0]),
+    st.floats(0, 3000),
+    longitudes,
+    st.floats(5, 3000),
+    st.lists(st.tuples(st.floats(0, 2 * math.pi), st.sampled_from([0.0, 0.5, 0.9, 1.1, 2.0])), min_size=5, max_size=20),
+)
+def test_circles_at_the_poles_hold_on_a_map_of_degrees_what_they_hold_on_the_ground(pole, off, lon, radius, places):
+    # A way past the pole that is shorter than a segment is bent on such a map.
+    assume(abs(off - radius) > 0.2 * radius)
+    lat = pole - math.copysign(off / 111_694, pole)
+    frame = LocalFrame(lat, lon)
+    shape = polygon(frame, Area(circle=Circle(center=Point(lat=lat, lon=lon), radius=radius)))
+    drawn = [shapely.Polygon(*map(list, (part[0], part[1:]))) for part in geojson(frame, shape)["coordinates"]]
+    assert all(part.is_valid for part in drawn)
+    for bearing, share in places:
+        x, y = share * radius * math.sin(bearing), share * radius * math.cos(bearing)
+        there_lat, there_lon = frame.latlon(x, y)
+        assert any(part.covers(shapely.Point(there_lon, there_lat)) for part in drawn) == (share < 1)
 
 
 def test_bow_tie_names_the_ring_and_the_place():

@@ -3,15 +3,16 @@
 import dataclasses
 import itertools
 import random
+import re
 
 import pytest
 from depth import examples
-from fractus_core.api import Drone
+from fractus_core.api import Depot, Drone, InvalidObject
 from fractus_core.api.nodes import Interface
 from fractus_core.geo import geodesic_m
 from fractus_core.planning import Infeasible, NodeLocations, Settings, flight_of, plan
 from fractus_core.planning.candidates import direct_range_m, direct_reach_m
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from test_planning import (
     CHECKER,
@@ -447,3 +448,64 @@ def test_plan_at_80_degrees_across_the_antimeridian():
     assert sorted(nodes_of(result, "ImageChecker")[1:]) == ["east", "west"]
     assert len(result.operation_area["coordinates"]) == 2
     assert reasons(result)["ImageChecker", "far"] == "NoCoverage"
+
+
+def anywhere(rng, lat, lon):
+    """A place around one, that may be a pole or on the antimeridian; near a pole at any longitude."""
+    spread = rng.choice([0, 1e-6, 1e-4, 1e-2, 0.1, 1])
+    there = rng.choice([lon + rng.uniform(-spread, spread), rng.uniform(-180, 180) if abs(lat) > 80 else lon])
+    return {
+        "lat": min(max(lat + rng.uniform(-spread, spread), -90), 90),
+        "lon": (there + 180) % 360 - 180,
+    }
+
+
+def asked_for(rng, place):
+    """Components that use the drone in one of the ways that a manifest can."""
+    path = [place() | {"alt": 10} for _ in range(rng.randint(1, 5))]
+    way = rng.choice(["depot", "path", "circle", "polygon", "points"])
+    if way == "points":
+        points = {"points": path, "serviceAccess": rng.choice(["points", "path"]), "ordered": rng.random() < 0.5}
+        return [VIEWER | {"pointsOfInterest": points}, CHECKER]
+    driver = navigator(path, point={"depot": "base"} if way == "depot" else {"position": path[0]})
+    if way in {"circle", "polygon"}:
+        circle = {"circle": {"center": place(), "radius": rng.choice([1, 50, 5000])}}
+        ring = {"polygon": {"exterior": [place() for _ in range(rng.randint(3, 5))]}}
+        region = circle if way == "circle" else ring
+        driver["controlPoints"] = [{"point": {"position": path[0]}, "navigation": "regionBased", "region": region}]
+    return [driver, VIEWER, CHECKER]
+
+
+@given(
+    st.integers(0, 2**32),
+    st.sampled_from([90, 89.99999, 89.999, 89.9, 89, 0]),
+    st.sampled_from([1, -1]),
+    st.sampled_from([180, -180, 179.9999, 0, 90]),
+)
+@example(7029, 90, 1, 180)
+@settings(max_examples=examples(300, 60), deadline=None)
+def test_any_place_gives_a_plan_or_a_reason(seed, lat, side, lon):
+    rng = random.Random(seed)
+
+    def place():
+        return anywhere(rng, side * lat, lon)
+
+    flying = Drone.from_body(
+        manifest("Drone", "d", drone("d").spec.to_dict() | {"home": place()}, status=drone("d").status.to_dict())
+    )
+    nodes = [
+        type(edge("x", (0, 0))).from_body(
+            manifest("EdgeNode", f"e{i}", edge("x", (0, 0)).spec.to_dict() | {"location": place()})
+        )
+        for i in range(3)
+    ]
+    base = Depot.from_body(manifest("Depot", "base", {"location": place(), "radius": rng.choice([20, 10_000])}))
+    stock = dataclasses.replace(inventory([flying], nodes), depots={"base": base})
+    try:
+        result = plan(application(*asked_for(rng, place)), stock, Settings(depot_radius_m=1e9, battery_reserve=0))
+    except Infeasible as error:
+        assert error.reason in {"NoDrone", "NoCloudNode"}
+    except InvalidObject as error:
+        assert re.fullmatch(r"(spec\.)?components\[0\]\.[^ ]+: .+", str(error))
+    else:
+        assert result.operation_area["coordinates"]

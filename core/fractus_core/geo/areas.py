@@ -142,9 +142,13 @@ def geojson(frame: LocalFrame, shape: BaseGeometry) -> dict[str, Any]:
     for part in shapely.get_parts(shape):
         rings = [_unwrapped(frame, ring) for ring in (part.exterior, *part.interiors)]
         reference = rings[0][0][0]
-        rings = [[(_near(lon, reference), lat) for lon, lat in ring] for ring in rings]
+        rings = [_shifted(ring, _near(ring[0][0], reference) - ring[0][0]) for ring in rings]
         whole = shapely.Polygon(rings[0], rings[1:])
-        polygons += [p for p in _cut(whole) if isinstance(p, shapely.Polygon) and p.area > 0]
+        if any(_turns(ring) for ring in rings) or not whole.is_valid:
+            # On the grid of what is written: slivers that a straight way past the pole leaves would round to nothing.
+            polygons += _parts(shapely.set_precision(part, 1e-7) for part in _parts(_cut(_beside_pole(rings))))
+        else:
+            polygons += _parts(_cut(whole))
     coordinates = [
         [[[round(x, 7), round(y, 7)] for x, y in ring.coords] for ring in (p.exterior, *p.interiors)]
         for p in (shapely.orient_polygons(q) for q in polygons)
@@ -175,6 +179,36 @@ def _unwrapped(frame: LocalFrame, ring: BaseGeometry) -> list[tuple[float, float
     # By whole turns, which are exact: so the ring stays closed.
     lons[1:] -= 360.0 * np.cumsum(np.round(np.diff(lons) / 360.0))
     return list(zip(lons.tolist(), lats.tolist(), strict=True))
+
+
+def _parts(shapes: Iterable[BaseGeometry]) -> list[shapely.Polygon]:
+    parts = shapely.get_parts(list(shapes))
+    return [part for part in parts if isinstance(part, shapely.Polygon) and part.area > 0]
+
+
+def _turns(ring: Sequence[tuple[float, float]]) -> bool:
+    """Whether an unwrapped ring goes around a pole: it ends a whole turn from where it began."""
+    return abs(ring[-1][0] - ring[0][0]) > 180.0
+
+
+def _beside_pole(rings: Iterable[Sequence[tuple[float, float]]]) -> BaseGeometry:
+    """What the rings enclose on a map of degrees, where a pole is a line and a straight way past it is none."""
+    exterior, *holes = rings
+    # A hole may lie a whole turn from where the exterior begins.
+    turned = (_closed(_shifted(hole, shift)) for hole in holes for shift in (-360.0, 0.0, 360.0))
+    return _closed(exterior).difference(shapely.union_all(list(turned)))
+
+
+def _closed(ring: Sequence[tuple[float, float]]) -> BaseGeometry:
+    over: list[tuple[float, float]] = []
+    if _turns(ring):
+        pole = math.copysign(90.0, sum(lat for _, lat in ring))
+        over = [(ring[-1][0], pole), (ring[0][0], pole)]
+    return shapely.make_valid(shapely.Polygon([*ring, *over]), method="structure", keep_collapsed=False)
+
+
+def _shifted(ring: Sequence[tuple[float, float]], by: float) -> list[tuple[float, float]]:
+    return [(lon + by, lat) for lon, lat in ring]
 
 
 def _near(lon: float, reference: float) -> float:

@@ -18,6 +18,8 @@ SAMPLES = 8192
 """About how many samples an area gets; more if it is long and narrow."""
 
 _MAX_SAMPLES = 200_000
+_MAX_CROSSINGS = 1_000_000
+"""How often the outline may cross the lattice's rows: a region may be a millimetre wide and many kilometres long."""
 _ACROSS = 4
 """Samples across the width of a narrow area, so that a corridor is not missed between two rows."""
 _TILT_RAD = math.atan((math.sqrt(5) - 1) / 2)
@@ -45,7 +47,7 @@ class Samples:
     def __init__(self, shape: BaseGeometry) -> None:
         area, outline = float(shape.area), float(shape.length)
         width = 2 * area / outline
-        finest = math.sqrt(area / _MAX_SAMPLES)
+        finest = max(math.sqrt(area / _MAX_SAMPLES), outline / _MAX_CROSSINGS)
         self.spacing_m = max(finest, min(math.sqrt(area / SAMPLES), width / _ACROSS))
         rows, columns = _lattice(shape, self.spacing_m)
         self._first = (int(rows.min()), int(columns.min()))

@@ -149,6 +149,9 @@ def check_tasks(
 
 
 def check_missions(before: ControlState, now: ControlState, actions: tuple[Action, ...], where: Where) -> None:
+    if now.lease is not None:
+        mission = now.missions.get(now.lease.key)
+        assert mission is None or mission.outcome is None, f"a driver waits for a mission that is over{where}"
     for key, mission in before.missions.items():
         if mission.outcome is not None:
             assert now.missions[key].outcome == mission.outcome, f"a mission that ended goes on{where}"
@@ -330,3 +333,32 @@ def test_a_mode_that_the_system_did_not_ask_for_is_a_pilots() -> None:
     assert foreign.authority is Authority.PILOT
     failsafe, _ = told_of(*FLIES, told.VehicleObserved(replace(FLYING, mode=RTL, failsafe=True)), told.Heartbeat())
     assert (failsafe.authority, failsafe.returning) == (Authority.SYSTEM, True)
+
+
+def test_a_mission_that_a_pilot_landed_is_not_granted_again() -> None:
+    pilots = FlightMode("LOITER", ModeKind.OTHER)
+    taken = (told.VehicleObserved(replace(FLYING, mode=pilots)), told.Heartbeat(), told.StreamOpened(2, "a", "A"))
+    waiting, _ = told_of(*FLIES, *taken)
+    assert waiting.authority is Authority.PILOT
+    assert waiting.lease is not None
+    landed, actions = told_of(
+        told.VehicleObserved(replace(FLYING, mode=pilots, armed=False, in_air=False)), told.Heartbeat(), state=waiting
+    )
+    assert landed.missions["a"].outcome is not None
+    assert landed.lease is None
+    assert [action.event.state for action in actions if isinstance(action, SendEvent)] == [StreamState.LOST]
+    again, _ = told_of(told.GrantControl(2), told.TransitBegan(1, "a", "A"), state=landed)
+    assert not again.drives
+    assert again.flight is None
+
+
+def test_a_waiting_driver_that_loses_its_grant_ends_no_other_mission() -> None:
+    other = told.GrantRef("b", leads=True)
+    grounded = (*ASKS, told.StreamClosed(1), told.GrantChanged(None, other), told.StreamOpened(2, "b", "B"))
+    state, _ = told_of(*grounded)
+    assert (state.active, state.lease is not None) == ("a", True)
+    after_, actions = told_of(told.GrantChanged(other, None), state=state)
+    assert after_.missions["a"].outcome is None
+    assert after_.missions["b"].outcome == Outcome(OutcomeKind.REVOKED, "the grant was removed")
+    assert (after_.active, after_.lease, after_.removed) == ("a", None, None)
+    assert [action.event.state for action in actions if isinstance(action, SendEvent)] == [StreamState.LOST]

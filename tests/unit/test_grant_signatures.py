@@ -392,6 +392,8 @@ def test_the_mission_is_signed_and_kept_while_the_grant_is() -> None:
     again = signer.sign(unnamed, grant(created))
     assert again["spec"]["mission"] == created["spec"]["mission"]
     assert signer.sign(unnamed)["spec"]["mission"] != created["spec"]["mission"]
+    moved = {**unnamed, "spec": {**unnamed["spec"], "node": "drone-2"}}
+    assert signer.sign(moved, grant(created))["spec"]["mission"] != created["spec"]["mission"]
     forged = {**first, "spec": {**first["spec"], "mission": "u2"}}
     with pytest.raises(BadSignature, match="changed"):
         verify(grant(forged), CAS)
@@ -402,6 +404,11 @@ def test_no_grant_takes_the_mission_of_another_instance(node: Node) -> None:
     other = signed(instance="app-b", component="B", mission="u1")
     other["metadata"]["uid"] = own["metadata"]["uid"] = "u1"
     assert grant(other).spec.mission_key != grant(own).spec.mission_key
+
+
+def test_a_tour_without_an_area_is_not_signed() -> None:
+    with pytest.raises(InvalidObject, match="a tour needs operationArea"):
+        signed(operationArea=[], tour=[{"lat": 39.36, "lon": 22.95, "alt": 10}], **{"class": None})
 
 
 @pytest.mark.parametrize("who", ["driver", "passenger"])

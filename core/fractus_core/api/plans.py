@@ -218,7 +218,8 @@ class GrantSpec(Model):
 
         An area that was left out by mistake must not let a drone fly anywhere: "everywhere" is said by an area that large.
         """
-        return f"a {self.class_} needs operationArea" if self.class_ is not None and not self.operation_area else ""
+        flies = self.class_ or ("tour" if self.tour else "")
+        return f"a {flies} needs operationArea" if flies and not self.operation_area else ""
 
     def methods(self, service: str) -> frozenset[str]:
         """The methods granted on a service; a driver may always get and return control."""

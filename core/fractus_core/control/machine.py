@@ -80,7 +80,16 @@ def transition(state: ControlState, event: Event, now: float) -> tuple[ControlSt
         _on_tick(step)
     else:
         assert_never(event)
+    _end_lease_of_ended_mission(step)
     return step.state, tuple(step.actions)
+
+
+def _end_lease_of_ended_mission(step: Step) -> None:
+    """No driver has or waits for the vehicle for a mission that is over: it could arm beside the pilot who landed it."""
+    lease = step.state.lease
+    mission = step.state.missions.get(lease.key) if lease is not None else None
+    if mission is not None and mission.outcome is not None:
+        step.lose_lease(str(mission.outcome))
 
 
 # Policies and grants
@@ -118,7 +127,12 @@ def _grant_changed(step: Step, event: GrantChanged) -> None:
     concerned = (lease is not None and lease.key == before.key) or step.state.active == before.key
     if mission is None or mission.outcome is not None or not concerned:
         return
-    step.set(active=step.state.active or before.key, removed=before.key)
+    if step.state.active not in {None, before.key}:
+        # It only waited for a vehicle that is another mission's: that one goes on.
+        step.lose_lease(GRANT_REMOVED)
+        step.end_mission(mission, OutcomeKind.REVOKED, GRANT_REMOVED)
+        return
+    step.set(active=before.key, removed=before.key)
     if step.state.authority is Authority.PILOT:
         step.end_mission(mission, OutcomeKind.REVOKED, GRANT_REMOVED)
     else:
@@ -131,8 +145,8 @@ def _grant_changed(step: Step, event: GrantChanged) -> None:
 def _on_system(step: Step, event: SystemEvent) -> None:
     match event:
         case TransitBegan(flight_id, key, identity):
-            if step.state.authority is Authority.PILOT or step.state.drives:
-                return  # the system flies for applications only where no one else has authority
+            if step.state.authority is Authority.PILOT or step.state.drives or _is_over(step, key):
+                return  # the system flies only for missions that go on, and where no one else has authority
             if step.state.touring != key:  # a tour begins its own transit, and must not end itself
                 step.stop_task()
             step.set(grace=None, authority=Authority.SYSTEM)
@@ -157,6 +171,11 @@ def _on_system(step: Step, event: SystemEvent) -> None:
             _on_tour(step, event)
         case _:
             assert_never(event)
+
+
+def _is_over(step: Step, key: str) -> bool:
+    mission = step.state.missions.get(key)
+    return mission is not None and mission.outcome is not None
 
 
 def _on_tour(step: Step, event: TourBegan | TourInterrupted | TourEnded) -> None:

@@ -83,9 +83,11 @@ class GrantSigner:
 def _mission(body: dict[str, Any], replaces: Grant | None) -> str:
     """The mission of a Grant: the one that it names, or else that of the same object before, or else a new one.
 
-    `metadata.uid` names the mission where no API server gives objects their uid.
+    `metadata.uid` names the mission where no API server gives objects their uid. On another node it is a new mission: the
+    first node has ended its own when the Grant left, and would refuse to fly it again.
     """
     uid = (body.get("metadata") or {}).get("uid")
-    same = replaces is not None and uid in {None, replaces.metadata.uid}
-    kept = replaces.spec.mission if replaces is not None and same else None
+    kept = None
+    if replaces is not None and replaces.spec.node == body["spec"]["node"] and uid in {None, replaces.metadata.uid}:
+        kept = replaces.spec.mission
     return str(body["spec"].get("mission") or kept or uid or uuid.uuid4())

@@ -7,6 +7,7 @@ import math
 
 from fractus_core.control import Mission
 from fractus_core.control.events import ArmingPrepared, ArmingRequested, MotorStart
+from fractus_core.control.values import ended_refusal
 from fractus_core.geo import LocalFrame
 
 from fractus_services.errors import AutopilotError, PreconditionFailed
@@ -60,7 +61,10 @@ class Arming:
 
     async def _arm(self, grant: ActiveGrant, permit: Permit) -> None:
         self._check()
-        home = self._home_of(grant, self._control.mission(grant))
+        mission = self._control.mission(grant)
+        if mission.outcome is not None:
+            raise PreconditionFailed(*ended_refusal(mission.outcome))
+        home = self._home_of(grant, mission)
         self._control.dispatch(ArmingRequested(grant.key, grant.identity, home))
         failure = await self._control.save(timeout_s=ARMING_TIMEOUT_S)
         if failure:

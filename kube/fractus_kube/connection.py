@@ -165,7 +165,10 @@ class Connection:
     def _open(self) -> None:
         """Make the pool of connections, once there is a loop; the official client's own keeps them for 15 s only."""
         if self._rest.pool_manager is None:
+            no_redirects = aiohttp.TraceConfig()
+            no_redirects.on_request_redirect.append(_refuse_redirect)
             self._rest.pool_manager = aiohttp.ClientSession(
+                trace_configs=[no_redirects],
                 connector=aiohttp.TCPConnector(
                     ssl=self._rest.ssl_context, limit=MAX_CONNECTIONS, keepalive_timeout=_KEPT_OPEN_S
                 ),
@@ -173,6 +176,13 @@ class Connection:
                 # Looking for proxies takes a request as long as all else, so not where there are none.
                 trust_env=self._trust_env and bool(getproxies_environment()),
             )
+
+
+async def _refuse_redirect(
+    _session: aiohttp.ClientSession, _context: object, redirect: aiohttp.TraceRequestRedirectParams
+) -> None:
+    """An API server does not redirect; what does could have Secrets sent to it, in plain text."""
+    raise aiohttp.ClientError(f"refused a redirect to {redirect.response.headers.get('Location', 'nowhere')}")
 
 
 @contextmanager

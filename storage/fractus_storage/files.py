@@ -18,7 +18,7 @@ def write_file(
 ) -> None:
     """Replace a file in one step and wait until it is on the disk.
 
-    The temporary file begins with a dot and ends in .tmp; each process has its own, and a kill may leave it behind.
+    The temporary file begins with a dot and ends in .tmp; each call has its own, and a kill may leave it behind.
 
     Args:
         path: The file; one process writes it at a time, unless it does not matter whose content stays.
@@ -30,7 +30,7 @@ def write_file(
     Raises:
         OSError: the disk is full, read-only or gone; the old content is untouched.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
         _write_new(temporary, content, mode, durable=durable)
         if former is not None:

@@ -137,6 +137,13 @@ async def test_a_refusal_is_told_by_what_to_do_about_it(status: int, error: type
     assert (raised.value.status, raised.value.reason) == (status, "Because")
 
 
+async def test_nothing_is_sent_where_a_redirect_points() -> None:
+    head = b"HTTP/1.1 307 Temporary Redirect\r\nLocation: http://127.0.0.1:1/stolen\r\nContent-Length: 0\r\n\r\n"
+    async with client_of(Server(head)) as client:
+        with pytest.raises(KubeError, match="refused a redirect to http"):
+            await client.request("POST", "/api/v1/secrets", {"data": {"tls.key": "c2VjcmV0"}})
+
+
 async def test_a_refusal_of_a_proxy_on_the_way_is_one_too() -> None:
     async with client_of(Server(answer(b"<html>Bad Gateway</html>", 502))) as client:
         with pytest.raises(KubeError, match="Bad Gateway") as raised:

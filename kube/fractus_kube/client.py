@@ -46,14 +46,16 @@ class Client(Connection):
         self,
         kind: Kind,
         *,
+        namespace: str = "",
         selectors: Mapping[str, str] | None = None,
         continue_: str = "",
         timeout_s: float = LIST_TIMEOUT_S,
     ) -> Page:
-        """Read one page of a collection over all namespaces.
+        """Read one page of a collection.
 
         Args:
             kind: Which collection.
+            namespace: Which part of it; empty: all namespaces.
             selectors: labelSelector and fieldSelector, where wanted.
             continue_: What the page before gave, to go on from.
             timeout_s: How long the page may take; within that, it must make progress.
@@ -64,7 +66,7 @@ class Client(Connection):
         params = {"limit": str(PAGE), **(selectors or {})}
         if continue_:
             params["continue"] = continue_
-        return Page(await self.request("GET", kind.path(), params=params, timeout_s=timeout_s))
+        return Page(await self.request("GET", kind.path(namespace), params=params, timeout_s=timeout_s))
 
     async def list(self, kind: Kind, *, selectors: Mapping[str, str] | None = None) -> list[Body]:
         """Read a whole collection over all namespaces."""
@@ -87,6 +89,7 @@ class Client(Connection):
         kind: Kind,
         *,
         resource_version: str,
+        namespace: str = "",
         selectors: Mapping[str, str] | None = None,
         timeout_s: int,
         silence_s: float,
@@ -96,6 +99,7 @@ class Client(Connection):
         Args:
             kind: Which collection.
             resource_version: Where to go on from.
+            namespace: As for the list.
             selectors: As for the list.
             timeout_s: The server ends the watch after this time.
             silence_s: The connection counts as dead after this time without a byte (the server sends a
@@ -112,7 +116,7 @@ class Client(Connection):
             **(selectors or {}),
         }
         with translated(f"watch of {kind.plural}"):
-            async with self.answer("GET", kind.path(), params, silence_s=silence_s) as response:
+            async with self.answer("GET", kind.path(namespace), params, silence_s=silence_s) as response:
                 rest = b""
                 while True:
                     # aiohttp's own time-out ends with the connection, also where that never tells the reader.

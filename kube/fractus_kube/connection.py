@@ -63,13 +63,15 @@ class Connection:
         self._access = access
         self._may_write_s = may_write_s
         self._trust_env = trust_env
+        self._closed = False
         try:
             self._rest = RESTClientObject(access.configuration)
         except (ssl.SSLError, OSError) as error:
             raise Unconfigured(f"the certificates of the cluster cannot be used: {error}") from error
 
     async def aclose(self) -> None:
-        """Close every connection."""
+        """Close every connection; requests from now on fail as if the API server were out of reach."""
+        self._closed = True
         await self._rest.close()
 
     async def request(
@@ -164,6 +166,8 @@ class Connection:
 
     def _open(self) -> None:
         """Make the pool of connections, once there is a loop; the official client's own keeps them for 15 s only."""
+        if self._closed:
+            raise aiohttp.ClientConnectionError("the connection was closed")
         if self._rest.pool_manager is None:
             no_redirects = aiohttp.TraceConfig()
             no_redirects.on_request_redirect.append(_refuse_redirect)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import random
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from typing import Generic, TypeVar
@@ -20,13 +21,16 @@ T = TypeVar("T")
 _WATCH_TIMEOUT_S = (240, 300)
 _SILENCE_S = 100.0
 _BACKOFF_S = (0.4, 30.0)
+_STEADY_S = 1.0
+"""A watch that ends sooner, without an event, is followed by a pause, as a failure is."""
 
 
 class Reflector(Generic[T]):
     """A current local copy of a collection.
 
     Only what `parse` returns is kept, so a large collection costs what is used of it. Every
-    difference is reported to `on_change(key, old, new)`, also those found by listing again.
+    difference is reported to `on_change(key, old, new)`, also those found by listing again. Of a namespaced kind it
+    holds all namespaces, or one.
     """
 
     def __init__(
@@ -37,9 +41,11 @@ class Reflector(Generic[T]):
         on_change: Callable[[Key, T | None, T | None], None],
         *,
         selectors: Mapping[str, str] | None = None,
+        namespace: str = "",
         rng: random.Random | None = None,
     ) -> None:
         self.kind = kind
+        self._namespace = namespace
         self.synced = asyncio.Event()
         self.restarts = 0
         self._client = client
@@ -87,22 +93,31 @@ class Reflector(Generic[T]):
     async def run(self) -> None:
         """List and watch until cancelled; failures are retried with growing, jittered pauses."""
         version = ""
+        loop = asyncio.get_running_loop()
         while True:
+            opened_s = math.inf
             try:
                 if not version:
                     version = await self._list()
-                    self._backoff.succeeded()
+                opened_s = loop.time()
                 async for seen in self._watch(version):
                     version = seen
                     self._backoff.succeeded()
             except Expired:
                 logger.info("reflector of %s: the watch expired; listing again", self.kind.plural)
-                version = ""
+                version, ended = "", False
             except KubeError as error:
                 if error.status not in (0, 429) and error.status < 500:
                     version = ""
                 log = logger.warning if self._backoff.attempts else logger.info
                 log("reflector of %s: %s", self.kind.plural, error)
+                ended = False
+            else:
+                ended = True
+            steady = loop.time() - opened_s >= _STEADY_S
+            if steady:
+                self._backoff.succeeded()
+            if not (steady and ended):
                 await asyncio.sleep(self._backoff.delay_s())
             self.restarts += 1
 
@@ -113,7 +128,9 @@ class Reflector(Generic[T]):
         listed: set[Key] = set()
         continue_ = ""
         while True:
-            page = await self._client.list_page(self.kind, selectors=self._selectors, continue_=continue_)
+            page = await self._client.list_page(
+                self.kind, namespace=self._namespace, selectors=self._selectors, continue_=continue_
+            )
             self._heard()
             # All pages show the same moment: what a later one brings is no older than an answer that comes meanwhile.
             self._reach(page.resource_version)
@@ -135,6 +152,7 @@ class Reflector(Generic[T]):
         timeout_s = self._rng.randint(*_WATCH_TIMEOUT_S)
         async for type_, body in self._client.watch(
             self.kind,
+            namespace=self._namespace,
             resource_version=version,
             selectors=self._selectors,
             timeout_s=timeout_s,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
 import shutil
 import uuid
@@ -18,30 +19,52 @@ def write_file(
 ) -> None:
     """Replace a file in one step and wait until it is on the disk.
 
-    The temporary file begins with a dot and ends in .tmp; each call has its own, and a kill may leave it behind.
+    Temporary files begin with a dot and end in .tmp; each call has its own. What a kill leaves of them, `remove_temporary`
+    removes.
 
     Args:
         path: The file; one process writes it at a time, unless it does not matter whose content stays.
         content: What it will hold.
         mode: Its permissions, whatever the umask.
-        former: Where the file as it was is kept, unless there was none.
+        former: Where the file as it was is kept, unless there was none; meanwhile the file is there, too.
         durable: False for what can be made again: in one step, but without waiting for the disk.
 
     Raises:
         OSError: the disk is full, read-only or gone; the old content is untouched.
     """
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    temporary = _temporary(path)
     try:
         _write_new(temporary, content, mode, durable=durable)
         if former is not None:
             with contextlib.suppress(FileNotFoundError):
-                path.replace(former)
+                _keep(path, former)
         temporary.replace(path)
     except OSError:
         temporary.unlink(missing_ok=True)
         raise
     if durable:
         _sync_directory(path.parent)
+
+
+def remove_temporary(path: Path) -> None:
+    """Remove what killed writers of a file left beside it, where that can be; only its one writer may ask for it."""
+    with contextlib.suppress(OSError):
+        for left in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
+            left.unlink(missing_ok=True)
+
+
+def _keep(path: Path, former: Path) -> None:
+    """Give a file a second name, in one step."""
+    spare = _temporary(path)
+    try:
+        spare.hardlink_to(path)
+    except FileNotFoundError:
+        raise
+    except OSError:  # a file system without hard links
+        path.replace(former)
+        return
+    spare.replace(former)
+    spare.unlink(missing_ok=True)  # where both were the same file already, nothing was renamed
 
 
 def remove_file(path: Path) -> bool:
@@ -61,11 +84,16 @@ def write_set(directory: Path, files: Mapping[str, bytes], mode: int = 0o600) ->
     """
     directory.mkdir(parents=True, exist_ok=True)
     fresh = directory / f"..{uuid.uuid4().hex}"
-    fresh.mkdir(mode=0o700)
-    for name, content in files.items():
-        _write_new(fresh / name, content, mode)
-    _sync_directory(fresh)
-    _link(directory / CURRENT, fresh.name)
+    try:
+        fresh.mkdir(mode=0o700)
+        for name, content in files.items():
+            _write_new(fresh / name, content, mode)
+        _sync_directory(fresh)
+        _link(directory / CURRENT, fresh.name)
+    except OSError:
+        # A key must not be left behind by each attempt.
+        shutil.rmtree(fresh, ignore_errors=True)
+        raise
     for name in files:
         target = f"{CURRENT}/{name}"
         if not (directory / name).is_symlink() or str((directory / name).readlink()) != target:
@@ -83,6 +111,10 @@ def read_set(directory: Path, names: tuple[str, ...]) -> dict[str, bytes] | None
         return {name: (home / name).read_bytes() for name in names}
     except FileNotFoundError:
         return None
+
+
+def _temporary(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
 
 
 def _write_new(path: Path, content: bytes, mode: int, *, durable: bool = True) -> None:

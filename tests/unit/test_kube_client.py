@@ -174,6 +174,19 @@ async def test_a_connection_that_is_closed_without_an_answer_is_an_error() -> No
             await client.request("POST", "/x", {})
 
 
+@pytest.mark.parametrize("used", [False, True])
+async def test_requests_after_the_end_are_errors_like_others(used: bool) -> None:
+    async with client_of(Server(answer({"a": 1}))) as client:
+        if used:
+            await client.request("GET", "/x")
+        await client.aclose()
+        with pytest.raises(KubeError, match="the connection was closed"):
+            await client.request("GET", "/x")
+        with pytest.raises(KubeError, match="the connection was closed"):
+            await anext(events(client))
+        assert not await client.ready()
+
+
 async def test_an_answer_that_is_no_json_is_an_error() -> None:
     async with client_of(Server(answer(b"<html>"))) as client:
         with pytest.raises(KubeError, match="JSONDecodeError"):

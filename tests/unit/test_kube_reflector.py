@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import random
 from collections.abc import AsyncIterator
 from typing import Any
@@ -27,7 +28,7 @@ class Script:
         self.calls: list[str] = []
         self.done = asyncio.Event()
 
-    async def list_page(self, kind: Any, *, selectors: Any = None, continue_: str = "", limit: int = 500) -> Page:
+    async def list_page(self, kind: Any, *, continue_: str = "", **_: Any) -> Page:
         self.calls.append(f"list {continue_}".strip())
         step = await self._next()
         if isinstance(step, Exception):
@@ -100,6 +101,32 @@ async def test_an_expired_watch_lists_again_and_reports_the_difference(monkeypat
     assert held == {("", "same"): 2, ("", "new"): 4}
     assert sorted(changes[3:]) == [(("", "gone"), 1, None), (("", "new"), 3, 4)]
     assert script.calls == ["list", "watch 5", "list", "watch 50"]
+
+
+@pytest.mark.parametrize("watch", [[], [Expired(410, "Expired", "too old")]], ids=["ends at once", "expires"])
+async def test_a_watch_that_comes_to_nothing_is_opened_less_and_less_often(
+    watch: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pauses: list[float] = []
+
+    async def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+
+    monkeypatch.setattr(asyncio, "sleep", sleep)
+
+    class Same(Script):
+        async def _next(self) -> Any:
+            return await super()._next() if len(pauses) >= 7 else page(5) if "list" in self.calls[-1] else watch
+
+    script = Same()
+    reflector: Reflector[int] = Reflector(script, ZONE, lambda body: body["value"], lambda *_: None)  # type: ignore[arg-type]
+    task = asyncio.create_task(reflector.run())
+    async with asyncio.timeout(5):
+        await script.done.wait()
+    task.cancel()
+    assert 0.2 <= pauses[0] <= 0.4
+    assert all(later > before * 0.9 for before, later in itertools.pairwise(pauses))
+    assert pauses[-1] >= 12
 
 
 async def test_a_broken_connection_is_taken_up_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ from fractus_core.api import Application, Depot, InvalidObject, Policy, Zone
 from fractus_core.api.geometry import Area
 from fractus_core.geo import LocalFrame, geodesic_m, middle, polygon
 from fractus_core.planning.area import operation_area
+from fractus_core.policy.selectors import is_attribute
 
 MAX_WAYPOINTS = 2000
 """Waypoints and points of interest of one application: far more than a battery lasts for."""
@@ -45,11 +46,18 @@ def check_zone(zone: Zone) -> None:
 
 
 def check_policy(policy: Policy, zones: Collection[str]) -> None:
-    """Refuse a policy that selects zones which do not exist.
+    """Refuse a policy that selects zones which do not exist, or nodes by attributes that none can have.
 
     Raises:
-        InvalidObject: naming the first such zone.
+        InvalidObject: naming the first such zone or attribute.
     """
+    for i, expression in enumerate(policy.spec.selector.nodes):
+        if not is_attribute(expression.key):
+            holds_for = "no node" if policy.spec.kind == "grant" else "every node"
+            raise InvalidObject(
+                f"spec.selector.nodes[{i}].key",
+                f"no Drone or EdgeNode has an attribute {expression.key}, so that this selects {holds_for}; correct the name",
+            )
     for i, name in enumerate(policy.spec.selector.zones):
         if name not in zones:
             known = ", ".join(sorted(zones)[:10]) or "there is none yet"

@@ -8,7 +8,7 @@ import yaml
 from fractus_core.api import KINDS, Application, InvalidObject, Policy, Zone
 from fractus_core.api.crd import crd
 from fractus_core.api.model import quantity
-from fractus_core.api.policies import ActiveTime, active_at
+from fractus_core.api.schedules import ActiveTime, active_at
 from fractus_core.validation import check_application, check_area, check_policy
 from test_planning import CHECKER, PATH, STORE, VIEWER, application, component, manifest, navigator
 
@@ -37,6 +37,18 @@ def test_every_number_has_its_unit_or_meaning():
         assert missing == []
 
 
+@pytest.mark.parametrize("kind", [k for k in KINDS if not k.WRITTEN_BY_OPERATOR], ids=lambda k: k.KIND)
+def test_kubectl_explains_every_field_that_users_write(kind):
+    def walk(schema, path):
+        for name, inner in schema.get("properties", {}).items():
+            yield from () if inner.get("description") else (f"{path}.{name}",)
+            yield from walk(inner, f"{path}.{name}")
+        yield from walk(schema.get("items", {}), path) if "items" in schema else ()
+
+    spec = crd(kind)["spec"]["versions"][0]["schema"]["openAPIV3Schema"]["properties"]["spec"]
+    assert list(walk(spec, kind.KIND)) == []
+
+
 def bad(*components):
     with pytest.raises(InvalidObject) as caught:
         application(*components)
@@ -53,24 +65,24 @@ def test_sentences_of_bad_applications():
         ([VIEWER | {"egress": []}], "spec.components[0].pointsOfInterest: an application with drone components needs"),
         ([navigator(PATH), navigator(PATH) | {"name": "Second"}], "spec.components[1].class: an application has at most one driver"),
         ([navigator([])], "spec.components[0].controlPoints[0].path: "),
-        ([navigator([plain | {"lat": 95}])], "spec.components[0].controlPoints[0].path[0].lat: input should be less than or equal to 90, not 95"),
-        ([STORE | {"replicas": 0}], "spec.components[0].replicas: input should be greater than or equal to 1, not 0"),
-        ([edge_component(locations=[{"center": plain, "radius": -1}])], "spec.components[0].locations[0].radius: input should be greater than 0, not -1"),
+        ([navigator([plain | {"lat": 95}])], "spec.components[0].controlPoints[0].path[0].lat: must be less than or equal to 90, not 95"),
+        ([STORE | {"replicas": 0}], "spec.components[0].replicas: must be greater than or equal to 1, not 0"),
+        ([edge_component(locations=[{"center": plain, "radius": -1}])], "spec.components[0].locations[0].radius: must be greater than 0, not -1"),
         ([edge_component(locations=[{"center": plain, "radius": 1, "instances": 0}])], "spec.components[0].locations[0].instances: instances is a whole number of 1 to 10000, or"),
         ([edge_component(locations=[])], "spec.components[0].locations: locations are needed for placement edge"),
         ([STORE | {"egress": ["Stranger"]}], "spec.components[0].egress[0]: egress names a component that the application does not have (Stranger)"),
         ([STORE | {"egress": ["DataStore"]}], "spec.components[0].egress[0]: egress names the component itself; remove it (DataStore)"),
-        ([edge_component(services=[{"service": "camera", "methods": ["Fly"]}])], "spec.components[0].services[0].methods[0]: input should be 'Arm'"),
+        ([edge_component(services=[{"service": "camera", "methods": ["Fly"]}])], "spec.components[0].services[0].methods[0]: must be 'Arm'"),
         ([edge_component(services=[{"service": "camera", "methods": ["Goto"]}])], "spec.components[0].services[0].methods[0]: the camera service has CaptureImage, DeleteImage"),
         ([edge_component(services=[{"service": "mobility", "methods": ["Goto"]}])], "spec.components[0].services: the mobility service is on drones only"),
-        ([STORE, STORE | {"name": "data-store"}], "spec.components[1].name: data-store and DataStore get the same object name"),
-        ([STORE | {"replica": 2}], "spec.components[0].replica: extra inputs are not permitted, not 2"),
+        ([STORE, STORE | {"name": "data-store"}], "spec.components[1].name: names of components differ in more than capitals and hyphens; rename one (data-store and DataStore)"),
+        ([STORE | {"replica": 2}], "spec.components[0].replica: there is no such field; remove it"),
         ([STORE | {"container": {"image": "x", "volumes": [{"name": "v", "mountPath": "/v"}]}}], "spec.components[0].container.volumes[0]: give exactly one of emptyDir"),
         ([STORE | {"container": {"image": "x", "volumes": [{"name": "v", "mountPath": "/v", "secret": "other-tls"}]}}], "spec.components[0].container.volumes[0].secret: Secrets whose names end in -tls"),
-        ([STORE | {"container": {"image": "x", "volumes": [{"name": "tls", "mountPath": "/v", "claim": "c"}]}}], "spec.components[0].container.volumes[0].name: tls is taken"),
+        ([STORE | {"container": {"image": "x", "volumes": [{"name": "tls", "mountPath": "/v", "claim": "c"}]}}], "spec.components[0].container.volumes[0].name: the pod has volumes tls and tmp of its own"),
         ([STORE | {"container": {"image": "x", "env": [{"name": "A", "value": "1"}, {"name": "A"}]}}], "spec.components[0].container.env[1].name: A is there twice; remove one of them"),
         ([STORE | {"container": {"image": "x", "ports": [{"port": 80}, {"port": 80}]}}], "spec.components[0].container.ports[1].port: 80 is there twice; remove one of them"),
-        ([STORE | {"container": {"image": "x", "ports": [{"port": 80, "name": "a"}, {"port": 81, "name": "a"}]}}], "spec.components[0].container.ports[1].name: a is taken; choose another name"),
+        ([STORE | {"container": {"image": "x", "ports": [{"port": 80, "name": "a"}, {"port": 81, "name": "a"}]}}], "spec.components[0].container.ports[1].name: each port needs a name of its own; choose another name"),
         ([STORE | {"container": {"image": "x", "resources": {"limits": {"cpu": "much"}}}}], "spec.components[0].container.resources.limits.cpu: 'much' is not a quantity"),
     ]  # fmt: skip
     for components, sentence in cases:
@@ -284,6 +296,14 @@ def test_wrong_types_are_told_in_words_of_manifests(spec, sentence):
 def test_too_many_waypoints_are_refused():
     path = [{"lat": 50 + i * 1e-6, "lon": 4} for i in range(1000)]
     point = {"navigation": "pathBased", "path": path}
-    app = application(navigator(PATH) | {"controlPoints": [point] * 3})
+    app = application(navigator(PATH) | {"control": "partial", "controlPoints": [point] * 3})
     with pytest.raises(InvalidObject, match=r"controlPoints: 3000 waypoints in all, more than 2000"):
         check_application(app, {})
+
+
+@pytest.mark.parametrize("control", [{}, {"control": "full"}])
+def test_full_control_takes_one_control_point(control):
+    point = {"navigation": "pathBased", "path": PATH}
+    with pytest.raises(InvalidObject, match=r"controlPoints: a driver with full control has one control point"):
+        application(navigator(PATH) | control | {"controlPoints": [point, point]})
+    application(navigator(PATH) | {"control": "partial", "controlPoints": [point, point]})

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from fractus_core.api.components import Component, Placement, PointsOfInterest, Reference
-from fractus_core.api.model import AGE, READY, Condition, InvalidObject, Model, OpenModel, Resource
+from fractus_core.api.model import AGE, READY, Condition, Model, OpenModel, Resource, keyed
 from fractus_core.api.rules import Broken, rule
 
 
@@ -45,20 +45,28 @@ class ApplicationSpec(Model):
     components: tuple[Component, ...] = Field(
         min_length=1,
         max_length=50,
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=keyed("name"),
+        description="The parts of the application, each a container image with a place to run.",
+    )
+    update_policy: Literal["OnGround", "Immediate"] = Field(
+        default="OnGround",
+        description="When a changed manifest is carried out: once the drone is on the ground, or also in flight, which restarts"
+        " what changed, such as the driver.",
     )
 
-    @model_validator(mode="after")
-    def _distinct_objects(self) -> Self:
-        seen: dict[str, Component] = {}
+    @rule(
+        "self.components.all(c, self.components.exists_one(d,"
+        " d.name.replace('-', '').lowerAscii() == c.name.replace('-', '').lowerAscii()))",
+        "names of components differ in more than capitals and hyphens; rename one",
+    )
+    def _distinct_objects(self) -> Broken:
+        seen: dict[str, str] = {}
         for i, component in enumerate(self.components):
-            other = seen.setdefault(component.slug, component)
-            if other is not component:
-                raise InvalidObject(
-                    f"components[{i}].name",
-                    f"{component.name} and {other.name} get the same object name; rename one",
-                )
-        return self
+            plain = component.name.replace("-", "").lower()
+            if plain in seen:
+                return f"components[{i}].name", f"{component.name} and {seen[plain]}"
+            seen[plain] = component.name
+        return None
 
     @rule(
         "self.components.filter(c, has(c.class) && c.class == 'driver').size() <= 1",
@@ -120,9 +128,14 @@ class ApplicationSpec(Model):
         return next((c for c in self.components if c.class_ == "driver"), None)
 
     @property
+    def leader(self) -> Component | None:
+        """The component that says where the drone flies: the driver, or the passenger that gives points of interest."""
+        return self.driver or next((c for c in self.components if c.points_of_interest is not None), None)
+
+    @property
     def points_of_interest(self) -> PointsOfInterest | None:
         """The points of the one passenger that gives some."""
-        return next((c.points_of_interest for c in self.components if c.points_of_interest is not None), None)
+        return self.leader.points_of_interest if self.leader is not None else None
 
     def on(self, placement: Placement) -> Iterator[Component]:
         """The components with this placement, in order."""
@@ -148,8 +161,28 @@ class ApplicationStatus(OpenModel):
     """Where the application stands."""
 
     observed_generation: int | None = None
-    phase: Literal["Pending", "Queued", "Deploying", "Running", "Completed", "Failed", "Invalid"] | None = None
+    phase: (
+        Literal[
+            "Pending",
+            "Queued",
+            "Deploying",
+            "Running",
+            "Waiting",
+            "TakingOff",
+            "Flying",
+            "Returning",
+            "Landed",
+            "Unknown",
+            "Completed",
+            "Failed",
+            "Invalid",
+        ]
+        | None
+    ) = None
     drone: str | None = Field(default=None, description="The drone that flies it.")
+    controller: str | None = Field(
+        default=None, description="Who flies it, while it is in the air: system, pilot, or a component."
+    )
     pods: str | None = Field(default=None, description="Ready pods of all pods, such as 6/7.")
     message: str | None = Field(default=None, description="One sentence on what is going on.")
     conditions: tuple[Condition, ...] = ()
@@ -161,8 +194,10 @@ class Application(Resource, plural="applications", short="fapp", namespaced=True
     COLUMNS = (
         ("Phase", "string", ".status.phase"),
         ("Drone", "string", ".status.drone"),
+        ("Controller", "string", ".status.controller"),
         ("Pods", "string", ".status.pods"),
         READY,
+        ("Reason", "string", ".status.conditions[?(@.type=='Ready')].reason"),
         AGE,
         ("Message", "string", ".status.message"),
     )

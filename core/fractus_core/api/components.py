@@ -38,8 +38,8 @@ def _belong(service: Service) -> Any:
 class ServiceRequest(Model):
     """A system service a component uses, and the methods it will call."""
 
-    service: Service
-    methods: tuple[Method, ...] = Field(min_length=1, max_length=32)
+    service: Service = Field(description="The system service of the component's node.")
+    methods: tuple[Method, ...] = Field(min_length=1, max_length=32, description="The methods that it will call.")
 
     _mobility_methods = _belong("mobility")
     _camera_methods = _belong("camera")
@@ -60,7 +60,9 @@ class ControlPoint(Model):
     point: Start | None = Field(
         default=None, description="Start location; unset: open (the first waypoint, or the region's middle)."
     )
-    navigation: Literal["pathBased", "regionBased"]
+    navigation: Literal["pathBased", "regionBased"] = Field(
+        description="How the driver will move: pathBased along the waypoints of path, regionBased anywhere in region."
+    )
     path: tuple[Position, ...] | None = Field(
         default=None, min_length=1, max_length=1000, description="Waypoints in the order flown."
     )
@@ -92,7 +94,7 @@ class ControlPoint(Model):
 class PointsOfInterest(Model):
     """What a passenger-only application wants the drone to visit."""
 
-    points: tuple[Position, ...] = Field(min_length=1, max_length=1000)
+    points: tuple[Position, ...] = Field(min_length=1, max_length=1000, description="The places to visit.")
     ordered: bool = Field(default=True, description="Visit the points in the order given.")
     service_access: Literal["points", "path"] = Field(
         default="path", description="Whether services are used only at the points, or along the whole path."
@@ -122,31 +124,53 @@ class EdgeLocation(Circle):
 class Heuristic(Model):
     """How the active instance of a hybrid component is chosen."""
 
-    kind: Literal["max", "min", "preferDirect"]
-    metric: Literal["ingress-bandwidth", "egress-bandwidth", "ingress-latency", "egress-latency"] | None = None
+    kind: Literal["max", "min", "preferDirect"] = Field(
+        description="max and min: the instance whose metric is largest or smallest; preferDirect: one with a direct link."
+    )
+    metric: Literal["ingress-bandwidth", "egress-bandwidth", "ingress-latency", "egress-latency"] | None = Field(
+        default=None, description="What max and min compare: of the traffic from (ingress) or to (egress) its peers."
+    )
 
-    @rule("self.kind == 'preferDirect' || has(self.metric)", "kinds max and min need a metric")
+    @rule(
+        "(self.kind == 'preferDirect') != has(self.metric)", "kinds max and min need a metric, preferDirect takes none"
+    )
     def _measured(self) -> Broken:
-        return "metric" if self.kind != "preferDirect" and self.metric is None else None
+        return "metric" if (self.kind == "preferDirect") == (self.metric is not None) else None
 
 
 class Component(Model):
     """One component of an application."""
 
-    name: ComponentName
-    placement: Placement
-    class_: ComponentClass | None = Field(default=None, alias="class")
+    name: ComponentName = Field(description="Its name in the application, CamelCase or with hyphens.")
+    placement: Placement = Field(
+        description="Where it runs: on the drone, at the edge (locations), where hybridTo says, or in the cloud."
+    )
+    class_: ComponentClass | None = Field(
+        default=None, alias="class", description="On a drone: a driver flies it, a passenger comes along."
+    )
     control: ControlScope | None = Field(
         default=None,
-        description="For a driver: control from arming to landing (full, the default), or only at its control points.",
+        description="For a driver: control from arming to landing (full, the default), or only at its control points (partial).",
     )
-    control_points: tuple[ControlPoint, ...] = Field(default=(), max_length=100)
+    control_points: tuple[ControlPoint, ...] = Field(
+        default=(), max_length=100, description="Where a driver takes over, in the order flown."
+    )
     points_of_interest: PointsOfInterest | None = None
-    locations: tuple[EdgeLocation, ...] = Field(default=(), max_length=100)
-    hybrid_to: tuple[ComponentName, ...] = Field(default=(), max_length=50)
+    locations: tuple[EdgeLocation, ...] = Field(
+        default=(),
+        max_length=100,
+        description="For placement edge: the places to serve, and how many instances each gets.",
+    )
+    hybrid_to: tuple[ComponentName, ...] = Field(
+        default=(),
+        max_length=50,
+        description="For placement hybrid: the components beside whose instances it gets instances of its own.",
+    )
     heuristic: Heuristic | None = None
     replicas: int | None = Field(default=None, ge=1, le=1000, description="For placement cloud; unset: 1.")
-    services: tuple[ServiceRequest, ...] = Field(default=(), max_length=8)
+    services: tuple[ServiceRequest, ...] = Field(
+        default=(), max_length=8, description="The system services that it calls, with the methods."
+    )
     ingress: tuple[ComponentName, ...] = Field(default=(), max_length=50, description="Components that call this one.")
     egress: tuple[ComponentName, ...] = Field(default=(), max_length=50, description="Components this one calls.")
     container: Container
@@ -188,6 +212,21 @@ class Component(Model):
     )
     def _points_have_driver(self) -> Broken:
         return "controlPoints" if self.control_points and self.class_ != "driver" else None
+
+    @rule(
+        "!has(self.controlPoints) || size(self.controlPoints) <= 1 || (has(self.control) && self.control == 'partial')",
+        "a driver with full control has one control point; give its whole path there, or set control: partial, so that"
+        " the system flies between the control points",
+    )
+    def _full_control_has_one_point(self) -> Broken:
+        return "controlPoints" if len(self.control_points) > 1 and self.control != "partial" else None
+
+    @rule(
+        "!has(self.control) || (has(self.class) && self.class == 'driver')",
+        "control is for a component of class driver",
+    )
+    def _controls(self) -> Broken:
+        return "control" if self.control is not None and self.class_ != "driver" else None
 
     @rule(
         "!has(self.pointsOfInterest) || (has(self.class) && self.class == 'passenger')",

@@ -2,51 +2,130 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Hashable, Iterable
 from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from fractus_core.api.model import InvalidObject, Model, Quantity
-from fractus_core.api.names import Name
+from fractus_core.api.model import InvalidObject, Model, Quantity, keyed, quantity
+from fractus_core.api.names import Name, PortName
 from fractus_core.api.rules import Broken, rule
+
+_RESOURCES = ("cpu", "memory", "ephemeral-storage")
+_EXTENDED = (
+    r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?([.][a-z0-9]([-a-z0-9]*[a-z0-9])?)*/[A-Za-z0-9]([-A-Za-z0-9_.]*[A-Za-z0-9])?$"
+)
+_NAME_LENGTH = 317
+TLS_DIR = "/var/run/fractus/tls"
+"""Where a component finds its certificate."""
+_OWN_VOLUMES = {"tls": TLS_DIR, "tmp": "/tmp"}  # noqa: S108  (the pod's own)
+_IMAGE = (
+    r"^([a-zA-Z0-9]([-a-zA-Z0-9.]*[a-zA-Z0-9])?(:[0-9]+)?/)?[a-z0-9]+(([._]|__|-+)[a-z0-9]+)*"
+    r"(/[a-z0-9]+(([._]|__|-+)[a-z0-9]+)*)*(:[A-Za-z0-9_][-A-Za-z0-9_.]{0,127})?(@[a-z0-9]+:[0-9a-f]{32,128})?$"
+)
 
 
 class ContainerPort(Model):
     """A port the component listens on."""
 
-    port: int = Field(ge=1, le=65535)
-    name: Name | None = None
-    protocol: Literal["TCP", "UDP"] = "TCP"
+    port: int = Field(ge=1, le=65535, description="Its number.")
+    name: PortName | None = Field(default=None, description="Unset: port- and its number.")
+    protocol: Literal["TCP", "UDP"] = Field(default="TCP", description="What it speaks.")
+
+    @rule(
+        "!has(self.name) || !self.name.startsWith('port-')",
+        "ports without a name get one that begins with port-; choose another name, or leave it out",
+    )
+    def _own_name(self) -> Broken:
+        return "name" if self.name is not None and self.name.startswith("port-") else None
+
+    @property
+    def label(self) -> str:
+        """The name that it goes by."""
+        return self.name or f"port-{self.port}{'-udp' if self.protocol == 'UDP' else ''}"
 
 
 class EnvVar(Model):
     """An environment variable."""
 
-    name: str = Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", max_length=128)
-    value: str = Field(default="", max_length=32768)
+    name: str = Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", max_length=128, description="What the program reads it as.")
+    value: str = Field(default="", max_length=32768, description="A text; put numbers in quotes.")
+
+    @rule(
+        "!self.name.startsWith('FRACTUS_')", "names that begin with FRACTUS_ are set by the system; choose another name"
+    )
+    def _own_name(self) -> Broken:
+        return "name" if self.name.startswith("FRACTUS_") else None
 
 
 class Resources(Model):
     """Kubernetes resources: cpu, memory, and extended ones such as fractus.dev/gpu."""
 
-    requests: dict[str, Quantity] = Field(default_factory=dict, max_length=32)
-    limits: dict[str, Quantity] = Field(default_factory=dict, max_length=32)
+    requests: dict[str, Quantity] = Field(
+        default_factory=dict, max_length=32, description="What it needs; the node must have it free."
+    )
+    limits: dict[str, Quantity] = Field(default_factory=dict, max_length=32, description="What it gets at most.")
+
+    @rule(
+        "[has(self.requests) ? self.requests : {}, has(self.limits) ? self.limits : {}]"
+        f".all(m, m.all(k, k in {list(_RESOURCES)} || (k.size() <= {_NAME_LENGTH} && k.matches('{_EXTENDED}'))))",
+        f"resources are {', '.join(_RESOURCES)}, or extended ones such as fractus.dev/gpu",
+    )
+    def _known(self) -> Broken:
+        for field, given in (("requests", self.requests), ("limits", self.limits)):
+            for name in given:
+                if name not in _RESOURCES and (len(name) > _NAME_LENGTH or not re.fullmatch(_EXTENDED, name)):
+                    return field, f"not {name!r:.60}"
+        return None
+
+    @rule(
+        "!has(self.requests) || !has(self.limits) || self.requests.all(k, !(k in self.limits) ||"
+        " !isQuantity(string(self.requests[k])) || !isQuantity(string(self.limits[k])) ||"
+        " quantity(string(self.requests[k])).compareTo(quantity(string(self.limits[k]))) <= 0)",
+        "a request must not be above the limit of the same resource",
+    )
+    def _within_limits(self) -> Broken:
+        for name, amount in self.requests.items():
+            if name in self.limits and quantity(amount) > quantity(self.limits[name]):
+                return f"requests.{name}", f"{amount} is above {self.limits[name]}"
+        return None
+
+    @rule(
+        "!has(self.requests) || self.requests.all(k, !k.contains('/') || (has(self.limits) && k in self.limits &&"
+        " (!isQuantity(string(self.requests[k])) || !isQuantity(string(self.limits[k])) ||"
+        " quantity(string(self.requests[k])).compareTo(quantity(string(self.limits[k]))) == 0)))",
+        "an extended resource needs a limit that is equal to its request",
+    )
+    def _not_overcommitted(self) -> Broken:
+        for name, amount in self.requests.items():
+            if "/" in name and (name not in self.limits or quantity(amount) != quantity(self.limits[name])):
+                return f"limits.{name}"
+        return None
+
+    @rule(
+        "!has(self.limits) || self.limits.all(k, !k.contains('/') || !isQuantity(string(self.limits[k])) ||"
+        " quantity(string(self.limits[k])).isInteger())",
+        "extended resources are whole",
+    )
+    def _whole(self) -> Broken:
+        parts = (name for name, amount in self.limits.items() if "/" in name and not quantity(amount).is_integer())
+        return next((f"limits.{name}" for name in parts), None)
 
 
 class EmptyDirectory(Model):
     """An empty directory that lives as long as the pod."""
 
     size_limit: Quantity | None = Field(default=None, description="Bytes, such as 256Mi; unset: what the node allows.")
-    medium: Literal["disk", "memory"] = "disk"
+    medium: Literal["disk", "memory"] = Field(default="disk", description="What keeps it; memory counts as the pod's.")
 
 
 class Volume(Model):
     """Files that the component sees: an empty directory, a ConfigMap, a Secret or a claim of storage."""
 
-    name: Name
+    name: Name = Field(description="Its name among the volumes of the component.")
     mount_path: str = Field(
-        pattern=r"^/[^:]*$", max_length=512, description="Where the component finds it; an absolute path."
+        pattern=r"^(/[^/:]+)+$", max_length=512, description="Where the component finds it; an absolute path."
     )
     read_only: bool = Field(default=False, description="ConfigMaps and Secrets are read-only anyway.")
     empty_dir: EmptyDirectory | None = None
@@ -68,6 +147,16 @@ class Volume(Model):
     )
     def _own_secret(self) -> Broken:
         return "secret" if self.secret is not None and self.secret.endswith("-tls") else None
+
+    @rule(
+        f"!(self.name in {list(_OWN_VOLUMES)}) && !(self.mountPath in {list(_OWN_VOLUMES.values())})",
+        f"the pod has volumes {' and '.join(_OWN_VOLUMES)} of its own at {' and '.join(_OWN_VOLUMES.values())};"
+        " choose another name and path",
+    )
+    def _apart(self) -> Broken:
+        return (
+            "name" if self.name in _OWN_VOLUMES else "mountPath" if self.mount_path in _OWN_VOLUMES.values() else None
+        )
 
     def pod_volume(self) -> dict[str, Any]:
         """The entry for volumes of a pod."""
@@ -93,37 +182,60 @@ class Volume(Model):
 class Container(Model):
     """What runs in the component's pods."""
 
-    image: str = Field(min_length=1, max_length=512)
-    command: tuple[str, ...] = Field(default=(), max_length=64)
-    args: tuple[str, ...] = Field(default=(), max_length=64)
-    env: tuple[EnvVar, ...] = Field(default=(), max_length=256)
-    ports: tuple[ContainerPort, ...] = Field(default=(), max_length=32)
+    image: str = Field(
+        min_length=1, max_length=512, pattern=_IMAGE, description="A name such as registry.example/app:1.2."
+    )
+    command: tuple[str, ...] = Field(default=(), max_length=64, description="Empty: the image's own entry point.")
+    args: tuple[str, ...] = Field(default=(), max_length=64, description="Arguments of the command.")
+    env: tuple[EnvVar, ...] = Field(
+        default=(), max_length=256, json_schema_extra=keyed("name"), description="Environment variables."
+    )
+    ports: tuple[ContainerPort, ...] = Field(
+        default=(),
+        max_length=32,
+        json_schema_extra=keyed("port", "protocol"),
+        description="The ports it listens on; components that name it in egress call the first.",
+    )
     resources: Resources = Field(default_factory=Resources)
-    volumes: tuple[Volume, ...] = Field(default=(), max_length=16)
+    volumes: tuple[Volume, ...] = Field(
+        default=(),
+        max_length=16,
+        json_schema_extra=keyed("name"),
+        description="Files that it sees besides those of its image.",
+    )
 
     @model_validator(mode="after")
-    def _distinct_names(self) -> Self:
+    def _distinct_keys(self) -> Self:
+        """What the API server refuses by the keys of lists."""
         for i in _repeated(v.name for v in self.env):
             raise InvalidObject(f"env[{i}].name", f"{self.env[i].name} is there twice; remove one of them")
         for i in _repeated((p.port, p.protocol) for p in self.ports):
             raise InvalidObject(f"ports[{i}].port", f"{self.ports[i].port} is there twice; remove one of them")
-        for i in _repeated(p.name for p in self.ports):
-            raise InvalidObject(f"ports[{i}].name", f"{self.ports[i].name} is taken; choose another name")
-        # The pod has volumes of its own, of these names.
-        for i in _repeated((v.name for v in self.volumes), taken=("tls", "tmp")):
+        for i in _repeated(v.name for v in self.volumes):
             raise InvalidObject(f"volumes[{i}].name", f"{self.volumes[i].name} is taken; choose another name")
-        for i in _repeated(v.mount_path for v in self.volumes):
-            raise InvalidObject(
-                f"volumes[{i}].mountPath", f"{self.volumes[i].mount_path} is taken; choose another path"
-            )
         return self
 
+    @rule(
+        "!has(self.ports) || self.ports.all(p, !has(p.name) || self.ports.exists_one(q, has(q.name) && q.name == p.name))",
+        "each port needs a name of its own; choose another name",
+    )
+    def _distinct_ports(self) -> Broken:
+        return next((f"ports[{i}].name" for i in _repeated(p.label for p in self.ports)), None)
 
-def _repeated(keys: Iterable[Hashable | None], taken: Iterable[Hashable] = ()) -> list[int]:
-    """Where keys are that are taken, or came before; None is no key."""
-    seen, found = set(taken), []
+    @rule(
+        "!has(self.volumes) || self.volumes.all(v, self.volumes.exists_one(w, w.mountPath == v.mountPath))",
+        "each volume needs a mountPath of its own; choose another path",
+    )
+    def _distinct_paths(self) -> Broken:
+        return next((f"volumes[{i}].mountPath" for i in _repeated(v.mount_path for v in self.volumes)), None)
+
+
+def _repeated(keys: Iterable[Hashable]) -> list[int]:
+    """Where keys are that came before."""
+    seen: set[Hashable] = set()
+    found = []
     for i, key in enumerate(keys):
-        if key is not None and key in seen:
+        if key in seen:
             found.append(i)
         seen.add(key)
     return found

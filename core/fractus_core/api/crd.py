@@ -10,10 +10,9 @@ import pathlib
 import sys
 from typing import Any
 
-import yaml
-
 from fractus_core.api import KINDS
-from fractus_core.api.model import GROUP, VERSION, Resource
+from fractus_core.api.model import GROUP, VALIDATIONS, VERSION, Resource
+from fractus_core.documents import dump_documents
 
 Schema = dict[str, Any]
 
@@ -38,6 +37,7 @@ def crd(kind: type[Resource]) -> Schema:
     for name in ("spec", "status"):
         if name in schema["properties"]:
             properties[name] = structural(schema["properties"][name], definitions, f"{kind.KIND}.{name}")
+    root = {VALIDATIONS: schema[VALIDATIONS]} if VALIDATIONS in schema else {}
     if kind.WRITTEN_BY_OPERATOR:
         properties = {name: _without_rules(schema) for name, schema in properties.items()}
     version: Schema = {
@@ -50,6 +50,7 @@ def crd(kind: type[Resource]) -> Schema:
                 "description": (kind.__doc__ or "").strip(),
                 "properties": properties,
                 "required": ["spec"],
+                **root,
             }
         },
         "additionalPrinterColumns": [
@@ -148,20 +149,12 @@ def _union(options: list[Schema], definitions: dict[str, Schema], path: str) -> 
     raise ValueError(f"{path}: a union of {kinds} has no structural form")
 
 
-class _Plain(yaml.SafeDumper):
-    """YAML without anchors: shared lists are written out where they are used."""
-
-    def ignore_aliases(self, data: object) -> bool:
-        """Say that nothing is shared."""
-        return True
-
-
 def write(directory: pathlib.Path) -> None:
     """Write crds/<plural>.yaml for every kind."""
     directory.mkdir(parents=True, exist_ok=True)
     for kind in KINDS:
         text = "# Generated from the models in core/fractus_core/api; change those, then run `make generate`.\n"
-        text += yaml.dump(crd(kind), Dumper=_Plain, sort_keys=False, width=120)
+        text += dump_documents([crd(kind)])
         (directory / f"{kind.PLURAL}.yaml").write_text(text)
 
 

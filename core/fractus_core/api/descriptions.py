@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import yaml
-
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.nodes import Drone, EdgeNode
+from fractus_core.documents import BadDocument, parse_document
 
 
 class InvalidDescription(Exception):
@@ -25,9 +22,9 @@ def parse_description(text: str, *kinds: type[Drone | EdgeNode]) -> Drone | Edge
         InvalidDescription: it is not one manifest of these kinds.
     """
     try:
-        body: Any = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise InvalidDescription(f"is not YAML: {' '.join(str(error).split())}") from None
+        body, found = parse_document(text.encode(), "description")
+    except BadDocument as error:
+        raise InvalidDescription(f"line {error.line}: {error.problem}") from None
     if body is None:
         return None
     kind = next((kind for kind in kinds if isinstance(body, dict) and body.get("kind") == kind.KIND), None)
@@ -36,4 +33,4 @@ def parse_description(text: str, *kinds: type[Drone | EdgeNode]) -> Drone | Edge
     try:
         return kind.from_body(body)
     except InvalidObject as error:
-        raise InvalidDescription(str(error)) from None
+        raise InvalidDescription(f"line {found.line(body, error.field)}: {error}") from None

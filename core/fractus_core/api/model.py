@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
 from datetime import datetime
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, WithJsonSchema
 from pydantic.alias_generators import to_camel
 from pydantic_core import ErrorDetails
+
+from fractus_core.api.names import DNS_SUBDOMAIN, SHAPES, LabelKey, LabelValue, Name
 
 GROUP = "fractus.dev"
 VERSION = "v1alpha1"
 API_VERSION = f"{GROUP}/{VERSION}"
 
-_QUANTITY = re.compile(r"^(\d+(?:\.\d+)?)(m|k|Ki|M|Mi|G|Gi|T|Ti|P|Pi)?$")
+_QUANTITY = r"^([0-9]+([.][0-9]+)?)(m|k|Ki|M|Mi|G|Gi|T|Ti|P|Pi)?$"
 _SCALE = {
     None: 1.0, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 1e9, "T": 1e12, "P": 1e15,
     "Ki": 2.0**10, "Mi": 2.0**20, "Gi": 2.0**30, "Ti": 2.0**40, "Pi": 2.0**50,
@@ -28,22 +31,58 @@ def quantity(text: str | float) -> float:
     Raises:
         ValueError: the text is not a non-negative Kubernetes quantity.
     """
-    match = _QUANTITY.match(str(text))
+    match = re.fullmatch(_QUANTITY, str(text))
     if match is None:
         raise ValueError(f"{text!r} is not a quantity such as 250m, 1.5 or 512Mi")
-    return float(match.group(1)) * _SCALE[match.group(2)]
+    return float(match.group(1)) * _SCALE[match.group(3)]
 
 
-def _checked_quantity(text: str) -> str:
-    quantity(text)
+def _checked_quantity(given: object) -> str:
+    text = str(given) if type(given) is int else given
+    if not isinstance(text, str) or len(text) > _QUANTITY_LENGTH or re.fullmatch(_QUANTITY, text) is None:
+        raise ValueError(f"{given!r:.40} is not a quantity such as 250m, '1.5' or 512Mi")
     return text
 
 
-Quantity = Annotated[str, Field(max_length=32, coerce_numbers_to_str=True), AfterValidator(_checked_quantity)]
-"""A Kubernetes quantity, such as 250m, 1.5 or 512Mi."""
+_QUANTITY_LENGTH = 32
+Quantity = Annotated[
+    str,
+    BeforeValidator(_checked_quantity),
+    WithJsonSchema(
+        {
+            "anyOf": [{"type": "integer"}, {"type": "string"}],
+            "pattern": _QUANTITY,
+            "maxLength": _QUANTITY_LENGTH,
+        }
+    ),
+]
+"""A Kubernetes quantity, such as 250m, 1.5 or 512Mi; whole numbers may be written without quotes."""
+
+_TIMESTAMP = (
+    r"^(19[7-9]|2[0-9][0-9])[0-9]-[0-9]{2}-[0-9]{2}T([01][0-9]|2[0-3]):[0-5][0-9]:[0-5][0-9]([.][0-9]{1,9})?"
+    r"(Z|[-+]([01][0-9]|2[0-3]):[0-5][0-9])$"
+)
+
+
+def _checked_timestamp(given: object) -> object:
+    if isinstance(given, datetime):
+        return given
+    try:
+        return datetime.fromisoformat(given if isinstance(given, str) and re.fullmatch(_TIMESTAMP, given) else "")
+    except ValueError:
+        raise ValueError(f"must be a time with its zone, such as 2026-06-01T12:00:00Z, not {given!r:.40}") from None
+
+
+Timestamp = Annotated[
+    datetime, Field(json_schema_extra={"pattern": _TIMESTAMP, "maxLength": 35}), BeforeValidator(_checked_timestamp)
+]
+"""A moment as RFC 3339 spells it, with its zone."""
 
 
 VALIDATIONS = "x-kubernetes-validations"
+
+MAX_OBJECT_BYTES = 3 * 2**19
+"""Of an object as JSON: what etcd takes by default."""
 
 
 def _add_rules(schema: dict[str, Any], model: type[Any]) -> None:
@@ -52,6 +91,11 @@ def _add_rules(schema: dict[str, Any], model: type[Any]) -> None:
     rules = [found for check in declared if (found := getattr(check, VALIDATIONS, None)) is not None]
     if rules:
         schema[VALIDATIONS] = rules
+
+
+def keyed(*keys: str) -> dict[str, Any]:
+    """What the schema of a list says where no two entries may have the same keys."""
+    return {"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": list(keys)}
 
 
 class Model(BaseModel):
@@ -91,13 +135,13 @@ class OwnerReference(OpenModel):
 class Metadata(OpenModel):
     """The part of ObjectMeta that Fractus reads."""
 
-    name: str
-    namespace: str | None = None
+    name: Annotated[str, Field(max_length=253, pattern=DNS_SUBDOMAIN)]
+    namespace: Name | None = None
     uid: str | None = None
     generation: int | None = None
     resource_version: str | None = None
-    labels: dict[str, str] = Field(default_factory=dict)
-    annotations: dict[str, str] = Field(default_factory=dict)
+    labels: dict[LabelKey, LabelValue] = Field(default_factory=dict)
+    annotations: dict[LabelKey, str] = Field(default_factory=dict)
     finalizers: tuple[str, ...] = ()
     owner_references: tuple[OwnerReference, ...] = ()
     creation_timestamp: datetime | None = None
@@ -122,7 +166,7 @@ READY: Column = ("Ready", "string", ".status.conditions[?(@.type=='Ready')].stat
 AGE: Column = ("Age", "date", ".metadata.creationTimestamp")
 
 
-class Resource(OpenModel):
+class Resource(Model):
     """An object of one of Fractus' kinds."""
 
     KIND: ClassVar[str]
@@ -160,9 +204,19 @@ class Resource(OpenModel):
             InvalidObject: with one sentence that names the field and the remedy.
         """
         try:
-            return cls.model_validate(_plain(body))
+            # As JSON, in strict mode: no text is taken for a number, as in the schemas of the API server.
+            text = json.dumps(_plain(body), separators=(",", ":"))
+            found = cls.model_validate_json(text, strict=True)
+            whole = json.dumps(_plain(body, nulls=True), separators=(",", ":"))
+            if whole != text:
+                _refuse_unknown(cls, whole)
         except ValidationError as error:
             raise InvalidObject.from_pydantic(error) from None
+        if len(text) > MAX_OBJECT_BYTES and not cls.WRITTEN_BY_OPERATOR:
+            raise InvalidObject(
+                "", f"has {len(text)} bytes as JSON, more than the {MAX_OBJECT_BYTES} that etcd keeps; split it"
+            )
+        return found
 
     @property
     def name(self) -> str:
@@ -170,13 +224,36 @@ class Resource(OpenModel):
         return self.metadata.name
 
 
-def _plain(value: Any) -> Any:
-    """Copy mappings and sequences of any type (kopf's views, say) into dicts and lists."""
+_WHOLE, _LARGEST = 2**63, 10**300
+
+
+def _plain(value: Any, *, nulls: bool = False) -> Any:
+    """Copy mappings and sequences of any type (kopf's views, say) into dicts and lists.
+
+    As the API server does: a field that is null is not there, unless `nulls`, 2.0 is a whole number, and what has more
+    than 64 bits is none.
+    """
     if hasattr(value, "items"):
-        return {k: _plain(v) for k, v in value.items()}
+        return {k: _plain(v, nulls=nulls) for k, v in value.items() if nulls or v is not None}
     if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    return value
+        return [_plain(v, nulls=nulls) for v in value]
+    if type(value) is int and abs(value) >= _WHOLE:
+        return float(max(-_LARGEST, min(value, _LARGEST)))
+    return int(value) if type(value) is float and abs(value) < _WHOLE and value.is_integer() else value
+
+
+def _refuse_unknown(model: type[Resource], text: str) -> None:
+    """Refuse fields that are null and that there are not; all other fields were checked without them."""
+    try:
+        model.model_validate_json(text, strict=True)
+    except ValidationError as error:
+        for finding in error.errors(include_url=False):
+            if finding["type"] == "extra_forbidden":
+                raise InvalidObject(_path(finding).lstrip("."), _problem(finding)) from None
+
+
+def _path(finding: ErrorDetails) -> str:
+    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in finding["loc"])
 
 
 class InvalidObject(ValueError):
@@ -191,9 +268,7 @@ class InvalidObject(ValueError):
     def from_pydantic(cls, error: ValidationError) -> InvalidObject:
         """Translate the first finding of pydantic into field path and sentence."""
         finding = error.errors(include_url=False)[0]
-        path = ""
-        for part in finding["loc"]:
-            path += f"[{part}]" if isinstance(part, int) else f".{part}"
+        path = _path(finding)
         context = finding.get("ctx", {}).get("error")
         if isinstance(context, InvalidObject):
             inner = context.field
@@ -201,22 +276,34 @@ class InvalidObject(ValueError):
             return cls((path + joint + inner).lstrip("."), context.problem)
         problem = str(context) if context is not None else _problem(finding)
         shown = finding.get("input")
-        if context is None and isinstance(shown, (str, int, float, bool)):
+        if context is None and finding["type"] != "extra_forbidden" and isinstance(shown, (str, int, float, bool)):
             text = repr(shown)
             problem += f", not {text if len(text) <= 80 else text[:77] + '...'}"
         return cls(path.lstrip("."), problem[:1].lower() + problem[1:])
 
 
+_SENTENCES = {
+    "tuple_type": "must be a list",
+    "list_type": "must be a list",
+    "model_type": "must be an object with named fields",
+    "model_attributes_type": "must be an object with named fields",
+    "dict_type": "must be an object with named fields",
+    "float_type": "must be a number",
+    "int_type": "must be a whole number",
+    "finite_number": "must be a finite number",
+    "bool_type": "must be true or false",
+    "string_type": "must be a text; put it in quotes",
+    "missing": "is missing; give it",
+    "extra_forbidden": "there is no such field; remove it, or correct its name",
+}
+"""What is wrong, in words of manifests where pydantic uses those of Python."""
+
+
 def _problem(finding: ErrorDetails) -> str:
-    """What is wrong, in words of manifests where pydantic uses those of Python."""
-    limits = finding.get("ctx", {})
-    match finding["type"]:
-        case "tuple_type" | "list_type":
-            return "must be a list"
-        case "model_type" | "model_attributes_type" | "dict_type":
-            return "must be an object with named fields"
-        case "too_long" if limits.get("field_type") == "Tuple":
-            return f"must have at most {limits['max_length']} entries, not {limits['actual_length']}"
-        case "too_short" if limits.get("field_type") == "Tuple":
-            return f"must have at least {limits['min_length']} entries, not {limits['actual_length']}"
-    return finding["msg"]
+    kind, limits = finding["type"], finding.get("ctx", {})
+    if kind == "string_pattern_mismatch":
+        return f"must be {SHAPES.get(limits['pattern'], 'of the form ' + limits['pattern'])}"
+    if kind in {"too_long", "too_short"} and limits.get("field_type") == "Tuple":
+        bound = f"most {limits['max_length']}" if kind == "too_long" else f"least {limits['min_length']}"
+        return f"must have at {bound} entries, not {limits['actual_length']}"
+    return _SENTENCES.get(kind) or finding["msg"].replace("Input should", "must").replace("String should", "must")

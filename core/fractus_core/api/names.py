@@ -26,12 +26,32 @@ COMPONENT_NAME = r"^[A-Za-z]([-A-Za-z0-9]*[A-Za-z0-9])?$"
 ComponentName = Annotated[str, Field(min_length=1, max_length=40, pattern=COMPONENT_NAME)]
 """A component's name; CamelCase is welcome, objects get its kebab-case form."""
 
-_DNS_SUBDOMAIN = re.compile(r"[a-z0-9]([-a-z0-9.]{0,251}[a-z0-9])?")
+DNS_SUBDOMAIN = r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?([.][a-z0-9]([-a-z0-9]*[a-z0-9])?)*$"
+"""RFC 1123; as Kubernetes names nodes, pods and most objects, in at most 253 characters."""
+
+PORT_NAME = r"^([a-z0-9]-?)*[a-z](-?[a-z0-9])*$"
+PortName = Annotated[str, Field(min_length=1, max_length=15, pattern=PORT_NAME)]
+"""A port's name (RFC 6335), as pods and Services take it."""
+
+LABEL_KEY = r"^([a-z0-9]([-a-z0-9.]*[a-z0-9])?/)?[A-Za-z0-9]([-A-Za-z0-9_.]*[A-Za-z0-9])?$"
+LabelKey = Annotated[str, Field(max_length=317, pattern=LABEL_KEY)]
+LABEL_VALUE = r"^([A-Za-z0-9]([-A-Za-z0-9_.]*[A-Za-z0-9])?)?$"
+LabelValue = Annotated[str, Field(max_length=63, pattern=LABEL_VALUE)]
+
+SHAPES = {
+    DNS_LABEL: "small letters, digits and hyphens, with a letter or digit first and last",
+    DNS_SUBDOMAIN: "small letters, digits, hyphens and dots, with a letter or digit beside each dot, first and last",
+    COMPONENT_NAME: "letters, digits and hyphens, with a letter first and no hyphen last",
+    LABEL_KEY: "letters, digits, hyphens, underscores and dots, perhaps after a DNS name and a slash",
+    LABEL_VALUE: "letters, digits, hyphens, underscores and dots, with a letter or digit first and last",
+    PORT_NAME: "small letters, digits and single hyphens between them, with at least one letter",
+}
+"""What names that match a pattern consist of."""
 
 
 def is_subdomain(text: str) -> bool:
     """Whether a text is a DNS subdomain (RFC 1123), as Kubernetes names nodes and pods; it is safe as a file name."""
-    return _DNS_SUBDOMAIN.fullmatch(text) is not None
+    return len(text) <= 253 and re.fullmatch(DNS_SUBDOMAIN, text) is not None
 
 
 def shortened(text: str, limit: int, *, digits: int = 8) -> str:

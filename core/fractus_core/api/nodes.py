@@ -3,19 +3,38 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, JsonValue
 
 from fractus_core.api.geometry import Point, Position
 from fractus_core.api.methods import CameraMethod, MobilityMethod
 from fractus_core.api.model import AGE, READY, Condition, Model, OpenModel, Resource
 from fractus_core.api.names import Name
+from fractus_core.api.rules import Broken, named_by_others, rule
 
 Technology = Literal["Ethernet", "4G", "5G", "WiFi", "BLE"]
-FlightState = Literal["inactive", "charging", "takingOff", "flying", "landing"]
+FlightState = Literal["unknown", "inactive", "charging", "takingOff", "flying", "landing"]
 GROUNDED: frozenset[FlightState] = frozenset({"inactive", "charging"})
 """Flight states of a drone on the ground."""
+
+FLIGHT_REPORT_S, DRONE_REPORT_S, EDGE_REPORT_S = 5.0, 30.0, 60.0
+"""Seconds between two reports of an agent at most: of a drone in the air, of one on the ground, of an edge node."""
+
+
+_BY_TYPE: dict[str, JsonValue] = {"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["type"]}
+"""Agent and operator each write conditions of their own."""
+
+
+def is_airborne(state: str | None, last: str | None) -> bool:
+    """Whether a drone is in the air for all that is known: one that is not heard of any more is where it was.
+
+    Args:
+        state: its flight state; None while it was never heard of, which takes it to be on the ground.
+        last: the last one that was known.
+    """
+    known = last if state in {None, "unknown"} else state
+    return known not in {None, "unknown", *GROUNDED}
 
 
 class Pairing(Model):
@@ -28,7 +47,7 @@ class Pairing(Model):
 class Interface(Model):
     """A network interface of a node."""
 
-    technology: Technology
+    technology: Technology = Field(description="What it connects by.")
     device: str | None = Field(
         default=None, max_length=15, description="Name of the device on the node, such as wlan0."
     )
@@ -90,6 +109,32 @@ class CameraMount(Model):
     )
 
 
+def _coefficient(name: str) -> Any:
+    return Field(default=None, ge=-100, le=100, description=f"Distortion coefficient {name} of OpenCV; unset: 0.")
+
+
+class CameraLens(Model):
+    """How a camera's lens projects what it sees."""
+
+    model: Literal["pinhole", "brownConrady", "equidistant"] = Field(
+        description="pinhole: straight lines stay straight (as do those of a picture that is rectified); brownConrady: pinhole"
+        " with the distortion that calibration tells; equidistant: a fisheye, with angles in proportion to pixels."
+    )
+    k1: float | None = _coefficient("k1")
+    k2: float | None = _coefficient("k2")
+    k3: float | None = _coefficient("k3")
+    p1: float | None = _coefficient("p1")
+    p2: float | None = _coefficient("p2")
+
+    @rule(
+        "self.model == 'brownConrady' || !(has(self.k1) || has(self.k2) || has(self.k3) || has(self.p1) || has(self.p2))",
+        "distortion coefficients belong to model brownConrady",
+    )
+    def _coefficients(self) -> Broken:
+        given = [name for name in ("k1", "k2", "k3", "p1", "p2") if getattr(self, name) is not None]
+        return given[0] if given and self.model != "brownConrady" else None
+
+
 class CameraFeatures(Model):
     """What the camera service of a node offers."""
 
@@ -101,13 +146,19 @@ class CameraFeatures(Model):
         " of geotagged pictures, or test: for a drawn one.",
     )
     model: str = Field(default="", max_length=128, description="Make and model.")
-    resolution: str = Field(default="1920x1080", pattern=r"^\d{2,5}x\d{2,5}$", description="Pixels, WIDTHxHEIGHT.")
+    resolution: str = Field(
+        default="1920x1080", pattern=r"^[1-9][0-9]{1,4}x[1-9][0-9]{1,4}$", description="Pixels, WIDTHxHEIGHT."
+    )
     sensor_type: Literal["RGB", "IR"] = Field(default="RGB", description="What the sensor sees.")
     horizontal_field_of_view: float | None = Field(
         default=None,
         gt=0,
         lt=180,
-        description="Degrees from side to side. Unset: unknown, and privacy policies take it to see everything around.",
+        description="Degrees from side to side through the middle of the picture, distortion included. Unset: unknown, and"
+        " privacy policies take it to see everything around.",
+    )
+    lens: CameraLens | None = Field(
+        default=None, description="Unset: unknown, and privacy policies take it to see what any of these lenses may."
     )
     mount: CameraMount | None = Field(
         default=None, description="Unset: unknown, and privacy policies take it to look everywhere."
@@ -119,6 +170,15 @@ class CameraFeatures(Model):
         """Width and height."""
         width, height = self.resolution.split("x")
         return int(width), int(height)
+
+    def unknown_view(self, fixed: bool) -> str:
+        """What is missing to know what it sees, on a fixed node or a drone; empty when nothing is."""
+        missing = [] if self.horizontal_field_of_view is not None else ["horizontalFieldOfView"]
+        if self.mount is None:
+            missing.append("mount")
+        elif fixed and self.mount.height is None:
+            missing.append("mount.height")
+        return ", ".join(missing)
 
 
 class NodeServices(Model):
@@ -138,7 +198,7 @@ class DroneSpec(Model):
         default=None, alias="class", description="Class of Commission Delegated Regulation (EU) 2019/945."
     )
     physical_features: PhysicalFeatures = Field(default_factory=PhysicalFeatures)
-    interfaces: tuple[Interface, ...] = Field(default=(), max_length=16)
+    interfaces: tuple[Interface, ...] = Field(default=(), max_length=16, description="Its network interfaces.")
     services: NodeServices = Field(default_factory=NodeServices)
     depot: Name | None = Field(default=None, description="The Depot it is kept in.")
     home: Position | None = Field(
@@ -150,6 +210,15 @@ class DroneSpec(Model):
         description="Seconds its pods stay when the node is unreachable; unset: indefinitely.",
     )
 
+    @rule(
+        "!has(self.services) || !has(self.services.camera) || !has(self.services.camera.mount)"
+        " || !has(self.services.camera.mount.height)",
+        "height is for the camera of an edge node; a drone's is where the drone is",
+    )
+    def _flies_its_camera(self) -> Broken:
+        mount = self.services.camera.mount if self.services.camera is not None else None
+        return "services.camera.mount.height" if mount is not None and mount.height is not None else None
+
 
 class Battery(OpenModel):
     """State of a drone's battery."""
@@ -159,15 +228,31 @@ class Battery(OpenModel):
     current: float | None = Field(default=None, description="Amperes drawn.")
 
 
-class DroneStatus(OpenModel):
-    """What the node's agent last saw, on change and every 10 s at most."""
+_AUDIT: Any = Field(
+    default=(),
+    max_length=16,
+    description="LOG:NUMBER:HASH of the last entries of the services' audit logs, for `fractus audit verify --since`.",
+)
 
-    flight_state: FlightState = "inactive"
+
+class DroneStatus(OpenModel):
+    """What the node's agent sees; where it sees nothing, the position and battery are the last known ones."""
+
+    flight_state: FlightState = Field(
+        default="unknown", description="What the drone does now; unknown while nothing is heard of it."
+    )
+    last_flight_state: FlightState | None = Field(default=None, description="The last flight state that was known.")
     position: Position | None = None
     battery: Battery | None = None
     controller: str | None = Field(default=None, description="Who flies: system, pilot, or the driver's identity.")
     last_seen: datetime | None = None
-    conditions: tuple[Condition, ...] = ()
+    audit: tuple[str, ...] = _AUDIT
+    conditions: tuple[Condition, ...] = Field(default=(), json_schema_extra=_BY_TYPE)
+
+    @property
+    def in_air(self) -> bool:
+        """Whether it is in the air, for all that is known."""
+        return is_airborne(self.flight_state, self.last_flight_state)
 
 
 class Drone(Resource, plural="drones", short="drn"):
@@ -177,8 +262,10 @@ class Drone(Resource, plural="drones", short="drn"):
         ("Class", "string", ".spec.class"),
         ("Depot", "string", ".spec.depot"),
         ("State", "string", ".status.flightState"),
+        ("Controller", "string", ".status.controller"),
         ("Battery", "number", ".status.battery.remaining"),
         READY,
+        ("Reason", "string", ".status.conditions[?(@.type=='Ready')].reason"),
         AGE,
     )
 
@@ -186,20 +273,30 @@ class Drone(Resource, plural="drones", short="drn"):
     spec: DroneSpec
     status: DroneStatus | None = None
 
+    @property
+    def in_air(self) -> bool:
+        """Whether it is in the air, for all that is known."""
+        return self.status is not None and self.status.in_air
+
 
 class EdgeNodeSpec(Model):
     """A fixed node at the edge."""
 
     location: Position
-    interfaces: tuple[Interface, ...] = Field(default=(), max_length=16)
+    interfaces: tuple[Interface, ...] = Field(default=(), max_length=16, description="Its network interfaces.")
     services: NodeServices = Field(default_factory=NodeServices)
+
+    @rule("!has(self.services) || !has(self.services.mobility)", "an edge node does not fly; remove services.mobility")
+    def _fixed(self) -> Broken:
+        return "services.mobility" if self.services.mobility is not None else None
 
 
 class EdgeNodeStatus(OpenModel):
     """What the node's agent last saw."""
 
     last_seen: datetime | None = None
-    conditions: tuple[Condition, ...] = ()
+    audit: tuple[str, ...] = _AUDIT
+    conditions: tuple[Condition, ...] = Field(default=(), json_schema_extra=_BY_TYPE)
 
 
 class EdgeNode(Resource, plural="edgenodes", short="edn"):
@@ -235,3 +332,5 @@ class Depot(Resource, plural="depots", short="dpt"):
 
     kind: Literal["Depot"] = "Depot"
     spec: DepotSpec
+
+    _nameable = named_by_others("Depot", "drones and applications")

@@ -38,6 +38,20 @@ class TransitLeg(Model):
     end: Position
 
 
+class LegLegality(Model):
+    """A leg that policies do not let be flown as it was asked for, as the policy engine judges it from standstill."""
+
+    start: Position
+    end: Position
+    flown_by: Literal["system", "driver"]
+    outcome: Literal["Detour", "Corrected", "Denied"] = Field(
+        description="The system flies around; altitude or speed are corrected; it is not flown, or not to its end."
+    )
+    reason: str = Field(description="CamelCase, for programs.")
+    message: str = Field(description="One sentence for people.")
+    policies: tuple[str, ...] = Field(default=(), description="Those that decided, the most restrictive first.")
+
+
 class Mission(Model):
     """What the application takes of the drone, with the way to its start and home, and what the drone has."""
 
@@ -56,6 +70,17 @@ class DroneChoice(Model):
     )
     mission: Mission | None = Field(default=None, description="Unset when the application comes along.")
     transit: tuple[TransitLeg, ...] = Field(default=(), description="The legs that the system flies, in order.")
+    legality: tuple[LegLegality, ...] = Field(
+        default=(),
+        description="The legs that policies deny, correct or lead around, in order, as of the last change of policies and"
+        " zones; empty: all are legal as asked.",
+    )
+    legality_omitted: int | None = Field(
+        default=None, ge=1, description="How many such legs are not listed, for there are too many."
+    )
+    policy_conflict: str | None = Field(
+        default=None, description="Why the policies do not let the mission be flown as planned; unset: they do."
+    )
     alternatives: tuple[Alternative, ...] = ()
 
 
@@ -101,7 +126,9 @@ class DeploymentPlanSpec(Model):
     placements: tuple[PlannedInstance, ...] = ()
     rejected: tuple[Rejection, ...] = ()
     rejected_omitted: int | None = Field(
-        default=None, ge=1, description="How many rejected nodes are not listed, for there are too many."
+        default=None,
+        ge=1,
+        description="How many rejected nodes are not listed: most of those too far away, and what is too much.",
     )
 
 

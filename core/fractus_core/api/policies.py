@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Sequence
-from datetime import UTC, datetime
-from typing import Annotated, Literal, get_args
+from collections.abc import Callable
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field
+from pydantic.alias_generators import to_snake
 
 from fractus_core.api.geometry import Altitude, AltitudeBand, Area, Reference
 from fractus_core.api.methods import Method
 from fractus_core.api.model import AGE, READY, Condition, Model, OpenModel, Resource
-from fractus_core.api.names import Name
-from fractus_core.api.rules import Broken, rule
+from fractus_core.api.names import ComponentName, Name
+from fractus_core.api.rules import Broken, named_by_others, rule
+from fractus_core.api.schedules import ActiveTime, Validity
 
 
 class ReadyStatus(OpenModel):
@@ -22,78 +22,6 @@ class ReadyStatus(OpenModel):
 
     observed_generation: int | None = None
     conditions: tuple[Condition, ...] = ()
-
-
-Day = Literal["Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun"]
-ClockTime = Annotated[str, Field(pattern=r"^([01][0-9]|2[0-3]):[0-5][0-9]$", max_length=5)]
-
-_DAYS: tuple[Day, ...] = get_args(Day)
-_DAY_S = 86_400.0
-_THURSDAY = 3
-"""1970-01-01 was one."""
-
-
-class Validity(Model):
-    """A window of time, open at the end that is not given."""
-
-    valid_from: datetime | None = Field(default=None, description="RFC 3339; unset: always valid before validUntil.")
-    valid_until: datetime | None = Field(default=None, description="RFC 3339; unset: valid indefinitely.")
-
-    @rule(
-        "!has(self.validFrom) || !has(self.validUntil) || self.validFrom < self.validUntil",
-        "validUntil must be after validFrom",
-    )
-    def _ordered(self) -> Broken:
-        return "validUntil" if self.window_s[0] >= self.window_s[1] else None
-
-    @property
-    def window_s(self) -> tuple[float, float]:
-        """Begin and end in seconds since 1970 UTC, infinite where they are not given; the end is not part of it."""
-        begin = -math.inf if self.valid_from is None else _unix(self.valid_from)
-        return begin, math.inf if self.valid_until is None else _unix(self.valid_until)
-
-
-class ActiveTime(Validity):
-    """When a zone is active; what is given must hold together. Times are UTC, as in ED-269."""
-
-    days: tuple[Day, ...] = Field(default=(), max_length=7, description="Days of the week in UTC; empty: every day.")
-    start: ClockTime | None = Field(default=None, description="HH:MM, UTC; unset: midnight.")
-    end: ClockTime | None = Field(
-        default=None, description="HH:MM, UTC; not later than start: on the day after. Unset: midnight."
-    )
-
-    @rule("has(self.start) == has(self.end)", "give start and end together, or neither")
-    def _start_and_end(self) -> Broken:
-        return "start" if (self.start is None) != (self.end is None) else None
-
-    def active(self, time_s: float) -> bool:
-        """Whether a moment, in seconds since 1970 UTC, is in this time."""
-        begin_s, end_s = self.window_s
-        if not begin_s <= time_s < end_s:
-            return False
-        start, end = _clock_s(self.start or "00:00"), _clock_s(self.end or "00:00")
-        length = end - start if end > start else _DAY_S + end - start
-        today = time_s // _DAY_S
-        # A time that began yesterday may last until today.
-        for day in (today, today - 1):
-            weekday = _DAYS[int(day + _THURSDAY) % 7]
-            if 0 <= time_s - day * _DAY_S - start < length and (not self.days or weekday in self.days):
-                return True
-        return False
-
-
-def active_at(schedule: Sequence[ActiveTime], time_s: float) -> bool:
-    """Whether a schedule is active at a moment, in seconds since 1970 UTC; an empty one always is."""
-    return not schedule or any(time.active(time_s) for time in schedule)
-
-
-def _clock_s(text: str) -> float:
-    hours, minutes = text.split(":")
-    return int(hours) * 3600.0 + int(minutes) * 60.0
-
-
-def _unix(moment: datetime) -> float:
-    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
 class ZoneShape(Model):
@@ -111,7 +39,7 @@ class ZoneShape(Model):
 class ZoneSpec(ZoneShape):
     """A named piece of air or ground."""
 
-    description: str = Field(default="", max_length=1024)
+    description: str = Field(default="", max_length=1024, description="For people.")
 
 
 class Zone(Resource, plural="zones", short="zn"):
@@ -122,6 +50,8 @@ class Zone(Resource, plural="zones", short="zn"):
     kind: Literal["Zone"] = "Zone"
     spec: ZoneSpec
     status: ReadyStatus | None = None
+
+    _selectable = named_by_others("Zone", "policies")
 
 
 _NUMBER = r"^[-+]?([0-9]+[.]?[0-9]*|[.][0-9]+)$"
@@ -135,8 +65,12 @@ class NodeExpression(Model):
         max_length=128,
         description="Attribute, dotted for nested ones: class, mtom, name, services.camera.model.",
     )
-    operator: Literal["In", "NotIn", "Exists", "Gt", "Lt"]
-    values: tuple[Annotated[str, Field(max_length=256)], ...] = Field(default=(), max_length=100)
+    operator: Literal["In", "NotIn", "Exists", "Gt", "Lt"] = Field(
+        description="How the attribute compares with values; Gt and Lt compare numbers."
+    )
+    values: tuple[Annotated[str, Field(max_length=256)], ...] = Field(
+        default=(), max_length=100, description="What it is compared with; left out for Exists."
+    )
 
     @rule(
         "self.operator == 'Exists' ? !has(self.values) || size(self.values) == 0 :"
@@ -169,7 +103,7 @@ class ApplicationSelector(Model):
 
     namespaces: tuple[Name, ...] = Field(default=(), max_length=100, description="Empty: every namespace.")
     names: tuple[Name, ...] = Field(default=(), max_length=100, description="Empty: every application.")
-    components: tuple[str, ...] = Field(default=(), max_length=100, description="Empty: every component.")
+    components: tuple[ComponentName, ...] = Field(default=(), max_length=100, description="Empty: every component.")
 
 
 class PolicySelector(Model):
@@ -216,11 +150,33 @@ def _listed(choices: object) -> str:
     return f"{', '.join(most)} or {last}"
 
 
+def _for_other(type_: PolicyType, then: str) -> str:
+    """A CEL rule that holds for all other types of policy."""
+    return f"self.type == '{type_}' || ({then})"
+
+
+def _only(message: str, there: Callable[[PolicySpec], bool], cel: str, *fields: str) -> Any:
+    """The rule that fields which elsewhere would do nothing are given only where they do something."""
+
+    @rule(cel, f"{message}; remove it, or correct the type")
+    def only(self: PolicySpec) -> Broken:
+        given = (f for f in fields if getattr(self, to_snake(f)) != PolicySpec.model_fields[to_snake(f)].default)
+        return None if there(self) else next(given, None)
+
+    return only
+
+
 class PolicySpec(Validity):
     """One rule of an authority or a provider."""
 
-    type: PolicyType
-    kind: Literal[AccessKind, LimitKind, GeofenceKind, "camera"]
+    type: PolicyType = Field(
+        description="Which calls are allowed (AccessControl), how fast and high to fly (LimitControl), where to fly"
+        " (GeofenceControl), or what pictures may show (PrivacyControl)."
+    )
+    kind: Literal[AccessKind, LimitKind, GeofenceKind, "camera"] = Field(
+        description="AccessControl: grant, denial. LimitControl: speed, altitude. GeofenceControl: inclusion, exclusion."
+        " PrivacyControl: camera."
+    )
     methods: tuple[Method, ...] = Field(default=(), max_length=64, description="For AccessControl: the methods meant.")
     lower_limit: Limit = None
     upper_limit: Limit = None
@@ -301,6 +257,33 @@ class PolicySpec(Validity):
     )
     def _limit_action(self) -> Broken:
         return "action" if self.type == "LimitControl" and not self._acts(LimitAction) else None
+
+    _limits_limit = _only(
+        "lowerLimit and upperLimit go with type LimitControl",
+        lambda spec: spec.type == "LimitControl",
+        _for_other("LimitControl", "!has(self.lowerLimit) && !has(self.upperLimit)"),
+        "lowerLimit",
+        "upperLimit",
+    )
+    _datum_of_altitudes = _only(
+        "altitudeReference goes with type LimitControl and kind altitude",
+        lambda spec: spec.type == "LimitControl" and spec.kind == "altitude",
+        "(self.type == 'LimitControl' && self.kind == 'altitude') || !has(self.altitudeReference)"
+        " || self.altitudeReference == 'home'",
+        "altitudeReference",
+    )
+    _access_to_methods = _only(
+        "methods go with type AccessControl",
+        lambda spec: spec.type == "AccessControl",
+        _for_other("AccessControl", "!has(self.methods) || size(self.methods) == 0"),
+        "methods",
+    )
+    _access_acts_alone = _only(
+        "AccessControl takes no action: what it denies is refused",
+        lambda spec: spec.type != "AccessControl",
+        _for("AccessControl", "!has(self.action)"),
+        "action",
+    )
 
     @rule(
         "!has(self.upperLimit) || !has(self.lowerLimit) || self.lowerLimit <= self.upperLimit",

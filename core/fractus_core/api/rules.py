@@ -12,12 +12,14 @@ agents from disk, in tests. One decorator declares both forms side by side, with
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 from pydantic import model_validator
 
 from fractus_core.api.model import VALIDATIONS, InvalidObject
+from fractus_core.api.names import DNS_LABEL
 
 M = TypeVar("M")
 
@@ -46,6 +48,20 @@ def rule(cel: str, message: str) -> Callable[[Callable[[M], Broken]], Any]:
         return model_validator(mode="after")(check)
 
     return declare
+
+
+def named_by_others(kind: str, others: str) -> Any:
+    """The rule of a kind whose objects are named in fields of others: its names fit there."""
+
+    @rule(
+        f"self.metadata.name.size() <= 63 && self.metadata.name.matches('{DNS_LABEL}')",
+        f"the name of a {kind} has at most 63 small letters, digits and hyphens, for {others} name it",
+    )
+    def nameable(self: Any) -> Broken:
+        name = self.metadata.name
+        return None if len(name) <= 63 and re.fullmatch(DNS_LABEL, name) else "metadata.name"
+
+    return nameable
 
 
 def one_of(first: str, second: str) -> Any:

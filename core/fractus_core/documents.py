@@ -1,0 +1,325 @@
+"""YAML and JSON as the API server reads them, within limits, and the line that each value is on.
+
+What programs of others made of a file must not be another thing than what Fractus makes of it. So plain scalars are typed
+as kubectl types them (a time stays a text, `on` is true, 1e3 a number), a key that is there twice is an error, and aliases
+are counted as what they stand for.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Hashable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import yaml
+
+MAX_BYTES = 64 * 2**20
+MAX_NODES = 5_000_000
+"""Scalars, lists and objects of one file at most: a hundred thousand nodes with their interfaces."""
+MAX_ALIASED = 100_000
+"""Those of them at most that aliases repeat: manifests repeat an image or a path, alias bombs repeat each other."""
+MAX_DEPTH = 100
+_MAX_DIGITS = 300
+
+_CONSTANTS: dict[str, bool | None] = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL")),
+    **dict.fromkeys(("y", "Y", "yes", "Yes", "YES", "true", "True", "TRUE", "on", "On", "ON"), True),
+    **dict.fromkeys(("n", "N", "no", "No", "NO", "false", "False", "FALSE", "off", "Off", "OFF"), False),
+}
+_INTEGER = re.compile(r"[-+]?(?:0[xX][0-9a-fA-F]+|0[bB][01]+|0[oO]?[0-7]+|0|[1-9][0-9]*)")
+_FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
+_NO_NUMBER = re.compile(r"[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)")
+_SURROGATES = re.compile(r"\\(?:u([dD][89abAB][0-9a-fA-F]{2})\\u([dD][c-fC-F][0-9a-fA-F]{2})|.)", re.DOTALL)
+_PART = re.compile(r"\.?([^.\[\]]+)|\[([0-9]+)\]")
+_TEXT_TAGS = frozenset({"!", "tag:yaml.org,2002:str"})
+_PLAIN_TAGS = frozenset({None, "!", "tag:yaml.org,2002:map", "tag:yaml.org,2002:seq"})
+
+_Lines = dict[Hashable, int]
+
+
+class _Dumper(yaml.CSafeDumper):
+    """Quotes what a program of another language would take for a number or a truth value; writes no aliases."""
+
+    def ignore_aliases(self, data: object) -> bool:
+        """Say that nothing is shared."""
+        return True
+
+
+_Dumper.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile("[yYnN]$"), list("yYnN"))
+_Dumper.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(f"(?:{_INTEGER.pattern}|{_FLOAT.pattern})$"), list("+-.0123456789")
+)
+
+
+def dump_documents(values: Iterable[Any]) -> str:
+    """A YAML stream that `parse_documents`, kubectl and all else read as these values."""
+    return yaml.dump_all(values, Dumper=_Dumper, sort_keys=False, width=120, allow_unicode=True)
+
+
+class BadDocument(ValueError):
+    """A file that cannot be read; one sentence that names the file and the line.
+
+    Attributes:
+        line: where, counted from 1; 0 where it is the file as a whole.
+        problem: what is wrong, and the remedy.
+    """
+
+    def __init__(self, name: str, line: int, problem: str) -> None:
+        self.line, self.problem = line, problem
+        super().__init__(f"{_place(name, line)}: {problem}")
+
+
+def _place(name: str, line: int) -> str:
+    return f"{name}:{line}" if line else name
+
+
+@dataclass(frozen=True)
+class Documents:
+    """The documents of a file."""
+
+    name: str
+    values: tuple[Any, ...]
+    _lines: dict[int, tuple[int, _Lines]] = field(repr=False)
+
+    def where(self, value: object, path: str = "") -> str:
+        """FILE:LINE of a list or object of these documents, or of a field below it, as far as the path leads."""
+        return _place(self.name, self.line(value, path))
+
+    def line(self, value: object, path: str = "") -> int:
+        """The line of a list or object of these documents, or of a field below it; 0 where it is not known."""
+        line, fields = self._lines.get(id(value), (0, {}))
+        for part in _PART.finditer(path):
+            key: Hashable = part[1] or part[2]
+            if isinstance(value, list):
+                key = int(str(key)) if str(key).isdigit() else key
+            if key not in fields:
+                break
+            line, value = fields[key], value[key]  # type: ignore[index]  # it has fields: it is a list or an object
+            fields = self._lines.get(id(value), (0, {}))[1]
+        return line
+
+
+def parse_documents(content: bytes, name: str, *, is_json: bool = False) -> Documents:
+    """The documents of a YAML stream, or the one of a JSON file.
+
+    Raises:
+        BadDocument: it cannot be parsed, has a key twice, or goes beyond a limit.
+    """
+    if len(content) > MAX_BYTES:
+        raise BadDocument(name, 0, f"it has more than {MAX_BYTES // 2**20} MiB; split it")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise BadDocument(name, line, "this is no text file in UTF-8") from None
+    if is_json:
+        _check_json(text, name)
+        text = _SURROGATES.sub(_joined, text)
+    reader = _Reader(name)
+    try:
+        for event in yaml.parse(text, Loader=yaml.CSafeLoader):
+            reader.take(event)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = mark.line + 1 if mark is not None else 0
+        raise BadDocument(name, line, f"this is not YAML: {error.problem or error.context}") from None
+    except yaml.YAMLError as error:
+        line = text[: getattr(error, "position", 0)].count("\n") + 1
+        raise BadDocument(name, line, f"this is not YAML: {getattr(error, 'reason', None) or error}") from None
+    return Documents(name, tuple(reader.values), reader.lines)
+
+
+def parse_document(content: bytes, name: str) -> tuple[Any, Documents]:
+    """The one document of a YAML file (None if it is empty), and where its parts are.
+
+    Raises:
+        BadDocument: it cannot be parsed, or has several documents.
+    """
+    found = parse_documents(content, name)
+    if len(found.values) > 1:
+        raise BadDocument(name, found.line(found.values[1]), "there is a second document; give one")
+    return (found.values[0] if found.values else None), found
+
+
+def _check_json(text: str, name: str) -> None:
+    def no_number(word: str) -> None:
+        raise BadDocument(name, 0, f"{word} is not a number that JSON has; give a finite one")
+
+    try:
+        json.loads(text, parse_int=len, parse_constant=no_number)
+    except json.JSONDecodeError as error:
+        raise BadDocument(name, error.lineno, f"this is not JSON: {error.msg.lower()}") from None
+    except RecursionError:
+        raise BadDocument(name, 0, f"its lists or objects are nested deeper than {MAX_DEPTH}; flatten them") from None
+
+
+def _joined(escape: re.Match[str]) -> str:
+    """Of two escaped surrogates (JSON) one escaped character (YAML)."""
+    if escape[1] is None:
+        return escape[0]
+    return f"\\U{0x10000 + ((int(escape[1], 16) - 0xD800) << 10) + int(escape[2], 16) - 0xDC00:08x}"
+
+
+_NO_KEY: Any = object()
+
+
+class _Open:
+    """A list or object that is being read."""
+
+    __slots__ = ("anchor", "before", "key", "line", "lines", "merged", "value")
+
+    def __init__(self, value: Any, line: int, anchor: str | None, before: int) -> None:
+        self.value, self.line, self.anchor, self.before = value, line, anchor, before
+        self.lines: _Lines = {}
+        self.key: Any = _NO_KEY
+        self.merged: list[dict[str, Any]] = []
+
+
+class _Reader:
+    """Makes values of the events of a parser."""
+
+    def __init__(self, name: str) -> None:
+        self.values: list[Any] = []
+        self.lines: dict[int, tuple[int, _Lines]] = {}
+        self._name = name
+        self._stack: list[_Open] = []
+        self._anchors: dict[str, tuple[Any, int] | None] = {}
+        self._nodes = self._aliased = 0
+
+    def take(self, event: Any) -> None:
+        """Go on with the next event."""
+        kind = type(event)
+        if kind is yaml.ScalarEvent:
+            self._scalar(event)
+        elif kind is yaml.MappingStartEvent or kind is yaml.SequenceStartEvent:
+            self._open(event, {} if kind is yaml.MappingStartEvent else [])
+        elif kind is yaml.MappingEndEvent or kind is yaml.SequenceEndEvent:
+            self._close()
+        elif kind is yaml.AliasEvent:
+            self._alias(event)
+        elif kind is yaml.DocumentStartEvent:
+            self._anchors.clear()
+
+    def _open(self, event: Any, value: Any) -> None:
+        line = event.start_mark.line + 1
+        if event.tag not in _PLAIN_TAGS:
+            raise self._bad(line, f"the tag {event.tag} means nothing here; remove it")
+        if len(self._stack) >= MAX_DEPTH:
+            raise self._bad(line, f"its lists or objects are nested deeper than {MAX_DEPTH}; flatten them")
+        if self._stack and self._expects_key():
+            raise self._bad(line, "a list or object cannot be a key; give a name")
+        self._count(line)
+        if event.anchor is not None:
+            self._anchors[event.anchor] = None
+        self._stack.append(_Open(value, line, event.anchor, self._nodes))
+
+    def _close(self) -> None:
+        done = self._stack.pop()
+        for other in done.merged:
+            for key, value in other.items():
+                if key in done.value:
+                    raise self._bad(done.line, f"{key} is given here and by <<; remove one of them")
+                done.value[key], done.lines[key] = value, done.line
+        self.lines[id(done.value)] = done.line, done.lines
+        if done.anchor is not None:
+            self._anchors[done.anchor] = done.value, self._nodes - done.before + 1
+        self._add(done.value, done.line)
+
+    def _scalar(self, event: Any) -> None:
+        line = event.start_mark.line + 1
+        self._count(line)
+        plain = event.implicit[0]
+        if not plain and event.tag is not None and event.tag not in _TEXT_TAGS:
+            raise self._bad(line, f"the tag {event.tag} means nothing here; remove it")
+        if self._stack and self._expects_key():
+            value: Any = event.value
+            if plain and value == "<<":
+                value = yaml.MappingStartEvent
+        else:
+            value = self._typed(event.value, line) if plain else event.value
+        if event.anchor is not None:
+            self._anchors[event.anchor] = value, 1
+        self._add(value, line)
+
+    def _alias(self, event: Any) -> None:
+        line = event.start_mark.line + 1
+        if event.anchor not in self._anchors:
+            raise self._bad(line, f"there is no anchor &{event.anchor} above; define it, or correct the name")
+        found = self._anchors[event.anchor]
+        if found is None:
+            raise self._bad(
+                line, f"*{event.anchor} stands for a part of the file that it is in; write out what is meant"
+            )
+        value, weight = found
+        self._aliased += weight
+        self._nodes += weight - 1
+        if self._aliased > MAX_ALIASED:
+            raise self._bad(line, f"aliases repeat more than {MAX_ALIASED} values; write fewer of them")
+        self._count(line)
+        if self._stack and self._expects_key() and not isinstance(value, str):
+            raise self._bad(line, "only a text can be a key; give a name")
+        self._add(value, line)
+
+    def _expects_key(self) -> bool:
+        top = self._stack[-1]
+        return top.key is _NO_KEY and isinstance(top.value, dict)
+
+    def _add(self, value: Any, line: int) -> None:
+        if not self._stack:
+            if value is not None:
+                self.values.append(value)
+            return
+        top = self._stack[-1]
+        if isinstance(top.value, list):
+            top.lines[len(top.value)] = line
+            top.value.append(value)
+        elif top.key is _NO_KEY:
+            top.key = value
+            if value in top.lines:
+                raise self._bad(line, f"{value} is given twice, on line {top.lines[value]} as well; remove one of them")
+            if isinstance(value, str):
+                top.lines[value] = line
+        elif top.key is yaml.MappingStartEvent:
+            self._merge(top, value, line)
+            top.key = _NO_KEY
+        else:
+            top.value[top.key] = value
+            top.key = _NO_KEY
+
+    def _merge(self, top: _Open, value: Any, line: int) -> None:
+        parts = value if isinstance(value, list) else [value]
+        if not all(isinstance(part, dict) for part in parts):
+            raise self._bad(line, "<< takes an alias of an object, or a list of them")
+        top.merged += parts
+
+    def _typed(self, text: str, line: int) -> Any:
+        if text in _CONSTANTS:
+            return _CONSTANTS[text]
+        number = text.replace("_", "") if text[0] in "+-0123456789" else text
+        if _INTEGER.fullmatch(number):
+            digits = number.lstrip("+-")
+            if len(digits) > _MAX_DIGITS:
+                raise self._bad(line, f"a number has more than {_MAX_DIGITS} digits; correct it")
+            if len(digits) > 1 and digits[0] == "0" and digits[1].isdigit():
+                number = number.replace("0", "0o", 1)
+            whole = int(number, 0)
+            return whole if -(2**63) <= whole < 2**63 else float(whole)
+        if _FLOAT.fullmatch(number):
+            found = float(number)
+            if not math.isfinite(found):
+                raise self._bad(line, f"{text[:40]} is larger than any number; correct it")
+            return found
+        if _NO_NUMBER.fullmatch(text):
+            raise self._bad(line, f"{text} is not a number that JSON has; give a finite one")
+        return text
+
+    def _count(self, line: int) -> None:
+        self._nodes += 1
+        if self._nodes > MAX_NODES:
+            raise self._bad(line, f"it has more than {MAX_NODES} values; split it")
+
+    def _bad(self, line: int, problem: str) -> BadDocument:
+        return BadDocument(self._name, line, problem)

@@ -1,0 +1,144 @@
+"""Files of users: what their values are, on which line, and the sentence for what no one can mean."""
+
+import json
+import time
+
+import pytest
+from fractus_core import documents
+from fractus_core.documents import BadDocument, dump_documents, parse_document, parse_documents
+
+BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 30)
+)
+
+
+def parsed(text, **how):
+    return parse_documents(text.encode(), "f.yaml", **how).values
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("", None), ("~", None), ("null", None),
+        ("on", True), ("Yes", True), ("y", True), ("off", False), ("No", False),
+        ("7", 7), ("-7", -7), ("+7", 7), ("010", 8), ("0o17", 15), ("0x1f", 31), ("-0b11", -3), ("1_000", 1000),
+        ("08", 8.0), ("1e3", 1000.0), (".5", 0.5), ("-1.", -1.0), ("9223372036854775808", 9223372036854775808.0),
+        ("__00", "__00"), (".5_0", ".5_0"), ("10:00", "10:00"), ("2026-01-01T00:00:00Z", "2026-01-01T00:00:00Z"), ("2026-01-01", "2026-01-01"),
+        ("1.2.3", "1.2.3"), ("'5'", "5"), ('"on"', "on"), ("!!str 5", "5"), ("|-\n  5", "5"), ("=", "="),
+    ],
+)  # fmt: skip
+def test_scalars_are_what_kubectl_takes_them_for(text, value):
+    ((found,),) = (tuple(one.values()) for one in parsed(f"a: {text}"))
+    assert (found, type(found)) == (value, type(value))
+
+
+def test_aliases_and_merges_are_what_they_stand_for():
+    (found,) = parsed("a: &a {p: 1, q: 2}\nb:\n  <<: *a\n  r: 3\nc: [*a, &n 5, *n]")
+    assert found == {"a": {"p": 1, "q": 2}, "b": {"p": 1, "q": 2, "r": 3}, "c": [{"p": 1, "q": 2}, 5, 5]}
+
+
+def test_json_is_read_as_such():
+    text = '{"a": "\\ud83d\\ude00 \\/ \\\\ud83d\\u00e9",\n\t"b": [1, 2.5, true, null, "on"]}'
+    assert parsed(text, is_json=True) == (json.loads(text),)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("a: 1\nb: 2\na: 3", "f.yaml:3: a is given twice, on line 1 as well; remove one of them"),
+        ("a:\n  b: {c: 1, d: 2, c: 1}", "f.yaml:2: c is given twice, on line 2 as well"),
+        ("a: &a {p: 1}\nb: {<<: *a, p: 2}", "f.yaml:2: p is given here and by <<; remove one of them"),
+        ("a: &a [1, *a]", "f.yaml:1: *a stands for a part of the file that it is in"),
+        ("a: *b", "f.yaml:1: there is no anchor &b above"),
+        ("a: &x 1\n---\nb: *x", "f.yaml:3: there is no anchor &x above"),
+        ("a: 1\nb: !!python/object/apply:os.system [ls]", "f.yaml:2: the tag tag:yaml.org,2002:python/object/apply"),
+        ("? [1]\n: 2", "f.yaml:1: a list or object cannot be a key"),
+        ("a: &a {b: 1}\n*a : 2", "f.yaml:2: only a text can be a key"),
+        ("<<: 3", "f.yaml:1: << takes an alias of an object"),
+        ("a: 1e999", "f.yaml:1: 1e999 is larger than any number"),
+        ("a: .nan", "f.yaml:1: .nan is not a number that JSON has"),
+        ("a: " + "9" * 5000, "f.yaml:1: a number has more than 300 digits"),
+        ("a: [1,\nb\n", "f.yaml:3: this is not YAML"),
+        ("a: 1\nb: '\x01'", "f.yaml:2: this is not YAML: control characters are not allowed"),
+        ("[" * 100_000, "f.yaml:1: its lists or objects are nested deeper than 100"),
+        ("- " * 100_000, "f.yaml:1: its lists or objects are nested deeper than 100"),
+        (BOMB, "f.yaml:6: aliases repeat more than 100000 values"),
+    ],
+)  # fmt: skip
+def test_what_no_one_can_mean_has_its_line(text, sentence):
+    begun = time.process_time()
+    with pytest.raises(BadDocument) as refused:
+        parsed(text)
+    assert str(refused.value).startswith(sentence)
+    assert time.process_time() - begun < 1
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ('{\n"kind": }', "f.yaml:2: this is not JSON: expecting value"),
+        ('{\n"a": 1,\n"a": 1}', "f.yaml:3: a is given twice"),
+        ('{"a": 1} # no', "f.yaml:1: this is not JSON: extra data"),
+        ('{"a": NaN}', "f.yaml: NaN is not a number that JSON has"),
+        ('{"a":' * 100_000, "f.yaml: its lists or objects are nested deeper"),
+        ('{"a":' * 200 + "1" + "}" * 200, "f.yaml:1: its lists or objects are nested deeper"),
+    ],
+)
+def test_what_is_no_json_has_its_line(text, sentence):
+    with pytest.raises(BadDocument) as refused:
+        parsed(text, is_json=True)
+    assert str(refused.value).startswith(sentence)
+
+
+def test_limits(monkeypatch):
+    for name, value, sentence in (("MAX_NODES", 10, "more than 10 values"), ("MAX_BYTES", 0, "more than 0 MiB")):
+        with monkeypatch.context() as patched, pytest.raises(BadDocument, match=sentence):
+            patched.setattr(documents, name, value)
+            parsed("[1, 2, 3, 4, 5, 6, 7, 8, 9, 10]")
+    with pytest.raises(BadDocument, match="f:2: this is no text file in UTF-8"):
+        parse_documents(b"a: 1\nb: \xff", "f")
+    with pytest.raises(BadDocument, match="f:3: there is a second document; give one"):
+        parse_document(b"a: 1\n---\nb: 1", "f")
+    assert parse_document(b"", "f")[0] is None
+
+
+def test_lines_of_fields():
+    text = "---\nkind: A\nspec:\n  list:\n    - {p: 1}\n    -\n      p: 2\n      q: [3]\n---\nkind: B\n"
+    found = parse_documents(text.encode(), "f")
+    first, second = found.values
+    paths = {"": 2, "spec": 3, "spec.list[0].p": 5, "spec.list[1].q[0]": 8, "spec.list[7].q": 4, "spec.lost": 3}
+    assert {path: found.line(first, path) for path in paths} == paths
+    assert found.where(second, "kind") == "f:10"
+    assert found.where({}) == "f"
+
+
+def test_a_large_zone_is_read_in_reasonable_time():
+    text = "ring:\n" + "".join(f"  - {{lat: {50 + i / 1e6}, lon: {4 + i / 1e6}}}\n" for i in range(50_000))
+    begun = time.process_time()
+    (found,) = parsed(text)
+    assert time.process_time() - begun < 4
+    assert len(found["ring"]) == 50_000
+
+
+def test_what_is_written_is_read_back():
+    texts = [
+        "",
+        "on",
+        "n",
+        "Y",
+        "1e3",
+        "0x1",
+        "010",
+        "1_0",
+        "+.5",
+        "10:00",
+        "2026-01-01",
+        "null",
+        "<<",
+        "é\n\t\u2028",
+        "#",
+    ]
+    same = {"lat": 1.5}
+    values = ({"a": [*texts, 1.5, 1e300, -3, None, True, same, same], **dict.fromkeys(texts, 5)}, {"n": "n"})
+    assert parsed(dump_documents(values)) == values
+    assert "&id" not in dump_documents(values)

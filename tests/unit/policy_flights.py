@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.engine import judge
+from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import Airframe, Call, GotoArgs, Situation, VelocityArgs, Verdict
 from numpy.typing import NDArray
 from policy_world import HOME, METHODS, NOW, compiled, policy, ring
@@ -28,7 +29,11 @@ ACCEL, CLIMB_ACCEL, JERK, GAIN = 2.5, 1.0, 5.0, 1.0
 UP_MPS, DOWN_MPS = 2.5, 1.5
 RATIO = 4.0
 """ArduPilot's CONTROL_TIME_CONSTANT_RATIO: it plans to brake with three quarters of its acceleration."""
-POSITION_ERROR_M, HEIGHT_ERROR_M, TRACKING_M, LATENCY_S = 1.5, 1.0, 1.0, 0.3
+POSITION_ERROR_M, HEIGHT_ERROR_M, TRACKING_M = 1.5, 1.0, 1.0
+LATENCY_S = (0.05, 0.8)
+"""A link that delays by up to half a second there and back, and what the autopilot takes."""
+COURSE_S = 0.3
+"""Accelerations that are told are those of this long ago, so that what was commanded since then is told as well."""
 HOURS = 12
 """The hour of the day at which all of it happens."""
 NORTH_M, EAST_M = 110_998.6, math.cos(math.radians(HOME.lat)) * 111_457.6
@@ -187,6 +192,11 @@ class Fleet:
         """The sway that each had when its present course began: from there on it strays."""
         self.beat = rng.uniform(0.05, 0.4, count)
         self.phase = rng.uniform(0, 2 * math.pi, count)
+        self.latency = rng.uniform(*LATENCY_S, count)
+        self.sent: list[list[tuple[float, tuple[float, float, float]]]] = [[] for _ in range(count)]
+        """Velocities that each was told of late, in the order in which it hears of them."""
+        self.mail: list[tuple[float, int, Verdict]] = []
+        self.asked: list[Call | None] = [None] * count
         self.time_s = 0.0
         # Commands: fly to a point with a speed, or hold a velocity until a time; all from a time on.
         self.goal = self.place.copy()
@@ -228,7 +238,10 @@ class Fleet:
         self.wanted[who] = 0.0
 
     def step(self) -> None:
-        """Move on by a little."""
+        """Move on by a little, and hear what has come."""
+        for due, i, verdict in [letter for letter in self.mail if letter[0] <= self.time_s]:
+            self.mail.remove((due, i, verdict))
+            self.obey(i, verdict)
         late = self.held & (self.time_s >= self.until)
         if late.any():
             self.stop(np.flatnonzero(late))
@@ -268,9 +281,30 @@ class Fleet:
         return Situation(
             time_s=NOW, lat=float(HOME.lat + y / NORTH_M), lon=float(HOME.lon + x / EAST_M), altitude_m=float(z), north_mps=north, east_mps=east,
             down_mps=-up, home=HOME, armed=True, in_air=True, position_error_m=POSITION_ERROR_M,
-            altitude_error_m=HEIGHT_ERROR_M, latency_s=LATENCY_S, speed_setpoint_mps=max(float(self.setpoint[i]), tends), forward_mps2=forward,
+            altitude_error_m=HEIGHT_ERROR_M, latency_s=float(self.latency[i]), pending=self._pending(i), speed_setpoint_mps=max(float(self.setpoint[i]), tends), forward_mps2=forward,
             airframe=Airframe(retraces=retraces),
         )  # fmt: skip
+
+    def _pending(self, i: int) -> tuple[tuple[float, float, float], ...]:
+        """What one was told that its state may not show yet."""
+        since = self.time_s - float(self.latency[i]) - COURSE_S
+        self.sent[i] = [(at, velocity) for at, velocity in self.sent[i] if at >= since]
+        return tuple(dict.fromkeys(velocity for _, velocity in self.sent[i]))
+
+    def send(self, i: int, verdict: Verdict) -> None:
+        """Put what the engine made of a request on its way: it comes within the latency, and after those before it."""
+        args, velocity = verdict.args, (0.0, 0.0, 0.0)
+        if isinstance(args, VelocityArgs) and not verdict.brake_first:
+            velocity = (args.north_mps, args.east_mps, args.down_mps)
+        elif isinstance(args, GotoArgs) and not verdict.brake_first:
+            x, y, z = self.seen[i]
+            east, north = (args.lon - HOME.lon) * EAST_M - x, (args.lat - HOME.lat) * NORTH_M - y
+            cruise = (args.speed_mps or float(self.setpoint[i])) / max(math.hypot(east, north), 1e-6)
+            rise = (args.alt or z) - z
+            velocity = (float(north * cruise), float(east * cruise), math.copysign(UP_MPS, -rise))
+        self.sent[i].append((self.time_s, velocity))
+        before = max((due for due, who, _ in self.mail if who == i), default=self.time_s)
+        self.mail.append((max(before, self.time_s + self.rng.uniform(0, float(self.latency[i]))), i, verdict))
 
     def obey(self, i: int, verdict: Verdict) -> None:
         """Carry out what the engine made of a request."""
@@ -287,7 +321,7 @@ class Fleet:
         elif isinstance(args, VelocityArgs):
             self.held[i] = True
             self.wanted[i] = (args.east_mps, args.north_mps, -args.down_mps)
-            self.until[i] = self.time_s + args.hold_s + self.rng.uniform(0, LATENCY_S)
+            self.until[i] = self.time_s + args.hold_s + self.rng.uniform(0, float(self.latency[i]))
 
     def trespassing(self) -> Flags:
         """Which zones each breaks: exclusion zones and limits one by one, inclusion zones all together in slot 0 of a second
@@ -335,10 +369,13 @@ class Tally:
     corrected: int = 0
     braked: int = 0
     taken: int = 0
+    shortened: int = 0
     wrong: list[str] = field(default_factory=list)
+    stopped: list[str] = field(default_factory=list)
+    """Flights that were permitted, and stopped by the monitor."""
 
 
-def flights(seed: int, count: int, shared: int = 8, requests: int = 3) -> Tally:
+def flights(seed: int, count: int, shared: int = 8, requests: int = 3, watch_every: int = 0) -> Tally:
     """Fly a fleet through random scenes, each drone with several requests, and look for trespasses.
 
     Args:
@@ -346,6 +383,7 @@ def flights(seed: int, count: int, shared: int = 8, requests: int = 3) -> Tally:
         count: drones.
         shared: drones to a scene: compiling policies takes longer than judging.
         requests: to each drone; the later ones interrupt the flight of the earlier.
+        watch_every: steps after which the monitor looks at each drone again, as the service has it look; 0 for never.
     """
     rng = np.random.default_rng(seed)
     scenes = [s for s in (scene(rng) for _ in range(math.ceil(count / shared))) for _ in range(shared)][:count]
@@ -353,12 +391,15 @@ def flights(seed: int, count: int, shared: int = 8, requests: int = 3) -> Tally:
     pardoned = excused(fleet)
     told: list[str] = [""] * count
     for turn in range(requests):
-        _ask_all(fleet, tally, told, rng)
-        span_s = 30.0 if turn == requests - 1 else rng.uniform(0.4, 7.0)
-        for _ in range(int(span_s / STEP_S)):
+        flown = _ask_all(fleet, tally, told, rng)
+        # Every third request comes before the one before it can have had its effect.
+        span_s = 30.0 if turn == requests - 1 else rng.choice([rng.uniform(0.05, 0.6), *rng.uniform(0.4, 7.0, 2)])
+        for n in range(int(span_s / STEP_S)):
             fleet.step()
-            if turn == requests - 1 and np.abs(fleet.speed).max() < 0.02:
+            if turn == requests - 1 and not fleet.mail and np.abs(fleet.speed).max() < 0.02:
                 break
+            if watch_every and n % watch_every == 0:
+                _watch(fleet, tally, flown, pardoned)
             found = fleet.trespassing() & ~pardoned
             for i in np.flatnonzero(found.any(axis=1)):
                 # Where wind takes a drone that nothing was permitted to is no one's doing.
@@ -369,11 +410,32 @@ def flights(seed: int, count: int, shared: int = 8, requests: int = 3) -> Tally:
     return tally
 
 
-def _ask_all(fleet: Fleet, tally: Tally, told: list[str], rng: np.random.Generator) -> None:
-    """One request of each drone; after a latency they are obeyed."""
-    verdicts: list[tuple[int, Verdict]] = []
+Flown = dict[int, tuple[str, tuple[float, float] | None, bool]]
+"""By drone: what was permitted, where its leg ends, and whether its acceleration is told."""
+
+
+def _watch(fleet: Fleet, tally: Tally, flown: Flown, pardoned: Flags) -> None:
+    """Look for drones that the monitor would stop; each is counted once."""
+    for i, (what, end, told) in list(flown.items()):
+        if np.abs(fleet.speed[i]).max() < 0.02:
+            continue
+        now = fleet.situation(i, retraces=True, told=told)
+        verdict = monitor(now, fleet.scenes[i].grant, bound_for=None if fleet.held[i] else end)
+        if verdict is None:
+            continue
+        del flown[i]
+        slots = [ZONES if name == "in" else int(name[4:]) for name in verdict.policies if name[:2] in {"in", "ou"}]
+        if not slots or not pardoned[i, slots].all():
+            tally.stopped.append(f"{fleet.time_s:.2f} s, drone {i}: {verdict} at {now} after {what}")
+
+
+def _ask_all(fleet: Fleet, tally: Tally, told: list[str], rng: np.random.Generator) -> Flown:
+    """One request of each drone. Returns those that the monitor has nothing against."""
+    flown: Flown = {}
     for i, place in enumerate(fleet.scenes):
-        call, now = _request(rng), fleet.situation(i, retraces=bool(rng.random() < 0.5), told=bool(rng.random() < 0.5))
+        call = fleet.asked[i] = _again(rng, fleet.asked[i]) or _request(rng)
+        retraces, measured = bool(rng.random() < 0.5), bool(rng.random() < 0.5)
+        now = fleet.situation(i, retraces=retraces, told=measured)
         verdict = judge(call, now, place.grant)
         tally.asked += 1
         tally.permitted += verdict.permits
@@ -383,14 +445,20 @@ def _ask_all(fleet: Fleet, tally: Tally, told: list[str], rng: np.random.Generat
         if verdict.permits:
             told[i] = f"{call} in {now} -> {verdict}"
             tally.wrong += [f"{what}: {told[i]}" for what in _odd(verdict, now, place)]
-            verdicts.append((i, verdict))
-    waits = rng.uniform(0, LATENCY_S, len(verdicts))
-    order = np.argsort(waits)
-    begun = fleet.time_s
-    for n in order:
-        while fleet.time_s - begun + STEP_S <= waits[n]:
-            fleet.step()
-        fleet.obey(*verdicts[n])
+            tally.shortened += "the last legal point" in verdict.reason
+            fleet.send(i, verdict)
+            if monitor(now, place.grant) is None:
+                leg = verdict.args if isinstance(verdict.args, GotoArgs) and not verdict.brake_first else None
+                flown[i] = told[i], (leg.lat, leg.lon) if leg is not None else None, measured
+    return flown
+
+
+def _again(rng: np.random.Generator, last: Call | None) -> Call | None:
+    """Half of the drivers that steer ask for the same once more, or a little faster."""
+    if last is None or not isinstance(last.args, VelocityArgs) or rng.random() < 0.5:
+        return None
+    args, faster = last.args, float(rng.choice([1.0, 1.3]))
+    return Call("SetVelocity", replace(args, north_mps=args.north_mps * faster, east_mps=args.east_mps * faster))
 
 
 def _request(rng: np.random.Generator) -> Call:
@@ -440,7 +508,7 @@ def excused(fleet: Fleet) -> Flags:
     trial = Fleet(np.random.default_rng(0), fleet.scenes)
     for name in ("place", "speed", "accel", "error", "gust", "beat", "phase", "settled"):
         setattr(trial, name, getattr(fleet, name).copy())
-    trial.held[:], trial.wanted, trial.until[:] = True, trial.speed.copy(), LATENCY_S
+    trial.held[:], trial.wanted, trial.until = True, trial.speed.copy(), fleet.latency.copy()
     margin = _CIRCLE * (POSITION_ERROR_M + TRACKING_M + 0.1)
     tall = HEIGHT_ERROR_M + TRACKING_M + 0.1
     around = np.where((fleet.kinds == EXCLUSION)[..., None], [-tall, tall], [tall, -tall])

@@ -7,11 +7,11 @@ import shapely
 from fractus_core.api import InvalidObject, Policy, Zone
 from fractus_core.api.policies import NodeExpression
 from fractus_core.geo import polygon
-from fractus_core.planning import flight_of, plan
+from fractus_core.planning import flight_of, grants, plan
 from fractus_core.planning.area import operation_area
-from fractus_core.policy import grants
-from fractus_core.policy.grants import compile_grants, refresh
-from fractus_core.policy.selectors import matches, node_attributes
+from fractus_core.planning.grants import compile_grants, refresh
+from fractus_core.policy.selectors import is_attribute, matches, node_attributes
+from fractus_core.validation import check_policy
 from test_planning import FRAME, PATH, VIEWER, application, at, drone, edge, inventory, manifest, navigator
 
 
@@ -210,6 +210,11 @@ def test_application_selector(applications, expected):
         ("mtom", "Lt", ["2000"], {"mtom": "heavy"}, True, False),
         ("camera", "Exists", [], {"camera": 1}, True, True),
         ("camera", "Exists", [], {}, False, False),
+        ("labels.owner", "Exists", [], {}, False, False),
+        ("camra", "Exists", [], {}, True, False),
+        ("services.camera.mount.pich", "Exists", [], {}, True, False),
+        ("interfaces.technology", "Exists", [], {}, True, False),
+        ("interfaces", "In", ["WiFi"], {"interfaces": [{"technology": "WiFi"}]}, True, False),
     ],
 )
 def test_node_expressions_hold_for_the_unknown_when_they_restrict(
@@ -227,3 +232,28 @@ def test_attributes_of_nodes():
     assert attributes["maxSpeed"] == 15
     assert attributes["services.mobility.maxSpeed"] == 15
     assert node_attributes(edge("e", (0, 0)))["location.lat"] == pytest.approx(at(0, 0)["lat"])
+    assert {"services.camera", "camera", "interfaces"} <= attributes.keys()
+    assert not {"services.camera", "camera"} & node_attributes(edge("e", (0, 0), camera=False)).keys()
+
+
+def test_every_attribute_of_a_node_is_one_that_selectors_know():
+    for node in (drone("d"), edge("e", (0, 0))):
+        assert [key for key in node_attributes(node) if not is_attribute(key)] == []
+    keys = "class mtom name kind depot services.camera.mount.pitch physicalFeatures.dimensions.height autonomy"
+    assert all(map(is_attribute, keys.split()))
+
+
+@pytest.mark.parametrize("operator", [{"operator": "Exists"}, {"operator": "In", "values": ["x"]}])
+def test_an_exclusion_with_a_mistyped_attribute_holds_and_is_told(operator):
+    near = zone("z", (100, 100))
+    mistyped = policy("fence", zones=["z"], nodes=[{"key": "camra", **operator}], **FENCE)
+    (grant,) = compiled(mistyped, zones=[near])
+    assert [p.name for p in grant.policies] == ["fence"]
+    with pytest.raises(
+        InvalidObject, match=r"nodes\[0\]\.key: no Drone or EdgeNode has an attribute camra.* every node"
+    ):
+        check_policy(mistyped, ["z"])
+    allowing = policy("may", nodes=[{"key": "camra", **operator}], type="AccessControl", kind="grant", methods=["Goto"])
+    assert compiled(allowing)[0].policies == ()
+    with pytest.raises(InvalidObject, match="selects no node"):
+        check_policy(allowing, [])

@@ -10,7 +10,8 @@ import pytest
 import shapely
 from depth import examples
 from fractus_core.api.nodes import CameraFeatures
-from fractus_core.policy.footprint import MAX_SIGHT_M, Footprint, footprint, lens_of
+from fractus_core.policy.footprint import MAX_SIGHT_M, Footprint, footprint
+from fractus_core.policy.lenses import lens_of
 from fractus_core.policy.privacy import compose, judge_privacy, remaining
 from fractus_core.policy.values import Attitude, Call, Filter, Lens, Situation
 from hypothesis import assume, given, settings
@@ -209,7 +210,12 @@ def test_policies_name_their_filters() -> None:
 
 
 def test_descriptions_tell_the_lens() -> None:
-    fields = {"methods": ["CaptureImage"], "resolution": "1600x900", "horizontalFieldOfView": 90}
+    fields = {
+        "methods": ["CaptureImage"],
+        "resolution": "1600x900",
+        "horizontalFieldOfView": 90,
+        "lens": {"model": "pinhole"},
+    }
     assert lens_of(None) is None
     assert lens_of(CameraFeatures.model_validate(fields)) is None, "no one knows where it looks"
     lens = lens_of(CameraFeatures.model_validate({**fields, "mount": {"pitch": -60, "stabilised": True}}))

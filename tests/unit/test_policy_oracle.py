@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import math
 import random
+from typing import Any
 
 import numpy as np
+import policy_flights
 import pytest
 from depth import examples
 from fractus_core.policy import legs, velocities
 from fractus_core.policy.engine import MIN_TAKEOFF_ALTITUDE_M
 from fractus_core.policy.limits import MIN_LEG_ALTITUDE_M
+from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import Call, GotoArgs, TakeoffArgs
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from policy_flights import CORNERS, LIMIT, ZONES, Fleet, Scene, excused, flights
+from policy_flights import CORNERS, EAST_M, LIMIT, NORTH_M, ZONES, Fleet, Scene, excused, flights
 from policy_world import HOME, Corners, altitude, ask, at, compiled, exclusion, goto, inclusion, ring, target
 
 EARTH_M = 6_371_000.0
@@ -239,3 +242,38 @@ def test_who_begins_beyond_a_limit_of_altitude_breaks_it_by_no_request() -> None
     fleet.place[:], fleet.speed[:], fleet.gust[:] = (0, 0, 19), 0, 0
     fleet.place[1:, 2] = 21.5, 39.5, 42
     assert excused(fleet)[:, 0].tolist() == [True, False, False, True]
+
+
+@pytest.fixture
+def shortening(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Legs only, and every fence shortens those that would break it, so that they end at its margin."""
+    made = policy_flights.policy
+
+    def shortens(name: str, *args: Any, **more: Any) -> dict[str, Any]:
+        return made(name, *args, **more | ({"action": "adjust"} if args[0] == "GeofenceControl" else {}))
+
+    def far(rng: np.random.Generator) -> Call:
+        x, y = rng.uniform(-85, 85, 2)
+        away = GotoArgs(
+            float(HOME.lat + y / NORTH_M), float(HOME.lon + x / EAST_M), speed_mps=float(rng.uniform(2, 14))
+        )
+        return Call("Goto", away)
+
+    monkeypatch.setattr(policy_flights, "policy", shortens)
+    monkeypatch.setattr(policy_flights, "_request", far)
+
+
+@pytest.mark.usefixtures("shortening")
+@pytest.mark.parametrize("seed", [3, 4])
+def test_the_monitor_lets_pass_what_is_permitted(seed: int) -> None:
+    tally = flights(seed=seed, count=400, requests=2, watch_every=3)
+    assert tally.wrong == []
+    assert tally.stopped == []
+    assert tally.shortened > 5
+    assert tally.permitted > tally.asked / 3
+
+
+@pytest.mark.usefixtures("shortening")
+def test_the_oracle_would_notice_a_monitor_that_stops_what_is_permitted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(policy_flights, "monitor", lambda now, grant, **_: monitor(now, grant))
+    assert flights(seed=3, count=400, requests=2, watch_every=3).stopped

@@ -22,7 +22,8 @@ CA_LIFE = timedelta(days=3650)
 COMPONENT_LIFE = timedelta(hours=24)
 NODE_LIFE = timedelta(days=30)
 SIGNER_LIFE = timedelta(days=30)
-_CLOCK_SKEW = timedelta(minutes=5)
+_CLOCK_SKEW = timedelta(hours=2)
+"""How much earlier than now certificates begin: a clock that is set back by an hour must cut off no new connection."""
 _RENEW_AFTER = 2 / 3
 
 Data = dict[str, str]

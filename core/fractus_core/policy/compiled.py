@@ -14,7 +14,8 @@ from fractus_core.api.components import ServiceRequest
 from fractus_core.api.geometry import AltitudeBand, Area, Point, Reference
 from fractus_core.api.methods import METHODS_OF, MOBILITY_METHODS
 from fractus_core.api.plans import GrantedPolicy, GrantSpec
-from fractus_core.api.policies import ActiveTime, PolicySpec, active_at
+from fractus_core.api.policies import PolicySpec
+from fractus_core.api.schedules import ActiveTime, active_at
 from fractus_core.geo import LocalFrame, middle, polygon
 from fractus_core.policy.values import Home, Moment, Situation, earliest
 

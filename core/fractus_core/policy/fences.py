@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import shapely
 from shapely.geometry.base import BaseGeometry
@@ -12,7 +12,7 @@ from shapely.geometry.base import BaseGeometry
 from fractus_core.api.policies import GeofenceAction
 from fractus_core.exhaustive import exhaustive
 from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Inclusion, PolicyZone, band_meets
-from fractus_core.policy.motion import XY, Leg, stop_altitude_m, stop_point
+from fractus_core.policy.motion import XY, Leg, earliest_stop, stop_altitude_m
 from fractus_core.policy.values import Situation, Takeover, Verdict, deny, distinct, metres
 
 SEVERITY: dict[GeofenceAction, int] = exhaustive(
@@ -148,15 +148,16 @@ def _area_breach(reason: str, enters: bool) -> Breach:
 def _exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Iterator[Breach]:
     if not grant.exclusions.zones:
         return
-    margin_m = air.margin_m
+    margin_m, certain = air.margin_m, _certain_way(leg, now)
     for zone in grant.exclusions.near(air, now, grant.flat_terrain):
         shape = zone.shape
         clearance_m = _clearance_outside(shape, leg.unavoidable)
         level = _is_level_with(zone, now, grant)
         if (
-            shape.dwithin(_certain_way(leg, now), margin_m)
+            shape.dwithin(certain, margin_m)
             and (level or not _comes_level(zone, leg, now, grant))
             and _leads_out(shape, leg, margin_m, clearance_m)
+            and _leads_away(shape, leg, certain)
         ):
             continue
         # A drone that is inside already, or cannot stop outside, does not enter by this request: it costs the request only.
@@ -167,12 +168,10 @@ def _exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Ite
 def _certain_way(leg: Leg, now: Situation) -> BaseGeometry:
     """The part of a leg that the drone certainly flies, even if it brakes already, as hard as it can.
 
-    Where its acceleration is unknown, its way to rest is overestimated, which must not open ways past a fence.
+    Its way to rest is overestimated, which must not open ways past a fence.
     """
-    if now.forward_mps2 is not None or leg.start == leg.stop:
-        return leg.unavoidable
-    stop = stop_point(replace(now, forward_mps2=-now.airframe.accel_mps2), leg.start)
-    return shapely.points(leg.start) if stop == leg.start else shapely.linestrings((leg.start, stop))
+    end = earliest_stop(now, leg.start)
+    return shapely.points(leg.start) if end == leg.start else shapely.linestrings((leg.start, end))
 
 
 def _is_level_with(zone: PolicyZone, now: Situation, grant: CompiledGrant) -> bool:
@@ -281,6 +280,8 @@ def _stays_inside(shape: BaseGeometry, border: BaseGeometry, leg: Leg, now: Situ
         return False
     if shape.covers(leg.unavoidable) and not shape.covers(ground):
         return False
+    if shape.covers(least) and not shape.covers(_from_rest(least, leg)):
+        return False
     inner = shape.buffer(-margin_m)
     return _returns(leg, inner, lambda point: signed_depth_m(shape, border, point))
 
@@ -296,6 +297,19 @@ def _leads_out(shape: BaseGeometry, leg: Leg, margin_m: float, clearance_m: floa
     if outer.intersects(target):
         return False
     return _monotone(line.intersection(outer), leg.stop, lambda point: -signed_depth_m(shape, border, point))
+
+
+def _leads_away(shape: BaseGeometry, leg: Leg, certain: BaseGeometry) -> bool:
+    """Whether a leg leads away from a shape also for a drone that comes to rest before it, though it need not."""
+    clearance_m = _clearance_outside(shape, certain)
+    if clearance_m == 0:
+        return True
+    return float(shape.distance(_from_rest(certain, leg))) >= clearance_m - 1e-6
+
+
+def _from_rest(certain: BaseGeometry, leg: Leg) -> BaseGeometry:
+    """From where the drone comes to rest at the earliest straight to the target."""
+    return shapely.linestrings((shapely.get_coordinates(certain)[-1], leg.target))
 
 
 def _returns(leg: Leg, inner: BaseGeometry, clearance: Callable[[BaseGeometry], float]) -> bool:

@@ -10,7 +10,6 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from fractus_core.api.nodes import CameraFeatures
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.motion import XY
 from fractus_core.policy.values import Attitude, Lens, Situation
@@ -136,21 +135,6 @@ def _attitude(now: Situation) -> Attitude | None:
     if now.attitude is None and now.lens is not None and now.lens.stabilised:
         return _ANY_YAW
     return now.attitude
-
-
-def lens_of(camera: CameraFeatures | None) -> Lens | None:
-    """What a description tells of a camera; None where it does not tell enough."""
-    if camera is None or camera.horizontal_field_of_view is None or camera.mount is None:
-        return None
-    width, height = camera.pixels
-    half = math.tan(math.radians(camera.horizontal_field_of_view) / 2) * height / width
-    return Lens(
-        camera.horizontal_field_of_view,
-        math.degrees(2 * math.atan(half)),
-        camera.mount.pitch,
-        camera.mount.yaw,
-        camera.mount.stabilised,
-    )
 
 
 def _everything(at: XY, now: Situation) -> Footprint:

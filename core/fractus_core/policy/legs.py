@@ -28,6 +28,7 @@ from fractus_core.policy.motion import (
     height_margin_m,
     margin_m,
     moving,
+    outlooks,
     standing,
     stop_altitude_m,
     stop_point,
@@ -81,8 +82,11 @@ def _judge_after_stop(request: _Request, target: XY) -> Verdict | None:
     """The verdict on a leg that begins with a stop; None when the stop itself breaks a fence."""
     now, grant, at = request.now, request.grant, request.at
     stop = stop_point(now, at)
-    heights = (now.altitude_m, stop_altitude_m(now))
-    braking = Leg(at, stop, stop, stop, min(heights), max(heights))
+    heights, corners = [now.altitude_m, stop_altitude_m(now)], list[XY]()
+    for place, other in outlooks(now, at):
+        corners += (place, stop_point(other, place))
+        heights += (other.altitude_m, stop_altitude_m(other))
+    braking = Leg(at, stop, stop, stop, min(heights), max(heights), tuple(corners))
     on_its_way = replace(grant, operation=grant.passage, operation_border=grant.passage_border)
     if breaches(braking, now, on_its_way, margin_m(now), height_margin_m(now)):
         return None
@@ -180,7 +184,8 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Clamped])
         )
     asked = request.args.speed_mps if aim.speed_mps is None else aim.speed_mps
     speed = clamp("Speed", "m/s", now.speed_setpoint_mps if asked is None else asked, speed_bounds(grant, now, air))
-    problem = height_on_entry(shapely.points(request.at), now, bounds, height_margin_m(now))
+    heights = (now.altitude_m, stop_altitude_m(now))
+    problem = height_on_entry(shapely.points(request.at), heights, bounds, height_margin_m(now))
     if problem is not None:
         return problem
     if isinstance(speed, Verdict):
@@ -190,8 +195,11 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Clamped])
 
 
 def _leg(at: XY, target: XY, now: Situation, altitude_m: float) -> Leg:
-    heights = (now.altitude_m, stop_altitude_m(now), altitude_m)
+    heights = [now.altitude_m, stop_altitude_m(now), altitude_m]
     turn, stops = turn_point(now, at, target), turning_stops(now, at, target)
+    for place, other in outlooks(now, at):
+        stops += (place, turn_point(other, place, target), *turning_stops(other, place, target))
+        heights += (other.altitude_m, stop_altitude_m(other))
     return Leg(at, stop_point(now, at), turn, target, min(heights), max(heights), stops)
 
 

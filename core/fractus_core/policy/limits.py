@@ -213,22 +213,32 @@ def lower_is_fine(bounds: list[Bound]) -> bool:
     )
 
 
-def height_on_entry(here: BaseGeometry, now: Situation, bounds: list[Bound], slack_m: float) -> Verdict | None:
-    """The denial of a leg that would carry the present altitude into a zone where it is not allowed."""
+def height_on_entry(
+    here: BaseGeometry, heights_m: tuple[float, float], bounds: list[Bound], slack_m: float
+) -> Verdict | None:
+    """The denial of a leg that would carry the present altitude into a zone where it is not allowed.
+
+    Args:
+        here: where the leg begins.
+        heights_m: the altitude there, and that at which a drone that climbs or sinks comes to rest.
+        bounds: limits of altitude along the leg.
+        slack_m: how far they may be missed.
+    """
+    low, high = min(heights_m), max(heights_m)
     for bound in bounds:
         if bound.shape is None or bound.shape.intersects(here):
             continue
-        if bound.upper is not None and now.altitude_m > bound.upper + slack_m:
+        if bound.upper is not None and high > bound.upper + slack_m:
             return deny(
                 "AltitudeAboveLimit",
-                f"the leg enters the zone of policy {bound.name} at {now.altitude_m:.1f} m, above its limit of"
+                f"the leg enters the zone of policy {bound.name} at {high:.1f} m, above its limit of"
                 f" {bound.upper:.1f} m; descend first",
                 (bound.name,),
             )
-        if bound.lower is not None and now.altitude_m < bound.lower - slack_m:
+        if bound.lower is not None and low < bound.lower - slack_m:
             return deny(
                 "AltitudeBelowLimit",
-                f"the leg enters the zone of policy {bound.name} at {now.altitude_m:.1f} m, below its limit of"
+                f"the leg enters the zone of policy {bound.name} at {low:.1f} m, below its limit of"
                 f" {bound.lower:.1f} m; climb first",
                 (bound.name,),
             )

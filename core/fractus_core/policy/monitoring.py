@@ -12,20 +12,31 @@ from fractus_core.api.policies import GeofenceAction
 from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, PolicyZone
 from fractus_core.policy.fences import SEVERITY, TAKEOVERS, breaches, signed_depth_m
 from fractus_core.policy.limits import Bound, altitude_bounds, can_be_kept, speed_bounds, strictest
-from fractus_core.policy.motion import XY, margin_m, moving, standing, stop_altitude_m, stop_point
+from fractus_core.policy.motion import XY, margin_m, moving, outlooks, reaction_s, standing, stop_altitude_m, stop_point
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Situation, Verdict
 
 TRACKING_SHARE = 0.3
 """Share of the tracking margin of accepted legs that the monitor keeps as well."""
 
+AIM_SHARE = 0.1
+"""A drone flies to a target that it would miss by no more than this share of its distance: gusts turn its velocity."""
+
 SINKING_MPS = 0.5
-"""A drone that climbs no faster than this may go on while its altitude limits cannot be worked out."""
+"""A drone that climbs no faster than this may go on while its altitude limits cannot be worked out; one that the system
+flies, and that sinks faster, is on its way back under a limit."""
 
 DEEPER_M = 0.6
 """A drone on the wrong side of a fence is stopped again only when it moves this much further in."""
 
 
-def monitor(now: Situation, grant: CompiledGrant, *, leaving: bool = False, changed: bool = False) -> Verdict | None:
+def monitor(
+    now: Situation,
+    grant: CompiledGrant,
+    *,
+    leaving: bool = False,
+    changed: bool = False,
+    bound_for: tuple[float, float] | None = None,
+) -> Verdict | None:
     """What the system must do about a flying drone at this moment.
 
     Judged is the way from the present position to where the drone comes to rest if it is told to stop now, with the
@@ -34,10 +45,12 @@ def monitor(now: Situation, grant: CompiledGrant, *, leaving: bool = False, chan
     Args:
         now: the state of the drone.
         grant: whose fences.
-        leaving: whether the system flies the drone already, so that only what gets worse counts: where it is on the wrong
-            side of a fence, the system's way leads back.
+        leaving: whether the system flies the drone already, or the autopilot by itself, so that only what gets worse
+            counts: where it is on the wrong side of a fence, or above a limit, the system's way leads back.
         changed: whether other fences may have been in force when the drone's way was judged. A drone that speeds up is
             faster before it hears of a stop, and whether there is room for that has not been judged: it is stopped in time.
+        bound_for: latitude and longitude where the leg under way ends, when it was accepted under this grant: the autopilot
+            brakes for that by itself, before it would hear of a stop.
 
     Returns:
         None when all is well; a takeover; a denial with `hover`, when the motion is to be stopped and the application
@@ -51,20 +64,20 @@ def monitor(now: Situation, grant: CompiledGrant, *, leaving: bool = False, chan
     if lat is None or lon is None or not now.sound:
         return Verdict("takeover", None, "PositionUnknown", "the drone's position is unknown", (), "hover")
     start, margin = grant.frame.xy(lat, lon), now.position_error_m + TRACKING_SHARE * now.airframe.tracking_m
-    surging = stop_point(now, start)
+    surging = [(start, now), *outlooks(now, start)] if changed else []
     # A drone that speeds up does so on a way that was judged with room for it, and brakes at its end in time.
     now = replace(now, forward_mps2=min(now.forward_mps2 or 0.0, 0.0))
     stop = stop_point(now, start)
-    rest_m = stop_altitude_m(now)
-    worst = _worst(_fences(now, grant, _look_ahead(now, start, stop, margin), leaving=leaving))
+    ahead = stop if bound_for is None else _arrival(now, start, stop, grant.frame.xy(*bound_for))
+    worst = _worst(_fences(now, grant, _look_ahead(now, start, ahead, margin), leaving=leaving))
     if worst is not None:
         return replace(worst, brake_first=worst.action == "takeover" and moving(now))
-    if changed and surging != stop:
+    for begin, then in surging:
         # Its way may end before the fence: it is stopped, and taken over only if it really goes too far.
-        worst = _worst(_fences(now, grant, _look_ahead(now, start, surging, margin), leaving=True))
+        worst = _worst(_fences(then, grant, _look_ahead(then, begin, stop_point(then, begin), margin), leaving=True))
         if worst is not None:
             return replace(worst, action="deny", takeover="hover")
-    return _heights(now, grant, start, stop, rest_m) or _speeds(now, grant, start)
+    return _heights(now, grant, start, stop, sinks_back=leaving) or _speeds(now, grant, start)
 
 
 def _worst(found: list[tuple[int, Verdict]]) -> Verdict | None:
@@ -76,6 +89,24 @@ def _worst(found: list[tuple[int, Verdict]]) -> Verdict | None:
     return found[min(ranked)[2]][1] if ranked else None
 
 
+def _arrival(now: Situation, start: XY, stop: XY, target: XY) -> XY:
+    """Where a drone comes to rest that flies to a target: there, while it can still brake for it as it was going to.
+
+    Told to stop now it flies on for its reaction; that it brakes for the target it knows already. So no further than that,
+    and as it strays from its leg, may the way to rest lead beyond the target.
+    """
+    (dx, dy), (tx, ty) = ((x - start[0], y - start[1]) for x, y in (stop, target))
+    run = math.hypot(dx, dy)
+    if run == 0.0:
+        return stop
+    along, aside = (dx * tx + dy * ty) / run, abs(dx * ty - dy * tx) / run
+    late = math.hypot(now.north_mps, now.east_mps) * reaction_s(now, now.airframe.accel_mps2)
+    strays = now.airframe.tracking_m
+    aims = aside <= strays + AIM_SHARE * max(along, 0.0)
+    arrives = aims and -strays <= along < run <= along + late + strays
+    return target if arrives else stop
+
+
 def must_rest(now: Situation, grant: CompiledGrant) -> bool:
     """Whether a moving drone must come to rest before it begins anything else, legal though that is.
 
@@ -85,8 +116,11 @@ def must_rest(now: Situation, grant: CompiledGrant) -> bool:
     at = grant.locate(now)
     if at is None or not now.in_air or not moving(now):
         return False
-    now = replace(now, forward_mps2=0.0)
-    return bool(_fences(now, grant, _look_ahead(now, at, stop_point(now, at), margin_m(now)), leaving=True))
+    ways = [(at, replace(now, forward_mps2=0.0)), *outlooks(now, at)]
+    return any(
+        _fences(then, grant, _look_ahead(then, begin, stop_point(then, begin), margin_m(then)), leaving=True)
+        for begin, then in ways
+    )
 
 
 def _look_ahead(now: Situation, start: XY, stop: XY, margin: float) -> _Ahead:
@@ -190,10 +224,10 @@ def _reaction(found: _Finding, *, leaving: bool) -> Verdict | None:
     return None
 
 
-def _heights(now: Situation, grant: CompiledGrant, start: XY, stop: XY, rest_m: float) -> Verdict | None:
+def _heights(now: Situation, grant: CompiledGrant, start: XY, stop: XY, *, sinks_back: bool) -> Verdict | None:
     """The correction of an altitude that breaks limits, when the drone has come to rest.
 
-    Lower limits do not hold for a drone that takes off or lands.
+    Lower limits do not hold for a drone that takes off or lands; `sinks_back`: nor upper ones for one that sinks.
     """
     if grant.max_altitude_m is None and not grant.altitude_limits:
         return None
@@ -201,10 +235,11 @@ def _heights(now: Situation, grant: CompiledGrant, start: XY, stop: XY, rest_m: 
     if isinstance(bounds, Verdict):
         sinking = now.down_mps > -SINKING_MPS
         return None if sinking else Verdict("deny", None, bounds.code, bounds.reason, bounds.policies, "hover")
-    slack = now.altitude_error_m + now.airframe.tracking_m
+    slack, rest_m = now.altitude_error_m + now.airframe.tracking_m, stop_altitude_m(now)
+    sinks_back = sinks_back and now.down_mps > SINKING_MPS
     over, under = strictest(bounds, above=True), strictest(bounds, above=False)
     high, low = max(now.altitude_m, rest_m), min(now.altitude_m, rest_m)
-    if over is not None and over.upper is not None and high > over.upper + slack:
+    if over is not None and over.upper is not None and high > over.upper + slack and not sinks_back:
         reason = f"the drone climbs to {high:.1f} m, above the limit of {over.upper:.1f} m"
         return _changed_height(_Trespass(over, over.upper, "AltitudeAboveLimit", reason), now, grant, stop)
     if under is not None and under.lower is not None and low < under.lower - slack and not now.vertical:

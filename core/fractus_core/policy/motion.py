@@ -52,14 +52,65 @@ def height_margin_m(now: Situation) -> float:
 
 
 def moving(now: Situation) -> bool:
-    """Whether the drone is too fast to turn on the spot."""
-    return math.hypot(now.north_mps, now.east_mps) >= STANDING_MPS or abs(now.down_mps) >= STANDING_MPS
+    """Whether the drone is too fast to turn on the spot, or may be by the time it is told to."""
+    if _fast(now.north_mps, now.east_mps, now.down_mps):
+        return True
+    return bool(now.pending) and any(_fast(*velocity) for velocity in now.pending)
+
+
+def _fast(north_mps: float, east_mps: float, down_mps: float) -> bool:
+    return math.hypot(north_mps, east_mps) >= STANDING_MPS or abs(down_mps) >= STANDING_MPS
+
+
+def outlooks(now: Situation, at: XY) -> list[tuple[XY, Situation]]:
+    """Where else the drone may be when it hears of a decision, in frame metres, and how it moves by then.
+
+    It may do what it was told last from this moment on, as hard as it can. These are the ends of what it may have done by
+    then: in between it may have done part of it, one after the other.
+    """
+    if not now.pending:
+        return []
+    frame, found = now.airframe, []
+    for north, east, down in _extremes(now.pending):
+        dn, de = _taken_up(
+            (now.north_mps, now.east_mps), (north, east), frame.accel_mps2, frame.jerk_mps3, now.latency_s
+        )
+        climb, _ = _taken_up((now.down_mps, 0.0), (down, 0.0), frame.climb_accel_mps2, frame.jerk_mps3, now.latency_s)
+        begun = (now.north_mps + dn / 2, now.east_mps + de / 2)
+        place = at[0] + begun[1] * now.latency_s, at[1] + begun[0] * now.latency_s
+        altitude_m = now.altitude_m - (now.down_mps + climb / 2) * now.latency_s
+        later = replace(
+            now, north_mps=now.north_mps + dn, east_mps=now.east_mps + de, down_mps=now.down_mps + climb,
+            altitude_m=altitude_m, latency_s=0.0, forward_mps2=0.0, pending=(),
+        )  # fmt: skip
+        found.append((place, later))
+    return found
+
+
+def _taken_up(present: XY, wanted: XY, accel: float, jerk: float, lasting_s: float) -> XY:
+    """How far a velocity changes toward a wanted one, with what it changes further while the acceleration ends."""
+    change = math.dist(present, wanted)
+    share = min(accel * (lasting_s + accel / (2 * jerk)) / change, 1.0) if change > 0 else 0.0
+    return (wanted[0] - present[0]) * share, (wanted[1] - present[1]) * share
+
+
+MAX_PENDING = 4
+"""Of more velocities than this the corners of the smallest box around them are looked at instead."""
+
+
+def _extremes(velocities: tuple[tuple[float, float, float], ...]) -> tuple[tuple[float, float, float], ...]:
+    if len(velocities) <= MAX_PENDING:
+        return velocities
+    (south, north), (west, east), (up, down) = ((min(axis), max(axis)) for axis in zip(*velocities, strict=True))
+    return (south, west, up), (south, east, down), (north, west, down), (north, east, up)
 
 
 def at_rest(now: Situation, grant_frame: LocalFrame, at: XY) -> Situation:
     """The situation after the drone was told to stop now, wherever its latency lets it come to rest."""
     lat, lon = grant_frame.latlon(*stop_point(now, at))
-    return replace(now, lat=lat, lon=lon, altitude_m=stop_altitude_m(now), north_mps=0.0, east_mps=0.0, down_mps=0.0)
+    return replace(
+        now, lat=lat, lon=lon, altitude_m=stop_altitude_m(now), north_mps=0.0, east_mps=0.0, down_mps=0.0, pending=()
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +138,8 @@ def surge(situation: Situation) -> Surge:
     forward = situation.forward_mps2
     if forward is None:
         forward = frame.accel_mps2 if STANDING_MPS <= speed < situation.speed_setpoint_mps else 0.0
+    elif forward < 0.0 and any(_fast(*velocity) for velocity in situation.pending):
+        forward = 0.0  # It may have been told to brake no longer.
     forward = min(max(forward, -frame.accel_mps2), frame.accel_mps2)
     if forward <= 0.0:
         # A drone that brakes already goes on braking: its speed is lower when the command takes effect.
@@ -112,6 +165,12 @@ def stop_point(situation: Situation, at: XY) -> XY:
     frame, begin = situation.airframe, surge(situation)
     run = begin.run_m + stopping_distance_m(begin.speed_mps, frame.accel_mps2, frame.position_gain)
     return at[0] + situation.east_mps / speed * run, at[1] + situation.north_mps / speed * run
+
+
+def earliest_stop(situation: Situation, at: XY) -> XY:
+    """Where the drone comes to rest, in frame metres, that brakes already, as hard as it can."""
+    run = math.hypot(situation.north_mps, situation.east_mps) / (2 * situation.airframe.accel_mps2)
+    return at[0] + situation.east_mps * run, at[1] + situation.north_mps * run
 
 
 def turn_point(situation: Situation, at: XY, target: XY) -> XY:
@@ -264,7 +323,8 @@ def swept(now: Situation, at: XY, asked: VelocityArgs) -> Leg:
     lasting_s = asked.hold_s + now.latency_s
     control = (frame.accel_mps2, frame.position_gain)
     # At the earliest it obeys at once, and slower than it may be by the latest: so it comes furthest the new way.
-    braked = speed - frame.accel_mps2 * now.latency_s if now.forward_mps2 is None else begin.speed_mps
+    known = now.forward_mps2 is not None and not now.pending
+    braked = begin.speed_mps if known else speed - frame.accel_mps2 * now.latency_s
     slowest = max(min(speed, braked), 0.0)
     ways = _course((ahead[0] * slowest, ahead[1] * slowest), wanted, lasting_s, frame, control)
     late = (ahead[0] * begin.run_m, ahead[1] * begin.run_m)
@@ -273,6 +333,12 @@ def swept(now: Situation, at: XY, asked: VelocityArgs) -> Leg:
     climbs = _course((climb, 0.0), (-asked.down_mps, 0.0), lasting_s, frame, (frame.climb_accel_mps2, 1.0))
     late_m = climb * reaction_s(now, frame.climb_accel_mps2)
     climbs += [(up + late_m, 0.0) for up, _ in climbs]
+    for (x, y), other in outlooks(now, (0.0, 0.0)):
+        taken = _course((other.east_mps, other.north_mps), wanted, lasting_s, frame, control)
+        ways[:0] = [(x, y), stop_point(other, (x, y)), *((x + dx, y + dy) for dx, dy in taken)]
+        rise = other.altitude_m - now.altitude_m
+        taken = _course((-other.down_mps, 0.0), (-asked.down_mps, 0.0), lasting_s, frame, (frame.climb_accel_mps2, 1.0))
+        climbs += [(rise, 0.0), (stop_altitude_m(other) - now.altitude_m, 0.0), *((rise + up, 0.0) for up, _ in taken)]
     heights = [now.altitude_m, stop_altitude_m(now), *(now.altitude_m + climb for climb, _ in climbs)]
     corners = tuple((at[0] + x, at[1] + y) for x, y in ways)
     stop = stop_point(now, at)

@@ -1,12 +1,78 @@
-"""The autopilot's own way home: straight, unless it retraces its path."""
+"""Ways home: the heights that the system flies them at, and whether the autopilot's own straight one is legal."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import shapely
 
-from fractus_core.policy.compiled import Air, CompiledGrant
-from fractus_core.policy.motion import XY, Leg, standing
+from fractus_core.policy.compiled import REACH_M, Air, CompiledGrant
+from fractus_core.policy.fences import breaches
+from fractus_core.policy.limits import altitude_bounds, speed_bounds
+from fractus_core.policy.motion import XY, Leg, height_margin_m, margin_m, standing
 from fractus_core.policy.values import Situation, Verdict, deny
+
+
+def homeward_heights_m(now: Situation, grant: CompiledGrant, worth_m: float) -> tuple[float, ...]:
+    """Altitudes above home at which the system flies home, the best one first.
+
+    The return altitude, or the present one if that is higher, as the limits of altitude on the straight way allow it; then
+    as those that hold here, or everywhere, do.
+
+    Args:
+        now: position, home and airframe; both places are known.
+        grant: whose limits.
+        worth_m: how high a climb is worth it.
+    """
+    at = grant.locate(now)
+    if at is None or now.home is None:
+        return (now.altitude_m,)
+    home = grant.frame.xy(now.home.lat, now.home.lon)
+    lane = shapely.linestrings((at, home)) if at != home else shapely.points(at)
+    best = max(now.altitude_m, min(now.airframe.return_altitude_m, worth_m))
+    found = []
+    for ground in (lane, shapely.points(at), shapely.Point()):
+        bounds = altitude_bounds(grant, now, Air(ground, margin_m(now), -math.inf, math.inf))
+        if isinstance(bounds, Verdict):
+            continue
+        for height_m in (best, now.altitude_m):
+            lowest = max((b.lower for b in bounds if b.lower is not None), default=-math.inf)
+            highest = min((b.upper for b in bounds if b.upper is not None), default=math.inf)
+            found.append(min(max(height_m, lowest), highest))
+    return (*dict.fromkeys(found), now.altitude_m)
+
+
+@dataclass(frozen=True, slots=True)
+class ReturnBounds:
+    """How high, in metres above home, and how fast a drone may come home that knows neither zones nor policies."""
+
+    height_m: float = math.inf
+    speed_mps: float = math.inf
+
+
+def return_bounds(now: Situation, grant: CompiledGrant) -> ReturnBounds:
+    """The strictest limits of altitude and speed in force anywhere between home and the operation area.
+
+    A limit of altitude whose datum is not known is left out.
+    """
+    anywhere = shapely.box(-REACH_M, -REACH_M, REACH_M, REACH_M)
+    air = Air(anywhere if grant.passage is None else grant.passage, margin_m(now), -math.inf, math.inf)
+    heights = altitude_bounds(grant, now, air)
+    known = [] if isinstance(heights, Verdict) else heights
+    return ReturnBounds(
+        min((bound.upper for bound in known if bound.upper is not None), default=math.inf),
+        min((bound.upper for bound in speed_bounds(grant, now, air) if bound.upper is not None), default=math.inf),
+    )
+
+
+def may_change_height(now: Situation, grant: CompiledGrant, altitude_m: float) -> bool:
+    """Whether the drone may climb or sink to an altitude where it is."""
+    at = grant.locate(now)
+    if at is None:
+        return False
+    column = standing(at, min(now.altitude_m, altitude_m), max(now.altitude_m, altitude_m))
+    return not breaches(column, now, grant, margin_m(now), height_margin_m(now))
 
 
 def straight_home_blocked(

@@ -94,13 +94,25 @@ def searching(
 
 def leads(start: XY, target: XY, now: Situation, grant: CompiledGrant, altitude_m: float) -> bool:
     """Whether a short search, of `QUICK_MAX_LEGS_TESTED` legs, finds any legal way from one place to another; see `route`."""
+    return quick_route(start, target, now, grant, altitude_m, max_excess=QUICK_MAX_EXCESS) is not None
+
+
+def quick_route(
+    start: XY,
+    target: XY,
+    now: Situation,
+    grant: CompiledGrant,
+    altitude_m: float,
+    *,
+    from_m: float | None = None,
+    max_excess: float = MAX_EXCESS,
+) -> tuple[XY, ...] | None:
+    """As `route`, but gives up after `QUICK_MAX_LEGS_TESTED` legs, and keeps no more room than it must."""
     if now.home is None or not now.sound:
-        return False
-    space = Space.around(now, grant, altitude_m, altitude_m, CLEARANCES_M[1])
-    return (
-        _finished(_Search(start, target, space, max_excess=QUICK_MAX_EXCESS, max_legs=QUICK_MAX_LEGS_TESTED).steps())
-        is not None
-    )
+        return None
+    low, high = sorted((altitude_m, altitude_m if from_m is None else from_m))
+    space = Space.around(now, grant, low, high, CLEARANCES_M[1])
+    return _finished(_Search(start, target, space, max_excess=max_excess, max_legs=QUICK_MAX_LEGS_TESTED).steps())
 
 
 def _finished(search: Steps) -> tuple[XY, ...] | None:

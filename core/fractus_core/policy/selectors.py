@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import assert_never
+from functools import cache
+from typing import assert_never, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic.alias_generators import to_camel
 
 from fractus_core.api import Application, Component, Drone, EdgeNode
+from fractus_core.api.nodes import DroneSpec, EdgeNodeSpec
 from fractus_core.api.plans import GrantApplication
 from fractus_core.api.policies import NodeExpression, PolicySpec
 
@@ -35,12 +40,12 @@ def matches(expression: NodeExpression, attributes: Mapping[str, object], *, unk
     """Whether a node's attributes satisfy an expression; `unknown` is the answer for an attribute not stated.
 
     A restriction holds for a node that does not say whether it is concerned (a drone of unknown mass is a heavy one);
-    a permission does not.
+    a permission does not. So it is with an attribute that no node has, such as a mistyped one.
     """
     value = attributes.get(expression.key)
     if expression.operator == "Exists":
-        return value is not None
-    if value is None:
+        return value is not None or (unknown and not is_attribute(expression.key))
+    if value is None or isinstance(value, dict | list):
         return unknown
     match expression.operator:
         case "In":
@@ -61,7 +66,8 @@ def matches(expression: NodeExpression, attributes: Mapping[str, object], *, unk
 def node_attributes(node: Drone | EdgeNode) -> dict[str, object]:
     """Attributes of a node for selectors: dotted paths of its spec, and the last part alone where that is unique.
 
-    So `physicalFeatures.mtom` is also `mtom`; `name` and `kind` come from the object.
+    So `physicalFeatures.mtom` is also `mtom`; `name` and `kind` come from the object. What has parts, such as
+    `services.camera`, is there to exist.
     """
     flat = dict(_flatten("", node.spec.to_dict()))
     short: dict[str, list[object]] = {}
@@ -77,8 +83,30 @@ def _flatten(prefix: str, value: object) -> Iterable[tuple[str, object]]:
     if isinstance(value, dict):
         for key, inner in value.items():
             yield from _flatten(f"{prefix}.{key}" if prefix else key, inner)
-    elif not isinstance(value, list):
+    if prefix and value not in ({}, []):
         yield prefix, value
+
+
+def is_attribute(key: str) -> bool:
+    """Whether a Drone or EdgeNode can have an attribute; any label may be."""
+    return key in _attribute_keys() or key.startswith("labels.")
+
+
+@cache
+def _attribute_keys() -> frozenset[str]:
+    paths = {*_paths("", DroneSpec), *_paths("", EdgeNodeSpec)}
+    return frozenset({"name", "kind", *paths, *(path.rsplit(".", 1)[-1] for path in paths)})
+
+
+def _paths(prefix: str, model: type[BaseModel]) -> Iterable[str]:
+    for name, field in model.model_fields.items():
+        path = f"{prefix}.{field.alias or to_camel(name)}".lstrip(".")
+        yield path
+        # What is in lists is not seen.
+        listed = get_origin(field.annotation) is tuple
+        for part in () if listed else (field.annotation, *get_args(field.annotation)):
+            if isinstance(part, type) and issubclass(part, BaseModel):
+                yield from _paths(path, part)
 
 
 def owner_of(application: Application) -> GrantApplication:

@@ -208,11 +208,13 @@ class Situation:
         home: None while it is unknown, and on fixed nodes.
         position_error_m: bound of the horizontal position error.
         altitude_error_m: bound of the vertical position error.
-        latency_s: time from a decision to its effect on the motion.
+        latency_s: time from this state to the effect of a decision on the motion, at most.
         speed_setpoint_mps: horizontal speed that the autopilot flies legs with, or that of the velocity it was told to
             hold, when that is higher: the speed that the present motion tends to.
         forward_mps2: how much the drone speeds up along its course (negative: slows down), from the last velocities; None
             while it is unknown.
+        pending: velocities north, east and down that it was told to take up a moment ago, which it may do at once or has
+            begun to, though neither velocity nor acceleration show it yet.
         vertical: whether the drone is taking off or landing, when lower altitude limits do not hold.
         attitude: None while it is unknown; the camera may look anywhere then, unless a gimbal keeps it level.
         lens: None on a node whose camera is not described: it may see everything around it.
@@ -236,6 +238,7 @@ class Situation:
     latency_s: float = 0.3
     speed_setpoint_mps: float = 5.0
     forward_mps2: float | None = None
+    pending: tuple[tuple[float, float, float], ...] = ()
     vertical: bool = False
     airframe: Airframe = field(default_factory=Airframe)
     attitude: Attitude | None = None

@@ -25,7 +25,7 @@ from fractus_core.policy.limits import (
     speed_bounds,
     strictest,
 )
-from fractus_core.policy.motion import XY, Leg, height_margin_m, margin_m, swept
+from fractus_core.policy.motion import XY, Leg, height_margin_m, margin_m, stop_altitude_m, swept
 from fractus_core.policy.values import (
     POSITION_UNKNOWN,
     Call,
@@ -143,7 +143,7 @@ def _within_heights(setpoint: _Setpoint) -> Verdict | None:
     if isinstance(bounds, Verdict):
         return bounds
     problem = conflict("Altitude", "m", bounds) or height_on_entry(
-        shapely.points(setpoint.at), now, bounds, height_margin_m(now)
+        shapely.points(setpoint.at), (now.altitude_m, stop_altitude_m(now)), bounds, height_margin_m(now)
     )
     if problem is not None:
         return problem

@@ -1,6 +1,6 @@
 """Zones in the formats of others: GeoJSON, KML, QGroundControl plans and ED-269."""
 
-from fractus_core.geo.formats.drafts import Exported, Imported
+from fractus_core.geo.formats.drafts import Exported, Imported, Inexact
 from fractus_core.geo.formats.ed269 import read_ed269, write_ed269
 from fractus_core.geo.formats.geojson import read_geojson, write_geojson
 from fractus_core.geo.formats.kml import read_kml, write_kml
@@ -9,6 +9,7 @@ from fractus_core.geo.formats.qgc_plan import read_qgc_plan, write_qgc_plan
 __all__ = [
     "Exported",
     "Imported",
+    "Inexact",
     "read_ed269",
     "read_geojson",
     "read_kml",

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import json
+import itertools
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeGuard
 
 from fractus_core.api import API_VERSION, InvalidObject, Zone
-from fractus_core.api.geometry import Area, Circle, Point, Polygon
-from fractus_core.geo.areas import middle, polygon
+from fractus_core.api.geometry import MAX_RING_POINTS, Area, Circle, Point, Polygon
+from fractus_core.documents import BadDocument, parse_documents
+from fractus_core.geo.areas import geojson, middle, polygon
 from fractus_core.geo.frames import LocalFrame
 
 LonLat = Sequence[float]
@@ -21,6 +22,10 @@ DESCRIPTION_LENGTH = 1024
 
 MAX_RADIUS_M = 200_000.0
 """Of a circle."""
+
+EARTH_RADIUS_M = 6_371_000.0
+MAX_BEND_M = 0.5
+"""A parallel is not straight: what GeoJSON draws along one gets a point wherever it would leave it by more."""
 
 CORNERS = 64
 """Corners of the polygon that stands for a circle where a format has none."""
@@ -42,19 +47,52 @@ class Exported:
     notes: tuple[str, ...]
 
 
-class Drafts:
-    """Zones while a file is read: each gets a name of its own, and is checked as it is made."""
+class Inexact(InvalidObject):
+    """Features that are no zones as they are: the first of them.
 
-    def __init__(self) -> None:
+    Attributes:
+        every: what is wrong with each of them.
+    """
+
+    def __init__(self, every: Sequence[InvalidObject]) -> None:
+        super().__init__(every[0].field, every[0].problem)
+        self.every = tuple(every)
+
+
+class Drafts:
+    """Zones while a file is read: each gets a name of its own, and is checked as it is made.
+
+    A zone is where, how high and when the file says, or there is none: one that is larger keeps out what may come in, and
+    lets out what must stay in.
+
+    Args:
+        without: titles of features that are left out.
+    """
+
+    def __init__(self, without: Collection[str] = ()) -> None:
         self.notes: list[str] = []
         self._zones: list[Zone] = []
         self._names: set[str] = set()
+        self._without = without
+        self._left_out: set[str] = set()
+        self._wrong: list[InvalidObject] = []
 
-    def add(self, title: str, spec: Mapping[str, Any]) -> None:
+    def take(self, title: str, read: Callable[[], None]) -> None:
+        """Read a feature, unless it is to be left out; what is wrong with it is told of with all others."""
+        if title in self._without:
+            self._left_out.add(title)
+            self.note(title, "left out, as asked for")
+            return
+        try:
+            read()
+        except InvalidObject as error:
+            self._wrong.append(InvalidObject(error.field, f"{error.problem} (in {title})"))
+
+    def add(self, title: str, spec: Mapping[str, Any], where: str) -> None:
         """Make a zone.
 
         Raises:
-            InvalidObject: its area is broken, or something is out of range; the field begins with the title.
+            InvalidObject: its area is broken, or something is out of range.
         """
         name = self._name(title)
         manifest = {"apiVersion": API_VERSION, "kind": "Zone", "metadata": {"name": name}, "spec": dict(spec)}
@@ -62,7 +100,7 @@ class Drafts:
             zone = Zone.from_body(manifest)
             polygon(LocalFrame.at(middle(zone.spec.area)), zone.spec.area)
         except InvalidObject as error:
-            raise InvalidObject(f"{title}: {error.field}".rstrip(": "), error.problem) from None
+            raise InvalidObject(where, f"{error.field.removeprefix('spec.')}: {error.problem}") from None
         self._zones.append(zone)
 
     def described(self, title: str, text: str) -> str:
@@ -82,7 +120,17 @@ class Drafts:
         self.notes.append(f"{title}: {problem}")
 
     def result(self) -> Imported:
-        """All that was read."""
+        """All that was read.
+
+        Raises:
+            Inexact: there are features that cannot be kept as they are.
+            InvalidObject: a feature that is to be left out is not there.
+        """
+        if self._wrong:
+            raise Inexact(self._wrong)
+        missing = sorted(set(self._without) - self._left_out)
+        if missing:
+            raise InvalidObject("", f"there is no feature {missing[0]} to leave out; correct its name")
         return Imported(tuple(self._zones), tuple(self.notes))
 
     def _name(self, title: str) -> str:
@@ -102,13 +150,9 @@ def parse_json(text: str) -> dict[str, Any]:
         InvalidObject: it is none.
     """
     try:
-        found = json.loads(text.removeprefix("\ufeff"))
-    except json.JSONDecodeError as error:
-        raise InvalidObject(f"line {error.lineno}", f"this is not JSON ({error.msg.lower()})") from None
-    except RecursionError:
-        raise InvalidObject("", "its lists or objects are nested too deeply") from None
-    except ValueError:
-        raise InvalidObject("", "a number in it has thousands of digits") from None
+        (found,) = parse_documents(text.encode(), "", is_json=True).values or (None,)
+    except BadDocument as error:
+        raise InvalidObject(f"line {error.line}" if error.line else "", error.problem) from None
     if not isinstance(found, dict):
         raise InvalidObject("", "this is not a JSON object")
     return found
@@ -140,6 +184,19 @@ def fields(found: Any, field: str) -> dict[str, Any]:
     return found
 
 
+def only(found: Mapping[str, Any], known: Collection[str], field: str) -> None:
+    """Refuse fields that say of a zone what is not understood.
+
+    Raises:
+        InvalidObject: there is one that says something.
+    """
+    for key, value in found.items():
+        if key not in known and value not in (None, "", [], {}):
+            raise InvalidObject(
+                f"{field}.{key}", "a Zone has no place for it; remove it if it means nothing for the zone"
+            )
+
+
 def number(found: Any) -> TypeGuard[float]:
     """Whether this is a number; true and false are none."""
     return isinstance(found, (int, float)) and not isinstance(found, bool)
@@ -159,6 +216,8 @@ def place(found: Any, field: str, *, lat_first: bool = False) -> Point:
     pair = found if isinstance(found, (list, tuple)) else ()
     if len(pair) < 2 or not all(map(number, pair[:2])):
         raise InvalidObject(field, "must be two numbers, degrees")
+    if any(pair[2:]):
+        raise InvalidObject(field, "has a height; say how high the zone is in its altitude, and remove the heights")
     lat, lon = (pair[0], pair[1]) if lat_first else (pair[1], pair[0])
     if not (-90 <= lat <= 90 and -180 <= lon <= 180):
         order = "lat, lon" if lat_first else "lon, lat"
@@ -168,11 +227,18 @@ def place(found: Any, field: str, *, lat_first: bool = False) -> Point:
     return Point(lat=lat, lon=lon)
 
 
-def ring(found: Any, field: str, *, lat_first: bool = False) -> list[dict[str, float]]:
+def ring(found: Any, field: str, *, lat_first: bool = False, planar: bool = False) -> list[dict[str, float]]:
     """A ring as manifests spell it: open, without the repetition of its first point.
 
+    Args:
+        found: the ring.
+        field: where it is.
+        lat_first: the order of its degrees.
+        planar: whether its edges are straight lines of degrees, which never cross the antimeridian.
+
     Raises:
-        InvalidObject: it has fewer than three points, or one that is none.
+        InvalidObject: it has fewer than three points, or one that is none, or crosses the antimeridian where none can, or its
+            sides are too long to follow.
     """
     if not isinstance(found, (list, tuple)):
         raise InvalidObject(field, "must be a list of positions")
@@ -181,7 +247,31 @@ def ring(found: Any, field: str, *, lat_first: bool = False) -> list[dict[str, f
         points = points[:-1]
     if len(points) < 3:
         raise InvalidObject(field, "a ring needs at least three points")
+    if planar and any(abs(a.lon - b.lon) > 180 for a, b in itertools.pairwise([*points, points[0]])):
+        raise InvalidObject(field, "crosses the antimeridian; cut it there, into two polygons (RFC 7946)")
+    if planar and len(points) <= MAX_RING_POINTS:  # a zone with more is refused for them
+        sides = list(itertools.pairwise([*points, points[0]]))
+        if sum(_pieces(*side) for side in sides) > MAX_RING_POINTS:
+            raise InvalidObject(field, f"has sides so long that they need more than {MAX_RING_POINTS} points; split it")
+        points = list(_along_degrees(sides))
     return [p.to_dict() for p in points]
+
+
+def _pieces(start: Point, end: Point) -> int:
+    """Into how many parts a straight line of degrees is cut, so that none bends by more than `MAX_BEND_M`."""
+    lat = math.radians(min(max(abs(start.lat), abs(end.lat)), 89.0))
+    width_m = math.radians(abs(end.lon - start.lon)) * math.cos(lat) * EARTH_RADIUS_M
+    return max(math.ceil(math.sqrt(width_m**2 * math.tan(lat) / (8 * EARTH_RADIUS_M) / MAX_BEND_M)), 1)
+
+
+def _along_degrees(sides: Iterable[tuple[Point, Point]]) -> Iterator[Point]:
+    """The corners of a ring, and points between where a straight line of degrees bends."""
+    for start, end in sides:
+        yield start
+        pieces = _pieces(start, end)
+        for share in (i / pieces for i in range(1, pieces)):
+            lat_deg, lon_deg = (a + (b - a) * share for a, b in ((start.lat, end.lat), (start.lon, end.lon)))
+            yield Point(lat=round(lat_deg, 9), lon=round(lon_deg, 9))
 
 
 def rings(found: Any, field: str) -> dict[str, Any]:
@@ -192,7 +282,7 @@ def rings(found: Any, field: str) -> dict[str, Any]:
     """
     if not isinstance(found, (list, tuple)) or not found:
         raise InvalidObject(field, "must be a list of rings")
-    exterior, *holes = [ring(r, f"{field}[{i}]") for i, r in enumerate(found)]
+    exterior, *holes = [ring(r, f"{field}[{i}]", planar=True) for i, r in enumerate(found)]
     return {"polygon": {"exterior": exterior} | ({"holes": holes} if holes else {})}
 
 
@@ -215,6 +305,20 @@ def area_rings(area: Area) -> list[list[list[float]]]:
         pairs = [[p.lon, p.lat] for p in points]
         closed.append([*pairs, pairs[0]])
     return closed
+
+
+def cut_rings(zone: Zone, notes: list[str]) -> list[list[list[list[float]]]]:
+    """Closed rings of the parts of an area, cut at the antimeridian where it crosses it; notes if it does."""
+    outline = area_rings(zone.spec.area)
+    crossings = sum(abs(a[0] - b[0]) > 180 for a, b in itertools.pairwise(outline[0]))
+    if crossings % 2:
+        notes.append(f"{zone.name}: it contains a pole; programs that draw degrees on a plane show it wrong")
+    elif crossings:
+        frame = LocalFrame.at(middle(zone.spec.area))
+        notes.append(f"{zone.name}: it crosses the antimeridian and is cut there, into parts")
+        parts: list[list[list[list[float]]]] = geojson(frame, polygon(frame, zone.spec.area))["coordinates"]
+        return parts
+    return [outline]
 
 
 def _circumscribed(circle: Circle | None) -> Polygon:

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any
 
 from fractus_core.api import InvalidObject, Zone
 from fractus_core.api.geometry import AltitudeBand
-from fractus_core.api.policies import ActiveTime
+from fractus_core.api.schedules import ActiveTime
 from fractus_core.geo.formats.drafts import (
     Drafts,
     Exported,
     Imported,
-    area_rings,
+    cut_rings,
     fields,
     number,
     objects,
+    only,
     parse_json,
     place,
     rings,
@@ -27,7 +29,7 @@ from fractus_core.geo.formats.drafts import (
 
 _UNITS_M = {"M": 1.0, "FT": 0.3048}
 _DAYS = {"MON": "Mon", "TUE": "Tue", "WED": "Wed", "THU": "Thu", "FRI": "Fri", "SAT": "Sat", "SUN": "Sun"}
-_REFERENCES = {"AGL": "terrain", "WGS84": None, "AMSL": "amsl"}
+_REFERENCES = {"AGL": "terrain", "AMSL": "amsl"}
 _USED = frozenset({"identifier", "name", "message", "restriction", "applicability", "geometry"})
 _OF_VOLUME = frozenset(
     {
@@ -35,133 +37,166 @@ _OF_VOLUME = frozenset(
         "horizontalProjection",
     }
 )  # fmt: skip
+_OF_PROJECTION = {"Polygon": frozenset({"type", "coordinates"}), "Circle": frozenset({"type", "center", "radius"})}
 _OF_PERIOD = frozenset({"permanent", "startDateTime", "endDateTime", "schedule"})
 _OF_DAY = frozenset({"day", "startTime", "endTime"})
-_TIME = re.compile(r"^(\d{2}):(\d{2})(?::(\d{2})(?:\.\d+)?)?Z?$")
+_TIME = re.compile(
+    r"([01]\d|2[0-4]):([0-5]\d)(?::([0-5]\d)(?:\.\d+)?)?(?:Z|([-+])([01]\d|2[0-3]):?([0-5]\d))", re.ASCII
+)
+_DAY_MIN = 1440
 
 
-def read_ed269(text: str) -> Imported:
+def read_ed269(text: str, without: Collection[str] = ()) -> Imported:
     """Zones from features: identifier, name, message, restriction (told in the description), applicability, geometry.
 
+    Args:
+        text: the file.
+        without: identifiers of features to leave out.
+
     Raises:
-        InvalidObject: this is not an ED-269 file, or a geometry is broken.
+        InvalidObject: this is not an ED-269 file, a geometry is broken, or a feature cannot be kept exactly.
     """
     whole = parse_json(text)
     if "features" not in whole:
         raise InvalidObject("features", "is missing; this is not an ED-269 file")
-    drafts = Drafts()
+    drafts = Drafts(without)
     for i, feature in enumerate(objects(whole["features"], "features")):
-        _read_feature(drafts, feature, f"features[{i}]")
+        field = f"features[{i}]"
+        title = str(feature.get("identifier") or feature.get("name") or field)
+        drafts.take(title, functools.partial(_read_feature, drafts, title, feature, field))
     return drafts.result()
 
 
-def _read_feature(drafts: Drafts, feature: dict[str, Any], field: str) -> None:
-    title = str(feature.get("identifier") or feature.get("name") or field)
+def _read_feature(drafts: Drafts, title: str, feature: dict[str, Any], field: str) -> None:
     told = [str(feature[key]) for key in ("name", "restriction", "message") if feature.get(key)]
     spec: dict[str, Any] = {"description": drafts.described(title, ": ".join(told))} if told else {}
-    drafts.unmapped(title, _given(feature), _USED)
+    drafts.unmapped(title, (key for key, value in feature.items() if value not in (None, "", [], {})), _USED)
     if feature.get("restriction"):
         drafts.note(title, f"a Zone forbids nothing by itself; add a policy for restriction {feature['restriction']}")
-    schedule = _schedule(drafts, title, feature, field)
+    schedule = _schedule(feature, field)
     if schedule:
         spec["schedule"] = schedule
     volumes = objects(feature.get("geometry"), f"{field}.geometry")
     if not volumes:
-        drafts.note(title, "it has no geometry; left out")
+        raise InvalidObject(f"{field}.geometry", "is missing; give at least one volume")
     for j, volume in enumerate(volumes):
         where = f"{field}.geometry[{j}]"
-        drafts.unmapped(title, _given(volume), _OF_VOLUME)
-        band = _band(drafts, title, volume)
-        drafts.add(title, {**spec, "area": _area(volume, where), **({"altitude": band} if band else {})})
-
-
-def _given(found: dict[str, Any]) -> list[str]:
-    """The fields that say something."""
-    return [key for key, value in found.items() if value not in (None, "", [], {})]
+        only(volume, _OF_VOLUME, where)
+        band = _band(volume, where)
+        drafts.add(title, {**spec, "area": _area(volume, where), **({"altitude": band} if band else {})}, where)
 
 
 def _area(volume: dict[str, Any], field: str) -> dict[str, Any]:
     where = f"{field}.horizontalProjection"
     projection = fields(volume.get("horizontalProjection"), where)
-    match projection.get("type"):
-        case "Polygon":
-            return rings(projection.get("coordinates"), f"{where}.coordinates")
-        case "Circle":
-            return round_area(
-                place(projection.get("center"), f"{where}.center"), projection.get("radius"), f"{where}.radius"
-            )
-        case other:
-            raise InvalidObject(f"{where}.type", f"must be Polygon or Circle, not {other!r}")
+    shape = projection.get("type")
+    if shape not in _OF_PROJECTION:
+        raise InvalidObject(f"{where}.type", f"must be Polygon or Circle, not {shape!r}")
+    only(projection, _OF_PROJECTION[shape], where)
+    if shape == "Polygon":
+        return rings(projection.get("coordinates"), f"{where}.coordinates")
+    if volume.get("uomDimensions") not in (None, "M"):
+        raise InvalidObject(f"{where}.radius", "may be metres or feet; give the volume in metres (uomDimensions M)")
+    centre = place(projection.get("center"), f"{where}.center")
+    return round_area(centre, projection.get("radius"), f"{where}.radius")
 
 
-def _band(drafts: Drafts, title: str, volume: dict[str, Any]) -> dict[str, Any]:
-    """The altitude band; what cannot be said makes the zone higher and deeper, never smaller."""
-    unit = str(volume.get("uomDimensions") or "M")
-    scale = _UNITS_M.get(unit)
-    if scale is None:
-        drafts.note(title, f"limits in {unit} are not taken over, M and FT are; the zone has no limits of altitude")
-        return {}
-    limits: dict[str, tuple[float, str]] = {}
+def _band(volume: dict[str, Any], field: str) -> dict[str, Any]:
+    """The altitude band; with a lower limit of 0 above ground it reaches from the ground up."""
+    unit = volume.get("uomDimensions") or "M"
+    if unit not in _UNITS_M:
+        raise InvalidObject(f"{field}.uomDimensions", f"must be M or FT, not {unit!r:.40}; convert the limits")
+    limits: dict[str, Any] = {}
+    references = set()
     for side in ("lower", "upper"):
-        value, datum = volume.get(f"{side}Limit"), str(volume.get(f"{side}VerticalReference"))
+        value, datum = volume.get(f"{side}Limit"), volume.get(f"{side}VerticalReference")
         if value is None:
             continue
         if not number(value):
-            drafts.note(
-                title, f"{side}Limit {value!r} is not a number and not taken over; the zone has no {side} limit"
-            )
-            continue
+            raise InvalidObject(f"{field}.{side}Limit", f"must be a number, not {value!r:.40}")
         if side == "lower" and value <= 0 and datum == "AGL":
             continue
-        reference = _REFERENCES.get(datum)
-        if reference is None:
-            drafts.note(title, f"{side}Limit above {datum} is not taken over; the zone has no {side} limit")
-        else:
-            limits[side] = (round(value * scale, 3), reference)
-    if len({reference for _, reference in limits.values()}) > 1:
-        drafts.note(title, "lowerLimit and upperLimit have different datums; the zone reaches from the ground up")
-        limits.pop("lower")
-    reference = next((r for _, r in limits.values()), None)
-    return {**{s: v for s, (v, _) in limits.items()}, "reference": reference} if reference else {}
+        if datum not in _REFERENCES:
+            raise InvalidObject(
+                f"{field}.{side}VerticalReference", f"must be AGL or AMSL, not {datum!r:.40}; convert it"
+            )
+        limits[side] = round(value * _UNITS_M[unit], 3)
+        references.add(_REFERENCES[datum])
+    if len(references) > 1:
+        raise InvalidObject(
+            f"{field}.lowerVerticalReference",
+            "differs from that of the upper limit; convert one of them, or split the volume",
+        )
+    return limits | {"reference": references.pop()} if limits else {}
 
 
-def _schedule(drafts: Drafts, title: str, feature: dict[str, Any], field: str) -> list[dict[str, Any]]:
+def _schedule(feature: dict[str, Any], field: str) -> list[dict[str, Any]]:
+    """When the zone is active; empty: always."""
     times: list[dict[str, Any]] = []
     for i, period in enumerate(objects(feature.get("applicability"), f"{field}.applicability")):
-        drafts.unmapped(title, _given(period), _OF_PERIOD)
-        if period.get("permanent") == "YES":
-            return []
+        where = f"{field}.applicability[{i}]"
+        only(period, _OF_PERIOD, where)
         valid = {
             ours: period[theirs]
             for ours, theirs in (("validFrom", "startDateTime"), ("validUntil", "endDateTime"))
             if period.get(theirs)
         }
-        daily = objects(period.get("schedule"), f"{field}.applicability[{i}].schedule")
-        times += [{**valid, **_daily(drafts, title, day)} for day in daily or [{}]]
-    return [time for time in times if time]
+        daily = objects(period.get("schedule"), f"{where}.schedule")
+        found = [{**valid, **_daily(day, f"{where}.schedule[{j}]")} for j, day in enumerate(daily)] or [valid]
+        permanent = period.get("permanent", "NO")
+        if permanent not in ("YES", "NO"):
+            raise InvalidObject(f"{where}.permanent", f"must be YES or NO, not {permanent!r:.40}")
+        if permanent == "YES" and {} not in found:
+            raise InvalidObject(f"{where}.permanent", "is YES, but there are times; remove them, or say NO")
+        times += found
+    return [] if {} in times else times
 
 
-def _daily(drafts: Drafts, title: str, day: dict[str, Any]) -> dict[str, Any]:
-    drafts.unmapped(title, _given(day), _OF_DAY)
+def _daily(day: dict[str, Any], field: str) -> dict[str, Any]:
+    """Days and times of day in UTC; empty: the whole of every day."""
+    only(day, _OF_DAY, field)
     given = day.get("day") or []
-    named = [str(d) for d in (given if isinstance(given, list) else [given])]
-    unknown = sorted(set(named) - set(_DAYS) - {"ANY"})
+    named = given if isinstance(given, list) else [given]
+    unknown = [name for name in named if name not in (*_DAYS, "ANY")]
     if unknown:
-        drafts.note(title, f"{', '.join(unknown)} is not a day of the week; the zone is active every day")
-    days = [_DAYS[d] for d in named if d in _DAYS]
-    found: dict[str, Any] = {"days": days} if days and not unknown and "ANY" not in named else {}
-    start, end = (_TIME.match(str(day.get(key, ""))) for key in ("startTime", "endTime"))
-    if start is not None and end is not None:
-        # Whole minutes that contain the time: a zone is rather active too long.
-        minutes = int(end[1]) * 60 + int(end[2]) + (1 if int(end[3] or 0) else 0)
-        found |= {"start": f"{start[1]}:{start[2]}", "end": f"{minutes // 60 % 24:02d}:{minutes % 60:02d}"}
-    elif day.get("startTime") or day.get("endTime"):
-        drafts.note(title, "startTime and endTime are not both HH:MM in UTC; the zone is active all day")
-    return found
+        raise InvalidObject(f"{field}.day", f"{unknown[0]!r:.40} is not MON to SUN or ANY; name the days of the week")
+    days = [] if "ANY" in named else [list(_DAYS.values()).index(_DAYS[name]) for name in named]
+    start, end = day.get("startTime"), day.get("endTime")
+    found: dict[str, Any] = {}
+    if start or end:
+        begin_min, finish_min = _minutes(start, f"{field}.startTime"), _minutes(end, f"{field}.endTime", last=True)
+        # East of Greenwich a day begins on the day before, in UTC.
+        days = [(index + begin_min // _DAY_MIN) % 7 for index in days]
+        begin_min, finish_min = begin_min % _DAY_MIN, finish_min % _DAY_MIN
+        if begin_min or finish_min:
+            found = {"start": _clock(begin_min), "end": _clock(finish_min)}
+    whole_week = len(set(days)) in (0, 7)
+    return found if whole_week else {"days": [list(_DAYS.values())[i] for i in sorted(set(days))], **found}
+
+
+def _minutes(given: Any, field: str, *, last: bool = False) -> int:
+    """Minutes from midnight UTC of the day that is named, negative on the day before; the 60th second ends a minute."""
+    found = _TIME.fullmatch(given) if isinstance(given, str) else None
+    minutes = int(found[1]) * 60 + int(found[2]) if found is not None else _DAY_MIN + 1
+    if found is None or minutes > (_DAY_MIN if last else _DAY_MIN - 1):
+        raise InvalidObject(field, f"must be a time of day with its zone, such as 08:00Z, not {given!r:.40}")
+    seconds = int(found[3] or 0)
+    if seconds and not (last and seconds == 59):
+        raise InvalidObject(field, f"must be a whole minute, not {given}")
+    offset = int(found[5] or 0) * 60 + int(found[6] or 0)
+    return minutes + bool(seconds) + (offset if found[4] == "-" else -offset)
+
+
+def _clock(minutes: int) -> str:
+    return f"{minutes // 60:02d}:{minutes % 60:02d}"
 
 
 def write_ed269(zones: Iterable[Zone], *, country: str = "XXX", restriction: str = "CONDITIONAL") -> Exported:
-    """A feature for each zone; what ED-269 asks for and a Zone does not know is filled in, and noted."""
+    """A feature for each zone; what ED-269 asks for and a Zone does not know is filled in, and noted.
+
+    Raises:
+        InvalidObject: an altitude is measured from home, for which ED-269 has no datum.
+    """
     zones = tuple(zones)
     notes = unsaid(zones)
     features = []
@@ -177,7 +212,7 @@ def write_ed269(zones: Iterable[Zone], *, country: str = "XXX", restriction: str
             "message": zone.spec.description,
             "applicability": _applicability(zone.spec.schedule),
             "zoneAuthority": [],
-            "geometry": [_geometry(zone, notes)],
+            "geometry": _volumes(zone, notes),
         }
         features.append(feature)
     if zones:
@@ -186,26 +221,28 @@ def write_ed269(zones: Iterable[Zone], *, country: str = "XXX", restriction: str
     return Exported(json.dumps(whole, indent=1) + "\n", tuple(notes))
 
 
-def _geometry(zone: Zone, notes: list[str]) -> dict[str, Any]:
+def _volumes(zone: Zone, notes: list[str]) -> list[dict[str, Any]]:
     band = zone.spec.altitude or AltitudeBand(reference="terrain")
     if band.reference == "home":
-        notes.append(f"{zone.name}: altitudes above home are written as above ground (AGL)")
+        raise InvalidObject(
+            f"{zone.name}: spec.altitude.reference", "ED-269 has no altitudes above home; give them as amsl or terrain"
+        )
     datum = "AMSL" if band.reference == "amsl" else "AGL"
     area = zone.spec.area
-    projection: dict[str, Any] = {"type": "Polygon", "coordinates": area_rings(area)}
     if area.circle is not None:
         centre = [area.circle.center.lon, area.circle.center.lat]
-        projection = {"type": "Circle", "center": centre, "radius": area.circle.radius}
+        projections: list[dict[str, Any]] = [{"type": "Circle", "center": centre, "radius": area.circle.radius}]
+    else:
+        projections = [{"type": "Polygon", "coordinates": part} for part in cut_rings(zone, notes)]
     found: dict[str, Any] = {
         "uomDimensions": "M",
         "lowerLimit": band.lower if band.lower is not None else 0,
         "lowerVerticalReference": datum if band.lower is not None else "AGL",
         "upperVerticalReference": datum,
-        "horizontalProjection": projection,
     }
     if band.upper is not None:
         found["upperLimit"] = band.upper
-    return found
+    return [{**found, "horizontalProjection": projection} for projection in projections]
 
 
 def _applicability(schedule: Iterable[ActiveTime]) -> list[dict[str, Any]]:

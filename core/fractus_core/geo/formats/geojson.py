@@ -2,82 +2,128 @@
 
 from __future__ import annotations
 
-import itertools
+import functools
 import json
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any
 
 from fractus_core.api import InvalidObject, Zone
-from fractus_core.geo.areas import geojson, middle, polygon
 from fractus_core.geo.formats.drafts import (
     Drafts,
     Exported,
     Imported,
-    area_rings,
+    cut_rings,
     fields,
     number,
     objects,
+    only,
     parse_json,
     place,
     rings,
     round_area,
     unsaid,
 )
-from fractus_core.geo.frames import LocalFrame
 
 _KNOWN = frozenset({"name", "title", "description", "radius", "altitude", "schedule"})
+_OF_GEOMETRY = frozenset({"type", "coordinates", "geometries", "bbox", "crs"})
+_AREAS = frozenset({"Polygon", "MultiPolygon", "GeometryCollection"})
+_WGS84 = frozenset(
+    {
+        "urn:ogc:def:crs:OGC:1.3:CRS84",
+        "urn:ogc:def:crs:OGC::CRS84",
+        "OGC:CRS84",
+        "EPSG:4326",
+        "urn:ogc:def:crs:EPSG::4326",
+    }
+)
+"""Names of the one reference system: older GeoJSON (2008) names it, and has lon before lat whatever its name says."""
 _STYLE = frozenset({"fill", "fill-opacity", "stroke", "stroke-width", "stroke-opacity", "marker-color"})
 
 
-def read_geojson(text: str) -> Imported:
+def read_geojson(text: str, without: Collection[str] = ()) -> Imported:
     """Zones from features; altitude and schedule come from properties of these names, spelt as in a Zone.
 
+    Args:
+        text: the file.
+        without: titles of features to leave out.
+
     Raises:
-        InvalidObject: this is not GeoJSON, or a geometry is broken.
+        InvalidObject: this is not GeoJSON, a geometry is broken, or a feature cannot be kept exactly.
     """
     whole = parse_json(text)
     kind = whole.get("type")
+    _check_system(whole, "crs")
     if kind == "FeatureCollection":
-        features = objects(whole.get("features"), "features")
+        features, field = objects(whole.get("features"), "features"), "features[{}]"
     elif kind == "Feature":
-        features = [whole]
-    elif kind in {"Polygon", "MultiPolygon"}:
-        features = [{"type": "Feature", "geometry": whole, "properties": {}}]
+        features, field = [whole], ""
+    elif kind in _AREAS:
+        features, field = [{"type": "Feature", "geometry": whole, "properties": {}}], ""
     else:
         raise InvalidObject("type", f"{kind!r} is not GeoJSON of zones; expected a FeatureCollection of polygons")
-    drafts = Drafts()
-    if whole.get("crs"):
-        drafts.note("crs", "is not looked at; coordinates are taken as WGS 84, lon, lat")
+    drafts = Drafts(without)
     for i, feature in enumerate(features):
-        _read_feature(drafts, feature, f"features[{i}]")
+        where = field.format(i)
+        properties = feature.get("properties")
+        said = properties if isinstance(properties, dict) else {}
+        title = str(said.get("name") or said.get("title") or feature.get("id") or f"zone {i}")
+        drafts.take(title, functools.partial(_read_feature, drafts, title, feature, where))
     return drafts.result()
 
 
-def _read_feature(drafts: Drafts, feature: dict[str, Any], field: str) -> None:
-    properties = fields(feature.get("properties"), f"{field}.properties")
-    title = str(properties.get("name") or properties.get("title") or feature.get("id") or f"zone {field[9:-1]}")
-    spec = {k: properties[k] for k in ("altitude", "schedule", "description") if properties.get(k)}
+def _check_system(found: dict[str, Any], field: str) -> None:
+    """Refuse coordinates in another reference system."""
+    system = found.get("crs")
+    if system is None:
+        return
+    named = system.get("properties") if isinstance(system, dict) else None
+    name = named.get("name") if isinstance(named, dict) else None
+    if name not in _WGS84:
+        raise InvalidObject(field, f"must be WGS 84, not {name or 'an unnamed one'}; convert the file to OGC:CRS84")
+
+
+def _read_feature(drafts: Drafts, title: str, feature: dict[str, Any], field: str) -> None:
+    inside = f"{field}." if field else ""
+    if feature.get("type") != "Feature":
+        raise InvalidObject(f"{inside}type", f"must be Feature, not {feature.get('type')!r}")
+    properties = fields(feature.get("properties"), f"{inside}properties")
+    _check_system(feature, f"{inside}crs")
+    known = ("altitude", "schedule", "description")
+    spec = {k: properties[k] for k in known if properties.get(k) is not None and properties[k] != ""}
     if isinstance(spec.get("description"), str):
         spec["description"] = drafts.described(title, spec["description"])
     dropped = sorted(set(properties) - _KNOWN - _STYLE)
     if dropped:
         drafts.note(title, f"no place for properties {', '.join(dropped)}; left out")
-    geometry = fields(feature.get("geometry"), f"{field}.geometry")
-    coordinates = geometry.get("coordinates")
-    if _heights(coordinates):
-        drafts.note(title, "heights of its points are not taken over; give properties.altitude")
-    where = f"{field}.geometry.coordinates"
+    geometry = fields(feature.get("geometry"), f"{inside}geometry")
+    if properties.get("radius") is not None and geometry.get("type") != "Point":
+        raise InvalidObject(f"{inside}properties.radius", "goes with a Point; draw the area of others as a polygon")
+    _read_geometry(drafts, title, geometry, spec | {"radius": properties.get("radius")}, f"{inside}geometry")
+
+
+def _read_geometry(drafts: Drafts, title: str, geometry: dict[str, Any], said: dict[str, Any], field: str) -> None:
+    """Make zones of a geometry, each with what was said of the feature."""
+    spec = {key: value for key, value in said.items() if key != "radius"}
+    coordinates, where = geometry.get("coordinates"), f"{field}.coordinates"
+    only(geometry, _OF_GEOMETRY, field)
+    _check_system(geometry, f"{field}.crs")
+    if "altitude" in spec and _heights(coordinates):
+        drafts.note(title, "heights of its points are not taken over, properties.altitude is")
+        coordinates = _flat(coordinates)
     match geometry.get("type"):
         case "Polygon":
-            drafts.add(title, {**spec, "area": rings(coordinates, where)})
+            drafts.add(title, {**spec, "area": rings(coordinates, where)}, field)
         case "MultiPolygon":
             if not isinstance(coordinates, list):
                 raise InvalidObject(where, "must be a list of polygons")
             for j, part in enumerate(coordinates):
-                drafts.add(title, {**spec, "area": rings(part, f"{where}[{j}]")})
-        case "Point" if "radius" in properties:
-            area = round_area(place(coordinates, where), properties["radius"], f"{field}.properties.radius")
-            drafts.add(title, {**spec, "area": area})
+                drafts.add(title, {**spec, "area": rings(part, f"{where}[{j}]")}, f"{where}[{j}]")
+        case "Point" if said["radius"] is not None:
+            radius = f"{field.removesuffix('geometry')}properties.radius"
+            drafts.add(title, {**spec, "area": round_area(place(coordinates, where), said["radius"], radius)}, field)
+        case "GeometryCollection":
+            for j, part in enumerate(objects(geometry.get("geometries"), f"{field}.geometries")):
+                _read_geometry(drafts, title, part, said, f"{field}.geometries[{j}]")
         case other:
             drafts.note(title, f"a geometry of type {other} is not a zone; left out")
 
@@ -94,6 +140,13 @@ def _heights(coordinates: Any) -> bool:
     return False
 
 
+def _flat(coordinates: Any) -> Any:
+    """The coordinates without heights."""
+    if isinstance(coordinates, list) and coordinates and number(coordinates[0]):
+        return coordinates[:2]
+    return [_flat(item) for item in coordinates] if isinstance(coordinates, list) else coordinates
+
+
 def write_geojson(zones: Iterable[Zone]) -> Exported:
     """A FeatureCollection with a polygon for each zone, cut at the antimeridian (RFC 7946); read_geojson takes it back."""
     zones = tuple(zones)
@@ -102,20 +155,10 @@ def write_geojson(zones: Iterable[Zone]) -> Exported:
     for zone in zones:
         spec = zone.spec.to_dict()
         properties = {"name": zone.name} | {k: spec[k] for k in ("altitude", "schedule", "description") if spec.get(k)}
-        outline = area_rings(zone.spec.area)
-        geometry: dict[str, Any] = {"type": "Polygon", "coordinates": outline}
-        crossings = _crossings(outline[0])
-        if crossings % 2:
-            notes.append(f"{zone.name}: it contains a pole; programs that draw degrees on a plane show it wrong")
-        elif crossings:
-            frame = LocalFrame.at(middle(zone.spec.area))
-            geometry = geojson(frame, polygon(frame, zone.spec.area))
-            notes.append(f"{zone.name}: it crosses the antimeridian and is cut there, into parts")
+        parts = cut_rings(zone, notes)
+        geometry: dict[str, Any] = {"type": "MultiPolygon", "coordinates": parts}
+        if len(parts) == 1:
+            geometry = {"type": "Polygon", "coordinates": parts[0]}
         features.append({"type": "Feature", "properties": properties, "geometry": geometry})
     text = json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"
     return Exported(text, tuple(notes))
-
-
-def _crossings(ring: list[list[float]]) -> int:
-    """How often a ring crosses the antimeridian: an odd number only if it runs around a pole."""
-    return sum(abs(a[0] - b[0]) > 180 for a, b in itertools.pairwise(ring))

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import functools
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from xml.etree import ElementTree
 from xml.sax.saxutils import escape
 
 from fractus_core.api import InvalidObject, Zone
-from fractus_core.geo.formats.drafts import Drafts, Exported, Imported, area_rings, ring, unsaid
+from fractus_core.geo.formats.drafts import Drafts, Exported, Imported, cut_rings, ring, unsaid
 
 _KNOWN = frozenset({"name", "description", "Polygon", "MultiGeometry"})
 _LOOK = frozenset({"Style", "StyleMap", "styleUrl", "visibility", "open", "Snippet", "LookAt", "Camera"})
+_HOLDERS = frozenset({"Document", "Folder", "NetworkLink"})
+_TIMES = frozenset({"TimeSpan", "TimeStamp"})
 _OTHERS = ("Point", "LineString", "LinearRing", "Model", "Track")
 
 
-def read_kml(text: str) -> Imported:
-    """Zones from the polygons of placemarks; heights and styles are not taken over.
+def read_kml(text: str, without: Collection[str] = ()) -> Imported:
+    """Zones from the polygons of placemarks; styles are not taken over.
+
+    Args:
+        text: the file.
+        without: names of placemarks to leave out.
 
     Raises:
-        InvalidObject: this is not KML, or a polygon is broken.
+        InvalidObject: this is not KML, a polygon is broken, or a placemark cannot be kept exactly.
     """
     if re.search(r"<!(DOCTYPE|ENTITY)", text):
         raise InvalidObject("", "a KML file must not declare entities")
@@ -29,40 +36,60 @@ def read_kml(text: str) -> Imported:
         raise InvalidObject("", f"this is not XML ({error})") from None
     if _tag(root) != "kml":
         raise InvalidObject("", f"the root element is {_tag(root)}, not kml")
-    drafts = Drafts()
+    for holder in (e for e in root.iter() if _tag(e) in _HOLDERS):
+        title = _text(holder, "name") or _tag(holder)
+        if _tag(holder) == "NetworkLink":
+            raise InvalidObject(title, "a NetworkLink leads to another file, which is not read; save all as one file")
+        _check_always(holder, title)
+    drafts = Drafts(without)
     for count, mark in enumerate(e for e in root.iter() if _tag(e) == "Placemark"):
-        _read_placemark(drafts, mark, count)
+        title = _text(mark, "name") or f"placemark {count + 1}"
+        drafts.take(title, functools.partial(_read_placemark, drafts, title, mark))
     return drafts.result()
 
 
-def _read_placemark(drafts: Drafts, mark: ElementTree.Element, count: int) -> None:
-    title = _text(mark, "name") or f"placemark {count + 1}"
+def _check_always(element: ElementTree.Element, field: str) -> None:
+    if any(_tag(child) in _TIMES for child in element):
+        raise InvalidObject(field, "has a time, which a Zone says otherwise; remove it, and give the Zone a schedule")
+
+
+def _read_placemark(drafts: Drafts, title: str, mark: ElementTree.Element) -> None:
     described = drafts.described(title, _text(mark, "description"))
     polygons = [e for e in mark.iter() if _tag(e) == "Polygon"]
     others = sorted({_tag(e) for e in mark.iter()} & set(_OTHERS) - ({"LinearRing"} if polygons else set()))
     if others:
         drafts.note(title, f"{', '.join(others)} is not a zone; left out")
     drafts.unmapped(title, map(_tag, mark), _KNOWN | _LOOK | set(_OTHERS))
+    if polygons:
+        _check_always(mark, "")
     for i, shape in enumerate(polygons):
-        field = f"{title}: Polygon[{i}]"
-        exterior = [_ring(e, f"{field}.outerBoundaryIs") for e in shape if _tag(e) == "outerBoundaryIs"]
-        holes = [_ring(e, f"{field}.innerBoundaryIs") for e in shape if _tag(e) == "innerBoundaryIs"]
+        field = f"Polygon[{i}]"
+        exterior = _rings(shape, "outerBoundaryIs", field)
+        holes = _rings(shape, "innerBoundaryIs", field)
         if len(exterior) != 1:
             raise InvalidObject(f"{field}.outerBoundaryIs", "a polygon has exactly one")
         mode = _text(shape, "altitudeMode")
         if mode not in {"", "clampToGround"}:
-            drafts.note(title, f"heights ({mode}) are not taken over; the zone reaches from the ground up")
+            raise InvalidObject(
+                f"{field}.altitudeMode", f"{mode} has heights, which a Zone says otherwise; clamp it to the ground"
+            )
         area = {"polygon": {"exterior": exterior[0]} | ({"holes": holes} if holes else {})}
-        drafts.add(title, {"area": area} | ({"description": described} if described else {}))
+        drafts.add(title, {"area": area} | ({"description": described} if described else {}), field)
 
 
-def _ring(boundary: ElementTree.Element, field: str) -> list[dict[str, float]]:
-    text = next((e.text or "" for e in boundary.iter() if _tag(e) == "coordinates"), "")
+def _rings(shape: ElementTree.Element, boundary: str, field: str) -> list[list[dict[str, float]]]:
+    """All rings of a polygon's boundaries of one kind: some programs put several into one boundary."""
+    texts = [e.text or "" for b in shape if _tag(b) == boundary for e in b.iter() if _tag(e) == "coordinates"]
+    return [_ring(text, f"{field}.{boundary}.coordinates") for text in texts]
+
+
+def _ring(text: str, field: str) -> list[dict[str, float]]:
     try:
-        positions = [[float(v) for v in group.split(",")] for group in text.split()]
+        # Of what is clamped to the ground, heights mean nothing.
+        positions = [[float(v) for v in group.split(",")][:2] for group in text.split()]
     except ValueError:
-        raise InvalidObject(f"{field}.coordinates", "must be lon,lat[,alt] groups") from None
-    return ring(positions, f"{field}.coordinates")
+        raise InvalidObject(field, "must be lon,lat[,alt] groups") from None
+    return ring(positions, field)
 
 
 def _tag(element: ElementTree.Element) -> str:
@@ -76,22 +103,28 @@ def _text(element: ElementTree.Element, child: str) -> str:
 def write_kml(zones: Iterable[Zone]) -> Exported:
     """A document with a placemark for each zone, clamped to the ground."""
     zones = tuple(zones)
-    marks = "".join(_placemark(zone) for zone in zones)
+    notes = unsaid(zones, "altitude", "schedule", "circle")
+    marks = "".join(_placemark(zone, notes) for zone in zones)
     text = (
         '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2">\n<Document>\n'
         f"{marks}</Document>\n</kml>\n"
     )
-    return Exported(text, tuple(unsaid(zones, "altitude", "schedule", "circle")))
+    return Exported(text, tuple(notes))
 
 
-def _placemark(zone: Zone) -> str:
-    exterior, *holes = area_rings(zone.spec.area)
-    boundaries = _boundary("outerBoundaryIs", exterior) + "".join(_boundary("innerBoundaryIs", h) for h in holes)
+def _placemark(zone: Zone, notes: list[str]) -> str:
+    polygons = "".join(map(_polygon, cut_rings(zone, notes)))
     description = f"<description>{escape(zone.spec.description)}</description>" if zone.spec.description else ""
     return (
         f"<Placemark><name>{escape(zone.name)}</name>{description}\n"
-        f"<Polygon><altitudeMode>clampToGround</altitudeMode>{boundaries}</Polygon></Placemark>\n"
+        f"<MultiGeometry>{polygons}</MultiGeometry></Placemark>\n"
     )
+
+
+def _polygon(rings: list[list[list[float]]]) -> str:
+    exterior, *holes = rings
+    boundaries = _boundary("outerBoundaryIs", exterior) + "".join(_boundary("innerBoundaryIs", h) for h in holes)
+    return f"<Polygon><altitudeMode>clampToGround</altitudeMode>{boundaries}</Polygon>"
 
 
 def _boundary(tag: str, points: list[list[float]]) -> str:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import json
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any
 
 from fractus_core.api import InvalidObject, Zone
@@ -13,6 +14,7 @@ from fractus_core.geo.formats.drafts import (
     Imported,
     fields,
     objects,
+    only,
     parse_json,
     place,
     ring,
@@ -21,10 +23,15 @@ from fractus_core.geo.formats.drafts import (
 )
 
 _FENCE_VERSION = 2
+_OF_FENCE = frozenset({"version", "polygons", "circles", "breachReturn"})
 
 
-def read_qgc_plan(text: str) -> Imported:
+def read_qgc_plan(text: str, without: Collection[str] = ()) -> Imported:
     """Zones from the fence's polygons and circles; whether each is for inclusion is told in its description.
+
+    Args:
+        text: the file.
+        without: titles of shapes to leave out, such as `exclusion polygon 1`.
 
     Raises:
         InvalidObject: this is not a plan file, or a shape is broken.
@@ -37,18 +44,16 @@ def read_qgc_plan(text: str) -> Imported:
         raise InvalidObject(
             "geoFence.version", f"must be {_FENCE_VERSION}, not {fence.get('version')!r}; save the plan again"
         )
-    drafts = Drafts()
+    only(fence, _OF_FENCE, "geoFence")
+    drafts = Drafts(without)
     for i, item in enumerate(objects(fence.get("polygons"), "geoFence.polygons")):
         field = f"geoFence.polygons[{i}]"
-        exterior = ring(item.get("polygon"), f"{field}.polygon", lat_first=True)
-        _add(drafts, f"polygon {i + 1}", {"polygon": {"exterior": exterior}}, inclusion=_inclusion(item, field))
+        title, kind = f"polygon {i + 1}", _kind(item, field)
+        drafts.take(f"{kind} {title}", functools.partial(_read_polygon, drafts, f"{kind} {title}", item, field, kind))
     for i, item in enumerate(objects(fence.get("circles"), "geoFence.circles")):
-        field = f"geoFence.circles[{i}].circle"
-        circle = fields(item.get("circle"), field)
-        area = round_area(
-            place(circle.get("center"), f"{field}.center", lat_first=True), circle.get("radius"), f"{field}.radius"
-        )
-        _add(drafts, f"circle {i + 1}", area, inclusion=_inclusion(item, f"geoFence.circles[{i}]"))
+        field = f"geoFence.circles[{i}]"
+        title, kind = f"circle {i + 1}", _kind(item, field)
+        drafts.take(f"{kind} {title}", functools.partial(_read_circle, drafts, f"{kind} {title}", item, field, kind))
     if fields(whole.get("mission"), "mission").get("items"):
         drafts.note("mission", "its items are not zones; left out")
     if fields(whole.get("rallyPoints"), "rallyPoints").get("points"):
@@ -58,22 +63,44 @@ def read_qgc_plan(text: str) -> Imported:
     return drafts.result()
 
 
-def _inclusion(item: dict[str, Any], field: str) -> bool:
-    found = item.get("inclusion", False)
+def _kind(item: dict[str, Any], field: str) -> str:
+    found = item.get("inclusion")
     if not isinstance(found, bool):
-        raise InvalidObject(f"{field}.inclusion", f"must be true or false, not {found!r}")
-    return found
+        raise InvalidObject(f"{field}.inclusion", f"must be true or false, not {found!r:.40}")
+    return "inclusion" if found else "exclusion"
 
 
-def _add(drafts: Drafts, title: str, area: dict[str, object], *, inclusion: bool) -> None:
-    kind = "inclusion" if inclusion else "exclusion"
-    drafts.add(f"{kind} {title}", {"area": area, "description": f"From a QGroundControl plan, for {kind}."})
-    drafts.note(f"{kind} {title}", f"a Zone forbids nothing by itself; add a GeofenceControl policy of kind {kind}")
+def _read_polygon(drafts: Drafts, title: str, item: dict[str, Any], field: str, kind: str) -> None:
+    only(item, ("polygon", "inclusion", "version"), field)
+    exterior = ring(item.get("polygon"), f"{field}.polygon", lat_first=True)
+    _add(drafts, title, {"polygon": {"exterior": exterior}}, field, kind)
+
+
+def _read_circle(drafts: Drafts, title: str, item: dict[str, Any], field: str, kind: str) -> None:
+    only(item, ("circle", "inclusion", "version"), field)
+    circle = fields(item.get("circle"), f"{field}.circle")
+    only(circle, ("center", "radius"), f"{field}.circle")
+    centre = place(circle.get("center"), f"{field}.circle.center", lat_first=True)
+    _add(drafts, title, round_area(centre, circle.get("radius"), f"{field}.circle.radius"), field, kind)
+
+
+def _add(drafts: Drafts, title: str, area: dict[str, object], field: str, kind: str) -> None:
+    drafts.add(title, {"area": area, "description": f"From a QGroundControl plan, for {kind}."}, field)
+    drafts.note(title, f"a Zone forbids nothing by itself; add a GeofenceControl policy of kind {kind}")
 
 
 def write_qgc_plan(zones: Iterable[Zone], *, inclusion: bool = False) -> Exported:
-    """A plan file without a mission whose fence has all zones, for exclusion or for inclusion."""
+    """A plan file without a mission whose fence has all zones, for exclusion or for inclusion.
+
+    Raises:
+        InvalidObject: without what the format cannot say, a fence to stay in would hold more than its zone.
+    """
     zones = tuple(zones)
+    lost = unsaid(zones, "altitude", "holes") if inclusion else []
+    if lost:
+        raise InvalidObject(
+            "", f"{lost[0].removesuffix('; left out')}; a fence to stay in would be larger than the zone"
+        )
     polygons, circles = [], []
     for zone in zones:
         area = zone.spec.area

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from fractus_core.api import Application, Component, Drone, EdgeNode, InvalidObject, Policy
+from fractus_core.api import Application, Component, Drone, EdgeNode, InvalidObject, Policy, Zone
+from fractus_core.api.components import ServiceRequest
 from fractus_core.api.geometry import MAX_HOLES, MAX_RING_POINTS, Area, Circle, Point, Position
+from fractus_core.api.methods import MOBILITY_METHODS
 from fractus_core.api.plans import (
     DeploymentPlanSpec,
     GrantedLimits,
@@ -19,7 +23,7 @@ from fractus_core.api.plans import (
     GrantSpec,
     PlannedInstance,
 )
-from fractus_core.geo import LocalFrame, area_of, ground, middle, polygon
+from fractus_core.geo import LocalFrame, area_of, distance_m, ground, middle, polygon
 from fractus_core.planning.area import OperationArea, operation_area
 from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.policy.selectors import holds, node_attributes, owner_of
@@ -29,6 +33,15 @@ ROUNDING_M = 0.01
 
 MAX_ROUNDING_M = 0.16
 """How far it may be where an outline has more points than a ring takes."""
+
+AROUND_WAY_M = 100.0
+"""Zones further than this from where a drone may be do not change its way."""
+
+_GENEROUS = 1.05
+"""Room for what the frame of a large zone bends."""
+
+_Bounds = tuple[Point, float]
+"""A place, and how far from there zones count, in metres."""
 
 FIXED_NODE_REACH_M = 1000.0
 """Zones further than this from a fixed node do not concern it."""
@@ -76,7 +89,10 @@ def compile_grants(
             continue
         if placed.placement == "drone" and area is not None:
             # All of them are on one drone.
-            aboard = aboard or _drone_grant(application, component, placed, inventory, area)
+            drone = inventory.drones[placed.node]
+            aboard = aboard or _drone_grant(
+                application, drone, inventory, area, component=component.name, instance=placed.instance
+            )
             grant = _granted_aboard(aboard, component, placed, inventory)
             grant = grant.model_copy(update={"tour": area.route}) if guides else grant
         else:
@@ -107,10 +123,25 @@ def refresh(grant: GrantSpec, inventory: Inventory) -> GrantSpec:
     return grant.model_copy(update={"policies": _policies(grant, inventory, grant.policies)})
 
 
+def flight_grant(application: Application, drone: Drone, inventory: Inventory, area: OperationArea) -> GrantSpec:
+    """The grant that an application would be flown under, as far as its way is concerned: with all methods of motion.
+
+    It has the policies that hold for the component that says where to fly, without zones far from the way. Policies that
+    cannot be resolved are left out: while there are such, nothing is granted.
+    """
+    leader = application.spec.leader or next(application.spec.on("drone"))
+    grant = _drone_grant(application, drone, inventory, area, component=leader.name, instance=leader.name)
+    corners = shapely.get_coordinates([polygon(area.frame, part) for part in grant.corridor])
+    reach_m = float(np.hypot(*corners.T).max()) + AROUND_WAY_M
+    middle_of_way = Point(lat=area.frame.lat, lon=area.frame.lon)
+    policies = _policies(grant, inventory, (), (middle_of_way, reach_m))
+    services = (ServiceRequest(service="mobility", methods=MOBILITY_METHODS),)
+    return grant.model_copy(update={"policies": policies, "services": services, "control": "full"})
+
+
 def _drone_grant(
-    application: Application, component: Component, placed: PlannedInstance, inventory: Inventory, area: OperationArea
+    application: Application, drone: Drone, inventory: Inventory, area: OperationArea, *, component: str, instance: str
 ) -> GrantSpec:
-    drone = inventory.drones[placed.node or ""]
     mobility = drone.spec.services.mobility
     depot = inventory.depots.get(drone.spec.depot or "")
     home = drone.spec.home
@@ -121,8 +152,8 @@ def _drone_grant(
     return GrantSpec(
         node=drone.name,
         application=owner_of(application),
-        component=component.name,
-        instance=placed.instance,
+        component=component,
+        instance=instance,
         operation_area=area_of(area.frame, shape),
         corridor=area_of(area.frame, way.simplify(ROUNDING_M)),
         depot=depot.spec.location if depot is not None else None,
@@ -205,7 +236,10 @@ def _edge_grant(
 
 
 def _policies(
-    grant: GrantSpec, inventory: Inventory, last: Sequence[GrantedPolicy] | None
+    grant: GrantSpec,
+    inventory: Inventory,
+    last: Sequence[GrantedPolicy] | None,
+    bounds: _Bounds | None = None,
 ) -> tuple[GrantedPolicy, ...]:
     """The policies for a grant, by name.
 
@@ -213,6 +247,7 @@ def _policies(
         grant: Its owner, component and node say which policies hold.
         inventory: As of now.
         last: The policies as they were granted last, to fall back on; None: nothing was granted yet.
+        bounds: A place, and how far from there zones count, whether sound or not; None: as far as the node gets.
 
     Raises:
         InvalidObject: a policy is broken, and `last` is None.
@@ -220,7 +255,8 @@ def _policies(
     node = inventory.drones.get(grant.node) or inventory.edge_nodes.get(grant.node)
     attributes = node_attributes(node) if node is not None else {"name": grant.node}
     kept = {policy.name: policy for policy in last or ()}
-    bounds = _bounds(grant, node, inventory)
+    beyond = bounds
+    bounds = bounds or _bounds(grant, node, inventory)
     granted = {name: policy for name, policy in kept.items() if name in inventory.unreadable_policies}
     for name, policy in inventory.policies.items():
         # The attributes of a node without a description are unknown: what held for it goes on.
@@ -228,7 +264,7 @@ def _policies(
         if known and not holds(policy.spec, grant.application, grant.component, attributes):
             continue
         try:
-            found = _granted(policy, inventory, bounds)
+            found = _granted(policy, inventory, bounds, beyond)
         except (ValueError, ArithmeticError, shapely.errors.ShapelyError) as error:
             if last is None:
                 if isinstance(error, InvalidObject):
@@ -240,20 +276,28 @@ def _policies(
     return tuple(granted[name] for name in sorted(granted))
 
 
-def _granted(policy: Policy, inventory: Inventory, bounds: tuple[Point, float] | None) -> GrantedPolicy | None:
+def _granted(
+    policy: Policy, inventory: Inventory, bounds: _Bounds | None, beyond: _Bounds | None = None
+) -> GrantedPolicy | None:
     """The policy with its zones; None if all of them are out of reach.
+
+    Zones that are easily seen to be out of reach of `beyond` are not looked at any closer.
 
     Raises:
         InvalidObject: a zone does not exist, or is broken.
     """
     named = dict.fromkeys(policy.spec.selector.zones)
-    zones = [_zone(policy, i, name, inventory) for i, name in enumerate(named)]
+    zones = [
+        _zone(policy, i, name, inventory)
+        for i, name in enumerate(named)
+        if beyond is None or policy.spec.kind == "inclusion" or not _surely_beyond(inventory.zones.get(name), *beyond)
+    ]
     # An inclusion zone out of reach still forbids everything else.
     if bounds is None or policy.spec.kind == "inclusion":
         near = zones
     else:
         near = [zone for zone in zones if _distance_m(zone.area, bounds[0]) <= bounds[1]]
-    if zones and not near:
+    if named and not near:
         return None
     # What is left out is not selected either, so that a node can tell a zone that is far from one that is missing.
     selector = policy.spec.selector.model_copy(update={"zones": tuple(zone.name for zone in near)})
@@ -262,7 +306,7 @@ def _granted(policy: Policy, inventory: Inventory, bounds: tuple[Point, float] |
     )
 
 
-def _bounds(grant: GrantSpec, node: Drone | EdgeNode | None, inventory: Inventory) -> tuple[Point, float] | None:
+def _bounds(grant: GrantSpec, node: Drone | EdgeNode | None, inventory: Inventory) -> _Bounds | None:
     """Where the node has its place, and how far from there zones concern it; None: wherever they are.
 
     It is made of what a grant keeps, so that it is the same when a grant is made and when it is refreshed.
@@ -295,6 +339,17 @@ def _zone(policy: Policy, index: int, name: str, inventory: Inventory) -> Grante
     except InvalidObject as error:
         raise InvalidObject(f"Zone {name} spec.area.{error.field}", error.problem) from None
     return GrantedZone(name=name, area=spec.area, altitude=spec.altitude, schedule=spec.schedule)
+
+
+def _surely_beyond(zone: Zone | None, base: Point, reach_m: float) -> bool:
+    """Whether a zone is out of reach, told in microseconds; False where that needs a closer look."""
+    if zone is None or zone.spec.area.polygon is None:
+        circle = zone.spec.area.circle if zone is not None else None
+        return circle is not None and distance_m(circle.center, base) > (reach_m + circle.radius) * _GENEROUS
+    ring = zone.spec.area.polygon.exterior
+    # No point of a polygon is further from a corner than half its outline.
+    outline_m = sum(distance_m(a, b) for a, b in itertools.pairwise((*ring, ring[0])))
+    return distance_m(ring[0], base) > (reach_m + outline_m / 2) * _GENEROUS
 
 
 @lru_cache(maxsize=256)

@@ -1,0 +1,93 @@
+"""What a camera's description tells of its view: for each lens, a pinhole's view that holds every ray of a picture."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fractus_core.api.nodes import CameraFeatures, CameraLens
+from fractus_core.policy.values import Lens
+
+MOUNT_ERROR_DEG = 2.0
+"""Bound of the error of a mount's direction."""
+OFF_AXIS_DEG = 1.0
+"""By how much more the axis of a lens that is not described may be off the middle of the picture."""
+_STEPS = 4000
+_MAX_TAN = math.tan(math.radians(80.0))
+"""Rays further from the axis than that (`footprint.MAX_HALF_VIEW_DEG`) make a view count as everything anyway."""
+
+
+def lens_of(camera: CameraFeatures | None) -> Lens | None:
+    """What a description tells of a camera; None where it does not tell enough."""
+    if camera is None or camera.horizontal_field_of_view is None or camera.mount is None:
+        return None
+    width, height = camera.pixels
+    half = _half_view(camera.lens, math.radians(camera.horizontal_field_of_view) / 2, height / width)
+    wide, tall = (2 * math.degrees(math.atan(side)) for side in half) if half is not None else (180.0, 180.0)
+    mount, error_deg = camera.mount, MOUNT_ERROR_DEG + (OFF_AXIS_DEG if camera.lens is None else 0.0)
+    return Lens(wide, tall, mount.pitch, mount.yaw, mount.stabilised, error_deg)
+
+
+def _half_view(lens: CameraLens | None, half: float, aspect: float) -> tuple[float, float] | None:
+    """Tangents of the half views that hold every ray of a picture; None where there are none.
+
+    Args:
+        lens: None where it is not described.
+        half: angle from the middle of the picture to the middle of a side.
+        aspect: height over width.
+    """
+    if lens is None:
+        return _any_lens(half, aspect)
+    if lens.model == "pinhole":
+        return math.tan(half), math.tan(half) * aspect
+    if lens.model == "equidistant":
+        return _corner(half * math.hypot(1.0, aspect), aspect)
+    return _distorted(lens, math.tan(half), aspect)
+
+
+def _corner(angle: float, aspect: float) -> tuple[float, float] | None:
+    """The tangents of a corner at an angle: the largest ones, where rays bend outwards more the further out they are."""
+    if angle >= math.pi / 2:
+        return None
+    far = math.tan(angle) / math.hypot(1.0, aspect)
+    return far, far * aspect
+
+
+def _any_lens(half: float, aspect: float) -> tuple[float, float] | None:
+    """For every lens that has an axis, and shows at its corners no more than an orthographic fisheye does.
+
+    Of all lenses with the same angle at their sides, that one compresses what is further out the most; so within are pinholes,
+    the other fisheyes (stereographic, equidistant, equisolid) and what Brown and Conrady's model tells of real lenses. What is
+    nearer to the middle than the sides is at a smaller angle, which is all that is known of it.
+    """
+    sine = math.sin(half) * math.hypot(1.0, aspect)
+    corner = _corner(math.asin(sine), aspect) if sine < 1.0 else None
+    side = math.tan(half)
+    return (max(corner[0], side), max(corner[1], side)) if corner is not None else None
+
+
+def _distorted(lens: CameraLens, side: float, aspect: float) -> tuple[float, float] | None:
+    """Brown and Conrady: a ray with tangent r is shown at g(r) = r (1 + k1 r² + k2 r⁴ + k3 r⁶), and off that by t r² at most.
+
+    So a ray that is shown is no further out than where g(r) - t r² reaches the corner of the picture; where it never does,
+    or turns back before, the model does not tell what is shown there.
+    """
+    k1, k2, k3, p1, p2 = (getattr(lens, name) or 0.0 for name in ("k1", "k2", "k3", "p1", "p2"))
+    tangential = 3.0 * (abs(p1) + abs(p2))
+    r = np.linspace(0.0, _MAX_TAN, _STEPS + 1)[1:]
+    stretch = 1.0 + r**2 * (k1 + r**2 * (k2 + r**2 * k3))
+    shown = r * stretch - tangential * r**2
+    wide = side * (1.0 + side**2 * (k1 + side**2 * (k2 + side**2 * k3))) + tangential * side**2
+    beyond = np.flatnonzero(shown >= wide * math.hypot(1.0, aspect))
+    if wide <= 0.0 or not beyond.size or beyond[0] == 0:
+        return None
+    last = int(beyond[0])
+    outwards = np.diff(shown[: last + 1]) / np.diff(r[: last + 1])
+    if r[last] < side or shown[0] <= 0.0 or not (outwards > 0.0).all():
+        return None
+    slack, shrunk = tangential * r[last] ** 2, 1.001 / stretch[: last + 1].min()
+    # Where a lens makes things smaller than that, a wider view stands for it, too: faces are looked for by their size.
+    least = float((outwards * (1.0 + r[1 : last + 1] ** 2)).min())
+    x, y = ((extent + slack) * shrunk for extent in (wide, wide * aspect))
+    return max(min(x, float(r[last])), wide / least), min(y, float(r[last]))

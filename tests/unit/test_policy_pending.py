@@ -1,0 +1,96 @@
+"""Setpoints in quick succession: what is on its way counts, whenever each of them is heard."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import pytest
+import shapely
+from fractus_core.policy.engine import judge
+from fractus_core.policy.motion import moving, stop_point, surge, swept
+from fractus_core.policy.values import Call, Situation, VelocityArgs
+from policy_world import at, box, compiled, exclusion, goto
+
+Velocity = tuple[float, float]
+STEP_S = 0.02
+BRAKES = -2.5
+
+
+def flown(rng: random.Random, now: Situation, pending: list[Velocity], asked: VelocityArgs) -> list[Velocity]:
+    """Where a drone may come that hears each of these some time within the latency, in their order, and stops in the end."""
+    moments = sorted(rng.choice([0.0, rng.uniform(0, now.latency_s), now.latency_s]) for _ in (*pending, asked))
+    wanted = [
+        (0.0, 0.0) if now.forward_mps2 == BRAKES else (now.east_mps, now.north_mps),
+        *((e, n) for n, e in pending),
+        (asked.east_mps, asked.north_mps),
+        (0.0, 0.0),
+    ]
+    moments.append(rng.choice([asked.hold_s, asked.hold_s + now.latency_s]))
+    x, y, vx, vy, time_s = 0.0, 0.0, now.east_mps, now.north_mps, 0.0
+    places = []
+    while time_s < moments[-1] or math.hypot(vx, vy) > 0.05:
+        tx, ty = wanted[sum(moment <= time_s for moment in moments)]
+        change = math.hypot(tx - vx, ty - vy)
+        share = min(now.airframe.accel_mps2 * STEP_S / change, 1.0) if change else 0.0
+        vx, vy = vx + (tx - vx) * share, vy + (ty - vy) * share
+        x, y, time_s = x + vx * STEP_S, y + vy * STEP_S, time_s + STEP_S
+        places.append((x, y))
+    return places
+
+
+def direction(rng: random.Random, fast: float) -> Velocity:
+    angle, speed = rng.uniform(0, 2 * math.pi), rng.choice([0.0, fast, rng.uniform(0, fast)])
+    return speed * math.cos(angle), speed * math.sin(angle)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_a_setpoint_sweeps_holds_what_is_flown(seed: int) -> None:
+    rng = random.Random(seed)
+    furthest_m, missed_m = 0.0, 0.0
+    for _ in range(150):
+        north, east = direction(rng, 9.0)
+        pending = [direction(rng, 12.0) for _ in range(rng.choice([1, 1, 2, 3, 7]))]
+        now = at(
+            0, 0, north_mps=north, east_mps=east, latency_s=rng.choice([0.3, 0.8, 1.5]), speed_setpoint_mps=12.0,
+            forward_mps2=rng.choice([None, 0.0, BRAKES]), pending=tuple((n, e, 0.0) for n, e in pending),
+        )  # fmt: skip
+        n, e = direction(rng, 12.0)
+        asked = VelocityArgs(n, e, hold_s=rng.choice([0.3, 0.5, 1.0]))
+        places = shapely.points(flown(rng, now, pending, asked))
+        holds = swept(now, (0.0, 0.0), asked).ground
+        furthest_m = max(furthest_m, float(shapely.distance(holds, places).max()))
+        blind = Situation(**{f: getattr(now, f) for f in Situation.__slots__ if f != "pending"})
+        missed_m = max(missed_m, float(shapely.distance(swept(blind, (0.0, 0.0), asked).ground, places).max()))
+    assert furthest_m < now.airframe.tracking_m, "legs keep that much more"
+    assert missed_m > 2.0, "it is what is pending that makes the difference"
+
+
+def test_a_drone_that_was_told_to_fly_on_does_not_go_on_braking() -> None:
+    braking = at(0, 0, east_mps=8, forward_mps2=-2.5, latency_s=0.5)
+    told = at(0, 0, east_mps=8, forward_mps2=-2.5, latency_s=0.5, pending=((0.0, 8.0, 0.0),))
+    stopped = at(0, 0, east_mps=8, forward_mps2=-2.5, latency_s=0.5, pending=((0.0, 0.0, 0.0),))
+    assert surge(told).speed_mps == 8.0
+    assert surge(stopped).speed_mps == surge(braking).speed_mps < 7.0
+    assert stop_point(told, (0.0, 0.0))[0] > stop_point(braking, (0.0, 0.0))[0] + 3.0
+
+
+def test_a_drone_that_was_told_to_fly_does_not_stand() -> None:
+    assert not moving(at(0, 0))
+    assert moving(at(0, 0, pending=((5.0, 0.0, 0.0),)))
+    assert not moving(at(0, 0, pending=((0.0, 0.0, 0.0),)))
+
+
+def test_a_leg_is_judged_for_a_drone_that_may_have_begun_another() -> None:
+    grant = compiled(exclusion(box(-30, 3.5, 30, 30)))
+    aside = goto(30, 0, speed_mps=5.0)
+    assert judge(aside, at(0, 0), grant).permits
+    verdict = judge(aside, at(0, 0, latency_s=0.8, pending=((9.0, 0.0, 0.0),)), grant)
+    assert not verdict.permits or verdict.brake_first
+
+
+def test_a_setpoint_that_was_refused_is_not_let_through_by_the_next() -> None:
+    grant = compiled(exclusion(box(-30, 30, 30, 60)))
+    call = Call("SetVelocity", VelocityArgs(9.0, 0.0, hold_s=1.0))
+    hot = at(0, 4, north_mps=8.9, forward_mps2=-2.0, latency_s=0.5, speed_setpoint_mps=9.0, pending=((9.0, 0.0, 0.0),))
+    assert not judge(call, hot, grant).permits

@@ -1,0 +1,81 @@
+"""A zone is never crossed because a drone may come to rest behind it: only because it certainly does not before it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from fractus_core.policy.engine import judge
+from fractus_core.policy.values import Airframe, Call, Situation, VelocityArgs
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from policy_world import at, box, compiled, exclusion, goto, policy, zone
+
+RETRACES = Airframe(retraces=True)
+
+
+@settings(max_examples=400, deadline=None)
+@given(
+    thick=st.floats(0.2, 8.0),
+    speed=st.floats(0.5, 14.0),
+    away=st.floats(0.05, 60.0),
+    latency=st.sampled_from([0.05, 0.3, 1.0, 1.8]),
+    forward=st.sampled_from([None, -2.5, -1.0, 0.0, 2.5]),
+    beyond=st.floats(0.0, 30.0),
+    velocity=st.booleans(),
+)
+def test_only_who_cannot_stop_before_a_zone_may_fly_on_through_it(
+    thick: float, speed: float, away: float, latency: float, forward: float | None, beyond: float, velocity: bool
+) -> None:
+    grant = compiled(exclusion(box(-60, away, 60, away + thick)), operationArea=[])
+    now: Situation = at(
+        0, 0, north_mps=speed, latency_s=latency, forward_mps2=forward, airframe=RETRACES, speed_setpoint_mps=max(speed, 5.0)
+    )  # fmt: skip
+    asked = (
+        Call("SetVelocity", VelocityArgs(speed, 0.0, hold_s=2.0)) if velocity else goto(0, away + thick + 5.0 + beyond)
+    )
+    verdict = judge(asked, now, grant)
+    if verdict.permits and not verdict.brake_first:
+        flown = verdict.args
+        if isinstance(flown, VelocityArgs) and math.hypot(flown.north_mps, flown.east_mps) < speed - 0.1:
+            return  # scaled: it stays before the zone
+        reach = speed * speed / (2 * now.airframe.accel_mps2)
+        assert reach >= away or (velocity and away > reach + 2.0 * speed), "it could stop before it"
+
+
+@pytest.mark.parametrize("thick", [0.5, 2.0, 4.0])
+def test_a_drone_that_certainly_enters_may_leave_at_the_far_side(thick: float) -> None:
+    grant = compiled(exclusion(box(-60, 5, 60, 5 + thick)), operationArea=[])
+    now = at(0, 0, north_mps=9.0, forward_mps2=0.0, airframe=RETRACES)
+    assert judge(goto(0, 60), now, grant).permits
+
+
+def test_a_drone_inside_a_thin_zone_may_leave_it() -> None:
+    grant = compiled(exclusion(box(-60, -1, 60, 1)), operationArea=[])
+    for end in (30, -30):
+        assert judge(goto(0, end), at(0, math.copysign(0.2, end), airframe=RETRACES), grant).permits
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    gap=st.floats(0.2, 6.0),
+    speed=st.floats(0.5, 14.0),
+    away=st.floats(0.05, 60.0),
+    latency=st.sampled_from([0.05, 0.3, 1.0, 1.8]),
+    forward=st.sampled_from([None, -2.5, 0.0, 2.5]),
+)
+def test_only_who_cannot_stop_before_a_gap_may_fly_on_across_it(
+    gap: float, speed: float, away: float, latency: float, forward: float | None
+) -> None:
+    here, there = box(-60, -60, 60, away), box(-60, away + gap, 60, 200)
+    now: Situation = at(
+        0, 0, north_mps=speed, latency_s=latency, forward_mps2=forward, airframe=RETRACES, speed_setpoint_mps=max(speed, 5.0)
+    )  # fmt: skip
+    grants = (
+        compiled(policy("in", "GeofenceControl", "inclusion", [zone("a", here), zone("b", there)]), operationArea=[]),
+        compiled(operationArea=[here, there]),
+    )
+    for grant in grants:
+        verdict = judge(goto(0, away + gap + 40.0), now, grant)
+        if verdict.permits and not verdict.brake_first:
+            assert speed * speed / (2 * now.airframe.accel_mps2) >= away, "it could stop before it"

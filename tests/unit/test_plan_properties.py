@@ -283,6 +283,119 @@ def test_no_edge_node_gets_more_than_it_has_and_none_is_refused_that_has_room(wa
         assert all((name, node) in placed or milli > room for node, room in left.items())
 
 
+# -- locations that compete for nodes --
+
+
+def wanting(name, *locations, milli=100):
+    """A static component with locations: middle, radius, and the number of instances."""
+    spots = [
+        {"center": at(*middle), "radius": radius, "instances": instances} for middle, radius, instances in locations
+    ]
+    return asking(name, "edge", milli, locations=spots)
+
+
+def hosted(app, stock):
+    """The nodes of each location of each component, or the component that has none at some location."""
+    try:
+        result = plan(app, stock)
+    except Infeasible as error:
+        return error.component
+    found = {(c.name, i): [] for c in app.spec.components for i in range(len(c.locations))}
+    for placed in result.placements:
+        found[placed.component, placed.location].append(placed.node)
+    return found
+
+
+def most_that_can_be_hosted(app, stock, rooms):
+    """By trying all: the most instances that all locations can have, each at least one; None if some gets none.
+
+    Instances ask for a share of the rooms that is the same for all.
+    """
+    slots = [(c.name, spot) for c in app.spec.components for spot in c.locations]
+    inside = [
+        [n.name for n in stock.edge_nodes.values() if geodesic_m(spot.center, n.spec.location) <= spot.radius]
+        for _, spot in slots
+    ]
+
+    def best(i, used):
+        if i == len(slots):
+            return 0
+        name, spot = slots[i]
+        free = [n for n in inside[i] if (name, n) not in used and sum(m == n for _, m in used) < rooms[n]]
+        found = None
+        for count in range(1, spot.instances + 1):
+            for chosen in itertools.combinations(free, count):
+                rest = best(i + 1, used | {(name, n) for n in chosen})
+                if rest is not None:
+                    found = max(found or 0, count + rest)
+        return found
+
+    return best(0, frozenset())
+
+
+spots = st.tuples(st.tuples(st.integers(0, 4).map(lambda i: 10 * i), st.just(0)), st.sampled_from([4, 11, 21, 60]))
+
+
+@given(
+    st.lists(st.lists(st.tuples(spots, st.integers(1, 2)), min_size=1, max_size=3), min_size=1, max_size=2), st.data()
+)
+@settings(max_examples=examples(600), deadline=None)
+def test_no_location_starves_another(wanted, data):
+    edges = [edge(f"e{i}", (10 * i, 0)) for i in range(5)]
+    rooms = {e.name: data.draw(st.integers(0, 2)) for e in edges}
+    stock = inventory(edges=edges, hosts=[host(n, "edge", cpu=room / 10) for n, room in rooms.items()])
+    app = application(*(wanting(f"S{i}", *[(*spot, k) for spot, k in some]) for i, some in enumerate(wanted)))
+    found = hosted(app, stock)
+    most = most_that_can_be_hosted(app, stock, rooms)
+    if most is None:
+        assert isinstance(found, str)
+        return
+    assert sum(map(len, found.values())) == most
+    for name, room in rooms.items():
+        used = [owner for (owner, _), nodes in found.items() for node in nodes if node == name]
+        assert len(used) == len(set(used)) <= room
+    for (owner, i), nodes in found.items():
+        spot = app.spec.component(owner).locations[i]
+        assert 1 <= len(nodes) <= spot.instances
+        assert all(geodesic_m(spot.center, stock.edge_nodes[n].spec.location) <= spot.radius for n in nodes)
+
+
+def test_a_location_yields_the_node_that_another_one_needs():
+    edges = [edge("a", (0, 0)), edge("b", (30, 0))]
+    both, only = ((0, 0), 50, 1), ((0, 0), 10, 1)
+    found = hosted(application(wanting("S", both, only)), inventory(edges=edges))
+    assert found == {("S", 0): ["b"], ("S", 1): ["a"]}
+    assert hosted(application(wanting("S", both), wanting("T", only)), inventory(edges=edges))["S", 0] == ["a"]
+    small = [host(e.name, "edge", cpu=0.1) for e in edges]
+    found = hosted(application(wanting("S", both), wanting("T", only)), inventory(edges=edges, hosts=small))
+    assert found == {("S", 0): ["b"], ("T", 0): ["a"]}
+
+
+def test_a_location_of_all_nodes_leaves_others_their_node():
+    edges = [edge("a", (0, 0)), edge("b", (30, 0))]
+    found = hosted(application(wanting("S", ((0, 0), 50, "*"), ((0, 0), 10, 1))), inventory(edges=edges))
+    assert found == {("S", 0): ["b"], ("S", 1): ["a"]}
+
+
+def test_a_further_instance_moves_nothing_that_runs():
+    app = application(wanting("S", ((0, 0), 50, 1), ((0, 0), 10, 2)))
+    few = [edge("a", (0, 0)), edge("c", (1, 0))]
+    before = plan(app, inventory(edges=few))
+    assert {(p.location, p.node) for p in before.placements} == {(0, "a"), (1, "c")}
+    stock = inventory(edges=[*few, edge("b", (30, 0))])
+    assert plan(app, stock, previous=before).placements == before.placements
+    assert hosted(app, stock) == {("S", 0): ["b"], ("S", 1): ["a", "c"]}
+
+
+def test_a_location_that_cannot_have_a_node_says_who_needs_them():
+    only = ((0, 0), 10, 1)
+    with pytest.raises(Infeasible) as caught:
+        plan(application(wanting("S", only, only)), inventory(edges=[edge("a", (0, 0))]))
+    assert caught.value.message == (
+        "no node can host S at locations[1]: a hosts S for locations[0], which has no other node"
+    )
+
+
 # -- sharing a flying drone --
 
 OTHER = ("default", "other")
@@ -355,6 +468,21 @@ def test_partial_control_takes_drones_of_depots_nearby():
         plan(application(navigator([at(950, 0, 10)], point=start)), inventory(fleet))
 
 
+def test_partial_control_from_a_named_depot_takes_its_drones_and_those_near_it():
+    fleet = [
+        drone("away", home=(2500, 0), minutes=60),
+        drone("far", home=(2500, 10), depot="other", minutes=60),
+        drone("near", home=(1900, 0), depot="other", minutes=60),
+    ]
+    app = application(navigator(PATH, control="partial"))
+    result = plan(app, inventory(fleet))
+    assert {result.drone.node, *(a.node for a in result.drone.alternatives)} == {"away", "near"}
+    assert reasons(result) == {("Navigator", "far"): "TooFar"}
+    with pytest.raises(Infeasible, match="near is 1900 m from the start, more than 1000 m"):
+        plan(app, inventory(fleet[1:]), Settings(depot_radius_m=1000))
+    assert reasons(plan(application(navigator(PATH)), inventory(fleet)))["Navigator", "near"] == "OtherDepot"
+
+
 def test_full_control_at_a_position_takes_the_drones_of_the_depot_there():
     start = {"position": at(15, 0)}
     fleet = [drone("kept", home=(400, 0)), drone("stray", home=(60, 0), depot=None)]
@@ -411,11 +539,26 @@ def test_far_nodes_are_listed_up_to_a_number_and_the_rest_is_counted():
     viewer = VIEWERS | {"egress": [], "locations": [{"center": at(0, 0), "radius": 100}]}
     result = plan(application(viewer), inventory(edges=edges))
     assert sum(r.reason == "OutsideLocation" for r in result.rejected) == 20
-    assert result.rejected_omitted is None
+    assert result.rejected_omitted == 20
     viewer["locations"][0]["instances"] = "*"
     few = plan(application(viewer), inventory(edges=edges), Settings(rejections_listed=35))
     assert [r.reason for r in few.rejected].count("ServiceMissing") == 30
-    assert (len(few.rejected), few.rejected_omitted) == (35, 15)
+    assert (len(few.rejected), few.rejected_omitted) == (35, 15 + 20)
+
+
+def test_every_node_is_listed_hosts_something_is_not_needed_or_is_counted():
+    fleet = [drone("d", minutes=30), *(drone(f"f{i:02d}", home=(9000 + i, 0), depot=None) for i in range(30))]
+    edges = [edge("short", (200, 60), wifi=40), edge("near", (200, 0))]
+    edges += [edge(f"e{i:02d}", (150, 600 + i)) for i in range(50)]
+    result = plan(application(navigator(PATH), VIEWER, CHECKER), inventory(fleet, edges))
+    listed = reasons(result)
+    assert listed["ImageChecker", "short"] == "NoCoverage"
+    assert sum(component == "ImageChecker" for component, _ in listed) == 1 + 20
+    assert sum(component == "Navigator" for component, _ in listed) == 20
+    assert result.rejected_omitted == (50 - 20) + (30 - 20)
+    with pytest.raises(Infeasible) as caught:
+        plan(application(navigator(PATH)), inventory(fleet[1:]))
+    assert (len(caught.value.rejected), caught.value.omitted) == (20, 10)
 
 
 def test_plan_at_80_degrees_across_the_antimeridian():

@@ -21,7 +21,7 @@ class Ledger:
 
     def __init__(self, hosts: Mapping[str, Host], kept: Iterable[tuple[Component, str]] = ()) -> None:
         self._hosts = hosts
-        self._placed: dict[str, dict[str, float]] = {}
+        self._placed: dict[str, dict[str, Mapping[str, float]]] = {}
         self._kept: dict[str, dict[str, Mapping[str, float]]] = {}
         for component, node in kept:
             self._kept.setdefault(node, {})[component.name] = requests(component)
@@ -36,20 +36,23 @@ class Ledger:
         """
         host = self._hosts[node]
         placed = self._placed.get(node, {})
-        kept = [amounts for name, amounts in self._kept.get(node, {}).items() if name not in asking]
+        kept = [
+            amounts for name, amounts in self._kept.get(node, {}).items() if name not in asking and name not in placed
+        ]
         for resource, amount in wanted.items():
-            free = host.allocatable.get(resource, 0.0) - host.requested.get(resource, 0.0) - placed.get(resource, 0.0)
-            free -= sum(amounts.get(resource, 0.0) for amounts in kept)
+            free = host.allocatable.get(resource, 0.0) - host.requested.get(resource, 0.0)
+            free -= sum(amounts.get(resource, 0.0) for amounts in (*placed.values(), *kept))
             if amount > free + 1e-9:
                 return f"{resource}: {amount:g} asked, {max(free, 0.0):g} free"
         return None
 
     def take(self, node: str, component: Component) -> None:
         """Book the component's requests on the node."""
-        self._kept.get(node, {}).pop(component.name, None)
-        placed = self._placed.setdefault(node, {})
-        for resource, wanted in requests(component).items():
-            placed[resource] = placed.get(resource, 0.0) + wanted
+        self._placed.setdefault(node, {})[component.name] = requests(component)
+
+    def release(self, node: str, component: Component) -> None:
+        """Undo the booking of a component; what was kept for it is kept again."""
+        self._placed[node].pop(component.name)
 
 
 def requests(component: Component) -> dict[str, float]:

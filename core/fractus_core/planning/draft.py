@@ -25,13 +25,20 @@ _MAX_INSTANCE_NAME = 57
 
 
 class Infeasible(Exception):
-    """No plan exists for the application; says which component has no host and why each node was dropped."""
+    """No plan exists for the application; says which component has no host and why each node was dropped.
 
-    def __init__(self, component: str, reason: str, message: str, rejected: Iterable[Rejection] = ()) -> None:
+    Attributes:
+        omitted: how many nodes that were too far away are not among those rejected.
+    """
+
+    def __init__(
+        self, component: str, reason: str, message: str, rejected: Iterable[Rejection] = (), omitted: int = 0
+    ) -> None:
         self.component = component
         self.reason = reason
         self.message = message
         self.rejected = tuple(rejected)
+        self.omitted = omitted
         super().__init__(message)
 
 
@@ -66,10 +73,15 @@ class Draft:
         self._placed: set[tuple[str, str | None]] = set()
         self._rejected: dict[tuple[str, str], Rejection] = {}
         self._far: dict[tuple[str, str], Rejection] = {}
+        self._candidates: dict[str, tuple[set[str], int]] = {}
 
     def had(self, component: Component, node: str) -> bool:
         """Whether the plan before had the component on the node."""
         return (component.name, node) in self._used_before
+
+    def placed(self, component: Component, node: str) -> bool:
+        """Whether this plan has the component on the node."""
+        return (component.name, node) in self._placed
 
     def flew(self, drone: str, *, shared: bool) -> bool:
         """Whether the plan before had the drone, and in the same way: for itself alone, or coming along."""
@@ -92,6 +104,14 @@ class Draft:
         notes = self._far if far else self._rejected
         notes.setdefault((component.name, node), check.rejection(component, node))
 
+    def consider(self, component: Component, names: Iterable[str], known: int) -> None:
+        """Note which nodes are candidates for a component by place, of how many that are known: the others are too far."""
+        self._candidates[component.name] = (set(names), known)
+
+    def rejected(self, component: Component, node: str) -> bool:
+        """Whether a node that was a candidate by place is rejected for a component."""
+        return (component.name, node) in self._rejected
+
     def far_note(self, component: Component, node: str) -> str:
         """Why a node was not a candidate by place; empty if that was not noted."""
         found = self._far.get((component.name, node))
@@ -109,7 +129,8 @@ class Draft:
         rejected = self.rejections(component)
         why = "; ".join(r.message for r in rejected[:5]) or nothing
         more = f"; and {len(rejected) - 5} more" if len(rejected) > 5 else ""
-        return Infeasible(component.name, reason, f"{problem}: {why}{more}", rejected)
+        omitted = self._unlisted(component.name, {r.node for r in rejected})
+        return Infeasible(component.name, reason, f"{problem}: {why}{more}", rejected, omitted)
 
     # -- deciding --
 
@@ -155,7 +176,17 @@ class Draft:
         kept = wanted[: self.settings.rejections_listed]
         order = {c.name: i for i, c in enumerate(self.spec.components)}
         kept.sort(key=lambda r: (order[r.component], r.node))
-        return tuple(kept), len(wanted) - len(kept)
+        mentioned: dict[str, set[str]] = {}
+        for name, node in (*notes, *self._placed):
+            if node is not None:
+                mentioned.setdefault(name, set()).add(node)
+        far = sum(self._unlisted(name, mentioned.get(name, set())) for name in self._candidates)
+        return tuple(kept), len(wanted) - len(kept) + far
+
+    def _unlisted(self, component: str, mentioned: set[str]) -> int:
+        """How many nodes were too far away for a component, and are not mentioned."""
+        candidates, known = self._candidates.get(component, (set(), 0))
+        return max(known - len(candidates | mentioned), 0)
 
 
 def _check_state(node: EdgeNode) -> Check:

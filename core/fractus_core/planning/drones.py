@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from fractus_core.api.components import Component
-from fractus_core.api.geometry import Point, Position
+from fractus_core.api.geometry import Point
 from fractus_core.api.nodes import Drone
 from fractus_core.api.plans import Alternative, DroneChoice, Mission
 from fractus_core.geo import ground
 from fractus_core.planning.area import OperationArea, start_of
 from fractus_core.planning.candidates import SUITABLE, Check, check_host, check_resources, check_services, readiness
 from fractus_core.planning.draft import Draft
-from fractus_core.planning.flight import Estimate, MissionEstimator, first_missed, remaining_minutes, transit_legs
+from fractus_core.planning.flight import (
+    Estimate,
+    MissionEstimator,
+    first_missed,
+    home_of,
+    remaining_minutes,
+    transit_legs,
+)
 from fractus_core.planning.index import Near
 from fractus_core.planning.inventory import DroneFacts
+from fractus_core.planning.legality import Way, WayJudge
 
 _DAY_MIN = 1440.0
 _ALTERNATIVES = 10
@@ -56,7 +64,8 @@ def find_drones(draft: Draft, area: OperationArea) -> DroneCandidates:
     """The candidates by place: from depots at or near the start, and for passengers alone also those that fly by."""
     leader = draft.spec.driver or next(draft.spec.on("drone"))
     flying = _flying_by(draft, leader) if draft.spec.driver is None else []
-    names = set(_standing(draft, area, leader))
+    names = set(_standing(draft, area, leader, flying))
+    draft.consider(leader, [*names, *flying], len(draft.located.stands) + len(draft.located.homeless))
     idle = [draft.inventory.drones[name] for name in sorted(names - set(flying)) if name in draft.inventory.drones]
     return DroneCandidates(tuple(idle), tuple(draft.inventory.drones[name] for name in flying))
 
@@ -84,44 +93,82 @@ def choose_drone(draft: Draft, area: OperationArea, candidates: DroneCandidates)
         nothing = f"of {known} known drones none is anywhere near the start" if known else "there is no drone"
         raise draft.infeasible(leader, reason, f"no drone can fly {leader.name}", nothing)
     ranked.sort(key=lambda r: (not draft.flew(r.drone.name, shared=r.used), -r.score, r.drone.name))
-    best = ranked[0]
+    best, way, conflict = _legal_first(draft, area, ranked, leader)
     for component in components:
         draft.place(component, "drone", best.drone.name)
-    home = _home(draft, best.drone)
+    home = home_of(best.drone, draft.inventory.depots)
     legs = transit_legs(draft.spec, area, home, draft.inventory.depots) if home is not None and not best.used else []
-    return DroneChoice(
+    others = [r for r in ranked if r is not best and not draft.rejected(leader, r.drone.name)]
+    choice = DroneChoice(
         node=best.drone.name,
         score=round(best.score, 6),
         shared_with="/".join(draft.inventory.flights[best.drone.name].holder) if best.used else None,
-        mission=_mission(best.mission) if best.mission is not None else None,
+        mission=_mission(best.mission, way) if best.mission is not None else None,
         transit=tuple(legs),
-        alternatives=tuple(
-            Alternative(node=r.drone.name, score=round(r.score, 6)) for r in ranked[1 : 1 + _ALTERNATIVES]
-        ),
+        alternatives=tuple(Alternative(node=r.drone.name, score=round(r.score, 6)) for r in others[:_ALTERNATIVES]),
     )
+    return way.noted(choice, conflict) if way is not None else choice
+
+
+def _legal_first(
+    draft: Draft, area: OperationArea, ranked: Sequence[_Ranked], leader: Component
+) -> tuple[_Ranked, Way | None, str | None]:
+    """The first drone that the policies let fly its way, with that way; those before it are rejected.
+
+    Where there is none, the first of all, with the conflict. A drone that has the application already stays, unless
+    conflicts are forbidden.
+
+    Raises:
+        Infeasible: there is none, and conflicts are forbidden.
+    """
+    judge = WayJudge(draft.application, area, draft.inventory, draft.settings)
+    forbids = draft.settings.policy_conflicts == "forbid"
+    tried: list[tuple[_Ranked, Way | None, str | None]] = []
+    for candidate in ranked:
+        if judge.exhausted:
+            break
+        kept = draft.flew(candidate.drone.name, shared=candidate.used)
+        way = judge.way(candidate.drone, candidate.mission)
+        available = candidate.mission.available_min if candidate.mission is not None and not kept else None
+        conflict = way.conflict(available) if way is not None else None
+        tried.append((candidate, way, conflict))
+        if conflict is None or (kept and not forbids):
+            break
+    legal = tried[-1][2] is None
+    if not legal and not forbids:
+        return tried[0]
+    for candidate, _, conflict in tried:
+        if conflict is not None:
+            draft.reject(leader, candidate.drone.name, Check("PolicyConflict", f"{candidate.drone.name}: {conflict}"))
+    if legal:
+        return tried[-1]
+    for candidate in ranked[len(tried) :]:
+        message = (
+            f"{candidate.drone.name} was not looked at, after {len(tried)} whose ways policies do not let be flown"
+        )
+        draft.reject(leader, candidate.drone.name, Check("NotJudged", message))
+    raise draft.infeasible(leader, "PolicyConflict", f"no drone may fly {leader.name}", "")
 
 
 # -- by place --
 
 
-def _standing(draft: Draft, area: OperationArea, leader: Component) -> list[str]:
+def _standing(draft: Draft, area: OperationArea, leader: Component, flying: Sequence[str]) -> list[str]:
     """Drones that stand where the application wants them; notes the nearest that do not."""
     located, settings = draft.located, draft.settings
     first = leader.control_points[0] if leader.control_points else None
     start = start_of(first, draft.inventory.depots) if first is not None else None
-    if first is not None and first.point is not None and first.point.depot is not None:
-        depot = draft.inventory.depots[first.point.depot]
-        centre, limit = depot.spec.location, depot.spec.radius
-        kept = located.kept_in(depot.name)
-        reason, wanted = "OtherDepot", f"not in {depot.name}"
-    elif start is not None and leader.control != "partial":
-        centre, limit = ground(start), settings.safety_radius_m
-        kept = frozenset().union(*(located.kept_in(name) for name in _depots_around(draft, centre)))
-        reason, wanted = "TooFar", f"more than {limit:.0f} m"
+    named = first.point.depot if first is not None and first.point is not None else None
+    centre = ground(start) if start is not None else area.start
+    inside = draft.inventory.depots[named].spec.radius if named is not None else settings.safety_radius_m
+    kept = located.kept_in(named) if named is not None else frozenset()
+    if start is None or leader.control == "partial":
+        limit, reason = max(settings.depot_radius_m, inside), "TooFar"
     else:
-        centre, limit = area.start, settings.depot_radius_m
-        kept = frozenset()
-        reason, wanted = "TooFar", f"more than {limit:.0f} m"
+        limit, reason = inside, "TooFar" if named is None else "OtherDepot"
+        if named is None:
+            kept = frozenset().union(*(located.kept_in(name) for name in _depots_around(draft, centre)))
+    wanted = f"not in {named}" if reason == "OtherDepot" else f"more than {limit:.0f} m"
     here = {name for name, _ in located.stands.within(centre, limit)} | kept
     for name, distance in located.stands.nearest(centre, settings.near_misses, limit, settings.near_miss_m):
         if name not in here and name in draft.inventory.drones:
@@ -130,7 +177,7 @@ def _standing(draft: Draft, area: OperationArea, leader: Component) -> list[str]
                 place = f"is kept in {draft.inventory.drones[name].spec.depot or 'no depot'},"
             message = f"{name} {place} {distance:.0f} m from the start, {wanted}"
             draft.reject(leader, name, Check(reason, message), far=True)
-    for name in sorted(located.homeless - kept)[: settings.near_misses]:
+    for name in sorted(located.homeless - kept - set(flying))[: settings.near_misses]:
         message = f"{name} has neither a depot that exists nor a home; set spec.depot or spec.home"
         draft.reject(leader, name, Check("NoHome", message))
     return sorted(here)
@@ -170,7 +217,7 @@ def _judge(
     """The drone with its score, or None with the first rule it fails noted."""
     leader = draft.spec.driver or components[0]
     kept = draft.flew(drone.name, shared=used)
-    home = _home(draft, drone)
+    home = home_of(drone, draft.inventory.depots)
     mission = asked.estimate(home, drone) if home is not None and not used else None
     check = _lasting(draft, drone, components, mission, kept=kept) and (
         _passing(draft, drone, components, mission, kept=kept, used=used)
@@ -240,19 +287,13 @@ def _too_long(drone: Drone, mission: Estimate, available_min: float, when: str) 
     )
 
 
-def _mission(found: Estimate) -> Mission:
+def _mission(found: Estimate, way: Way | None) -> Mission:
+    flown = way if way is not None and way.legs and way.denied is None else found
     return Mission(
-        distance=round(found.distance_m, 1),
-        duration=round(found.needed_min, 3),
+        distance=round(flown.distance_m, 1),
+        duration=round(flown.needed_min, 3),
         available=round(found.available_min, 3),
     )
-
-
-def _home(draft: Draft, drone: Drone) -> Position | None:
-    """Where the drone stands, on the ground."""
-    depot = draft.inventory.depots.get(drone.spec.depot or "")
-    place = drone.spec.home or (depot.spec.location if depot is not None else None)
-    return Position(lat=place.lat, lon=place.lon) if place is not None else None
 
 
 def _check_state(drone: Drone) -> Check:

@@ -1,4 +1,4 @@
-"""Which edge nodes host static and hybrid components (thesis Algorithms 7 to 10)."""
+"""Which edge nodes host hybrid components (thesis Algorithms 8 and 10)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fractus_core.api.components import Component, EdgeLocation
+from fractus_core.api.components import Component
 from fractus_core.api.geometry import Point
 from fractus_core.api.nodes import Drone, EdgeNode, Interface
 from fractus_core.api.plans import PlannedInstance, Serves
@@ -16,81 +16,8 @@ from fractus_core.planning.area import OperationArea
 from fractus_core.planning.candidates import Check, direct_range_m, direct_reach_m
 from fractus_core.planning.coverage import CoverScene, Samples, greedy_cover
 from fractus_core.planning.draft import Draft
-from fractus_core.planning.index import Near
 
-# -- static components (Algorithms 7 and 9) --
-
-
-def find_static(draft: Draft, component: Component) -> list[list[Near]]:
-    """For each location the edge nodes in it, nearest first; notes the nearest nodes that are in none."""
-    found = [_known(draft, draft.located.edge_nodes.within(spot.center, spot.radius)) for spot in component.locations]
-    inside = {name for nodes in found for name, _ in nodes}
-    limit_m = draft.settings.near_miss_m
-    for i, spot in enumerate(component.locations):
-        for name, distance in draft.located.edge_nodes.nearest(
-            spot.center, draft.settings.near_misses, spot.radius, limit_m
-        ):
-            if name not in inside and name in draft.inventory.edge_nodes:
-                message = f"{name} is {distance:.0f} m from the centre of locations[{i}], more than {spot.radius:.0f} m"
-                draft.reject(component, name, Check("OutsideLocation", message), far=True)
-    return found
-
-
-def place_static(draft: Draft, component: Component, candidates: Sequence[Sequence[Near]]) -> None:
-    """Fill each location with the nearest nodes that suit; where the component is already, it stays.
-
-    Raises:
-        Infeasible: a location that needs instances gets none.
-    """
-    before = {(p.location, p.node) for p in draft.before if p.component == component.name}
-    taken: set[str] = set()
-    for i, (spot, nodes) in enumerate(zip(component.locations, candidates, strict=True)):
-        wanted = len(nodes) if spot.instances == "*" else spot.instances
-        count = 0
-        for name, _ in _staying_first(draft, component, i, nodes, before):
-            if count == wanted:
-                break
-            if name in taken:
-                continue
-            check = draft.check_edge(draft.inventory.edge_nodes[name], component)
-            if check:
-                count += 1
-                taken.add(name)
-                draft.place(component, "static", name, location=i)
-            else:
-                draft.reject(component, name, check)
-        if count == 0 and spot.instances != "*":
-            raise draft.infeasible(
-                component, "NoEdgeNode", f"no node can host {component.name} at locations[{i}]", _nothing(spot)
-            )
-
-
-def _nothing(spot: EdgeLocation) -> str:
-    return f"there is no edge node within {spot.radius:.0f} m of {spot.center.lat:.6f}, {spot.center.lon:.6f}"
-
-
-def _staying_first(
-    draft: Draft,
-    component: Component,
-    location: int,
-    nodes: Sequence[Near],
-    before: set[tuple[int | None, str | None]],
-) -> list[Near]:
-    """Nodes that host the component for this location first, those that do for another one last."""
-
-    def rank(near: Near) -> int:
-        if (location, near[0]) in before or (None, near[0]) in before:
-            return 0
-        return 2 if draft.had(component, near[0]) else 1
-
-    return sorted(nodes, key=rank) if before else list(nodes)
-
-
-def _known(draft: Draft, near: Sequence[Near]) -> list[Near]:
-    return [(name, distance) for name, distance in near if name in draft.inventory.edge_nodes]
-
-
-# -- hybrid components beside static ones (Algorithms 8 and 10) --
+# -- beside static components --
 
 
 @dataclass(slots=True)
@@ -137,10 +64,10 @@ def _beside(draft: Draft, component: Component, here: EdgeNode) -> list[str]:
     found = []
     if ours is None:
         return []
-    for name, distance in _known(draft, draft.located.edge_nodes.within(ground(here.spec.location), ours)):
-        reach = direct_reach_m(here.spec.interfaces, draft.inventory.edge_nodes[name].spec.interfaces)
-        if name == here.name:
+    for name, distance in draft.located.edge_nodes.within(ground(here.spec.location), ours):
+        if name == here.name or name not in draft.inventory.edge_nodes:
             continue
+        reach = direct_reach_m(here.spec.interfaces, draft.inventory.edge_nodes[name].spec.interfaces)
         if reach is None:
             message = f"{name} has no interface that pairs with {here.name}'s"
             draft.reject(component, name, Check("NoDirectInterface", message))
@@ -159,7 +86,7 @@ def _reaches(here: EdgeNode, node: EdgeNode) -> bool:
     return reach is not None and distance_m(ground(here.spec.location), ground(node.spec.location)) <= reach
 
 
-# -- hybrid components along the drone's way (Algorithms 8 and 10) --
+# -- along the drone's way --
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,6 +119,7 @@ def find_along(draft: Draft, component: Component, drone: Drone, area: Operation
         elif reach is not None:
             found.append(i)
             reach_m.append(reach)
+    draft.consider(component, names, len(draft.located.edge_nodes))
     _note_far(draft, component, drone, area, set(names))
     return AlongTheWay(drone, area, [names[i] for i in found], xy[found], np.array(reach_m, dtype=np.float64))
 
@@ -228,9 +156,9 @@ def place_along(draft: Draft, component: Component, other: Component, along: Alo
 
 def _note_useless(draft: Draft, component: Component, scene: CoverScene, hosts: HybridHosts) -> None:
     """Note candidates whose own reach falls short of the area, though the drone's would not."""
-    node, _, _ = scene.samples.runs(scene.xy, scene.reach_m)
+    node, first, end = scene.samples.runs(scene.xy, scene.reach_m)
     useful = np.zeros(len(scene.names), dtype=bool)
-    useful[node] = True
+    useful[node[end > first]] = True
     for i in np.flatnonzero(~useful).tolist():
         name = scene.names[i]
         if name not in hosts.nodes:

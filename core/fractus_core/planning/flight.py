@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +46,7 @@ class MissionEstimator:
     def __init__(self, spec: ApplicationSpec, area: OperationArea, settings: Settings) -> None:
         self._area = area
         self._settings = settings
-        self._stay_min = sum(p.duration or 0.0 for p in spec.driver.control_points) if spec.driver is not None else 0.0
+        self._stay_min = stay_minutes(spec)
         self._ways: dict[tuple[float, float], tuple[float, float]] = {}
         self._climbs: dict[float | None, tuple[float, float]] = {}
 
@@ -103,6 +104,55 @@ def remaining_minutes(drone: Drone) -> float:
     return mobility.max_flight_time * (battery.remaining if battery else 1.0)
 
 
+def stay_minutes(spec: ApplicationSpec) -> float:
+    """Minutes that a driver will move in the regions of its control points."""
+    return sum(p.duration or 0.0 for p in spec.driver.control_points) if spec.driver is not None else 0.0
+
+
+def home_of(drone: Drone, depots: Mapping[str, Depot]) -> Position | None:
+    """Where a drone stands, on the ground; None where that is not known."""
+    depot = depots.get(drone.spec.depot or "")
+    place = drone.spec.home or (depot.spec.location if depot is not None else None)
+    return Position(lat=place.lat, lon=place.lon) if place is not None else None
+
+
+@dataclass(frozen=True, slots=True)
+class MissionLeg:
+    """A straight piece of a mission.
+
+    Attributes:
+        flown_by: the way home counts as the system's, for any application may leave it to the system.
+        free: the driver finds its own way there, in a region.
+    """
+
+    start: Position
+    end: Position
+    flown_by: Literal["system", "driver"]
+    free: bool = False
+
+
+def mission_legs(
+    spec: ApplicationSpec, area: OperationArea, home: Position, depots: Mapping[str, Depot]
+) -> Iterator[MissionLeg]:
+    """The legs from the drone's stand and back to it, in order."""
+    driver, at = spec.driver, home
+    if driver is None:
+        for place in area.route:
+            yield MissionLeg(at, place, "system")
+            at = place
+    for point, route in zip(
+        driver.control_points if driver is not None else (),
+        control_routes(driver.control_points, depots) if driver is not None else (),
+        strict=True,
+    ):
+        for i, place in enumerate(route):
+            transit = i == 0 and driver is not None and driver.control == "partial"
+            roams = point.region is not None and i == len(route) - 1
+            yield MissionLeg(at, place, "system" if transit else "driver", free=roams and not transit)
+            at = place
+    yield MissionLeg(at, home, "system")
+
+
 def transit_legs(
     spec: ApplicationSpec, area: OperationArea, home: Position, depots: Mapping[str, Depot]
 ) -> list[TransitLeg]:
@@ -111,18 +161,13 @@ def transit_legs(
     To and between the control points of a driver with partial control, through all points of interest of an
     application without a driver, and home from there. A driver with full control flies all of it.
     """
-    driver = spec.driver
-    if driver is not None and driver.control != "partial":
+    if spec.driver is not None and spec.driver.control != "partial":
         return []
-    if driver is None:
-        stops = [home, *area.route, home]
-        pairs = list(itertools.pairwise(stops))
-    else:
-        routes = [route for route in control_routes(driver.control_points, depots) if route]
-        entries = [*(route[0] for route in routes), home]
-        exits = [home, *(route[-1] for route in routes)]
-        pairs = list(zip(exits, entries, strict=True))
-    return [TransitLeg(start=a, end=b) for a, b in pairs if (a.lat, a.lon) != (b.lat, b.lon)]
+    return [
+        TransitLeg(start=leg.start, end=leg.end)
+        for leg in mission_legs(spec, area, home, depots)
+        if leg.flown_by == "system" and (leg.start.lat, leg.start.lon) != (leg.end.lat, leg.end.lon)
+    ]
 
 
 def flight_of(application: Application, depots: Mapping[str, Depot], reached: int = 0) -> Flight:

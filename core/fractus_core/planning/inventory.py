@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 from fractus_core.api.geometry import Position
 from fractus_core.api.model import InvalidObject
@@ -113,6 +114,8 @@ DroneScore = Callable[[DroneFacts], float]
 """Scores a drone, higher is better; equals go by name."""
 
 
+PolicyConflicts = Literal["warn", "forbid"]
+
 _BOUNDS = {
     "safety_radius_m": ("safety radius", 0.1, 10_000.0),
     "depot_radius_m": ("depot radius", 0.0, math.inf),
@@ -138,6 +141,10 @@ class Settings:
         near_misses: how many nodes a plan lists that were too far away to be candidates, for each place asked for.
         near_miss_m: how far from there they may be to be listed.
         rejections_listed: how many rejected nodes a plan lists at most, so that it fits into an object of Kubernetes.
+        time_s: when the flight begins, in seconds since 1970; None: what policies say of its way is not asked.
+        policy_conflicts: what becomes of a mission whose way policies do not let be flown, where no drone has another one:
+            the plan warns, or there is none.
+        flat_terrain: whether the ground counts as level with home everywhere, as for the mobility service.
         score_drone: replaces the ranking of drones.
         cover: replaces the choice of nodes that cover the operation area.
     """
@@ -152,6 +159,9 @@ class Settings:
     near_misses: int = 20
     near_miss_m: float = 100_000.0
     rejections_listed: int = 5000
+    time_s: float | None = None
+    policy_conflicts: PolicyConflicts = "warn"
+    flat_terrain: bool = False
     score_drone: DroneScore | None = None
     cover: CoverStrategy | None = None
 

@@ -14,15 +14,9 @@ from fractus_core.planning.area import OperationArea, operation_area
 from fractus_core.planning.candidates import check_host, check_resources
 from fractus_core.planning.draft import Draft, Infeasible, instance_name
 from fractus_core.planning.drones import choose_drone, find_drones
-from fractus_core.planning.edges import (
-    HybridHosts,
-    find_along,
-    find_static,
-    place_along,
-    place_beside,
-    place_static,
-)
+from fractus_core.planning.edges import HybridHosts, find_along, place_along, place_beside
 from fractus_core.planning.inventory import Inventory, Settings
+from fractus_core.planning.statics import find_static, place_static
 
 __all__ = ["Infeasible", "instance_name", "plan", "plan_in_steps"]
 
@@ -44,9 +38,9 @@ def plan(
     long as they are suitable, so that a new plan moves as little as it can.
 
     Rejected nodes: every node that was a candidate by its place and was looked at is listed with the first rule it
-    fails. Of the nodes that are too far away, only the nearest are (Settings.near_misses for each place asked for);
-    nodes behind the best ones, which did not have to be looked at, are not. Above Settings.rejections_listed the plan tells
-    how many it leaves out.
+    fails. Of the nodes that are too far away, only the nearest are (Settings.near_misses for each place asked for), and
+    Settings.rejections_listed of all; the plan tells how many it leaves out. Nodes behind the best ones, which did not have to
+    be looked at, are not rejected.
 
     Raises:
         Infeasible: some component has no suitable node.
@@ -91,17 +85,16 @@ def _drafted(draft: Draft) -> Generator[str, None, DeploymentPlanSpec]:
         yield "drone.candidates"
         choice = choose_drone(draft, area, drones)
         yield "drone.host"
+    locations = [location for component in draft.spec.on("edge") for location in find_static(draft, component)]
+    yield "static.candidates"
+    place_static(draft, locations)
+    yield "static.host"
     # Hybrid components go beside those that have their places already, so these come first.
     for placement in _IN_ORDER:
         for component in draft.spec.on(placement):
             match placement:
-                case "drone":
-                    pass  # choose_drone has placed them, all on one drone.
-                case "edge":
-                    nodes = find_static(draft, component)
-                    yield "static.candidates"
-                    place_static(draft, component, nodes)
-                    yield "static.host"
+                case "drone" | "edge":
+                    pass  # They are placed: all on one drone, and the static ones.
                 case "hybrid":
                     _place_cloud(draft, component, 1)
                     yield "cloud.host"

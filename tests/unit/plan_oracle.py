@@ -1,0 +1,761 @@
+"""Random fleets, applications and policies, and what a plan of them must be, by looking at everything.
+
+The oracle knows the rules (thesis chapter 8.5 and its errata, docs/policies.md), but nothing of the planner's indexes, searches and
+geometry: distances are geodesics, flights are sampled, zones are circles around which a grid is flooded, instances are
+assigned by trying all. Where a figure is so near its bound that rounding decides, a scene is `Undecided`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+import shapely
+from fractus_core.api import Application, Depot, Drone, EdgeNode, Policy, Zone
+from fractus_core.api.geometry import Position
+from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.geo import LocalFrame, geodesic_m
+from fractus_core.planning import Flight, Host, Infeasible, Inventory, Settings, operation_area, plan
+from fractus_core.planning.coverage import Samples
+
+NOW_S = 1_780_000_000.0
+FLOWN_M = 10.0
+"""The altitude of all waypoints."""
+SAFETY_M, NEAR_M, RESERVE, CRUISE_MPS, CLIMB_MPS = 7.0, 800.0, 0.2, 5.0, 1.5
+MARGIN_M = 2.5
+"""What a leg from standstill keeps from zones: position error and deviation of the autopilot."""
+STEP_M = 3.0
+CPU, ROOMS = 0.1, (0.05, 0.1, 0.2, 0.2, 4.0, 4.0)
+OTHER = ("default", "other")
+
+
+class Undecided(Exception):
+    """Rounding decides."""
+
+
+# -- scenes --
+
+
+@dataclass
+class Scene:
+    """What is planned, and what the oracle is told of it in plain figures."""
+
+    application: Application
+    stock: Inventory
+    settings: Settings
+    frame: LocalFrame
+    zones: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+
+    def xy(self, place: Any) -> tuple[float, float]:
+        return self.frame.xy(place.lat, place.lon)
+
+
+class Maker:
+    """Makes the scene of a seed."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = random.Random(seed)
+        self.frame = LocalFrame(self.rng.choice([0.0, 39.36, -33.9, 64.1]), self.rng.choice([22.93, 179.9995, -0.0004]))
+
+    def at(self, x: float, y: float, alt: float | None = None) -> dict[str, float]:
+        lat, lon = self.frame.latlon(x, y)
+        return {"lat": lat, "lon": lon} | ({"alt": alt} if alt is not None else {})
+
+    def somewhere(self, size: float) -> tuple[float, float]:
+        return self.rng.uniform(-size, size), self.rng.uniform(-size, size)
+
+    def scene(self) -> Scene:
+        rng = self.rng
+        self.depots = {
+            f"depot-{i}": {"location": self.at(*self.somewhere(500 * i)), "radius": rng.choice([20, 60, 300])}
+            for i in range(rng.randint(1, 3))
+        }
+        path = [self.somewhere(250) for _ in range(rng.randint(1, 4))]
+        drones, edges = self.drones(), self.edges()
+        components = self.aboard(path)
+        components += self.on_the_ground([c["name"] for c in components if c["name"] == "Viewer"])
+        application = Application.from_body(body("Application", "app", {"components": components}))
+        zones, policies = self.policies(path)
+        hosts = [self.host(d.name, "drone") for d in drones] + [self.host(e.name, "edge") for e in edges]
+        hosts += [self.host(f"cloud-{i}", "cloud") for i in range(rng.randint(0, 2) or 1)]
+        flights = self.flights(path, drones) if rng.random() < 0.7 else {}
+        claimed = {name: flight.holder for name, flight in flights.items()}
+        stock = Inventory(
+            hosts={h.name: h for h in hosts},
+            drones={d.name: d for d in drones},
+            edge_nodes={e.name: e for e in edges},
+            depots={n: Depot.from_body(body("Depot", n, s)) for n, s in self.depots.items()},
+            zones={n: Zone.from_body(body("Zone", n, z)) for n, z in zones.items()},
+            policies={n: Policy.from_body(body("Policy", n, p)) for n, p in policies.items()},
+            claimed=claimed,
+            flights=flights,
+        )
+        settings = Settings(
+            depot_radius_m=NEAR_M, time_s=NOW_S, policy_conflicts=rng.choice(["warn", "forbid"]), near_misses=3
+        )
+        circles = {
+            n: (*self.frame.xy(*z["area"]["circle"]["center"].values()), z["area"]["circle"]["radius"])
+            for n, z in zones.items()
+        }
+        return Scene(application, stock, settings, self.frame, circles)
+
+    def host(self, name: str, node_class: str) -> Host:
+        rng = self.rng
+        plain = rng.random() < 0.92
+        return Host(
+            name,
+            {"fractus.dev/class": node_class},
+            {"cpu": rng.choice(ROOMS) if node_class != "cloud" or rng.random() < 0.1 else 4.0},
+            ready=plain or rng.random() < 0.5,
+            schedulable=plain or rng.random() < 0.5,
+        )
+
+    def interfaces(self) -> list[dict[str, Any]]:
+        reach = self.rng.choice([None, 80, 80, 150, 150])
+        wifi = [{"technology": "WiFi", "range": reach, "pairing": {"networkId": "n"}}] if reach else []
+        return [{"technology": "4G"}, *wifi]
+
+    def drones(self) -> list[Drone]:
+        rng, found = self.rng, []
+        for i in range(rng.randint(1, 6)):
+            depot = rng.choice([*self.depots, "depot-0", "depot-0", None])
+            home = self.at(*self.somewhere(rng.choice([30, 300, 900]))) if depot is None or rng.random() < 0.2 else None
+            if rng.random() < 0.03:
+                depot, home = None, None
+            mobility = {
+                "maxAltitude": rng.choice([8, *[80] * 9]),
+                "maxFlightTime": rng.choice([4, 15, 30, 30, 60]),
+                "maxSpeed": rng.choice([2, 15, 15]),
+                "methods": ["Arm", "Takeoff", "Goto"] if rng.random() < 0.97 else ["Arm"],
+            }
+            services = {"camera": {"methods": ["CaptureImage"]}} if rng.random() < 0.95 else {}
+            services |= {"mobility": mobility} if rng.random() < 0.98 else {}
+            ready = {
+                "type": "Ready",
+                "status": "True" if rng.random() < 0.95 else "False",
+                "reason": "R",
+                "lastTransitionTime": "2026-01-01T00:00:00Z",
+            }
+            status = {
+                "battery": {"remaining": rng.choice([0.4, 0.9, 1.0])},
+                "flightState": rng.choice(["inactive", "inactive", "charging"]),
+                "conditions": [ready],
+            }
+            spec = {"interfaces": self.interfaces(), "services": services}
+            spec |= {k: v for k, v in (("depot", depot), ("home", home)) if v is not None}
+            found.append(Drone.from_body(body("Drone", f"d{i}", spec, status=status)))
+        return found
+
+    def edges(self) -> list[EdgeNode]:
+        return [
+            EdgeNode.from_body(
+                body("EdgeNode", f"e{i}", {"location": self.at(*self.somewhere(300)), "interfaces": self.interfaces()})
+            )
+            for i in range(self.rng.choice([0, 3, 5, 7, 9]))
+        ]
+
+    def aboard(self, path: Sequence[tuple[float, float]]) -> list[dict[str, Any]]:
+        rng = self.rng
+        way = [self.at(x, y, FLOWN_M) for x, y in path]
+        camera = [{"service": "camera", "methods": ["CaptureImage"]}] if rng.random() < 0.7 else []
+        viewer = component("Viewer", "drone", services=camera, **{"class": "passenger"})
+        kind = rng.choice(["none", "tour", "tour", "full", "full", "partial", "partial"])
+        if kind == "none":
+            return []
+        if kind == "tour":
+            return [viewer | {"pointsOfInterest": {"points": way, "ordered": True}}]
+        starts: list[dict[str, Any]] = [
+            {},
+            {"point": {"depot": "depot-0"}},
+            {"point": {"position": self.at(*path[0], FLOWN_M)}},
+        ]
+        points = [{**rng.choice(starts), "navigation": "pathBased", "path": way}]
+        if kind == "partial" and len(way) > 1 and rng.random() < 0.5:
+            points = [points[0] | {"path": way[:1]}, {"navigation": "pathBased", "path": way[1:]}]
+        mobility = [{"service": "mobility", "methods": ["Arm", "Takeoff", "Goto"]}]
+        driver = component(
+            "Driver", "drone", services=mobility, control=kind, controlPoints=points, **{"class": "driver"}
+        )
+        return [driver, *([viewer] if rng.random() < 0.5 else [])]
+
+    def on_the_ground(self, viewers: list[str]) -> list[dict[str, Any]]:
+        rng, found = self.rng, []
+        for i in range(rng.choice([0, 0, 1, 1, 2])):
+            locations = [
+                {
+                    "center": self.at(*self.somewhere(150)),
+                    "radius": rng.choice([100, 200, 300]),
+                    "instances": rng.choice([1, 1, 2, "*"]),
+                }
+                for _ in range(rng.choice([1, 1, 2, 3]))
+            ]
+            found.append(component(f"Static{i}", "edge", locations=locations))
+        targets = [c["name"] for c in found[:1]] + viewers
+        found += [component("Checker", "hybrid", hybridTo=targets)] if targets else []
+        found.append(component("Store", "cloud"))
+        return found
+
+    def policies(self, path: Sequence[tuple[float, float]]) -> tuple[dict[str, Any], dict[str, Any]]:
+        rng = self.rng
+        zones: dict[str, Any] = {}
+        policies: dict[str, Any] = {}
+        for i in range(rng.choice([0, 1, 1, 2, 3])):
+            x, y = rng.choice([*path, self.somewhere(400)])
+            centre = self.at(x + rng.uniform(-60, 60), y + rng.uniform(-60, 60))
+            zones[f"z{i}"] = {"area": {"circle": {"center": centre, "radius": rng.choice([5, 15, 40])}}}
+            policies[f"keep-out-{i}"] = {"type": "GeofenceControl", "kind": "exclusion"} | self.scope([f"z{i}"])
+        if rng.random() < 0.25:
+            limit = {"type": "LimitControl", "kind": "speed", "upperLimit": rng.choice([0.5, 1.5, 4])}
+            policies["slow"] = limit | self.scope([])
+        if rng.random() < 0.25:
+            edge = rng.choice([{"upperLimit": 6}, {"lowerLimit": 20}, {"upperLimit": 6, "action": "refuse"}])
+            policies["height"] = {"type": "LimitControl", "kind": "altitude"} | edge | self.scope([])
+        return zones, policies
+
+    def scope(self, zones: list[str]) -> dict[str, Any]:
+        """For whom and when a policy holds."""
+        rng = self.rng
+        selector: dict[str, Any] = {"zones": zones}
+        if rng.random() < 0.6:
+            names = rng.sample([f"d{i}" for i in range(5)], 2)
+            selector["nodes"] = [{"key": "name", "operator": rng.choice(["In", "NotIn"]), "values": names}]
+        if rng.random() < 0.15:
+            selector["applications"] = {"names": [rng.choice(["app", "another"])]}
+        begin, end = rng.choice(
+            [(None, None)] * 6 + [(NOW_S + 5, None), (NOW_S + 1e6, None), (None, NOW_S - 5), (None, NOW_S + 5)]
+        )
+        window = {k: stamp(t) for k, t in (("validFrom", begin), ("validUntil", end)) if t is not None}
+        return {"selector": selector} | window
+
+    def flights(self, path: Sequence[tuple[float, float]], drones: list[Drone]) -> dict[str, Flight]:
+        """What drones of another application fly: along this one's points, against their order, past some, or elsewhere."""
+        rng, found = self.rng, {}
+        for drone in rng.sample(drones, rng.randint(0, min(2, len(drones)))):
+            way = list(path)
+            match rng.choice(["along", "against", "past", "elsewhere"]):
+                case "along":
+                    way = [self.somewhere(300), *((x + rng.uniform(-4, 4), y) for x, y in way), self.somewhere(300)]
+                case "against":
+                    way = way[::-1]
+                case "past":
+                    way = [(x, y + rng.choice([0, 30])) for x, y in way]
+                case _:
+                    way = [self.somewhere(400) for _ in range(3)]
+            found[drone.name] = Flight(OTHER, (tuple(Position.model_validate(self.at(x, y, FLOWN_M)) for x, y in way),))
+        return found
+
+
+def body(kind: str, name: str, spec: dict[str, Any], **more: Any) -> dict[str, Any]:
+    return {"apiVersion": "fractus.dev/v1alpha1", "kind": kind, "metadata": {"name": name}, "spec": spec, **more}
+
+
+def component(name: str, placement: str, **more: Any) -> dict[str, Any]:
+    container = {"image": "app", "ports": [{"port": 80}], "resources": {"requests": {"cpu": f"{1000 * CPU:.0f}m"}}}
+    return {"name": name, "placement": placement, "container": container, **more}
+
+
+def stamp(time_s: float) -> str:
+    return datetime.fromtimestamp(time_s, UTC).isoformat()
+
+
+# -- what must be --
+
+
+@dataclass
+class Judged:
+    """What becomes of a way: None where rounding decides."""
+
+    legal: bool
+    needed_min: float
+    changed: bool
+
+
+class Oracle:
+    """What a plan of a scene must be."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.spec = scene.application.spec
+        self.stock = scene.stock
+        self.left = {name: host.allocatable["cpu"] for name, host in scene.stock.hosts.items()}
+        self.reasons: dict[str, str] = {}
+
+    def near(self, a: Any, b: Any, limit_m: float) -> bool:
+        distance = geodesic_m(a, b)
+        if abs(distance - limit_m) < 0.02:
+            raise Undecided
+        return distance <= limit_m
+
+    def host_is_fine(self, name: str, count: int = 1) -> bool:
+        host = self.stock.hosts[name]
+        return host.ready and host.schedulable and self.left[name] >= count * CPU - 1e-9
+
+    # -- the drone --
+
+    def expected_drone(self) -> str | None:
+        """The drone that flies; None where there is none (raises nothing)."""
+        leader = self.spec.leader
+        assert leader is not None
+        candidates = []
+        for name, drone in self.stock.drones.items():
+            flight = self.stock.flights.get(name)
+            used = self.spec.driver is None and flight is not None and self.visits(flight)
+            if not used and not self.stands_right(drone):
+                continue
+            reason = self.reason(drone, used=used)
+            if reason:
+                self.reasons[name] = reason
+            else:
+                minutes = drone.spec.services.mobility.max_flight_time if drone.spec.services.mobility else 0.0
+                assert drone.status is not None
+                assert drone.status.battery is not None
+                ready = 2.0 if used else 0.0 if drone.status.flight_state == "charging" else 1.0
+                score = ready + min(minutes * drone.status.battery.remaining / 1440, 0.999)
+                candidates.append((-score, name, used))
+        candidates.sort()
+        for _, name, used in candidates:
+            if used or self.legal(self.stock.drones[name]):
+                return name
+            self.reasons[name] = "PolicyConflict"
+        if candidates and self.scene.settings.policy_conflicts == "warn":
+            for _, name, _ in candidates:
+                del self.reasons[name]
+            return candidates[0][1]
+        return None
+
+    def home(self, drone: Drone) -> Any:
+        depot = self.stock.depots.get(drone.spec.depot or "")
+        return drone.spec.home or (depot.spec.location if depot is not None else None)
+
+    def stands_right(self, drone: Drone) -> bool:
+        home, driver = self.home(drone), self.spec.driver
+        if home is None:
+            return False
+        first = driver.control_points[0] if driver is not None else None
+        point = first.point if first is not None else None
+        kept = point is not None and point.depot is not None and drone.spec.depot == point.depot
+        if point is not None and point.depot is not None:
+            named = self.stock.depots[point.depot].spec
+            limit = max(NEAR_M, named.radius) if driver is not None and driver.control == "partial" else named.radius
+            return kept or self.near(named.location, home, limit)
+        if driver is not None and driver.control == "full" and point is not None:
+            depot = self.stock.depots.get(drone.spec.depot or "")
+            around = depot is not None and self.near(depot.spec.location, point.position, depot.spec.radius)
+            return around or self.near(point.position, home, SAFETY_M)
+        return self.near(self.route()[0], home, NEAR_M)
+
+    def route(self) -> list[Any]:
+        if self.spec.driver is None:
+            assert self.spec.points_of_interest is not None
+            return list(self.spec.points_of_interest.points)
+        found: list[Any] = []
+        for point in self.spec.driver.control_points:
+            if point.point is not None:
+                found.append(
+                    self.stock.depots[point.point.depot].spec.location if point.point.depot else point.point.position
+                )
+            found += point.path or ()
+        return found
+
+    def reason(self, drone: Drone, *, used: bool) -> str:
+        """The first rule that a drone fails; empty if it keeps all."""
+        return next((reason for reason, broken in self.rules(drone, used=used) if broken), "")
+
+    def rules(self, drone: Drone, *, used: bool) -> Iterator[tuple[str, bool]]:
+        """The rules in their order, each with whether a drone fails it."""
+        services, mobility, status = drone.spec.services, drone.spec.services.mobility, drone.status
+        assert status is not None
+        aboard = list(self.spec.on("drone"))
+        for request in (request for one in aboard for request in one.services):
+            offered = getattr(services, request.service)
+            yield "ServiceMissing", offered is None
+            yield "MethodMissing", not set(request.methods) <= set(offered.methods)
+        needed = 0.0
+        if not used:
+            yield "ServiceMissing", mobility is None
+            assert mobility is not None
+            yield "TooHigh", mobility.max_altitude < FLOWN_M
+            needed = self.flight_min(drone, self.asked_m(drone), CRUISE_MPS, FLOWN_M)
+            yield "FlightTooLong", _over(needed, (1 - RESERVE) * mobility.max_flight_time)
+            yield "Claimed", drone.name in self.stock.claimed
+        host = self.stock.hosts[drone.name]
+        yield "NodeNotReady", not host.ready
+        yield "NodeUnschedulable", not host.schedulable
+        yield "DroneNotReady", status.conditions[0].status != "True"
+        yield "FlightTooLong", not used and _over(needed, self.available_min(drone))
+        yield "InsufficientResources", self.left[drone.name] < len(aboard) * CPU - 1e-9
+
+    def asked_m(self, drone: Drone) -> float:
+        stops = [self.home(drone), *self.route(), self.home(drone)]
+        return sum(geodesic_m(a, b) for a, b in itertools.pairwise(stops))
+
+    def flight_min(self, drone: Drone, distance_m: float, speed_mps: float, height_m: float) -> float:
+        assert drone.spec.services.mobility is not None
+        speed = min(speed_mps, drone.spec.services.mobility.max_speed)
+        return (distance_m / speed + 2 * height_m / CLIMB_MPS) / 60
+
+    def available_min(self, drone: Drone) -> float:
+        mobility, status = drone.spec.services.mobility, drone.status
+        assert mobility is not None
+        assert status is not None
+        assert status.battery is not None
+        return mobility.max_flight_time * (status.battery.remaining - RESERVE)
+
+    def visits(self, flight: Flight) -> bool:
+        """Whether a flight passes all points in order, by looking at it each quarter of a metre."""
+        xy = [self.scene.xy(p) for leg in flight.legs for p in leg]
+        places = [np.array(xy[0])]
+        for a, b in itertools.pairwise(xy):
+            count = max(int(math.dist(a, b) / 0.25), 1)
+            places += [np.array(a) + (np.array(b) - np.array(a)) * k / count for k in range(1, count + 1)]
+        way, at = np.array(places), 0
+        for point in self.route():
+            away = np.hypot(*(way - np.array(self.scene.xy(point))).T)
+            if np.abs(away[at:].min() - SAFETY_M) < 0.3:
+                raise Undecided
+            inside = np.flatnonzero(away[at:] <= SAFETY_M)
+            if not len(inside):
+                # What the flight left behind by a hair may count as ahead.
+                if (away[max(at - 4, 0) :] <= SAFETY_M).any():
+                    raise Undecided
+                return False
+            at += int(inside[0])
+        return True
+
+    # -- policies --
+
+    def holding(self, drone: Drone, minutes: float) -> Iterator[Policy]:
+        for policy in self.stock.policies.values():
+            selector = policy.spec.selector
+            wanted = selector.applications
+            if wanted is not None and "app" not in wanted.names:
+                continue
+            if any((drone.name in e.values) != (e.operator == "In") for e in selector.nodes):
+                continue
+            begin, end = policy.spec.window_s
+            if begin <= NOW_S + minutes * 60 and end > NOW_S:
+                yield policy
+
+    def legal(self, drone: Drone) -> bool:
+        asked_min = self.flight_min(drone, self.asked_m(drone), CRUISE_MPS, FLOWN_M)
+        policies = list(self.holding(drone, asked_min))
+        circles = [self.scene.zones[z] for p in policies for z in p.spec.selector.zones]
+        speed, height, changed = CRUISE_MPS, FLOWN_M, False
+        for policy in policies:
+            spec = policy.spec
+            if spec.kind == "speed" and spec.upper_limit is not None:
+                assert drone.spec.services.mobility is not None
+                changed |= spec.upper_limit < min(CRUISE_MPS, drone.spec.services.mobility.max_speed)
+                speed = min(speed, spec.upper_limit)
+            elif spec.kind == "altitude":
+                if spec.action == "refuse":
+                    return False
+                height = (
+                    min(height, spec.upper_limit or math.inf)
+                    if spec.upper_limit
+                    else max(height, spec.lower_limit or 0)
+                )
+                changed = True
+        home = self.scene.xy(self.home(drone))
+        if _blocked([home, home], circles):
+            return False
+        stops = [home, *map(self.scene.xy, self.route()), home]
+        systems = self.flown_by_system(len(stops) - 1)
+        detour = False
+        for (a, b), system in zip(itertools.pairwise(stops), systems, strict=True):
+            if _blocked([a, b], circles):
+                if not system or not self.way_around(a, b, circles, drone):
+                    return False
+                detour = True
+        if detour or not changed:
+            if detour and (0.4 * self.available_min(drone) < asked_min or changed):
+                raise Undecided  # How long the detour is, is not known here.
+            return True
+        return not _over(self.flight_min(drone, self.asked_m(drone), speed, height), self.available_min(drone))
+
+    def flown_by_system(self, legs: int) -> list[bool]:
+        """Which legs the system flies: all of a tour, those to control points under partial control, and the last."""
+        driver = self.spec.driver
+        if driver is None:
+            return [True] * legs
+        found = []
+        for point in driver.control_points:
+            places = (point.point is not None) + len(point.path or ())
+            found += [driver.control == "partial"] + [False] * (places - 1)
+        return [*found, True]
+
+    def way_around(self, a: tuple[float, float], b: tuple[float, float], circles: Any, drone: Drone) -> bool:
+        """Whether a grid has a way between two places, in the hull of operation area and stand."""
+        if any(abs(math.dist(p, (x, y)) - r - MARGIN_M) < 3 * STEP_M for p in (a, b) for x, y, r in circles):
+            raise Undecided  # The grid is too coarse there.
+        area = operation_area(self.spec, self.stock.depots, SAFETY_M)
+        assert area is not None
+        depot = self.stock.depots.get(drone.spec.depot or "")
+        # The planner's frame lies a few hundred metres off ours: the same to a millimetre.
+        coordinates = shapely.get_coordinates(area.shape)
+        points = [self.scene.frame.xy(*area.frame.latlon(x, y)) for x, y in coordinates]
+        stand = shapely.Point(self.scene.xy(self.home(drone))).buffer(depot.spec.radius if depot is not None else 30.0)
+        hull = shapely.union(shapely.MultiPoint(points), stand).convex_hull
+        answers = {self.floods(a, b, circles, hull, MARGIN_M + slack) for slack in (1.5 * STEP_M, -1.5 * STEP_M)}
+        if len(answers) > 1:
+            raise Undecided
+        return answers.pop()
+
+    def floods(self, a: tuple[float, float], b: tuple[float, float], circles: Any, hull: Any, margin_m: float) -> bool:
+        if _blocked([b, b], circles):
+            return False
+        west, south, east, north = hull.bounds
+        columns, rows = int((east - west) / STEP_M) + 1, int((north - south) / STEP_M) + 1
+        x, y = np.meshgrid(west + STEP_M * np.arange(columns), south + STEP_M * np.arange(rows), indexing="ij")
+        inner = hull.buffer(-margin_m)
+        free = shapely.contains_xy(inner, x, y) if not inner.is_empty else np.zeros_like(x, dtype=bool)
+        for cx, cy, radius in circles:
+            free &= np.hypot(x - cx, y - cy) > radius + margin_m
+        reach = 2 * STEP_M + max(margin_m, 0)
+        begin, goal = (np.hypot(x - p[0], y - p[1]) <= reach for p in (a, b))
+        pending = deque(map(tuple, np.argwhere(begin & free).tolist()))
+        seen = begin & free
+        while pending:
+            i, j = pending.popleft()
+            if goal[i, j]:
+                return True
+            for di, dj in itertools.product((-1, 0, 1), repeat=2):
+                k, m = i + di, j + dj
+                if 0 <= k < columns and 0 <= m < rows and free[k, m] and not seen[k, m]:
+                    seen[k, m] = True
+                    pending.append((k, m))
+        return False
+
+    # -- edge nodes --
+
+    def check_statics(self, found: DeploymentPlanSpec | None) -> bool:
+        """Whether static components are where they must be; with no plan, whether there cannot be one."""
+        slots = [(c.name, i, spot) for c in self.spec.on("edge") for i, spot in enumerate(c.locations)]
+        inside = {
+            (name, i): sorted(
+                (n for n in self.stock.edge_nodes if self.near(spot.center, self.place(n), spot.radius)),
+                key=lambda n, spot=spot: geodesic_m(spot.center, self.place(n)),
+            )
+            for name, i, spot in slots
+        }
+        for nodes, (_, _, spot) in zip(inside.values(), slots, strict=True):
+            away = [geodesic_m(spot.center, self.place(n)) for n in nodes]
+            if any(b - a < 0.01 for a, b in itertools.pairwise(away)):
+                raise Undecided
+        rooms = {n: int(self.left[n] / CPU + 1e-9) if self.host_is_fine(n) else 0 for n in self.stock.edge_nodes}
+        numbered = [(name, i, int(spot.instances)) for name, i, spot in slots if spot.instances != "*"]
+        greedy = self.greedy(numbered, inside, rooms)
+        most = most_instances(numbered, inside, rooms)
+        if found is None:
+            return most is None
+        assert most is not None, "a plan where a location can have no instance"
+        self.check_placed(found, inside, rooms, greedy, most)
+        return True
+
+    def check_placed(
+        self,
+        found: DeploymentPlanSpec,
+        inside: dict[tuple[str, int], list[str]],
+        rooms: dict[str, int],
+        greedy: dict[tuple[str, int], list[str]],
+        most: int,
+    ) -> None:
+        """That the instances of a plan are as many as there can be, and the nearest where the nearest do."""
+        slots = [(c.name, i, spot) for c in self.spec.on("edge") for i, spot in enumerate(c.locations)]
+        numbered = [(name, i, int(spot.instances)) for name, i, spot in slots if spot.instances != "*"]
+        placed: dict[tuple[str, int], list[str]] = {key: [] for key in inside}
+        for p in found.placements:
+            if p.role == "static":
+                placed[p.component, p.location or 0].append(p.node or "")
+        if sum(map(len, greedy.values())) == sum(count for _, _, count in numbered):
+            assert {k: placed[k] for k in greedy} == greedy, "not the nearest nodes"
+        assert sum(len(placed[name, i]) for name, i, _ in numbered) == most, "fewer instances than there can be"
+        for (name, i), nodes in placed.items():
+            assert set(nodes) <= set(inside[name, i]), "outside its location"
+        for name, i, count in numbered:
+            assert 1 <= len(placed[name, i]) <= count, "not as many instances as asked for"
+        for name in {name for name, _, _ in slots}:
+            nodes = [n for (c, _), some in placed.items() if c == name for n in some]
+            assert len(nodes) == len(set(nodes)), "two instances on one node"
+        for some in placed.values():
+            for node in some:
+                rooms[node] -= 1
+                self.left[node] -= CPU
+        assert min(rooms.values(), default=0) >= 0, "more than a node has"
+        for name, i, spot in slots:
+            if spot.instances == "*":
+                hosts = {n for (c, _), some in placed.items() if c == name for n in some}
+                assert all(rooms[n] == 0 or n in hosts for n in inside[name, i]), "a suitable node is left out"
+
+    def place(self, node: str) -> Any:
+        return self.stock.edge_nodes[node].spec.location
+
+    def greedy(self, wanted: Any, inside: Any, rooms: dict[str, int]) -> dict[tuple[str, int], list[str]]:
+        """The nearest nodes, location by location, as the thesis has it."""
+        left, used, found = dict(rooms), set(), {}
+        for name, i, count in wanted:
+            chosen = [n for n in inside[name, i] if left[n] > 0 and (name, n) not in used][:count]
+            found[name, i] = chosen
+            used |= {(name, n) for n in chosen}
+            for n in chosen:
+                left[n] -= 1
+        return found
+
+    def reach_m(self, a: Any, b: Any) -> float | None:
+        ranges = [[i.range for i in node.spec.interfaces if i.range] for node in (a, b)]
+        return min(ranges[0][0], ranges[1][0]) if all(ranges) else None
+
+    def expected_hybrids(self, found: DeploymentPlanSpec) -> list[tuple[str, str]]:
+        """Instances of Checker: (role, node), in order."""
+        checker = self.spec.find("Checker")
+        placed: list[tuple[str, str]] = []
+        for other in checker.hybrid_to if checker is not None else ():
+            if self.spec.component(other).placement == "edge":
+                for static in [p.node or "" for p in found.placements if p.component == other]:
+                    self.place_beside(static, placed)
+            elif found.drone is not None:
+                self.place_along(self.stock.drones[found.drone.node], placed)
+        return placed
+
+    def take(self, name: str, role: str, placed: list[tuple[str, str]]) -> None:
+        self.left[name] -= CPU
+        placed.append((role, name))
+
+    def place_beside(self, static: str, placed: list[tuple[str, str]]) -> None:
+        edges, here = self.stock.edge_nodes, self.stock.edge_nodes[static]
+        around = []
+        for n in edges:
+            reach = self.reach_m(here, edges[n])
+            if n != here.name and reach is not None and self.near(here.spec.location, self.place(n), reach):
+                around.append(n)
+        around.sort(key=lambda n: geodesic_m(here.spec.location, self.place(n)))
+        for n in [here.name, *around]:
+            if n in {node for _, node in placed}:
+                return
+            if self.host_is_fine(n):
+                self.take(n, "hybrid-edge", placed)
+                return
+
+    def place_along(self, drone: Drone, placed: list[tuple[str, str]]) -> None:
+        area = operation_area(self.spec, self.stock.depots, SAFETY_M)
+        assert area is not None
+        xy = Samples(area.shape).xy()
+        covers = {}
+        for n, node in sorted(self.stock.edge_nodes.items()):
+            reach = self.reach_m(drone, node)
+            if reach is not None:
+                away = np.hypot(*(xy - np.array(area.frame.xy(node.spec.location.lat, node.spec.location.lon))).T)
+                covers[n] = away <= reach
+        open_ = np.ones(len(xy), dtype=bool)
+        for n in {node for _, node in placed} & covers.keys():
+            open_ &= ~covers[n]
+        free = [n for n in covers if n not in {node for _, node in placed}]
+        while free and open_.sum() > (1 - 0.95) * len(xy):
+            gains = [int((covers[n] & open_).sum()) for n in free]
+            if max(gains) == 0:
+                return
+            best = free.pop(gains.index(max(gains)))
+            if self.host_is_fine(best):
+                self.take(best, "hybrid-drone", placed)
+                open_ &= ~covers[best]
+
+
+def most_instances(wanted: Any, inside: Any, rooms: dict[str, int]) -> int | None:
+    """By trying all: the most instances that all locations can have, each at least one; None if one can have none."""
+
+    def best(i: int, used: frozenset[tuple[str, str]]) -> int | None:
+        if i == len(wanted):
+            return 0
+        name, index, count = wanted[i]
+        free = [n for n in inside[name, index] if (name, n) not in used and sum(m == n for _, m in used) < rooms[n]]
+        found: int | None = None
+        for k in range(1, count + 1):
+            for chosen in itertools.combinations(free, k):
+                rest = best(i + 1, used | {(name, n) for n in chosen})
+                if rest is not None:
+                    found = max(found or 0, k + rest)
+        return found
+
+    return best(0, frozenset())
+
+
+def _blocked(leg: Sequence[tuple[float, float]], circles: Sequence[tuple[float, float, float]]) -> bool:
+    line = shapely.LineString(leg) if leg[0] != leg[1] else shapely.Point(leg[0])
+    for x, y, radius in circles:
+        away = line.distance(shapely.Point(x, y)) - radius - MARGIN_M
+        if abs(away) < 0.05 + 0.02 * radius:  # The planner's circle is a polygon around it.
+            raise Undecided
+        if away < 0:
+            return True
+    return False
+
+
+def _over(needed: float, available: float) -> bool:
+    if abs(needed - available) < 1e-3 * max(needed, 1):
+        raise Undecided
+    return needed > available
+
+
+def deviation(seed: int) -> str | None:
+    """What is wrong with the plan of a seed's scene; None if it is as the oracle says.
+
+    Raises:
+        Undecided: rounding decides.
+    """
+    scene = Maker(seed).scene()
+    oracle = Oracle(scene)
+    problem: Infeasible | None = None
+    found: DeploymentPlanSpec | None = None
+    try:
+        found = plan(scene.application, scene.stock, scene.settings)
+    except Infeasible as error:
+        problem = error
+    try:
+        if scene.application.spec.leader is not None and not _compare_drone(oracle, found, problem):
+            return None
+        _compare_nodes(oracle, found, problem)
+    except AssertionError as error:
+        return str(error) or "asserts"
+    return None
+
+
+def _compare_drone(oracle: Oracle, found: DeploymentPlanSpec | None, problem: Infeasible | None) -> bool:
+    """Compare the drone, and why others do not fly; whether there is one."""
+    reason, spec = problem.reason if problem is not None else "", oracle.spec
+    flies = oracle.expected_drone()
+    assert (flies is None) == (reason in {"NoDrone", "DroneBusy", "PolicyConflict"}), (
+        f"{flies}, but {reason or 'a plan'}"
+    )
+    leader = (spec.driver or next(spec.on("drone"))).name
+    rejected = problem.rejected if problem is not None else found.rejected if found is not None else ()
+    told = {r.node: r.reason for r in rejected if r.component == leader}
+    if found is not None or flies is None:
+        wrong = {n: (r, told.get(n)) for n, r in oracle.reasons.items() if told.get(n) != r}
+        assert not wrong, f"rejected for another reason: {wrong}"
+    if flies is None:
+        return False
+    assert found is None or (found.drone is not None and found.drone.node == flies), f"another one flies than {flies}"
+    oracle.left[flies] -= CPU * len(list(spec.on("drone")))
+    return True
+
+
+def _compare_nodes(oracle: Oracle, found: DeploymentPlanSpec | None, problem: Infeasible | None) -> None:
+    """Compare where all other components are."""
+    if problem is not None and problem.reason == "NoEdgeNode":
+        assert oracle.check_statics(None), "a location can have an instance"
+        return
+    clouds = [n for n, h in oracle.stock.hosts.items() if h.node_class == "cloud" and oracle.host_is_fine(n)]
+    assert (found is None) == (not clouds), f"cloud {clouds}, {problem}"
+    if found is None:
+        return
+    oracle.check_statics(found)
+    told = [(p.role, p.node) for p in found.placements if p.component == "Checker" and p.node is not None]
+    wanted = oracle.expected_hybrids(found)
+    assert told == wanted, f"hybrids {told}, not {wanted}"

@@ -1,0 +1,246 @@
+"""What the policies say of a mission's way before takeoff: in the plan, by the engine that judges the flight."""
+
+import math
+import random
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import pytest
+from fractus_core.api import Zone
+from fractus_core.api.plans import DroneChoice
+from fractus_core.planning import Infeasible, Settings, operation_area, plan
+from fractus_core.planning.grants import AROUND_WAY_M, _distance_m, compile_grants, flight_grant
+from fractus_core.planning.legality import MAX_LISTED, MAX_SEARCHES, with_legality
+from fractus_core.policy.compiled import compile_grant
+from fractus_core.policy.engine import judge
+from fractus_core.policy.values import Airframe, Call, GotoArgs, Home, Situation
+from test_grants import FENCE, guide, policy, zone
+from test_plan_properties import flown_by_other, shared
+from test_planning import PATH, application, at, drone, inventory, manifest, navigator
+
+NOW = 1_780_000_000.0
+WARN = Settings(time_s=NOW)
+FORBID = Settings(time_s=NOW, policy_conflicts="forbid")
+APP = application(navigator(PATH))
+NEAR = {"control": "partial"}
+
+
+def stock(*policies, zones=(), drones=None, **more):
+    fleet = [drone("d", minutes=30)] if drones is None else drones
+    return inventory(fleet, policies={p.name: p for p in policies}, zones={z.name: z for z in zones}, **more)
+
+
+def fenced(x, y, radius=20, **more):
+    """An inventory with a zone to keep out of."""
+    return stock(policy("keep-out", zones=["z"], **FENCE | more), zones=[zone("z", (x, y), radius)])
+
+
+def outcomes(choice: DroneChoice):
+    return [(leg.flown_by, leg.outcome, leg.policies) for leg in choice.legality]
+
+
+def test_a_legal_way_has_nothing_to_say():
+    for inventory_ in (stock(), fenced(2000, 2000)):
+        choice = plan(APP, inventory_, FORBID).drone
+        assert choice.legality == ()
+        assert choice.policy_conflict is None
+        assert choice.mission == plan(APP, inventory_).drone.mission
+
+
+def test_policies_are_not_asked_without_a_time():
+    assert plan(APP, fenced(200, 0)).drone.legality == ()
+
+
+def test_a_leg_through_a_zone_is_known_before_takeoff():
+    choice = plan(APP, fenced(200, 0), WARN).drone
+    assert outcomes(choice)[0] == ("driver", "Denied", ("keep-out",))
+    assert choice.policy_conflict.startswith("policies do not let the leg to 39.3606")
+    assert "crosses zone z for 40.0 m of policy keep-out" in choice.policy_conflict
+    with pytest.raises(Infeasible) as caught:
+        plan(APP, fenced(200, 0), FORBID)
+    assert caught.value.reason == "PolicyConflict"
+    assert [(r.node, r.reason) for r in caught.value.rejected] == [("d", "PolicyConflict")]
+
+
+def test_the_plan_says_what_the_engine_says_in_flight():
+    inventory_ = fenced(200, 0)
+    found = plan(APP, inventory_, WARN)
+    (grant,) = compile_grants(APP, found, inventory_)
+    start, end = (at(x, 0, 10) for x in (100, 300))
+    home = Home(at(0, 0)["lat"], at(0, 0)["lon"], 0.0)
+    now = Situation(NOW, start["lat"], start["lon"], 10.0, home=home, in_air=True, airframe=Airframe(retraces=True))
+    verdict = judge(Call("Goto", GotoArgs(end["lat"], end["lon"], 10.0)), now, compile_grant(grant))
+    leg = found.drone.legality[0]
+    assert (verdict.code, verdict.reason) == (leg.reason, leg.message)
+
+
+def test_the_system_flies_around_a_zone_and_the_plan_counts_that():
+    partial = application(navigator([at(300, 60, 10), at(330, 60, 10)], point={"position": at(280, 0)}, **NEAR))
+    inventory_ = fenced(140, 0)
+    choice = plan(partial, inventory_, FORBID).drone
+    assert outcomes(choice)[0] == ("system", "Detour", ("keep-out",))
+    assert choice.policy_conflict is None
+    assert choice.mission.distance > plan(partial, inventory_).drone.mission.distance
+
+
+def test_a_zone_around_a_point_is_a_conflict_of_a_tour():
+    tour = application(guide([at(100, 0, 10), at(300, 0, 10)]))
+    choice = plan(tour, fenced(300, 0), WARN).drone
+    assert next(leg for leg in outcomes(choice) if leg[1] == "Denied") == ("system", "Denied", ("keep-out",))
+    with pytest.raises(Infeasible):
+        plan(tour, fenced(300, 0), FORBID)
+
+
+def test_a_depot_inside_a_zone_is_a_conflict():
+    choice = plan(APP, fenced(0, 0), WARN).drone
+    assert choice.legality[0].start == choice.legality[0].end
+    assert choice.policy_conflict is not None
+
+
+def test_a_limit_of_speed_makes_a_mission_too_long():
+    slow = policy("slow", type="LimitControl", kind="speed", upperLimit=0.5)
+    choice = plan(APP, stock(slow), WARN).drone
+    assert {leg[1:] for leg in outcomes(choice)} == {("Corrected", ("slow",))}
+    assert choice.mission.duration == pytest.approx(600 / 0.5 / 60 + 20 / 1.5 / 60, rel=0.01)
+    assert choice.policy_conflict is None
+    short = stock(slow, drones=[drone("d", minutes=20)])
+    choice = plan(APP, short, WARN).drone
+    assert "with what slow ask for the mission takes 20.2 min" in choice.policy_conflict
+    assert "can fly 16.0 min with its reserve kept" in choice.policy_conflict
+    with pytest.raises(Infeasible, match=r"no drone may fly Navigator: d: with what slow"):
+        plan(APP, short, FORBID)
+
+
+def test_a_limit_of_altitude_is_told_and_no_conflict():
+    low = policy("low", type="LimitControl", kind="altitude", upperLimit=8)
+    choice = plan(APP, stock(low), FORBID).drone
+    assert {leg[1:] for leg in outcomes(choice)} == {("Corrected", ("low",))}
+    refusing = policy("low", type="LimitControl", kind="altitude", upperLimit=8, action="refuse")
+    assert plan(APP, stock(refusing), WARN).drone.policy_conflict is not None
+
+
+@pytest.mark.parametrize("how", [WARN, FORBID])
+def test_a_drone_that_may_fly_is_preferred(how):
+    fleet = [drone("a", minutes=30), drone("b", battery=0.9, minutes=30)]
+    banned = policy("ban", zones=["z"], nodes=[{"key": "name", "operator": "In", "values": ["a"]}], **FENCE)
+    inventory_ = stock(banned, zones=[zone("z", (200, 0))], drones=fleet)
+    found = plan(APP, inventory_, how)
+    assert found.drone.node == "b"
+    assert found.drone.alternatives == ()
+    assert [(r.node, r.reason) for r in found.rejected] == [("a", "PolicyConflict")]
+    assert plan(APP, inventory_).drone.node == "a"
+
+
+def test_a_drone_that_has_the_application_stays_unless_that_is_forbidden():
+    fleet = [drone("a", battery=0.9, minutes=30), drone("b", minutes=30)]
+    alone = stock(drones=fleet[:1])
+    before = plan(APP, alone, WARN)
+    banned = policy("ban", zones=["z"], nodes=[{"key": "name", "operator": "In", "values": ["a"]}], **FENCE)
+    inventory_ = stock(banned, zones=[zone("z", (200, 0))], drones=fleet)
+    after = plan(APP, inventory_, WARN, previous=before)
+    assert after.drone.node == "a"
+    assert after.drone.policy_conflict is not None
+    assert plan(APP, inventory_, FORBID, previous=before).drone.node == "b"
+
+
+def test_who_comes_along_has_no_way_of_its_own():
+    tour = application(guide([at(120, 0), at(250, 3)]))
+    base = shared([drone("busy", minutes=30)], {"busy": flown_by_other()})
+    fences = fenced(200, 0)
+    choice = plan(tour, replace(base, policies=fences.policies, zones=fences.zones), FORBID).drone
+    assert choice.shared_with == "default/other"
+    assert choice.legality == ()
+
+
+def test_policies_that_begin_or_end_during_the_mission_count():
+    for begin_s, end_s, conflicts in ((60, 9000, True), (-9000, 60, True), (9000, 9060, False), (-9000, -60, False)):
+        window = {"validFrom": _utc(NOW + begin_s), "validUntil": _utc(NOW + end_s)}
+        choice = plan(APP, fenced(200, 0, **window), WARN).drone
+        assert (choice.policy_conflict is not None) == conflicts, begin_s
+
+
+def _utc(time_s):
+    return datetime.fromtimestamp(time_s, UTC).isoformat()
+
+
+def test_a_driver_in_a_region_finds_its_own_way():
+    region = {"polygon": {"exterior": [at(100, -100), at(300, -100), at(300, 100), at(100, 100)]}}
+    driver = navigator(PATH) | {"controlPoints": [{"navigation": "regionBased", "region": region, "duration": 5}]}
+    choice = plan(application(driver), fenced(200, 0, radius=10), FORBID).drone
+    assert [leg for leg in choice.legality if leg.outcome == "Denied"] == []
+
+
+def test_a_plan_in_force_follows_policies_and_zones():
+    before = plan(APP, stock(), WARN)
+    assert with_legality(APP, before, stock(), WARN) is before
+    after = with_legality(APP, before, fenced(200, 0), WARN)
+    assert after.drone.policy_conflict is not None
+    assert after.placements == before.placements
+    assert with_legality(APP, after, stock(), WARN) == before
+    gone = with_legality(APP, before, stock(drones=[]), WARN)
+    assert gone is before
+
+
+def test_many_legs_are_listed_up_to_a_number():
+    path = [at(100 + i % 2 * 40, i, 10) for i in range(2 * MAX_LISTED)]
+    slow = policy("slow", type="LimitControl", kind="speed", upperLimit=4)
+    choice = plan(application(navigator(path)), stock(slow, drones=[drone("d", minutes=60)]), WARN).drone
+    assert len(choice.legality) == MAX_LISTED
+    assert choice.legality_omitted == 2 * MAX_LISTED + 1 - MAX_LISTED
+
+
+def test_what_cannot_be_resolved_is_left_to_the_grants():
+    broken = policy("keep-out", zones=["nowhere"], **FENCE)
+    assert plan(APP, stock(broken), FORBID).drone.policy_conflict is None
+
+
+def test_zones_that_the_drone_passes_above_are_no_conflict():
+    flat = Zone.from_body(
+        manifest("Zone", "z", {"area": {"circle": {"center": at(200, 0), "radius": 20}}, "altitude": {"upper": 5}})
+    )
+    below = stock(policy("keep-out", zones=["z"], **FENCE), zones=[flat])
+    assert plan(APP, below, FORBID).drone.legality == ()
+
+
+def test_every_zone_around_the_way_counts():
+    rng = random.Random(5)
+
+    def area():
+        x, y = rng.uniform(-3000, 3000), rng.uniform(-3000, 3000)
+        size = rng.choice([5, 300, 3000, 30_000])
+        if rng.random() < 0.5:
+            return {"circle": {"center": at(x, y), "radius": size}}
+        around = [(0, 0), (1, rng.uniform(-1, 0.4)), (1, 1), (rng.uniform(-1, 0.4), 1)]
+        return {"polygon": {"exterior": [at(x + size * (dx - 0.5), y + size * (dy - 0.5)) for dx, dy in around]}}
+
+    zones = [Zone.from_body(manifest("Zone", f"z{i}", {"area": area()})) for i in range(300)]
+    inventory_ = stock(policy("keep-out", zones=[z.name for z in zones], **FENCE), zones=zones)
+    area_ = operation_area(APP.spec, inventory_.depots, 7.0)
+    grant = flight_grant(APP, inventory_.drones["d"], inventory_, area_)
+    corners = [area_.frame.xy(p.lat, p.lon) for p in grant.corridor[0].polygon.exterior]
+    reach_m = max(math.hypot(x, y) for x, y in corners) + AROUND_WAY_M
+    near = {z.name for z in zones if _distance_m(z.spec.area, area_.frame) <= reach_m}
+    assert {z.name for z in grant.policies[0].zones} == near
+    assert 50 < len(near) < 300
+
+
+def test_a_corridor_too_narrow_for_a_driver_is_known_before_takeoff():
+    partial = application(navigator(PATH, point={"position": at(100, 0)}, control="partial"))
+    far = policy("far", type="LimitControl", kind="altitude", upperLimit=70)
+    narrow = replace(WARN, safety_radius_m=2.0)
+    choice = plan(partial, stock(far), narrow).drone
+    assert next(leg.reason for leg in choice.legality if leg.flown_by == "driver") == "OutsideOperationArea"
+    assert plan(partial, stock(far), WARN).drone.legality == ()
+
+
+def test_a_plan_looks_for_a_limited_number_of_ways_around():
+    walls = [zone(f"z{i}", (115, 60 * i), 10) for i in range(MAX_SEARCHES + 5)]
+    tour = application(guide([p for i in range(len(walls)) for p in (at(50, 60 * i, 10), at(180, 60 * i, 10))]))
+    fleet = [drone(f"d{i}", home=(i, 0), minutes=1000) for i in range(3)]
+    inventory_ = stock(policy("keep-out", zones=[z.name for z in walls], **FENCE), zones=walls, drones=fleet)
+    choice = plan(tour, inventory_, WARN).drone
+    assert sum(leg.outcome == "Detour" for leg in choice.legality) == MAX_SEARCHES
+    assert choice.legality[-1].message.startswith("no more ways around are looked for: ")
+    with pytest.raises(Infeasible) as caught:
+        plan(tour, inventory_, FORBID)
+    assert sorted(r.reason for r in caught.value.rejected) == ["NotJudged", "NotJudged", "PolicyConflict"]

@@ -140,7 +140,19 @@ async def driver_lost_on_its_way_home(f: Flight) -> None:
     stream = await f.up(held)
     await f.goto(held, 0, 60)
     returning = f.call("ReturnToLaunch", lambda: f.world.service.return_to_launch(held))
-    await f.until(lambda: f.world.plane.vehicle.mode == RTL)
+    await f.until(lambda: f.world.plane.xy[1] < 40)
+    returning.cancel()
+    stream.cancel()
+    await f.landed()
+
+
+@course
+async def driver_lost_over_its_home(f: Flight) -> None:
+    held = f.put(spec())
+    stream = await f.up(held)
+    await f.goto(held, 0, 60)
+    returning = f.call("ReturnToLaunch", lambda: f.world.service.return_to_launch(held))
+    await f.until(lambda: f.world.plane.vehicle.mode == LAND)
     returning.cancel()
     stream.cancel()
     await f.landed()

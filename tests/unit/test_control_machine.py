@@ -21,7 +21,16 @@ from fractus_core.control.actions import (
     StartSystemTask,
     StopMotion,
 )
-from fractus_core.control.values import ActiveMotion, FlightMode, Grace, ModeKind, SystemTask, TaskKind, VehicleFacts
+from fractus_core.control.values import (
+    ActiveMotion,
+    FlightMode,
+    Grace,
+    ModeKind,
+    SystemTask,
+    TaskKind,
+    VehicleFacts,
+    ended_refusal,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -50,7 +59,7 @@ EVENTS: tuple[told.Event, ...] = (
     told.MotionCancelled(1), told.MotionCancelled(2), told.MotionStopped("Slower", "it is too fast"),
     told.TakeoverDemanded("hover", "X", "x"), told.TakeoverDemanded("land", "X", "x"),
     told.TakeoverDemanded("returnToLaunch", "X", "x"), told.TakeoverDemanded("revoke", "X", "x"),
-    told.BrakeDemanded("PositionUnknown", "x"),
+    told.BrakeDemanded("X", "x"), told.PositionLost("x"), told.PositionFound(),
     told.GrantChanged(None, DRIVER), told.GrantChanged(DRIVER, None), told.GrantChanged(DRIVER, DRIVER),
     told.GrantChanged(None, TOUR), told.GrantChanged(TOUR, None),
     *(told.VehicleObserved(facts) for facts in FACTS),
@@ -296,6 +305,58 @@ def test_a_lost_driver_has_its_grace_and_then_the_vehicle_comes_home() -> None:
     assert home.missions["a"].outcome == Outcome(OutcomeKind.FAILED, "driver lost")
 
 
+def refused_transit(state: ControlState, lease_id: int, begins: float, ends: float) -> ControlState:
+    """A waiting driver for which the system flies until the way is refused, and its stream ends."""
+    for event in (
+        told.StreamOpened(lease_id, "a", "A"),
+        told.TransitRequested(lease_id),
+        told.TransitBegan(lease_id, "a", "A"),
+    ):
+        state, _ = transition(state, event, begins)
+    for event in (told.SystemFlightEnded(lease_id), told.StreamClosed(lease_id)):
+        state, _ = transition(state, event, ends)
+    return state
+
+
+def test_transits_that_are_refused_begin_no_grace_again() -> None:
+    state, _ = told_of(*FLIES, told.StreamClosed(1))
+    for attempt in range(3):
+        state = refused_transit(state, 2 + attempt, 1.0 + attempt, 1.5 + attempt)
+        assert state.grace == Grace(5.0, "a", "driver lost")
+    home, _ = transition(state, told.Tick(), 5.0)
+    assert home.task is not None
+    assert home.task.kind is TaskKind.RETURN
+
+
+def test_a_grace_waits_for_the_end_of_a_transit_and_a_driver_that_gets_the_vehicle_ends_it() -> None:
+    state, _ = told_of(*FLIES, told.StreamClosed(1))
+    asks = (told.StreamOpened(2, "a", "A"), told.TransitRequested(2), told.TransitBegan(9, "a", "A"))
+    flying, _ = told_of(*asks, state=state)
+    assert flying.deadline is None
+    later, _ = transition(flying, told.Tick(), 50.0)
+    assert later.missions["a"].outcome is None
+    arrived, _ = told_of(told.SystemFlightEnded(9), told.GrantControl(2), state=later)
+    assert (arrived.grace, arrived.drives) == (None, True)
+    refused, _ = transition(later, told.SystemFlightEnded(9), 50.0)
+    assert refused.deadline == 5.0
+    home, _ = transition(refused, told.Tick(), 50.0)
+    assert home.missions["a"].outcome == Outcome(OutcomeKind.FAILED, "driver lost")
+
+
+def test_a_way_home_that_fails_each_time_is_left_to_the_autopilot() -> None:
+    state = replace(ControlState(), decided=True, armed_seen=True, vehicle=FLYING)
+    takes = 0
+    for tick in range(100):
+        state, actions = transition(state, told.Tick(), tick * 0.05)
+        takes += any(isinstance(action, RecordAudit) for action in actions)
+        if state.task is not None:
+            state, _ = transition(state, told.SystemTaskEnded(state.task.task_id, finished=False), tick * 0.05)
+    assert takes == 3
+    assert state.unattended_since == 0.0, "so that the heartbeats end"
+    landed, _ = told_of(told.VehicleObserved(replace(FLYING, armed=False, in_air=False)), told.Heartbeat(), state=state)
+    assert (landed.unattended, landed.attended) == (0, True)
+
+
 def test_a_second_stream_that_leaves_while_it_waits_leaves_no_authority_behind() -> None:
     second = (told.StreamOpened(2, "a", "A"), told.StreamClosed(2))
     state, _ = told_of(*ASKS, *second)
@@ -335,6 +396,39 @@ def test_a_mode_that_the_system_did_not_ask_for_is_a_pilots() -> None:
     assert (failsafe.authority, failsafe.returning) == (Authority.SYSTEM, True)
 
 
+def test_a_mode_change_whose_answers_were_lost_is_the_systems() -> None:
+    flies = replace(FLYING, mode=RTL)
+    ours, _ = told_of(*FLIES, told.VehicleObserved(replace(flies, failsafe=True)), told.Heartbeat())
+    given_up, _ = told_of(told.ModeChangeBegan(GUIDED), told.ModeChangeEnded(GUIDED, RTL, done=False), state=ours)
+    shown = (told.VehicleObserved(FLYING), told.Heartbeat())
+    obeyed, _ = told_of(*shown, state=given_up)
+    assert (obeyed.authority, obeyed.task, obeyed.returning) == (Authority.SYSTEM, ours.task, True)
+    other, _ = told_of(told.VehicleObserved(replace(FLYING, mode=LOITER)), told.Heartbeat(), state=given_up)
+    assert other.authority is Authority.PILOT
+    observed, _ = told_of(shown[0], state=given_up)
+    assert transition(observed, shown[1], LATE_S)[0].authority is Authority.PILOT, "too late to be ours"
+
+
+def test_a_return_that_a_pilot_chooses_after_a_failsafe_is_the_pilots() -> None:
+    flies = replace(FLYING, failsafe=True)
+    heard = [(told.VehicleObserved(replace(flies, mode=mode)), told.Heartbeat()) for mode in (RTL, GUIDED, RTL)]
+    taken = (told.ModeChangeBegan(GUIDED), *heard[1], told.ModeChangeEnded(GUIDED, RTL, done=True))
+    ours, _ = told_of(*FLIES, *heard[0], *taken, told.Heartbeat())
+    assert ours.authority is Authority.SYSTEM
+    assert told_of(*heard[2], state=ours)[0].authority is Authority.PILOT
+
+
+def test_a_return_that_is_found_is_told_from_one_of_the_system() -> None:
+    known, _ = told_of(told.ArmingRequested("a", "A", (1.0, 2.0, 3.0)), told.VehicleObserved(replace(FLYING, mode=RTL)))
+    found, _ = told_of(told.VehicleFound(), state=replace(known, expected_mode=None))
+    assert found.task is not None and found.task.found
+    again, _ = told_of(told.VehicleFound(), state=found)
+    assert again.task is not None and again.task.found, "a broken link makes it no one else's"
+    begun, _ = told_of(told.TakeoverDemanded("returnToLaunch", "X", "x"), state=replace(known, expected_mode=RTL))
+    again, _ = told_of(told.VehicleFound(), state=begun)
+    assert again.task is not None and not again.task.found
+
+
 def test_a_mission_that_a_pilot_landed_is_not_granted_again() -> None:
     pilots = FlightMode("LOITER", ModeKind.OTHER)
     taken = (told.VehicleObserved(replace(FLYING, mode=pilots)), told.Heartbeat(), told.StreamOpened(2, "a", "A"))
@@ -362,3 +456,9 @@ def test_a_waiting_driver_that_loses_its_grant_ends_no_other_mission() -> None:
     assert after_.missions["b"].outcome == Outcome(OutcomeKind.REVOKED, "the grant was removed")
     assert (after_.active, after_.lease, after_.removed) == ("a", None, None)
     assert [action.event.state for action in actions if isinstance(action, SendEvent)] == [StreamState.LOST]
+
+
+def test_a_mission_that_is_over_is_refused_with_what_begins_another() -> None:
+    code, reason = ended_refusal(Outcome(OutcomeKind.FAILED, "the driver did not come back"))
+    assert code == "ControlLost"
+    assert reason.endswith("; another flight needs a Grant with another uid")

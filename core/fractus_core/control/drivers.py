@@ -100,7 +100,7 @@ def _grant(step: Step, lease_id: int) -> None:
         return
     mission = step.mission(lease.key, lease.identity)
     step.stop_task()
-    step.set(grace=None, authority=Authority.DRIVER, lease=replace(lease, granted=True))
+    step.set(grace=None, authority=Authority.DRIVER, lease=replace(lease, granted=True), unattended=0)
     step.adopt(mission)
     step.audit("control", "granted", lease.identity, f"control point {mission.points_done}")
     granted = ControlEvent(StreamState.GRANTED, mission.points_done, "", mission.waypoints)
@@ -149,7 +149,11 @@ def _close(step: Step, event: StreamClosed) -> None:
     step.stop_motion(StopKind.LOST, "ControlLost", "the driver's stream broke")
     if step.state.vehicle.armed and not descends:
         step.start(TaskKind.HOVER)
+    before = step.state.grace
     step.begin_grace(mission, DRIVER_LOST)
+    grace = step.state.grace
+    if not lease.granted and grace is not None and before is not None and before.key == grace.key:
+        step.set(grace=replace(grace, until=min(before.until, grace.until)))
 
 
 def _fail_transit(step: Step, event: TransitFailed) -> None:

@@ -151,6 +151,18 @@ class GrantRef:
 
 
 @dataclass(frozen=True, slots=True)
+class PositionLost:
+    """The flying vehicle's position is not known, or not in time."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class PositionFound:
+    """The flying vehicle's position is known."""
+
+
+@dataclass(frozen=True, slots=True)
 class GrantChanged:
     """A grant came, changed or went."""
 
@@ -321,7 +333,7 @@ DriverEvent = (
     | CruiseSpeedSet
 )  # fmt: skip
 MotionEvent = MotionBegan | MotionFinished | MotionFailed | MotionCancelled | MotionStopped
-PolicyEvent = TakeoverDemanded | BrakeDemanded | GrantChanged
+PolicyEvent = TakeoverDemanded | BrakeDemanded | PositionLost | PositionFound | GrantChanged
 VehicleEvent = VehicleObserved | VehicleFound | Heartbeat | Airborne | ModeChangeBegan | ModeChangeEnded
 ArmingEvent = ArmingRequested | ArmingPrepared | MotorStart
 SystemEvent = (

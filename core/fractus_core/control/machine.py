@@ -19,6 +19,8 @@ from fractus_core.control.events import (
     MotionEvent,
     PassengerBoarded,
     PolicyEvent,
+    PositionFound,
+    PositionLost,
     SystemEvent,
     SystemFlightBegan,
     SystemFlightEnded,
@@ -49,8 +51,15 @@ TAKEOVERS: dict[Takeover, tuple[TaskKind, OutcomeKind | None]] = exhaustive(
 )
 """What each takeover that policies name does with the vehicle, and with the mission."""
 
+POSITION_UNKNOWN = "PositionUnknown"
+"""Code of a vehicle that hovers, as far as it hears, until its position is known."""
+
 UNATTENDED = "NoControlAuthority"
 """Code of the takeover of a vehicle that no one has: by a fault of the service, and the last line behind all others."""
+
+MAX_UNATTENDED = 3
+"""How many times a vehicle that no one has is taken: a task that fails each time would be begun again indefinitely. After that
+the supervisor's heartbeats end, and the autopilot's own failsafe brings it home."""
 
 
 def transition(state: ControlState, event: Event, now: float) -> tuple[ControlState, tuple[Action, ...]]:
@@ -103,14 +112,31 @@ def _on_policy(step: Step, event: PolicyEvent) -> None:
                 step.seize(kind, code, reason, policies, outcome)
         case BrakeDemanded(code, reason, policies):
             step.audit("control", "brake", step.state.controller, reason, code, policies=policies)
-            # A position that is not known now may be known in a moment.
-            kind_of_stop = StopKind.PASSING if code == "PositionUnknown" else StopKind.ABORTED
-            step.stop_motion(kind_of_stop, code, reason, policies)
+            step.stop_motion(StopKind.ABORTED, code, reason, policies)
             step.act(Brake())
+        case PositionLost(reason):
+            _position_lost(step, reason)
+        case PositionFound():
+            if step.state.grace is not None and step.state.grace.code == POSITION_UNKNOWN:
+                step.set(grace=None)
+                step.audit("control", "resumed", step.state.controller, "the position is known again")
         case GrantChanged():
             _grant_changed(step, event)
         case _:
             assert_never(event)
+
+
+def _position_lost(step: Step, reason: str) -> None:
+    """Hover; a driver keeps the vehicle and may fly again when the position is known within the grace.
+
+    The motion may be asked for again: a position that is not known now may be known in a moment.
+    """
+    step.audit("control", "brake", step.state.controller, reason, POSITION_UNKNOWN)
+    step.stop_motion(StopKind.PASSING, POSITION_UNKNOWN, reason)
+    step.act(Brake())
+    mission = step.state.mission
+    if step.state.drives and step.state.grace is None and mission is not None:
+        step.begin_grace(mission, reason, POSITION_UNKNOWN)
 
 
 def _grant_changed(step: Step, event: GrantChanged) -> None:
@@ -149,7 +175,10 @@ def _on_system(step: Step, event: SystemEvent) -> None:
                 return  # the system flies only for missions that go on, and where no one else has authority
             if step.state.touring != key:  # a tour begins its own transit, and must not end itself
                 step.stop_task()
-            step.set(grace=None, authority=Authority.SYSTEM)
+            grace = step.state.grace
+            # A transit that is refused again and again must not begin the grace again each time.
+            kept = grace if grace is not None and grace.key == key else None
+            step.set(grace=kept, authority=Authority.SYSTEM)
             step.adopt(step.mission(key, identity))
             step.set(flight=SystemFlight(flight_id, key))
         case SystemFlightBegan(flight_id, key):
@@ -226,7 +255,7 @@ def _task_ended(step: Step, task_id: int, finished: bool) -> None:
 def _on_tick(step: Step) -> None:
     """Deadlines that have come, and the last look: an armed vehicle that no one answers for is taken by the system."""
     grace, motion = step.state.grace, step.state.motion
-    if grace is not None and step.now >= grace.until:
+    if grace is not None and step.now >= grace.until and not step.state.in_transit:
         _end_grace(step)
     if (
         motion is step.state.motion
@@ -235,23 +264,27 @@ def _on_tick(step: Step) -> None:
         and step.now >= motion.hover_at
     ):
         hover_after_cancelled(step)
-    if step.state.decided and not step.state.attended:
-        if step.state.unattended_since is None:
-            step.set(unattended_since=step.now)
-        _attend(step)
     if step.state.attended:
         step.set(unattended_since=None)
+    elif step.state.decided:
+        if step.state.unattended_since is None:
+            step.set(unattended_since=step.now)
+        if step.state.unattended < MAX_UNATTENDED:
+            step.set(unattended=step.state.unattended + 1)
+            _attend(step)
 
 
 def _end_grace(step: Step) -> None:
-    """The driver did not come back: its mission has failed."""
+    """The driver did not come back, or the position: the mission has failed."""
     grace = step.state.grace
     step.set(grace=None)
     mission = step.state.missions.get(grace.key) if grace is not None else None
     if grace is None or mission is None or mission.outcome is not None:
         return
     step.end_mission(mission, OutcomeKind.FAILED, grace.reason)
-    step.audit("takeover", TaskKind.RETURN.value, "system", grace.reason, "DriverLost")
+    step.audit("takeover", TaskKind.RETURN.value, "system", grace.reason, grace.code)
+    if step.state.drives:
+        step.lose_lease(grace.reason)
     if step.state.authority is Authority.SYSTEM and not step.state.returning:
         step.start(TaskKind.RETURN)
 

@@ -132,13 +132,13 @@ class Step:
 
     # The system
 
-    def start(self, kind: TaskKind) -> None:
+    def start(self, kind: TaskKind, *, found: bool = False) -> None:
         """Begin what the system wants of the vehicle; what it did before ends.
 
         Coming down counts as returning from here on, so that no monitor or supervisor interferes before the task runs.
         """
         self.stop_task()
-        task = SystemTask(self.state.last_task_id + 1, kind)
+        task = SystemTask(self.state.last_task_id + 1, kind, found=found)
         self.set(task=task, last_task_id=task.task_id)
         self.set(returning=kind is not TaskKind.HOVER and self.state.vehicle.armed)
         self.act(StartSystemTask(task))
@@ -149,16 +149,16 @@ class Step:
             self.act(StopSystemTask(self.state.task.task_id))
             self.set(task=None)
 
-    def begin_grace(self, mission: Mission, reason: str) -> None:
-        """Give a lost driver its time to come back; on the ground, before any flight, there is nothing to save."""
+    def begin_grace(self, mission: Mission, reason: str, code: str = "DriverLost") -> None:
+        """Give a lost driver or position its time to come back; on the ground, before any flight, there is nothing to save."""
         waits = mission.flown or self.state.vehicle.armed
-        grace = Grace(self.now + self.state.grace_s, mission.key, reason) if waits else None
+        grace = Grace(self.now + self.state.grace_s, mission.key, reason, code) if waits else None
         self.set(grace=grace)
 
-    def follow_descent(self, kind: TaskKind) -> None:
+    def follow_descent(self, kind: TaskKind, *, found: bool = False) -> None:
         """The autopilot comes down by itself: the system watches it to the ground, and does the rest if it stops."""
         self.set(authority=Authority.SYSTEM)
-        self.start(kind)
+        self.start(kind, found=found)
         self.set(returning=True)
 
     def take_back(self, mission: Mission) -> None:

@@ -95,7 +95,7 @@ def ended_refusal(outcome: Outcome) -> tuple[str, str]:
     """Code and reason with which a mission that is over is refused."""
     if outcome.kind is OutcomeKind.COMPLETE:
         return "MissionComplete", "the mission is complete"
-    return "ControlLost", f"the mission has ended ({outcome})"
+    return "ControlLost", f"the mission has ended ({outcome}); another flight needs a Grant with another uid"
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,11 +182,13 @@ class SystemTask:
         task_id: tells it from those before it.
         kind: what it does.
         key: the mission of a tour.
+        found: whether the autopilot was found coming down, by no doing of the system: it may be a pilot's choice.
     """
 
     task_id: int
     kind: TaskKind
     key: str = ""
+    found: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,11 +216,12 @@ class ActiveMotion:
 
 @dataclass(frozen=True, slots=True)
 class Grace:
-    """The time that a lost driver has to come back; when it is over, its mission has failed."""
+    """The time that a lost driver, or a lost position, has to come back; when it is over, the mission has failed."""
 
     until: float
     key: str
     reason: str
+    code: str = "DriverLost"
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,10 +247,13 @@ class ControlState:
         decided: whether it is settled who has the vehicle.
         armed_seen: whether the motors ran at the last heartbeat; None before the first.
         expected_mode: the mode that the vehicle is in by the system's doing, or that is known; another one is foreign.
+        unconfirmed: a mode that the system asked for without an answer, and until when it may still be obeyed.
+        failsafe_seen: whether a failsafe acted at the last heartbeat already.
         mode_changes: how many changes of mode by the system are under way.
         starting_motors: whether the system starts the motors at this moment.
         preparing: how many attempts to arm are under way, from the fence that is raised first to running motors.
         unattended_since: when the armed vehicle was first found without authority over it.
+        unattended: how many times the system took such a vehicle, since it had a driver or stood.
         last_task_id: of the system task that began last.
     """
 
@@ -269,10 +275,13 @@ class ControlState:
     decided: bool = False
     armed_seen: bool | None = None
     expected_mode: FlightMode | None = None
+    unconfirmed: tuple[FlightMode, float] | None = None
+    failsafe_seen: bool = False
     mode_changes: int = 0
     starting_motors: bool = False
     preparing: int = 0
     unattended_since: float | None = None
+    unattended: int = 0
     last_task_id: int = 0
 
     @property
@@ -325,14 +334,20 @@ class ControlState:
             or self.grace is not None
         ):
             return True
-        if self.lease is not None and (self.drives or self.flight is not None):
-            return True
-        return self.task is not None and (self.returning or self.touring is not None)
+        driven = self.lease is not None and (self.drives or self.flight is not None)
+        return driven or (self.task is not None and (self.returning or self.touring is not None))
+
+    @property
+    def in_transit(self) -> bool:
+        """Whether the system flies for a driver that waits: its grace does not end meanwhile."""
+        lease, flight = self.lease, self.flight
+        return lease is not None and flight is not None and not lease.granted and lease.key == flight.key
 
     @property
     def deadline(self) -> float | None:
         """When the next Tick has something to do."""
-        moments = (self.grace.until if self.grace else None, self.motion.hover_at if self.motion else None)
+        grace = self.grace if not self.in_transit else None
+        moments = (grace.until if grace else None, self.motion.hover_at if self.motion else None)
         return min((moment for moment in moments if moment is not None), default=None)
 
     def flies_for(self, key: str) -> bool:
@@ -353,32 +368,33 @@ class Readiness:
     """What else an application must wait for.
 
     Attributes:
-        configured: whether the autopilot's failsafes were set.
-        ready: whether the autopilot would arm.
-        why: what it says when it would not.
+        unverified: why the autopilot's failsafes do not count as set; empty when they do.
+        unready: why the autopilot would not arm; empty when it would.
         located: whether position and home are known.
+        link: what is wrong with the link to the autopilot; empty when nothing is.
     """
 
-    configured: bool
-    ready: bool
-    why: str
+    unverified: str
+    unready: str
     located: bool
+    link: str = ""
 
 
 def not_ready_reason(state: ControlState, key: str, readiness: Readiness) -> str | None:
     """Why the vehicle cannot fly for a mission now; None when it can."""
-    vehicle, why = state.vehicle, readiness.why
+    vehicle = state.vehicle
     reasons = (
         (not vehicle.connected, "the autopilot is not connected"),
         (not state.decided, "it is not known yet what the drone does"),
         (state.taken(key), "another application has the drone"),
-        (not readiness.configured, "the autopilot's failsafes are being set"),
+        (bool(readiness.unverified), f"the autopilot's failsafes are not verified: {readiness.unverified}"),
         (state.authority is Authority.PILOT, f"a human pilot has the drone ({vehicle.mode.name})"),
         (state.returning, "the system brings the drone home"),
         (
-            not vehicle.armed and not readiness.ready,
-            f"the autopilot is not ready to arm{': ' if why else ''}{why}",
+            not vehicle.armed and bool(readiness.unready),
+            f"the autopilot is not ready to arm: {readiness.unready}",
         ),
         (not readiness.located, "position and home are not known yet"),
+        (not vehicle.armed and bool(readiness.link), readiness.link),
     )
     return next((reason for holds, reason in reasons if holds), None)

@@ -19,10 +19,13 @@ from fractus_core.control.events import (
     VehicleObserved,
 )
 from fractus_core.control.step import DRIVER_LOST, Step
-from fractus_core.control.values import Authority, ModeKind, OutcomeKind, TaskKind
+from fractus_core.control.values import Authority, FlightMode, ModeKind, OutcomeKind, TaskKind
 
 FAILSAFE_TEXT_S = 3.0
 """A mode change this soon after the autopilot spoke of a failsafe is the failsafe's."""
+
+UNCONFIRMED_S = 10.0
+"""A mode that the system asked for may show this long after its answer was given up: only the answers may have been lost."""
 
 FLEW_HOME_ALONE = "the autopilot flew home by itself while the mobility service was away"
 
@@ -47,8 +50,10 @@ def on_vehicle(step: Step, event: VehicleEvent) -> None:
         case ModeChangeEnded(mode, before, done):
             step.set(mode_changes=max(step.state.mode_changes - 1, 0))
             # A change that failed for certain is not expected any more; one that the vehicle shows after all is.
-            if not done and step.state.expected_mode == mode and step.state.vehicle.mode != mode:
-                step.set(expected_mode=before)
+            if done:
+                step.set(unconfirmed=None)
+            elif step.state.expected_mode == mode and step.state.vehicle.mode != mode:
+                step.set(expected_mode=before, unconfirmed=(mode, step.now + UNCONFIRMED_S))
         case _:
             assert_never(event)
 
@@ -74,7 +79,8 @@ def _found(step: Step) -> None:
         step.set(armed_seen=vehicle.armed)
     if lease is not None and (lease.granted or step.state.flight is not None):
         return  # the driver, or the transit for one, goes on where the link broke
-    step.set(expected_mode=vehicle.mode)
+    task = step.state.task if step.state.returning and step.state.expected_mode == vehicle.mode else None
+    step.set(expected_mode=vehicle.mode, failsafe_seen=vehicle.failsafe)
     if vehicle.armed and step.state.authority is Authority.PILOT:
         return
     if not vehicle.armed:
@@ -92,11 +98,15 @@ def _found(step: Step) -> None:
     elif comes_down:
         step.end_mission(mission, OutcomeKind.FAILED, FLEW_HOME_ALONE)
         step.audit("takeover", "homeward", "system", f"found the drone in {vehicle.mode.name}")
-        step.follow_descent(TaskKind.LAND if vehicle.mode.kind is ModeKind.LANDING else TaskKind.RETURN)
+        step.follow_descent(_descent(vehicle.mode), found=task is None or task.found)
     else:
         step.set(authority=Authority.SYSTEM)
         step.audit("takeover", TaskKind.HOVER.value, "system", "found the drone in the air")
         step.take_back(mission)
+
+
+def _descent(mode: FlightMode) -> TaskKind:
+    return TaskKind.LAND if mode.kind is ModeKind.LANDING else TaskKind.RETURN
 
 
 def _heartbeat(step: Step) -> None:
@@ -116,6 +126,7 @@ def _heartbeat(step: Step) -> None:
         step.set(expected_mode=vehicle.mode)
     elif step.state.expected_mode is not None and vehicle.mode != step.state.expected_mode:
         _foreign_mode(step)
+    step.set(failsafe_seen=vehicle.failsafe)
 
 
 def _armed(step: Step) -> None:
@@ -128,7 +139,7 @@ def _disarmed(step: Step) -> None:
     """The motors stopped; a driver that has the vehicle keeps it."""
     mission = step.state.mission
     step.stop_task()
-    step.set(returning=False)
+    step.set(returning=False, unattended=0)
     if step.state.authority is Authority.PILOT and mission is not None and mission.flown:
         mission = step.end_mission(mission, OutcomeKind.FAILED, "a human pilot took the drone and landed it")
     if not step.state.granted:
@@ -145,14 +156,20 @@ def _foreign_mode(step: Step) -> None:
     """The mode was changed by others: the autopilot's own failsafe, or a human pilot, who may also hand the vehicle back."""
     state, vehicle, mission = step.state, step.state.vehicle, step.state.mission
     step.set(expected_mode=vehicle.mode)
+    unconfirmed, piloted = state.unconfirmed, state.authority is Authority.PILOT
+    if unconfirmed is not None and vehicle.mode == unconfirmed[0] and step.now < unconfirmed[1] and not piloted:
+        step.set(unconfirmed=None)
+        return  # the system's own change: the autopilot obeyed, and its answers were lost
+    # A failsafe stays reported for the rest of the flight: a pilot may choose the mode long after it.
+    begins = vehicle.failsafe and not state.failsafe_seen
     said = vehicle.failsafe_text if step.now - vehicle.failsafe_text_at < FAILSAFE_TEXT_S else ""
-    if (vehicle.failsafe or said) and vehicle.mode.comes_down and state.authority is not Authority.PILOT:
+    if (begins or said) and vehicle.mode.comes_down and not piloted:
         reason = f"the autopilot's own failsafe took the drone ({said or vehicle.mode.name})"
         step.audit("takeover", vehicle.mode.name, "system", reason, "AutopilotFailsafe")
         step.end_mission(mission, OutcomeKind.FAILED, reason)
         step.lose_lease(reason)
-        step.follow_descent(TaskKind.LAND if vehicle.mode.kind is ModeKind.LANDING else TaskKind.RETURN)
-    elif state.authority is Authority.PILOT and vehicle.mode.commanded and mission is not None:
+        step.follow_descent(_descent(vehicle.mode))
+    elif piloted and vehicle.mode.commanded and mission is not None:
         step.audit("takeover", TaskKind.HOVER.value, "system", "the pilot handed the drone back")
         step.set(authority=Authority.SYSTEM)
         step.take_back(mission)

@@ -28,7 +28,7 @@ from fractus_core.linking import (
 from fractus_core.linking.horizon import UNREACHABLE, Horizon, solve
 from fractus_core.linking.learning import connected, expected, failed, heard, lost
 from fractus_core.linking.prediction import predict
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 CLOUD = PathMetrics(8.0, 8.0, 60.0, 60.0)
@@ -73,6 +73,11 @@ scores = st.one_of(st.just(UNREACHABLE), st.integers(0, 30).map(float))
     st.integers(1, 7).flatmap(lambda n: st.lists(st.lists(scores, min_size=n, max_size=n), min_size=1, max_size=3)),
     st.integers(1, 3),
     st.sampled_from([0.0, 1.0, 5.0]),
+)
+@example(
+    [[UNREACHABLE] * 5, [0.0, UNREACHABLE, 0.0, 9.0, UNREACHABLE], [0.0, UNREACHABLE, 9.0, UNREACHABLE, UNREACHABLE]],
+    2,
+    0.0,
 )
 def test_the_plan_is_the_best_of_all(rows: list[list[float]], connect_steps: int, cost: float) -> None:
     horizon = Horizon(8.0, tuple(tuple(row) for row in rows), connect_steps, cost, 0.5)

@@ -79,19 +79,20 @@ def solve(horizon: Horizon) -> Solution:
     for step in range(horizon.steps - 1, -1, -1):
         after = values[-1]
         up = min(step + horizon.connect_steps, horizon.steps)
-        # All links cost the same to connect to, so the best one is the same from every state.
-        gains = [
-            values[-(up - step)][state] if horizon.reaches(state, step) and horizon.reaches(state, up) else UNREACHABLE
+        # All links cost the same to connect to, so the best one is the same from every state but its own: there it is the
+        # second best.
+        gains = {
+            state: values[-(up - step)][state] + horizon.cloud * (up - step) - horizon.switch_cost
             for state in states[1:]
-        ]
-        target = 1 + max(range(len(gains)), key=gains.__getitem__) if gains else 0
-        connected = horizon.cloud * (up - step) - horizon.switch_cost + (gains[target - 1] if gains else UNREACHABLE)
+            if horizon.reaches(state, step) and horizon.reaches(state, up)
+        }
+        best = sorted(gains, key=gains.__getitem__, reverse=True)[:2]
         left = horizon.cloud + after[0]
         row = []
         for state in states:
             stays = horizon.score(state, step) + after[state] if horizon.reaches(state, step) else UNREACHABLE
-            options = ((stays, state), (left, 0), (connected if target != state else UNREACHABLE, target))
-            row.append(max(options, key=lambda option: option[0]))
+            others = ((gains[target], target) for target in best if target != state)
+            row.append(max((stays, state), (left, 0), *others, key=lambda option: option[0]))
         values.append(tuple(value for value, _ in row))
         moves.append(tuple(move for _, move in row))
     return Solution(tuple(reversed(values)), tuple(reversed(moves)))
@@ -131,7 +132,8 @@ def plan_link(
     direct = tuple(tuple(UNREACHABLE if path is None else heuristic(path) for path in row) for row in rows)
     base = heuristic(cloud)
     advantage = max((score - base for row in direct for score in row), default=0.0)
-    connect_steps = math.ceil((settings.link_up_s + settings.probe_s) / settings.step_s)
+    # A link that is up at once would be one of its own successors.
+    connect_steps = max(math.ceil((settings.link_up_s + settings.probe_s) / settings.step_s), 1)
     cost = max(advantage, 0.0) * settings.switch_cost_s / settings.step_s
     horizon = Horizon(base, direct, connect_steps, cost, settings.step_s)
     solution = solve(horizon)

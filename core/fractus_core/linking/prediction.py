@@ -46,7 +46,8 @@ def _along(track: Track, steps: int, step_s: float) -> list[Position]:
 
 def offered(peer: Peer, reach: Reach, position: Position, settings: Settings) -> PathMetrics | None:
     """What the direct link to a peer is expected to offer from a position; None out of its reach."""
-    share = strength(math.dist(position, peer.position) / (peer.range_m * reach.range_factor), settings.edge)
+    reach_m = peer.range_m * reach.range_factor
+    share = strength(math.dist(position, peer.position) / reach_m, settings.edge) if reach_m > 0 else 0.0
     if share <= 0:
         return None
     factor = share * reach.rate_factor

@@ -12,6 +12,7 @@ from pathlib import Path
 import click
 
 from fractus_vehicle.earth import Place
+from fractus_vehicle.estimator import FULL_START_S
 from fractus_vehicle.links import Hub, LinkError, LinkSpec
 from fractus_vehicle.lockstep import LockstepServer, run_lockstep
 from fractus_vehicle.params import ParameterValueError, UnknownParameterError
@@ -145,7 +146,12 @@ def _parameters(_context: click.Context, _option: click.Parameter, texts: tuple[
 @click.option("--param", "parameters", multiple=True, callback=_parameters, metavar="NAME=VALUE", help="A parameter.")
 @click.option("--wind", callback=_wind, metavar="SPEED,DIR[,TURB]", help="Wind, m/s and degrees it comes from.")
 @click.option(
-    "--ready-after", type=click.FloatRange(0.1), default=32.0, callback=_finite, help="Seconds until ready to arm."
+    "--ready-after",
+    type=click.FloatRange(0.1),
+    default=FULL_START_S,
+    show_default=True,
+    callback=_finite,
+    help="Seconds until ready to arm; less than the default runs through the whole start faster.",
 )
 @click.option("--count", type=click.IntRange(1, 200), default=1, help="Number of vehicles; ports and ids count up.")
 @click.option(
@@ -154,6 +160,13 @@ def _parameters(_context: click.Context, _option: click.Parameter, texts: tuple[
     default=10.0,
     callback=_finite,
     help="Distance between vehicles, metres toward east.",
+)
+@click.option(
+    "--throttle",
+    type=click.IntRange(900, 2100),
+    default=1000,
+    show_default=True,
+    help="Where the radio's throttle stick rests, microseconds; 1500 holds the height in LOITER.",
 )
 @click.option("--store", type=click.Path(path_type=Path), help="File that keeps changed parameters.")
 @click.option(
@@ -180,6 +193,7 @@ def vehicle(
     ready_after: float,
     count: int,
     spacing: float,
+    throttle: int,
     store: Path | None,
     tlog: Path | None,
     lockstep: str | None,
@@ -199,16 +213,19 @@ def vehicle(
         ready_after_s=ready_after,
         parameters=parameters | wind,
         store=store,
+        throttle_us=throttle,
         epoch_us=REPEATABLE_EPOCH_US if lockstep else int(time.time() * 1e6),
     )
     with contextlib.ExitStack() as stack:
-        hub = Hub()
+        hub, opened = Hub(), list[tuple[int, str]]()
         stack.callback(hub.close)
         try:
             simulation = Simulation(formation(config, count, spacing))
             for at, craft in enumerate(simulation.crafts):
-                for port, text in enumerate(links or (DEFAULT_LISTEN,)):
-                    hub.open(LinkSpec.parse(text).shifted(at), craft, port)
+                specs = [LinkSpec.parse(text).shifted(at) for text in links or (DEFAULT_LISTEN,)]
+                for port, spec in enumerate(specs):
+                    hub.open(spec, craft, port)
+                opened.append((craft.config.sysid, " ".join(map(str, specs))))
                 if tlog is not None:
                     name = tlog if count == 1 else tlog.with_stem(f"{tlog.stem}-{craft.config.sysid}")
                     craft.record(stack.enter_context(name.open("wb")))
@@ -217,7 +234,8 @@ def vehicle(
             raise click.ClickException(str(error)) from error
         except UnknownParameterError as error:
             raise click.ClickException(f"unknown parameter {error.args[0]}") from error
-        click.echo(f"vehicle {sysid} ready for connections on {' '.join(links or (DEFAULT_LISTEN,))}", err=True)
+        for number, where in opened:
+            click.echo(f"vehicle {number} ready for connections on {where}", err=True)
         if lockstep_server is not None:
             run_lockstep(simulation, hub, lockstep_server, lambda: stop.wanted)
         else:

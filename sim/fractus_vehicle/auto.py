@@ -30,6 +30,7 @@ class AutoFlight(Flight):
         self._index = 0
         self._arrived_s: float | None = None
         self._started = False
+        self._announced = False
         self._landing = False
         self._returning: ReturnToLaunch | None = None
         self.paused = False
@@ -60,6 +61,19 @@ class AutoFlight(Flight):
         else:
             self._start_from(v, mission.current)
 
+    def wait(self, v: VehicleState) -> None:
+        """Motors off: the mission only names the item that it would begin with."""
+        if not self._announced and v.origin is not None:
+            self.announce(v)
+
+    def announce(self, v: VehicleState) -> None:
+        """Name the item to begin with, as a start of the mission does."""
+        self._announced = True
+        index = v.mission.first_navigating(v.mission.current)
+        if index is not None:
+            v.mission.current = index
+            v.say(MAV_SEVERITY.INFO, f"Mission: {index} {title(v.mission.items[index])}")
+
     def pause(self, v: VehicleState, *, paused: bool) -> None:
         """DO_PAUSE_CONTINUE: stop where it is; continuing repeats the current item."""
         if paused and not self.paused:
@@ -87,9 +101,9 @@ class AutoFlight(Flight):
             item = v.mission.items[index]
             if item.navigates:
                 v.mission.current = index
+                self._commands.begin(v, waiting)
                 v.say(MAV_SEVERITY.INFO, f"Mission: {index} {title(item)}")
                 self._begin_item(v, index, item)
-                self._commands.begin(v, waiting)
                 return
             waiting.append(index)
             index = v.mission.next_after(index)
@@ -178,8 +192,9 @@ class AutoFlight(Flight):
         elif item.command == MAV_CMD.NAV_LOITER_TURNS and self._circle_centre is not None:
             self._turn(v, item)
         elif self._done(v, item):
-            v.broadcast("MISSION_ITEM_REACHED", {"seq": self._index})
-            v.say(MAV_SEVERITY.INFO, f"Reached command #{self._index}")
+            v.item_reached = self._index
+            if item.command != MAV_CMD.NAV_TAKEOFF:
+                v.say(MAV_SEVERITY.INFO, f"Reached command #{self._index}")
             self._start_from(v, v.mission.next_after(self._index))
         v.heading.step(v.est)
 
@@ -197,7 +212,7 @@ class AutoFlight(Flight):
         if v.armed:
             return
         self._item = None
-        v.broadcast("MISSION_ITEM_REACHED", {"seq": self._index})
+        v.item_reached = self._index
         following = v.mission.next_after(self._index)
         v.mission.complete = following is None
         if following is not None:
@@ -212,7 +227,7 @@ class AutoFlight(Flight):
         self._turned += abs(step)
         v.control.target = (centre[0] + radius * math.cos(self._angle), centre[1] + radius * math.sin(self._angle))
         if self._turned >= 2.0 * math.pi * max(item.param1, 1.0):
-            v.broadcast("MISSION_ITEM_REACHED", {"seq": self._index})
+            v.item_reached = self._index
             self._start_from(v, v.mission.next_after(self._index))
 
     def _done(self, v: VehicleState, item: Item) -> bool:

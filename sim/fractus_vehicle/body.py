@@ -11,8 +11,10 @@ import random
 from dataclasses import dataclass
 
 GRAVITY = 9.80665
-# Hitting the ground faster than this, or leaning more than this, breaks propellers.
+# Hitting the ground while leaning, or while falling and turning fast, breaks propellers; a fall upright and without a turn
+# does not: the ground is as forgiving as SITL's.
 CRASH_IMPACT_MPS = 4.0
+CRASH_TURN_RPS = 1.0
 CRASH_LEAN_COSINE = 0.5
 CRASHED_ROLL_RAD = math.radians(75.0)
 
@@ -91,6 +93,7 @@ class Body:
         "down",
         "east",
         "impact_mps",
+        "impacts",
         "motors",
         "north",
         "on_ground",
@@ -119,6 +122,7 @@ class Body:
         self.on_ground = True
         self.crashed = False
         self.impact_mps = 0.0
+        self.impacts = 0
 
     def euler(self) -> tuple[float, float, float]:
         """Roll, pitch, yaw in radians."""
@@ -174,10 +178,12 @@ class Body:
         self.down += self.vd * dt
         if self.down >= 0.0 and self.vd > 0.0:
             self.impact_mps = self.vd
-            lean_cosine = 1.0 - 2.0 * (x * x + y * y)
-            if not self.crashed and self.vd > CRASH_IMPACT_MPS and lean_cosine >= CRASH_LEAN_COSINE:
+            self.impacts += 1
+            leans = 1.0 - 2.0 * (x * x + y * y) < CRASH_LEAN_COSINE
+            tumbles = self.vd > CRASH_IMPACT_MPS and max(abs(self.p), abs(self.q), abs(self.r)) > CRASH_TURN_RPS
+            if tumbles and not (self.crashed or leans):
                 self._topple()
-            self.crashed = self.crashed or self.vd > CRASH_IMPACT_MPS or lean_cosine < CRASH_LEAN_COSINE
+            self.crashed = self.crashed or leans or tumbles
             self.down = 0.0
             self.vn = self.ve = self.vd = 0.0
             self.on_ground = True

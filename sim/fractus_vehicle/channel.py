@@ -10,7 +10,7 @@ from fractus_mavlink import Endpoint, Message, Value
 
 # A client that does not read costs at most this much memory; what does not fit is dropped, as on a radio.
 OUTBOX_LIMIT = 256 * 1024
-PARAMETERS_PER_TICK = 14
+PARAMETERS_PER_TICK = 23
 # Sums of intervals round differently from multiples of the step.
 TIME_SLACK_S = 1e-6
 AT_ONCE = -1e9
@@ -46,6 +46,7 @@ class Channel(Endpoint):
         self.peers: set[tuple[int, int]] = set()
         self.parameters: deque[int] = deque()
         self.dropped = 0
+        self._defaults: dict[str, float | None] = {}
         self._outbox: deque[bytes] = deque()
         self._waiting = 0
         self._tap = tap
@@ -105,6 +106,15 @@ class Channel(Endpoint):
         else:
             self.streams[name] = Stream(interval_s, AT_ONCE)
             self.next_due_s = AT_ONCE
+
+    def set_default(self, name: str, interval_s: float | None) -> None:
+        """Send a message at an interval, now and whenever its default rate is asked for."""
+        self._defaults[name] = interval_s
+        self.set_interval(name, interval_s)
+
+    def reset_interval(self, name: str) -> None:
+        """Go back to the default rate of a message."""
+        self.set_interval(name, self._defaults.get(name))
 
     @property
     def speaks_s(self) -> float:

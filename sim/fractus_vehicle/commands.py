@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from fractus_mavlink import Message, layout_of
+from fractus_mavlink import Message
 from fractus_mavlink.enums import (
     COPTER_MODE,
     MAV_CMD,
@@ -17,6 +17,12 @@ from fractus_mavlink.enums import (
     REBOOT_SHUTDOWN_ACTION,
 )
 
+from fractus_vehicle.accessories import (
+    FENCE_SWITCH,
+    SWITCH_HIGH,
+    SWITCH_LOW,
+    SWITCHED_MODES,
+)
 from fractus_vehicle.auto import AutoFlight
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.copter import (
@@ -25,8 +31,7 @@ from fractus_vehicle.copter import (
     FORCE_MAGIC,
     GLOBAL_FRAMES,
     SUPPORTED_MODES,
-    VERSION_TEXT,
-    mode_title,
+    UNAVAILABLE,
 )
 from fractus_vehicle.earth import valid_coordinates
 from fractus_vehicle.guided import GuidedFlight
@@ -34,12 +39,10 @@ from fractus_vehicle.home import set_home_at, set_home_here
 from fractus_vehicle.mission_commands import item_target, switch_fence
 from fractus_vehicle.mission_items import Item
 from fractus_vehicle.orders import Order, read_order
-from fractus_vehicle.readiness import arming_refusal
-from fractus_vehicle.streams import BUILDERS
+from fractus_vehicle.readiness import arming_refusals, mandatory_refusals, mode_refusal
+from fractus_vehicle.requests import ANSWERS
 from fractus_vehicle.telemetry import send
 from fractus_vehicle.vehicle import Vehicle
-
-NOT_ARMABLE = frozenset({COPTER_MODE.RTL, COPTER_MODE.SMART_RTL, COPTER_MODE.LAND, COPTER_MODE.BRAKE, COPTER_MODE.AUTO})
 
 
 def _arm_disarm(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
@@ -48,11 +51,13 @@ def _arm_disarm(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
     if want == 1.0:
         if v.armed:
             return MAV_RESULT.ACCEPTED
-        if magic != FORCE_ARM_MAGIC:
-            refusal = f"{mode_title(v.mode)} mode not armable" if v.mode in NOT_ARMABLE else arming_refusal(v)
-            if refusal is not None:
-                v.say(MAV_SEVERITY.CRITICAL, f"Arm: {refusal}")
-                return MAV_RESULT.FAILED
+        forced = magic == FORCE_ARM_MAGIC
+        refusals = mandatory_refusals(v) if forced else arming_refusals(v)
+        unsuited = None if forced or refusals else mode_refusal(v)
+        for refusal in (*refusals, *((unsuited,) if unsuited else ())):
+            v.say(MAV_SEVERITY.CRITICAL, f"Arm: {refusal}")
+        if refusals or unsuited:
+            return MAV_RESULT.FAILED
         vehicle.arm()
         return MAV_RESULT.ACCEPTED
     if want == 0.0:
@@ -99,7 +104,7 @@ def set_mode_number(vehicle: Vehicle, base_mode: int, custom_mode: int) -> MAV_R
     v = vehicle.state
     if not base_mode & MAV_MODE_FLAG.CUSTOM_MODE_ENABLED:
         return MAV_RESULT.DENIED
-    if custom_mode not in SUPPORTED_MODES:
+    if custom_mode not in SUPPORTED_MODES | UNAVAILABLE.keys():
         v.say(MAV_SEVERITY.WARNING, f"No such mode {custom_mode}")
         return MAV_RESULT.FAILED
     return MAV_RESULT.ACCEPTED if vehicle.modes.change(COPTER_MODE(custom_mode)) else MAV_RESULT.FAILED
@@ -115,28 +120,34 @@ def _change_speed(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
     v = vehicle.state
     if not math.isfinite(o.params[0]):
         return MAV_RESULT.DENIED
-    return MAV_RESULT.ACCEPTED if v.control.limits.change_speed(int(o.params[0]), o.params[1]) else MAV_RESULT.FAILED
+    # Any other kind than the first three is a descent.
+    kind = min(max(int(o.params[0]), 0), 3)
+    takes = v.mode in CHANGES_SPEED and v.control.limits.change_speed(kind, o.params[1])
+    return MAV_RESULT.ACCEPTED if takes else MAV_RESULT.FAILED
 
 
 def _reposition(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
     v = vehicle.state
     switch = bool(int(o.params[1]) & MAV_DO_REPOSITION_FLAGS.CHANGE_MODE) if math.isfinite(o.params[1]) else False
-    if not v.armed or (v.mode is not COPTER_MODE.GUIDED and not switch):
+    if v.mode is not COPTER_MODE.GUIDED and not switch:
         return MAV_RESULT.DENIED
+    if o.frame not in GLOBAL_FRAMES:
+        v.say(MAV_SEVERITY.INFO, f"Unknown mavlink coordinate frame {o.frame}")
     placed = o.has_place and valid_coordinates(o.x, o.y) and math.isfinite(o.z)
     if not placed or v.altitude_base_m(o.frame) is None:
         return MAV_RESULT.DENIED
     north, east, down = item_target(v, o.item)
-    if v.landed or v.outside_fence(north, east, down) or not vehicle.modes.change(COPTER_MODE.GUIDED):
+    if v.outside_fence(north, east, down) or not vehicle.modes.change(COPTER_MODE.GUIDED):
         return MAV_RESULT.FAILED
     flight = vehicle.modes.flight
-    if not isinstance(flight, GuidedFlight):
-        return MAV_RESULT.FAILED
-    flight.go_to(v, north, east, down)
-    if math.isfinite(o.params[3]) and o.params[3] != 0.0:
-        v.heading.turn_to(o.params[3] % 360.0, 0.0, 0, relative=False)
-    else:
-        v.heading.follow_course()
+    if (
+        isinstance(flight, GuidedFlight) and not v.landed
+    ):  # on the ground it is noted, and a takeoff sets another target
+        flight.go_to(v, north, east, down)
+        if math.isfinite(o.params[3]) and o.params[3] != 0.0:
+            v.heading.turn_to(o.params[3] % 360.0, 0.0, 0, relative=False)
+        else:
+            v.heading.follow_course()
     return MAV_RESULT.ACCEPTED
 
 
@@ -145,7 +156,9 @@ def _yaw(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
     angle, rate, direction, relative = o.params
     if v.mode not in (COPTER_MODE.GUIDED, COPTER_MODE.AUTO) or not all(math.isfinite(p) for p in o.params):
         return MAV_RESULT.FAILED
-    turned = v.heading.turn_to(angle, rate, int(direction), relative=relative > 0.5)
+    if relative not in (0.0, 1.0) or not 0.0 <= angle <= 360.0:
+        return MAV_RESULT.FAILED
+    turned = v.heading.turn_to(angle, rate, int(direction), relative=relative == 1.0)
     return MAV_RESULT.ACCEPTED if turned else MAV_RESULT.FAILED
 
 
@@ -163,7 +176,7 @@ def _roi(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
 
 def _set_home(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
     v = vehicle.state
-    if o.params[0] == 1.0:
+    if o.params[0] == 1.0 or (o.x == 0 and o.y == 0 and math.isfinite(o.z)):
         return MAV_RESULT.ACCEPTED if set_home_here(v) else MAV_RESULT.FAILED
     if not o.has_place or not math.isfinite(o.z):
         return MAV_RESULT.DENIED
@@ -175,66 +188,18 @@ def _set_home(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
     return MAV_RESULT.ACCEPTED if set_home_at(v, o.x, o.y, altitude) else MAV_RESULT.FAILED
 
 
-def _get_home(vehicle: Vehicle, _o: Order, c: Channel) -> MAV_RESULT:
-    v = vehicle.state
-    if not send(v, c, "HOME_POSITION"):
-        return MAV_RESULT.FAILED
-    send(v, c, "GPS_GLOBAL_ORIGIN")
-    return MAV_RESULT.ACCEPTED
-
-
-def _message_name(number: float) -> str | None:
-    layout = layout_of(int(number)) if math.isfinite(number) and number >= 0.0 else None
-    return layout.name if layout is not None and layout.name in BUILDERS else None
-
-
-def _set_interval(vehicle: Vehicle, o: Order, c: Channel) -> MAV_RESULT:
-    name, interval_us = _message_name(o.params[0]), o.params[1]
-    if name is None or not math.isfinite(interval_us):
-        return MAV_RESULT.DENIED
-    if interval_us < 0.0:
-        c.set_interval(name, None)
-    elif interval_us == 0.0:
-        c.set_interval(name, 1.0 if name == "HEARTBEAT" else None)
-    else:
-        c.set_interval(name, max(interval_us, 10_000.0) / 1e6)
-    return MAV_RESULT.ACCEPTED
-
-
-def _get_interval(_vehicle: Vehicle, o: Order, c: Channel) -> MAV_RESULT:
-    name = _message_name(o.params[0])
-    stream = c.streams.get(name) if name is not None else None
-    interval = 0 if name is None else -1 if stream is None else round(stream.interval_s * 1e6)
-    number = o.params[0]
-    if not math.isfinite(number) or not 0 <= number <= 65535:
-        return MAV_RESULT.DENIED
-    c.send("MESSAGE_INTERVAL", {"message_id": int(number), "interval_us": interval})
-    return MAV_RESULT.ACCEPTED if name is not None else MAV_RESULT.FAILED
-
-
-def _request_message(vehicle: Vehicle, o: Order, c: Channel) -> MAV_RESULT:
-    v = vehicle.state
-    name = _message_name(o.params[0])
-    if name is None:
-        return MAV_RESULT.FAILED
-    return MAV_RESULT.ACCEPTED if send(v, c, name) else MAV_RESULT.FAILED
-
-
-def _capabilities(vehicle: Vehicle, o: Order, c: Channel) -> MAV_RESULT:
-    v = vehicle.state
-    if o.params[0] != 1.0:
-        return MAV_RESULT.FAILED
-    send(v, c, "AUTOPILOT_VERSION")
-    return MAV_RESULT.ACCEPTED
-
-
 def _fence_enable(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
     v = vehicle.state
     return MAV_RESULT.ACCEPTED if switch_fence(v, o.params[0]) else MAV_RESULT.FAILED
 
 
 def _mission_start(vehicle: Vehicle, _o: Order, _c: Channel) -> MAV_RESULT:
-    return MAV_RESULT.ACCEPTED if vehicle.modes.change(COPTER_MODE.AUTO) else MAV_RESULT.FAILED
+    if not vehicle.modes.change(COPTER_MODE.AUTO):
+        return MAV_RESULT.FAILED
+    flight = vehicle.modes.flight
+    if isinstance(flight, AutoFlight):
+        flight.announce(vehicle.state)
+    return MAV_RESULT.ACCEPTED
 
 
 def _mission_current(vehicle: Vehicle, o: Order, c: Channel) -> MAV_RESULT:
@@ -242,7 +207,7 @@ def _mission_current(vehicle: Vehicle, o: Order, c: Channel) -> MAV_RESULT:
     if not math.isfinite(o.params[0]):
         return MAV_RESULT.DENIED
     if not set_current(vehicle, int(o.params[0])):
-        return MAV_RESULT.FAILED
+        return MAV_RESULT.DENIED
     send(v, c, "MISSION_CURRENT")
     return MAV_RESULT.ACCEPTED
 
@@ -301,22 +266,42 @@ def _prearm(vehicle: Vehicle, _o: Order, _c: Channel) -> MAV_RESULT:
     v = vehicle.state
     if v.armed:
         return MAV_RESULT.TEMPORARILY_REJECTED
-    refusal = arming_refusal(v)
-    if refusal is not None:
+    for refusal in arming_refusals(v):
         v.say(MAV_SEVERITY.CRITICAL, f"PreArm: {refusal}")
     return MAV_RESULT.ACCEPTED
 
 
-def _banner(vehicle: Vehicle, _o: Order, _c: Channel) -> MAV_RESULT:
-    for text in (VERSION_TEXT, "Frame: QUAD/X"):
-        vehicle.state.say(MAV_SEVERITY.INFO, text)
+def _calibrate(vehicle: Vehicle, _o: Order, _c: Channel) -> MAV_RESULT:
+    v = vehicle.state
+    if v.armed or v.motor_test_until_s is not None:
+        v.say(MAV_SEVERITY.NOTICE, "Disarm to allow calibration")
+        return MAV_RESULT.FAILED
     return MAV_RESULT.ACCEPTED
 
 
-def _grounded_only(vehicle: Vehicle, _o: Order, _c: Channel) -> MAV_RESULT:
+def _storage(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
     v = vehicle.state
-    return MAV_RESULT.FAILED if v.armed else MAV_RESULT.ACCEPTED
+    if o.params[0] != 2.0 or v.armed:
+        return MAV_RESULT.DENIED
+    v.params.reset()
+    v.say(MAV_SEVERITY.WARNING, "All parameters reset, reboot board")
+    return MAV_RESULT.ACCEPTED
 
+
+def _switch(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
+    """DO_AUX_FUNCTION: what a switch of a radio would do; of the functions only modes and the fence have an effect."""
+    function, position = o.params[:2]
+    if not (math.isfinite(function) and math.isfinite(position)) or not SWITCH_LOW <= int(position) <= SWITCH_HIGH:
+        return MAV_RESULT.DENIED
+    if int(function) == FENCE_SWITCH:
+        switch_fence(vehicle.state, 1.0 if int(position) == SWITCH_HIGH else 0.0)
+    elif int(function) in SWITCHED_MODES and int(position) == SWITCH_HIGH:
+        vehicle.modes.change(SWITCHED_MODES[int(function)])
+    return MAV_RESULT.ACCEPTED
+
+
+# The modes that fly with speeds a client may change.
+CHANGES_SPEED = frozenset({COPTER_MODE.GUIDED, COPTER_MODE.AUTO, COPTER_MODE.RTL, COPTER_MODE.SMART_RTL})
 
 HANDLERS: dict[int, Callable[[Vehicle, Order, Channel], MAV_RESULT]] = {
     MAV_CMD.COMPONENT_ARM_DISARM: _arm_disarm,
@@ -332,11 +317,6 @@ HANDLERS: dict[int, Callable[[Vehicle, Order, Channel], MAV_RESULT]] = {
     MAV_CMD.DO_SET_ROI_LOCATION: _roi,
     MAV_CMD.DO_SET_ROI_NONE: _roi,
     MAV_CMD.DO_SET_HOME: _set_home,
-    MAV_CMD.GET_HOME_POSITION: _get_home,
-    MAV_CMD.SET_MESSAGE_INTERVAL: _set_interval,
-    MAV_CMD.GET_MESSAGE_INTERVAL: _get_interval,
-    MAV_CMD.REQUEST_MESSAGE: _request_message,
-    MAV_CMD.REQUEST_AUTOPILOT_CAPABILITIES: _capabilities,
     MAV_CMD.DO_FENCE_ENABLE: _fence_enable,
     MAV_CMD.MISSION_START: _mission_start,
     MAV_CMD.DO_SET_MISSION_CURRENT: _mission_current,
@@ -345,9 +325,11 @@ HANDLERS: dict[int, Callable[[Vehicle, Order, Channel], MAV_RESULT]] = {
     MAV_CMD.DO_FLIGHTTERMINATION: _terminate,
     MAV_CMD.PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
     MAV_CMD.RUN_PREARM_CHECKS: _prearm,
-    MAV_CMD.DO_SEND_BANNER: _banner,
-    MAV_CMD.PREFLIGHT_CALIBRATION: _grounded_only,
-    MAV_CMD.PREFLIGHT_STORAGE: _grounded_only,
+    MAV_CMD.PREFLIGHT_CALIBRATION: _calibrate,
+    MAV_CMD.PREFLIGHT_STORAGE: _storage,
+    MAV_CMD.NAV_VTOL_TAKEOFF: _takeoff,
+    MAV_CMD.NAV_VTOL_LAND: _mode_command(COPTER_MODE.LAND),
+    MAV_CMD.DO_AUX_FUNCTION: _switch,
 }
 # Commands that ArduPilot takes only with integer coordinates.
 INT_ONLY = frozenset({MAV_CMD.DO_REPOSITION})
@@ -356,11 +338,11 @@ INT_ONLY = frozenset({MAV_CMD.DO_REPOSITION})
 def handle_command(vehicle: Vehicle, message: Message, channel: Channel) -> None:
     """Carry out a command and acknowledge it."""
     order = read_order(message)
-    handler = HANDLERS.get(order.command)
-    if handler is None:
+    handler, answer = HANDLERS.get(order.command), ANSWERS.get(order.command)
+    if answer is not None:
+        result = answer(vehicle.state, order, channel)
+    elif handler is None or (order.command in INT_ONLY and not order.integer):
         result = MAV_RESULT.UNSUPPORTED
-    elif order.command in INT_ONLY and not order.integer:
-        result = MAV_RESULT.COMMAND_INT_ONLY
     else:
         result = handler(vehicle, order, channel)
     channel.send(

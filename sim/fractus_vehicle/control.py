@@ -23,8 +23,6 @@ from fractus_vehicle.shaping import (
 
 # Slower than this counts as stopped: the position is held from then on.
 STOPPED_MPS = 0.05
-# What the lean of the airframe allows when it has to stop.
-BRAKING_JERK_MPS3 = 10.0
 
 
 Vector = tuple[float, float, float]
@@ -48,7 +46,8 @@ class Limits:
     sink_mps: float = 1.5
     accel_mps2: float = 2.5
     accel_z_mps2: float = 1.0
-    jerk_mps3: float = 5.0
+    jerk_mps3: float = 3.0  # toward a position
+    velocity_jerk_mps3: float = 5.0  # toward a velocity
     tilt_max_rad: float = math.radians(30.0)
     yaw_rate_rps: float = math.radians(60.0)
 
@@ -95,9 +94,9 @@ class Gains:
     altitude: float = 1.0
     climb: float = 5.0
     climb_i: float = 1.0
-    attitude: float = 5.0
+    attitude: float = 8.0
     yaw: float = 2.5
-    rate: float = 16.0
+    rate: float = 18.0
     yaw_accel: float = 6.0
     max_rate_rps: float = 4.0
 
@@ -126,7 +125,6 @@ class Control:
         self.yaw_setpoint = 0.0
         self._integral = [0.0, 0.0, 0.0]
         self._stopping = False
-        self.speed_cap_mps = math.inf  # of the present target, where its climb takes longer than its way
         self._braking_mps2 = 0.0
         self.thrust_share = 0.0
         self.wanted_n = (0.0, 0.0, 0.0, 0.0)  # what each motor is asked for
@@ -175,7 +173,6 @@ class Control:
         """Fly to a point and stay; without `down` the vertical target stays as it is."""
         self.horizontal = Axis.POSITION
         self._stopping = False
-        self.speed_cap_mps = math.inf
         self.target = (north, east)
         self.target_velocity = (0.0, 0.0)
         if down is not None:
@@ -221,7 +218,7 @@ class Control:
                 error,
                 here,
                 bend,
-                speed_max=min(limits.speed_mps, self.speed_cap_mps),
+                speed_max=limits.speed_mps,
                 accel_max=limits.accel_mps2,
                 jerk_max=limits.jerk_mps3,
                 dt=dt,
@@ -229,8 +226,9 @@ class Control:
             )
         elif self.horizontal is Axis.VELOCITY:
             accel = self._braking_mps2 if self._stopping else limits.accel_mps2
-            jerk = BRAKING_JERK_MPS3 if self._stopping else limits.jerk_mps3
-            acc[0], acc[1] = shape_velocity_xy(self.target_velocity, here, bend, accel_max=accel, jerk_max=jerk, dt=dt)
+            acc[0], acc[1] = shape_velocity_xy(
+                self.target_velocity, here, bend, accel_max=accel, jerk_max=limits.velocity_jerk_mps3, dt=dt
+            )
         vel[0] += acc[0] * dt
         vel[1] += acc[1] * dt
         pos[0] += vel[0] * dt

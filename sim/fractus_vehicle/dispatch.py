@@ -19,6 +19,7 @@ from fractus_vehicle.channel import Channel
 from fractus_vehicle.commands import handle_command, set_current, set_mode_number
 from fractus_vehicle.flight import Flight
 from fractus_vehicle.home import set_home_at
+from fractus_vehicle.report_units import UNKNOWN_U16
 from fractus_vehicle.state import VehicleState
 from fractus_vehicle.streams import ALL_GROUPS, GROUPS
 from fractus_vehicle.targets import attitude_target, global_target, guided_item, local_target
@@ -35,11 +36,18 @@ def dispatch(vehicle: Vehicle, message: Message, channel: Channel) -> None:
         return
     if message.has("target_system") and message.integer("target_system") not in (0, v.sysid):
         return
-    if message.has("target_component") and message.integer("target_component") not in (0, v.compid):
+    if message.has("target_component") and _is_for_another(v, message.integer("target_component")):
         return
     handler = HANDLERS.get(message.name)
     if handler is not None:
         handler(vehicle, message, channel)
+
+
+def _is_for_another(v: VehicleState, component: int) -> bool:
+    """Whether another part of the vehicle was heard that a message is for; without one, the autopilot takes it itself."""
+    if component in (0, v.compid):
+        return False
+    return any((v.sysid, component) in channel.peers for channel in v.channels)
 
 
 def _answer(name: str) -> Handler:
@@ -66,11 +74,15 @@ def _set_mode(vehicle: Vehicle, m: Message, _c: Channel) -> None:
 
 
 def _request_stream(vehicle: Vehicle, m: Message, c: Channel) -> None:
+    v = vehicle.state
     group = m.integer("req_stream_id")
     rate = m.integer("req_message_rate") if m.integer("start_stop") else 0
     for number in ALL_GROUPS if group == MAV_DATA_STREAM.ALL else (group,):
-        for name in GROUPS.get(number, ("", ()))[1]:
-            c.set_interval(name, 1.0 / min(rate, 100) if rate > 0 else None)
+        label, names = GROUPS.get(number, ("", ()))
+        if names and c.port is not None:
+            v.params.assign(f"SR{min(c.port, 6)}_{label}", rate)
+        for name in names:
+            c.set_default(name, 1.0 / min(rate, 100) if rate > 0 else None)
 
 
 def _parameter_list(vehicle: Vehicle, _m: Message, c: Channel) -> None:
@@ -82,7 +94,7 @@ def _parameter_list(vehicle: Vehicle, _m: Message, c: Channel) -> None:
 def _parameter_read(vehicle: Vehicle, m: Message, c: Channel) -> None:
     v = vehicle.state
     index = m.integer("param_index")
-    send_parameter(v, c, m.text("param_id"), index)
+    send_parameter(v, c, m.text("param_id"), index, UNKNOWN_U16 if index < 0 else None)
 
 
 def _parameter_set(vehicle: Vehicle, m: Message, c: Channel) -> None:
@@ -94,26 +106,13 @@ def _parameter_set(vehicle: Vehicle, m: Message, c: Channel) -> None:
         v.say(MAV_SEVERITY.WARNING, f"Param write denied ({name})")
     for channel in v.channels:
         if channel is c or not channel.signing:
-            send_parameter(v, channel, name, -1, 65535)
+            send_parameter(v, channel, name, -1, UNKNOWN_U16)
 
 
 def _timesync(vehicle: Vehicle, m: Message, c: Channel) -> None:
     v = vehicle.state
     if m.integer("tc1") == 0:
         c.send("TIMESYNC", {"tc1": int(v.time_s * 1e9), "ts1": m.integer("ts1")})
-
-
-def _ping(vehicle: Vehicle, m: Message, c: Channel) -> None:
-    if m.integer("target_system") == 0:
-        c.send(
-            "PING",
-            {
-                "time_usec": m.integer("time_usec"),
-                "seq": m.integer("seq"),
-                "target_system": m.sysid,
-                "target_component": m.compid,
-            },
-        )
 
 
 def _file_transfer(_vehicle: Vehicle, m: Message, c: Channel) -> None:
@@ -198,7 +197,6 @@ HANDLERS: dict[str, Handler] = {
     "PARAM_SET": _parameter_set,
     "FILE_TRANSFER_PROTOCOL": _file_transfer,
     "TIMESYNC": _timesync,
-    "PING": _ping,
     "AUTOPILOT_VERSION_REQUEST": _answer("AUTOPILOT_VERSION"),
     "SET_POSITION_TARGET_LOCAL_NED": _target(local_target),
     "SET_POSITION_TARGET_GLOBAL_INT": _target(global_target),

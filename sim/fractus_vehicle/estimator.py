@@ -14,19 +14,37 @@ from fractus_vehicle.params import Parameters
 from fractus_vehicle.sensors import Drift, Gps
 
 GPS_INTERVAL_S = 0.2
-GPS_TIMEOUT_S = 5.0
+GPS_TIMEOUT_S = 7.0
 
-# Shares of the time to readiness at which things happen, and what is said then.
-FIRST_FIX = 0.35
-ORIGIN_SET = 0.8
+# What happens when in a start that takes this long, as a real one does; a shorter start runs through it faster.
+FULL_START_S = 41.0
+INITIALISED_S = 2.6
+FILTER_STARTED_S = 5.0
+FILTER_ACTIVE_S = 5.2
+TILT_ALIGNED_S = 7.0
+ACCELS_CONSISTENT_S = 12.0
+FIRST_FIX_S = 11.0
+ORIGIN_SET_S = 21.0
+HOME_SET_S = 21.5
 ANNOUNCEMENTS = (
-    (0.05, "EKF3 IMU0 initialised"),
-    (0.1, "AHRS: EKF3 active"),
-    (0.12, "EKF3 IMU0 tilt alignment complete"),
-    (0.15, "EKF3 IMU0 MAG0 initial yaw alignment complete"),
-    (FIRST_FIX, "GPS 1: detected u-blox"),
-    (ORIGIN_SET, "EKF3 IMU0 origin set"),
+    (1.0, "Calibrating barometer"),
+    (2.4, "Barometer 1 calibration complete"),
+    (2.4, "Barometer 2 calibration complete"),
+    (INITIALISED_S, "ArduPilot Ready"),
+    (3.0, "AHRS: DCM active"),
+    (3.2, "RC7: SaveWaypoint LOW"),
+    (FILTER_STARTED_S, "EKF3 IMU0 initialised"),
+    (FILTER_STARTED_S, "EKF3 IMU1 initialised"),
+    (FILTER_ACTIVE_S, "AHRS: EKF3 active"),
+    (TILT_ALIGNED_S, "EKF3 IMU0 tilt alignment complete"),
+    (TILT_ALIGNED_S, "EKF3 IMU1 tilt alignment complete"),
+    (8.0, "EKF3 IMU0 MAG0 initial yaw alignment complete"),
+    (8.0, "EKF3 IMU1 MAG0 initial yaw alignment complete"),
+    (9.5, "GPS 1: probing for u-blox at 230400 baud"),
+    (FIRST_FIX_S, "GPS 1: detected u-blox"),
 )
+# Where the vehicle climbs through this height for the first time, the heading is aligned once more.
+FINAL_ALIGNMENT_M = 2.5
 
 _FLAGS_STARTING = (
     EKF_STATUS_FLAGS.ATTITUDE
@@ -76,26 +94,45 @@ class Estimator:
         self.gps = Gps()
         self.origin: Place | None = None
         self.position_ok = False
-        self.ready = False  # whether the start is over
         self._drift = Drift(rng, noise_m)
         self._time_s = 0.0
         self._next_fix_s = 0.0
         self._fix_s = -1e9
         self._announced = 0
+        self._finally_aligned = False
+
+    def since_boot(self, boot_s: float) -> bool:
+        """Whether the start has come to what a full one reaches `boot_s` after power on."""
+        return self._time_s * FULL_START_S >= boot_s * self._ready_after_s
 
     @property
-    def healthy(self) -> bool:
-        """Whether the filter runs at all."""
-        return self._time_s >= 0.5 * self._ready_after_s
+    def initialised(self) -> bool:
+        """Whether the autopilot has finished its own start and runs its main loop."""
+        return self.since_boot(INITIALISED_S)
+
+    @property
+    def active(self) -> bool:
+        """Whether the filter runs and the vehicle uses it."""
+        return self.since_boot(FILTER_ACTIVE_S)
+
+    @property
+    def aligned(self) -> bool:
+        """Whether attitude and height can be trusted."""
+        return self.since_boot(TILT_ALIGNED_S)
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the accelerometers have agreed for long enough."""
+        return self.since_boot(ACCELS_CONSISTENT_S)
 
     @property
     def flags(self) -> EKF_STATUS_FLAGS:
         """What EKF_STATUS_REPORT says of the filter."""
         if self.position_ok:
             return _FLAGS_READY
-        if self.origin is not None:
-            return _FLAGS_NO_POSITION
-        return EKF_STATUS_FLAGS.UNINITIALIZED if self._time_s < 0.1 * self._ready_after_s else _FLAGS_STARTING
+        if not self.aligned:
+            return EKF_STATUS_FLAGS.UNINITIALIZED
+        return _FLAGS_NO_POSITION if self.origin is not None else _FLAGS_STARTING
 
     def estimate(self, body: Body) -> Estimate:
         """The estimate of the moment."""
@@ -124,36 +161,44 @@ class Estimator:
         if time_s < self._next_fix_s:
             return
         self._next_fix_s += GPS_INTERVAL_S
-        if int(self._params["SIM_GPS1_ENABLE"]) and time_s >= FIRST_FIX * self._ready_after_s:
+        if not int(self._params["SIM_GPS_DISABLE"]) and self.since_boot(FIRST_FIX_S):
             self.gps.update(
                 self._start.offset(body.north, body.east, body.down),
                 (body.vn, body.ve),
-                noise_m=max(self._params["SIM_GPS1_NOISE"], 0.0) + self._noise_m,
-                satellites=int(self._params["SIM_GPS1_NUMSATS"]),
+                noise_m=max(self._params["SIM_GPS_NOISE"], 0.0) + self._noise_m,
+                satellites=int(self._params["SIM_GPS_NUMSATS"]),
                 rng=self._rng,
             )
             if self.gps.fix_type >= GPS_FIX_TYPE.TYPE_3D_FIX:
                 self._fix_s = time_s
-        elif time_s >= 0.05 * self._ready_after_s:
+        elif self.since_boot(FILTER_STARTED_S):
             self.gps.lose()
+        self._announce(body)
         self._judge(time_s)
-        while (
-            self._announced < len(ANNOUNCEMENTS) and time_s >= ANNOUNCEMENTS[self._announced][0] * self._ready_after_s
-        ):
-            self._say(MAV_SEVERITY.INFO, ANNOUNCEMENTS[self._announced][1])
+
+    def _announce(self, body: Body) -> None:
+        """Say what a start says when it gets there, and what the first climb does."""
+        while self._announced < len(ANNOUNCEMENTS) and self.since_boot(ANNOUNCEMENTS[self._announced][0]):
+            self._inform(ANNOUNCEMENTS[self._announced][1])
             self._announced += 1
+        if not self._finally_aligned and self.position_ok and -body.down > FINAL_ALIGNMENT_M:
+            self._finally_aligned = True
+            for unit in (0, 1):
+                self._inform(f"EKF3 IMU{unit} MAG0 in-flight yaw alignment complete")
+
+    def _inform(self, text: str) -> None:
+        self._say(MAV_SEVERITY.INFO, text)
 
     def _judge(self, time_s: float) -> None:
         age_s = time_s - self._fix_s
         self._drift.step(GPS_INTERVAL_S, aided=self.origin is None or age_s <= 2.0 * GPS_INTERVAL_S)
-        if (
-            self.origin is None
-            and self.gps.fix_type >= GPS_FIX_TYPE.TYPE_3D_FIX
-            and time_s >= ORIGIN_SET * self._ready_after_s
-        ):
+        if self.origin is None and self.gps.fix_type >= GPS_FIX_TYPE.TYPE_3D_FIX and self.since_boot(ORIGIN_SET_S):
             self.origin = self._start
-        self.ready = time_s >= self._ready_after_s
-        ok = self.origin is not None and self.ready and age_s < GPS_TIMEOUT_S
+            self._inform("EKF3 IMU0 origin set")
+            self._inform(f"Field Elevation Set: {self._start.alt_m:.0f}m")
+            self._inform("EKF3 IMU1 origin set")
+        ok = self.origin is not None and self.since_boot(FULL_START_S) and age_s < GPS_TIMEOUT_S
         if ok != self.position_ok:
-            self._say(MAV_SEVERITY.INFO, "EKF3 IMU0 is using GPS" if ok else "EKF3 IMU0 stopped aiding")
+            for unit in (0, 1):
+                self._inform(f"EKF3 IMU{unit} is using GPS" if ok else f"EKF3 IMU{unit} stopped aiding")
         self.position_ok = ok

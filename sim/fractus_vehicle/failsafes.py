@@ -219,7 +219,7 @@ class Failsafes:
         if v.failsafes.ekf or not v.armed or v.time_s - self._lost_since_s < POSITION_LOST_S:
             return
         v.failsafes.ekf = True
-        v.say(MAV_SEVERITY.CRITICAL, "EKF variance: position lost")
+        v.say(MAV_SEVERITY.CRITICAL, "EKF variance")
         setting = int(v.params["FS_EKF_ACTION"])
         if setting == EKF_REPORTS_ONLY or v.landed or v.mode is COPTER_MODE.LAND:
             return
@@ -230,17 +230,20 @@ class Failsafes:
         v.say(MAV_SEVERITY.CRITICAL, f"EKF Failsafe: changed to {mode_title(v.mode)} Mode")
 
     def _check_fence(self, v: VehicleState) -> None:
-        if not v.fence.enabled or v.home is None or v.origin is None:
-            v.fence.breaches = NO_BREACH
+        fence = v.fence
+        if not fence.enabled or v.home is None or v.origin is None or not v.armed or v.landed:
+            fence.breaches = NO_BREACH
             return
-        if not v.armed or v.landed:
-            v.fence.breaches = NO_BREACH
+        if v.time_s < fence.recovery_until_s:
             return
-        new = v.fence.check(v.est.north, v.est.east, v.altitude_m, v.home_xy, v.time_s)
+        before = fence.breaches
+        new = fence.check(v.est.north, v.est.east, v.altitude_m, v.home_xy, v.time_s)
+        if before and not fence.breaches:
+            v.say(MAV_SEVERITY.NOTICE, "Fence breach cleared")
         if not new:
             return
         v.say(MAV_SEVERITY.NOTICE, f"{breach_names(new)} breached")
         action = FENCE_ACTIONS.get(int(v.params["FENCE_ACTION"]), Action.NONE)
         if action is not Action.NONE and v.mode is not COPTER_MODE.LAND:
-            far = v.fence.distance_m(v.est.north, v.est.east, v.altitude_m, v.home_xy) > FENCE_GIVE_UP_M
+            far = fence.distance_m(v.est.north, v.est.east, v.altitude_m, v.home_xy) > FENCE_GIVE_UP_M
             act(v, self._modes, Action.LAND if far else action)

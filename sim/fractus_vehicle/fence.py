@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from fractus_mavlink.enums import FENCE_BREACH, FENCE_TYPE, MAV_CMD
@@ -25,6 +25,18 @@ def _to_edge_m(north: float, east: float, a: Vertex, b: Vertex) -> float:
     share = 0.0 if length2 == 0.0 else ((north - a[0]) * run_n + (east - a[1]) * run_e) / length2
     share = min(1.0, max(0.0, share))
     return math.hypot(north - a[0] - share * run_n, east - a[1] - share * run_e)
+
+
+def _ahead_m(here: Vertex, course: Vertex, a: Vertex, b: Vertex) -> float | None:
+    """How far ahead on a course an edge is crossed."""
+    run_n, run_e = b[0] - a[0], b[1] - a[1]
+    turn = course[0] * run_e - course[1] * run_n
+    if abs(turn) < 1e-9:
+        return None
+    to_n, to_e = a[0] - here[0], a[1] - here[1]
+    ahead = (to_n * run_e - to_e * run_n) / turn
+    share = (to_n * course[1] - to_e * course[0]) / turn
+    return ahead if ahead >= 0.0 and 0.0 <= share <= 1.0 else None
 
 
 class FenceShapeError(ValueError):
@@ -50,6 +62,11 @@ class Polygon:
             previous = vertex
         return inside
 
+    def distance_along_m(self, here: Vertex, course: Vertex) -> float | None:
+        """How far ahead the first edge lies on a course."""
+        edges = zip(self.vertices, (*self.vertices[1:], self.vertices[0]), strict=True)
+        return min((d for a, b in edges if (d := _ahead_m(here, course, a, b)) is not None), default=None)
+
     def edge_distance_m(self, north: float, east: float) -> float:
         """Distance to the nearest edge."""
         edges = zip(self.vertices, (*self.vertices[1:], self.vertices[0]), strict=True)
@@ -69,6 +86,16 @@ class Circle:
         """Whether the point lies inside."""
         return math.hypot(north - self.north, east - self.east) <= self.radius_m
 
+    def distance_along_m(self, here: Vertex, course: Vertex) -> float | None:
+        """How far ahead the rim lies on a course."""
+        north, east = here[0] - self.north, here[1] - self.east
+        along = north * course[0] + east * course[1]
+        square = along * along - (north * north + east * east - self.radius_m * self.radius_m)
+        if square < 0.0:
+            return None
+        ways = (-along - math.sqrt(square), -along + math.sqrt(square))
+        return min((way for way in ways if way >= 0.0), default=None)
+
     def edge_distance_m(self, north: float, east: float) -> float:
         """Distance to the rim."""
         return abs(math.hypot(north - self.north, east - self.east) - self.radius_m)
@@ -79,27 +106,33 @@ Shape = Polygon | Circle
 
 @dataclass(frozen=True, slots=True)
 class FenceItem:
-    """One uploaded item: command, first parameter, position in local metres."""
+    """One uploaded item: command, first parameter, position in local metres, and whether that lies on Earth."""
 
     command: int
     param1: float
     north: float
     east: float
+    valid: bool = True
 
 
 def build_shapes(items: Sequence[FenceItem]) -> tuple[Shape, ...]:
     """Group the items of an upload into shapes.
 
     Raises:
-        FenceShapeError: a polygon is incomplete or too small, a radius not positive, or a command foreign.
+        FenceShapeError: with the autopilot's own words for what is wrong.
     """
     shapes: list[Shape] = []
+    if sum(item.command == MAV_CMD.NAV_FENCE_RETURN_POINT for item in items) > 1:
+        raise FenceShapeError("Multiple return points")
     at = 0
     while at < len(items):
         item = items[at]
+        if not item.valid:
+            raise FenceShapeError("Bad lat or lon")
         if item.command in (MAV_CMD.NAV_FENCE_CIRCLE_INCLUSION, MAV_CMD.NAV_FENCE_CIRCLE_EXCLUSION):
+            # A real autopilot aborts in the simulator where the radius is not a number.
             if not item.param1 > 0.0:
-                raise FenceShapeError(f"fence item {at}: radius {item.param1} must be positive")
+                raise FenceShapeError("Non-positive circle radius")
             inclusion = item.command == MAV_CMD.NAV_FENCE_CIRCLE_INCLUSION
             shapes.append(Circle(item.north, item.east, item.param1, inclusion))
             at += 1
@@ -107,18 +140,34 @@ def build_shapes(items: Sequence[FenceItem]) -> tuple[Shape, ...]:
             MAV_CMD.NAV_FENCE_POLYGON_VERTEX_INCLUSION,
             MAV_CMD.NAV_FENCE_POLYGON_VERTEX_EXCLUSION,
         ):
-            count = int(item.param1)
-            group = items[at : at + count]
-            if count < 3 or len(group) < count or any(g.command != item.command or g.param1 != count for g in group):
-                raise FenceShapeError(f"fence item {at}: polygon of {count} vertices is incomplete")
+            group = _vertices(items, at)
             inclusion = item.command == MAV_CMD.NAV_FENCE_POLYGON_VERTEX_INCLUSION
             shapes.append(Polygon(tuple((g.north, g.east) for g in group), inclusion))
-            at += count
+            at += len(group)
         elif item.command == MAV_CMD.NAV_FENCE_RETURN_POINT:
             at += 1
         else:
-            raise FenceShapeError(f"fence item {at}: command {item.command} is no fence command")
+            raise FenceShapeError(f"Bad command ({item.command})")
     return tuple(shapes)
+
+
+def _vertices(items: Sequence[FenceItem], at: int) -> Sequence[FenceItem]:
+    """The corners of the polygon that begins at an item."""
+    first = items[at]
+    count = int(first.param1) if math.isfinite(first.param1) else 0
+    if count < 3:
+        raise FenceShapeError(f"Invalid vertex count ({count})")
+    group = items[at : at + count]
+    for other in group:
+        if other.command != first.command:
+            raise FenceShapeError("Incorrect item count")
+        if other.param1 != first.param1:
+            raise FenceShapeError(f"Unexpected vertex count want={count} got={other.param1:.0f}\n")
+        if not other.valid:
+            raise FenceShapeError("Bad lat or lon")
+    if len(group) < count:
+        raise FenceShapeError("Incorrect item count")
+    return group
 
 
 @dataclass(slots=True)
@@ -134,6 +183,10 @@ class Fence:
     breaches: FENCE_TYPE = NO_BREACH
     breach_count: int = 0
     breach_time_s: float = 0.0
+    margin_m: float = 2.0
+    avoid: bool = True  # velocities are limited before the fence
+    limiting: bool = False
+    recovery_until_s: float = -math.inf  # until then a change of mode in the breach suspends the checks
 
     @property
     def present(self) -> bool:
@@ -169,6 +222,27 @@ class Fence:
             wrong = [shape for shape in self.shapes if shape.contains(north, east) != shape.inclusion]
             beyond += [shape.edge_distance_m(north, east) for shape in wrong]
         return max(beyond)
+
+    def speed_allowed(
+        self, north: float, east: float, home: Vertex, course: Vertex, brake: Callable[[float], float]
+    ) -> float:
+        """How fast the vehicle may go along a course (a unit vector): slow enough to stop the margin before the fence.
+
+        `brake` tells the greatest speed from which a vehicle stops within a distance.
+        """
+        if not (self.enabled and self.avoid):
+            return math.inf
+        shapes: list[Shape] = list(self.shapes) if self.types & FENCE_TYPE.POLYGON else []
+        if self.types & FENCE_TYPE.CIRCLE:
+            shapes.append(Circle(home[0], home[1], self.radius_m, inclusion=True))
+        allowed = math.inf
+        for shape in shapes:
+            if shape.contains(north, east) != shape.inclusion:
+                continue  # beyond it already: the breach is another matter
+            ahead = shape.distance_along_m((north, east), course)
+            if ahead is not None:
+                allowed = min(allowed, brake(max(ahead - self.margin_m, 0.0)))
+        return allowed
 
     def check(self, north: float, east: float, altitude_m: float, home: Vertex, now_s: float) -> FENCE_TYPE:
         """Update the breaches and return the new ones."""

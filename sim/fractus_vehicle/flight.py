@@ -19,5 +19,8 @@ class Flight:
     def step(self, v: VehicleState) -> None:
         """Called at every control step while armed."""
 
+    def wait(self, v: VehicleState) -> None:
+        """Called at every control step while the motors are off."""
+
     def end(self, v: VehicleState) -> None:
         """Called once when another mode begins."""

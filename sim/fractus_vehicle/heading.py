@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 
-from fractus_vehicle.control import Axis, Control, Estimate
+from fractus_vehicle.control import Control, Estimate
 from fractus_vehicle.params import Parameters
 from fractus_vehicle.shaping import wrap_pi
 
-# Below this speed the nose keeps its heading instead of following the course.
-COURSE_SPEED_MPS = 1.0
+# Below this share of the speed allowed the nose keeps its heading instead of following the course.
+COURSE_SHARE = 0.05
 
 
 class Heading:
@@ -61,6 +61,5 @@ class Heading:
                 control.target_yaw = math.atan2(de, dn)
         elif not self._fixed and int(self._params["WP_YAW_BEHAVIOR"]) in (1, 2, 3):
             speed = math.hypot(control.vel[0], control.vel[1])
-            far = math.hypot(control.target[0] - control.pos[0], control.target[1] - control.pos[1]) > 2.0
-            if speed > COURSE_SPEED_MPS and (far or control.horizontal is Axis.VELOCITY):
+            if speed > COURSE_SHARE * control.limits.speed_mps:
                 control.target_yaw = math.atan2(control.vel[1], control.vel[0])

@@ -1,4 +1,4 @@
-"""BRAKE and LAND: the modes that stop, and that come down where the vehicle is."""
+"""BRAKE, AVOID_ADSB and LAND: the modes that stop, and that come down where the vehicle is."""
 
 from __future__ import annotations
 
@@ -7,10 +7,18 @@ from fractus_vehicle.descent import descend
 from fractus_vehicle.flight import Flight
 from fractus_vehicle.state import VehicleState
 
-# BRAKE decelerates with this, whatever WPNAV_ACCEL says.
-BRAKE_MPS2 = 5.0
+# BRAKE may decelerate with this, whatever WPNAV_ACCEL says; PSC_JERK_XY keeps it from doing so below some 11 m/s.
+BRAKE_MPS2 = 7.5
 # A landing that a failsafe begins waits so long, for a pilot to object.
 FAILSAFE_PAUSE_S = 4.0
+
+
+class Hold(Flight):
+    """Stops and holds: AVOID_ADSB with nothing to avoid."""
+
+    def begin(self, v: VehicleState) -> None:
+        """Stop and hold."""
+        v.control.hold_here()
 
 
 class Brake(Flight):

@@ -1,50 +1,110 @@
-"""A straight line in space: the climb keeps step with the way over ground, as a real waypoint controller flies."""
+"""A straight line in space, flown from rest to rest as a real waypoint controller flies it: with WPNAV_JERK."""
 
 from __future__ import annotations
 
 import math
 
-from fractus_vehicle.shaping import clamp
-from fractus_vehicle.state import VehicleState
+from fractus_vehicle.control import Axis
+from fractus_vehicle.profile import Profile
+from fractus_vehicle.shaping import clamp, shape_velocity, shape_velocity_xy
+from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
-# Shorter ways over ground are climbs.
-UPRIGHT_M = 0.5
-# How fast a deviation from the line is corrected, 1/s.
-LINE_GAIN = 1.0
+# A motion that is brought to rest beside the line is over once it is slower than this; how long that may take.
+RESTING_MPS = 0.02
+_STILL = (0.0, 0.0, 0.0)
+STOP_STEPS = 3000
+
+
+Vector = tuple[float, float, float]
+
+
+def _stopping(v: VehicleState) -> list[tuple[Vector, Vector, Vector]]:
+    """How the motion of this moment comes to rest: positions, velocities and accelerations, one a control step."""
+    control, limits, dt = v.control, v.control.limits, CONTROL_STEP_S
+    pos, vel, acc = list(control.pos), list(control.vel), list(control.acc)
+    rest: list[tuple[Vector, Vector, Vector]] = []
+    while math.hypot(*vel) > RESTING_MPS and len(rest) < STOP_STEPS:
+        acc[0], acc[1] = shape_velocity_xy(
+            (0.0, 0.0),
+            (vel[0], vel[1]),
+            (acc[0], acc[1]),
+            accel_max=limits.accel_mps2,
+            jerk_max=limits.velocity_jerk_mps3,
+            dt=dt,
+        )
+        acc[2] = shape_velocity(
+            0.0, vel[2], acc[2], accel_max=limits.accel_z_mps2, jerk_max=limits.velocity_jerk_mps3, dt=dt
+        )
+        for axis in range(3):
+            vel[axis] += acc[axis] * dt
+            pos[axis] += vel[axis] * dt
+        rest.append(((pos[0], pos[1], pos[2]), (vel[0], vel[1], vel[2]), (acc[0], acc[1], acc[2])))
+    return rest
+
+
+def resting_place(v: VehicleState) -> Vector:
+    """Where the trajectory of this moment would come to rest."""
+    rest = _stopping(v)
+    return rest[-1][0] if rest else (v.control.pos[0], v.control.pos[1], v.control.pos[2])
 
 
 class Leg:
-    """From where the trajectory is to a local point; made when the leg begins, and stepped until it is left."""
+    """From where the trajectory would come to rest to a local point; made when the leg begins, and stepped until it is left."""
 
     def __init__(self, v: VehicleState, north: float, east: float, down: float) -> None:
-        control = v.control
+        control, limits = v.control, v.control.limits
         self.end = (north, east, down)
-        self._start = (control.pos[0], control.pos[1], control.pos[2])
-        way_n, way_e, rise = north - self._start[0], east - self._start[1], down - self._start[2]
-        self._length = math.hypot(way_n, way_e)
-        control.go_to(north, east, down)
-        if self._length < UPRIGHT_M:
-            self._slope = 0.0
-            return
-        self._along = (way_n / self._length, way_e / self._length)
-        self._slope = rise / self._length
-        vertical = control.limits.climb_mps if rise < 0.0 else control.limits.sink_mps
-        if self._slope:
-            control.speed_cap_mps = vertical / abs(self._slope)
+        self._rest = _stopping(v)
+        last = resting_place(v)
+        self._start = last
+        way = (north - last[0], east - last[1], down - last[2])
+        length = math.hypot(*way)
+        self._along = (way[0] / length, way[1] / length, way[2] / length) if length > 0.0 else (0.0, 0.0, 0.0)
+        level, rise = math.hypot(self._along[0], self._along[1]), self._along[2]
+        vertical = limits.climb_mps if rise < 0.0 else limits.sink_mps
+        self._speed_mps = min(
+            limits.speed_mps / level if level > 0.0 else math.inf, vertical / abs(rise) if rise else math.inf
+        )
+        accel = min(
+            limits.accel_mps2 / level if level > 0.0 else math.inf,
+            limits.accel_z_mps2 / abs(rise) if rise else math.inf,
+        )
+        jerk = max(v.params["WPNAV_JERK"], 0.1)
+        speed, accel = min(self._speed_mps, 1e3), min(accel, 1e3)
+        self._profile = Profile(length, speed, accel, jerk)
+        self._begun_mps = limits.speed_mps
+        self._pace = 1.0
+        self._time_s = 0.0
+        self._at = 0
+        control.target, control.target_down, control.target_velocity = (north, east), down, (0.0, 0.0)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the trajectory has arrived."""
+        return self._at >= len(self._rest) and self._time_s >= self._profile.duration_s
 
     def step(self, v: VehicleState) -> None:
-        """Let the altitude follow the line."""
-        if not self._slope:
+        """Move the trajectory along; a speed that is changed on the way is taken up with the acceleration that legs have."""
+        control, limits, dt = v.control, v.control.limits, CONTROL_STEP_S
+        if self.finished:
+            if control.horizontal is Axis.PATH:
+                control.track(self.end, _STILL, _STILL)
+                control.go_to(*self.end)
             return
-        control = v.control
-        pos, vel, limits = control.pos, control.vel, control.limits
-        done = (pos[0] - self._start[0]) * self._along[0] + (pos[1] - self._start[1]) * self._along[1]
-        if done >= self._length - UPRIGHT_M:
-            control.go_to_altitude(self.end[2])
-            return
-        on_line = self._start[2] + self._slope * max(done, 0.0)
-        keep_up = self._slope * (vel[0] * self._along[0] + vel[1] * self._along[1])
-        control.climb(clamp(keep_up + LINE_GAIN * (on_line - pos[2]), -limits.climb_mps, limits.sink_mps))
+        change = limits.accel_mps2 / max(self._begun_mps, 0.1) * dt
+        self._pace += clamp(limits.speed_mps / self._begun_mps - self._pace, -change, change)
+        self._time_s += dt * self._pace
+        way, speed, accel = self._profile.at(self._time_s)
+        speed *= self._pace
+        moving = self._rest[self._at] if self._at < len(self._rest) else (self._start, _STILL, _STILL)
+        self._at += 1
+        north, east, down = self._along
+        position, velocity, acceleration = moving
+        control.track(
+            (position[0] + way * north, position[1] + way * east, position[2] + way * down),
+            (velocity[0] + speed * north, velocity[1] + speed * east, velocity[2] + speed * down),
+            (acceleration[0] + accel * north, acceleration[1] + accel * east, acceleration[2] + accel * down),
+        )
 
     def reached(self, v: VehicleState, radius_m: float) -> bool:
         """Whether the vehicle is within a radius of the end."""

@@ -1,4 +1,4 @@
-"""The modes that a pilot flies with the sticks: STABILIZE, ALT_HOLD and LOITER."""
+"""The modes that a pilot flies with the sticks, or lets fly until the sticks move."""
 
 from __future__ import annotations
 
@@ -68,6 +68,26 @@ class Stabilize(Flight):
             v.land_complete()
 
 
+class Acro(Stabilize):
+    """Sticks set rates of turn and thrust; a vehicle whose sticks are let go levels itself (ACRO_TRAINER 2)."""
+
+    def step(self, v: VehicleState) -> None:
+        """Follow the sticks."""
+        roll, pitch = v.control.attitude
+        super().step(v)
+        turn = math.radians(v.params["ACRO_RP_RATE"]) * CONTROL_STEP_S
+        lean = v.control.limits.tilt_max_rad
+        right, forward = stick_rate(v.sticks[0]), stick_rate(v.sticks[1])
+        v.control.attitude = (
+            clamp(roll + right * turn, -lean, lean) if right else 0.0,
+            clamp(pitch + forward * turn, -lean, lean) if forward else 0.0,
+        )
+
+
+class Throw(Flight):
+    """Waits with still motors to be thrown into the air, which nothing here does."""
+
+
 class AltHold(Flight):
     """Sticks set lean angles; the altitude holds unless the throttle leaves its centre."""
 
@@ -107,3 +127,29 @@ class Loiter(Flight):
             v.control.stop()
         self._moving = bool(forward or right)
         pilot_climb(v)
+
+
+class Circle(Flight):
+    """Circles around a point that lies CIRCLE_RADIUS ahead, the nose toward it; the throttle stick climbs and sinks."""
+
+    def __init__(self) -> None:
+        self._centre = (0.0, 0.0)
+        self._angle = 0.0
+
+    def begin(self, v: VehicleState) -> None:
+        """Set the centre ahead of where the vehicle stops."""
+        v.control.hold_here()
+        radius, yaw = v.params["CIRCLE_RADIUS"] / 100.0, v.est.yaw
+        north, east = v.control.target
+        self._centre = (north + radius * math.cos(yaw), east + radius * math.sin(yaw))
+        self._angle = yaw + math.pi
+
+    def step(self, v: VehicleState) -> None:
+        """Go on along the circle."""
+        radius = v.params["CIRCLE_RADIUS"] / 100.0
+        pilot_climb(v)
+        fastest = v.control.limits.speed_mps / max(radius, 1.0)
+        self._angle += clamp(math.radians(v.params["CIRCLE_RATE"]), -fastest, fastest) * CONTROL_STEP_S
+        north, east = self._centre
+        v.control.go_to(north + radius * math.cos(self._angle), east + radius * math.sin(self._angle))
+        v.control.target_yaw = math.atan2(east - v.est.east, north - v.est.north)

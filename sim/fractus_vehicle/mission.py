@@ -36,6 +36,10 @@ class Mission:
         self.complete = False
         self._jumps.clear()
 
+    def first_navigating(self, index: int) -> int | None:
+        """The first item from an index on, home excepted, that navigates."""
+        return next((at for at in range(max(index, 1), len(self.items)) if self.items[at].navigates), None)
+
     def peek_after(self, index: int) -> int | None:
         """The next item that navigates, without counting jumps as done; None where jumps only lead in a circle."""
         jumps = dict(self._jumps)

@@ -44,7 +44,7 @@ class MissionCommands:
                 return
             self._indices.popleft()
             self._begun_s = None
-            v.broadcast("MISSION_ITEM_REACHED", {"seq": index})
+            v.item_reached = index
 
 
 def _fulfilled(v: VehicleState, item: Item, waited_s: float) -> bool:
@@ -86,7 +86,7 @@ def switch_fence(v: VehicleState, action: float) -> bool:
         return True
     if action not in (0.0, 1.0) or (action == 1.0 and not v.fence.present):
         return False
-    v.params.assign("FENCE_ENABLE", action)
+    v.fence.enabled = bool(action)
     return True
 
 

@@ -107,6 +107,24 @@ _CURRENT_FRAMES: dict[int, int] = {
 }
 
 
+# Commands whose items have a place; of the others no frame is kept.
+PLACED = frozenset(
+    {
+        MAV_CMD.NAV_WAYPOINT,
+        MAV_CMD.NAV_LOITER_UNLIM,
+        MAV_CMD.NAV_LOITER_TURNS,
+        MAV_CMD.NAV_LOITER_TIME,
+        MAV_CMD.NAV_LAND,
+        MAV_CMD.NAV_TAKEOFF,
+        MAV_CMD.NAV_SPLINE_WAYPOINT,
+        MAV_CMD.DO_SET_HOME,
+        MAV_CMD.DO_LAND_START,
+        MAV_CMD.DO_SET_ROI,
+        MAV_CMD.DO_SET_ROI_LOCATION,
+    }
+)
+
+
 def item_from(message: Message) -> Item:
     """Read MISSION_ITEM_INT, or MISSION_ITEM with its degrees in floats."""
     frame = message.integer("frame")
@@ -117,7 +135,9 @@ def item_from(message: Message) -> Item:
     command, z = message.integer("command"), message.real("z")
     return Item(
         command=command,
-        frame=_CURRENT_FRAMES.get(frame, frame),
+        frame=_CURRENT_FRAMES.get(frame, frame)
+        if command in PLACED or command >= MAV_CMD.NAV_FENCE_RETURN_POINT
+        else MAV_FRAME.GLOBAL,
         param1=_finite(message.real("param1")),
         param2=_finite(message.real("param2")),
         param3=_finite(message.real("param3")),
@@ -141,6 +161,8 @@ def judge(item: Item, kind: MAV_MISSION_TYPE) -> MAV_MISSION_RESULT:
         return MAV_MISSION_RESULT.UNSUPPORTED
     if item.frame not in GLOBAL_FRAMES and item.frame != MAV_FRAME.MISSION and item.has_place:
         return MAV_MISSION_RESULT.UNSUPPORTED_FRAME
+    if kind is MAV_MISSION_TYPE.FENCE:
+        return MAV_MISSION_RESULT.ACCEPTED  # judged as a whole
     if item.navigates and not valid_coordinates(item.x, item.y):
         return MAV_MISSION_RESULT.INVALID_PARAM5_X if abs(item.x) > 900_000_000 else MAV_MISSION_RESULT.INVALID_PARAM6_Y
     if item.navigates and not abs(item.z) < ALTITUDE_MAX_M:

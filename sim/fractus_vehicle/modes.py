@@ -5,17 +5,19 @@ from __future__ import annotations
 from fractus_mavlink.enums import COPTER_MODE, MAV_SEVERITY
 
 from fractus_vehicle.auto import AutoFlight
-from fractus_vehicle.copter import mode_title
+from fractus_vehicle.copter import TRAITS, UNAVAILABLE, mode_title
 from fractus_vehicle.flight import Flight
-from fractus_vehicle.guided import GuidedFlight
-from fractus_vehicle.landing import Brake, Land
-from fractus_vehicle.manual import AltHold, Loiter, Stabilize
-from fractus_vehicle.readiness import WITHOUT_POSITION
+from fractus_vehicle.guided import GuidedFlight, GuidedWithoutGps
+from fractus_vehicle.landing import Brake, Hold, Land
+from fractus_vehicle.manual import Acro, AltHold, Circle, Loiter, Stabilize, Throw
 from fractus_vehicle.rtl import ReturnToLaunch
 from fractus_vehicle.settings import set_limits
 from fractus_vehicle.smart_rtl import SmartReturn
 from fractus_vehicle.state import VehicleState
 from fractus_vehicle.telemetry import send_on_all
+
+# After a change of mode in a breach, the fence is not checked for so long.
+MANUAL_RECOVERY_S = 10.0
 
 _FLIGHTS: dict[COPTER_MODE, type[Flight]] = {
     COPTER_MODE.GUIDED: GuidedFlight,
@@ -26,6 +28,14 @@ _FLIGHTS: dict[COPTER_MODE, type[Flight]] = {
     COPTER_MODE.LAND: Land,
     COPTER_MODE.RTL: ReturnToLaunch,
     COPTER_MODE.SMART_RTL: SmartReturn,
+    COPTER_MODE.ACRO: Acro,
+    COPTER_MODE.CIRCLE: Circle,
+    COPTER_MODE.DRIFT: Stabilize,
+    COPTER_MODE.POSHOLD: Loiter,
+    COPTER_MODE.THROW: Throw,
+    COPTER_MODE.AVOID_ADSB: Hold,
+    COPTER_MODE.GUIDED_NOGPS: GuidedWithoutGps,
+    COPTER_MODE.ZIGZAG: Loiter,
 }
 
 
@@ -37,16 +47,18 @@ class FlightModes:
         self.flight = self._new_flight(state.mode)
 
     def refusal(self, mode: COPTER_MODE) -> str | None:
-        """Why a mode cannot be entered now, or None; on the ground with the motors off every mode can."""
+        """Why a mode cannot be entered now, or None; on the ground with the motors off nearly every mode can."""
         v = self._state
+        if mode in UNAVAILABLE:
+            return f"Mode change to {mode_title(mode)} failed: {UNAVAILABLE[mode][1]}"
         if mode is COPTER_MODE.SMART_RTL and not v.breadcrumbs.active:
             return f"Mode change to {mode_title(mode)} failed: init failed"
         if not v.armed:
             return None
-        if mode not in WITHOUT_POSITION and not v.position_ok:
+        if TRAITS[mode].needs_position and not v.position_ok:
             return f"Mode change to {mode_title(mode)} failed: requires position"
-        if mode is COPTER_MODE.AUTO and len(v.mission.items) <= 1:
-            return "Mode change to AUTO failed: init failed"
+        if mode is COPTER_MODE.THROW or (mode is COPTER_MODE.AUTO and len(v.mission.items) <= 1):
+            return f"Mode change to {mode_title(mode)} failed: init failed"
         return None
 
     def change(self, mode: COPTER_MODE) -> bool:
@@ -55,7 +67,8 @@ class FlightModes:
             return True
         refusal = self.refusal(mode)
         if refusal is not None:
-            self._state.say(MAV_SEVERITY.WARNING, refusal)
+            for text in (*UNAVAILABLE.get(mode, ((),))[0], refusal):
+                self._state.say(MAV_SEVERITY.WARNING, text)
             return False
         self.force(mode)
         return True
@@ -72,6 +85,9 @@ class FlightModes:
         if v.landed or not v.armed:
             v.control.reset(v.est)
         v.taking_off_until_m = None
+        if v.fence.breaches:
+            v.fence.recovery_until_s = v.time_s + MANUAL_RECOVERY_S
+            v.say(MAV_SEVERITY.INFO, "Manual recovery started")
         self.flight.begin(v)
         send_on_all(v, "HEARTBEAT")
 

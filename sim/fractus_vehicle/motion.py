@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from fractus_mavlink.enums import COPTER_MODE
+import math
+
+from fractus_mavlink.enums import COPTER_MODE, MAV_SEVERITY
 
 from fractus_vehicle.state import ARMING_DELAY_S, CONTROL_STEP_S, VehicleState
 
 PHYSICS_PER_CONTROL = 2
 # Share of full thrust at which armed motors idle.
 IDLE_SPIN = 0.05
+# A vehicle that bounces tells of the first contact only.
+IMPACT_TEXTS_S = 1.0
+# Turning faster than its gyroscopes measure, a vehicle has lost its attitude for good.
+GYRO_RANGE_RPS = math.radians(2000.0)
 # A throttle stick above this lifts off in a mode that hands the throttle to the pilot.
 LIFT_THROTTLE_US = 1550
 
@@ -18,7 +24,8 @@ def move(v: VehicleState) -> None:
     dt = CONTROL_STEP_S / PHYSICS_PER_CONTROL
     body = v.body
     full = body.airframe.full_thrust_n
-    share = v.battery.thrust_share
+    # The mixer keeps the motors below MOT_SPIN_MAX; thrust goes with the square of their speed.
+    share = v.battery.thrust_share * v.params["MOT_SPIN_MAX"] ** 2
     lifting = v.armed and _may_lift(v)
     if body.on_ground and not lifting:
         spin = IDLE_SPIN * full if v.armed and v.time_s > v.armed_at_s + ARMING_DELAY_S else 0.0
@@ -28,7 +35,9 @@ def move(v: VehicleState) -> None:
         return
     for _ in range(PHYSICS_PER_CONTROL):
         air = v.wind.step(dt, v.rng, -body.down)
-        commands = v.control.step(dt, v.est, full * share) if lifting else (0.0, 0.0, 0.0, 0.0)
+        commands = (0.0, 0.0, 0.0, 0.0)
+        if lifting and abs(body.r) < GYRO_RANGE_RPS:
+            commands = v.control.step(dt, v.est, full * share)
         failed = int(v.params["SIM_ENGINE_FAIL"])
         if failed:
             left = v.params["SIM_ENGINE_MUL"]
@@ -37,6 +46,11 @@ def move(v: VehicleState) -> None:
         body.step(dt, commands, air)
         v.est = v.estimator.estimate(body)
     v.battery.step(CONTROL_STEP_S, sum(body.motors) / (body.airframe.mass_kg * 9.80665))
+    if body.impacts > v.impacts_told:
+        v.impacts_told = body.impacts
+        if v.time_s - v.impact_told_s > IMPACT_TEXTS_S:
+            v.say(MAV_SEVERITY.INFO, f"SIM Hit ground at {body.impact_mps:f} m/s")
+        v.impact_told_s = v.time_s
     if v.landed and not body.on_ground:
         v.landed = False
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 
 from fractus_mavlink import Value
-from fractus_mavlink.enums import COPTER_MODE, MAV_FRAME
+from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_FRAME, MAV_TYPE
 
 from fractus_vehicle.control import Axis
-from fractus_vehicle.copter import POSITION_ONLY, VELOCITY_ONLY
+from fractus_vehicle.copter import GLOBAL_TARGET_ONLY, POSITION_ONLY, VELOCITY_ONLY
 from fractus_vehicle.earth import Place
 from fractus_vehicle.report_units import UNKNOWN_U16, Values, boot_ms, boot_us, centi
 from fractus_vehicle.state import VehicleState
+
+_AUTOMATIC = frozenset({COPTER_MODE.GUIDED, COPTER_MODE.AUTO, COPTER_MODE.RTL, COPTER_MODE.SMART_RTL})
 
 
 def global_position_int(v: VehicleState) -> Values:
@@ -105,38 +107,30 @@ def nav_controller_output(v: VehicleState) -> Values:
 
 
 def position_target_global_int(v: VehicleState) -> Values | None:
-    """POSITION_TARGET_GLOBAL_INT while a guided or automatic flight has a target."""
-    if (
-        v.origin is None
-        or v.mode not in (COPTER_MODE.GUIDED, COPTER_MODE.AUTO, COPTER_MODE.RTL, COPTER_MODE.SMART_RTL)
-        or v.landed
-    ):
+    """POSITION_TARGET_GLOBAL_INT while a guided or automatic flight has a place as its target."""
+    if v.origin is None or v.mode not in _AUTOMATIC or v.landed or v.control.horizontal is Axis.VELOCITY:
         return None
     place = v.origin.offset(*v.control.target, v.control.target_down)
-    return _target(v, MAV_FRAME.GLOBAL_INT, {"lat_int": place.lat_e7, "lon_int": place.lon_e7, "alt": place.alt_m})
+    return {
+        "time_boot_ms": boot_ms(v),
+        "coordinate_frame": MAV_FRAME.GLOBAL,
+        "type_mask": GLOBAL_TARGET_ONLY,
+        "lat_int": place.lat_e7,
+        "lon_int": place.lon_e7,
+        "alt": place.alt_m,
+    }
 
 
 def position_target_local_ned(v: VehicleState) -> Values | None:
-    """POSITION_TARGET_LOCAL_NED while in GUIDED."""
+    """POSITION_TARGET_LOCAL_NED while in GUIDED: a place, or a velocity."""
     if v.origin is None or v.mode is not COPTER_MODE.GUIDED or v.landed:
         return None
-    north, east = v.control.target
-    return _target(v, MAV_FRAME.LOCAL_NED, {"x": north, "y": east, "z": v.control.target_down})
-
-
-def _target(v: VehicleState, frame: MAV_FRAME, position: Values) -> Values:
-    """Position and velocity; of a target that is only a velocity, the position stays zero."""
     c = v.control
-    moving = c.horizontal is Axis.VELOCITY
-    return {
-        "time_boot_ms": boot_ms(v),
-        "coordinate_frame": frame,
-        "type_mask": VELOCITY_ONLY if moving else POSITION_ONLY,
-        "vx": c.target_velocity[0],
-        "vy": c.target_velocity[1],
-        "vz": c.target_vd,
-        **({} if moving else position),
-    }
+    values: dict[str, Value] = {"time_boot_ms": boot_ms(v), "coordinate_frame": MAV_FRAME.LOCAL_NED}
+    if c.horizontal is Axis.VELOCITY:
+        north, east = c.target_velocity
+        return values | {"type_mask": VELOCITY_ONLY, "vx": north, "vy": east, "vz": c.target_vd}
+    return values | {"type_mask": POSITION_ONLY, "x": c.target[0], "y": c.target[1], "z": c.target_down}
 
 
 def home_position(v: VehicleState) -> Values | None:
@@ -227,4 +221,35 @@ def simstate(v: VehicleState) -> Values:
         "zgyro": v.body.r,
         "lat": place.lat_e7,
         "lng": place.lon_e7,
+    }
+
+
+def sim_state(v: VehicleState) -> Values:
+    """SIM_STATE: the truth once more, with velocity and height."""
+    w, x, y, z = v.body.quaternion
+    place = v.true_place
+    degrees = {"lat": place.lat_e7 * 1e-7, "lon": place.lon_e7 * 1e-7, "lat_int": place.lat_e7, "lon_int": place.lon_e7}
+    truth = {name: value for name, value in simstate(v).items() if name not in ("lat", "lng")}
+    speed = {"vn": v.body.vn, "ve": v.body.ve, "vd": v.body.vd}
+    return truth | {"q1": w, "q2": x, "q3": y, "q4": z, "alt": place.alt_m} | degrees | speed
+
+
+def high_latency2(v: VehicleState) -> Values:
+    """HIGH_LATENCY2: what matters, in one small message."""
+    place, speed = v.place, math.hypot(v.est.vn, v.est.ve)
+    return {
+        "timestamp": boot_ms(v),
+        "type": MAV_TYPE.QUADROTOR,
+        "autopilot": MAV_AUTOPILOT.ARDUPILOTMEGA,
+        "custom_mode": int(v.mode),
+        "latitude": place.lat_e7,
+        "longitude": place.lon_e7,
+        "altitude": round(place.alt_m),
+        "target_altitude": round(place.alt_m),
+        "heading": v.heading_cdeg // 200,
+        "throttle": v.throttle_percent,
+        "groundspeed": round(speed * 5.0),
+        "climb_rate": round(-v.est.vd * 10.0),
+        "battery": v.battery.percent,
+        "wp_num": v.mission.current,
     }

@@ -20,7 +20,10 @@ RANGES = {
 }
 # Names of later ArduCopter releases for the same thing, accepted beside the ones of this release.
 ALIASES = {"MAV_GCS_SYSID": "SYSID_MYGCS", "MAV_SYSID": "SYSID_THISMAV"}
-READ_ONLY = frozenset({"FORMAT_VERSION", "MIS_TOTAL", "FENCE_TOTAL", "RALLY_TOTAL", "SYSID_THISMAV"})
+# These describe what is stored or who the vehicle is on its links; a real autopilot lets a client overwrite them.
+READ_ONLY = frozenset({"MIS_TOTAL", "FENCE_TOTAL", "RALLY_TOTAL", "SYSID_THISMAV"})
+# What is added to a value before its fraction is cut off.
+ROUNDING = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +40,7 @@ class Parameter:
         return MAV_PARAM_TYPE[self.kind]
 
     def coerce(self, value: float) -> float:
-        """The value as this type stores it; the nearest one where it does not fit.
+        """The value as this type stores it: without its fraction, and the nearest one that fits.
 
         Raises:
             ParameterValueError: the value is not a number.
@@ -49,7 +52,7 @@ class Parameter:
         if self.kind == "REAL32":
             rounded: float = struct.unpack("<f", struct.pack("<f", value))[0]
             return rounded
-        return float(round(value))
+        return float(int(value + math.copysign(ROUNDING, value)))
 
 
 @functools.cache
@@ -138,6 +141,13 @@ class Parameters(Mapping[str, float]):
         self.assign(name, value)
         self._save()
         return True
+
+    def reset(self) -> None:
+        """Set all parameters that a client may set back to their defaults."""
+        for row in table():
+            if row.name not in READ_ONLY and self._values[row.name] != row.coerce(row.default):
+                self.assign(row.name, row.default)
+        self._save()
 
     def changes(self) -> dict[str, float]:
         """The parameters that differ from their defaults."""

@@ -18,7 +18,7 @@ from fractus_mavlink.enums import (
 )
 
 from fractus_vehicle.copter import POSITION_ONLY
-from fractus_vehicle.readiness import arming_refusal
+from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.simulation import Craft, Simulation
 
 HEARTBEAT_INTERVAL_S = 1.0
@@ -126,7 +126,10 @@ class Pilot:
                 "param_type": MAV_PARAM_TYPE.REAL32,
             },
         )
-        return self.expect("PARAM_VALUE").real("param_value")
+        while True:
+            answer = self.expect("PARAM_VALUE")
+            if answer.text("param_id") == name:
+                return answer.real("param_value")
 
     def take_off(self, altitude_m: float, timeout_s: float = 90.0) -> float:
         """Switch to GUIDED, arm, climb, and return the seconds from the takeoff command to 95 % of the altitude.
@@ -137,7 +140,7 @@ class Pilot:
         v = self.craft.vehicle.state
         if self.mode(COPTER_MODE.GUIDED) is not MAV_RESULT.ACCEPTED:
             raise PilotTimeoutError("GUIDED was refused")
-        self.wait(lambda: arming_refusal(v) is None, timeout_s)
+        self.wait(lambda: not arming_refusals(v), timeout_s)
         if self.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is not MAV_RESULT.ACCEPTED:
             raise PilotTimeoutError(f"arming was refused: {self.texts[-1:]}")
         if self.command(MAV_CMD.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m) is not MAV_RESULT.ACCEPTED:

@@ -7,7 +7,7 @@ from typing import assert_never
 
 from fractus_mavlink.enums import COPTER_MODE, MAV_MISSION_RESULT, MAV_MISSION_TYPE, MAV_SEVERITY
 
-from fractus_vehicle.earth import Place
+from fractus_vehicle.earth import Place, valid_coordinates
 from fractus_vehicle.fence import FenceItem, FenceShapeError, build_shapes
 from fractus_vehicle.mission_items import Item, ItemStore, home_item
 from fractus_vehicle.state import VehicleState
@@ -45,8 +45,10 @@ def _accept(v: VehicleState, kind: MAV_MISSION_TYPE, items: list[Item]) -> MAV_M
             try:
                 v.fence.shapes = build_shapes(_local(v, items))
             except FenceShapeError as error:
-                v.say(MAV_SEVERITY.WARNING, f"Fence: {error}")
-                return MAV_MISSION_RESULT.INVALID
+                severity = MAV_SEVERITY.INFO if "item count" in str(error) else MAV_SEVERITY.WARNING
+                v.say(severity, str(error))
+                v.say(MAV_SEVERITY.WARNING, "Fence validation failed")
+                return MAV_MISSION_RESULT.ERROR
             v.params.assign("FENCE_TOTAL", len(items))
         case MAV_MISSION_TYPE.RALLY:
             v.params.assign("RALLY_TOTAL", len(items))
@@ -61,5 +63,5 @@ def _local(v: VehicleState, items: Sequence[Item]) -> list[FenceItem]:
     local = []
     for item in items:
         north, east, _ = v.start.vector_to(Place(item.x, item.y, 0.0))
-        local.append(FenceItem(item.command, item.param1, north, east))
+        local.append(FenceItem(item.command, item.param1, north, east, valid_coordinates(item.x, item.y)))
     return local

@@ -11,8 +11,9 @@ RELEASED, UNCHANGED = 0, 65535
 class Receiver:
     """The channels in microseconds; overrides last for RC_OVERRIDE_TIME."""
 
-    def __init__(self) -> None:
-        self.channels: tuple[int, ...] = STICKS_CENTRED
+    def __init__(self, throttle_us: int = 1500) -> None:
+        self._rest = (*STICKS_CENTRED[:2], throttle_us, *STICKS_CENTRED[3:])
+        self.channels: tuple[int, ...] = self._rest
         self.overridden = False
         self._until_s = 0.0
 
@@ -21,7 +22,7 @@ class Receiver:
         channels = list(self.channels)
         for at, value in enumerate(values[: len(channels)]):
             if value == RELEASED:
-                channels[at] = STICKS_CENTRED[at]
+                channels[at] = self._rest[at]
             elif value != UNCHANGED:
                 channels[at] = int(clamp(value, 800, 2200))
         self.channels = tuple(channels)
@@ -30,7 +31,7 @@ class Receiver:
 
     def release(self) -> None:
         """Back to the sticks themselves."""
-        self.channels = STICKS_CENTRED
+        self.channels = self._rest
         self.overridden = False
 
     def step(self, now_s: float) -> None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from enum import Enum
 
 from fractus_vehicle.descent import descend
 from fractus_vehicle.flight import Flight
 from fractus_vehicle.home import return_point
+from fractus_vehicle.leg import Leg, resting_place
 from fractus_vehicle.state import VehicleState
 
 
@@ -26,8 +26,10 @@ class ReturnToLaunch(Flight):
 
     def __init__(self) -> None:
         self.stage = RtlStage.CLIMB
+        self._leg: Leg | None = None
         self._loiter_until_s = 0.0
         self._target = (0.0, 0.0)
+        self._down = 0.0
 
     @property
     def landing(self) -> bool:
@@ -50,8 +52,7 @@ class ReturnToLaunch(Flight):
         wanted = max(wanted, height)
         if p["RTL_SPEED"] > 0.0:
             v.control.limits.speed_mps = p["RTL_SPEED"] / 100.0
-        v.control.stop()
-        v.control.go_to_altitude(base_down - wanted)
+        self._down = base_down - wanted
         v.control.yaw_rate = None
         v.control.target_yaw = v.control.yaw_setpoint
         v.touch_time_s = 0.0
@@ -59,14 +60,14 @@ class ReturnToLaunch(Flight):
     def step(self, v: VehicleState) -> None:
         """Go through the stages."""
         control = v.control
+        if self._leg is not None:
+            self._leg.step(v)
         if self.stage is RtlStage.CLIMB:
-            if abs(v.est.down - control.target_down) < 0.5 or v.est.down < control.target_down:
-                self.stage = RtlStage.RETURN
-                control.go_to(*self._target)
+            self._climb(v)
         elif self.stage is RtlStage.RETURN:
-            near = math.hypot(self._target[0] - v.est.north, self._target[1] - v.est.east)
-            if near < max(v.params["WPNAV_RADIUS"] / 100.0, 0.5):
+            if self._arrived(v):
                 self.stage = RtlStage.LOITER
+                self._leg = None
                 self._loiter_until_s = v.time_s + v.params["RTL_LOIT_TIME"] / 1000.0
                 control.target_yaw = v.armed_heading
         elif self.stage is RtlStage.LOITER:
@@ -77,3 +78,15 @@ class ReturnToLaunch(Flight):
                     control.go_to(*self._target, return_point(v).base_down - final)
         elif self.stage is RtlStage.LAND:
             descend(v)
+
+    def _climb(self, v: VehicleState) -> None:
+        """Come to rest, and climb from there; the way back begins at its top."""
+        if self._leg is None:
+            self._leg = Leg(v, *resting_place(v)[:2], self._down)
+        elif self._arrived(v):
+            self.stage = RtlStage.RETURN
+            self._leg = Leg(v, *self._target, self._down)
+
+    def _arrived(self, v: VehicleState) -> bool:
+        leg, radius_m = self._leg, max(v.params["WPNAV_RADIUS"] / 100.0, 0.5)
+        return leg is not None and leg.finished and leg.reached(v, radius_m)

@@ -14,6 +14,7 @@ from fractus_vehicle.shaping import clamp
 from fractus_vehicle.state import VehicleState
 
 _BARO_AXIS = 16
+SERVOS_REPORTED = 16
 
 
 def gps_raw_int(v: VehicleState) -> Values:
@@ -40,7 +41,6 @@ def gps_raw_int(v: VehicleState) -> Values:
         "satellites_visible": g.satellites,
         "h_acc": 300,
         "v_acc": 300,
-        "vel_acc": 40,
     }
 
 
@@ -81,6 +81,12 @@ def scaled_imu2(v: VehicleState) -> Values:
     return {"time_boot_ms": boot_ms(v), **_imu(v)}
 
 
+def scaled_imu3(v: VehicleState) -> Values:
+    """SCALED_IMU3: of the third unit there is only the compass."""
+    whole = _imu(v)
+    return {"time_boot_ms": boot_ms(v), **{name: whole[name] for name in ("xmag", "ymag", "zmag")}}
+
+
 def scaled_pressure(v: VehicleState) -> Values:
     """SCALED_PRESSURE from the standard atmosphere."""
     altitude = v.true_altitude_amsl_m
@@ -96,6 +102,7 @@ def servo_output_raw(v: VehicleState) -> Values:
     """SERVO_OUTPUT_RAW: motor 1 to 4."""
     full = v.body.airframe.full_thrust_n
     values: dict[str, Value] = {"time_usec": boot_us(v) & 0xFFFFFFFF, "port": 0}
+    values |= {f"servo{number}_raw": pwm for number, pwm in v.servos.items() if number <= SERVOS_REPORTED}
     for at, thrust in enumerate(v.body.motors, start=1):
         values[f"servo{at}_raw"] = 1000 if not v.armed else round(1100 + 850 * math.sqrt(clamp(thrust / full, 0, 1)))
     return values

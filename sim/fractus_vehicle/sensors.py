@@ -14,7 +14,6 @@ from fractus_vehicle.shaping import clamp
 
 # Open-circuit voltage of a lithium polymer cell against the share of charge that is left.
 _CELL_CURVE = ((0.0, 3.27), (0.05, 3.60), (0.1, 3.69), (0.2, 3.75), (0.4, 3.80), (0.6, 3.90), (0.8, 4.03), (1.0, 4.20))
-IDLE_CURRENT_A = 0.4
 # How far an estimated attitude wanders from the truth: roll, pitch, yaw.
 TILT_SIGMA_RAD = (math.radians(0.15), math.radians(0.15), math.radians(0.6))
 TILT_CORRELATION_S = 20.0
@@ -22,15 +21,16 @@ HOVER_CURRENT_A = 14.0
 
 
 class Battery:
-    """A lithium polymer pack: charge drawn by the motors, voltage that sags under load."""
+    """A lithium polymer pack: charge drawn by the motors; its voltage follows the charge only where SIM_BATT_CAP_AH says so."""
 
     def __init__(self, full_v: float, capacity_mah: float, resistance_ohm: float = 0.035) -> None:
         self.full_v = full_v
         self.capacity_mah = max(capacity_mah, 1.0)
+        self.pack_mah = 0.0  # what the simulated pack holds; 0: it never empties
         self.resistance_ohm = resistance_ohm
         self.used_mah = 0.0
         self.used_j = 0.0
-        self.current_a = IDLE_CURRENT_A
+        self.current_a = 0.0
         self.voltage_v = full_v
         self._rest_v = full_v
         self._rest_for: tuple[float, float] | None = None
@@ -47,7 +47,7 @@ class Battery:
 
     def _rest_voltage(self) -> float:
         """Voltage without load; looked up again for each thousandth of the charge."""
-        left = round(self.left, 3)
+        left = round(clamp(1.0 - self.used_mah / self.pack_mah, 0.0, 1.0), 3)
         if self._rest_for != (left, self.full_v):
             self._rest_for = (left, self.full_v)
             self._rest_v = self._curve(left)
@@ -61,11 +61,14 @@ class Battery:
 
     def step(self, dt: float, load: float) -> None:
         """Draw current for `dt` seconds; `load` is thrust as a multiple of the hover thrust."""
-        wanted = IDLE_CURRENT_A + HOVER_CURRENT_A * max(load, 0.0) ** 1.5
+        wanted = HOVER_CURRENT_A * max(load, 0.0) ** 1.5
         self.current_a += (wanted - self.current_a) * min(1.0, dt / 0.1)
         self.used_mah += self.current_a * dt / 3.6
         self.used_j += self.current_a * self.voltage_v * dt
-        self.voltage_v = max(self._rest_voltage() - self.current_a * self.resistance_ohm, 0.0)
+        if self.pack_mah > 0.0:
+            self.voltage_v = max(self._rest_voltage() - self.current_a * self.resistance_ohm, 0.0)
+        else:
+            self.voltage_v = max(self.full_v, 0.0)
 
     @property
     def thrust_share(self) -> float:

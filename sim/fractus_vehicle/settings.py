@@ -12,7 +12,10 @@ from fractus_vehicle.sensors import Battery
 from fractus_vehicle.shaping import clamp
 
 # The attitude controllers leave this share of the jerk that the parameter allows.
-JERK_SHARE = 0.6
+JERK_SHARE = 0.75
+
+# AVOID_ENABLE: velocities are limited at the fence.
+AVOID_FENCE = 1
 
 LIMIT_PREFIXES = frozenset({"WPNAV", "PSC", "ANGLE", "ATC", "MOT", "LOIT"})
 
@@ -32,7 +35,8 @@ def set_limits(params: Parameters, control: Control) -> None:
     limits.speed_mps, limits.climb_mps, limits.sink_mps = leg_speeds_mps(params)
     limits.accel_mps2 = max(params["WPNAV_ACCEL"] / 100.0, 0.5)
     limits.accel_z_mps2 = max(params["WPNAV_ACCEL_Z"] / 100.0, 0.5)
-    limits.jerk_mps3 = max(JERK_SHARE * params["PSC_JERK_XY"], 1.0)
+    limits.velocity_jerk_mps3 = max(params["PSC_JERK_XY"], 1.0)
+    limits.jerk_mps3 = JERK_SHARE * limits.velocity_jerk_mps3
     lean_deg = params["PSC_ANGLE_MAX"] or params["ANGLE_MAX"] / 100.0
     limits.tilt_max_rad = math.radians(clamp(lean_deg, 10.0, 80.0))
     limits.yaw_rate_rps = math.radians(clamp(params["ATC_SLEW_YAW"] / 100.0, 5.0, 180.0))
@@ -41,18 +45,22 @@ def set_limits(params: Parameters, control: Control) -> None:
     gains.velocity_i = clamp(params["PSC_VELXY_I"], 0.0, 2.0)
 
 
-def set_fence(params: Parameters, fence: Fence) -> None:
-    """The fence's switches and simple limits."""
-    fence.enabled = int(params["FENCE_ENABLE"]) != 0
+def set_fence(params: Parameters, fence: Fence, changed: str = "FENCE_ENABLE") -> None:
+    """The fence's switches and simple limits; only the parameter itself switches it, since commands do so, too."""
+    if changed == "FENCE_ENABLE":
+        fence.enabled = int(params["FENCE_ENABLE"]) != 0
     fence.types = int(params["FENCE_TYPE"])
     fence.alt_max_m, fence.alt_min_m = params["FENCE_ALT_MAX"], params["FENCE_ALT_MIN"]
     fence.radius_m = params["FENCE_RADIUS"]
+    fence.margin_m = max(params["FENCE_MARGIN"], 0.0)
+    fence.avoid = bool(int(params["AVOID_ENABLE"]) & AVOID_FENCE)
 
 
 def set_battery(params: Parameters, battery: Battery) -> None:
     """Capacity and voltage of the full battery."""
     battery.capacity_mah = max(params["BATT_CAPACITY"], 1.0)
     battery.full_v = params["SIM_BATT_VOLTAGE"]
+    battery.pack_mah = 1000.0 * max(params["SIM_BATT_CAP_AH"], 0.0)
 
 
 def set_wind(params: Parameters, wind: Wind) -> None:

@@ -92,7 +92,7 @@ class SmartReturn(Flight):
         return math.hypot(v.est.vn, v.est.ve) < STOPPED_MPS
 
     def _come_down(self, v: VehicleState) -> None:
-        if self._leg is not None and not (self._stopped(v) and self._leg.reached(v, _radius_m(v))):
+        if self._leg is not None and not (self._leg.finished and self._leg.reached(v, _radius_m(v))):
             return
         final_m = v.params["RTL_ALT_FINAL"] / 100.0
         if final_m <= 0.0 or v.failsafes.radio or self._leg is None:

@@ -17,7 +17,7 @@ from fractus_vehicle.channel import Channel
 from fractus_vehicle.control import Control
 from fractus_vehicle.copter import ABSOLUTE_FRAMES, GLOBAL_FRAMES, TERRAIN_FRAMES
 from fractus_vehicle.earth import Place
-from fractus_vehicle.estimator import Estimator
+from fractus_vehicle.estimator import FULL_START_S, Estimator
 from fractus_vehicle.fence import Fence
 from fractus_vehicle.heading import Heading
 from fractus_vehicle.mission import Mission
@@ -25,7 +25,7 @@ from fractus_vehicle.mission_items import ItemStore
 from fractus_vehicle.params import Parameters
 from fractus_vehicle.receiver import Receiver
 from fractus_vehicle.sensors import Battery, Gps
-from fractus_vehicle.settings import set_fence, set_limits, set_wind
+from fractus_vehicle.settings import set_battery, set_fence, set_limits, set_wind
 from fractus_vehicle.shaping import clamp
 
 CONTROL_STEP_S = 0.01
@@ -43,11 +43,12 @@ class VehicleConfig:
     heading_deg: float = 0.0
     sysid: int = 1
     seed: int = 1
-    ready_after_s: float = 32.0
+    ready_after_s: float = FULL_START_S
     parameters: Mapping[str, float] = field(default_factory=dict)
     store: Path | None = None
     epoch_us: int = REPEATABLE_EPOCH_US
     position_noise_m: float = 0.12
+    throttle_us: int = 1500
 
 
 @dataclass(slots=True)
@@ -100,7 +101,12 @@ class VehicleState:
         self.rally = ItemStore(MAV_MISSION_TYPE.RALLY)
         self.breadcrumbs = Breadcrumbs(self.params, self.say)
         self.heading = Heading(self.control, self.params)
-        self.receiver = Receiver()
+        self.item_reached: int | None = None  # of the mission, to be told at the end of a step: the last one counts
+        self.impacts_told = 0
+        self.impact_told_s = -math.inf
+        self.receiver = Receiver(config.throttle_us)
+        self.servos: dict[int, int] = {}
+        self.motor_test_until_s: float | None = None
         self.armed = False
         self.armed_at_s = 0.0
         self.armed_heading = math.radians(config.heading_deg)
@@ -116,6 +122,7 @@ class VehicleState:
         set_limits(self.params, self.control)
         set_fence(self.params, self.fence)
         set_wind(self.params, self.wind)
+        set_battery(self.params, self.battery)
         self.control.reset(self.est)
 
     # -- time and place ----------------------------------------------------------------------------------------

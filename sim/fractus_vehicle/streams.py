@@ -26,7 +26,13 @@ BUILDERS: dict[str, Builder] = {
     "MISSION_CURRENT": status_reports.mission_current,
     "RAW_IMU": sensor_reports.raw_imu,
     "SCALED_IMU2": sensor_reports.scaled_imu2,
+    "SCALED_IMU": sensor_reports.scaled_imu2,
+    "SCALED_IMU3": sensor_reports.scaled_imu3,
     "SCALED_PRESSURE": sensor_reports.scaled_pressure,
+    "SCALED_PRESSURE2": sensor_reports.scaled_pressure,
+    "HWSTATUS": status_reports.hwstatus,
+    "SIM_STATE": motion_reports.sim_state,
+    "HIGH_LATENCY2": motion_reports.high_latency2,
     "POWER_STATUS": status_reports.power_status,
     "MEMINFO": status_reports.meminfo,
     "NAV_CONTROLLER_OUTPUT": motion_reports.nav_controller_output,
@@ -46,9 +52,56 @@ BUILDERS: dict[str, Builder] = {
     "ALTITUDE": motion_reports.altitude,
 }
 
+# What ArduCopter knows besides, and sends only with a device or in a state that does not occur here.
+SILENT = frozenset(
+    [
+        "ADSB_VEHICLE",
+        "AIRSPEED",
+        "AOA_SSA",
+        "CAMERA_CAPTURE_STATUS",
+        "CAMERA_FEEDBACK",
+        "CAMERA_FOV_STATUS",
+        "CAMERA_INFORMATION",
+        "CAMERA_SETTINGS",
+        "DISTANCE_SENSOR",
+        "EFI_STATUS",
+        "ESC_TELEMETRY_5_TO_8",
+        "ESC_TELEMETRY_9_TO_12",
+        "GENERATOR_STATUS",
+        "GIMBAL_DEVICE_ATTITUDE_STATUS",
+        "GIMBAL_MANAGER_INFORMATION",
+        "GIMBAL_MANAGER_STATUS",
+        "GPS2_RAW",
+        "GPS2_RTK",
+        "GPS_RTK",
+        "LANDING_TARGET",
+        "MAG_CAL_PROGRESS",
+        "MAG_CAL_REPORT",
+        "MCU_STATUS",
+        "MISSION_ITEM_REACHED",
+        "NAMED_VALUE_FLOAT",
+        "OPTICAL_FLOW",
+        "PARAM_VALUE",
+        "PID_TUNING",
+        "RANGEFINDER",
+        "RC_CHANNELS_RAW",
+        "RC_CHANNELS_SCALED",
+        "RELAY_STATUS",
+        "RPM",
+        "SCALED_PRESSURE3",
+        "SERVO_OUTPUT_RAW",
+        "TERRAIN_REQUEST",
+        "WATER_DEPTH",
+        "WINCH_STATUS",
+    ]
+)
+
 # MAV_DATA_STREAM groups as ArduCopter fills them; the second column names the SRn_ parameter.
 GROUPS: dict[int, tuple[str, tuple[str, ...]]] = {
-    MAV_DATA_STREAM.RAW_SENSORS: ("RAW_SENS", ("RAW_IMU", "SCALED_IMU2", "SCALED_PRESSURE")),
+    MAV_DATA_STREAM.RAW_SENSORS: (
+        "RAW_SENS",
+        ("RAW_IMU", "SCALED_IMU2", "SCALED_IMU3", "SCALED_PRESSURE", "SCALED_PRESSURE2"),
+    ),
     MAV_DATA_STREAM.EXTENDED_STATUS: (
         "EXT_STAT",
         (
@@ -72,7 +125,6 @@ GROUPS: dict[int, tuple[str, tuple[str, ...]]] = {
         (
             "AHRS",
             "SYSTEM_TIME",
-            "WIND",
             "TERRAIN_REPORT",
             "BATTERY_STATUS",
             "EKF_STATUS_REPORT",

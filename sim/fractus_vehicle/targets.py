@@ -6,9 +6,9 @@ import math
 from typing import NamedTuple
 
 from fractus_mavlink import Message
-from fractus_mavlink.enums import ATTITUDE_TARGET_TYPEMASK, MAV_FRAME, POSITION_TARGET_TYPEMASK
+from fractus_mavlink.enums import ATTITUDE_TARGET_TYPEMASK, MAV_FRAME, MAV_SEVERITY, POSITION_TARGET_TYPEMASK
 
-from fractus_vehicle.copter import IGNORE_ACCELERATION, IGNORE_POSITION, IGNORE_VELOCITY
+from fractus_vehicle.copter import GLOBAL_FRAMES, IGNORE_ACCELERATION, IGNORE_POSITION, IGNORE_VELOCITY
 from fractus_vehicle.earth import Place, valid_coordinates
 from fractus_vehicle.flight import Flight
 from fractus_vehicle.guided import GuidedFlight
@@ -66,6 +66,8 @@ def global_target(v: VehicleState, flight: Flight, m: Message) -> None:
     if origin is None:
         return
     base = v.altitude_base_m(frame)
+    if frame not in GLOBAL_FRAMES:
+        v.say(MAV_SEVERITY.INFO, f"Unknown mavlink coordinate frame {frame}")
     if base is None or not valid_coordinates(lat, lon):
         _stop(v, flight)
         return

@@ -54,7 +54,7 @@ def send_parameter(v: VehicleState, channel: Channel, name: str, index: int, sho
 def attach(v: VehicleState, channel: Channel) -> None:
     """Open a link: HEARTBEAT at 1 Hz and silence otherwise, unless SR parameters ask for streams."""
     v.channels.append(channel)
-    channel.set_interval("HEARTBEAT", 1.0)
+    channel.set_default("HEARTBEAT", 1.0)
     for group in ALL_GROUPS:
         _set_default_rate(v, channel, group)
 
@@ -72,4 +72,4 @@ def _set_default_rate(v: VehicleState, channel: Channel, group: int) -> None:
     rate_hz = 0.0 if channel.port is None else v.params[f"SR{min(channel.port, 6)}_{label}"]
     if rate_hz > 0.0:
         for name in names:
-            channel.set_interval(name, 1.0 / min(rate_hz, MAX_RATE_HZ))
+            channel.set_default(name, 1.0 / min(rate_hz, MAX_RATE_HZ))

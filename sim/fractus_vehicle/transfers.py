@@ -6,14 +6,20 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from fractus_mavlink import Message, Value
-from fractus_mavlink.enums import MAV_CMD, MAV_MISSION_RESULT, MAV_MISSION_TYPE
+from fractus_mavlink.enums import MAV_CMD, MAV_MISSION_RESULT, MAV_MISSION_TYPE, MAV_SEVERITY
 
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.mission_items import Item, ItemStore, item_from, judge, judge_numbers
 
-MAX_ITEMS = 724
+# What the storage of the autopilot holds.
+MAX_ITEMS = {MAV_MISSION_TYPE.MISSION: 650, MAV_MISSION_TYPE.FENCE: 70, MAV_MISSION_TYPE.RALLY: 46}
 UPLOAD_TIMEOUT_S = 8.0
 RETRY_S = 1.0
+# What is said when a list is stored.
+RECEIVED = {
+    MAV_MISSION_TYPE.MISSION: (MAV_SEVERITY.INFO, "Flight plan received"),
+    MAV_MISSION_TYPE.FENCE: (MAV_SEVERITY.DEBUG, "Fence Indexed OK"),
+}
 # What is refused until an upload of the same list has ended.
 NOT_WHILE_UPLOADED = {
     "MISSION_REQUEST_LIST": MAV_MISSION_RESULT.DENIED,
@@ -37,6 +43,7 @@ class Upload:
     partial: bool
     heard_s: float
     asked_s: float
+    old_format: bool = False
 
 
 def _address(peer: Message | Upload, kind: int) -> dict[str, Value]:
@@ -50,9 +57,11 @@ class Transfers:
         self,
         stores: Mapping[MAV_MISSION_TYPE, ItemStore],
         replace_items: Callable[[ItemStore, list[Item]], MAV_MISSION_RESULT],
+        say: Callable[[MAV_SEVERITY, str], None],
     ) -> None:
         self._stores = stores
         self._replace = replace_items
+        self._say = say
         self.upload: Upload | None = None
         self.now_s = 0.0
 
@@ -64,11 +73,7 @@ class Transfers:
         """Answer one message of the protocol."""
         self.now_s = now_s
         kind_number = message.integer("mission_type") if message.has("mission_type") else 0
-        if kind_number == MAV_MISSION_TYPE.ALL and message.name == "MISSION_CLEAR_ALL":
-            for store in self._stores.values():
-                self._replace(store, [])
-            self._ack(channel, message, kind_number, MAV_MISSION_RESULT.ACCEPTED)
-        elif kind_number not in self._stores:
+        if kind_number not in self._stores:
             self._ack(channel, message, kind_number, MAV_MISSION_RESULT.UNSUPPORTED)
         elif self.upload is not None and self.upload.kind == kind_number and message.name in NOT_WHILE_UPLOADED:
             self._ack(channel, message, kind_number, NOT_WHILE_UPLOADED[message.name])
@@ -115,10 +120,11 @@ class Transfers:
         """Begin to ask for the items of `wanted`; all of a new list, or a part of the stored one."""
         if self.upload is not None and not self._is_uploader(channel, message):
             self._ack(channel, message, store.kind, MAV_MISSION_RESULT.DENIED)
-        elif wanted.stop > MAX_ITEMS:
+        elif wanted.stop > MAX_ITEMS[store.kind]:
+            self._say(MAV_SEVERITY.WARNING, f"Only {MAX_ITEMS[store.kind]} items are supported")
             self._ack(channel, message, store.kind, MAV_MISSION_RESULT.NO_SPACE)
         elif not wanted:
-            self._ack(channel, message, store.kind, self._replace(store, []))
+            self._complete(channel, message, store, [])
         else:
             partial = message.name == "MISSION_WRITE_PARTIAL_LIST"
             self.upload = Upload(
@@ -155,14 +161,27 @@ class Transfers:
             self.upload = None
             self._ack(channel, message, store.kind, verdict)
             return
+        if message.name == "MISSION_ITEM" and not up.old_format:
+            up.old_format = True
+            self._say(MAV_SEVERITY.WARNING, "got MISSION_ITEM; GCS should send MISSION_ITEM_INT")
         up.items[seq : seq + 1] = [item]
+        if store.kind is MAV_MISSION_TYPE.MISSION and up.next < up.last:
+            # A mission is written as it arrives: an upload that ends here leaves so much of it, and nothing of the old one.
+            self._replace(store, list(up.items))
         up.next += 1
         up.heard_s = self.now_s
         if up.next <= up.last:
             self._ask(up)
             return
         self.upload = None
-        self._ack(channel, message, store.kind, self._replace(store, up.items))
+        self._complete(channel, message, store, up.items)
+
+    def _complete(self, channel: Channel, message: Message, store: ItemStore, items: list[Item]) -> None:
+        """Store a list that has arrived, and say so."""
+        verdict = self._replace(store, items)
+        self._ack(channel, message, store.kind, verdict)
+        if verdict is MAV_MISSION_RESULT.ACCEPTED and store.kind in RECEIVED:
+            self._say(*RECEIVED[store.kind])
 
     @staticmethod
     def _judge(message: Message, item: Item, store: ItemStore, up: Upload) -> MAV_MISSION_RESULT:
@@ -181,7 +200,7 @@ class Transfers:
         # Item 0 of a mission is home, and may be read even when there is no mission.
         homes = [store.home] if store.home is not None and not store.items else store.items
         if not 0 <= seq < len(homes):
-            self._ack(channel, message, store.kind, MAV_MISSION_RESULT.INVALID_SEQUENCE)
+            self._ack(channel, message, store.kind, MAV_MISSION_RESULT.ERROR)
             return
         item = homes[seq]
         integers = message.name == "MISSION_REQUEST_INT"
@@ -193,7 +212,7 @@ class Transfers:
                 "frame": item.frame,
                 "command": item.command,
                 "current": 0,
-                "autocontinue": item.autocontinue,
+                "autocontinue": 1 if store.kind is MAV_MISSION_TYPE.MISSION else 0,
                 "param1": item.param1,
                 "param2": item.param2,
                 "param3": item.param3,

@@ -4,19 +4,28 @@ from __future__ import annotations
 
 from fractus_mavlink.enums import COPTER_MODE, MAV_SEVERITY
 
+from fractus_vehicle.accessories import end_motor_test
 from fractus_vehicle.channel import Channel
+from fractus_vehicle.estimator import HOME_SET_S
 from fractus_vehicle.failsafes import Failsafes
 from fractus_vehicle.home import set_home
 from fractus_vehicle.modes import FlightModes
 from fractus_vehicle.motion import move
 from fractus_vehicle.plans import replace_items, stores_of
+from fractus_vehicle.readiness import arming_refusals
+from fractus_vehicle.report_units import UNKNOWN_U16
 from fractus_vehicle.settings import LIMIT_PREFIXES, set_battery, set_fence, set_limits, set_wind
 from fractus_vehicle.state import VehicleConfig, VehicleState
-from fractus_vehicle.telemetry import attach, follow_rate, serve
+from fractus_vehicle.telemetry import attach, follow_rate, send_parameter, serve
 from fractus_vehicle.transfers import Transfers
 
 # The modes that switch the motors off as soon as they have landed.
 _LANDING_MODES = frozenset({COPTER_MODE.LAND, COPTER_MODE.RTL, COPTER_MODE.SMART_RTL})
+
+# How often a disarmed vehicle tells why it would not arm, and the pressure that it measures on the ground.
+CHECKS_TOLD_S = 30.0
+PRESSURE_TOLD_S = 10.0
+FIRST_PRESSURE_S = 1.0
 
 
 class Vehicle:
@@ -26,9 +35,13 @@ class Vehicle:
         self.state = VehicleState(config)
         self.modes = FlightModes(self.state)
         self.failsafes = Failsafes(self.state, self.modes)
-        self.transfers = Transfers(stores_of(self.state), lambda store, items: replace_items(self.state, store, items))
+        self.transfers = Transfers(
+            stores_of(self.state), lambda store, items: replace_items(self.state, store, items), self.state.say
+        )
         self.signing_key: bytes | None = None
         self.reboot_wanted = False
+        self._next_checks_s = 0.5 * CHECKS_TOLD_S
+        self._next_pressure_s = FIRST_PRESSURE_S
         self.state.params.watch(self._parameter_changed)
 
     def attach(self, channel: Channel) -> None:
@@ -61,7 +74,7 @@ class Vehicle:
         v = self.state
         v.advance_time()
         v.estimator.step(v.time_s, v.body)
-        if v.home is None and v.estimator.ready and v.position_ok:
+        if v.home is None and v.origin is not None and v.estimator.since_boot(HOME_SET_S):
             set_home(v, v.place)
         self.failsafes.step()
         v.breadcrumbs.step(v.time_s, v.known_position, v.mode, armed=v.armed)
@@ -69,11 +82,31 @@ class Vehicle:
         if v.armed:
             self.modes.flight.step(v)
             self._check_idle()
+        else:
+            self.modes.flight.wait(v)
+            end_motor_test(v)
+            self._tell_while_disarmed()
+        if v.item_reached is not None:
+            v.broadcast("MISSION_ITEM_REACHED", {"seq": v.item_reached})
+            v.item_reached = None
         move(v)
         if self.transfers.upload is not None and self.transfers.step(v.time_s):
             v.say(MAV_SEVERITY.WARNING, "Mission upload timeout")
         for channel in v.channels:
             serve(v, channel)
+
+    def _tell_while_disarmed(self) -> None:
+        """What keeps the vehicle from arming, now and then, and the pressure on the ground that is measured until it does."""
+        v = self.state
+        if v.time_s >= self._next_checks_s:
+            self._next_checks_s += CHECKS_TOLD_S
+            for refusal in arming_refusals(v):
+                v.say(MAV_SEVERITY.CRITICAL, f"PreArm: {refusal}")
+        if v.time_s >= self._next_pressure_s:
+            self._next_pressure_s = v.time_s + PRESSURE_TOLD_S
+            for channel in v.channels:
+                for name in ("BARO1_GND_PRESS", "BARO2_GND_PRESS"):
+                    send_parameter(v, channel, name, -1, UNKNOWN_U16)
 
     def _check_idle(self) -> None:
         v = self.state
@@ -89,8 +122,8 @@ class Vehicle:
         prefix = name.split("_", 1)[0]
         if prefix in LIMIT_PREFIXES:
             set_limits(v.params, v.control)
-        elif prefix == "FENCE":
-            set_fence(v.params, v.fence)
+        elif prefix in ("FENCE", "AVOID"):
+            set_fence(v.params, v.fence, name)
         elif name.startswith("SIM_WIND"):
             set_wind(v.params, v.wind)
         elif prefix in ("SIM", "BATT"):

@@ -64,3 +64,11 @@ def test_a_file_that_holds_no_parameters_is_neither_read_nor_replaced(content: b
         Parameters(store=store)
     store.write_text("WPNAV_SPEED,700\nOF_ANOTHER_RELEASE,1\n")
     assert Parameters(store=store)["WPNAV_SPEED"] == 700.0
+
+
+def test_every_vehicle_of_a_row_is_announced():
+    options = ["--count", "3", "--listen", "udpout:127.0.0.1:26000", "--duration", "0.1", "--speedup", "0"]
+    done = CliRunner().invoke(vehicle, options)
+    assert done.stderr.splitlines() == [
+        f"vehicle {i + 1} ready for connections on udpout:127.0.0.1:{26000 + i}" for i in range(3)
+    ]

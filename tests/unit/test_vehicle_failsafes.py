@@ -59,11 +59,11 @@ def test_low_and_critical_battery():
     )
     pilot.go_to(60.0, 0.0, 10.0)
     pilot.fly_on(8.0)
-    pilot.parameter("SIM_BATT_VOLTAGE", 11.8)
+    pilot.parameter("SIM_BATT_VOLTAGE", 11.4)
     pilot.wait(lambda: vehicle.mode is COPTER_MODE.RTL, 10.0)
     assert any(text.startswith("Battery 1 is low 11.") for text in pilot.texts)
     assert pilot.texts[-1] == "Battery Failsafe"
-    pilot.parameter("SIM_BATT_VOLTAGE", 11.0)
+    pilot.parameter("SIM_BATT_VOLTAGE", 10.7)
     pilot.wait(lambda: vehicle.mode is COPTER_MODE.LAND, 10.0)
     assert any(text.startswith("Battery 1 is critical 10.") for text in pilot.texts)
     pilot.wait(lambda: not vehicle.armed, 60.0)
@@ -72,7 +72,7 @@ def test_low_and_critical_battery():
 
 def test_lost_gps_lands_it():
     vehicle, pilot = airborne(15.0)
-    pilot.parameter("SIM_GPS1_ENABLE", 0)
+    pilot.parameter("SIM_GPS_DISABLE", 1)
     pilot.wait(lambda: vehicle.mode is COPTER_MODE.LAND, 15.0)
     assert "EKF Failsafe: changed to LAND Mode" in pilot.texts
     assert pilot.mode(COPTER_MODE.GUIDED) is MAV_RESULT.FAILED
@@ -82,9 +82,9 @@ def test_lost_gps_lands_it():
 
 def test_short_gps_loss_is_ridden_out():
     vehicle, pilot = airborne(15.0)
-    pilot.parameter("SIM_GPS1_ENABLE", 0)
+    pilot.parameter("SIM_GPS_DISABLE", 1)
     pilot.fly_on(3.0)
-    pilot.parameter("SIM_GPS1_ENABLE", 1)
+    pilot.parameter("SIM_GPS_DISABLE", 0)
     pilot.fly_on(10.0)
     assert vehicle.mode is COPTER_MODE.GUIDED
     assert distance_m(vehicle, 0.0, 0.0) < 2.0
@@ -97,7 +97,7 @@ def test_crossing_the_fence_brings_it_back():
     for _ in range(200):
         pilot.send(
             "SET_POSITION_TARGET_LOCAL_NED",
-            {"target_system": 1, "target_component": 1, "coordinate_frame": 1, "type_mask": 0xDC7, "vx": 5.0},
+            {"target_system": 1, "target_component": 1, "coordinate_frame": 1, "type_mask": 0xDC7, "vx": 9.0},
         )
         pilot.fly_on(0.1)
         if vehicle.mode is COPTER_MODE.RTL:
@@ -205,3 +205,47 @@ def test_failed_motor_brings_it_down():
 def _crashed(vehicle: VehicleState, pilot: Pilot) -> bool:
     pilot.wait(lambda: not vehicle.armed, 10.0)
     return any(text.startswith("Crash: Disarming") for text in pilot.texts)
+
+
+def test_a_low_battery_forbids_arming_and_its_failsafe_stays_until_a_restart():
+    vehicle, pilot = airborne(10.0, BATT_LOW_TIMER=1, BATT_FS_LOW_ACT=1)
+    pilot.parameter("SIM_BATT_VOLTAGE", 10.3)
+    pilot.wait(lambda: not vehicle.armed, 60.0)
+    assert "Battery 1 is low 10.30V used" in " ".join(pilot.texts)
+    before = len(pilot.texts)
+    pilot.mode(COPTER_MODE.GUIDED)
+    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.FAILED
+    assert pilot.texts[before:] == ["Arm: Battery 1 low voltage failsafe", "Arm: Battery failsafe"]
+    pilot.parameter("SIM_BATT_VOLTAGE", 12.6)
+    pilot.fly_on(1.0)
+    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.FAILED
+    assert pilot.texts[-1] == "Arm: Battery failsafe"
+
+
+def test_a_change_of_mode_in_a_breach_suspends_the_fence_and_its_end_is_told():
+    vehicle, pilot = airborne(10.0, FENCE_RADIUS=30, FENCE_TYPE=2, AVOID_ENABLE=0, FENCE_ENABLE=1)
+    while vehicle.mode is COPTER_MODE.GUIDED:
+        pilot.send(
+            "SET_POSITION_TARGET_LOCAL_NED",
+            {"target_system": 1, "target_component": 1, "coordinate_frame": 1, "type_mask": 0xDC7, "vx": 6.0},
+        )
+        pilot.fly_on(0.2)
+    assert pilot.texts[-2:] == ["Circle fence breached", "Manual recovery started"]
+    pilot.mode(COPTER_MODE.LOITER)
+    assert pilot.texts[-1] == "Manual recovery started"
+    pilot.mode(COPTER_MODE.RTL)
+    pilot.wait(lambda: "Fence breach cleared" in pilot.texts, 30.0)
+    assert pilot.texts.count("Circle fence breached") == 1
+
+
+def test_velocities_are_slowed_before_the_fence():
+    vehicle, pilot = airborne(10.0, FENCE_RADIUS=30, FENCE_TYPE=2, FENCE_ENABLE=1)
+    for _ in range(75):
+        pilot.send(
+            "SET_POSITION_TARGET_LOCAL_NED",
+            {"target_system": 1, "target_component": 1, "coordinate_frame": 1, "type_mask": 0xDC7, "vx": 3.0},
+        )
+        pilot.fly_on(0.2)
+    assert vehicle.mode is COPTER_MODE.GUIDED
+    assert 26.0 < vehicle.est.north < 30.0
+    assert vehicle.fence.limiting

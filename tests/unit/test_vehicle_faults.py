@@ -7,7 +7,7 @@ import math
 import pytest
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_RESULT, MAV_SEVERITY
 from fractus_vehicle.pilot import Pilot
-from fractus_vehicle.readiness import arming_refusal
+from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.state import VehicleState
 from vehicle_world import START, airborne, alone, distance_m, upload
 
@@ -38,12 +38,12 @@ def test_gps_loss_lands_after_a_pause(mode: COPTER_MODE):
     vehicle, pilot = _in_mission() if mode is COPTER_MODE.AUTO else airborne(15.0)
     if mode is not COPTER_MODE.AUTO:
         pilot.mode(mode)
-    pilot.parameter("SIM_GPS1_ENABLE", 0)
+    pilot.parameter("SIM_GPS_DISABLE", 1)
     pilot.wait(lambda: vehicle.mode is COPTER_MODE.LAND, 12.0)
     assert _in_order(
         pilot.texts,
         "EKF3 IMU0 stopped aiding",
-        "EKF variance: position lost",
+        "EKF variance",
         "EKF Failsafe: changed to LAND Mode",
     )
     height_m = vehicle.height_m
@@ -55,19 +55,19 @@ def test_gps_loss_lands_after_a_pause(mode: COPTER_MODE):
 
 def test_gps_loss_may_hold_altitude_instead():
     vehicle, pilot = airborne(15.0, FS_EKF_ACTION=2)
-    pilot.parameter("SIM_GPS1_ENABLE", 0)
+    pilot.parameter("SIM_GPS_DISABLE", 1)
     pilot.wait(lambda: vehicle.mode is COPTER_MODE.ALT_HOLD, 12.0)
     assert "EKF Failsafe: changed to ALT_HOLD Mode" in pilot.texts
-    pilot.parameter("SIM_GPS1_ENABLE", 1)
+    pilot.parameter("SIM_GPS_DISABLE", 0)
     pilot.wait(lambda: "EKF Failsafe Cleared" in pilot.texts, 10.0)
-    assert "EKF3 IMU0 is using GPS" in pilot.texts[-2:]
+    assert "EKF3 IMU0 is using GPS" in pilot.texts[-3:]
     assert vehicle.mode is COPTER_MODE.ALT_HOLD
     assert pilot.mode(COPTER_MODE.GUIDED) is MAV_RESULT.ACCEPTED
 
 
 def test_too_few_satellites_are_no_position():
     vehicle, pilot = airborne(15.0)
-    pilot.parameter("SIM_GPS1_NUMSATS", 3)
+    pilot.parameter("SIM_GPS_NUMSATS", 3)
     pilot.wait(lambda: vehicle.mode is COPTER_MODE.LAND, 12.0)
     assert "EKF Failsafe: changed to LAND Mode" in pilot.texts
 
@@ -138,14 +138,14 @@ def test_guided_flight_may_go_on_without_radio_where_the_companion_is_watched(op
 
 def test_a_lost_radio_on_the_ground_stops_the_motors_and_forbids_arming():
     vehicle, pilot = alone()
-    pilot.wait(lambda: arming_refusal(vehicle) is None, 5.0)
     pilot.mode(COPTER_MODE.GUIDED)
+    pilot.wait(lambda: not arming_refusals(vehicle), 5.0)
     pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0)
     pilot.parameter("SIM_RC_FAIL", 1)
     pilot.wait(lambda: not vehicle.armed, 3.0)
     assert "Radio Failsafe - Disarming" in pilot.texts
     assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.FAILED
-    assert pilot.texts[-1] == "Arm: Radio failsafe on"
+    assert "Arm: Radio failsafe on" in pilot.texts
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ def test_a_battery_that_drops(setting: int, mode: COPTER_MODE):
     vehicle, pilot = airborne(10.0, BATT_LOW_VOLT=11.5, BATT_FS_LOW_ACT=setting)
     pilot.go_to(30.0, 0.0, 10.0)
     pilot.fly_on(3.0)
-    pilot.parameter("SIM_BATT_VOLTAGE", 11.6)
+    pilot.parameter("SIM_BATT_VOLTAGE", 10.4)
     pilot.wait(lambda: vehicle.failsafes.battery, 15.0)
     assert vehicle.mode is mode
     assert _in_order(pilot.texts, "Battery 1 is low 1", "Battery Failsafe")
@@ -173,14 +173,14 @@ def test_a_battery_that_drops(setting: int, mode: COPTER_MODE):
 
 def test_a_terminating_battery_failsafe_stops_the_motors():
     vehicle, pilot = airborne(10.0, BATT_CRT_VOLT=11.5, BATT_FS_CRT_ACT=5)
-    pilot.parameter("SIM_BATT_VOLTAGE", 11.6)
+    pilot.parameter("SIM_BATT_VOLTAGE", 10.4)
     pilot.wait(lambda: not vehicle.armed, 15.0)
     assert _in_order(pilot.texts, "Battery 1 is critical 1", "Battery Failsafe", "Disarming motors")
 
 
 def test_a_landing_for_the_battery_is_not_undone_by_a_lost_link():
     vehicle, pilot = airborne(25.0, BATT_CRT_VOLT=11.5, BATT_FS_CRT_ACT=1, FS_GCS_ENABLE=1, FS_OPTIONS=0)
-    pilot.parameter("SIM_BATT_VOLTAGE", 11.6)
+    pilot.parameter("SIM_BATT_VOLTAGE", 10.4)
     pilot.wait(lambda: vehicle.mode is COPTER_MODE.LAND, 15.0)
     pilot.heartbeats = False
     pilot.wait(lambda: vehicle.failsafes.gcs, 8.0)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_MISSION_RESULT, MAV_RESULT
 from fractus_vehicle.pilot import Pilot
-from fractus_vehicle.readiness import arming_refusal
+from fractus_vehicle.profile import Profile
+from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.state import VehicleState
 from vehicle_world import START, airborne, alone, distance_m, upload
 
@@ -45,8 +47,8 @@ MISSION = [
 def test_a_mission_is_flown_with_its_jump_and_return():
     vehicle, pilot = alone()
     assert upload(pilot, 0, MISSION) == MAV_MISSION_RESULT.ACCEPTED
-    pilot.wait(lambda: arming_refusal(vehicle) is None, 5.0)
     pilot.mode(COPTER_MODE.GUIDED)
+    pilot.wait(lambda: not arming_refusals(vehicle), 5.0)
     assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.ACCEPTED
     assert pilot.command(MAV_CMD.MISSION_START) is MAV_RESULT.ACCEPTED
     reached: list[int] = []
@@ -58,7 +60,7 @@ def test_a_mission_is_flown_with_its_jump_and_return():
             fastest_after_change = max(fastest_after_change, abs(vehicle.body.ve))
         if not vehicle.armed:
             break
-    assert reached == [1, 2, 3, 4, 2, 3, 4, 6]
+    assert reached == [1, 3, 4, 3, 4, 6], "of two items that end in one step the later one is told"
     assert vehicle.mission.state(vehicle.mode) == 5
     assert fastest_after_change < 4.4
     assert not vehicle.armed
@@ -134,7 +136,7 @@ def test_a_stalled_upload_is_repeated_then_given_up_and_changes_nothing():
 def test_bad_items_end_the_upload(item: dict[str, float], result: MAV_MISSION_RESULT):
     vehicle, pilot = alone()
     assert upload(pilot, 0, [HOME, item]) == result
-    assert vehicle.mission.items == []
+    assert len(vehicle.mission.items) == 1, "what had arrived is left"
 
 
 def test_a_heading_may_be_nan():
@@ -370,3 +372,36 @@ def test_a_rally_point_that_is_too_far_is_none():
     pilot.command(MAV_CMD.NAV_RETURN_TO_LAUNCH)
     pilot.wait(lambda: not vehicle.armed, 90.0)
     assert distance_m(vehicle, 0.0, 0.0) < 1.0
+
+
+def test_a_mission_tells_its_items_in_the_order_of_the_real_one():
+    vehicle, pilot = alone()
+    speed = {"command": 178, "param1": 1.0, "param2": 4.0}
+    assert upload(pilot, 0, [HOME, MISSION[1], speed, _waypoint(10.0, 0.0, 10.0), {"command": 20}]) == 0
+    assert pilot.texts[-1] == "Flight plan received"
+    pilot.mode(COPTER_MODE.GUIDED)
+    pilot.wait(lambda: not arming_refusals(vehicle), 5.0)
+    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.ACCEPTED
+    before = len(pilot.texts)
+    assert pilot.command(MAV_CMD.MISSION_START) is MAV_RESULT.ACCEPTED
+    pilot.wait(lambda: not vehicle.armed, 120.0)
+    told = [text for text in pilot.texts[before:] if text.startswith(("Mission", "Reached"))]
+    start = ["Mission: 1 Takeoff", "Mission: 1 Takeoff"]
+    assert told == [*start, "Mission: 2 ChangeSpeed", "Mission: 3 WP", "Reached command #3", "Mission: 4 RTL"]
+
+
+def test_legs_are_flown_with_the_jerk_of_waypoints():
+    """25 m from rest to rest: a real autopilot takes some 9 s, since WPNAV_JERK lets it bend so gently."""
+    profile = Profile(25.0, 10.0, 2.5, 1.0)
+    assert profile.duration_s == pytest.approx(4.0 * 12.5 ** (1.0 / 3.0))
+    assert profile.at(0.0) == pytest.approx((0.0, 0.0, 0.0))
+    way, speed, _ = profile.at(0.5 * profile.duration_s)
+    assert way == pytest.approx(12.5)
+    assert speed == pytest.approx(profile.speed_mps)
+    assert profile.at(profile.duration_s) == pytest.approx((25.0, 0.0, 0.0))
+    long = Profile(300.0, 10.0, 2.5, 1.0)
+    steps = [long.at(at * 0.01)[0] for at in range(int(100.0 * long.duration_s) + 2)]
+    speeds = [(later - sooner) / 0.01 for sooner, later in itertools.pairwise(steps)]
+    assert max(speeds) == pytest.approx(10.0, abs=0.01)
+    assert steps[-1] == pytest.approx(300.0)
+    assert max(abs(b - a) for a, b in itertools.pairwise(speeds)) < 2.6 * 0.01

@@ -10,7 +10,6 @@ import pytest
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_RESULT
 from fractus_vehicle.breadcrumbs import Breadcrumbs, Point, distance_to_segment, segment_gap
 from fractus_vehicle.pilot import Pilot
-from fractus_vehicle.readiness import arming_refusal
 from fractus_vehicle.state import VehicleState
 from vehicle_world import airborne, alone, distance_m
 
@@ -196,7 +195,7 @@ def _provoke(parameter: str, pilot: Pilot) -> None:
     elif parameter == "FS_THR_ENABLE":
         pilot.parameter("SIM_RC_FAIL", 1)
     else:
-        pilot.parameter("SIM_BATT_VOLTAGE", 11.8)
+        pilot.parameter("SIM_BATT_VOLTAGE", 10.4)
 
 
 @pytest.mark.parametrize(
@@ -226,9 +225,9 @@ def test_a_full_memory_ends_it_for_the_flight():
 
 def test_a_long_time_without_position_ends_it():
     vehicle, pilot = airborne(10.0, FS_EKF_ACTION=0)
-    pilot.parameter("SIM_GPS1_ENABLE", 0)
+    pilot.parameter("SIM_GPS_DISABLE", 1)
     pilot.wait(lambda: "SmartRTL deactivated: bad position" in pilot.texts, 30.0)
-    pilot.parameter("SIM_GPS1_ENABLE", 1)
+    pilot.parameter("SIM_GPS_DISABLE", 0)
     pilot.fly_on(3.0)
     assert not vehicle.breadcrumbs.active
     assert pilot.mode(COPTER_MODE.SMART_RTL) is MAV_RESULT.FAILED
@@ -261,6 +260,6 @@ def test_a_new_flight_begins_a_new_path():
 def test_before_there_is_a_position_it_cannot_be_chosen():
     vehicle, pilot = alone()
     assert pilot.mode(COPTER_MODE.SMART_RTL) is MAV_RESULT.FAILED
-    pilot.wait(lambda: arming_refusal(vehicle) is None, 5.0)
+    pilot.wait(lambda: vehicle.position_ok, 5.0)
     pilot.fly_on(0.5)
     assert pilot.mode(COPTER_MODE.SMART_RTL) is MAV_RESULT.ACCEPTED

@@ -136,9 +136,9 @@ def breaches(pilot: Pilot) -> None:
         pilot.fly_on(1.0)
     pilot.wait(lambda: "Polygon fence breached" in pilot.texts, 10.0)
     pilot.fly_on(15.0)
-    pilot.parameter("SIM_GPS1_ENABLE", 0.0)
+    pilot.parameter("SIM_GPS_DISABLE", 1.0)
     pilot.fly_on(9.0)
-    pilot.parameter("SIM_GPS1_ENABLE", 1.0)
+    pilot.parameter("SIM_GPS_DISABLE", 0.0)
     pilot.fly_on(20.0)
 
 
@@ -198,7 +198,7 @@ _RANDOM_ORDERS: tuple[Callable[[Pilot, random.Random], object], ...] = (
     lambda p, r: p.parameter(
         *r.choice(
             (
-                ("SIM_WIND_SPD", 6.0), ("SIM_WIND_TURB", 2.0), ("SIM_GPS1_ENABLE", 0.0), ("SIM_GPS1_ENABLE", 1.0),
+                ("SIM_WIND_SPD", 6.0), ("SIM_WIND_TURB", 2.0), ("SIM_GPS_DISABLE", 1.0), ("SIM_GPS_DISABLE", 0.0),
                 ("FENCE_ENABLE", 1.0), ("FENCE_ENABLE", 0.0), ("WPNAV_SPEED", 400.0), ("FS_GCS_ENABLE", 1.0),
                 ("SIM_RC_FAIL", 1.0), ("SIM_RC_FAIL", 0.0), ("RTL_ALT_FINAL", 300.0), ("TERRAIN_ENABLE", 0.0),
                 ("BATT_FS_LOW_ACT", 2.0), ("SIM_BATT_VOLTAGE", 10.2), ("SIM_BATT_VOLTAGE", 12.6), ("GUID_TIMEOUT", 1.0),

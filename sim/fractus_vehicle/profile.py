@@ -1,0 +1,51 @@
+"""Motion along a line from rest to rest, with limits on speed, acceleration and jerk: seven phases, in time and in reverse alike."""
+
+from __future__ import annotations
+
+import math
+
+
+class Profile:
+    """Way, speed and acceleration over time."""
+
+    def __init__(self, length_m: float, speed_mps: float, accel_mps2: float, jerk_mps3: float) -> None:
+        speed = min(speed_mps, self._fastest(length_m, accel_mps2, jerk_mps3))
+        self.length_m = length_m
+        self.speed_mps = speed
+        self._jerk = jerk_mps3
+        self._bend_s = min(accel_mps2 / jerk_mps3, math.sqrt(speed / jerk_mps3))
+        accel = self._bend_s * jerk_mps3
+        self._rise_s = self._bend_s + speed / accel if accel > 0.0 else 0.0
+        cruise_m = max(length_m - speed * self._rise_s, 0.0)
+        self.duration_s = 2.0 * self._rise_s + (cruise_m / speed if speed > 0.0 else 0.0)
+
+    @staticmethod
+    def _fastest(length_m: float, accel: float, jerk: float) -> float:
+        """The speed that is just reached halfway."""
+        speed = 0.5 * accel * (math.sqrt((accel / jerk) ** 2 + 4.0 * length_m / accel) - accel / jerk)
+        return speed if speed * jerk >= accel * accel else (length_m * length_m * jerk / 4.0) ** (1.0 / 3.0)
+
+    def at(self, time_s: float) -> tuple[float, float, float]:
+        """Way, speed and acceleration after a time."""
+        left_s = self.duration_s - time_s
+        if left_s <= 0.0:
+            return self.length_m, 0.0, 0.0
+        if left_s < self._rise_s:
+            way, speed, accel = self._rise(left_s)
+            return self.length_m - way, speed, -accel
+        if time_s <= self._rise_s:
+            return self._rise(max(time_s, 0.0))
+        return self.speed_mps * (time_s - 0.5 * self._rise_s), self.speed_mps, 0.0
+
+    def _rise(self, t: float) -> tuple[float, float, float]:
+        """Speeding up: jerk, steady acceleration, jerk back."""
+        jerk, bend = self._jerk, self._bend_s
+        if t <= bend:
+            return jerk * t**3 / 6.0, 0.5 * jerk * t * t, jerk * t
+        if t <= self._rise_s - bend:
+            steady = t - bend
+            accel, base = jerk * bend, 0.5 * jerk * bend * bend
+            return jerk * bend**3 / 6.0 + base * steady + 0.5 * accel * steady * steady, base + accel * steady, accel
+        rest = self._rise_s - t
+        way = 0.5 * self.speed_mps * self._rise_s - self.speed_mps * rest + jerk * rest**3 / 6.0
+        return way, self.speed_mps - 0.5 * jerk * rest * rest, jerk * rest

@@ -1,0 +1,131 @@
+"""Commands that only ask for something, or whose answer is all there is to them: messages, rates, devices that are not there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from fractus_mavlink import layout_of
+from fractus_mavlink.enums import MAV_CMD, MAV_RESULT, MAV_SEVERITY
+
+from fractus_vehicle.accessories import ABSENT, TAKEN, reset_battery, set_relay, set_servo, start_motor_test
+from fractus_vehicle.channel import Channel
+from fractus_vehicle.copter import VERSION_TEXT
+from fractus_vehicle.orders import Order
+from fractus_vehicle.state import VehicleState
+from fractus_vehicle.streams import BUILDERS, SILENT
+from fractus_vehicle.telemetry import send
+
+Answer = Callable[[VehicleState, Order, Channel], MAV_RESULT]
+
+# Messages may come at this share of the main loop's rate.
+MAX_LOOP_SHARE = 0.8
+FRAMES = {0: "PLUS", 1: "X"}
+
+
+def _get_home(v: VehicleState, _o: Order, c: Channel) -> MAV_RESULT:
+    if v.home is None:
+        return MAV_RESULT.FAILED
+    send(v, c, "HOME_POSITION")
+    send(v, c, "GPS_GLOBAL_ORIGIN")
+    return MAV_RESULT.ACCEPTED
+
+
+def _message_name(number: float) -> str | None:
+    layout = layout_of(int(number)) if math.isfinite(number) and number >= 0.0 else None
+    return layout.name if layout is not None and (layout.name in BUILDERS or layout.name in SILENT) else None
+
+
+def _named(v: VehicleState, number: float) -> str | None:
+    """The message of a number; one that ArduCopter does not have is complained about."""
+    name = _message_name(number)
+    if name is None and math.isfinite(number):
+        v.say(MAV_SEVERITY.INFO, f"No ap_message for mavlink id ({int(number)})")
+    return name
+
+
+def _set_interval(v: VehicleState, o: Order, c: Channel) -> MAV_RESULT:
+    interval_us = o.params[1]
+    name = _named(v, o.params[0])
+    # A real autopilot aborts in the simulator where the interval is not a number.
+    if name is None or not math.isfinite(interval_us) or interval_us < -1.0:
+        return MAV_RESULT.DENIED
+    if interval_us < 0.0:
+        c.set_interval(name, None)
+    elif interval_us == 0.0:
+        c.reset_interval(name)
+    elif interval_us < 1e6 / (MAX_LOOP_SHARE * max(v.params["SCHED_LOOP_RATE"], 1.0)):
+        text = f"Requested rate for message ID {int(o.params[0])} too fast. Increase SCHED_LOOP_RATE"
+        v.say(MAV_SEVERITY.INFO, text)
+        return MAV_RESULT.DENIED
+    else:
+        c.set_interval(name, max(interval_us, 10_000.0) / 1e6)
+    return MAV_RESULT.ACCEPTED
+
+
+def _get_interval(_v: VehicleState, o: Order, c: Channel) -> MAV_RESULT:
+    name = _message_name(o.params[0])
+    stream = c.streams.get(name) if name is not None else None
+    interval = 0 if name is None else -1 if stream is None else round(stream.interval_s * 1e6)
+    number = o.params[0]
+    if not math.isfinite(number) or not 0 <= number <= 65535:
+        return MAV_RESULT.DENIED
+    c.send("MESSAGE_INTERVAL", {"message_id": int(number), "interval_us": interval})
+    return MAV_RESULT.ACCEPTED if name is not None else MAV_RESULT.FAILED
+
+
+def _request_message(v: VehicleState, o: Order, c: Channel) -> MAV_RESULT:
+    name = _message_name(o.params[0])
+    if name is None:
+        return MAV_RESULT.FAILED
+    send(v, c, name)  # accepted even where there is nothing to send now
+    return MAV_RESULT.ACCEPTED
+
+
+def _capabilities(v: VehicleState, o: Order, c: Channel) -> MAV_RESULT:
+    if o.params[0] != 1.0:
+        return MAV_RESULT.FAILED
+    send(v, c, "AUTOPILOT_VERSION")
+    return MAV_RESULT.ACCEPTED
+
+
+def _banner(v: VehicleState, _o: Order, _c: Channel) -> MAV_RESULT:
+    for text in (VERSION_TEXT, f"Frame: QUAD/{FRAMES.get(int(v.params['FRAME_TYPE']), 'UNSUPPORTED')}"):
+        v.say(MAV_SEVERITY.INFO, text)
+    return MAV_RESULT.ACCEPTED
+
+
+def _high_latency(v: VehicleState, o: Order, _c: Channel) -> MAV_RESULT:
+    if o.params[0] not in (0.0, 1.0):
+        return MAV_RESULT.DENIED
+    v.say(MAV_SEVERITY.NOTICE, f"High Latency {'enabled' if o.params[0] else 'disabled'}")
+    return MAV_RESULT.ACCEPTED
+
+
+def _parachute(_v: VehicleState, o: Order, _c: Channel) -> MAV_RESULT:
+    """There is none to release, but the switches are there."""
+    return MAV_RESULT.ACCEPTED if o.params[0] in (0.0, 1.0, 2.0) else MAV_RESULT.FAILED
+
+
+def _always(result: MAV_RESULT) -> Answer:
+    return lambda _v, _order, _channel: result
+
+
+ANSWERS: dict[int, Answer] = {
+    MAV_CMD.GET_HOME_POSITION: _get_home,
+    MAV_CMD.SET_MESSAGE_INTERVAL: _set_interval,
+    MAV_CMD.GET_MESSAGE_INTERVAL: _get_interval,
+    MAV_CMD.REQUEST_MESSAGE: _request_message,
+    MAV_CMD.REQUEST_AUTOPILOT_CAPABILITIES: _capabilities,
+    MAV_CMD.DO_SEND_BANNER: _banner,
+    MAV_CMD.DO_PARACHUTE: _parachute,
+    MAV_CMD.CONTROL_HIGH_LATENCY: _high_latency,
+    MAV_CMD.DO_SET_SERVO: lambda v, o, _c: set_servo(v, *o.params[:2]),
+    MAV_CMD.DO_REPEAT_SERVO: lambda v, o, _c: set_servo(v, *o.params[:2]),
+    MAV_CMD.DO_SET_RELAY: lambda v, o, _c: set_relay(v, o.params[0]),
+    MAV_CMD.DO_REPEAT_RELAY: lambda v, o, _c: set_relay(v, o.params[0]),
+    MAV_CMD.DO_MOTOR_TEST: lambda v, o, _c: start_motor_test(v, o.params[0], o.params[3]),
+    MAV_CMD.BATTERY_RESET: lambda v, o, _c: reset_battery(v, *o.params[:2]),
+    **dict.fromkeys(ABSENT, _always(MAV_RESULT.FAILED)),
+    **dict.fromkeys(TAKEN, _always(MAV_RESULT.ACCEPTED)),
+}

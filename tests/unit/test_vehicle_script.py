@@ -1,0 +1,36 @@
+"""The simulated vehicle beside the answers of a real ArduCopter 4.6.3, one script for both."""
+
+from __future__ import annotations
+
+import pytest
+from vehicle_script import SimulatedLine, Step, agrees, compare, steps
+
+
+def test_every_step_is_played_or_says_why_not():
+    assert len({step.name for step in steps()}) == len(steps())
+    assert [step.name for step in steps() if not step.do and not step.note] == []
+
+
+def test_the_vehicle_answers_as_the_real_one():
+    differing: list[str] = []
+
+    def report(step: Step, answer: str, verdict: str) -> None:
+        if verdict == "differs":
+            differing.append(f"{step.name}: real {step.real}, ours {answer}")
+
+    assert compare(SimulatedLine(), report) == 0, differing
+
+
+@pytest.mark.parametrize(
+    ("real", "ours", "same"),
+    [
+        ("ACCEPTED -> 4", "ACCEPTED -> 4", True),
+        ("ACCEPTED -> 4", "ACCEPTED -> 6", False),
+        ("s=5.0~10% mode=6", "s=4.6 mode=6", True),
+        ("s=5.0~10% mode=6", "s=4.4 mode=6", False),
+        ("N=0~0.5", "N=-0.4", True),
+        ("N=0~0.5", "E=0.1", False),
+    ],
+)
+def test_tolerances_belong_to_single_numbers(real: str, ours: str, same: bool):
+    assert agrees(real, ours) is same

@@ -1,0 +1,124 @@
+"""A cold start: what the vehicle says, when it would arm in which mode, and what its status bits claim meanwhile."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from fractus_mavlink.enums import (
+    COPTER_MODE,
+    MAV_CMD,
+    MAV_MODE_FLAG,
+    MAV_RESULT,
+    MAV_STATE,
+    MAV_SYS_STATUS_SENSOR,
+)
+from fractus_vehicle.pilot import Pilot
+from fractus_vehicle.state import VehicleConfig, VehicleState
+from vehicle_world import START, alone
+
+COLD = VehicleConfig(start=replace(START, alt_m=0.1))
+WITHOUT_POSITION, WITH_POSITION = 167, 831
+TEXTS = """Calibrating barometer
+Barometer 1 calibration complete
+Barometer 2 calibration complete
+ArduPilot Ready
+AHRS: DCM active
+RC7: SaveWaypoint LOW
+EKF3 IMU0 initialised
+EKF3 IMU1 initialised
+AHRS: EKF3 active
+EKF3 IMU0 tilt alignment complete
+EKF3 IMU1 tilt alignment complete
+EKF3 IMU0 MAG0 initial yaw alignment complete
+EKF3 IMU1 MAG0 initial yaw alignment complete
+GPS 1: probing for u-blox at 230400 baud
+GPS 1: detected u-blox
+EKF3 IMU0 origin set
+Field Elevation Set: 0m
+EKF3 IMU1 origin set
+EKF3 IMU0 is using GPS
+EKF3 IMU1 is using GPS"""
+
+
+def _cold() -> tuple[VehicleState, Pilot]:
+    vehicle, pilot = alone(config=COLD)
+    for number in (1, 193):
+        pilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, number, 200_000)
+    return vehicle, pilot
+
+
+def _prearm(pilot: Pilot) -> bool:
+    return bool(
+        pilot.expect("SYS_STATUS").integer("onboard_control_sensors_health") & MAV_SYS_STATUS_SENSOR.PREARM_CHECK
+    )
+
+
+def _refusals(pilot: Pilot) -> list[str]:
+    before = len(pilot.texts)
+    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.FAILED
+    return [text for text in pilot.texts[before:] if text.startswith("Arm: ")]
+
+
+def test_a_cold_start_says_what_a_real_one_says():
+    _, pilot = _cold()
+    pilot.fly_on(42.0)
+    assert [text for text in pilot.texts if not text.startswith("PreArm: ")] == TEXTS.splitlines()
+    assert pilot.texts.count("PreArm: AHRS: waiting for home") == 1, "every 30 s, from the 15th on"
+
+
+def test_a_warm_start_says_the_same():
+    _, pilot = alone(config=replace(COLD, ready_after_s=1.0))
+    pilot.fly_on(1.2)
+    assert pilot.texts == TEXTS.splitlines()
+
+
+def test_the_prearm_bit_is_healthy_long_before_guided_may_arm():
+    vehicle, pilot = _cold()
+    pilot.wait(lambda: _prearm(pilot), 60.0)
+    assert vehicle.time_s == pytest.approx(22.0, abs=1.0)
+    assert pilot.expect("EKF_STATUS_REPORT").integer("flags") == WITHOUT_POSITION
+    pilot.mode(COPTER_MODE.GUIDED)
+    assert _refusals(pilot) == ["Arm: Need Position Estimate"]
+    assert not _prearm(pilot)
+    pilot.wait(lambda: _prearm(pilot), 60.0)
+    assert vehicle.time_s == pytest.approx(41.0, abs=1.0)
+    assert pilot.expect("EKF_STATUS_REPORT").integer("flags") == WITH_POSITION
+    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.ACCEPTED
+
+
+def test_all_checks_that_fail_are_told_and_depend_on_the_mode():
+    _, pilot = _cold()
+    pilot.fly_on(3.5)
+    first = ["Arm: Accels inconsistent", "Arm: EKF attitude is bad", "Arm: AHRS: not using configured AHRS type"]
+    assert _refusals(pilot) == first
+    pilot.fly_on(2.0)
+    pilot.mode(COPTER_MODE.GUIDED)
+    later = ["Need Alt Estimate", "Accels inconsistent", "EKF attitude is bad", "AHRS: waiting for home"]
+    assert _refusals(pilot) == [f"Arm: {text}" for text in later]
+    pilot.fly_on(2.0)
+    before = len(pilot.texts)
+    assert pilot.command(MAV_CMD.RUN_PREARM_CHECKS) is MAV_RESULT.ACCEPTED
+    assert pilot.texts[before:] == ["PreArm: Accels inconsistent", "PreArm: AHRS: waiting for home"]
+
+
+def test_without_checks_or_by_force_a_position_is_still_needed():
+    _, pilot = _cold()
+    pilot.parameter("ARMING_CHECK", 0.0)
+    pilot.mode(COPTER_MODE.GUIDED)
+    pilot.fly_on(25.0)
+    assert _refusals(pilot) == ["Arm: Need Position Estimate"]
+    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0, 2989.0) is MAV_RESULT.FAILED
+    pilot.mode(COPTER_MODE.STABILIZE)
+    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.ACCEPTED
+
+
+def test_the_first_heartbeats_tell_of_a_start():
+    _, pilot = _cold()
+    beat = pilot.expect("HEARTBEAT")
+    assert beat.integer("system_status") == MAV_STATE.BOOT
+    assert beat.integer("base_mode") & MAV_MODE_FLAG.GUIDED_ENABLED
+    pilot.fly_on(3.0)
+    beat = pilot.expect("HEARTBEAT")
+    assert beat.integer("system_status") == MAV_STATE.STANDBY
+    assert not beat.integer("base_mode") & MAV_MODE_FLAG.GUIDED_ENABLED

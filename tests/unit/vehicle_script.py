@@ -1,0 +1,572 @@
+"""One script of MAVLink exchanges, played on any autopilot, beside what a real ArduCopter 4.6.3 answered.
+
+    python tests/unit/vehicle_script.py [--autopilot tcp:HOST:PORT] [--all]
+
+The steps and the real one's answers are in `tests/golden/vehicle/arducopter-4.6.3.tsv`: name, what to do, the answer, and a
+note where the simulated vehicle is meant to differ or where the step cannot be repeated. A number `4.2~10%` holds within 10 %,
+`4.2~0.5` within 0.5. Without --autopilot the simulated vehicle is asked, cold, in simulated time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import select
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from fractus_mavlink import Endpoint, Message, Value, layout_named, layout_of
+from fractus_mavlink.enums import (
+    MAV_CMD,
+    MAV_COMPONENT,
+    MAV_MISSION_RESULT,
+    MAV_RESULT,
+    MAV_SYS_STATUS_SENSOR,
+    MAV_TYPE,
+)
+from fractus_vehicle.earth import Place
+from fractus_vehicle.simulation import Simulation
+from fractus_vehicle.state import VehicleConfig
+
+STEPS = Path(__file__).parents[1] / "golden/vehicle/arducopter-4.6.3.tsv"
+HOME = Place.from_degrees(50.864, 4.679, 0.1)
+TARGET: dict[str, Value] = {"target_system": 1, "target_component": 1}
+GUIDED, RTL, BRAKE = 4, 6, 17
+KINDS = {"mission": 0, "fence": 1, "rally": 2}
+TEXTS_S = 0.6
+# What an autopilot says by itself, whatever it is asked.
+SPONTANEOUS = ("EKF3", "GPS 1", "AHRS", "Field", "Barometer", "Calibrating", "RC7", "ArduPilot", "SIM ", "PreArm")
+# Lists to upload: command, frame, metres north and east (or None, or degrees), altitude, first parameters.
+Row = tuple[int, int, float | None, float, float, tuple[float, ...]]
+_HOME_ROW: Row = (16, 0, 0.0, 0.0, 0.0, ())
+_TAKEOFF: Row = (22, 3, None, 0.0, 12.0, ())
+_RTL: Row = (20, 3, None, 0.0, 0.0, ())
+
+
+def _way(north: float, east: float, command: int = 16, frame: int = 3, *params: float) -> Row:
+    return (command, frame, north, east, 12.0, params)
+
+
+def _mission(third: Row) -> list[Row]:
+    return [_HOME_ROW, _TAKEOFF, third, _way(25.0, 25.0), _RTL]
+
+
+def _ring(declared: tuple[float, ...]) -> list[Row]:
+    corners = ((-60.0, -60.0), (-60.0, 60.0), (60.0, 60.0), (60.0, -60.0))
+    return [(5001, 0, *corners[at % 4], 0.0, (count,)) for at, count in enumerate(declared)]
+
+
+LISTS: dict[str, list[Row]] = {
+    "good": _mission(_way(25.0, 0.0)),
+    "lat200": _mission(_way(math.inf, 0.0)),
+    "unknown_cmd": _mission(_way(25.0, 0.0, 4000)),
+    "unsupported_cmd": _mission(_way(25.0, 0.0, 189 + 3800)),
+    "bad_frame": _mission(_way(25.0, 0.0, 16, 99)),
+    "local_frame": _mission(_way(25.0, 0.0, 16, 1)),
+    "terrain": _mission(_way(25.0, 0.0, 16, 10)),
+    "frame_mission": _mission((178, 2, None, 0.0, 0.0, (1.0, 3.0))),
+    "spline": _mission(_way(25.0, 0.0, 82)),
+    "p1_300": _mission(_way(25.0, 0.0, 16, 3, 300.0, 300.0)),
+    "nan_p4": _mission(_way(25.0, 0.0, 16, 3, 0.0, 0.0, 0.0, math.nan)),
+    "none": [],
+    "ring": _ring((4, 4, 4, 4)),
+    "two": _ring((2, 2)),
+    "short": _ring((5, 5, 5, 5)),
+    "mixed": _ring((4, 4, 4, 3)),
+    "circle": [(5003, 0, 0.0, 0.0, 0.0, (50.0,))],
+    "circle_negative": [(5003, 0, 0.0, 0.0, 0.0, (-50.0,))],
+    "circle_zero": [(5003, 0, 0.0, 0.0, 0.0, (0.0,))],
+    "circle_nan": [(5003, 0, 0.0, 0.0, 0.0, (math.nan,))],
+    "circle_lat200": [(5003, 0, math.inf, 0.0, 0.0, (50.0,))],
+    "circle_frame3": [(5003, 3, 0.0, 0.0, 0.0, (50.0,))],
+    "ring_return": [*_ring((4, 4, 4, 4)), (5000, 0, 0.0, 0.0, 0.0, ())],
+    "two_returns": [(5000, 0, 0.0, 0.0, 0.0, ()), (5000, 0, 1.0, 0.0, 0.0, ())],
+    "rally": [(5100, 3, 10.0, 10.0, 20.0, ())],
+}
+
+
+class Line(Protocol):
+    """A conversation with one autopilot."""
+
+    now_s: float
+
+    def send(self, name: str, values: dict[str, Value]) -> None:
+        """Send a message."""
+
+    def hear(self) -> list[Message]:
+        """What has come since; time goes on by a little."""
+
+
+class SimulatedLine:
+    """The simulated vehicle, cold, in simulated time."""
+
+    def __init__(self) -> None:
+        self._simulation = Simulation([VehicleConfig(start=HOME, throttle_us=1000)])
+        self._craft = self._simulation.crafts[0]
+        self._channel = self._craft.open("script", 0)
+        self._endpoint = Endpoint(255, MAV_COMPONENT.MISSIONPLANNER, saturate=True)
+        self.now_s = 0.0
+
+    def send(self, name: str, values: dict[str, Value]) -> None:
+        """Send a message."""
+        self._craft.receive(self._channel, self._endpoint.encode(name, values))
+
+    def hear(self) -> list[Message]:
+        """One control step."""
+        self._simulation.step()
+        self.now_s = self._simulation.time_s
+        return self._endpoint.decode(self._channel.take())
+
+
+class TcpLine:
+    """Any autopilot behind a TCP link, in real time."""
+
+    def __init__(self, address: str) -> None:
+        _, host, port = address.split(":")
+        self._socket = socket.create_connection((host, int(port)), 10.0)
+        self._endpoint = Endpoint(255, MAV_COMPONENT.MISSIONPLANNER, saturate=True)
+        self._begun_s = time.monotonic()
+        self.now_s = 0.0
+
+    def send(self, name: str, values: dict[str, Value]) -> None:
+        """Send a message."""
+        self._socket.sendall(self._endpoint.encode(name, values))
+
+    def hear(self) -> list[Message]:
+        """Wait a little for bytes."""
+        ready = select.select([self._socket], [], [], 0.02)[0]
+        data = self._socket.recv(65536) if ready else b""
+        if ready and not data:
+            raise ConnectionError("the autopilot closed the link")
+        self.now_s = time.monotonic() - self._begun_s
+        return self._endpoint.decode(data)
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One row of the file."""
+
+    name: str
+    do: str
+    real: str
+    note: str
+
+
+def steps(path: Path = STEPS) -> list[Step]:
+    """The whole script."""
+    rows = (line.split("\t") for line in path.read_text(encoding="utf-8").splitlines() if line and line[0] != "#")
+    return [Step(*row) for row in rows]
+
+
+def agrees(real: str, ours: str) -> bool:
+    """Whether an answer is the real one's; numbers may have a tolerance."""
+    wanted, got = real.split(), ours.split()
+    return len(wanted) == len(got) and all(map(_same, wanted, got))
+
+
+def _same(wanted: str, got: str) -> bool:
+    key, tilde, tolerance = wanted.partition("~")
+    if not tilde:
+        return wanted == got
+    name, _, number = key.rpartition("=")
+    got_name, _, got_number = got.rpartition("=")
+    slack = abs(float(number)) * float(tolerance[:-1]) / 100.0 if tolerance.endswith("%") else float(tolerance)
+    return name == got_name and abs(float(got_number) - float(number)) <= slack
+
+
+class Player:
+    """Plays steps on a line and tells what came back."""
+
+    def __init__(self, line: Line) -> None:
+        self.line = line
+        self.last: dict[str, Message] = {}
+        self.texts: list[str] = []
+        self.home = HOME
+        self._next_beat_s = 0.0
+        self._chunks = ""
+
+    # -- talking -----------------------------------------------------------------------------------------------
+
+    def _hear(self) -> list[Message]:
+        if self.line.now_s >= self._next_beat_s:
+            self._next_beat_s = self.line.now_s + 1.0
+            self.line.send("HEARTBEAT", {"type": MAV_TYPE.GCS, "autopilot": 8, "mavlink_version": 3})
+        messages = self.line.hear()
+        for message in messages:
+            self.last[message.name] = message
+            if message.name == "STATUSTEXT":
+                self._chunks += message.text("text")
+                if not message.integer("id") or len(message.text("text")) < 50:
+                    self.texts.append(f"[{message.integer('severity')}] {self._chunks.strip()}")
+                    self._chunks = ""
+        return messages
+
+    def _stream(self, duration_s: float) -> Iterator[Message]:
+        end = self.line.now_s + duration_s
+        while self.line.now_s < end:
+            yield from self._hear()
+
+    def _until(self, name: str, timeout_s: float, fits: Callable[[Message], bool] = lambda _m: True) -> Message | None:
+        return next((m for m in self._stream(timeout_s) if m.name == name and fits(m)), None)
+
+    def _said(self, before: int) -> str:
+        """What was said since, in answer to something."""
+        for _ in self._stream(TEXTS_S):
+            pass
+        said = [t for t in self.texts[before:] if not t[4:].startswith(SPONTANEOUS)]
+        return "".join(f" | {'; '.join(said)}" for _ in said[:1])
+
+    def _ack(self, command: int) -> str:
+        ack = self._until("COMMAND_ACK", 3.0, lambda m: m.integer("command") == command)
+        return "no ack" if ack is None else MAV_RESULT(ack.integer("result")).name
+
+    def _ordered(self, command: int, params: list[float], component: int = 1) -> str:
+        before = len(self.texts)
+        values: dict[str, Value] = {f"param{at}": value for at, value in enumerate(params, start=1)}
+        self.line.send("COMMAND_LONG", values | TARGET | {"target_component": component, "command": command})
+        return self._ack(command) + self._said(before)
+
+    def _mode(self) -> int:
+        beat = self._until("HEARTBEAT", 3.0)
+        return -1 if beat is None else beat.integer("custom_mode")
+
+    def _set(self, name: str, value: float) -> Message | None:
+        values = {"param_id": name.encode("ascii"), "param_value": value, "param_type": 9}
+        self.line.send("PARAM_SET", TARGET | values)
+        return self._until("PARAM_VALUE", 1.5, lambda m: m.text("param_id") == name)
+
+    @staticmethod
+    def _shown(message: Message | None) -> str:
+        if message is None:
+            return "no reply"
+        value = message.real("param_value")
+        index, kind = message.integer("param_index"), message.integer("param_type")
+        return f"PARAM_VALUE {message.text('param_id')} idx={index} type={kind} val={value:g}"
+
+    def _position(self) -> tuple[float, float, float]:
+        at = self._until("GLOBAL_POSITION_INT", 3.0)
+        if at is None:
+            raise TimeoutError("no GLOBAL_POSITION_INT")
+        north, east, _ = self.home.vector_to(Place(at.integer("lat"), at.integer("lon"), 0.0))
+        return north, east, at.integer("relative_alt") / 1000.0
+
+    # -- the verbs ---------------------------------------------------------------------------------------------
+
+    def play(self, do: str) -> str:
+        """Do one step and tell the answer."""
+        verb, *words = do.split()
+        method: Callable[..., str] = getattr(self, f"do_{verb}")
+        return method(*words)
+
+    def do_heartbeat(self) -> str:
+        beat = self._until("HEARTBEAT", 3.0)
+        names = (("type", "type"), ("autopilot", "ap"), ("base_mode", "base"), ("custom_mode", "custom"))
+        assert beat is not None
+        return " ".join(f"{short}={beat.integer(name)}" for name, short in (*names, ("system_status", "status")))
+
+    def do_hear(self, duration: str) -> str:
+        return " ".join(sorted({m.name for m in self._stream(float(duration))} | set(self.last)))
+
+    def do_told(self) -> str:
+        return "; ".join(self.texts)
+
+    def do_wait(self, duration: str) -> str:
+        for _ in self._stream(float(duration)):
+            pass
+        return "done"
+
+    def do_command(self, command: str, *params: str) -> str:
+        component = next((int(p[1:]) for p in params if p[0] == "@"), 1)
+        return self._ordered(int(command), [float(p) for p in params if p[0] != "@"], component)
+
+    def do_prearm(self) -> str:
+        before = len(self.texts)
+        self.line.send("COMMAND_LONG", TARGET | {"command": MAV_CMD.RUN_PREARM_CHECKS})
+        result = self._ack(MAV_CMD.RUN_PREARM_CHECKS)
+        self._said(before)
+        return f"{result} | {'; '.join(t for t in self.texts[before:] if t[4:].startswith('PreArm'))}"
+
+    def do_int(self, command: str, frame: str, north: str, east: str, alt: str, *params: str) -> str:
+        before, place = len(self.texts), self.home.offset(float(north), float(east))
+        values: dict[str, Value] = {f"param{at}": float(p) for at, p in enumerate(params, start=1)}
+        where: dict[str, Value] = {"x": place.lat_e7, "y": place.lon_e7, "z": float(alt), "frame": int(frame)}
+        self.line.send("COMMAND_INT", values | where | TARGET | {"command": int(command)})
+        return self._ack(int(command)) + self._said(before)
+
+    def do_mode(self, number: str) -> str:
+        answer = self._ordered(MAV_CMD.DO_SET_MODE, [1.0, float(number)])
+        return f"{answer} -> {self._mode()}"
+
+    def do_arm(self, number: str) -> str:
+        self._ordered(MAV_CMD.DO_SET_MODE, [1.0, float(number)])
+        mode, answer = self._mode(), self._ordered(MAV_CMD.COMPONENT_ARM_DISARM, [1.0])
+        if answer.startswith("ACCEPTED"):
+            self._ordered(MAV_CMD.COMPONENT_ARM_DISARM, [0.0])
+        return f"mode={mode} {answer}"
+
+    def do_list(self) -> str:
+        self.line.send("PARAM_REQUEST_LIST", TARGET)
+        seen: set[int] = set()
+        for message in self._stream(4.0):
+            if message.name == "PARAM_VALUE" and message.integer("param_index") < 65535:
+                seen.add(message.integer("param_index"))
+        return f"count={self.last['PARAM_VALUE'].integer('param_count')} got={len(seen)}"
+
+    def do_read(self, name: str) -> str:
+        self.line.send("PARAM_REQUEST_READ", TARGET | {"param_id": name.encode("ascii"), "param_index": -1})
+        return self._shown(self._until("PARAM_VALUE", 1.5, lambda m: m.text("param_id") == name))
+
+    def do_index(self, index: str) -> str:
+        self.line.send("PARAM_REQUEST_READ", TARGET | {"param_index": int(index)})
+        return self._shown(self._until("PARAM_VALUE", 1.5, lambda m: m.integer("param_index") == int(index)))
+
+    def do_set(self, name: str, value: str) -> str:
+        return self._shown(self._set(name, float(value)))
+
+    def do_request(self, name: str) -> str:
+        self.line.send(
+            "COMMAND_LONG", TARGET | {"command": MAV_CMD.REQUEST_MESSAGE, "param1": layout_named(name).msgid}
+        )
+        messages = list(self._stream(1.0))
+        acks = [m for m in messages if m.name == "COMMAND_ACK"]
+        result = MAV_RESULT(acks[-1].integer("result")).name if acks else "no ack"
+        return f"{result} sent={'yes' if any(m.name == name for m in messages) else 'no'}"
+
+    def do_fields(self, name: str, *fields: str) -> str:
+        self.line.send(
+            "COMMAND_LONG", TARGET | {"command": MAV_CMD.REQUEST_MESSAGE, "param1": layout_named(name).msgid}
+        )
+        message = self._until(name, 2.0)
+        return "none" if message is None else " ".join(f"{field}={message.integer(field):#x}" for field in fields)
+
+    def do_interval(self, number: str, interval_us: str) -> str:
+        return self._ordered(MAV_CMD.SET_MESSAGE_INTERVAL, [float(number), float(interval_us)])
+
+    def do_rate(self, number: str, interval_us: str) -> str:
+        result = self._ordered(MAV_CMD.SET_MESSAGE_INTERVAL, [float(number), float(interval_us)])
+        layout, duration_s = layout_of(int(number)), 3.0
+        assert layout is not None
+        count = sum(message.name == layout.name for message in self._stream(duration_s))
+        return f"{result.split(' ')[0]} hz={count / duration_s:.1f}"
+
+    def do_streams(self, rate: str) -> str:
+        values = {"req_stream_id": 0, "req_message_rate": int(rate), "start_stop": 1}
+        self.line.send("REQUEST_DATA_STREAM", TARGET | values)
+        ignored = {"STATUSTEXT", "PARAM_VALUE", "COMMAND_ACK", "TIMESYNC"}
+        return " ".join(sorted({m.name for m in self._stream(3.0)} - ignored))
+
+    def do_ready(self) -> str:
+        """Wait in a mode that flies by itself until the checks pass; tell the filter's flags before and after."""
+        self._ordered(MAV_CMD.DO_SET_MODE, [1.0, GUIDED])
+        for number in (1, 193):
+            self._ordered(MAV_CMD.SET_MESSAGE_INTERVAL, [float(number), 250_000.0])
+        bit = MAV_SYS_STATUS_SENSOR.PREARM_CHECK
+        healthy = self._until("SYS_STATUS", 120.0, lambda m: bool(m.integer("onboard_control_sensors_health") & bit))
+        flags = self._until("EKF_STATUS_REPORT", 2.0)
+        assert flags is not None
+        return f"{'ready' if healthy else 'not ready'} flags={flags.integer('flags')}"
+
+    def do_status(self, *fields: str) -> str:
+        status = self._until("SYS_STATUS", 3.0)
+        assert status is not None
+        return " ".join(f"{field}={status.integer('onboard_control_sensors_' + field):#x}" for field in fields)
+
+    # -- lists -------------------------------------------------------------------------------------------------
+
+    def _item(self, kind: int, seq: int, row: Row) -> dict[str, Value]:
+        command, frame, north, east, alt, params = row
+        if north is None:
+            x, y = 0, 0
+        elif math.isinf(north):
+            x, y = 2_000_000_000, self.home.lon_e7
+        else:
+            place = self.home.offset(north, east)
+            x, y = place.lat_e7, place.lon_e7
+        values: dict[str, Value] = {f"param{at}": float(p) for at, p in enumerate(params, start=1)}
+        where: dict[str, Value] = {"seq": seq, "frame": frame, "command": command, "x": x, "y": y, "z": alt}
+        return values | where | TARGET | {"autocontinue": 1, "mission_type": kind}
+
+    def do_upload(self, kind_name: str, name: str, old: str = "") -> str:
+        before, kind, rows = len(self.texts), KINDS[kind_name], LISTS[name]
+        self.line.send("MISSION_COUNT", TARGET | {"count": len(rows), "mission_type": kind})
+        asked, end = 0, self.line.now_s + 6.0
+        while self.line.now_s < end:
+            for message in self._hear():
+                if message.name in ("MISSION_REQUEST", "MISSION_REQUEST_INT"):
+                    asked += 1
+                    seq = message.integer("seq")
+                    item = self._item(kind, seq, rows[seq])
+                    if old:
+                        item |= {"x": float(str(item["x"])) * 1e-7, "y": float(str(item["y"])) * 1e-7}
+                    self.line.send("MISSION_ITEM" if old else "MISSION_ITEM_INT", item)
+                elif message.name == "MISSION_ACK":
+                    result = MAV_MISSION_RESULT(message.integer("type")).name
+                    return f"{result} mt={message.integer('mission_type')} after {asked}{self._said(before)}"
+        return f"no ack after {asked} requests"
+
+    def do_count(self, kind_name: str, count: str) -> str:
+        before = len(self.texts)
+        self.line.send("MISSION_COUNT", TARGET | {"count": int(count), "mission_type": KINDS[kind_name]})
+        ack = self._until("MISSION_ACK", 2.0)
+        result = "no ack" if ack is None else MAV_MISSION_RESULT(ack.integer("type")).name
+        return f"{result}{self._said(before)}"
+
+    def do_clear(self, kind: str) -> str:
+        self.line.send("MISSION_CLEAR_ALL", TARGET | {"mission_type": int(kind)})
+        ack = self._until("MISSION_ACK", 2.0)
+        assert ack is not None
+        return f"{MAV_MISSION_RESULT(ack.integer('type')).name} mt={ack.integer('mission_type')}"
+
+    def do_left(self, kind_name: str, bad: str = "") -> str:
+        """How many items are stored; after an upload that fails, where one is named."""
+        if bad:
+            self.do_upload(kind_name, "good")
+            self.do_upload(kind_name, bad)
+        self.line.send("MISSION_REQUEST_LIST", TARGET | {"mission_type": KINDS[kind_name]})
+        count = self._until("MISSION_COUNT", 2.0)
+        return f"count={-1 if count is None else count.integer('count')}"
+
+    def do_item(self, kind_name: str, seq: str, *fields: str) -> str:
+        self.line.send("MISSION_REQUEST_INT", TARGET | {"seq": int(seq), "mission_type": KINDS[kind_name]})
+        names = ("MISSION_ITEM_INT", "MISSION_ACK")
+        message = next((m for m in self._stream(2.0) if m.name in names), None)
+        assert message is not None
+        shown = fields if message.name == "MISSION_ITEM_INT" else ("type",)
+        return " ".join((message.name, *(f"{field}={message.integer(field)}" for field in shown)))
+
+    # -- flying ------------------------------------------------------------------------------------------------
+
+    def do_fly(self, altitude: str) -> str:
+        """Arm in GUIDED, climb, and hover there."""
+        self._ordered(MAV_CMD.SET_MESSAGE_INTERVAL, [33.0, 100_000.0])
+        self.do_ready()
+        armed, up_m = self._ordered(MAV_CMD.COMPONENT_ARM_DISARM, [1.0]), float(altitude)
+        begun_s = self.line.now_s
+        taken = self._ordered(MAV_CMD.NAV_TAKEOFF, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, up_m])
+        while self.line.now_s < begun_s + 40.0 and self._position()[2] < up_m - 0.5:
+            pass
+        reached_s = self.line.now_s - begun_s
+        self.do_wait("4")
+        return f"arm={armed.split(' ')[0]} takeoff={taken.split(' ')[0]} reached_s={reached_s:.1f}"
+
+    def _fast(self) -> tuple[float, float]:
+        at = self._until("GLOBAL_POSITION_INT", 3.0)
+        if at is None:
+            raise TimeoutError("no GLOBAL_POSITION_INT")
+        return math.hypot(at.integer("vx"), at.integer("vy")) / 100.0, at.integer("lat") / 1e7
+
+    def do_goto(self, frame: str, north: str, east: str, up: str) -> str:
+        """A position target so far from here; the way and the highest speed within 6 s."""
+        before, (n0, e0, u0) = len(self.texts), self._position()
+        place = self.home.offset(n0 + float(north), e0 + float(east))
+        base = {0: HOME.alt_m, 5: HOME.alt_m}.get(int(frame), 0.0)
+        values: dict[str, Value] = {"coordinate_frame": int(frame), "type_mask": 0xDF8, "alt": base + u0 + float(up)}
+        self.line.send(
+            "SET_POSITION_TARGET_GLOBAL_INT", TARGET | values | {"lat_int": place.lat_e7, "lon_int": place.lon_e7}
+        )
+        peak, end = 0.0, self.line.now_s + 6.0
+        while self.line.now_s < end:
+            peak = max(peak, self._fast()[0])
+        n1, e1, u1 = self._position()
+        said = self._said(before)
+        return f"E={e1 - e0:.1f} N={n1 - n0:.1f} U={u1 - u0:.1f} vmax={peak:.1f}{said}"
+
+    def _run(self, speed: float, duration_s: float = 8.0) -> None:
+        end = self.line.now_s + duration_s
+        while self.line.now_s < end:
+            values: dict[str, Value] = {"coordinate_frame": 1, "type_mask": 0xDC7, "vx": speed}
+            self.line.send("SET_POSITION_TARGET_LOCAL_NED", TARGET | values)
+            self.do_wait("0.2")
+
+    def _stopped(self, slow_mps: float) -> tuple[float, float]:
+        """Seconds until it stands, and how far it came."""
+        begun_s, (n0, e0, _) = self.line.now_s, self._position()
+        while self.line.now_s < begun_s + 15.0 and self._fast()[0] > slow_mps:
+            pass
+        stood_s = self.line.now_s - begun_s
+        self.do_wait("2")
+        n1, e1, _ = self._position()
+        return stood_s, math.hypot(n1 - n0, e1 - e0)
+
+    def do_brake(self, speed: str) -> str:
+        self._run(float(speed))
+        self.line.send("SET_MODE", {"target_system": 1, "base_mode": 1, "custom_mode": BRAKE})
+        stop_s, way_m = self._stopped(0.5)
+        self._ordered(MAV_CMD.DO_SET_MODE, [1.0, GUIDED])
+        return f"stop_s={stop_s:.2f} dist={way_m:.1f}"
+
+    def do_stop(self, speed: str) -> str:
+        self._run(float(speed))
+        self.line.send("SET_POSITION_TARGET_LOCAL_NED", TARGET | {"coordinate_frame": 1, "type_mask": 0xDC7})
+        stop_s, way_m = self._stopped(0.5)
+        return f"stop_s={stop_s:.2f} dist={way_m:.1f}"
+
+    def do_timeout(self, timeout: str) -> str:
+        self._set("GUID_TIMEOUT", float(timeout))
+        self._run(3.0, 4.0)
+        return f"s={0.2 + self._stopped(0.15)[0]:.1f}"
+
+    def do_breach(self, speed: str) -> str:
+        """Fly north with a velocity until the fence acts; the farthest point from home, then."""
+        before, farthest, end = len(self.texts), 0.0, self.line.now_s + 40.0
+        while self.line.now_s < end and self._mode() == GUIDED:
+            self._run(float(speed), 0.6)
+            farthest = max(farthest, self._position()[0])
+        for _ in range(20):
+            farthest = max(farthest, self._position()[0])
+        return f"N={farthest:.0f} mode={self._mode()}{self._said(before)}"
+
+    def do_home(self) -> str:
+        """RTL, and the seconds until the motors are off."""
+        begun_s = self.line.now_s
+        self._ordered(MAV_CMD.DO_SET_MODE, [1.0, RTL])
+        self._until("HEARTBEAT", 150.0, lambda m: not m.integer("base_mode") & 128)
+        return f"s={self.line.now_s - begun_s:.0f}"
+
+    def do_until(self, timeout: str, *words: str) -> str:
+        """Wait for a text; the seconds it took and the mode then."""
+        begun_s, before, wanted = self.line.now_s, len(self.texts), " ".join(words)
+        while self.line.now_s < begun_s + float(timeout) and not any(wanted in t for t in self.texts[before:]):
+            self._hear()
+        waited_s = self.line.now_s - begun_s
+        return f"s={waited_s:.1f} mode={self._mode()}"
+
+
+def compare(line: Line, report: Callable[[Step, str, str], None]) -> int:
+    """Play everything, report each step (with `same`, `differs` or `meant`), and return how many differ."""
+    player, wrong = Player(line), 0
+    for step in steps():
+        if not step.do:
+            report(step, "", "not played")
+            continue
+        answer = player.play(step.do)
+        verdict = "same" if agrees(step.real, answer) else "meant" if step.note else "differs"
+        wrong += verdict == "differs"
+        report(step, answer, verdict)
+    return wrong
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description="Compare an autopilot with a real ArduCopter 4.6.3.")
+    parser.add_argument("--autopilot", help="tcp:HOST:PORT, freshly booted; without it the simulated vehicle is asked")
+    parser.add_argument("--all", action="store_true", help="print also what is the same and what is not played")
+    options = parser.parse_args()
+    line: Line = TcpLine(options.autopilot) if options.autopilot else SimulatedLine()
+
+    def report(step: Step, answer: str, verdict: str) -> None:
+        if options.all or verdict in ("differs", "meant"):
+            print(f"{verdict:10} | {step.name} | {step.real} | {answer} | {step.note}", flush=True)
+
+    wrong = compare(line, report)
+    print(f"{wrong} of {len(steps())} steps differ without being meant to")
+    sys.exit(1 if wrong else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -99,6 +99,8 @@ def side_by_side(folder: Path, seconds: float, stream_rate: int) -> dict[str, tu
     pki = StandalonePki.create(folder / "pki")
     (folder / "grants").mkdir()
     program = Path(sys.executable).with_name("mavproxy.py")
+    if not program.exists():
+        raise SystemExit(f"bench: {program} is missing; install MAVProxy into this environment (pip install MAVProxy)")
     with Processes(folder) as processes:
         processes.start(
             "vehicle", sys.executable, "-m", "fractus_vehicle", "--listen", ours, "--listen", theirs, "--home", HOME

@@ -100,7 +100,7 @@ def serve_plainly(arguments: list[str]) -> None:
         return made
 
     grpc.aio.server = server
-    admission.caller_of = lambda _context, _time_s: Caller(IDENTITY, 0.0, math.inf)
+    admission.Callers.of = lambda _self, _context, _urgent: Caller(IDENTITY, math.inf)
     camera(arguments)
 
 

@@ -11,8 +11,9 @@ from typing import Any
 
 import grpc
 from fractus_core.policy.values import Verdict
+from google.protobuf.message import DecodeError
 
-from fractus_services.auth import Caller, caller_of
+from fractus_services.auth import Caller, Callers
 from fractus_services.errors import InternalError, InvalidRequest, PolicyDenied, Refused, ResourceExhausted
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.replies import abort
@@ -73,7 +74,7 @@ class CallAdmission:
         failed: Callable[[Verdict], None] = lambda _verdict: None,
     ) -> None:
         self._grants = grants
-        self.clock = clock
+        self._callers = Callers(clock)
         self._translate = translate
         self._failed = failed
         self._allowance = Allowance()
@@ -86,12 +87,13 @@ class CallAdmission:
 
         Args:
             context: gRPC's context of the call.
-            urgent: the call only makes things safer: it needs no deadline, and no flood of other calls holds it up.
+            urgent: the call only makes things safer: it needs no deadline and no certificate of this moment, and no flood of
+                other calls holds it up.
             lasting: a stream that is the caller's sign of life, and needs no deadline either.
         """
         admitted = ""
         try:
-            caller = caller_of(context.auth_context(), self.clock())
+            caller = self._callers.of(context.auth_context(), urgent)
             self._admit(caller.identity, self._urgent if urgent else self._allowance, urgent)
             admitted = caller.identity
             self._open[admitted] += 1
@@ -116,6 +118,25 @@ class CallAdmission:
                 self._open[admitted] -= 1
                 if not self._open[admitted]:
                     del self._open[admitted]
+
+    def decoded(self, handler: grpc.RpcMethodHandler) -> grpc.RpcMethodHandler:
+        """A handler whose requests are decoded once their caller is let in and counted: a flood of nonsense is one too."""
+        decode, handle = handler.request_deserializer, handler.unary_unary or handler.unary_stream
+
+        def attempt(request: bytes) -> Any:
+            try:
+                return decode(request)
+            except DecodeError:
+                return None
+
+        async def behaviour(request: Any, context: Any) -> Any:
+            if request is not None:
+                return await handle(request, context)
+            async with self.call(context, lasting=True):
+                raise InvalidRequest("InvalidArgument", "the request cannot be decoded; send this method's message")
+
+        build = grpc.unary_unary_rpc_method_handler if handler.unary_unary else grpc.unary_stream_rpc_method_handler
+        return build(behaviour, attempt, handler.response_serializer)
 
     def _admit(self, identity: str, allowance: Allowance, urgent: bool) -> None:
         """Count a call.

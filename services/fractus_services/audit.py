@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 import math
@@ -16,16 +17,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from fractus_services.chain import (
-    PRUNED,
-    Link,
-    canonical,
-    digest,
-    first_of,
-    last_link,
-    segment,
-    segments,
-)
+from fractus_storage import remove_temporary, write_file
+
+from fractus_services.chain import PRUNED, Link, canonical, digest, first_of, last_link, segment, segments
+from fractus_services.checkpoints import signed
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +35,9 @@ MAX_SEGMENTS = 32
 
 MAX_WAITING = 10_000
 """Entries that wait in memory while the disk does not take them."""
+
+CHECKPOINT_INTERVAL_S = 60.0
+"""How often a checkpoint is written while there are new entries."""
 
 HANG_TIMEOUT_S = 2.0
 """A write that takes longer counts as failed until it returns."""
@@ -76,6 +74,7 @@ class AuditLog:
         clock: Unix time in seconds.
         segment_bytes: when the file is closed and the next one begun.
         keep: how many closed files are kept.
+        tls: directory of the node's key and certificate, which checkpoints are signed with.
     """
 
     def __init__(
@@ -85,11 +84,17 @@ class AuditLog:
         *,
         segment_bytes: int = MAX_SEGMENT_BYTES,
         keep: int = MAX_SEGMENTS,
+        tls: Path | None = None,
     ) -> None:
         self._path = path
         self._clock = clock
         self._segment_bytes = segment_bytes
         self._keep = keep
+        self._tls = tls
+        self._checkpoint = path.with_suffix(".checkpoint")
+        self._checkpoint_due_s = 0.0
+        self._signed = Link()
+        remove_temporary(self._checkpoint)
         self._pruned: list[Path] = []
         self._waiting: deque[_Waiting] = deque()
         self._lost = 0
@@ -100,7 +105,10 @@ class AuditLog:
         self._busy_since_s: float | None = None
         self._sound_bytes: int | None = None
         path.parent.mkdir(parents=True, exist_ok=True)
-        torn = _cut_torn_line(path)
+        torn = 0
+        with contextlib.suppress(OSError):  # a disk that is read-only is told of when the first entry is written
+            torn = _cut_torn_line(path)
+            path.touch(0o640)  # so that verification can tell when it is missing
         self._end = self._found()
         self._thread = threading.Thread(target=self._write, name="audit", daemon=True)
         self._thread.start()
@@ -150,6 +158,10 @@ class AuditLog:
         """Record that a grant file grants nothing."""
         self.append("grant", {"change": "refused", "name": name, "reason": reason})
 
+    def clock_stepped(self, step_s: float, trusted: bool) -> None:
+        """Record a step of the clock, from which entries have their times."""
+        self.append("clock", {"step_s": round(step_s, 3), "trusted": trusted})
+
     async def close(self) -> None:
         """Write what is left."""
         with self._changed:
@@ -161,17 +173,21 @@ class AuditLog:
         """The thread: append in batches, one fsync for each."""
         while True:
             with self._changed:
-                while not self._waiting and not self._closing:
-                    self._changed.wait()
-                self._changed.wait_for(lambda: self._closing or (self._urgent and not self._problem), SYNC_INTERVAL_S)
+                if self._changed.wait_for(lambda: self._waiting or self._closing, self._until_checkpoint_s()):
+                    self._changed.wait_for(
+                        lambda: self._closing or (self._urgent and not self._problem), SYNC_INTERVAL_S
+                    )
                 batch, self._urgent, closing = tuple(self._waiting), False, self._closing
             written = not batch or self._flush(batch)
             if written and batch:
                 self._take_off(len(batch))
                 self._tidy()
             with self._changed:
-                if closing and (not written or not self._waiting):
-                    return
+                ended = closing and (not written or not self._waiting)
+            if written:
+                self._write_checkpoint(ended)
+            if ended:
+                return
 
     def _take_off(self, written: int) -> None:
         """Remove what is on disk from the queue, and record what was lost while it was full."""
@@ -214,9 +230,36 @@ class AuditLog:
                 del self._pruned[0]
             if self._path.stat().st_size >= self._segment_bytes:
                 self._path.rename(segment(self._path, self._first_entry()))
+                self._path.touch(0o640)
                 self._record_pruning()
         except (OSError, ValueError) as error:
             log.warning("audit: cannot close a segment (file=%s): %s", self._path, error)
+        finally:
+            self._busy_since_s = None
+
+    def _until_checkpoint_s(self) -> float | None:
+        """How long to wait for an entry before those on disk are signed; None when they are, or nothing can sign them."""
+        if self._tls is None or self._end in (Link(), self._signed):
+            return None
+        due_s = self._checkpoint_due_s
+        return max(due_s - time.monotonic(), 0.0) if due_s else CHECKPOINT_INTERVAL_S
+
+    def _write_checkpoint(self, at_once: bool) -> None:
+        """Sign how far the log has come, now and then."""
+        if self._tls is None or self._end in (Link(), self._signed):
+            return
+        if not at_once and time.monotonic() < self._checkpoint_due_s:
+            return
+        self._checkpoint_due_s = time.monotonic() + CHECKPOINT_INTERVAL_S
+        self._busy_since_s = time.monotonic()
+        try:
+            content = signed(self._path.stem, self._end, self._moment(), self._tls)
+            write_file(self._checkpoint, content, 0o640, durable=False)
+            self._signed = self._end
+        except FileNotFoundError:
+            self._checkpoint_due_s = 0.0  # the node has no certificate yet
+        except (OSError, ValueError, TypeError) as error:
+            log.warning("audit: cannot write a checkpoint (file=%s): %s", self._checkpoint, error)
         finally:
             self._busy_since_s = None
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import functools
 import logging
-from collections.abc import Mapping
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,18 @@ from typing import Any
 import grpc
 from cryptography import x509
 from fractus_core.api.names import SPIFFE_SCHEME
+from fractus_core.policy.values import Moment
 
+from fractus_services.clock import steady_s
 from fractus_services.errors import NotAuthenticated
 
 log = logging.getLogger(__name__)
 
 FILES = ("tls.key", "tls.crt", "ca.crt")
+MAX_SEEN = 256
+"""Certificates whose first sight is remembered; the one that called longest ago is forgotten."""
+MAX_SKEW_S = 60.0
+"""How far a caller's certificate may begin in the future."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,28 +33,85 @@ class Caller:
 
     Attributes:
         identity: SPIFFE id.
-        valid_from_s: Unix time.
-        valid_until_s: Unix time.
+        until_s: steady time at which its certificate expires.
     """
 
     identity: str
-    valid_from_s: float
-    valid_until_s: float
+    until_s: float
 
-    def check(self, time_s: float) -> None:
+    @property
+    def left_s(self) -> float:
+        """Seconds until its certificate expires."""
+        return max(self.until_s - steady_s(), 0.0)
+
+    def check(self) -> None:
         """Handshakes check validity once; long connections must be checked again.
 
         Raises:
-            NotAuthenticated: the certificate is not valid at this time.
+            NotAuthenticated: the certificate has expired.
         """
-        if time_s >= self.valid_until_s:
+        if not self.left_s:
             raise NotAuthenticated("the client certificate has expired; connect again with the renewed one")
-        if time_s < self.valid_from_s - 60.0:
+
+
+class Callers:
+    """Who calls, by client certificates.
+
+    A certificate is judged by the clock when it is first seen. From then on it has the rest of its life by steady time,
+    whatever the clock says: a step cuts off no driver in flight, and revives no certificate that has expired here. Each new
+    connection is also judged by the TLS handshake, which knows nothing but the clock.
+
+    Args:
+        clock: Unix time.
+    """
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._seen: OrderedDict[bytes, Caller] = OrderedDict()
+
+    def of(self, auth_context: Mapping[str, Any], urgent: bool = False) -> Caller:
+        """The peer of a call.
+
+        Args:
+            auth_context: gRPC's authentication context of the call.
+            urgent: the call only makes things safer, so that the handshake of its connection is proof enough.
+
+        Raises:
+            NotAuthenticated: there is no certificate, or it names no one, or it is not valid now.
+        """
+        chain = auth_context.get("x509_pem_cert") or ()
+        if not chain:
+            raise NotAuthenticated("no client certificate; connect with mutual TLS")
+        pem = bytes(chain[0])
+        caller = self._seen.get(pem)
+        if caller is None:
+            caller = self._first_seen(pem, urgent)
+        else:
+            self._seen.move_to_end(pem)
+        if not urgent:
+            caller.check()
+        return caller
+
+    def _first_seen(self, pem: bytes, urgent: bool) -> Caller:
+        try:
+            identity, begin_s, end_s = _read(pem)
+        except ValueError:
+            raise NotAuthenticated("the client certificate cannot be read") from None
+        now_s = self._clock()
+        caller = Caller(identity, steady_s() + end_s - now_s)
+        begun = now_s >= begin_s - MAX_SKEW_S
+        if not (begun or urgent):
             raise NotAuthenticated("the client certificate is not valid yet; check the clocks")
+        if begun and caller.left_s and not isinstance(now_s, Moment):
+            # While the clock is in doubt, or wrong about this certificate, nothing is remembered: it may be right later.
+            self._seen[pem] = caller
+            if len(self._seen) > MAX_SEEN:
+                self._seen.popitem(last=False)
+        return caller
 
 
-@functools.lru_cache(maxsize=256)
-def _read(pem: bytes) -> Caller:
+def _read(pem: bytes) -> tuple[str, float, float]:
+    """Identity, begin and end of a certificate."""
     certificate = x509.load_pem_x509_certificate(pem)
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -57,28 +120,7 @@ def _read(pem: bytes) -> Caller:
     uris = [uri for uri in names.get_values_for_type(x509.UniformResourceIdentifier) if uri.startswith(SPIFFE_SCHEME)]
     if len(uris) != 1:
         raise NotAuthenticated(f"the client certificate must name one SPIFFE id, not {len(uris)}")
-    return Caller(uris[0], certificate.not_valid_before_utc.timestamp(), certificate.not_valid_after_utc.timestamp())
-
-
-def caller_of(auth_context: Mapping[str, Any], time_s: float) -> Caller:
-    """The peer of a call.
-
-    Args:
-        auth_context: gRPC's authentication context of the call.
-        time_s: Unix time.
-
-    Raises:
-        NotAuthenticated: there is no certificate, or it names no one, or it is not valid now.
-    """
-    chain = auth_context.get("x509_pem_cert") or ()
-    if not chain:
-        raise NotAuthenticated("no client certificate; connect with mutual TLS")
-    try:
-        caller = _read(bytes(chain[0]))
-    except ValueError:
-        raise NotAuthenticated("the client certificate cannot be read") from None
-    caller.check(time_s)
-    return caller
+    return uris[0], certificate.not_valid_before_utc.timestamp(), certificate.not_valid_after_utc.timestamp()
 
 
 class TlsFiles:

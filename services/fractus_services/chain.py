@@ -53,7 +53,7 @@ def last_link(path: Path) -> Link | None:
             try:
                 entry = json.loads(lines[-1])
                 return Link(int(entry["seq"]), str(entry["hash"]))
-            except (KeyError, TypeError) as error:
+            except (KeyError, TypeError, RecursionError) as error:
                 raise ValueError(f"no audit entry: {error}") from None
     return None
 
@@ -78,13 +78,16 @@ def first_of(path: Path) -> int:
 def logs(paths: Iterable[Path]) -> dict[Path, list[Path]]:
     """The logs that files and directories belong to, each with its files in order.
 
-    A log's present file stands for all of it, a segment for itself.
+    A log's present file stands for all of it, a segment for itself, and a directory for all of each log that it has a part or
+    a checkpoint of: a present file that is missing there is listed too.
     """
     found: dict[Path, set[Path]] = {}
     for path in paths:
-        for file in sorted(path.glob("*.jsonl")) if path.is_dir() else (path,):
+        whole = path.is_dir()
+        checkpointed = (file.with_suffix(".jsonl") for file in path.glob("*.checkpoint"))
+        for file in sorted({*path.glob("*.jsonl"), *checkpointed}) if whole else (path,):
             log = _of(file)
-            found.setdefault(log, set()).update((file,) if log != file else (*segments(file), file))
+            found.setdefault(log, set()).update((*segments(log), log) if whole or log == file else (file,))
     return {log: sorted(files, key=lambda file: (file == log, file)) for log, files in found.items()}
 
 
@@ -120,12 +123,14 @@ class Finding:
     before: int = 0
 
 
-def verify(lines: Iterable[bytes], part: bool = False) -> Finding:
+def verify(lines: Iterable[bytes], part: bool = False, since: Link | None = None) -> Finding:
     """Check the chain of an audit log, line by line.
 
     Args:
         lines: the log.
         part: the lines are not the whole log; what comes before and after them is not judged.
+        since: an entry that the log is known to have had; all from there on must be in the lines. Without one, no entry
+            may be missing at the beginning: who removes entries can also write the entry that records it.
     """
     previous, count, torn = Link(), 0, False
     begin: Link | None = None
@@ -144,21 +149,46 @@ def verify(lines: Iterable[bytes], part: bool = False) -> Finding:
             previous = Link(int(entry["seq"]), str(entry["hash"]))
             if entry.get("kind") == PRUNED:
                 pruned.add((entry["last"], entry["last_hash"]))
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, RecursionError):
             problem = "is not an audit entry"
+        if since is not None and previous.sequence == since.sequence and previous != since:
+            problem = problem or "is another entry than the checkpoint's: it and all before it were written again"
         if problem:
             return Finding(count, number, problem)
         count += 1
-    begin = begin or Link()
-    if begin == Link() or part:
+    if part:
         return Finding(count, torn=torn)
+    begin = begin or Link()
+    return Finding(count, torn=torn, before=begin.sequence, **_ends(begin, previous, max(count, 1), pruned, since))
+
+
+def _ends(
+    begin: Link, end: Link, last_line: int, pruned: set[tuple[object, object]], since: Link | None
+) -> dict[str, Any]:
+    """What is wrong with where a log begins and where it ends."""
+    first = begin.sequence + 1
+    if since is not None and end.sequence < since.sequence:
+        problem = f"is number {end.sequence}, the last one, and the checkpoint is number {since.sequence}: entries are missing"
+        return {"line": last_line, "problem": problem}
+    if since is not None and begin.sequence >= since.sequence and begin != since:
+        return {
+            "line": 1,
+            "problem": f"is number {first}, and those since the checkpoint, number {since.sequence}, are missing",
+        }
+    if begin == Link():
+        return {}
     if (begin.sequence, begin.hash) not in pruned:
-        return Finding(
-            0,
-            1,
-            f"is number {begin.sequence + 1}, and the entries before it were removed, and no entry records that",
+        return {
+            "line": 1,
+            "problem": f"is number {first}, and the entries before it were removed, and no entry records that",
+        }
+    if since is None:
+        problem = (
+            f"is number {first}; an entry records that those before were removed to make room, which only a checkpoint from"
+            " before can prove: give it with --since"
         )
-    return Finding(count, torn=torn, before=begin.sequence)
+        return {"line": 1, "problem": problem}
+    return {}
 
 
 def _problem(entry: dict[str, Any], previous: Link, line: bytes) -> str:

@@ -1,46 +1,64 @@
-"""Wall-clock time that does not go back when the clock is set back."""
+"""Wall-clock time of a machine whose clock may be stepped, and the steady time that no step moves."""
 
 from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 
 from fractus_core.policy.values import Moment
 
 log = logging.getLogger(__name__)
 
 TRUST_AFTER_S = 120.0
-"""A clock that was set back and has run this long since is right: what it showed before was a glitch."""
+"""A clock that has run on for this long after a step is right: what it showed before was wrong."""
 
 MAX_SLEW_S = 1.0
-"""How far NTP sets a clock back in normal operation."""
+"""How far NTP sets a clock in normal operation."""
+
+
+def steady_s() -> float:
+    """Seconds that no step of the clock moves; unlike the event loop's, they go on while the machine sleeps."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 class Clock:
     """Unix time in seconds.
 
-    A clock that is set back must not bring expired certificates and policies back to life, and one that jumped ahead for
-    a moment must not end them for good. Until it is clear which of the two happened, the time is a `Moment`: what it is
-    as a number is the later reading, so that certificates are expired at either, and the policy engine counts both
-    against the caller.
+    A clock that is stepped, back or ahead, must neither bring what has expired back to life nor end at once what restricts.
+    Until it is clear which reading is right, the time is a `Moment`: what it is as a number is the later reading, and the
+    policy engine counts both against the caller. Who was let in before the step stays in by steady time (`auth.Callers`).
+
+    Args:
+        stepped: told of each step, in seconds, and whether the new reading counts from now on; 0: it was taken back. This may
+            be from any thread.
     """
 
-    def __init__(self) -> None:
-        self._offset_s = time.time() - time.monotonic()
-        self._behind_since_s: float | None = None
+    def __init__(self, stepped: Callable[[float, bool], None] = lambda _step_s, _trusted: None) -> None:
+        self.stepped = stepped
+        self._offset_s = self._stepped_to_s = time.time() - steady_s()
+        self._doubted_since_s: float | None = None
 
     def __call__(self) -> float:
         """Now."""
-        steady_s = time.monotonic()
-        offset_s = time.time() - steady_s
-        back_s = self._offset_s - offset_s
-        if back_s <= MAX_SLEW_S:
-            self._behind_since_s = None
-        elif self._behind_since_s is None:
-            self._behind_since_s = steady_s
-        if self._behind_since_s is not None and steady_s - self._behind_since_s < TRUST_AFTER_S:
-            return Moment(steady_s + self._offset_s, steady_s + offset_s)
-        if back_s > MAX_SLEW_S:
-            log.warning("clock: set back, now trusted (seconds=%.0f)", back_s)
-        self._offset_s, self._behind_since_s = offset_s, None
-        return steady_s + offset_s
+        now_s = steady_s()
+        offset_s = time.time() - now_s
+        step_s = offset_s - self._offset_s
+        if abs(step_s) <= MAX_SLEW_S:
+            if self._doubted_since_s is not None:
+                self._doubted_since_s = None
+                log.warning("clock: the step was taken back")
+                self.stepped(0.0, True)
+            self._offset_s = offset_s
+            return now_s + offset_s
+        if self._doubted_since_s is None or abs(offset_s - self._stepped_to_s) > MAX_SLEW_S:
+            self._doubted_since_s, self._stepped_to_s = now_s, offset_s
+            log.warning("clock: stepped, both readings count for now (seconds=%.0f for_s=%.0f)", step_s, TRUST_AFTER_S)
+            self.stepped(step_s, False)
+        if now_s - self._doubted_since_s < TRUST_AFTER_S:
+            readings = now_s + self._offset_s, now_s + offset_s
+            return Moment(max(readings), min(readings))
+        self._offset_s, self._doubted_since_s = offset_s, None
+        log.warning("clock: the step lasted, the new reading counts (seconds=%.0f)", step_s)
+        self.stepped(step_s, True)
+        return now_s + offset_s

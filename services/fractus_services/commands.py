@@ -31,6 +31,12 @@ def _service_options(service: str, port: int, kinds: str, state: str) -> Callabl
         _option("--tls", "/var/lib/fractus/tls", "Directory of tls.crt, tls.key and ca.crt.", DIRECTORY),
         _option("--state", f"/var/lib/fractus/{service}", f"Directory of {state}.", DIRECTORY),
         _option("--audit", f"/var/lib/fractus/audit/{service}.jsonl", "Audit log.", FILE),
+        _option(
+            "--node-object",
+            "/var/lib/fractus/node.json",
+            f"{kinds} of this node as its agent stores it; counts before --description.",
+            _DESCRIPTION,
+        ),
         _option("--description", "/etc/fractus/node.yaml", f"{kinds} manifest of this node.", _DESCRIPTION),
         _option("--listen", f"[::]:{port}", "Address of the gRPC server.", callback=address),
         _option(

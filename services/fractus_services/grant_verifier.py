@@ -19,7 +19,7 @@ from fractus_core.policy.signatures import (
     verify,
 )
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
-from fractus_storage import write_file
+from fractus_storage import remove_temporary, write_file
 
 log = logging.getLogger(__name__)
 
@@ -64,6 +64,7 @@ class GrantVerifier:
         self._seen: dict[str, _Seen] = {}
         self._oldest = _iso(_EPOCH)
         self._unsaved = self._failing = False
+        remove_temporary(memory)
         self._restore()
 
     def reload_authorities(self) -> bool:

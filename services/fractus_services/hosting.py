@@ -1,17 +1,15 @@
-"""What both services do once they run: read the node's description, bind, serve, stop."""
+"""What both services do once they run: bind, serve, stop."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Coroutine
-from pathlib import Path
+from collections.abc import Callable, Coroutine, Mapping
 from typing import Any
 
 import grpc
-from fractus_core.api.descriptions import InvalidDescription, parse_description
-from fractus_core.api.nodes import Drone, EdgeNode
 
+from fractus_services.admission import CallAdmission
 from fractus_services.auth import KEEPALIVE, TlsFiles
 from fractus_services.errors import CannotServe
 
@@ -20,26 +18,30 @@ log = logging.getLogger(__name__)
 STOP_TIMEOUT_S = 2.0
 
 
-def read_description(path: Path, *kinds: type[Drone | EdgeNode]) -> Drone | EdgeNode | None:
-    """Read the manifest that describes this node; None where there is none.
+class _Registry:
+    """What generated code adds the handlers of a service to.
 
-    Raises:
-        CannotServe: the file is not a valid manifest of one of these kinds.
+    Args:
+        server: where they go.
+        admission: lets their callers in.
     """
-    try:
-        description = parse_description(path.read_text(encoding="utf-8"), *kinds)
-    except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
-        description = None
-    except (OSError, UnicodeDecodeError) as error:
-        raise CannotServe(f"--description {path}: cannot be read: {error}") from None
-    except InvalidDescription as error:
-        raise CannotServe(f"--description {path}: {error}") from None
-    if description is None:
-        log.warning("service: this node has no description, using defaults (file=%s)", path)
-    return description
+
+    def __init__(self, server: grpc.aio.Server, admission: CallAdmission) -> None:
+        self._server = server
+        self._admission = admission
+
+    def add_generic_rpc_handlers(self, _handlers: object) -> None:
+        """The same handlers once more, by name; they are registered already."""
+
+    def add_registered_method_handlers(self, service: str, handlers: Mapping[str, grpc.RpcMethodHandler]) -> None:
+        """Add the handlers of a service."""
+        decoded = {name: self._admission.decoded(handler) for name, handler in handlers.items()}
+        self._server.add_registered_method_handlers(service, decoded)
 
 
-async def serve_grpc(name: str, listen: str, tls: TlsFiles, register: Callable[[grpc.aio.Server], None]) -> None:
+async def serve_grpc(
+    name: str, listen: str, tls: TlsFiles, register: Callable[[Any], None], admission: CallAdmission
+) -> None:
     """Wait for certificates, then serve calls until cancelled.
 
     Args:
@@ -47,12 +49,13 @@ async def serve_grpc(name: str, listen: str, tls: TlsFiles, register: Callable[[
         listen: HOST:PORT.
         tls: certificates of the server.
         register: adds the handlers to the server.
+        admission: lets callers in.
 
     Raises:
         CannotServe: the address cannot be bound.
     """
     server = grpc.aio.server(options=KEEPALIVE)
-    register(server)
+    register(_Registry(server, admission))
     await tls.wait()
     try:
         server.add_secure_port(listen, tls.server_credentials())

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import signal
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
+from fractus_storage import logs
 
 from fractus_services.errors import CannotServe
 from fractus_services.options import ServiceOptions
 from fractus_services.service_lock import ServiceLock
+
+# gRPC reads it when it is imported, which is later. Below that, its core writes a line for each handshake that fails, past any
+# limit of ours.
+os.environ.setdefault("GRPC_VERBOSITY", "ERROR")
 
 _Options = TypeVar("_Options", bound=ServiceOptions)
 
@@ -53,7 +59,7 @@ def until_signalled(
     Raises:
         click.ClickException: the service cannot run as it is told to.
     """
-    logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    logs.configure(level)
 
     async def main() -> None:
         stop = asyncio.Event()

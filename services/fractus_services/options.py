@@ -15,6 +15,7 @@ class ServiceOptions:
     state: Path
     audit: Path
     node: str | None
+    node_object: Path
     description: Path
     listen: str
     lock_timeout: float

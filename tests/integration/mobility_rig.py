@@ -233,7 +233,7 @@ class Rig:
         home = ",".join(str(v) for v in HOME)
         self._start(
             "vehicle", "-m", "fractus_vehicle", "--listen", self.link, "--home", home, "--speedup", str(speedup),
-            "--ready-after", "2", *more,
+            "--ready-after", "2", "--throttle", "1500", *more,
         )  # fmt: skip
 
     def start_service(self, *more: str, link: str = "", name: str = "service") -> None:

@@ -11,6 +11,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,6 @@ from mobility_rig import (
 Status = grpc.StatusCode
 ASK = pb.GetSpeedRequest()
 LOST = pb.ControlEvent.STATE_LOST
-HOMEWARD = {"RTL", "SMART_RTL"}
 FLOOD_PER_S = 500.0
 
 
@@ -168,7 +168,38 @@ async def test_a_grant_that_is_not_signed_is_none(rig: Rig) -> None:
     await until(lambda: rig.entries("grant")[-1]["change"] == "added", "the grant")
 
 
-async def test_a_clock_that_is_set_back_revives_no_certificate(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_nonsense_is_counted_and_fills_no_disk(rig: Rig) -> None:
+    rig.write_grant(grant())
+    rig.start_service()
+    await served(rig)
+    log = rig.directory / "service.log"
+    begun = log.stat().st_size
+    channel, codes = rig.channel(DRIVER), Counter[Status]()
+    await mobility_pb2_grpc.MobilityServiceStub(channel).GetSpeed(ASK, timeout=5, wait_for_ready=True)
+    for method, kind in (("SetSpeed", channel.unary_unary), ("Goto", channel.unary_stream)):
+        for _ in range(300):
+            call: Any = kind(f"/fractus.v1.MobilityService/{method}")(b"\xff" * 8, timeout=5)
+            codes[await call.code()] += 1
+    assert codes[Status.INVALID_ARGUMENT] <= BURST + CALLS_PER_S * 10
+    assert codes.keys() == {Status.INVALID_ARGUMENT, Status.RESOURCE_EXHAUSTED}
+    host, port = rig.address.split(":")
+    stranger = ssl.create_default_context()
+    stranger.check_hostname, stranger.verify_mode = False, ssl.CERT_NONE
+    stranger.set_alpn_protocols(["h2"])
+    for _ in range(200):
+        for context in (stranger, None):
+            with suppress(OSError):
+                reader, writer = await asyncio.open_connection(host, int(port), ssl=context)
+                writer.write(b"GET / HTTP/1.1\r\n\r\n")
+                await reader.read()
+                writer.close()
+    assert log.stat().st_size - begun < 20_000, log.read_text()[-2000:]
+    assert "Traceback" not in log.read_text()
+
+
+async def test_a_step_of_the_clock_cuts_off_no_caller_and_revives_no_certificate(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shift = rig.directory / "shift"
     shift.write_text("0")
     (rig.directory / "sitecustomize.py").write_text(CLOCK.format(file=str(shift)))
@@ -176,15 +207,28 @@ async def test_a_clock_that_is_set_back_revives_no_certificate(rig: Rig, monkeyp
     rig.write_grant(grant())
     rig.start_service()
     await served(rig)
-    stub = rig.stub(DRIVER, seconds=600.0)
-    await stub.GetSpeed(ASK, timeout=5)
-    shift.write_text("900")
-    code, why = await denied(stub.GetSpeed(ASK, timeout=5))
-    assert (code, why.code) == (Status.UNAUTHENTICATED, "NotAuthenticated")
-    assert "expired" in why.reason
-    shift.write_text("-3600")
-    code, why = await denied(stub.GetSpeed(ASK, timeout=5))
-    assert (code, why.code) == (Status.UNAUTHENTICATED, "NotAuthenticated")
+    stub, short = rig.stub(DRIVER, seconds=600.0), rig.stub(DRIVER, seconds=5.0)
+    await short.GetSpeed(ASK, timeout=5)
+    for step_s in (0, 400 * 86_400, 0, -3600, -400 * 86_400):
+        shift.write_text(str(step_s))
+        await stub.GetSpeed(ASK, timeout=5)
+        if step_s > 0:
+            code, why = await denied(rig.stub(DRIVER).GetSpeed(ASK, timeout=5))
+            assert (code, why.code) == (Status.UNAUTHENTICATED, "NotAuthenticated"), "who was not known before"
+            assert "expired" in why.reason
+    assert [round(entry["step_s"] / 86_400, 2) for entry in rig.entries("clock")][:3] == [400.0, 0.0, -0.04]
+
+    async def watched() -> None:
+        async for _ in short.SubscribeTelemetry(pb.SubscribeTelemetryRequest(), timeout=20):
+            pass
+
+    for call in (watched, lambda: short.GetSpeed(ASK, timeout=5)):
+        code, why = await denied(call())
+        assert (code, why.code) == (Status.UNAUTHENTICATED, "NotAuthenticated"), (
+            "its time is up, whatever the clock says"
+        )
+    code, why = await denied(short.Hover(pb.HoverRequest(), timeout=5))
+    assert (code, why.code) == (Status.FAILED_PRECONDITION, "NotInControl"), "stopping is not refused by date"
     # A grant does not hang on the node's clock.
     rig.write_grant(grant(altitude_limit(5, 15)))
     await until(lambda: [e for e in rig.entries("grant") if e["change"] == "changed"], "the new grant")
@@ -380,7 +424,7 @@ async def test_an_older_grant_in_flight_brings_the_drone_home(rig: Rig) -> None:
     fresh.write_text(json.dumps(older))
     fresh.replace(path)
     await driver.next(LOST, 15)
-    await rig.until(lambda t: t.mode in HOMEWARD and t.controller == "system", 10)
+    await rig.until(lambda t: t.mode == "LAND" and t.controller == "system", 30)
     refused = [e for e in rig.entries("grant") if e["change"] == "refused"]
     assert "not after the one of" in refused[-1]["reason"]
     code, why = await denied(flown(driver.going(0, 20)))

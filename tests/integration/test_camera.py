@@ -17,7 +17,9 @@ import grpc
 import numpy as np
 import pytest
 import yaml
+from fractus_agent.registration.handover import Handover
 from fractus_cluster.ports import free_port
+from fractus_core.api.nodes import EdgeNode
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
 from fractus_services.chain import verify
 from mobility_rig import (
@@ -48,6 +50,7 @@ spec:
       model: test
       resolution: 640x480
       horizontalFieldOfView: 60
+      lens: {{model: pinhole}}
       mount: {{pitch: -90, height: 4}}
       methods: [CaptureImage, RetrieveImage]
 """
@@ -60,6 +63,7 @@ spec:
     camera:
       resolution: 640x480
       horizontalFieldOfView: 50
+      lens: {{model: pinhole}}
       mount: {{pitch: -90, stabilised: true}}
       methods: [CaptureImage, RetrieveImage]
 """
@@ -126,6 +130,45 @@ async def test_pictures_of_an_edge_node(rig: Rig) -> None:
     assert code == grpc.StatusCode.INVALID_ARGUMENT
     with (rig.directory / "camera.jsonl").open("rb") as log:
         assert not verify(log).problem
+
+
+async def test_the_description_that_the_agent_hands_over_is_judged_by_at_once(rig: Rig) -> None:
+    rig.write_grant(
+        passenger_grant(privacy("refuse", 40, -20, 60, 20), services=CAMERA, operationArea=[], **{"class": None})
+    )
+    handed = rig.directory / "node.json"
+    handover = Handover(handed)
+    camera = stub(rig, rig.start_camera("--node-object", str(handed)))
+    assert (await denied(capture(camera)))[1].code == "PositionUnknown", "not even the kind of node is known"
+    await rig.until_logged("camera", "it counts as seeing everything (missing=services.camera)")
+
+    async def becomes(code: str) -> None:
+        found: str | None = None
+        async with asyncio.timeout(15):
+            while found != code:
+                try:
+                    status, why = await denied(capture(camera, width=64, height=48))
+                    found = why.code if status is grpc.StatusCode.PERMISSION_DENIED else None
+                except AssertionError:
+                    found = ""
+                await asyncio.sleep(0.1)
+
+    def hand_over(**mount: float) -> None:
+        described = yaml.safe_load(EDGE)
+        described["spec"]["services"]["camera"]["mount"] = mount
+        handover.put(EdgeNode.from_body(described))
+
+    hand_over(pitch=-90, height=4)
+    await becomes("")
+    hand_over(pitch=-90, height=80)
+    await becomes("PrivacyZone")
+    hand_over(pitch=-90, height=4)
+    await becomes("")
+    handed.write_text("{")
+    await becomes("PositionUnknown")
+    log = (rig.directory / "camera.jsonl").read_bytes().splitlines(keepends=True)
+    assert not verify(log).problem
+    assert sum(json.loads(line)["kind"] == "started" for line in log) == 5
 
 
 async def until_refused(call: Any) -> tuple[grpc.StatusCode, types_pb2.Decision]:
@@ -302,7 +345,7 @@ async def test_a_face_in_the_simulated_world_is_hidden_and_the_rest_stays(rig: R
             "location": {"lat": BILLBOARD[0], "lon": BILLBOARD[1], "alt": 0, "altitudeReference": "amsl"},
             "services": {"camera": {
                 "connection": f"http://127.0.0.1:{port}/snapshot.jpg", "resolution": "640x360", "methods": ALL,
-                "horizontalFieldOfView": 62.2, "mount": {"pitch": -90, "height": 4},
+                "horizontalFieldOfView": 62.2, "lens": {"model": "pinhole"}, "mount": {"pitch": -90, "height": 4},
             }},
         },
     }  # fmt: skip

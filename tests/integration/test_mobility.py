@@ -10,11 +10,15 @@ from pathlib import Path
 
 import grpc
 import pytest
+from fractus_agent.registration.handover import Handover
+from fractus_core.api.model import API_VERSION
 from fractus_core.api.names import node_identity
+from fractus_core.api.nodes import Drone
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_proto.v1 import types_pb2
 from fractus_services.chain import verify
 from mobility_rig import (
+    ALL,
     DRIVER,
     NAVIGATOR_MISSION,
     NODE,
@@ -182,6 +186,26 @@ async def test_renewed_server_certificates_are_used(rig: Rig) -> None:
     rig.authority = Authority(rig.directory, "next")
     rig.write_tls()
     await rig.stub(DRIVER).GetPosition(pb.GetPositionRequest(), timeout=5)
+
+
+async def test_an_autopilot_that_is_described_later_is_used(rig: Rig) -> None:
+    handed = rig.directory / "node.json"
+    rig.write_grant(grant())
+    rig.start_service("--autopilot", "", "--node-object", str(handed))
+    await rig.until_logged("service", "description: this node has none")
+    services = {
+        "mobility": {"connection": rig.link, "maxAltitude": 80, "maxFlightTime": 15, "maxSpeed": 15, "methods": ALL}
+    }
+    Handover(handed).put(
+        Drone.from_body(
+            {"apiVersion": API_VERSION, "kind": "Drone", "metadata": {"name": NODE}, "spec": {"services": services}}
+        )
+    )
+    assert await rig.ended("service") == 1
+    assert f"tells another autopilot ({rig.link}); starting again" in rig.log("service")
+    rig.start_service("--autopilot", "", "--node-object", str(handed))
+    rig.start_vehicle()
+    await rig.until(lambda t: t.ready and t.HasField("position"), 20)
 
 
 async def test_cancelling_a_motion_stops_the_drone(rig: Rig) -> None:

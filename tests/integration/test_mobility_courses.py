@@ -206,6 +206,10 @@ async def test_asking_does_nothing(rig: Rig) -> None:
     assert not rig.entries("takeover")
 
 
+async def parameter(autopilot: MavlinkAutopilot, name: str) -> float:
+    return (await autopilot.vehicle_parameters.read([(name,)]))[name]
+
+
 async def test_the_vehicle_itself_turns_back_at_the_outer_bounds(rig: Rig) -> None:
     rig.write_grant(grant(corridor=[area(-20, -20, 20, 20)]))
     rig.start_service()
@@ -218,8 +222,8 @@ async def test_the_vehicle_itself_turns_back_at_the_outer_bounds(rig: Rig) -> No
         while not pilot.connected:
             await pilot.update(0.5)
     assert len(await download(pilot)) == 4
-    assert await pilot.read_parameter("FENCE_ENABLE") == 1.0
-    assert await pilot.read_parameter("FENCE_ALT_MAX") == 65.0
+    assert await parameter(pilot, "FENCE_ENABLE") == 1.0
+    assert await parameter(pilot, "FENCE_ALT_MAX") == 65.0
     rig.kill("service")
     lat, lon = FRAME.latlon(0, 95)
     await pilot.set_rates(flying=True)
@@ -246,9 +250,9 @@ async def test_the_owners_fence_comes_back_after_the_mission(rig: Rig) -> None:
     owner = MavlinkAutopilot(rig.link, ARDUCOPTER)
     task = asyncio.create_task(owner.run())
     async with asyncio.timeout(20):
-        while not owner.connected or await owner.read_parameter("FENCE_ALT_MAX") != 77.0:
+        while not owner.connected or await parameter(owner, "FENCE_ALT_MAX") != 77.0:
             await owner.update(0.2)
-    assert await owner.read_parameter("FENCE_ENABLE") == 0.0
+    assert await parameter(owner, "FENCE_ENABLE") == 0.0
     assert await download(owner) == ()
     task.cancel()
 

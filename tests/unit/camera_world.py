@@ -106,7 +106,9 @@ def active_grant(*policies: dict[str, Any], uid: str = "u1", instance: str = "ap
 class World:
     """A camera service with what it needs."""
 
-    def __init__(self, directory: Path, resolution: tuple[int, int] = (64, 64), keep: int = 50) -> None:
+    def __init__(
+        self, directory: Path, resolution: tuple[int, int] = (64, 64), keep: int = 50, pinhole: bool = False
+    ) -> None:
         self.directory = directory / "album"
         self.drone, self.scene, self.finder = Drone(), Scene(), Finder()
         self.shutter = Shutter(self.scene, timeout_s=5.0)
@@ -114,7 +116,7 @@ class World:
         self.album = Album(self.directory, keep, 10**9)
         judge, queue = PictureJudge(self.audit, self.finder), FairQueue(MAX_PER_OWNER, MAX_FILTERING)
         self.camera = PictureCapture(
-            self.drone, self.shutter, CameraProperties(resolution), detector=self.finder, filter_queue=queue,
+            self.drone, self.shutter, CameraProperties(resolution, pinhole=pinhole), detector=self.finder, filter_queue=queue,
             album=self.album, judge=judge, clock=lambda: NOW,
         )  # fmt: skip
         self.library = PictureLibrary(

@@ -27,7 +27,9 @@ from fractus_services.mobility.flight.service import Progress
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
+from fractus_services.mobility.mavlink.returning import MavlinkReturn
 from fractus_services.mobility.rpc.wiring import Parts
+from parameter_vehicle import FAILSAFES, MOVEMENT, told
 
 FRAME = LocalFrame(39.36, 22.95)
 BRAKE, GUIDED, LAND, LOITER, RTL, SMART_RTL = (
@@ -94,7 +96,8 @@ class Plane(MavlinkAutopilot):
     """An autopilot of few words: it acknowledges, and moves as ArduCopter does, roughly."""
 
     def __init__(self) -> None:
-        super().__init__("tcp:nowhere:1", ARDUCOPTER)
+        self.on_parameter: Callable[[str], None] = lambda _name: None
+        super().__init__("tcp:nowhere:1", ARDUCOPTER, on_parameter=lambda name: self.on_parameter(name))  # noqa: PLW0108
         self.target = (1, 1)
         self.xy, self.velocity = [0.0, 0.0], [0.0, 0.0]
         self.height, self.climb = 0.0, 0.0
@@ -109,38 +112,52 @@ class Plane(MavlinkAutopilot):
         self.trace: list[tuple[float, float, float]] = []
         self.refuses: set[int] = set()
         self.deaf = False
+        self.uplink_s = self.downlink_s = 0.0
+        self.fixed: tuple[str, ...] = ()
         self.measured = False
         """Whether it tells velocities often enough to know how it speeds up."""
-        self.parameters = {"FS_GCS_ENABLE": 3.0, "BATT_FS_LOW_ACT": 3.0}
+        self.parameters = MOVEMENT | FAILSAFES | {"WPNAV_SPEED": 100 * DEFAULT_MPS}
         vehicle = self.vehicle
-        vehicle.mode, vehicle.ready, vehicle.located, vehicle.position_error_m = GUIDED, True, True, 0.5
+        vehicle.mode, vehicle.located, vehicle.position_error_m = GUIDED, True, 0.5
+        vehicle.ready = vehicle.estimated = True
         vehicle.home = Home(39.36, 22.95, 10.0)
 
     async def run(self) -> None:
+        turn = 0
         while True:
             self._step()
+            if turn % 4 == 0:
+                self._probe(self.now)
+            turn += 1
             await asyncio.sleep(STEP_S)
 
-    async def read_parameter(self, name: str, attempts: int = 4) -> float | None:
-        del attempts
-        return self.parameters.get(name)
-
-    async def write_parameter(self, name: str, value: float) -> float | None:
-        self.parameters[name] = value
-        return value
-
     def send(self, outgoing: Message) -> None:
-        if self.deaf:
-            return
+        if not self.deaf:
+            self._after(self.uplink_s, self._hear, outgoing)
+
+    def _after(self, delay_s: float, what: Callable[..., None], *args: Any) -> None:
+        if delay_s > 0:
+            asyncio.get_running_loop().call_later(delay_s, what, *args)
+        else:
+            what(*args)
+
+    def _reply(self, outgoing: Message) -> None:
+        self._after(self.downlink_s, self.take, outgoing)
+
+    def _hear(self, outgoing: Message) -> None:
+        for answer in told(self.parameters, outgoing, self.fixed):
+            self._reply(answer)
         kind, command = outgoing.name, outgoing.values.get("command", 0)
         if kind in {"COMMAND_LONG", "COMMAND_INT"}:
             self.commands.append(command)
             refused = command in self.refuses
             if not refused:
                 self._obey(outgoing)
-            self.take(
+            self._reply(
                 message("COMMAND_ACK", command=command, result=MAV_RESULT.FAILED if refused else MAV_RESULT.ACCEPTED)
             )
+        elif kind == "TIMESYNC":
+            self._reply(message("TIMESYNC", tc1=round(self.now * 1e9), ts1=outgoing.integer("ts1")))
         elif kind == "SET_POSITION_TARGET_LOCAL_NED" and self.vehicle.mode == GUIDED and self.height > 0.2:
             self.commands.append(84)
             self.positions = False
@@ -227,17 +244,24 @@ class Plane(MavlinkAutopilot):
         return x / away * speed, y / away * speed
 
     def _tell(self) -> None:
+        state = (*FRAME.latlon(self.xy[0], self.xy[1]), self.height, self.heading, *self.velocity, -self.climb)
+        self._after(self.downlink_s, self._show, round(self.now * 1e3), *state)
+
+    def _show(self, boot_ms: int, *state: float) -> None:
         vehicle = self.vehicle
-        vehicle.lat, vehicle.lon = FRAME.latlon(self.xy[0], self.xy[1])
-        vehicle.altitude_m, vehicle.yaw_deg = self.height, self.heading
-        vehicle.east_mps, vehicle.north_mps = self.velocity
-        vehicle.down_mps = -self.climb
+        late_s = self.timing.sampled(boot_ms, self.now)
+        if late_s is None:
+            return
+        (
+            vehicle.lat, vehicle.lon, vehicle.altitude_m, vehicle.yaw_deg, vehicle.east_mps, vehicle.north_mps, vehicle.down_mps,
+        ) = state  # fmt: skip
         if self.measured:
-            vehicle.courses.append((self.now, vehicle.north_mps, vehicle.east_mps))
-            while vehicle.courses[0][0] < self.now - COURSE_S:
+            vehicle.courses.append((boot_ms / 1e3, vehicle.north_mps, vehicle.east_mps))
+            while vehicle.courses[0][0] < boot_ms / 1e3 - COURSE_S:
                 vehicle.courses.popleft()
-        vehicle.position_at = vehicle.heartbeat_at = vehicle.landed_at = self.now
-        vehicle.landed_state = 2 if self.height > 0.2 else 1
+        vehicle.position_at = self.now - late_s
+        vehicle.heartbeat_at = vehicle.landed_at = vehicle.checks_at = vehicle.estimated_at = self.now
+        vehicle.landed_state = 2 if vehicle.altitude_m > 0.2 else 1
         self.notify()
 
 
@@ -284,6 +308,9 @@ class Fence:
     async def lower(self, idle: Callable[[], bool]) -> None:
         self.raised = self.raised and not idle()
 
+    async def hold(self) -> tuple[str, ...]:
+        return ()
+
 
 class World:
     """Everything on a drone; use it inside `fly`."""
@@ -299,6 +326,8 @@ class World:
         known: bool = True,
     ) -> None:
         self.plane = after.plane if after is not None else Plane()
+        if retraces:
+            self.plane.parameters |= {"FS_GCS_ENABLE": 3.0, "BATT_FS_LOW_ACT": 3.0, "SRTL_POINTS": 300.0}
         self.grants = Grants()
         self.entries: list[tuple[str, dict[str, Any]]] = []
         self.audit = SimpleNamespace(append=lambda kind, content, **_: self.entries.append((kind, content)), failure="")
@@ -307,7 +336,7 @@ class World:
         self.fence = Fence()
         facts = self.plane.vehicle
         parts = Parts(
-            self.plane, MavlinkFailsafes(self.plane), self.fence, journal=self.journal, grants=self.grants,  # type: ignore[arg-type]
+            self.plane, MavlinkFailsafes(self.plane), self.fence, MavlinkReturn(self.plane, directory), journal=self.journal, grants=self.grants,  # type: ignore[arg-type]
             audit=self.audit, clock=lambda: 1_790_000_000.0 + self.plane.now, grace_s=grace_s, boarding_s=boarding_s,  # type: ignore[arg-type]
             state=ControlState(decided=known, armed_seen=facts.armed if known else None, expected_mode=GUIDED),
         )  # fmt: skip
@@ -316,6 +345,7 @@ class World:
             parts.tours, parts.monitor, parts.supervisor, parts.observer,
         )  # fmt: skip
         self.control.set_checked(Checked("", (), Airframe(retraces=retraces), 8.0, retraces))
+        self.plane.on_parameter = self.observer.parameter
         self._tasks = [asyncio.ensure_future(part) for part in (self.plane.run(), self.monitor.run(), self.tours.run())]
         self.events: list[ControlEvent] = []
 

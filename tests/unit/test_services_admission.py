@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import AsyncExitStack
 from typing import Any, cast
@@ -53,7 +54,8 @@ class Context:
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> CallAdmission:
-    monkeypatch.setattr(admission, "caller_of", lambda _context, _time: Caller("spiffe://fractus.dev/a", 0.0, 1e12))
+    known = Caller("spiffe://fractus.dev/a", math.inf)
+    monkeypatch.setattr(admission.Callers, "of", lambda _self, _context, _urgent: known)
     monkeypatch.setattr(admission.time, "monotonic", lambda: 1.0)
     return CallAdmission(cast("Any", None), lambda: 0.0)
 
@@ -105,7 +107,7 @@ async def test_a_call_needs_a_deadline(calls: CallAdmission, urgent: bool, lasti
 async def test_whatever_breaks_refuses_and_is_told(
     error: Callable[[], Exception], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(admission, "caller_of", lambda _context, _time: Caller("a", 0.0, 1e12))
+    monkeypatch.setattr(admission.Callers, "of", lambda _self, _context, _urgent: Caller("a", math.inf))
     told: list[str] = []
     calls = CallAdmission(cast("Any", None), lambda: 0.0, failed=lambda verdict: told.append(verdict.code))
     with pytest.raises(Aborted, match="INTERNAL: the service failed; nothing was done"):

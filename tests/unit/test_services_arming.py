@@ -14,7 +14,7 @@ from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.autopilot import Checked
-from mobility_world import BRAKE, World, end, fly, refusal, spec
+from mobility_world import BRAKE, World, end, fly, partial, refusal, spec
 
 
 class Slow:
@@ -79,9 +79,9 @@ def test_failsafes_that_are_set_again_meanwhile_forbid_arming(
             control, plane = world.control, world.plane
             grant = world.grants.put(spec())
             await world.drive(grant)
-            write, set_mode, raise_around = plane.write_parameter, plane.set_mode, world.fence.raise_around
+            write, set_mode, raise_around = plane.vehicle_parameters.write, plane.set_mode, world.fence.raise_around
 
-            async def chosen(name: str, value: float) -> float | None:
+            async def chosen(name: str, value: float) -> float:
                 control.set_checked(found)
                 return await write(name, value)
 
@@ -95,7 +95,7 @@ def test_failsafes_that_are_set_again_meanwhile_forbid_arming(
 
             if during == "choice":
                 control.dispatch(ArmingRequested(grant.key, grant.identity, (39.3604, 22.95, 10.0)))
-                plane.write_parameter = chosen  # type: ignore[method-assign]
+                plane.vehicle_parameters.write = chosen  # type: ignore[method-assign]
             elif during == "fence":
                 world.fence.raise_around = raised  # type: ignore[method-assign]
             else:
@@ -189,5 +189,78 @@ def test_nothing_arms_that_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.M
             assert why.verdict.code in {"JournalUnavailable", "AuditUnavailable"}
             assert "No space left" in str(why)
             assert MAV_CMD.COMPONENT_ARM_DISARM not in world.plane.commands
+
+    fly(flight)
+
+
+def test_a_refused_arming_is_tried_again_while_the_caller_waits(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            await world.drive(grant)
+            plane, arm = world.plane, MAV_CMD.COMPONENT_ARM_DISARM
+            plane.refuses.add(arm)
+            begun = plane.now
+            with pytest.raises(AutopilotError, match="failed"):
+                await world.service.arm(grant, 9.0)
+            assert plane.now - begun <= 9.0
+            assert plane.commands.count(arm) > 3
+            asyncio.get_running_loop().call_later(5.0, plane.refuses.discard, arm)
+            await world.service.arm(grant, 9.0)
+            assert plane.vehicle.armed
+
+    fly(flight)
+
+
+def test_nothing_arms_for_a_caller_that_has_hung_up(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            await world.drive(grant)
+            plane, arm = world.plane, MAV_CMD.COMPONENT_ARM_DISARM
+            plane.refuses.add(arm)
+            call = asyncio.ensure_future(world.service.arm(grant, 60.0))
+            await asyncio.sleep(5.0)
+            call.cancel()
+            await asyncio.sleep(0.5)
+            plane.refuses.discard(arm)
+            tried = plane.commands.count(arm)
+            await asyncio.sleep(20.0)
+            assert plane.commands.count(arm) == tried
+            assert not plane.vehicle.armed
+
+    fly(flight)
+
+
+def test_a_waiting_driver_is_told_why_the_system_does_not_arm(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            plane, arm, heard = world.plane, MAV_CMD.COMPONENT_ARM_DISARM, list[str]()
+            plane.refuses.add(arm)
+
+            async def follow() -> None:
+                async for event in world.streams.follow(world.grants.put(partial())):
+                    heard.append(event.reason)
+
+            following = asyncio.ensure_future(follow())
+            await asyncio.sleep(6.0)
+            assert any("COMPONENT_ARM_DISARM" in reason for reason in heard)
+            plane.refuses.discard(arm)
+            await world.until(lambda: plane.vehicle.in_air, 20)
+            following.cancel()
+
+    fly(flight)
+
+
+def test_what_is_not_ready_is_not_asked_to_arm(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            await world.drive(grant)
+            world.plane.vehicle.estimated = False
+            why = await refusal(world.service.arm(grant))
+            assert why.verdict.code == "NotReady"
+            assert MAV_CMD.COMPONENT_ARM_DISARM not in world.plane.commands
+            assert not world.fence.raised
 
     fly(flight)

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import asyncio
+import base64
+import errno
 import json
 import math
 import os
+import re
 import threading
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from fractus_agent.registration.evidence import audit_heads
 from fractus_cli.audit import audit
+from fractus_core.identity.authority import Authority
 from fractus_services.audit import AuditLog
-from fractus_services.chain import digest, segments, verify
+from fractus_services.chain import digest, last_link, segments, verify
+
+EPOCH = datetime.fromtimestamp(0, UTC)
+AUTHORITY = Authority.generate(EPOCH)
 
 
 async def written(path: Path, count: int, begin: int = 0) -> list[bytes]:
@@ -65,6 +75,16 @@ async def test_no_entry_can_be_touched(tmp_path: Path, which: str) -> None:
     assert finding.line in {1, 3, 4}
 
 
+async def test_a_line_of_a_great_many_brackets_is_no_entry(tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    lines = await written(path, 2)
+    path.write_bytes(b"".join(lines) + b"[" * 200_000 + b"\n")
+    finding = verify(read(path))
+    assert (finding.line, finding.problem) == (3, "is not an audit entry")
+    with pytest.raises(ValueError, match="no audit entry"):
+        last_link(path)
+
+
 async def test_a_torn_last_line_is_cut_off_and_noted(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     lines = await written(path, 4)
@@ -81,6 +101,7 @@ async def test_a_full_disk_is_told_and_nothing_is_lost_when_there_is_room_again(
     folder = tmp_path / "log"
     path = folder / "audit.jsonl"
     log = AuditLog(path, lambda: 0.0)
+    path.unlink()
     folder.rmdir()  # any write fails now
     log.append("call", {"n": 0})
     await until(lambda: log.failure)
@@ -184,7 +205,7 @@ async def test_what_is_no_json_is_the_callers_error(tmp_path: Path) -> None:
     assert verify(read(tmp_path / "audit.jsonl")).entries == 1
 
 
-async def filled(path: Path, count: int, **bounds: int) -> None:
+async def filled(path: Path, count: int, **bounds: Any) -> None:
     """A log written entry by entry, so that it is closed as often as it can be."""
     log = AuditLog(path, lambda: 0.0, **bounds)
     for n in range(count):
@@ -194,7 +215,7 @@ async def filled(path: Path, count: int, **bounds: int) -> None:
     assert not log.failure
 
 
-def verified(*paths: Path) -> tuple[int, str]:
+def verified(*paths: Path | str) -> tuple[int, str]:
     done = CliRunner().invoke(audit, ["verify", *map(str, paths)])
     return done.exit_code, done.output.strip()
 
@@ -217,23 +238,234 @@ async def test_the_chain_goes_on_through_segments_and_restarts(tmp_path: Path) -
 async def test_a_log_that_was_just_closed_is_continued(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     await filled(path, 3, segment_bytes=1)
-    assert not path.exists()
+    assert path.read_bytes() == b"", "it begins at once, so that it is known when it is missing"
     await filled(path, 1)
     assert [json.loads(line)["seq"] for line in read(path)] == [4]
     assert verified(path)[0] == 0
 
 
-async def test_the_oldest_segments_go_and_the_log_says_so(tmp_path: Path) -> None:
-    path = tmp_path / "audit.jsonl"
+@pytest.fixture
+def tls(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return node_files(tmp_path_factory.mktemp("tls"), AUTHORITY)
+
+
+def node_files(directory: Path, authority: Authority) -> Path:
+    for name, content in authority.issue_node("drone-1", EPOCH).items():
+        (directory / name).write_bytes(base64.b64decode(content))
+    return directory
+
+
+async def checkpoint(path: Path, count: int, tls: Path, **bounds: int) -> Path:
+    """A copy of the checkpoint that a log ends with, after more entries."""
+    await filled(path, count, tls=tls, **bounds)
+    kept = path.parent.parent / f"kept-{len(list(path.parent.parent.iterdir()))}"
+    kept.write_bytes(path.with_suffix(".checkpoint").read_bytes())
+    return kept
+
+
+async def test_only_a_checkpoint_proves_that_the_oldest_segments_went_to_make_room(tmp_path: Path, tls: Path) -> None:
+    path = tmp_path / "audit" / "audit.jsonl"
+    old = await checkpoint(path, 5, tls, segment_bytes=500, keep=2)
     await filled(path, 30, segment_bytes=500, keep=2)
-    await until(lambda: len(segments(path)) <= 3)
-    code, said = verified(path)
-    assert code == 0, said
-    assert "before were removed to make room" in said
-    segments(path)[0].unlink()
+    recent = await checkpoint(path, 1, tls, segment_bytes=500, keep=2)
     code, said = verified(path)
     assert code == 1
+    assert "to make room, which only a checkpoint from before can prove: give it with --since" in said
+    code, said = verified(path, "--since", recent)
+    assert code == 0, said
+    assert "before were removed to make room" in said
+    assert re.search(
+        r"all since number \d+ are there, as signed by spiffe://fractus.dev/node/drone-1, whose cert", said
+    )
+    assert "--ca" not in verified(path, "--since", recent, "--ca", tls / "ca.crt")[1]
+    code, said = verified(path, "--since", old)
+    assert code == 1
+    assert "and those since the checkpoint, number 5, are missing" in said
+    segments(path)[0].unlink()
+    code, said = verified(path, "--since", recent)
+    assert code == 1
     assert "the entries before it were removed, and no entry records that" in said
+
+
+async def test_what_was_removed_and_recorded_by_another_is_found(tmp_path: Path, tls: Path) -> None:
+    path = tmp_path / "audit" / "audit.jsonl"
+    kept = await checkpoint(path, 12, tls, segment_bytes=500)
+    await filled(path, 6)
+    gone = segments(path)[:2]
+    end = last_link(gone[-1])
+    assert end is not None
+    log = AuditLog(path, lambda: 0.0)
+    log.append("pruned", {"first": 1, "last": end.sequence, "last_hash": end.hash})
+    await log.close()
+    for segment in gone:
+        segment.unlink()
+    assert verified(path)[0] == 1
+    assert verified(path, "--since", kept)[0] == 0, "what the checkpoint stands for is there"
+    for segment in segments(path):
+        segment.unlink()
+    code, said = verified(path.parent, "--since", kept)
+    assert (code, "and those since the checkpoint" in said or "no entry records" in said) == (1, True)
+
+
+@pytest.mark.parametrize("which", ["end", "rewritten", "emptied", "missing", "log"])
+async def test_a_checkpoint_finds_what_the_chain_alone_does_not(tmp_path: Path, tls: Path, which: str) -> None:
+    path = tmp_path / "audit" / "audit.jsonl"
+    kept = await checkpoint(path, 4, tls)
+    if which == "end":
+        path.write_bytes(b"".join(read(path)[:3]))
+        why = "is number 3, the last one, and the checkpoint is number 4: entries are missing"
+    elif which == "rewritten":
+        path.unlink()
+        await filled(path, 3)
+        await filled(path, 3)
+        why = "is another entry than the checkpoint's: it and all before it were written again"
+    elif which == "emptied":
+        path.write_bytes(b"")
+        why = "is number 0, the last one"
+    elif which == "missing":
+        path.rename(path.with_name("audit.000000000001.jsonl"))
+        why = "audit.jsonl: is missing; the log is not complete without it"
+    else:
+        path.rename(path.with_name("other.jsonl"))
+        path.with_suffix(".checkpoint").unlink()
+        why = "--since: the checkpoint is of audit.jsonl; give that log, or its directory"
+    if which not in {"missing", "log"}:
+        assert verified(path.parent)[0] == 0
+    code, said = verified(path.parent, "--since", kept)
+    assert (code, why in said) == (1, True), said
+
+
+async def test_what_the_status_of_the_node_tells_is_a_checkpoint_too(tmp_path: Path, tls: Path) -> None:
+    path = tmp_path / "audit" / "audit.jsonl"
+    assert audit_heads(path.parent) == []
+    await filled(path, 4, tls=tls)
+    (head,) = audit_heads(path.parent)
+    assert head == f"audit:4:{json.loads(read(path)[-1])['hash']}"
+    (path.parent / "odd.checkpoint").write_bytes(b"{")
+    (path.parent / "other.checkpoint").write_text(json.dumps({"log": "a b", "seq": 1, "hash": "0" * 64}))
+    assert audit_heads(path.parent) == [head]
+    code, said = verified(path, "--since", head)
+    assert (code, "all since number 4 are there" in said, "signed" in said) == (0, True, False)
+    path.write_bytes(b"".join(read(path)[:3]))
+    code, said = verified(path, "--since", head)
+    assert code == 1
+    assert "entries are missing" in said
+    code, said = verified(path, "--since", "audit:4:nonsense")
+    assert (code, "No such file" in said) == (1, True)
+
+
+async def test_a_log_that_is_gone_is_missed_in_its_directory(tmp_path: Path, tls: Path) -> None:
+    for name in ("camera", "mobility"):
+        await filled(tmp_path / "audit" / f"{name}.jsonl", 2, tls=tls)
+    assert verified(tmp_path / "audit")[0] == 0
+    (tmp_path / "audit" / "camera.jsonl").unlink()
+    code, said = verified(tmp_path / "audit")
+    assert code == 1
+    assert "camera.jsonl: is missing" in said
+
+
+@pytest.mark.parametrize("which", ["changed", "other", "component", "nonsense", "twice"])
+async def test_a_checkpoint_that_proves_nothing(tmp_path: Path, tls: Path, which: str) -> None:
+    path = tmp_path / "audit" / "audit.jsonl"
+    kept, more = await checkpoint(path, 4, tls), list[Path]()
+    if which == "changed":
+        kept.write_bytes(kept.read_bytes().replace(b'"seq":4', b'"seq":3'))
+        why = "was changed after it was signed"
+    elif which == "other":
+        kept = await checkpoint(path, 1, node_files(tls, Authority.generate(EPOCH)))
+        (tls / "ca.crt").write_bytes(AUTHORITY.certificate_pem)
+        why = "is signed with a certificate of another authority"
+    elif which == "component":
+        issued = AUTHORITY.issue_component("spiffe://fractus.dev/ns/a/app/b/component/c/instance/d", EPOCH)
+        for name, content in issued.items():
+            (tls / name).write_bytes(base64.b64decode(content))
+        kept, why = await checkpoint(path, 1, tls), "is not signed by a node"
+    elif which == "nonsense":
+        kept.write_bytes(b"[" * 9_000)
+        why = "is no checkpoint"
+    else:
+        more, why = [await checkpoint(path, 1, tls)], "is the second of audit.jsonl"
+    options = [word for file in (kept, *more) for word in ("--since", file)]
+    code, said = verified(path, *options, "--ca", tls / "ca.crt")
+    assert (code, why in said) == (1, True), said
+
+
+async def test_a_node_without_a_certificate_has_no_checkpoint_yet(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, tls: Path
+) -> None:
+    path = tmp_path / "audit.jsonl"
+    await filled(path, 2, tls=tmp_path)
+    assert not path.with_suffix(".checkpoint").exists()
+    assert not caplog.text
+    (tls / "tls.key").write_bytes(b"nonsense")
+    await filled(path, 2, tls=tls)
+    assert "cannot write a checkpoint" in caplog.text
+    assert verified(path)[0] == 0
+
+
+async def test_the_last_entries_are_signed_though_no_other_follows(
+    tmp_path: Path, tls: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fractus_services.audit.CHECKPOINT_INTERVAL_S", 0.2)
+    path = tmp_path / "audit.jsonl"
+    found = path.with_suffix(".checkpoint")
+    log = AuditLog(path, lambda: 0.0, tls=tls)
+    log.append("call", {"n": 0})
+    await until(found.exists)
+    log.append("call", {"n": 1})
+    await until(lambda: json.loads(found.read_bytes())["seq"] == 2)
+    before = found.read_bytes()
+    await asyncio.sleep(0.5)
+    await log.close()
+    assert found.read_bytes() == before, "nothing new, nothing signed"
+
+
+async def test_a_certificate_that_is_missing_is_looked_for_now_and_then(
+    tmp_path: Path, tls: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried = []
+
+    def missing(*_: object) -> bytes:
+        tried.append(1)
+        raise FileNotFoundError
+
+    with monkeypatch.context() as patched:
+        patched.setattr("fractus_services.audit.CHECKPOINT_INTERVAL_S", 0.1)
+        patched.setattr("fractus_services.audit.signed", missing)
+        path = tmp_path / "audit.jsonl"
+        log = AuditLog(path, lambda: 0.0, tls=tls)
+        log.append("call", {"n": 0})
+        await until(lambda: tried)
+        await asyncio.sleep(0.5)
+        assert 2 <= len(tried) <= 7
+    await log.close()
+    assert json.loads(path.with_suffix(".checkpoint").read_bytes())["seq"] == 1
+
+
+async def test_a_disk_that_became_read_only_is_a_failure_and_no_crash(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "audit.jsonl"
+    await written(path, 2)
+    real = os.open
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    def opened(name: Any, flags: int, *args: Any, **named: Any) -> int:
+        if flags & (os.O_WRONLY | os.O_RDWR) and str(name) == str(path):
+            refuse()
+        return real(name, flags, *args, **named)
+
+    with monkeypatch.context() as patched:
+        patched.setattr("fractus_services.audit._cut_torn_line", refuse)
+        patched.setattr("fractus_services.audit.os.open", opened)
+        log = AuditLog(path, lambda: 0.0)
+        log.append("call", {"n": 2})
+        await until(lambda: "Read-only file system" in log.failure)
+    await log.close()
+    finding = verify(read(path))
+    assert (finding.entries, finding.problem) == (3, "")
 
 
 @pytest.mark.parametrize("which", ["middle", "change", "torn"])

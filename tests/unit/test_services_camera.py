@@ -12,9 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 from camera_world import Scene, World, active_grant, grain, private, refusal
+from fractus_core.api.model import API_VERSION
+from fractus_core.api.nodes import Drone
 from fractus_core.policy.values import CaptureArgs, Lens
 from fractus_services.camera.album.album import owner_of
 from fractus_services.camera.capture.driver import CameraFailed, Wanted
+from fractus_services.camera.capture.properties import CameraProperties
 from fractus_services.camera.capture.shutter import Shutter
 from fractus_services.camera.pictures.fair_queue import MAX_PER_OWNER, QueueFull
 from fractus_services.errors import PolicyDenied, Refused
@@ -66,6 +69,28 @@ async def test_a_camera_that_looks_aside_and_back_during_the_exposure_keeps_no_p
     world.scene.during = lambda: looked(yaw=180.0)
     shot = await world.capture(active_grant(elsewhere))
     assert await refusal(world.library.retrieve(active_grant(), shot.name)) == "PrivacyZone"
+
+
+@pytest.mark.parametrize("model", ["pinhole", "equidistant", None])
+async def test_only_a_pinholes_view_tells_its_focal_length(tmp_path: Path, model: str | None) -> None:
+    """Of another lens only a bound of its view is known, which is wider."""
+    described = {"methods": ["CaptureImage"], "horizontalFieldOfView": 60} | (
+        {"lens": {"model": model}} if model else {}
+    )
+    body = {
+        "apiVersion": API_VERSION,
+        "kind": "Drone",
+        "metadata": {"name": "d"},
+        "spec": {"services": {"camera": described}},
+    }
+    world = World(tmp_path, pinhole=CameraProperties.of(Drone.from_body(body)).pinhole)
+    elsewhere = policy("q", "PrivacyControl", "camera", [zone("z", box(500, 500, 510, 510))], action="refuse")
+    shot = await world.capture(active_grant(elsewhere))
+    source = (await world.library.retrieve(active_grant(elsewhere), shot.name))[2]
+    data = source if isinstance(source, bytes) else source.read_bytes()
+    assert b"GPSXYAccuracy" in data
+    assert (b"PerspectiveFocalLength" in data) == (model == "pinhole")
+    world.shutter.close()
 
 
 async def test_a_camera_that_shows_what_was_is_judged_by_where_it_was(world: World) -> None:

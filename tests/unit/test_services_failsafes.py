@@ -4,40 +4,41 @@ from __future__ import annotations
 
 import asyncio
 import math
-from typing import Any
+from collections.abc import Coroutine
+from typing import Any, TypeVar
 
 import pytest
 from fractus_core.policy.values import Airframe
+from fractus_mavlink import message
 from fractus_services.mobility.autopilot import Checked
-from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.link import SYSTEM_ID
+from mobility_world import Loop
+from parameter_vehicle import MOVEMENT, ParameterVehicle
 
 SOUND = {
     "FS_GCS_ENABLE": 1.0, "FS_GCS_TIMEOUT": 5.0, "BATT_FS_LOW_ACT": 2.0, "BATT_FS_CRT_ACT": 1.0, "FS_EKF_ACTION": 1.0,
 }  # fmt: skip
 
 
-class Parameters:
+class Parameters(ParameterVehicle):
     """An autopilot that only has parameters; those in `fixed` cannot be set."""
 
     def __init__(self, values: dict[str, float], fixed: tuple[str, ...] = ()) -> None:
-        self.values = SOUND | values
-        self.fixed = fixed
-        self.stack = ARDUCOPTER
-
-    async def read_parameter(self, name: str, attempts: int = 4) -> float | None:
-        del attempts
-        return self.values.get(name)
-
-    async def write_parameter(self, name: str, value: float) -> float | None:
-        if name not in self.fixed:
-            self.values[name] = value
-        return self.values[name]
+        super().__init__(MOVEMENT | SOUND | values, fixed)
 
 
-def configured(parameters: Any) -> Checked:
-    return asyncio.run(MavlinkFailsafes(parameters).configure())
+T = TypeVar("T")
+
+
+def run(work: Coroutine[Any, Any, T]) -> T:
+    """The outcome of work in a loop whose time jumps."""
+    with asyncio.Runner(loop_factory=Loop) as runner:
+        return runner.run(work)
+
+
+def configured(parameters: Parameters) -> Checked:
+    return run(MavlinkFailsafes(parameters).configure())
 
 
 def test_the_companion_is_no_ground_station() -> None:
@@ -101,7 +102,7 @@ def test_a_failsafe_that_stays_straight_retraces_nothing(fixed: str) -> None:
 
 def test_armed_elsewhere_it_goes_straight_and_from_home_again_on_its_path() -> None:
     async def chosen() -> None:
-        vehicle: Any = Parameters(RETRACING)
+        vehicle = Parameters(RETRACING)
         checked = await MavlinkFailsafes(vehicle).configure()
         away = await MavlinkFailsafes(vehicle).choose_return(checked, retrace=False)
         assert not away.airframe.retraces
@@ -110,7 +111,7 @@ def test_armed_elsewhere_it_goes_straight_and_from_home_again_on_its_path() -> N
         assert again.airframe.retraces
         assert vehicle.values["FS_GCS_ENABLE"] == 3.0
 
-    asyncio.run(chosen())
+    run(chosen())
 
 
 def test_a_velocity_ends_soon_without_another() -> None:
@@ -136,7 +137,7 @@ def test_the_vehicles_own_fence_caps_its_way_home() -> None:
 
 def test_a_fence_raised_later_caps_it_as_well() -> None:
     async def learnt() -> None:
-        vehicle: Any = Parameters(RETRACING | {"RTL_ALT": 5000.0})
+        vehicle = Parameters(RETRACING | {"RTL_ALT": 5000.0})
         checked = await MavlinkFailsafes(vehicle).configure()
         assert checked.airframe.return_altitude_m == 50.0
         vehicle.values |= {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 5.0, "FENCE_ALT_MAX": 35.0}
@@ -146,7 +147,7 @@ def test_a_fence_raised_later_caps_it_as_well() -> None:
         vehicle.values["FENCE_ALT_MAX"] = math.nan
         assert "FENCE_ALT_MAX is not a number" in (await MavlinkFailsafes(vehicle).learn_return(checked)).problem
 
-    asyncio.run(learnt())
+    run(learnt())
 
 
 FENCED = {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 5.0, "FENCE_ALT_MAX": 65.0}
@@ -155,37 +156,29 @@ FENCED = {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 5.0, "FENCE_ALT_MAX": 65.0}
 @pytest.mark.parametrize("lost", ["RTL_ALT", "FENCE_ENABLE"])
 def test_a_return_altitude_that_is_lost_stays_and_forbids_arming(lost: str) -> None:
     async def learnt() -> None:
-        vehicle: Any = Parameters(RETRACING | FENCED | {"RTL_ALT": 6000.0})
+        vehicle = Parameters(RETRACING | FENCED | {"RTL_ALT": 6000.0})
         checked = await MavlinkFailsafes(vehicle).configure()
         assert checked.airframe.return_altitude_m == 60.0
         vehicle.values |= {"RTL_ALT": 9000.0}
         del vehicle.values[lost]
         later = await MavlinkFailsafes(vehicle).learn_return(checked)
         assert later.airframe.return_altitude_m == 60.0
-        assert later.problem == f"{lost} cannot be read any more"
-        assert not (
-            await MavlinkFailsafes(vehicle).learn_return(await MavlinkFailsafes(vehicle).configure())
-        ).problem, "what never was is not lost"
+        assert later.problem == f"{lost} cannot be read: the autopilot does not answer"
 
-    asyncio.run(learnt())
+    run(learnt())
 
 
-def test_a_ceiling_that_cannot_be_read_forbids_arming() -> None:
-    async def learnt() -> None:
-        vehicle: Any = Parameters(RETRACING | {"RTL_ALT": 6000.0})
-        checked = await MavlinkFailsafes(vehicle).configure()
-        vehicle.values |= FENCED
-        del vehicle.values["FENCE_ALT_MAX"]
-        assert (await MavlinkFailsafes(vehicle).learn_return(checked)).problem == "FENCE_ALT_MAX cannot be read"
-
-    asyncio.run(learnt())
+def test_a_fence_without_its_ceiling_forbids_arming() -> None:
+    vehicle = Parameters(RETRACING | FENCED)
+    del vehicle.values["FENCE_ALT_MAX"]
+    assert configured(vehicle).problem == "the autopilot has no FENCE_ALT_MAX"
 
 
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("retrace", [True, False])
 def test_in_flight_the_way_home_stays_as_it_was_chosen(retrace: bool, known: bool) -> None:
     async def flown() -> None:
-        vehicle: Any = Parameters(RETRACING)
+        vehicle = Parameters(RETRACING)
         chosen = await MavlinkFailsafes(vehicle).choose_return(
             await MavlinkFailsafes(vehicle).configure(), retrace=retrace
         )
@@ -196,19 +189,30 @@ def test_in_flight_the_way_home_stays_as_it_was_chosen(retrace: bool, known: boo
         landed = await MavlinkFailsafes(vehicle).configure(before=chosen)
         assert landed.airframe.retraces
 
-    asyncio.run(flown())
+    run(flown())
 
 
 def test_in_flight_what_cannot_be_read_is_as_it_was() -> None:
     async def flown() -> None:
         moves = {"WPNAV_ACCEL": 100.0, "RTL_ALT": 6000.0, "WPNAV_SPEED": 800.0}
-        vehicle: Any = Parameters(RETRACING | moves)
+        vehicle = Parameters(RETRACING | moves)
         before = await MavlinkFailsafes(vehicle).configure()
         for name in (*moves, "SRTL_POINTS"):
             del vehicle.values[name]
         again = await MavlinkFailsafes(vehicle).configure(flying=True, before=before)
         assert (again.airframe, again.speed_mps) == (before.airframe, 8.0)
         assert again.airframe.retraces
-        assert "WPNAV_ACCEL cannot be read any more" in again.problem
+        assert "WPNAV_ACCEL" in again.problem
+        assert "cannot be read: the autopilot does not answer" in again.problem
 
-    asyncio.run(flown())
+    run(flown())
+
+
+@pytest.mark.parametrize(("kind", "firmware"), [(2, 12), (1, 3), (10, 3), (20, 3)])
+def test_nothing_is_set_in_a_vehicle_that_is_no_arducopter(kind: int, firmware: int) -> None:
+    vehicle = Parameters(RETRACING | {"FS_GCS_ENABLE": 0.0})
+    vehicle.vehicle.take(message("HEARTBEAT", type=kind, autopilot=firmware), 1.0)
+    assert configured(vehicle).problem == f"the vehicle is no ArduCopter (MAV_AUTOPILOT {firmware}, MAV_TYPE {kind})"
+    assert vehicle.values["FS_GCS_ENABLE"] == 0.0
+    vehicle.vehicle.take(message("HEARTBEAT", type=13, autopilot=3), 2.0)
+    assert not configured(vehicle).problem

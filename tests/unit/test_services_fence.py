@@ -1,4 +1,4 @@
-"""Commands that were overtaken are not sent, one parameter is asked for by one; no duty, no heartbeats."""
+"""Commands that were overtaken are not sent; no duty, no heartbeats."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import asyncio
 from typing import Any
 
 import pytest
-from fractus_mavlink import message
 from fractus_services.mobility.mavlink import autopilot as module
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
@@ -50,22 +49,3 @@ async def test_no_duty_no_heartbeat(monkeypatch: pytest.MonkeyPatch) -> None:
     duty = True
     autopilot.beat()
     assert sent[-1].name == "HEARTBEAT"
-
-
-async def test_two_that_read_one_parameter_both_hear_it(
-    link: tuple[MavlinkAutopilot, list[Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    autopilot, sent = link
-    autopilot.target = (1, 1)
-    monkeypatch.setattr(module, "ACK_TIMEOUT_S", 5.0)
-    values = [1.0, 2.0]
-
-    def answered(outgoing: Any) -> None:
-        sent.append(outgoing)
-        told = message("PARAM_VALUE", param_id=b"FENCE_TYPE", param_value=values.pop(0))
-        asyncio.get_running_loop().call_soon(autopilot.take, told)
-
-    monkeypatch.setattr(autopilot, "send", answered)
-    both = await asyncio.gather(autopilot.read_parameter("FENCE_TYPE"), autopilot.write_parameter("FENCE_TYPE", 2.0))
-    assert both == [1.0, 2.0]
-    assert [m.name for m in sent] == ["PARAM_REQUEST_READ", "PARAM_SET"]

@@ -111,6 +111,43 @@ def test_a_drone_that_speeds_up_toward_a_new_zone_is_stopped_before_it_is_known_
     fly(flight)
 
 
+@pytest.mark.parametrize("speed_mps", [2.0, 6.0, 11.0])
+@pytest.mark.parametrize("measured", [True, False])
+def test_a_leg_that_is_shortened_is_flown_to_its_end(tmp_path: Path, speed_mps: float, measured: bool) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.plane.measured = measured
+            grant = world.grants.put(spec(zone("wall", "adjust", *WALL)))
+            await world.up(grant)
+            arrived = await end(world.service.goto(grant, goto(0, 70, speed_mps=speed_mps), 0))
+            assert arrived.verdict.code == "LegShortened"
+            assert "wall" in arrived.verdict.policies
+            assert isinstance(arrived.verdict.args, GotoArgs)
+            assert world.plane.vehicle.distance_m(arrived.verdict.args.lat, arrived.verdict.args.lon) < 1.5
+            assert not world.kinds("monitor")
+            assert 1.0 < clear_m(world, *WALL) < 5.0
+
+    fly(flight)
+
+
+def test_a_driver_that_asks_again_and_again_for_a_way_that_is_refused_keeps_no_drone_in_the_air(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(partial(zone("around", "ignore", -20, 50, 20, 90)))
+            refused: list[float] = []
+            while not world.outcome():
+                why = await refusal(world.drive(grant))
+                refused.append(world.plane.now)
+                assert why.verdict.code in {"NoLegalWay", "ControlLost"}
+                await asyncio.sleep(2)
+            assert len(refused) > 1
+            assert refused[-1] - refused[0] < 10, "the grace of 5 s is over"
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert math.hypot(*world.plane.xy) < 1
+
+    fly(flight)
+
+
 def test_no_way_to_the_control_point_is_told(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:

@@ -1,4 +1,4 @@
-"""Grant files, identities and clocks."""
+"""Grant files."""
 
 from __future__ import annotations
 
@@ -7,11 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_core.policy.values import Moment, earliest
 from fractus_services.admission import Allowance
-from fractus_services.auth import Caller, caller_of
-from fractus_services.clock import TRUST_AFTER_S, Clock
-from fractus_services.errors import NotAuthenticated
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import ActiveGrant, GrantFiles
 from grant_signing import CA_PEM, signed
@@ -92,49 +88,6 @@ def test_a_missing_directory_is_empty(tmp_path: Path) -> None:
     files = grant_files(tmp_path / "none")
     files.scan()
     assert not files.active
-
-
-def test_callers() -> None:
-    with pytest.raises(NotAuthenticated, match="mutual TLS"):
-        caller_of({}, 0.0)
-    with pytest.raises(NotAuthenticated, match="cannot be read"):
-        caller_of({"x509_pem_cert": [b"nonsense"]}, 0.0)
-    caller = Caller("spiffe://fractus.dev/node/a", 100.0, 200.0)
-    caller.check(150.0)
-    with pytest.raises(NotAuthenticated, match="expired"):
-        caller.check(200.0)
-    with pytest.raises(NotAuthenticated, match="not valid yet"):
-        caller.check(10.0)
-
-
-def test_time_never_runs_backwards(monkeypatch: pytest.MonkeyPatch) -> None:
-    wall, steady = [1000.0], [50.0]
-    monkeypatch.setattr("fractus_services.clock.time.time", lambda: wall[0])
-    monkeypatch.setattr("fractus_services.clock.time.monotonic", lambda: steady[0])
-    clock = Clock()
-    assert clock() == 1000.0
-    wall[0], steady[0] = 500.0, 60.0
-    assert clock() == 1010.0, "set back: it goes on by its own count"
-    wall[0] = 5000.0
-    assert clock() == 5000.0, "set forward: it follows"
-
-
-def test_a_jump_ahead_that_is_corrected_does_not_last_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    wall, steady = [1000.0], [50.0]
-    monkeypatch.setattr("fractus_services.clock.time.time", lambda: wall[0])
-    monkeypatch.setattr("fractus_services.clock.time.monotonic", lambda: steady[0])
-    clock = Clock()
-    wall[0] = 900_000.0
-    assert clock() == 900_000.0
-    wall[0], steady[0] = 1001.0, 51.0
-    doubtful = clock()
-    assert (doubtful, earliest(doubtful)) == (900_001.0, 1001.0), "both readings count"
-    wall[0], steady[0] = 1000.0 + TRUST_AFTER_S, 50.0 + TRUST_AFTER_S
-    assert isinstance(clock(), Moment)
-    wall[0], steady[0] = 1002.0 + TRUST_AFTER_S, 52.0 + TRUST_AFTER_S
-    assert (clock(), type(clock())) == (1002.0 + TRUST_AFTER_S, float)
-    wall[0] -= 0.5
-    assert type(clock()) is float, "a clock is set right all the time"
 
 
 NESTED = b"[" * 100_000

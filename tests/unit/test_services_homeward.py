@@ -5,21 +5,34 @@ from __future__ import annotations
 import asyncio
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
-import shapely
 from fractus_core.control.values import FlightMode
 from fractus_core.policy.values import GotoArgs
+from fractus_mavlink import message
 from fractus_mavlink.enums import MAV_CMD
 from fractus_services.mobility.authority import drivers
-from mobility_world import LAND, RTL, SMART_RTL, World, at, end, fly, partial, refusal, spec, touring, zone
+from mobility_world import (
+    GUIDED,
+    LAND,
+    RTL,
+    SMART_RTL,
+    World,
+    area,
+    at,
+    clear_m,
+    end,
+    fly,
+    partial,
+    refusal,
+    spec,
+    touring,
+    zone,
+)
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
 REPOSITION = 192
-
-
-def clear_m(world: World, *box: float) -> float:
-    return float(min(shapely.box(*box).distance(shapely.Point(x, y)) for x, y, _ in world.plane.trace))
 
 
 async def beyond_the_wall(world: World) -> None:
@@ -39,14 +52,13 @@ def test_a_driver_turns_home_from_standstill(tmp_path: Path) -> None:
             flying = asyncio.ensure_future(end(world.service.goto(grant, GotoArgs(*at(0, 90), 10.0), 0)))
             await world.until(lambda: world.plane.velocity[1] > 6)
             turned: list[float] = []
-            obey = world.plane.set_to
+            go_to = world.plane.go_to
 
-            def noted(mode: FlightMode) -> None:
-                if mode == RTL:
-                    turned.append(math.hypot(*world.plane.velocity))
-                obey(mode)
+            async def noted(*where: Any) -> None:
+                turned.append(math.hypot(*world.plane.velocity))
+                await go_to(*where)
 
-            world.plane.set_to = noted  # type: ignore[method-assign]
+            world.plane.go_to = noted  # type: ignore[method-assign]
             await end(world.service.return_to_launch(grant))
             assert turned
             assert max(turned) < 0.5
@@ -172,9 +184,9 @@ def test_the_way_home_is_judged_below_the_fence_of_the_mission(tmp_path: Path) -
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
             await world.drive(grant)
-            world.plane.parameters |= {"RTL_ALT": 9000.0, "FENCE_ENABLE": 1.0, "FENCE_TYPE": 5.0, "FENCE_ALT_MAX": 65.0}
+            world.plane.parameters |= {"RTL_ALT": 9000.0, "FENCE_ENABLE": 1.0, "FENCE_TYPE": 5.0, "FENCE_ALT_MAX": 55.0}
             await world.service.arm(grant)
-            assert world.guard.situation().airframe.return_altitude_m == 63.0
+            assert world.guard.situation().airframe.return_altitude_m == 53.0
 
     fly(flight)
 
@@ -203,14 +215,14 @@ def test_failsafes_are_set_again_when_setting_them_broke(tmp_path: Path) -> None
         async with World(tmp_path) as world:
             control, plane = world.control, world.plane
             plane.parameters |= {"SYSID_MYGCS": 244.0}
-            read, broken = plane.read_parameter, [KeyError("FENCE_ENABLE"), KeyError("FENCE_ENABLE")]
+            read, broken = plane.vehicle_parameters.read, [KeyError("FENCE_ENABLE"), KeyError("FENCE_ENABLE")]
 
-            async def breaking(name: str, attempts: int = 4) -> float | None:
+            async def breaking(wanted: Any) -> dict[str, float]:
                 if broken:
                     raise broken.pop()
-                return await read(name, attempts)
+                return await read(wanted)
 
-            plane.read_parameter = breaking  # type: ignore[method-assign]
+            plane.vehicle_parameters.read = breaking  # type: ignore[method-assign]
             world.observer.found()
             await world.until(lambda: control.checked is not None and not control.checked.problem, 10)
             assert not broken
@@ -236,5 +248,267 @@ def test_a_fault_of_ours_ends_the_mission_once(tmp_path: Path, monkeypatch: pyte
             assert world.plane.commands.count(MAV_CMD.COMPONENT_ARM_DISARM) == 1, "not armed again"
             await asyncio.sleep(20)
             assert world.plane.commands.count(MAV_CMD.COMPONENT_ARM_DISARM) == 1
+
+    fly(flight)
+
+
+SLOW = {"maxAltitude": 60, "maxSpeed": 4}
+
+
+@pytest.mark.parametrize("who", ["driver", "failsafe", "system"])
+def test_what_appears_on_the_way_home_is_flown_around_as_fast_as_allowed(tmp_path: Path, who: str) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            plane = world.plane
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            await end(world.service.goto(grant, GotoArgs(*at(0, 120), 10.0), 0))
+            homeward = None
+            if who == "system":
+                await drivers.give_back(world.control, grant)
+            elif who == "driver":
+                homeward = asyncio.ensure_future(end(world.service.return_to_launch(grant)))
+            else:
+                plane.vehicle.failsafe = True
+                plane.set_to(RTL)
+                world.observer.heartbeat()
+            await world.until(lambda: plane.xy[1] < 90)
+            world.grants.put(spec(zone("wall", "ignore", *WALL), limits=SLOW))
+            plane.trace.clear()
+            await asyncio.sleep(6)
+            fastest = 0.0
+            while plane.vehicle.armed:
+                await plane.update(0.1)
+                fastest = max(fastest, math.hypot(*plane.velocity))
+            assert fastest <= 4.0 + 1e-6
+            assert clear_m(world, *WALL) > 1.0
+            assert math.hypot(*plane.xy) < 1.0
+            alarms = [entry["action"] for entry in world.kinds("monitor")]
+            assert ("takeBack" in alarms) == (who == "failsafe")
+            if homeward is not None:
+                await homeward
+
+    fly(flight)
+
+
+def test_what_appears_before_a_pilot_who_chose_to_return_is_told_and_left(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            plane = world.plane
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            await end(world.service.goto(grant, GotoArgs(*at(0, 120), 10.0), 0))
+            plane.set_to(RTL)
+            world.observer.heartbeat()
+            await world.until(lambda: plane.xy[1] < 90)
+            world.grants.put(spec(zone("wall", "revoke", *WALL), limits=SLOW))
+            commands = len(plane.commands)
+            await world.until(lambda: not plane.vehicle.armed)
+            alarms = [(entry["action"], entry["code"]) for entry in world.kinds("monitor")]
+            assert {("alarm", "ExclusionZoneAhead"), ("alarm", "SpeedAboveLimit")} <= set(alarms)
+            assert len(alarms) < 10, "each is told once while it lasts"
+            assert "zone wall-zone" in caplog.text
+            assert MAV_CMD.DO_SET_MODE not in plane.commands[commands:]
+
+    fly(flight)
+
+
+def test_a_return_that_a_new_service_finds_is_told_of_and_left(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            plane = world.plane
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            await end(world.service.goto(grant, GotoArgs(*at(0, 120), 10.0), 0))
+            plane.set_to(RTL)
+            world.observer.heartbeat()
+            await world.until(lambda: plane.xy[1] < 90)
+        async with World(tmp_path, after=world, known=False) as again:
+            again.grants.put(spec(zone("wall", "revoke", *WALL)))
+            again.observer.found()
+            commands = len(again.plane.commands)
+            await again.until(lambda: not again.plane.vehicle.armed)
+            assert ("alarm", "ExclusionZoneAhead") in [(e["action"], e["code"]) for e in again.kinds("monitor")]
+            assert MAV_CMD.DO_SET_MODE not in again.plane.commands[commands:]
+
+    fly(flight)
+
+
+@pytest.mark.parametrize("who", ["driver", "system"])
+@pytest.mark.parametrize("low", [12.0, 5.0])
+def test_the_way_home_keeps_limits_of_height_and_speed(tmp_path: Path, who: str, low: float) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            plane = world.plane
+            here = {"type": "LimitControl", "kind": "altitude", "upperLimit": low, "selector": {"zones": ["near-zone"]}}
+            near = {"name": "near", "spec": here, "zones": [{"name": "near-zone", "area": area(-60, -30, 60, 50)}]}
+            limits = {"maxAltitude": 12, "maxSpeed": 3}
+            grant = world.grants.put(spec(near, limits=limits))
+            plane.vehicle.mode = GUIDED
+            await world.up(grant, min(low, 10.0))
+            await end(world.service.goto(grant, GotoArgs(*at(0, 49), min(low, 10.0)), 0))
+            await end(world.service.goto(grant, GotoArgs(*at(0, 90), 10.0), 0))
+            plane.trace.clear()
+            fastest = 0.0
+            if who == "system":
+                await drivers.give_back(world.control, grant)
+            else:
+                homeward = asyncio.ensure_future(end(world.service.return_to_launch(grant)))
+            while plane.vehicle.armed:
+                await plane.update(0.1)
+                fastest = max(fastest, math.hypot(*plane.velocity))
+            assert fastest <= 3.0 + 1e-6
+            assert max(z for *_, z in plane.trace) <= 12.2
+            assert max(z for _, y, z in plane.trace if y < 50) <= low + 0.3
+            assert math.hypot(*plane.xy) < 1.0
+            if who == "driver":
+                await homeward
+
+    fly(flight)
+
+
+@pytest.mark.parametrize("code", ["AltitudeAboveLimit", "SpeedAboveLimit"])
+def test_a_failsafe_that_breaks_a_limit_is_relieved(tmp_path: Path, code: str) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            plane = world.plane
+            limits = {"maxAltitude": 12, "maxSpeed": 12} if code == "AltitudeAboveLimit" else SLOW
+            grant = world.grants.put(spec(limits=limits))
+            await world.up(grant)
+            await end(world.service.goto(grant, GotoArgs(*at(0, 120), 10.0, speed_mps=4.0), 0))
+            plane.vehicle.failsafe = True
+            plane.speed_mps = 8.0
+            plane.set_to(RTL)
+            world.observer.heartbeat()
+            await world.until(lambda: not plane.vehicle.armed)
+            assert [entry["code"] for entry in world.kinds("monitor")] == [code]
+            assert plane.vehicle.mode == LAND
+            assert max(z for *_, z in plane.trace) < limits["maxAltitude"] + 2.5
+
+    fly(flight)
+
+
+def test_what_is_the_last_line_already_is_not_ended(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            plane = world.plane
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            await end(world.service.goto(grant, GotoArgs(*at(0, 120), 10.0), 0))
+            world.grants.put(spec(zone("all-around", "ignore", -20, -20, 20, 20)))
+            await drivers.give_back(world.control, grant)
+            await world.until(lambda: not plane.vehicle.armed)
+            assert plane.vehicle.mode == RTL
+            alarms = [(entry["action"], entry["code"]) for entry in world.kinds("monitor")]
+            assert alarms == [("alarm", "ExclusionZoneAhead"), ("alarm", "InsideExclusionZone")]
+
+    fly(flight)
+
+
+def test_a_driver_that_flies_on_is_kept_from_zones_by_the_same_grant(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, retraces=True) as world:
+            plane = world.plane
+            grant = world.grants.put(spec(zone("wall", "ignore", *WALL)))
+            await world.up(grant)
+            for x, y in ((60, 30), (60, 70), (0, 70)):
+                await end(world.service.goto(grant, GotoArgs(*at(x, y), 10.0), 0))
+            world.monitor._way_home.given_up = grant  # as a way home left it that its driver has stopped
+            await asyncio.sleep(2)
+            plane.vehicle.failsafe = True
+            plane.set_to(RTL)
+            world.observer.heartbeat()
+            await world.until(lambda: not plane.vehicle.armed)
+            assert "takeBack" in [entry["action"] for entry in world.kinds("monitor")]
+            assert clear_m(world, *WALL) > 0
+
+    fly(flight)
+
+
+def test_an_autopilot_that_lands_by_itself_breaks_no_lower_limit(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            low = {"type": "LimitControl", "kind": "altitude", "lowerLimit": 5.0}
+            grant = world.grants.put(spec({"name": "low", "spec": low, "zones": []}))
+            await world.up(grant)
+            await drivers.give_back(world.control, grant)
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert not world.kinds("monitor")
+
+    fly(flight)
+
+
+def changes(world: World, name: str, value: float, *, told: bool = True) -> None:
+    """Another station sets a parameter; with `told` the vehicle says so to all that listen."""
+    plane = world.plane
+    plane.parameters[name] = value
+    if told:
+        plane.take(message("PARAM_VALUE", param_id=name.encode(), param_value=value, param_count=1, param_index=65535))
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_failsafe_that_is_changed_in_flight_is_set_back(tmp_path: Path, told: bool) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.observer.found()
+            grant = world.grants.put(spec())
+            await world.until(lambda: world.control.checked is not None, 10)
+            await world.up(grant)
+            changes(world, "FS_GCS_ENABLE", 0.0, told=told)
+            await world.until(lambda: world.plane.parameters["FS_GCS_ENABLE"] == 1.0, 1 if told else 12)
+            await world.until(lambda: any("FS_GCS_ENABLE was 0 and is 1" in str(e) for _, e in world.entries), 2)
+            assert world.control.lease is not None, "the driver keeps the drone"
+
+    fly(flight)
+
+
+def test_how_the_vehicle_moves_is_heard_at_once(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.observer.found()
+            grant = world.grants.put(spec())
+            await world.until(lambda: world.control.checked is not None, 10)
+            await world.up(grant)
+            assert world.guard.situation().airframe.accel_mps2 == 2.5
+            changes(world, "WPNAV_ACCEL", 100.0)
+            assert world.guard.situation().airframe.accel_mps2 == 1.0
+            changes(world, "WPNAV_ACCEL", 50.0, told=False)
+            await world.until(lambda: world.guard.situation().airframe.accel_mps2 == 0.5, 12)
+            await world.until(lambda: any("moves otherwise" in str(e) for _, e in world.entries), 2)
+
+    fly(flight)
+
+
+def test_a_failsafe_that_cannot_be_set_back_ends_the_flight(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.observer.found()
+            grant = world.grants.put(spec())
+            await world.until(lambda: world.control.checked is not None, 10)
+            await world.up(grant)
+            world.plane.fixed = ("FS_GCS_ENABLE",)
+            changes(world, "FS_GCS_ENABLE", 0.0)
+            await world.until(world.outcome, 10)
+            assert "FS_GCS_ENABLE is 0 and cannot be set to 1" in world.outcome()
+            await world.until(lambda: not world.plane.vehicle.armed, 120)
+
+    fly(flight)
+
+
+def test_what_is_changed_on_the_ground_is_verified_before_anything_arms(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.observer.found()
+            grant = world.grants.put(spec())
+            await world.until(lambda: world.control.checked is not None, 10)
+            await world.drive(grant)
+            changes(world, "WPNAV_ACCEL", 100.0)
+            why = await refusal(world.service.arm(grant))
+            assert why.verdict.code == "FailsafesNotVerified"
+            await world.until(lambda: world.control.checked is not None and not world.control.checked.problem, 5)
+            await world.service.arm(grant)
+            assert world.guard.situation().airframe.accel_mps2 == 1.0
 
     fly(flight)

@@ -6,13 +6,13 @@ import asyncio
 
 import pytest
 from fractus_mavlink import Message, message
-from fractus_mavlink.enums import MAV_MISSION_TYPE
+from fractus_mavlink.enums import MAV_MISSION_RESULT, MAV_MISSION_TYPE
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink import itemlists
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.bounds import Item
-from fractus_services.mobility.mavlink.itemlists import NoLists, download, upload
+from fractus_services.mobility.mavlink.itemlists import NoLists, NoSpace, download, upload
 
 ITEMS = tuple(Item(5001, 3.0, 393600000 + i, 229500000 - i) for i in range(3))
 
@@ -102,3 +102,28 @@ async def test_without_a_vehicle_nothing_is_sent() -> None:
     keeper.target = None
     with pytest.raises(AutopilotError, match="not connected"):
         await download(keeper)
+
+
+@pytest.mark.parametrize(
+    ("result", "kind"), [(MAV_MISSION_RESULT.ERROR, AutopilotError), (MAV_MISSION_RESULT.NO_SPACE, NoSpace)]
+)
+async def test_a_refusal_says_what_the_autopilot_says(result: MAV_MISSION_RESULT, kind: type[AutopilotError]) -> None:
+    keeper = Keeper(result=result)
+    text = message("STATUSTEXT", severity=4, text=b"Invalid vertex count (2)")
+    asyncio.get_running_loop().call_later(0.1, keeper.take, text)
+    with pytest.raises(kind, match=r"refused the fence: .*: Invalid vertex count \(2\)"):
+        await upload(keeper, ITEMS)
+
+
+async def test_a_lost_answer_to_the_last_item_is_no_refusal() -> None:
+    class Finished(Keeper):
+        """As ArduPilot, which answers ERROR to an item that it does not await."""
+
+        def _answer(self, outgoing: Message) -> Message | None:
+            if outgoing.name == "MISSION_ITEM_INT" and len(self.items) == self.wanted:
+                return message("MISSION_ACK", type=MAV_MISSION_RESULT.ERROR, mission_type=MAV_MISSION_TYPE.FENCE)
+            return super()._answer(outgoing)
+
+    keeper = Finished(8)
+    await upload(keeper, ITEMS)
+    assert await download(keeper) == ITEMS

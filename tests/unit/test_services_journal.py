@@ -26,11 +26,7 @@ async def kept(directory: Path) -> Journal:
     return journal
 
 
-OLD = b'{"version": 1, "active": "k", "missions": [{"key": "k", "identity": "id", "outcome": "failed: driver lost"}]}'
-"""An outcome that cannot be understood makes the whole file unreadable: a mission that ended must not begin again."""
-
-
-@pytest.mark.parametrize("torn", [b"", b"{", b'{"missions": 3}', OLD])
+@pytest.mark.parametrize("torn", [b"", b"{", b'{"missions": 3}', b'{"missions": [3]}', b"[]", b"[" * 90_000])
 async def test_a_torn_journal_leaves_the_copy_before_it(tmp_path: Path, torn: bytes) -> None:
     await kept(tmp_path)
     (tmp_path / "journal.json").write_bytes(torn)
@@ -42,6 +38,40 @@ async def test_a_torn_journal_leaves_the_copy_before_it(tmp_path: Path, torn: by
     assert json.loads((tmp_path / "journal.last.json").read_bytes())["active"] == "k", (
         "a torn file replaces no sound one"
     )
+
+
+@pytest.mark.parametrize(
+    ("stored", "outcome"),
+    [
+        ("", None),
+        ("complete", Outcome(OutcomeKind.COMPLETE)),
+        ("failed: driver lost: it left", Outcome(OutcomeKind.FAILED, "driver lost: it left")),
+        ("revoked: the grant was removed", Outcome(OutcomeKind.REVOKED, "the grant was removed")),
+    ],
+)
+async def test_the_first_version_is_read(tmp_path: Path, stored: str, outcome: Outcome | None) -> None:
+    mission = {"key": "k", "identity": "id", "outcome": stored, "points_done": 2, "waypoints": 3, "flown": True}
+    body = {"version": 1, "active": "k", "missions": [{**mission, "home": [39, 22, 10]}]}
+    (tmp_path / "journal.json").write_text(json.dumps(body))
+    found = Journal(tmp_path).record
+    assert found == Record({"k": Mission("k", "id", outcome, 2, 3, True, (39.0, 22.0, 10.0))}, "k")
+
+
+@pytest.mark.parametrize("odd", ["lost in space", {"kind": "lost", "reason": ""}, {"kind": "failed"}, 7, ["failed"]])
+async def test_a_mission_that_ended_in_an_unknown_way_has_ended(tmp_path: Path, odd: object) -> None:
+    body = {"version": 3, "active": None, "missions": [{"key": "k", "identity": "id", "outcome": odd}]}
+    (tmp_path / "journal.json").write_text(json.dumps(body))
+    outcome = Journal(tmp_path).record.missions["k"].outcome
+    assert outcome is not None
+    assert outcome.kind is OutcomeKind.FAILED
+
+
+async def test_what_is_lost_for_good_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    await kept(tmp_path)
+    for name in ("journal.json", "journal.last.json"):
+        (tmp_path / name).write_bytes(b"{")
+    assert Journal(tmp_path).record == Record()
+    assert "remove Grants that must not fly again" in caplog.text
 
 
 async def test_what_a_newer_release_wrote_is_left_out(tmp_path: Path) -> None:

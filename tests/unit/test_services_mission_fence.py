@@ -5,19 +5,22 @@ from __future__ import annotations
 import asyncio
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import shapely
 from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame
+from fractus_mavlink import Message
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink import fence as module
-from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.bounds import ROOM_M, Item, bounds_of
 from fractus_services.mobility.mavlink.fence import MissionFence
-from fractus_services.mobility.mavlink.itemlists import NoLists
+from fractus_services.mobility.mavlink.itemlists import NoLists, NoSpace
+from hypothesis import given
+from hypothesis import strategies as st
+from mobility_world import Loop
+from parameter_vehicle import ParameterVehicle
 
 FRAME = LocalFrame(39.36, 22.95)
 
@@ -43,25 +46,19 @@ def outline(items: tuple[Item, ...]) -> Any:
     return shapely.Polygon([FRAME.xy(i.lat_e7 / 1e7, i.lon_e7 / 1e7) for i in items])
 
 
-class Vehicle:
+class Vehicle(ParameterVehicle):
     """An autopilot that has parameters and one list of items."""
 
-    def __init__(self, **values: float) -> None:
-        self.values = {"FENCE_ENABLE": 0.0, "FENCE_TYPE": 7.0, "FENCE_ALT_MAX": 100.0, "FENCE_ACTION": 2.0} | values
-        self.values |= {"FS_GCS_ENABLE": 1.0, "FENCE_OPTIONS": 1.0}
+    def __init__(self) -> None:
+        values = {"FENCE_ENABLE": 0.0, "FENCE_TYPE": 7.0, "FENCE_ALT_MAX": 100.0, "FENCE_ACTION": 2.0}
+        super().__init__(values | {"FS_GCS_ENABLE": 1.0, "FENCE_OPTIONS": 1.0, "FENCE_TOTAL": 0.0})
         self.items: tuple[Item, ...] = ()
         self.written: list[str] = []
-        self.vehicle = SimpleNamespace(armed=False)
-        self.stack = ARDUCOPTER
 
-    async def read_parameter(self, name: str, attempts: int = 4) -> float | None:
-        del attempts
-        return self.values.get(name)
-
-    async def write_parameter(self, name: str, value: float) -> float | None:
-        self.written.append(name)
-        self.values[name] = value
-        return value
+    def send(self, outgoing: Message) -> None:
+        if outgoing.name == "PARAM_SET":
+            self.written.append(outgoing.text("param_id"))
+        super().send(outgoing)
 
 
 @pytest.fixture
@@ -70,6 +67,7 @@ def vehicle(monkeypatch: pytest.MonkeyPatch) -> Vehicle:
 
     async def upload(_autopilot: Any, items: Any) -> None:
         vehicle.items = tuple(items)
+        vehicle.values["FENCE_TOTAL"] = float(len(vehicle.items))
 
     async def download(_autopilot: Any) -> tuple[Item, ...]:
         return vehicle.items
@@ -107,14 +105,56 @@ def test_a_round_area_has_few_vertices() -> None:
     assert outline(bounds.items).contains(shapely.Point(0, 0).buffer(5000))
 
 
+@given(
+    st.lists(st.tuples(st.floats(-300, 300), st.floats(-300, 300), st.floats(5, 200)), min_size=1, max_size=5),
+    st.sampled_from([60, 30, 15, 8, 4]),
+)
+def test_fewer_vertices_lie_further_out(circles: list[tuple[float, float, float]], vertices: int) -> None:
+    areas = []
+    for x, y, radius in circles:
+        lat, lon = FRAME.latlon(x, y)
+        areas.append({"circle": {"center": {"lat": lat, "lon": lon}, "radius": radius}})
+    bounds = bounds_of(spec(*areas), vertices)
+    assert bounds is not None
+    assert 3 <= len(bounds.items) <= vertices
+    whole = shapely.union_all([shapely.Point(x, y).buffer(radius, 64) for x, y, radius in circles])
+    assert outline(bounds.items).is_valid
+    assert outline(bounds.items).contains(whole.buffer(ROOM_M - 0.5))
+
+
+async def test_a_vehicle_with_little_space_gets_fewer_vertices(
+    vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    round_area = {"circle": {"center": {"lat": 39.36, "lon": 22.95}, "radius": 300}}
+    sent, room = list[int](), 12
+
+    async def little(_autopilot: Any, items: Any) -> None:
+        sent.append(len(items))
+        if len(items) > room:
+            vehicle.items = ()
+            raise NoSpace("the autopilot refused the fence: no space: Only 12 items are supported")
+        vehicle.items = tuple(items)
+
+    monkeypatch.setattr(module, "upload", little)
+    fence = MissionFence(vehicle, tmp_path)
+    await fence.raise_around(spec(round_area), retraces=False)
+    assert sent[-1] <= room < sent[0]
+    assert outline(vehicle.items).contains(shapely.Point(0, 0).buffer(300 + ROOM_M - 0.5))
+    await fence.lower(lambda: True)
+    room = 3
+    with pytest.raises(AutopilotError, match="Only 12 items"):
+        await fence.raise_around(spec(round_area), retraces=False)
+
+
 def test_nothing_bounded_nothing_loaded() -> None:
     assert bounds_of(spec()) is None
 
 
 async def test_a_fence_is_raised_and_put_back(vehicle: Vehicle, tmp_path: Path) -> None:
+    vehicle.values["FENCE_TOTAL"] = 1.0
     before = dict(vehicle.values)
     vehicle.items = (Item(5003, 30.0, 1, 2),)
-    fence = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
+    fence = MissionFence(vehicle, tmp_path)
     await fence.raise_around(spec(area(-50, -50, 50, 50), **LIMITS), retraces=True)
     assert vehicle.written[-1] == "FENCE_ENABLE", "it is switched on when all else stands"
     assert vehicle.values["FENCE_TYPE"] == 5.0
@@ -123,7 +163,7 @@ async def test_a_fence_is_raised_and_put_back(vehicle: Vehicle, tmp_path: Path) 
     assert {i.command for i in vehicle.items} == {5001}, (
         "what the owner had stored and not enabled stays out of the way"
     )
-    again = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
+    again = MissionFence(vehicle, tmp_path)
     assert again.raised, "a service that was restarted knows"
     await again.raise_around(spec(area(-10, -10, 10, 10)), retraces=False)
     await again.lower(lambda: True)
@@ -135,7 +175,7 @@ async def test_a_fence_is_raised_and_put_back(vehicle: Vehicle, tmp_path: Path) 
 async def test_the_owners_own_fence_stays_in_force(vehicle: Vehicle, tmp_path: Path) -> None:
     vehicle.values |= {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 3.0, "FENCE_ALT_MAX": 40.0, "FENCE_OPTIONS": 3.0}
     vehicle.items = (Item(5003, 30.0, 1, 2),)
-    fence = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
+    fence = MissionFence(vehicle, tmp_path)
     await fence.raise_around(spec(area(-50, -50, 50, 50), **LIMITS), retraces=True)
     assert [n for n in vehicle.written if n == "FENCE_ENABLE"] == ["FENCE_ENABLE"] * 2, (
         "off, and on with all that is new"
@@ -150,15 +190,22 @@ async def test_the_owners_own_fence_stays_in_force(vehicle: Vehicle, tmp_path: P
     assert vehicle.values["FENCE_OPTIONS"] == 1.0, "a union of inclusion areas would weaken both"
 
 
-async def test_a_vehicle_without_fences_is_left_alone(vehicle: Vehicle, tmp_path: Path) -> None:
-    del vehicle.values["FENCE_ENABLE"]
-    fence = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
-    await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
-    assert "FENCE_ENABLE" in fence.missing
-    assert not vehicle.written
-    vehicle.values.clear()
-    with pytest.raises(AutopilotError, match="stopped answering"):
+def test_a_vehicle_without_fences_is_left_alone_and_one_that_is_silent_is_none(
+    vehicle: Vehicle, tmp_path: Path
+) -> None:
+    async def raised() -> None:
+        fence = MissionFence(vehicle, tmp_path)
+        with pytest.raises(AutopilotError, match="FENCE_ENABLE cannot be read"):
+            vehicle.loss = 1.0
+            await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+        vehicle.loss = 0.0
+        del vehicle.values["FENCE_ENABLE"]
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+        assert fence.missing == "the autopilot has no FENCE_ENABLE"
+        assert not vehicle.written
+
+    with asyncio.Runner(loop_factory=Loop) as runner:
+        runner.run(raised())
 
 
 async def test_a_vehicle_without_item_lists_is_left_alone(
@@ -168,7 +215,7 @@ async def test_a_vehicle_without_item_lists_is_left_alone(
         raise NoLists("the autopilot keeps no fence items")
 
     monkeypatch.setattr(module, "download", unsupported)
-    fence = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
+    fence = MissionFence(vehicle, tmp_path)
     await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     assert fence.missing
     assert not fence.raised
@@ -181,22 +228,19 @@ async def test_what_is_read_back_must_be_what_was_sent(
         vehicle.items = tuple(items)[:-1]
 
     monkeypatch.setattr(module, "upload", forgetful)
-    fence = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
+    fence = MissionFence(vehicle, tmp_path)
     with pytest.raises(AutopilotError, match="stores 3 fence items"):
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
 
 
 async def test_a_parameter_that_stays_as_it_is_is_told(vehicle: Vehicle, tmp_path: Path) -> None:
-    async def stubborn(name: str, _value: float) -> float:
-        return vehicle.values[name]
-
-    vehicle.write_parameter = stubborn  # type: ignore[method-assign]
+    vehicle.fixed = ("FENCE_TYPE",)
     with pytest.raises(AutopilotError, match="FENCE_TYPE cannot be set to 4"):
-        await MissionFence(vehicle, tmp_path).raise_around(spec(area(-50, -50, 50, 50)), retraces=False)  # type: ignore[arg-type]
+        await MissionFence(vehicle, tmp_path).raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
 
 
 async def test_nothing_is_changed_before_the_owners_fence_is_stored(vehicle: Vehicle, tmp_path: Path) -> None:
-    fence = MissionFence(vehicle, tmp_path / "gone")  # type: ignore[arg-type]
+    fence = MissionFence(vehicle, tmp_path / "gone")
     with pytest.raises(OSError, match="gone"):
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     assert not vehicle.written
@@ -205,7 +249,7 @@ async def test_nothing_is_changed_before_the_owners_fence_is_stored(vehicle: Veh
 
 async def test_a_damaged_memory_of_the_owners_fence_is_no_memory(vehicle: Vehicle, tmp_path: Path) -> None:
     await asyncio.to_thread((tmp_path / "fence.json").write_text, json.dumps({"items": 3}))
-    await MissionFence(vehicle, tmp_path).lower(lambda: True)  # type: ignore[arg-type]
+    await MissionFence(vehicle, tmp_path).lower(lambda: True)
     assert not vehicle.written
 
 
@@ -215,7 +259,7 @@ OWNED = {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 3.0, "FENCE_ALT_MAX": 40.0}
 async def test_no_fence_is_changed_while_the_motors_run(vehicle: Vehicle, tmp_path: Path) -> None:
     vehicle.values |= OWNED
     vehicle.vehicle.armed = True
-    fence = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
+    fence = MissionFence(vehicle, tmp_path)
     with pytest.raises(AutopilotError, match="the motors run"):
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     assert not vehicle.written
@@ -231,16 +275,16 @@ async def test_no_fence_is_changed_while_the_motors_run(vehicle: Vehicle, tmp_pa
 
 async def test_motors_that_start_while_the_fence_is_asked_for_keep_it_on(vehicle: Vehicle, tmp_path: Path) -> None:
     vehicle.values |= OWNED
-    read, asked = vehicle.read_parameter, 0
+    send, asked = vehicle.send, 0
 
-    async def slow(name: str, attempts: int = 4) -> float | None:
+    def heard(outgoing: Message) -> None:
         nonlocal asked
-        asked += name == "FENCE_ENABLE"
+        asked += outgoing.name == "PARAM_REQUEST_READ" and outgoing.text("param_id") == "FENCE_ENABLE"
         vehicle.vehicle.armed = asked >= 3
-        return await read(name, attempts)
+        send(outgoing)
 
-    vehicle.read_parameter = slow  # type: ignore[method-assign]
-    fence = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
+    vehicle.send = heard  # type: ignore[method-assign]
+    fence = MissionFence(vehicle, tmp_path)
     with pytest.raises(AutopilotError, match="not switched off"):
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     assert not vehicle.written
@@ -261,7 +305,7 @@ async def test_a_fence_that_cannot_be_raised_leaves_the_owners(
             raise AutopilotError("no space") if how == "refused" else asyncio.CancelledError
 
     monkeypatch.setattr(module, "upload", full)
-    fence = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
+    fence = MissionFence(vehicle, tmp_path)
     with pytest.raises((AutopilotError, asyncio.CancelledError)):
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     assert vehicle.values == before
@@ -278,7 +322,57 @@ async def test_an_owners_fence_that_cannot_be_put_back_at_once_is_remembered(
         raise AutopilotError("the autopilot stopped answering", link=True)
 
     monkeypatch.setattr(module, "upload", silent)
-    fence = MissionFence(vehicle, tmp_path)  # type: ignore[arg-type]
+    fence = MissionFence(vehicle, tmp_path)
     with pytest.raises(AutopilotError, match="stopped answering"):
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     assert fence.raised, "the supervisor puts it back later"
+
+
+async def test_in_flight_what_another_station_changes_of_the_fence_is_set_back(
+    vehicle: Vehicle, tmp_path: Path
+) -> None:
+    fence = MissionFence(vehicle, tmp_path)
+    await fence.raise_around(spec(area(-50, -50, 50, 50), **LIMITS), retraces=False)
+    raised = dict(vehicle.values)
+    vehicle.vehicle.armed = True
+    assert await MissionFence(vehicle, tmp_path).hold() == ()
+    vehicle.values |= {"FENCE_ENABLE": 0.0, "FENCE_ALT_MAX": 900.0, "FENCE_ACTION": 0.0}
+    changed = await MissionFence(vehicle, tmp_path).hold()
+    assert changed == (
+        "FENCE_ALT_MAX was 900 and is 65", "FENCE_ACTION was 0 and is 1", "FENCE_ENABLE was 0 and is 1",
+    )  # fmt: skip
+    assert vehicle.values == raised
+    vehicle.values["FENCE_ACTION"], vehicle.fixed = 0.0, ("FENCE_ACTION",)
+    with pytest.raises(AutopilotError, match="FENCE_ACTION cannot be set to 1; it stays 0"):
+        await fence.hold()
+
+
+async def test_a_fence_that_another_station_replaced_is_told(vehicle: Vehicle, tmp_path: Path) -> None:
+    fence = MissionFence(vehicle, tmp_path)
+    await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+    vehicle.values["FENCE_TOTAL"] = 1.0
+    with pytest.raises(AutopilotError, match="another station changed its fence, which has 1 items and had 4"):
+        await fence.hold()
+
+
+async def test_a_fence_that_stands_is_not_loaded_again(vehicle: Vehicle, tmp_path: Path) -> None:
+    fence, loads = MissionFence(vehicle, tmp_path), list[int]()
+
+    async def counted(_autopilot: Any, items: Any) -> None:
+        loads.append(len(items))
+
+    await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+    upload, module.upload = module.upload, counted  # type: ignore[assignment]
+    try:
+        vehicle.values["FENCE_ACTION"] = 0.0
+        await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+        assert not loads
+        assert vehicle.values["FENCE_ACTION"] == 1.0, "what another station changed is set back"
+    finally:
+        module.upload = upload
+    vehicle.values["FENCE_TOTAL"] = 9.0
+    vehicle.items = ()
+    await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+    assert len(vehicle.items) == 4, "what another station replaced is loaded again"
+    await fence.raise_around(spec(area(-60, -50, 50, 50)), retraces=False)
+    assert len(vehicle.items) == 4

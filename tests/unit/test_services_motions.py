@@ -8,15 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fractus_core.api.geometry import Position
 from fractus_core.control import Authority
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
-from fractus_core.policy.values import Call, SetSpeedArgs, VelocityArgs
+from fractus_core.policy.values import Call, SetSpeedArgs, TakeoffArgs, VelocityArgs
 from fractus_mavlink.enums import MAV_CMD
-from fractus_services.errors import AutopilotError, Refused
+from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.mobility.authority import drivers
+from fractus_services.mobility.authority.leases import FlightConstraints
+from fractus_services.mobility.authority.readiness import not_ready_reason
 from fractus_services.mobility.flight import monitor as monitoring
-from mobility_world import GUIDED, World, area, clear_m, end, fly, goto, partial, refusal, spec, zone
+from fractus_services.mobility.flight.courses import Courses, Trip
+from mobility_world import GUIDED, LOITER, World, area, clear_m, end, fly, goto, partial, refusal, spec, zone
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
 
@@ -272,6 +276,52 @@ def test_a_leg_that_begins_too_fast_is_not_told_to_fly_faster_than_it_may(tmp_pa
     fly(flight)
 
 
+def test_a_correction_that_a_pilot_came_before_is_not_made(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            await world.up(grant, 25.0)
+            world.grants.put(spec(limit("altitude", 15.0)))
+            world.monitor.look()
+            world.plane.set_to(LOITER)
+            world.observer.heartbeat()
+            commands = len(world.plane.commands)
+            await asyncio.sleep(5)
+            assert world.control.authority is Authority.PILOT
+            assert MAV_CMD.DO_REPOSITION not in world.plane.commands[commands:]
+            assert world.control.motion is None
+
+    fly(flight)
+
+
+@pytest.mark.parametrize("what", ["course", "launch"])
+def test_what_the_system_may_not_fly_ends_no_motion(tmp_path: Path, what: str) -> None:
+    def forbidden(_motion: object) -> Any:
+        def check() -> None:
+            raise PreconditionFailed("ControlLost", "the driver is gone")
+
+        return check
+
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            flown = world.control.begin("Goto")
+            trip = Trip(FlightConstraints(grant, grant.compiled), "Transit", forbidden)
+            away = goto(0, 50)
+            with pytest.raises(PreconditionFailed, match="is gone"):
+                async for _ in (
+                    Courses(world.control, world.guard).fly(trip, away)
+                    if what == "course"
+                    else world.tours._launch(trip, Position(lat=away.lat, lon=away.lon))
+                ):
+                    pass
+            flown.check()
+            assert world.control.motion is flown
+
+    fly(flight)
+
+
 # Commands that are lost
 
 
@@ -489,5 +539,117 @@ def test_a_goto_that_counts_as_complete_at_once_has_still_been_judged_before(
             world.grants.put(spec(zone("far", "ignore", 60, 60, 90, 90)))
             await world.until(lambda: world.plane.xy[1] > 3)
             assert changed[-1], "the autopilot flies there all the same"
+
+    fly(flight)
+
+
+def test_a_takeoff_whose_acknowledgement_is_lost_goes_on(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            await world.drive(grant)
+            await world.service.arm(grant)
+            plane, obey, heard = world.plane, world.plane._obey, 0
+
+            def once(outgoing: Any) -> None:
+                nonlocal heard
+                if outgoing.integer("command") == MAV_CMD.NAV_TAKEOFF:
+                    heard += 1
+                    plane.refuses.add(MAV_CMD.NAV_TAKEOFF)
+                    if heard == 1:
+                        plane._reply = lambda _: None  # type: ignore[method-assign]
+                        asyncio.get_running_loop().call_later(0.1, delattr, plane, "_reply")
+                obey(outgoing)
+
+            plane._obey = once  # type: ignore[method-assign]
+            await end(world.service.take_off(grant, TakeoffArgs(10.0)))
+            assert plane.height > 9.0
+            assert plane.commands.count(MAV_CMD.NAV_TAKEOFF) == 2
+
+    fly(flight)
+
+
+# The link is cut
+
+
+async def cut(world: World, seconds: float, *, frozen: bool = False) -> None:
+    """The link is cut, or the autopilot stands still with its clock, and is heard again."""
+    plane = world.plane
+    step = plane._step
+    plane.deaf = True
+    if frozen:
+        plane._step = lambda: None  # type: ignore[method-assign]
+    await asyncio.sleep(seconds)
+    plane._step, plane.deaf = step, False  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize(("seconds", "frozen"), [(1.5, False), (3.0, False), (4.5, False), (5.0, True)])
+def test_a_driver_flies_on_after_a_short_cut_of_the_link(tmp_path: Path, seconds: float, frozen: bool) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, grace_s=10.0) as world:
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            flying = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 150), 0)))
+            await world.until(lambda: world.plane.velocity[1] > 3)
+            await cut(world, seconds, frozen=frozen)
+            stopped = await flying
+            assert isinstance(stopped, Unavailable), "which the driver's library tries again"
+            assert world.control.authority is Authority.DRIVER
+            if seconds > 1.5:
+                with pytest.raises(Unavailable):
+                    world.service.goto(grant, goto(0, 150), 0)
+            await world.until(lambda: world.control.state.grace is None, 3)
+            await world.until(lambda: math.hypot(*world.plane.velocity) < 0.5, 10)
+            await end(world.service.goto(grant, goto(0, 150), 0))
+            assert math.dist(world.plane.xy, (0, 150)) < 1.5
+            assert [event.state.name for event in world.events] == ["GRANTED"]
+            actions = [note["action"] for note in world.kinds("control") if note["code"] != ""]
+            assert "brake" in actions
+
+    fly(flight)
+
+
+def test_a_cut_that_outlasts_the_grace_ends_the_mission(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, grace_s=5.0) as world:
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            flying = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 150), 0)))
+            await world.until(lambda: world.plane.velocity[1] > 3)
+            await cut(world, 7.0)
+            assert isinstance(await flying, Unavailable)
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert world.outcome().startswith("failed: the drone's position is unknown")
+            assert [event.state.name for event in world.events] == ["GRANTED", "LOST"]
+            assert math.dist(world.plane.xy, (0, 0)) < 1.5
+
+    fly(flight)
+
+
+def test_nothing_flies_while_the_link_is_too_slow(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, grace_s=15.0) as world:
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            flying = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 190), 0)))
+            await world.until(lambda: world.plane.velocity[1] > 3)
+            world.plane.uplink_s = world.plane.downlink_s = 1.0
+            assert isinstance(await flying, Unavailable)
+            await world.until(lambda: math.hypot(*world.plane.velocity) < 0.1, 20)
+            assert isinstance(await refusal(world.service.set_velocity(grant, VelocityArgs(3.0, 0.0))), Unavailable)
+            world.plane.uplink_s = world.plane.downlink_s = 0.0
+            await world.until(lambda: world.control.state.grace is None, 14)
+            await end(world.service.goto(grant, goto(0, 190), 0))
+
+    fly(flight)
+
+
+def test_a_slow_link_lets_no_one_arm(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.plane.uplink_s = world.plane.downlink_s = 0.7
+            await asyncio.sleep(6)
+            grant = world.grants.put(spec())
+            assert "delays by 1.4 s there and back" in str(not_ready_reason(world.control, grant.key))
 
     fly(flight)

@@ -230,6 +230,7 @@ def test_pictures_tell_where_they_were_taken(photo: Pixels) -> None:
         ("Yaw", "90.0000"),
         ("Roll", "0.0000"),
         ("AboveGroundAltitude", "12.5000"),
+        ("PerspectiveFocalLength", "443.4050"),
     ):
         assert name in xmp
         assert value in xmp

@@ -48,7 +48,7 @@ def told(vehicle: Vehicle, now: float, missions: bool = False) -> Any:
     ended = Mission("uid", "identity", outcome=Outcome(OutcomeKind.REVOKED, "why"))
     state = ControlState(missions={"uid": ended, "other": Mission("other", "identity")})
     control: Any = SimpleNamespace(autopilot=autopilot, checked=None, state=state)
-    return telemetry_of(control, 0.0, missions)
+    return telemetry_of(control, 0.0, missions=missions, ready=True)
 
 
 def test_telemetry_carries_no_stale_position() -> None:

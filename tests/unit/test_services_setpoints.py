@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fractus_core.policy.motion import surge
 from fractus_core.policy.values import VelocityArgs
 from fractus_services.errors import AutopilotError
 from mobility_world import World, clear_m, end, fly, goto, refusal, spec, zone
@@ -175,5 +176,26 @@ def test_a_setpoint_that_waited_is_watched_as_well(tmp_path: Path, monkeypatch: 
             assert world.plane.wanted == (3.0, 0.0, 0.0)
             await asyncio.sleep(0.7)
             assert world.plane.wanted == (0.0, 0.0, 0.0), "it ran out"
+
+    fly(flight)
+
+
+def test_a_drone_that_slows_down_to_a_setpoint_is_not_taken_to_brake_on(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.plane.measured = True
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            for north in (8.0, 8.0, 8.0, 4.0):
+                await world.service.set_velocity(grant, VelocityArgs(north, 0.0, hold_s=2.0))
+                await asyncio.sleep(1.4)
+            now = world.guard.situation()
+            assert now.forward_mps2 is not None
+            assert now.forward_mps2 < -2.0
+            assert now.pending == ((4.0, 0.0, 0.0),)
+            assert surge(now).speed_mps == pytest.approx(now.north_mps)
+            await world.service.hover(grant)
+            await asyncio.sleep(1.0)
+            assert world.guard.situation().pending == ((0.0, 0.0, 0.0),)
 
     fly(flight)

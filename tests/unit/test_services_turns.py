@@ -62,7 +62,7 @@ class Context:
 
 @pytest.fixture
 def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], World]:
-    monkeypatch.setattr(admission, "caller_of", lambda grant, _time: Caller(grant.identity, 0.0, 1e12))
+    monkeypatch.setattr(admission.Callers, "of", lambda _self, grant, _urgent: Caller(grant.identity, math.inf))
     return lambda: World(tmp_path)
 
 

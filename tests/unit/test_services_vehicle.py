@@ -32,7 +32,50 @@ def test_it_tells_how_it_speeds_up(vx: tuple[int, int], forward_mps2: float) -> 
     vehicle = Vehicle(stack=ARDUCOPTER, located=True)
     assert vehicle.forward_mps2 is None
     for i in range(12):
-        told = message("GLOBAL_POSITION_INT", lat=1, lon=1, vx=vx[0] + i * vx[1])
+        told = message("GLOBAL_POSITION_INT", time_boot_ms=i * 50, lat=1, lon=1, vx=vx[0] + i * vx[1])
         vehicle.take(told, i * 0.05)
     assert vehicle.forward_mps2 == pytest.approx(forward_mps2, abs=0.01)
     assert len(vehicle.courses) < 10, "old ones are forgotten"
+
+
+HEALTHY = {"onboard_control_sensors_present": 1 << 28, "onboard_control_sensors_health": 1 << 28}
+BOOTED, POSITIONED = 167, 831
+"""Flags of EKF_STATUS_REPORT of a real ArduCopter, after 22 s and after 41 s."""
+
+
+def test_ready_is_what_the_arming_mode_needs() -> None:
+    vehicle = Vehicle(stack=ARDUCOPTER)
+    assert "SYS_STATUS" in vehicle.unready(30.0)
+    vehicle.take(message("SYS_STATUS"), 30.0)
+    vehicle.ready = False
+    vehicle.take(message("STATUSTEXT", severity=2, text=b"PreArm: AHRS: waiting for home"), 30.0)
+    assert vehicle.unready(30.0) == "PreArm: AHRS: waiting for home"
+    vehicle.take(message("SYS_STATUS", **HEALTHY), 31.0)
+    assert "EKF_STATUS_REPORT" in vehicle.unready(31.0), "one that never tells is not ready"
+    vehicle.take(message("EKF_STATUS_REPORT", flags=BOOTED), 31.0)
+    vehicle.take(message("HOME_POSITION", latitude=393600000, longitude=229500000), 31.0)
+    assert "does not know its position" in vehicle.unready(31.0), "the checks pass in STABILIZE without a position"
+    for flags in (POSITIONED & ~16, POSITIONED & ~512):
+        vehicle.take(message("EKF_STATUS_REPORT", flags=flags), 32.0)
+        assert vehicle.unready(32.0)
+    vehicle.take(message("EKF_STATUS_REPORT", flags=POSITIONED), 33.0)
+    assert vehicle.unready(33.0) == ""
+    vehicle.home = None
+    assert "home" in vehicle.unready(33.0)
+
+
+@pytest.mark.parametrize("silent", ["SYS_STATUS", "EKF_STATUS_REPORT"])
+def test_what_was_told_long_ago_is_not_ready(silent: str) -> None:
+    vehicle = Vehicle(stack=ARDUCOPTER)
+    vehicle.take(message("HOME_POSITION", latitude=393600000, longitude=229500000), 31.0)
+    for now in (31.0, 39.0):
+        for told in (message("SYS_STATUS", **HEALTHY), message("EKF_STATUS_REPORT", flags=POSITIONED)):
+            if now == 31.0 or told.name != silent:
+                vehicle.take(told, now)
+        assert (silent in vehicle.unready(now)) is (now > 31.0)
+
+
+def test_a_home_of_zeroes_is_none() -> None:
+    vehicle = Vehicle(stack=ARDUCOPTER)
+    vehicle.take(message("HOME_POSITION"), 1.0)
+    assert vehicle.home is None

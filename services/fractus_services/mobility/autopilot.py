@@ -15,6 +15,7 @@ from typing import Protocol
 from fractus_core.api.plans import GrantSpec
 from fractus_core.control.values import FlightMode, ModeKind
 from fractus_core.geo import LocalFrame
+from fractus_core.policy.returning import ReturnBounds
 from fractus_core.policy.values import STANDING_MPS, Airframe, Home
 from fractus_mavlink.enums import GPS_FIX_TYPE, MAV_LANDED_STATE
 
@@ -34,8 +35,14 @@ DEFAULT_ERROR_M = 1.5
 MAX_POSITION_AGE_S = 1.0
 """A position older than this is no position: at 20 Hz in flight, twenty in a row were lost."""
 
+READY_MAX_AGE_S = 5.0
+"""What the autopilot told of its readiness longer ago says nothing: at 1 Hz, four messages in a row were lost."""
+
 COURSE_S = 0.3
-"""Velocities this far back tell how the drone speeds up."""
+"""Velocities this far back, by the vehicle's clock, tell how the drone speeds up."""
+
+LEG_MPS = 1000.0
+"""Of a leg that was begun a moment ago only the direction is known: it is pending with this speed, and so vertically."""
 
 SLOW_MPS = 0.1
 """Below this speed a drone has no course: its velocity is noise."""
@@ -46,7 +53,12 @@ class VehicleState:
     """What the autopilot last said of the vehicle; times are monotonic seconds.
 
     Attributes:
+        position_at: when the position would have come, had it come as fast as the fastest of late.
         yaw_deg: heading as the position says it; `heading_deg` is the attitude's.
+        ready: whether its checks before arming pass, in the mode in which it is.
+        checks_at: when it told that.
+        estimated: whether its estimator has an absolute position, and predicts one.
+        estimated_at: when it told that.
         path_lost: whether the autopilot has given up remembering its path since it was armed.
         located: whether GPS has a three-dimensional fix of some accuracy; positions without one are not taken.
     """
@@ -75,6 +87,9 @@ class VehicleState:
     battery_v: float = math.nan
     battery_a: float = math.nan
     ready: bool = False
+    checks_at: float = -math.inf
+    estimated: bool = False
+    estimated_at: float = -math.inf
     fix_type: int = GPS_FIX_TYPE.NO_GPS
     located: bool = False
     position_error_m: float = DEFAULT_ERROR_M
@@ -109,6 +124,19 @@ class VehicleState:
     def speed_mps(self) -> float:
         """Horizontal speed over ground."""
         return math.hypot(self.north_mps, self.east_mps)
+
+    def unready(self, now: float) -> str:
+        """Why it would not arm in the mode in which it obeys the companion; empty when it would, as far as it has told lately."""
+        if now - self.checks_at > READY_MAX_AGE_S:
+            return "it does not tell whether its checks pass (SYS_STATUS)"
+        if not self.ready:
+            told = next((text for text in reversed(self.texts) if text.startswith("PreArm")), "")
+            return told or "its checks fail"
+        if now - self.estimated_at > READY_MAX_AGE_S:
+            return "it does not tell whether it knows its position (EKF_STATUS_REPORT)"
+        if not self.estimated:
+            return "it does not know its position well enough yet (EKF_STATUS_REPORT)"
+        return "" if self.home is not None else "it has no home yet (HOME_POSITION)"
 
     def position_fresh(self, now: float) -> bool:
         """Whether the position is recent enough to judge and to fly by; `now` is monotonic, as `position_at` is."""
@@ -160,7 +188,8 @@ class Checked:
         remembers: whether the vehicle can go back the way it came; `airframe.retraces` says that its failsafes will.
         airframe: how it moves, from its own parameters.
         speed_mps: the speed it flies legs with.
-        known: parameters of its movements that it has told.
+        changed: what was set, in sentences.
+        lost: whether the problem is only that the vehicle did not answer.
     """
 
     problem: str
@@ -168,7 +197,8 @@ class Checked:
     airframe: Airframe
     speed_mps: float
     remembers: bool = False
-    known: frozenset[str] = frozenset()
+    changed: tuple[str, ...] = ()
+    lost: bool = False
 
 
 class Modes(Protocol):
@@ -207,6 +237,29 @@ class Autopilot(Protocol):
     @property
     def now(self) -> float:
         """Monotonic seconds."""
+
+    @property
+    def pace(self) -> float:
+        """How many of the vehicle's seconds go by in one of ours: more than one in a simulator that runs faster."""
+
+    @property
+    def latency_s(self) -> float:
+        """The vehicle's seconds from the state that is known to the effect of a command that is sent now, at most.
+
+        Infinite while that is not known, or too long to fly by.
+        """
+
+    @property
+    def pending(self) -> tuple[tuple[float, float, float], ...]:
+        """Velocities north, east and down that commands of late ask for, which the state that is known may not show yet."""
+
+    @property
+    def link_problem(self) -> str:
+        """Why the link lets nothing arm; empty when nothing is wrong."""
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the vehicle surely stands, and was told nothing else."""
 
     @property
     def found(self) -> bool:
@@ -273,6 +326,26 @@ class Failsafes(Protocol):
     async def learn_return(self, checked: Checked) -> Checked:
         """Learn at which altitude the autopilot flies home by itself."""
 
+    def concerns(self, name: str) -> bool:
+        """Whether a parameter is one of those that are set or read here."""
+
+    def learn(self, checked: Checked) -> Checked:
+        """How the vehicle moves by what it has told until now."""
+
+
+class ReturnLimits(Protocol):
+    """How high and how fast the autopilot flies home by itself."""
+
+    @property
+    def limited(self) -> bool:
+        """Whether the vehicle has values of ours."""
+
+    async def limit(self, bounds: ReturnBounds) -> tuple[str, ...]:
+        """Set what is above the bounds, and what was lowered more than they ask; what changed, in sentences."""
+
+    async def lift(self, idle: Callable[[], bool]) -> None:
+        """Put back what the owner had, if anything was changed."""
+
 
 class Fence(Protocol):
     """The vehicle's own fence around a mission."""
@@ -290,6 +363,9 @@ class Fence(Protocol):
 
     async def lower(self, idle: Callable[[], bool]) -> None:
         """Put back what the owner had, if anything was changed."""
+
+    async def hold(self) -> tuple[str, ...]:
+        """Set back what another station changed of the mission's fence; what that was, in sentences."""
 
 
 Approach = Callable[[Callable[[], bool], int], Awaitable[FlightMode]]

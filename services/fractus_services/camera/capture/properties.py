@@ -24,19 +24,24 @@ class CameraProperties:
         model: make and model; may be empty.
         sensor: what it sees.
         fixed: it does not move.
+        pinhole: its lens is described as one, so that the field of view tells its focal length.
     """
 
     resolution: tuple[int, int] = (1280, 720)
     model: str = ""
     sensor: Literal["RGB", "IR"] = "RGB"
     fixed: bool = False
+    pinhole: bool = False
 
     @classmethod
     def of(cls, description: Drone | EdgeNode | None) -> CameraProperties:
         """The properties of a node's camera; defaults where the node describes none."""
         camera = description.spec.services.camera if description is not None else None
         fixed = isinstance(description, EdgeNode)
-        return cls(camera.pixels, camera.model, camera.sensor_type, fixed) if camera is not None else cls(fixed=fixed)
+        if camera is None:
+            return cls(fixed=fixed)
+        pinhole = camera.lens is not None and camera.lens.model == "pinhole"
+        return cls(camera.pixels, camera.model, camera.sensor_type, fixed, pinhole)
 
     def source_size(self, width: int, height: int) -> tuple[int, int]:
         """Pixels to ask the camera for, in its own proportions, so that they can be cropped to a width and height."""

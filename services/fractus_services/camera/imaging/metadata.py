@@ -14,7 +14,7 @@ _EXIF = b"Exif\x00\x00"
 _XMP = b"http://ns.adobe.com/xap/1.0/\x00"
 
 
-def with_metadata(jpeg: bytes, pose: Pose, *, time_s: float, camera: str, view_width_px: int) -> bytes:
+def with_metadata(jpeg: bytes, pose: Pose, *, time_s: float, camera: str, view_width_px: int | None) -> bytes:
     """The JPEG of an unfiltered picture with EXIF and XMP segments right after its start, as readers expect them.
 
     Args:
@@ -22,7 +22,8 @@ def with_metadata(jpeg: bytes, pose: Pose, *, time_s: float, camera: str, view_w
         pose: where it was taken; what is unknown is left out.
         time_s: Unix time.
         camera: make and model; may be empty.
-        view_width_px: pixels of the whole view, before the picture was cropped.
+        view_width_px: pixels of the whole view, before the picture was cropped; None where the pose's field of view does not
+            tell the focal length.
 
     Raises:
         ValueError: the bytes are no JPEG.
@@ -77,11 +78,11 @@ def _sexagesimal(degrees: float) -> tuple[float, float, float]:
     return whole, minutes, round(seconds, 6)
 
 
-def _xmp(pose: Pose, view_width_px: int) -> str:
+def _xmp(pose: Pose, view_width_px: int | None) -> str:
     """Attitude and height as Pix4D's `Camera` schema has them, which photogrammetry reads."""
     roll_deg, pitch_deg, yaw_deg = directions(pose)
     half = math.radians(pose.lens.horizontal_deg) / 2 if pose.lens is not None else 0.0
-    focal_px = view_width_px / 2 / math.tan(half) if half else None
+    focal_px = view_width_px / 2 / math.tan(half) if half and view_width_px is not None else None
     known = {
         "AboveGroundAltitude": pose.altitude_m if pose.lat is not None else None,
         "Roll": roll_deg,

@@ -188,7 +188,8 @@ class PictureCapture:
         call, camera = Call("CaptureImage", args), self._camera
         plan, verdict = self._judge.plan(call, grant, exposure.verdict, after, face_px=face_px)
         poses, moment_s = tuple(Pose.of(one) for one in after.exposure), float(after.time_s)
-        source_width_px = camera.source_size(args.width, args.height)[0]
+        # Of another lens the pose has a bound of the view, which is wider.
+        view_px = camera.source_size(args.width, args.height)[0] if camera.pinhole else None
 
         def work() -> bytes:
             sized = _sized(frames, args)
@@ -198,7 +199,7 @@ class PictureCapture:
             if verdict.filters:
                 # A filtered picture tells nothing of where it was taken.
                 return data
-            return with_metadata(data, poses[-1], time_s=moment_s, camera=camera.model, view_width_px=source_width_px)
+            return with_metadata(data, poses[-1], time_s=moment_s, camera=camera.model, view_width_px=view_px)
 
         data = await asyncio.to_thread(work)
         shot = Shot(exposure.name, moment_s, args.width, args.height, len(data), poses, face_px, plan.filters)

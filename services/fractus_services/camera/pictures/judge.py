@@ -30,7 +30,7 @@ class PictureJudge:
 
     def __init__(self, audit: AuditLog, detector: Detector) -> None:
         self._audit = audit
-        self._detector = detector
+        self.detector = detector
 
     def judge(self, call: Call, grant: ActiveGrant, now: Situation, *, record: bool = True) -> Verdict:
         """The verdict on a call, which permits it.
@@ -85,7 +85,7 @@ class PictureJudge:
             Refused: faces cannot be hidden reliably, and a policy allows no picture then.
         """
         try:
-            plan = plan_filters(verdict.filters, face_px, self._detector)
+            plan = plan_filters(verdict.filters, face_px, self.detector)
         except FacesNotReliable as error:
             refusal = Verdict("deny", None, "FacesNotFound", f"{verdict.reason}; {error}", verdict.policies)
             self.require(call, grant, refusal, seen)

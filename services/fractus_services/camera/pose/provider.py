@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Protocol
 
 from fractus_core.api.nodes import EdgeNodeSpec
-from fractus_core.policy.footprint import lens_of
+from fractus_core.policy.lenses import lens_of
 from fractus_core.policy.values import Attitude, Home, Situation
 
 SURVEY_ERROR_M = 0.5

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import socket
 import time
+from collections.abc import Coroutine
+from functools import partial
+from typing import Any
 
-import grpc
 from fractus_core.api.nodes import Drone, EdgeNode
-from fractus_core.policy.footprint import lens_of
+from fractus_core.policy.lenses import lens_of
 from fractus_proto.v1 import camera_pb2_grpc
 
 from fractus_services.admission import CallAdmission
@@ -28,11 +31,14 @@ from fractus_services.camera.pose.provider import FixedPose, PoseProvider
 from fractus_services.camera.rpc.handlers import CameraHandlers
 from fractus_services.camera.rpc.telemetry import follow_telemetry
 from fractus_services.clock import Clock
+from fractus_services.description import NodeDescription
 from fractus_services.errors import CannotServe
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import GrantFiles
-from fractus_services.hosting import read_description, run_until, serve_grpc
+from fractus_services.hosting import run_until, serve_grpc
 from fractus_services.options import CameraOptions
+
+log = logging.getLogger(__name__)
 
 
 def detector_of(options: CameraOptions) -> Detector:
@@ -50,22 +56,46 @@ def detector_of(options: CameraOptions) -> Detector:
 
 
 async def run(options: CameraOptions, stop: asyncio.Event) -> None:
-    """Serve until `stop` is set, or a part of the service fails.
+    """Serve until `stop` is set, or a part of the service fails; begin again when the node is described otherwise.
 
     Raises:
         CannotServe: an option is wrong; also within an ExceptionGroup.
     """
     clock = Clock()
-    description = read_description(options.description, Drone, EdgeNode)
-    node = options.node or (description.name if description is not None else socket.gethostname())
+    description = NodeDescription(options.node, options.node_object, options.description, Drone, EdgeNode)
+    node = options.node or (description.value.name if description.value is not None else socket.gethostname())
     tls = TlsFiles(options.tls)
-    audit = AuditLog(options.audit, clock)
+    audit = AuditLog(options.audit, clock, tls=options.tls)
+    clock.stepped = audit.clock_stepped
     grants = GrantFiles(
         options.grants, node, GrantVerifier(options.tls, options.grant_memory), refused=audit.refused_grant
     )
     grants.scan()
-    described = description.spec.services.camera if description is not None else None
-    camera = CameraProperties.of(description)
+    judge = PictureJudge(audit, detector_of(options))
+    while not stop.is_set():
+        audit.append("started", {"node": node})
+        await _serve(options, description, node, stop, tls=tls, grants=grants, clock=clock, judge=judge)
+    await audit.close()
+
+
+async def _serve(
+    options: CameraOptions,
+    description: NodeDescription,
+    node: str,
+    stop: asyncio.Event,
+    *,
+    tls: TlsFiles,
+    grants: GrantFiles,
+    clock: Clock,
+    judge: PictureJudge,
+) -> None:
+    """Serve until `stop` is set, or the description changes."""
+    described = description.value.spec.services.camera if description.value is not None else None
+    fixed = isinstance(description.value, EdgeNode)
+    missing = described.unknown_view(fixed) if described is not None else "services.camera"
+    if missing:
+        log.warning("camera: what it sees is not described, it counts as seeing everything (missing=%s)", missing)
+    camera = CameraProperties.of(description.value)
     shutter = Shutter(driver_for(options.camera or (described.connection if described is not None else "test:")))
     album = Album(
         options.state,
@@ -74,29 +104,28 @@ async def run(options: CameraOptions, stop: asyncio.Event) -> None:
         options.keep_total_mb * 1_000_000,
         lambda: [owner_of(grant) for grant in grants.active.values()],
     )
-    detector = detector_of(options)
-    judge = PictureJudge(audit, detector)
     queue = FairQueue(MAX_PER_OWNER, MAX_FILTERING)
-    parts = [grants.run()]
+    ended = asyncio.Event()
+    parts = [grants.run(), _set_after(stop.wait(), ended), _set_after(description.changed(), ended)]
     poses: PoseProvider
-    if isinstance(description, EdgeNode):
-        poses = FixedPose(description.spec, options.relief)
+    if isinstance(description.value, EdgeNode):
+        poses = FixedPose(description.value.spec, options.relief)
     else:
-        lens = lens_of(described) if described is not None else None
-        poses = history = PoseHistory(time.monotonic, lens=lens, relief_m=options.relief)
+        poses = history = PoseHistory(time.monotonic, lens=lens_of(described), relief_m=options.relief)
         parts.append(follow_telemetry(options.mobility, node, tls, history.add))
+    admission = CallAdmission(grants, clock)
     handlers = CameraHandlers(
         PictureCapture(
-            poses, shutter, camera, detector=detector, filter_queue=queue, album=album, judge=judge, clock=clock
+            poses, shutter, camera, detector=judge.detector, filter_queue=queue, album=album, judge=judge, clock=clock
         ),
-        PictureLibrary(poses, album, detector=detector, filter_queue=queue, judge=judge, clock=clock),
-        CallAdmission(grants, clock),
+        PictureLibrary(poses, album, detector=judge.detector, filter_queue=queue, judge=judge, clock=clock),
+        admission,
     )
-
-    def register(server: grpc.aio.Server) -> None:
-        camera_pb2_grpc.add_CameraServiceServicer_to_server(handlers, server)
-
-    audit.append("started", {"node": node})
-    await run_until(stop, *parts, serve_grpc("camera", options.listen, tls, register))
+    register = partial(camera_pb2_grpc.add_CameraServiceServicer_to_server, handlers)
+    await run_until(ended, *parts, serve_grpc("camera", options.listen, tls, register, admission))
     shutter.close()
-    await audit.close()
+
+
+async def _set_after(waiting: Coroutine[Any, Any, object], event: asyncio.Event) -> None:
+    await waiting
+    event.set()

@@ -3,24 +3,33 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
+from collections.abc import AsyncGenerator, Awaitable, Callable
 
 from fractus_core.control import Mission
 from fractus_core.control.events import ArmingPrepared, ArmingRequested, MotorStart
 from fractus_core.control.values import ended_refusal
 from fractus_core.geo import LocalFrame
 
-from fractus_services.errors import AutopilotError, PreconditionFailed
+from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.autopilot import BEING_SET, Checked, Failsafes, Fence, Permit
 
 ARMING_TIMEOUT_S = 3.0
+AGAIN_S = 2.0
 WAIT_S = 0.5
-FENCE_TIMEOUT_S = 15.0
+FENCE_TIMEOUT_S = 45.0
 HOME_M = 5.0
 STRAY_M = 50.0
 """A drone that stands further than this from the home of its grant would be brought to the wrong place."""
+
+_PASSING = frozenset(
+    {"NotReady", "PositionUnknown", "LinkTooSlow", "FailsafesNotVerified", "FenceNotRaised", "ReturnNotLimited"}
+)
+
+log = logging.getLogger(__name__)
 
 
 class Arming:
@@ -30,27 +39,55 @@ class Arming:
         control: the drone.
         failsafes: the autopilot's own, one by one.
         fence: the vehicle's own.
+        limit_return: lets the autopilot fly home no higher and no faster than a grant allows.
     """
 
-    def __init__(self, control: Control, failsafes: Failsafes, fence: Fence) -> None:
+    def __init__(
+        self,
+        control: Control,
+        failsafes: Failsafes,
+        fence: Fence,
+        limit_return: Callable[[ActiveGrant], Awaitable[tuple[str, ...]]],
+    ) -> None:
         self._control = control
         self._failsafes = failsafes
         self._fence = fence
+        self._limit_return = limit_return
 
-    async def arm(self, grant: ActiveGrant, permit: Permit) -> None:
-        """Arm in GUIDED, unless it is armed by then; one caller at a time.
+    async def arm(
+        self, grant: ActiveGrant, permit: Permit, judge: Callable[[], object], patience_s: float
+    ) -> AsyncGenerator[str, None]:
+        """Arm in GUIDED, unless it is armed by then; one caller at a time. What may pass is tried again.
 
-        Goes on to its end when the caller hangs up, so that nothing stays armed that no one asks for.
+        Each try goes on to its end when the caller hangs up, so that nothing stays armed that no one asks for.
 
         Args:
             grant: the grant to fly under.
             permit: raises when the caller may not arm any more.
+            judge: raises when policies forbid it; asked before each try.
+            patience_s: how long the caller waits.
+
+        Yields:
+            Why the drone is not armed yet.
 
         Raises:
             Refused: a failsafe is not verified, audit log or journal cannot be written, or the caller may no more.
             AutopilotError: the autopilot refuses.
         """
-        await self._control.tasks.complete(self._in_turn(grant, permit))
+        control = self._control
+        until = control.autopilot.now + patience_s
+        while True:
+            try:
+                judge()
+                await control.tasks.complete(self._in_turn(grant, permit))
+            except (AutopilotError, Refused) as error:
+                if not _passing(error) or control.autopilot.now + AGAIN_S > until:
+                    raise
+                log.warning("arming: not yet, trying again (identity=%s, error=%s)", grant.identity, error)
+                yield str(error)
+            else:
+                return
+            await asyncio.sleep(AGAIN_S)
 
     async def _in_turn(self, grant: ActiveGrant, permit: Permit) -> None:
         """Arm when no one else does: what is prepared on the ground must not be prepared under a drone that flies."""
@@ -61,6 +98,9 @@ class Arming:
 
     async def _arm(self, grant: ActiveGrant, permit: Permit) -> None:
         self._check()
+        autopilot = self._control.autopilot
+        if unready := autopilot.vehicle.unready(autopilot.now):
+            raise PreconditionFailed("NotReady", f"the autopilot is not ready to arm: {unready}")
         mission = self._control.mission(grant)
         if mission.outcome is not None:
             raise PreconditionFailed(*ended_refusal(mission.outcome))
@@ -125,7 +165,12 @@ class Arming:
             why = f"the vehicle's own fence cannot be raised around the operation area: {said}"
             raise PreconditionFailed("FenceNotRaised", why) from error
         self._check(checked)
-        if not self._fence.missing:
+        try:
+            lowered = await self._limit_return(grant)
+        except (AutopilotError, OSError) as error:
+            why = f"the autopilot would fly home higher or faster than it may: {error}"
+            raise PreconditionFailed("ReturnNotLimited", why) from error
+        if lowered or not self._fence.missing:
             checked = self._learnt(checked, await self._failsafes.learn_return(checked))
         return checked
 
@@ -141,6 +186,8 @@ class Arming:
         if checked is None or checked.problem or (chosen is not None and checked is not chosen):
             why = (checked.problem if checked is not None else "") or BEING_SET
             raise PreconditionFailed("FailsafesNotVerified", f"the autopilot's failsafes are not verified: {why}")
+        if self._control.autopilot.link_problem:
+            raise PreconditionFailed("LinkTooSlow", self._control.autopilot.link_problem)
         if self._control.audit.failure:
             raise PreconditionFailed("AuditUnavailable", self._control.audit.failure)
         return checked
@@ -159,3 +206,8 @@ class Arming:
                     "NotAtHome", f"the drone would return to a place {away:.0f} m away from the home of its grant"
                 )
         return lat, lon, amsl_m
+
+
+def _passing(error: AutopilotError | Refused) -> bool:
+    """Whether the next try may succeed without anyone's doing."""
+    return isinstance(error, AutopilotError | Unavailable) or error.verdict.code in _PASSING

@@ -5,11 +5,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from typing import Any
 
-from fractus_core.control import Authority, ControlState, Mission, not_ready_reason
+from fractus_core.control import Authority, ControlState, Mission
 from fractus_core.control.actions import Action, RecordAudit
 from fractus_core.control.events import (
     BrakeDemanded,
@@ -28,7 +28,6 @@ from fractus_core.control.events import (
     TourBegan,
     TransitBegan,
 )
-from fractus_core.control.values import Readiness
 from fractus_core.policy.compiled import CompiledGrant, for_transit
 from fractus_core.policy.values import Verdict
 
@@ -38,7 +37,7 @@ from fractus_services.mobility.authority.journal import Journal, Record
 from fractus_services.mobility.authority.leases import FlightConstraints, Lease, Motion
 from fractus_services.mobility.authority.machine import Machine
 from fractus_services.mobility.authority.performer import ModeCommands, Performer
-from fractus_services.mobility.autopilot import Approach, Autopilot, Checked
+from fractus_services.mobility.autopilot import Approach, Autopilot, Checked, Permit, always
 
 CORRECTION = "Correction"
 """What the motions are called with which the monitor leads a driver's drone back."""
@@ -143,8 +142,7 @@ class Control:
     def constraints(self) -> FlightConstraints | None:
         """The fences under which the system flies an application's drone; None while it does not."""
         known, constraints = self._machine.known.flight, self._constraints
-        matches = known is not None and constraints is not None and constraints.flight_id == known.flight_id
-        return constraints if matches else None
+        return constraints if constraints and known and constraints.flight_id == known.flight_id else None
 
     @property
     def mission_grant(self) -> ActiveGrant | None:
@@ -184,13 +182,6 @@ class Control:
             return state.speed_mps
         return self._checked.speed_mps if self._checked is not None else DEFAULT_SPEED_MPS
 
-    def not_ready_reason(self, key: str) -> str | None:
-        """Why the drone cannot fly for a mission now; None when it can."""
-        vehicle = self.autopilot.vehicle
-        why = next((text for text in reversed(vehicle.texts) if text.startswith("PreArm")), "")
-        located = vehicle.lat is not None and vehicle.home is not None
-        return not_ready_reason(self.state, key, Readiness(self._checked is not None, vehicle.ready, why, located))
-
     def mission(self, grant: ActiveGrant) -> Mission:
         """The mission of a grant; a new one, when nothing is known of it yet."""
         return self._machine.known.missions.get(grant.key) or Mission(grant.key, grant.identity)
@@ -201,7 +192,7 @@ class Control:
         return now is not None and now.key == grant.key
 
     def note(self, action: str, reason: str, code: str = "") -> None:
-        """Write down what the system does; authority stays where it is."""
+        """Write down what the system does."""
         self._performer.perform((RecordAudit("control", action, "system", reason, code),))
 
     # What survives a restart
@@ -236,10 +227,11 @@ class Control:
             self._performer.run(self._machine.known.task, work)
 
     def _constraints_of(self, grant: ActiveGrant) -> FlightConstraints:
-        self._constraints = FlightConstraints(grant, self._for_transit(grant))
+        self._constraints = FlightConstraints(grant, self.for_transit(grant))
         return self._constraints
 
-    def _for_transit(self, grant: ActiveGrant) -> CompiledGrant:
+    def for_transit(self, grant: ActiveGrant) -> CompiledGrant:
+        """The fences of a grant for what the system flies."""
         if self._transit is None or self._transit[0] is not grant:
             self._transit = grant, for_transit(grant.spec, flat_terrain=grant.compiled.flat_terrain)
         return self._transit[1]
@@ -253,9 +245,10 @@ class Control:
         if motion is not None and motion.speed_mps is not None:
             motion.speed_mps = leg_mps
 
-    def begin(self, kind: str) -> Motion:
-        """Start a motion; the one under way is replaced."""
+    def begin(self, kind: str, permit: Callable[[Motion], Permit] = lambda _motion: always) -> Motion:
+        """Start a motion, if its permit allows it; the one under way is replaced."""
         motion = Motion(kind)
+        permit(motion)()
         self.dispatch(MotionBegan(motion.motion_id, kind))
         self._performer.motion = motion
         return motion
@@ -292,7 +285,7 @@ class Control:
             if lease is not None and lease.key == new.key:
                 lease.grant = new
             if constraints is not None and constraints.grant.key == new.key:
-                constraints.grant, constraints.compiled = new, self._for_transit(new)
+                constraints.grant, constraints.compiled = new, self.for_transit(new)
         self.dispatch(GrantChanged(_reference(old), _reference(new)))
         if old is not None and self._machine.known.removed == old.key:
             self._removed = old

@@ -34,8 +34,8 @@ def open_lease(control: Control, grant: ActiveGrant) -> Lease:
 
 
 def grant_control(control: Control, lease: Lease) -> None:
-    """Give the drone to a driver that waits, when there is nothing left to wait for."""
-    if control.lease is lease and control.not_ready_reason(lease.key) is None:
+    """Give the drone to a driver that waits."""
+    if control.lease is lease:
         control.dispatch(GrantControl(lease.lease_id))
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from fractus_core.control import Mission, Outcome, OutcomeKind
-from fractus_storage import write_file
+from fractus_storage import remove_temporary, write_file
 
 log = logging.getLogger(__name__)
 
@@ -31,11 +31,25 @@ class Record:
     active: str | None = None
 
 
+def _outcome(stored: Any) -> Outcome:
+    """How a mission ended; version 1 of the journal had it as text, such as "failed: driver lost"."""
+    try:
+        if isinstance(stored, str):
+            kind, _, reason = stored.partition(": ")
+            return Outcome(OutcomeKind(kind), reason)
+        return Outcome(OutcomeKind(stored["kind"]), str(stored["reason"]))
+    except (ValueError, KeyError, TypeError):
+        # It ended, and must not begin again.
+        return Outcome(OutcomeKind.FAILED, "the journal tells in a way that this release does not know how it ended")
+
+
 def _mission(stored: dict[str, Any]) -> Mission:
     """A stored mission; what a newer release wrote beside it is left out."""
     known = {name: value for name, value in stored.items() if name in _FIELDS}
-    if known.get("outcome") is not None:
-        known["outcome"] = Outcome(OutcomeKind(known["outcome"]["kind"]), str(known["outcome"]["reason"]))
+    if known.get("outcome"):
+        known["outcome"] = _outcome(known["outcome"])
+    else:
+        known["outcome"] = None
     if known.get("home") is not None:
         lat, lon, amsl_m = known["home"]
         known["home"] = (float(lat), float(lon), float(amsl_m))
@@ -49,7 +63,10 @@ def _stored(mission: Mission) -> dict[str, Any]:
 
 
 def _read(path: Path) -> Record:
-    stored = json.loads(path.read_bytes())
+    try:
+        stored = json.loads(path.read_bytes())
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
     return Record({m["key"]: _mission(m) for m in stored["missions"]}, stored["active"])
 
 
@@ -73,20 +90,25 @@ class Journal:
         self.record = Record()
         self.failure = ""
         directory.mkdir(parents=True, exist_ok=True)
-        for left in directory.glob("journal.*.new"):
-            left.unlink(missing_ok=True)
+        remove_temporary(self._path)
         self._load()
 
     def _load(self) -> None:
+        unreadable = False
         for path in (self._path, self._last):
             try:
                 self.record = _read(path)
             except FileNotFoundError:
                 continue
-            except (OSError, ValueError, KeyError, TypeError) as error:
+            except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
                 log.critical("journal: cannot be read (path=%s, error=%s)", path, error)
+                unreadable = True
                 continue
             return
+        if unreadable:
+            log.critical(
+                "journal: the missions before are forgotten, also those that are over; remove Grants that must not fly again"
+            )
 
     async def save(self, record: Record, timeout_s: float | None = None) -> None:
         """Write everything; on disk when this returns, unless `failure` says why not.
@@ -128,6 +150,6 @@ class Journal:
     def _sound(self) -> bool:
         try:
             _read(self._path)
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, AttributeError):
             return False
         return True

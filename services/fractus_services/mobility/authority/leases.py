@@ -66,6 +66,7 @@ class Motion:
         kind: what it is called.
         braking: whether the drone comes to rest first, so that nothing stops the motion before it begins.
         leg: what it flies at present; None while it flies none.
+        under_way: whether the autopilot has acknowledged that leg.
         speed_mps: with what that leg is flown.
     """
 
@@ -74,6 +75,7 @@ class Motion:
         self.kind = kind
         self.braking = False
         self.leg: GotoArgs | None = None
+        self.under_way = False
         self.speed_mps: float | None = None
         self._stopped: Refused | None = None
 

@@ -82,11 +82,11 @@ class ModeController:
         autopilot = self._autopilot
         deadline = autopilot.now + SETTLE_TIMEOUT_S
         while self._state().motion is None and autopilot.vehicle.mode.commanded and autopilot.now < deadline:
-            known = autopilot.vehicle.position_fresh(autopilot.now)
-            if known and autopilot.vehicle.speed_mps < SETTLED_MPS and abs(autopilot.vehicle.down_mps) < SETTLED_MPS:
+            speeds = autopilot.vehicle.speed_mps, abs(autopilot.vehicle.down_mps)
+            if autopilot.at_rest and max(speeds) < SETTLED_MPS:
                 return
             autopilot.stop()
-            await asyncio.sleep(RETRY_S)
+            await asyncio.sleep(BRAKE_AGAIN_S / autopilot.pace)
 
     async def disarm(self) -> bool:
         """Stop the motors; False when the autopilot refuses, as it does in the air."""
@@ -143,10 +143,10 @@ class ModeController:
         deadline = autopilot.now + BRAKE_TIMEOUT_S
         autopilot.stop()
         while wanted() and vehicle.in_air and vehicle.mode.commanded and autopilot.now < deadline:
-            if vehicle.at_rest(autopilot.now) or not vehicle.position_fresh(autopilot.now):
+            if autopilot.at_rest or not vehicle.position_fresh(autopilot.now):
                 return
             autopilot.stop()
-            await autopilot.update(BRAKE_AGAIN_S)
+            await autopilot.update(BRAKE_AGAIN_S / autopilot.pace)
 
     async def _hover(self) -> None:
         """Hold at once, and again when a takeoff under way gets off the ground."""

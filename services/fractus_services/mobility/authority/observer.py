@@ -4,31 +4,50 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from dataclasses import replace
 
 from fractus_core.control.events import Heartbeat, VehicleFound
+from fractus_core.policy.values import Verdict
 
 from fractus_services.errors import AutopilotError
+from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.autopilot import BEING_SET, Failsafes
+from fractus_services.mobility.autopilot import BEING_SET, Failsafes, Fence
 
 log = logging.getLogger(__name__)
 
 RETRY_S, MAX_RETRY_S = 0.5, 30.0
+VERIFY_S = 10.0
+"""In flight the failsafes and the fence are read again after this time: the news of a change by another station may be lost."""
 
 
 class Observer:
-    """Follows the autopilot's link and heartbeats.
+    """Follows the autopilot's link, heartbeats and parameters.
 
     Args:
         control: decides what they mean.
-        failsafes: set when the autopilot is there.
+        failsafes: set when the autopilot is there, and kept in flight.
+        fence: the vehicle's own, kept in flight.
+        limit_return: lets the autopilot fly home no higher and no faster than a grant allows, as it is by now.
     """
 
-    def __init__(self, control: Control, failsafes: Failsafes) -> None:
+    def __init__(
+        self,
+        control: Control,
+        failsafes: Failsafes,
+        fence: Fence,
+        limit_return: Callable[[ActiveGrant], Awaitable[tuple[str, ...]]],
+    ) -> None:
         self._control = control
         self._failsafes = failsafes
+        self._fence = fence
+        self._limit_return = limit_return
         self._preparing: asyncio.Task[None] | None = None
+        self._changed = asyncio.Event()
+        self._verified_at = -math.inf
 
     def found(self) -> None:
         """The autopilot is there, for the first time or again."""
@@ -42,17 +61,30 @@ class Observer:
         """The autopilot told its mode, and whether it is armed."""
         self._control.dispatch(Heartbeat())
 
+    def grant_changed(self, _old: ActiveGrant | None, _new: ActiveGrant | None) -> None:
+        """Limits may be others by now: what follows for the autopilot's own way home is set at once."""
+        if self._control.autopilot.vehicle.armed:
+            self._changed.set()
+
+    def parameter(self, name: str) -> None:
+        """Another station changed a parameter: what follows from it holds at once, and what must not change is set back."""
+        control, checked = self._control, self._control.checked
+        if checked is None or not self._failsafes.concerns(name):
+            return
+        log.warning("observer: another station changed a parameter (name=%s)", name)
+        flying = control.autopilot.vehicle.armed
+        control.set_checked(self._failsafes.learn(checked) if flying else replace(checked, problem=BEING_SET))
+        self._changed.set()
+
     async def _prepare(self) -> None:
-        """Set the failsafes; again, while nothing flies, as long as they are not verified: a message may have been lost."""
+        """Set the failsafes; again, as long as they are not verified, for a message may have been lost, and during flight."""
         autopilot, again_s = self._control.autopilot, RETRY_S
         while autopilot.found:
-            if autopilot.connected and self._unverified():
+            if autopilot.connected and self._due():
+                self._changed.clear()
                 try:
                     await autopilot.set_rates(flying=autopilot.vehicle.armed)
-                    before = self._control.checked
-                    self._control.set_checked(
-                        await self._failsafes.configure(flying=autopilot.vehicle.armed, before=before)
-                    )
+                    await self._verify()
                     self._control.wake()
                     if autopilot.vehicle.home is None:
                         await self._control.tasks.attempt(autopilot.ask_home)
@@ -61,13 +93,51 @@ class Observer:
                 except Exception:
                     log.exception("observer: preparing the autopilot failed; it is tried again")
                 else:
-                    again_s = min(2 * again_s, MAX_RETRY_S)
+                    again_s = min(2 * again_s, VERIFY_S if autopilot.vehicle.armed else MAX_RETRY_S)
             else:
                 again_s = RETRY_S
-            await asyncio.sleep(again_s)
+                if autopilot.connected:
+                    await self._control.tasks.attempt(autopilot.set_rates, flying=autopilot.vehicle.armed)
+            await asyncio.sleep(RETRY_S)
+            with suppress(TimeoutError):
+                async with asyncio.timeout(again_s - RETRY_S):
+                    await self._changed.wait()
 
-    def _unverified(self) -> bool:
-        checked, idle = self._control.checked, not self._control.autopilot.vehicle.armed
-        if checked is None or checked.problem == BEING_SET:
+    async def _verify(self) -> None:
+        """Set and read the failsafes; in flight the fence, too, and a drone that cannot keep them comes home."""
+        control, before = self._control, self._control.checked
+        flying = control.autopilot.vehicle.armed
+        self._verified_at = -math.inf
+        checked = await self._failsafes.configure(flying=flying, before=before)
+        if not flying:
+            control.set_checked(checked)
+            return
+        refused, changed = "" if checked.lost else checked.problem, checked.changed
+        try:
+            if control.last_grant is not None:
+                for what in await self._limit_return(control.last_grant):
+                    control.note("limited", f"how the autopilot flies home: {what}", "ReturnLimited")
+            if self._fence.raised:
+                changed += await self._fence.hold()
+        except AutopilotError as error:
+            if error.link:
+                raise
+            refused = str(error)
+        checked = self._failsafes.learn(checked)
+        control.set_checked(checked)
+        for what in changed:
+            control.note("restored", f"set back in flight: {what}", "SettingChanged")
+        if before is not None and before.airframe != checked.airframe:
+            control.note("airframe", f"the vehicle moves otherwise by now: {checked.airframe}", "SettingChanged")
+        if refused and not control.state.returning:
+            why = f"the autopilot would not keep the drone safe by itself any more: {refused}"
+            control.take_over(Verdict("takeover", None, "FailsafeLost", why, (), "returnToLaunch"))
+        self._verified_at = control.autopilot.now
+
+    def _due(self) -> bool:
+        control, checked = self._control, self._control.checked
+        if checked is None or checked.problem == BEING_SET or self._changed.is_set():
             return True
-        return bool(checked.problem) and idle and not self._control.state.preparing
+        if control.autopilot.vehicle.armed:
+            return bool(checked.problem) or control.autopilot.now - self._verified_at >= VERIFY_S
+        return bool(checked.problem) and not control.state.preparing

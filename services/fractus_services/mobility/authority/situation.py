@@ -2,15 +2,32 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
+from fractus_core.control import Authority
+from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.values import Airframe, Situation
 
 from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.autopilot import LEG_MPS
+
+
+def fences_of(control: Control) -> CompiledGrant | None:
+    """The fences by which the present flight is judged; None where no grant says anything of it.
+
+    What the system flies, or the autopilot by itself, may be anywhere on the way between home and operation area.
+    """
+    if control.constraints is not None:
+        return control.constraints.compiled
+    alone = control.state.returning or control.autopilot.vehicle.mode.comes_down
+    if control.authority is Authority.DRIVER or not alone:
+        return control.mission_grant.compiled if control.mission_grant is not None else None
+    return control.for_transit(control.last_grant) if control.last_grant is not None else None
 
 
 def situation_of(control: Control, time_s: float) -> Situation:
-    """The state of the drone at this moment; a stale position counts as unknown.
+    """The state of the drone at this moment; a position that is stale, or comes over too slow a link, counts as unknown.
 
     Args:
         control: the drone.
@@ -29,7 +46,8 @@ def situation_of(control: Control, time_s: float) -> Situation:
         altitude_m=vehicle.altitude_m,
         speed_setpoint_mps=control.cruise_mps,
     )
-    if not vehicle.position_fresh(autopilot.now):
+    latency_s = autopilot.latency_s
+    if not vehicle.position_fresh(autopilot.now) or not math.isfinite(latency_s):
         return unlocated
     return replace(
         unlocated,
@@ -39,6 +57,23 @@ def situation_of(control: Control, time_s: float) -> Situation:
         east_mps=vehicle.east_mps,
         down_mps=vehicle.down_mps,
         position_error_m=vehicle.position_error_m,
+        latency_s=latency_s,
         forward_mps2=vehicle.forward_mps2,
-        vertical=motion is not None and motion.kind in {"Takeoff", "Land", "ReturnToLaunch"},
+        pending=_pending(control),
+        vertical=vehicle.mode.comes_down
+        or (motion is not None and motion.kind in {"Takeoff", "Land", "ReturnToLaunch"}),
     )
+
+
+def _pending(control: Control) -> tuple[tuple[float, float, float], ...]:
+    """What the drone was told of late; a leg is flown no faster than it was told to."""
+    pending, motion = control.autopilot.pending, control.motion
+    most = max(control.cruise_mps, (motion.speed_mps or 0.0) if motion is not None else 0.0)
+
+    def capped(velocity: tuple[float, float, float]) -> tuple[float, float, float]:
+        north, east, down = velocity
+        if max(map(abs, velocity)) < LEG_MPS / 2:
+            return velocity
+        return north * most / LEG_MPS, east * most / LEG_MPS, min(max(down, -most), most)
+
+    return tuple(map(capped, pending))

@@ -9,7 +9,7 @@ import math
 from fractus_core.control.events import Tick
 
 from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.autopilot import Fence
+from fractus_services.mobility.autopilot import Fence, ReturnLimits
 
 log = logging.getLogger(__name__)
 
@@ -20,6 +20,8 @@ UNATTENDED_TIMEOUT_S = 3.0
 """How long an armed drone may be without authority though control tries to take it: then its own failsafe brings it home."""
 
 LOWER_AGAIN_S = 10.0
+LOWER_AFTER_S = 5.0
+"""How long nothing needs the fence before it is put back: an arming that is tried again finds it as it was."""
 
 
 class Supervisor:
@@ -28,15 +30,16 @@ class Supervisor:
     The heartbeats that hold off the autopilot's own failsafe are sent only while this is sound.
     """
 
-    def __init__(self, control: Control, fence: Fence) -> None:
+    def __init__(self, control: Control, fence: Fence, limits: ReturnLimits) -> None:
         self._control = control
         self._fence = fence
+        self._limits = limits
         self._ticked_at = -math.inf
         self._lowering: asyncio.Task[None] | None = None
-        self._lower_at = -math.inf
+        self._lower_at = self._needed_at = -math.inf
 
     def tick(self) -> None:
-        """Let control take a drone that no one answers for. Put back the fence that no mission needs.
+        """Let control take a drone that no one answers for. Put back the fence and the limits that no mission needs.
 
         Raises:
             Exception: control failed; the heartbeats end until it works again.
@@ -47,7 +50,11 @@ class Supervisor:
         self._ticked_at = now
         if mute and self.alive():
             control.autopilot.beat()
-        if now >= self._lower_at and self._idle() and self._fence.raised:
+        needed = not self._idle()
+        if needed:
+            self._needed_at = now
+        due = now >= max(self._lower_at, self._needed_at + LOWER_AFTER_S)
+        if not needed and due and (self._fence.raised or self._limits.limited):
             self._lower_at = now + LOWER_AGAIN_S
             if self._lowering is None or self._lowering.done():
                 self._lowering = control.tasks.spawn(self._lower())
@@ -72,4 +79,8 @@ class Supervisor:
         return over and not state.preparing
 
     async def _lower(self) -> None:
-        await self._control.tasks.attempt(self._fence.lower, self._idle)
+        for put_back in (self._fence.lower, self._limits.lift):
+            try:
+                await self._control.tasks.attempt(put_back, self._idle)
+            except Exception:
+                log.exception("supervisor: the owner's fence or limits were not put back, trying again")

@@ -6,9 +6,9 @@ import asyncio
 import time
 from collections.abc import Callable
 
-from fractus_core.policy.values import Call, Verdict
+from fractus_core.policy.values import POSITION_UNKNOWN, Call, Verdict
 
-from fractus_services.errors import Aborted, denied
+from fractus_services.errors import Aborted, Unavailable, denied
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.flight.guard import Guard
@@ -16,6 +16,9 @@ from fractus_services.mobility.flight.guard import Guard
 REST_FACTORS = {True: 1.0, False: 4.0}
 """How long the next judgement waits, in times of what the last one took: for the driver that has the drone, and for all
 other callers together. A flood of calls so never takes more than a part of the event loop, which the monitor needs."""
+
+RETRY_AFTER_S = 0.5
+"""When a call is tried again whose drone has no position at the moment."""
 
 MOVING = frozenset(
     {"Arm", "Disarm", "Takeoff", "Land", "Goto", "ReturnToLaunch", "Hover", "SetSpeed", "SetVelocity", "ReturnControl"}
@@ -104,6 +107,8 @@ class CallJudge:
         if verdict.action == "takeover":
             self._control.take_over(verdict)
             raise denied(verdict)
+        if verdict.code == POSITION_UNKNOWN.code and verdict.action == "deny":
+            raise Unavailable("AutopilotUnavailable", verdict.reason, retry_after_s=RETRY_AFTER_S)
         if not verdict.permits:
             if verdict.takeover is not None:
                 self._control.brake(verdict)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import AsyncGenerator, Callable, Iterable
+import math
+from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable
 from contextlib import aclosing
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import shapely
 from fractus_core.api.geometry import Position, Reference
+from fractus_core.control.values import FlightMode
 from fractus_core.policy.compiled import Air, CompiledGrant, height_m
 from fractus_core.policy.limits import speed_bounds
 from fractus_core.policy.motion import margin_m
@@ -17,6 +20,7 @@ from fractus_core.policy.values import Call, GotoArgs, Home, Situation
 
 from fractus_services.background import in_slices
 from fractus_services.errors import Aborted, PreconditionFailed, Refused, Unavailable
+from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import FlightConstraints, Motion
 from fractus_services.mobility.autopilot import Permit
@@ -26,10 +30,13 @@ from fractus_services.mobility.flight.motions import REACHED_M, Step, come_to_re
 log = logging.getLogger(__name__)
 
 MAX_REPLANS = 5
-"""How many times a way is looked for again after the monitor stopped the drone on it."""
+"""How many times a way is looked for again after the monitor stopped the drone on it, under the same fences."""
 
 MAX_LEGS = 60
 """A way with more legs than this makes no headway: every leg is planned again from where the drone is."""
+
+NEAR_M = 0.3
+"""A drone this near to a waypoint is there: waypoints keep more than this beyond the margin of legs."""
 
 FAULT = "the mobility service has a fault, see its log"
 """What clients read when an error of ours ends a mission; its details are in the log."""
@@ -37,10 +44,13 @@ FAULT = "the mobility service has a fault, see its log"
 STOPPED = frozenset(
     {
         "ExclusionZoneAhead", "InsideExclusionZone", "InclusionBorderAhead", "OutsideInclusionZone",
-        "OperationAreaBorderAhead", "OutsideOperationArea", "AltitudeAboveLimit",
+        "OperationAreaBorderAhead", "OutsideOperationArea", "AltitudeAboveLimit", "AltitudeBelowLimit",
     }
 )  # fmt: skip
 """Codes with which the monitor stops a leg that has become illegal: another way may exist. Other codes end the flight."""
+
+
+Search = Callable[[], Awaitable["NextLeg | None"]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,9 +87,42 @@ def above_home_m(altitude_m: float, reference: Reference, home: Home | None, gra
     return height
 
 
-def stopped_by_monitor(refusal: Refused) -> bool:
-    """Whether a leg ended because it had become illegal, so that another way may exist."""
-    return isinstance(refusal, Aborted) and refusal.verdict.code in STOPPED
+class Replans:
+    """Counts how often another way was looked for, since the fences changed last.
+
+    Args:
+        constraints: of the flight.
+    """
+
+    def __init__(self, constraints: FlightConstraints) -> None:
+        self._constraints = constraints
+        self._compiled = constraints.compiled
+        self._count = 0
+
+    def allow(self, refusal: Refused) -> bool:
+        """Whether a flight that was refused goes on: a leg of it had become illegal, so that another way may exist."""
+        if self._constraints.compiled is not self._compiled:
+            self._compiled, self._count = self._constraints.compiled, 0
+        self._count += 1
+        if self._count > MAX_REPLANS or not (isinstance(refusal, Aborted) and refusal.verdict.code in STOPPED):
+            return False
+        log.info("courses: leg stopped, searching another way (attempt=%d, reason=%s)", self._count, refusal)
+        return True
+
+
+@dataclass(frozen=True, slots=True)
+class NextLeg:
+    """What is flown next of a way.
+
+    Attributes:
+        args: the leg.
+        last: whether the way ends with it.
+        reached_m: how near to its end it is complete.
+    """
+
+    args: GotoArgs
+    last: bool
+    reached_m: float = REACHED_M
 
 
 async def first_leg(
@@ -118,7 +161,9 @@ async def _first_leg(
     for height in heights_m:
         way = await in_slices(searching(begin, end, now, grant, height, from_m=now.altitude_m))
         if way is not None:
-            return GotoArgs(*frame.latlon(*way[0]), height), len(way) == 1, height
+            # From a place this near to a waypoint the next leg is legal, and this one would change nothing.
+            first = min(math.dist(begin, way[0]) <= NEAR_M, len(way) - 1)
+            return GotoArgs(*frame.latlon(*way[first]), height), len(way) == first + 1, height
     return None
 
 
@@ -143,6 +188,22 @@ def limited_mps(speed_mps: float, leg: GotoArgs, now: Situation, grant: Compiled
     return min([speed_mps, *(bound.upper for bound in speed_bounds(grant, now, air) if bound.upper is not None)])
 
 
+class WayHome(Protocol):
+    """The way home, as others need it.
+
+    Attributes:
+        given_up: the grant under which no legal way home was known last: the autopilot's own is flown then.
+    """
+
+    given_up: ActiveGrant | None
+
+    def attempt(self, trip: Trip, motion: Motion) -> AsyncGenerator[Step, None]:
+        """Fly home for a driver, as one motion; the drone is in GUIDED."""
+
+    def descent(self, grant: ActiveGrant) -> FlightMode:
+        """How the autopilot does the rest."""
+
+
 class Courses:
     """Flies the system's trips."""
 
@@ -157,38 +218,54 @@ class Courses:
             Refused: there is no legal way, or the trip is over.
             AutopilotError: the autopilot refuses.
         """
-        for attempt in range(MAX_REPLANS + 1):
-            motion = self._control.begin(trip.kind)
+        async with aclosing(self.follow(trip, lambda: self._next(trip, target))) as steps:
+            async for step in steps:
+                yield step
+
+    async def follow(self, trip: Trip, search: Search) -> AsyncGenerator[Step, None]:
+        """Fly leg by leg, as `fly` does.
+
+        Args:
+            trip: whose flight.
+            search: the next leg from where the drone rests; None when it is there.
+        """
+        replans = Replans(trip.constraints)
+        while True:
+            motion = self._control.begin(trip.kind, trip.permit)
             try:
-                async with aclosing(self._along(trip, motion, target)) as steps:
+                async with aclosing(self.legs(trip, motion, search)) as steps:
                     async for step in steps:
                         yield step
             except Refused as refusal:
-                if attempt == MAX_REPLANS or not stopped_by_monitor(refusal):
+                if not replans.allow(refusal):
                     raise
-                log.info("courses: leg stopped, searching another way (attempt=%d, reason=%s)", attempt + 1, refusal)
             else:
                 return
             finally:
                 self._control.finish(motion)
 
-    async def _along(self, trip: Trip, motion: Motion, target: GotoArgs) -> AsyncGenerator[Step, None]:
+    async def legs(self, trip: Trip, motion: Motion, search: Search) -> AsyncGenerator[Step, None]:
+        """One attempt of `follow`, as one motion."""
         autopilot, permit = self._control.autopilot, trip.permit(motion)
         for _ in range(MAX_LEGS):
             # A leg is judged from where it begins: a drone that still moves would begin it somewhere else.
-            if not autopilot.vehicle.at_rest(autopilot.now):
+            if not autopilot.at_rest:
                 await come_to_rest(autopilot, motion, permit)
-            leg, last = await self._next(trip, target)
-            leg = self._allowed(trip, leg)
-            if last:
-                leg = replace(leg, yaw_deg=target.yaw_deg)
-            async for step in fly_to(autopilot, motion, leg, REACHED_M, permit):
-                yield Step(step.distance_m, step.complete and last)
-            if last:
+            leg = await search()
+            if leg is None:
+                return
+            away_m = autopilot.vehicle.distance_m(leg.args.lat, leg.args.lon)
+            # A leg that is shorter than the usual radius, out of a zone's margin say, is flown all the same.
+            short = NEAR_M < away_m < 2 * leg.reached_m and not leg.last
+            reached_m = min(leg.reached_m, max(away_m / 3, NEAR_M)) if short else leg.reached_m
+            async with aclosing(fly_to(autopilot, motion, leg.args, reached_m, permit)) as steps:
+                async for step in steps:
+                    yield Step(step.distance_m, step.complete and leg.last)
+            if leg.last:
                 return
         raise Aborted("NotFollowing", f"the drone did not arrive within {MAX_LEGS} legs")
 
-    async def _next(self, trip: Trip, target: GotoArgs) -> tuple[GotoArgs, bool]:
+    async def _next(self, trip: Trip, target: GotoArgs) -> NextLeg:
         now, grant = self._guard.situation(), trip.constraints.compiled
         if now.lat is None or now.lon is None:
             raise Unavailable("AutopilotUnavailable", "the drone's position is not known")
@@ -202,7 +279,8 @@ class Courses:
             if self._arrived(leg):
                 raise self._unreachable(trip, target)
             last = False
-        return leg, last
+        leg = self._allowed(trip, leg)
+        return NextLeg(replace(leg, yaw_deg=target.yaw_deg) if last else leg, last)
 
     def _arrived(self, leg: GotoArgs) -> bool:
         """Whether the drone is at the end of a leg already, so that flying it would change nothing."""

@@ -5,11 +5,14 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 from fractus_core.control import Authority
-from fractus_core.control.events import Airborne
+from fractus_core.control.events import Airborne, PositionFound, PositionLost
+from fractus_core.control.machine import POSITION_UNKNOWN
+from fractus_core.control.values import ModeKind, TaskKind
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Verdict
@@ -19,9 +22,10 @@ from fractus_services.errors import Aborted, AutopilotError, Refused
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import CORRECTION, Control
 from fractus_services.mobility.authority.leases import Motion
+from fractus_services.mobility.authority.situation import fences_of
 from fractus_services.mobility.authority.supervisor import Supervisor
 from fractus_services.mobility.autopilot import Permit
-from fractus_services.mobility.flight.courses import limited_mps
+from fractus_services.mobility.flight.courses import STOPPED, WayHome, limited_mps
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import REACHED_M, fly_to
 
@@ -42,25 +46,32 @@ START_S = 2.0
 """How long a drone may take to move after it was told to fly; one that keeps its place longer flies nothing."""
 
 
+Permits = Callable[[Motion | None], Permit]
+"""For a motion, the check that its commands must pass."""
+
+
 class MotionMonitor:
     """Judges the flying drone's present state, and acts on what it finds."""
 
-    def __init__(self, control: Control, guard: Guard, audit: AuditLog, supervisor: Supervisor) -> None:
+    def __init__(
+        self, control: Control, guard: Guard, audit: AuditLog, supervisor: Supervisor, way_home: WayHome
+    ) -> None:
         self._control = control
         self._guard = guard
         self._audit = audit
         self._supervisor = supervisor
+        self._way_home = way_home
         self._alarm = ""
         self._alarm_at = 0.0
         self._grant: ActiveGrant | None = None
         self._changed_at = -math.inf
-        self._corrections: set[asyncio.Task[None]] = set()
 
     async def run(self) -> None:
         """Watch until cancelled."""
         autopilot = self._control.autopilot
         while True:
-            await autopilot.update(TICK_S if autopilot.vehicle.in_air else IDLE_S)
+            await autopilot.update(TICK_S / autopilot.pace if autopilot.vehicle.in_air else IDLE_S)
+            self._renew_way_home()
             if autopilot.vehicle.in_air:
                 self._control.dispatch(Airborne())
                 try:
@@ -75,25 +86,39 @@ class MotionMonitor:
                 # No heartbeat follows a supervisor that fails: within seconds the autopilot takes the drone home.
                 log.exception("monitor: supervisor failed, the autopilot's failsafe brings the drone home")
 
+    def _renew_way_home(self) -> None:
+        """What was the last line holds only for the flight home that it ended: not for a drone that stands or flies on."""
+        control, vehicle = self._control, self._control.autopilot.vehicle
+        homeward = control.state.returning or (control.motion is not None and control.motion.kind == "ReturnToLaunch")
+        if not vehicle.in_air or (vehicle.mode.commanded and not homeward):
+            self._way_home.given_up = None
+
     def look(self) -> None:
         """One check."""
-        control, grant = self._control, self._control.mission_grant
-        source = control.constraints or grant
-        compiled = source.compiled if source is not None else None
-        coming = control.state.returning and control.constraints is None
+        control, mode = self._control, self._control.autopilot.vehicle.mode
         piloted = control.authority is Authority.PILOT
-        if compiled is None or piloted or coming or not control.autopilot.vehicle.mode.commanded:
+        compiled = fences_of(control) if mode.comes_down or (mode.commanded and not piloted) else None
+        verdict, ours = self._judge(compiled) if compiled is not None else (None, False)
+        if verdict is None or verdict.code != POSITION_UNKNOWN:
+            control.dispatch(PositionFound())
+        if compiled is None or verdict is None:
             self._alarm = ""
             return
-        verdict, ours = self._judge(compiled)
-        if verdict is None:
-            self._alarm = ""
-            return
-        fresh = verdict.code != self._alarm or control.autopilot.now - self._alarm_at > CORRECT_AGAIN_S
+        watched = not mode.commanded or (control.state.returning and control.motion is None)
+        acts = not watched or self._may_take_back(verdict)
+        lasting = control.autopilot.now - self._alarm_at > CORRECT_AGAIN_S
+        fresh = verdict.code != self._alarm or (lasting and acts)
         if fresh:
             self._alarm, self._alarm_at = verdict.code, control.autopilot.now
-            log.warning("monitor: alarm (code=%s, reason=%s)", verdict.code, verdict.reason)
-        if verdict.action == "takeover" and not ours:
+            log.warning("monitor: alarm (code=%s, mode=%s, reason=%s)", verdict.code, mode.name, verdict.reason)
+        if watched:
+            if fresh:
+                self._note("takeBack" if acts else "alarm", verdict)
+            if fresh and acts:
+                self._take_back(verdict)
+        elif verdict.code == POSITION_UNKNOWN:
+            self._hover(verdict, fresh)
+        elif verdict.action == "takeover" and not ours:
             control.take_over(verdict)
         elif verdict.action in {"takeover", "deny"}:
             self._stop(verdict, fresh)
@@ -103,15 +128,50 @@ class MotionMonitor:
     def _judge(self, compiled: CompiledGrant) -> tuple[Verdict | None, bool]:
         """What is wrong, and whether the system flies the drone already, so that there is no driver to take it from."""
         control, now = self._control, self._guard.situation()
-        changed = self._has_changed(
-            control.constraints.grant if control.constraints is not None else control.mission_grant
-        )
-        if control.state.returning:
-            return monitor(now, compiled, leaving=True, changed=changed), True
-        verdict = monitor(now, compiled, changed=changed)
-        if verdict is None or verdict.takeover != "hover" or control.authority is Authority.DRIVER:
+        changed, motion = self._has_changed(self._flown_grant), control.motion
+        leg = motion.leg if motion is not None and motion.under_way and not motion.braking else None
+        bound_for = (leg.lat, leg.lon) if leg is not None else None
+        if control.state.returning or not control.autopilot.vehicle.mode.commanded:
+            # The autopilot's own ways were judged by no one, whatever the grant was.
+            changed = changed or not control.autopilot.vehicle.mode.commanded
+            return monitor(now, compiled, leaving=True, changed=changed, bound_for=bound_for), True
+        verdict = monitor(now, compiled, changed=changed, bound_for=bound_for)
+        alone = control.constraints is not None and verdict is not None and verdict.action == "correct"
+        if verdict is None or (not alone and (verdict.takeover != "hover" or control.authority is Authority.DRIVER)):
             return verdict, False
-        return monitor(now, compiled, leaving=True, changed=changed), True
+        return monitor(now, compiled, leaving=True, changed=changed, bound_for=bound_for), True
+
+    @property
+    def _flown_grant(self) -> ActiveGrant | None:
+        constraints = self._control.constraints
+        return constraints.grant if constraints is not None else self._control.last_grant
+
+    def _may_take_back(self, verdict: Verdict) -> bool:
+        """Whether the system may end what the autopilot flies by itself.
+
+        Not what a pilot chose or may have chosen before the service began, not a landing of the system or a failsafe, and not the last line behind the system's own ways.
+        """
+        control, mode = self._control, self._control.autopilot.vehicle.mode
+        if mode.commanded or verdict.code == POSITION_UNKNOWN or self._way_home.given_up is self._flown_grant:
+            return False
+        if control.authority is Authority.DRIVER:
+            return True
+        task = control.state.task
+        ours = task is not None and task.kind is TaskKind.RETURN and not task.found
+        returns = ours and mode.kind is ModeKind.RETURNING
+        return returns and control.authority is Authority.SYSTEM
+
+    def _take_back(self, verdict: Verdict) -> None:
+        """Stop the drone in GUIDED: its driver is told why, the system looks for a legal way home."""
+        control, state = self._control, self._control.state
+        control.stop_motion(verdict)
+
+        def permit() -> None:
+            now = control.state
+            if now.authority is not state.authority or now.task != state.task or now.motion is not None:
+                raise AutopilotError("something else flies by now")
+
+        control.tasks.spawn(control.tasks.attempt(control.modes.hold, permit))
 
     def _has_changed(self, grant: ActiveGrant | None) -> bool:
         """Whether the drone's way may have been judged by another grant than this."""
@@ -132,51 +192,69 @@ class MotionMonitor:
         """
         control = self._control
         motion = control.motion
-        waits = motion is not None and motion.braking and verdict.code != "PositionUnknown"
+        waits = motion is not None and motion.braking
         if not waits and (fresh or motion is not None):
             control.brake(verdict)
         else:
             control.autopilot.stop()
 
-    def _correct(self, verdict: Verdict, compiled: CompiledGrant) -> None:
-        self._audit.append(
-            "monitor", {"action": verdict.action, "code": verdict.code, "reason": verdict.reason, "policies": list(verdict.policies)}
-        )  # fmt: skip
-        task = asyncio.get_running_loop().create_task(self._carry_out(verdict, self._control.motion, compiled))
-        self._corrections.add(task)
-        task.add_done_callback(self._corrections.discard)
+    def _hover(self, verdict: Verdict, fresh: bool) -> None:
+        """Nothing flies on while the position is not known; who has the drone keeps it for the grace time."""
+        if fresh or self._control.motion is not None:
+            self._control.dispatch(PositionLost(verdict.reason))
+        else:
+            self._control.autopilot.stop()
 
-    async def _carry_out(self, verdict: Verdict, seen: Motion | None, compiled: CompiledGrant) -> None:
-        if self._control.motion is not seen:
+    def _note(self, action: str, verdict: Verdict) -> None:
+        """Write down what was found."""
+        content = {"action": action, "code": verdict.code, "reason": verdict.reason, "policies": list(verdict.policies)}
+        self._audit.append("monitor", content | {"mode": self._control.autopilot.vehicle.mode.name})
+
+    def _correct(self, verdict: Verdict, compiled: CompiledGrant) -> None:
+        if self._control.constraints is not None and verdict.code in STOPPED:
+            self._stop(verdict, fresh=True)  # The system's flights look for another way by themselves.
+            return
+        self._note(verdict.action, verdict)
+        self._control.tasks.spawn(self._carry_out(verdict, self._control.motion, self._permits(), compiled))
+
+    def _permits(self) -> Permits:
+        """What corrects a motion is sent only while no one else flies than at this moment."""
+        control = self._control
+        lease, authority = control.lease, control.authority
+
+        def permit(motion: Motion | None) -> Permit:
+            def check() -> None:
+                if control.lease is not lease or control.authority is not authority or control.motion is not motion:
+                    raise Aborted("Replaced", "something else flies by now")
+
+            return check
+
+        return permit
+
+    async def _carry_out(
+        self, verdict: Verdict, seen: Motion | None, permits: Permits, compiled: CompiledGrant
+    ) -> None:
+        try:
+            permits(seen)()
+        except Aborted:
             self._alarm = ""
             return  # Another motion has begun: the next look judges that one.
         try:
             if isinstance(verdict.args, SetSpeedArgs):
-                await self._slow_down(verdict.args.speed_mps)
+                await self._slow_down(verdict.args.speed_mps, permits(seen))
             elif isinstance(verdict.args, GotoArgs):
-                await self._lead_back(verdict, verdict.args, compiled)
+                await self._lead_back(verdict, verdict.args, permits, compiled)
         except (AutopilotError, Refused) as error:
             log.warning("monitor: correction failed (error=%s)", error)
 
-    def _permit(self, motion: Motion | None) -> Permit:
-        """What corrects a motion is sent only while no one else flies."""
-        control = self._control
-        lease, authority = control.lease, control.authority
-
-        def check() -> None:
-            if control.lease is not lease or control.authority is not authority or control.motion is not motion:
-                raise Aborted("Replaced", "something else flies by now")
-
-        return check
-
-    async def _slow_down(self, speed_mps: float) -> None:
+    async def _slow_down(self, speed_mps: float, permit: Permit) -> None:
         """Fly the present leg slower; the next one is judged by itself."""
         motion = self._control.motion
         if motion is not None and motion.speed_mps is not None:
             speed_mps = motion.speed_mps = min(speed_mps, motion.speed_mps)
-        await self._control.autopilot.set_speed(speed_mps, self._permit(motion))
+        await self._control.autopilot.set_speed(speed_mps, permit)
 
-    async def _lead_back(self, verdict: Verdict, place: GotoArgs, compiled: CompiledGrant) -> None:
+    async def _lead_back(self, verdict: Verdict, place: GotoArgs, permits: Permits, compiled: CompiledGrant) -> None:
         """Fly to where the limits hold, as a motion that follows the one that left them."""
         control = self._control
         control.stop_motion(verdict)
@@ -184,7 +262,7 @@ class MotionMonitor:
         speed = limited_mps(control.cruise_mps, place, self._guard.situation(), compiled)
         leg = replace(place, speed_mps=speed)
         try:
-            async for _ in fly_to(control.autopilot, motion, leg, REACHED_M, self._permit(motion)):
+            async for _ in fly_to(control.autopilot, motion, leg, REACHED_M, permits(motion)):
                 pass
         except Exception:
             control.failed(motion)

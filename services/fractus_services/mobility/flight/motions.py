@@ -30,7 +30,7 @@ TURNED_DEG, TURN_TIMEOUT_S = 8.0, 8.0
 SPEED_TIMEOUT_S = 1.3
 """A leg whose speed is not acknowledged in this time, in which it is sent twice, is stopped and begun once more."""
 
-REST_TIMEOUT_S, STOP_RESEND_S = 12.0, 0.4
+REST_TIMEOUT_S, STOP_RESEND_S = 12.0, 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,11 +85,15 @@ async def fly_to(
     motion.leg, motion.speed_mps = args, args.speed_mps
 
     async def begin() -> None:
+        motion.under_way = False
         await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg, judged or permit)
+        motion.under_way = True
         if not await _hears_speed(autopilot, motion, permit):
             # It flies at an unknown speed, maybe its own default: above a limit that was judged. Stop, and try once more.
+            motion.under_way = False
             await come_to_rest(autopilot, motion, permit)
             await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg, judged or permit)
+            motion.under_way = True
             if not await _hears_speed(autopilot, motion, permit):
                 raise AutopilotError("the autopilot does not acknowledge the speed of the leg", link=True)
         if args.yaw_deg is not None:
@@ -150,11 +154,11 @@ async def come_to_rest(autopilot: Autopilot, motion: Motion, permit: Permit) -> 
     deadline, sent = autopilot.now + REST_TIMEOUT_S, -math.inf
     motion.braking = True
     try:
-        while not autopilot.vehicle.at_rest(autopilot.now):
+        while not autopilot.at_rest:
             if autopilot.now > deadline:
                 speed = autopilot.vehicle.speed_mps
                 raise Aborted("NotStopping", f"the drone does not stop; it still flies {speed:.1f} m/s")
-            if autopilot.now - sent >= STOP_RESEND_S:
+            if autopilot.now - sent >= STOP_RESEND_S / autopilot.pace:
                 permit()
                 autopilot.stop()
                 sent = autopilot.now

@@ -18,7 +18,7 @@ from fractus_services.mobility.authority.drivers import driver_permit
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.autopilot import Autopilot, Permit
 from fractus_services.mobility.flight.calls import CallJudge
-from fractus_services.mobility.flight.courses import Trip
+from fractus_services.mobility.flight.courses import Replans, Trip, WayHome
 from fractus_services.mobility.flight.motions import REACHED_M, Step, climb, come_down, come_to_rest, fly_to
 from fractus_services.mobility.flight.steering import Steering
 
@@ -53,7 +53,7 @@ class MobilityService:
         control: who has the drone.
         arming: starts the motors.
         calls: gives calls their turn, before they come here, and judges them.
-        way_home: flies to where the autopilot's own return is legal.
+        way_home: flies home.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class MobilityService:
         control: Control,
         arming: Arming,
         calls: CallJudge,
-        way_home: Callable[[Trip, Motion], AsyncGenerator[Step, None]],
+        way_home: WayHome,
     ) -> None:
         self.calls = calls
         self._control = control
@@ -70,12 +70,12 @@ class MobilityService:
         self._steering = Steering(control)
         self._autopilot: Autopilot = control.autopilot
 
-    async def arm(self, grant: ActiveGrant) -> Verdict:
-        """Start the motors."""
-        verdict = self.calls.allow_motion(Call("Arm"), grant)
-        if not self._autopilot.vehicle.armed:
-            await self._arming.arm(grant, driver_permit(self._control, grant))
-        return verdict
+    async def arm(self, grant: ActiveGrant, patience_s: float = 0.0) -> Verdict:
+        """Start the motors; what may pass, as that the autopilot is not ready yet, is tried again for so long."""
+        permit, call = driver_permit(self._control, grant), Call("Arm")
+        async for _ in self._arming.arm(grant, permit, lambda: self.calls.allow_motion(call, grant), patience_s):
+            pass
+        return Verdict("allow")
 
     async def disarm(self, grant: ActiveGrant) -> Verdict:
         """Stop the motors on the ground."""
@@ -131,7 +131,7 @@ class MobilityService:
             async for step in climb(self._autopilot, motion, altitude, permit):
                 yield Progress(verdict, step)
 
-        return self._run("Takeoff", steps)
+        return self._run("Takeoff", grant, steps)
 
     def goto(self, grant: ActiveGrant, args: GotoArgs, reached_m: float) -> AsyncGenerator[Progress, None]:
         """Fly straight to a point."""
@@ -144,7 +144,7 @@ class MobilityService:
             call, final = Call("Goto", args), verdict
             for _ in range(MAX_JUDGEMENTS):
                 final = await self._settled(call, grant, final, motion, permit)
-                leg, judged = self._leg(final, args), self._judged(call, grant, final, permit)
+                leg, judged = _leg(final, args, self._control.cruise_mps), self._judged(call, grant, final, permit)
                 try:
                     async with aclosing(fly_to(self._autopilot, motion, leg, radius, permit, judged=judged)) as flying:
                         async for step in flying:
@@ -157,12 +157,7 @@ class MobilityService:
                     return
             raise Aborted("NotFollowing", f"the autopilot was told {MAX_JUDGEMENTS} times where to fly, and does not")
 
-        return self._run("Goto", steps)
-
-    def _leg(self, verdict: Verdict, args: GotoArgs) -> GotoArgs:
-        """What is flown of a goto, with its speed."""
-        goal = verdict.args if isinstance(verdict.args, GotoArgs) else args
-        return replace(goal, speed_mps=goal.speed_mps or self._control.cruise_mps)
+        return self._run("Goto", grant, steps)
 
     def _judged(self, call: Call, grant: ActiveGrant, verdict: Verdict, permit: Permit) -> Permit:
         """A permit that judges the leg again when its command is sent late, from where the drone is by then."""
@@ -171,7 +166,7 @@ class MobilityService:
         def check() -> None:
             nonlocal judged_at
             permit()
-            if self._autopilot.now - judged_at <= JUDGE_AGAIN_S:
+            if self._autopilot.now - judged_at <= JUDGE_AGAIN_S / self._autopilot.pace:
                 return
             judged_at = self._autopilot.now
             again = self.calls.allow_motion(call, drivers.require(self._control, grant).grant, verdict)
@@ -195,7 +190,7 @@ class MobilityService:
             await self._control.modes.enter_guided(permit)
             if verdict.brake_first:
                 await come_to_rest(self._autopilot, motion, permit)
-            elif self._autopilot.now - begun <= JUDGE_AGAIN_S:
+            elif self._autopilot.now - begun <= JUDGE_AGAIN_S / self._autopilot.pace:
                 return verdict
             permit()
             verdict = self.calls.allow_motion(call, drivers.require(self._control, grant).grant, verdict)
@@ -229,36 +224,44 @@ class MobilityService:
             async for step in come_down(self._autopilot, motion):
                 yield Progress(verdict, step)
 
-        return self._run("Land", steps)
+        return self._run("Land", grant, steps)
 
     def return_to_launch(self, grant: ActiveGrant) -> AsyncGenerator[Progress, None]:
-        """Fly home, around what is in the way, and land."""
+        """Fly home on a legal way, and land; a way that becomes illegal under the flying drone is replaced by another."""
         self.calls.supersede(grant)
         verdict = self.calls.allow_motion(Call("ReturnToLaunch"), grant)
         self._flying("ReturnToLaunch")
+        return self._return(grant, verdict)
 
-        async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
-            control = self._control
-            permit = driver_permit(control, grant, motion)
-            constraints = control.begin_system_flight(drivers.require(control, grant).grant)
-            try:
-                await control.modes.enter_guided(permit)
-                trip = Trip(constraints, motion.kind, lambda _motion: permit)
-                async with aclosing(self._way_home(trip, motion)) as legs:
-                    async for step in legs:
-                        yield Progress(verdict, step)
-                mode = control.autopilot.stack.return_straight
-            except Refused as refusal:
-                if refusal.verdict.code != "NoLegalWay" or not control.retraces:
-                    raise
-                mode = control.autopilot.stack.return_retracing
-            finally:
-                control.end_system_flight(constraints)
-            await control.modes.change_mode(mode, permit)
-            async for step in come_down(self._autopilot, motion):
+    async def _return(self, grant: ActiveGrant, verdict: Verdict) -> AsyncGenerator[Progress, None]:
+        control = self._control
+        constraints = control.begin_system_flight(drivers.require(control, grant).grant)
+        trip = Trip(constraints, "ReturnToLaunch", lambda motion: driver_permit(control, grant, motion))
+        replans, goes_on = Replans(constraints), True
+        try:
+            while goes_on:
+                goes_on = False
+                attempt = self._run(trip.kind, grant, lambda motion: self._homeward(trip, motion, verdict))
+                try:
+                    async with aclosing(attempt) as running:
+                        async for progress in running:
+                            yield progress
+                except Refused as refusal:
+                    if not (goes_on := replans.allow(refusal)):
+                        raise
+        finally:
+            control.end_system_flight(constraints)
+
+    async def _homeward(self, trip: Trip, motion: Motion, verdict: Verdict) -> AsyncGenerator[Progress, None]:
+        """One attempt to come home."""
+        permit, modes = trip.permit(motion), self._control.modes
+        await modes.enter_guided(permit)
+        async with aclosing(self._way_home.attempt(trip, motion)) as steps:
+            async for step in steps:
                 yield Progress(verdict, step)
-
-        return self._run("ReturnToLaunch", steps)
+        await modes.change_mode(self._way_home.descent(trip.constraints.grant), permit)
+        async for step in come_down(self._autopilot, motion):
+            yield Progress(verdict, step)
 
     def _standing_by(self, call: Call, grant: ActiveGrant) -> None:
         """Refuse a takeoff that cannot be carried out before its costly judgement.
@@ -278,9 +281,9 @@ class MobilityService:
             raise PreconditionFailed("NotFlying", f"{method} needs a drone in the air; take off first")
 
     async def _run(
-        self, kind: str, steps: Callable[[Motion], AsyncGenerator[Progress, None]]
+        self, kind: str, grant: ActiveGrant, steps: Callable[[Motion], AsyncGenerator[Progress, None]]
     ) -> AsyncGenerator[Progress, None]:
-        motion = self._control.begin(kind)
+        motion = self._control.begin(kind, lambda motion: driver_permit(self._control, grant, motion))
         try:
             async with aclosing(steps(motion)) as running:
                 async for progress in running:
@@ -292,3 +295,9 @@ class MobilityService:
             self._control.failed(motion)
             raise
         self._control.finish(motion)
+
+
+def _leg(verdict: Verdict, args: GotoArgs, cruise_mps: float) -> GotoArgs:
+    """What is flown of a goto, with its speed."""
+    goal = verdict.args if isinstance(verdict.args, GotoArgs) else args
+    return replace(goal, speed_mps=goal.speed_mps or cruise_mps)

@@ -15,8 +15,11 @@ from fractus_services.mobility.autopilot import Permit
 log = logging.getLogger(__name__)
 
 RESEND_S = 0.2
-"""How often a setpoint is sent again while it holds. A lost message must not leave the setpoint before it in force, and
-ArduCopter itself stops after GUID_TIMEOUT (1 s, set with the failsafes) without one."""
+"""How often, by the vehicle's clock, a setpoint is sent again while it holds. A lost message must not leave the setpoint
+before it in force, and ArduCopter itself stops after GUID_TIMEOUT (1 s, set with the failsafes) without one."""
+
+OVER_S = 1e-3
+"""A hold that ends this soon is over: the event loop sleeps no shorter."""
 
 
 class Steering:
@@ -42,10 +45,10 @@ class Steering:
 
     async def _watch(self, setpoint: VelocityArgs, motion: Motion, permit: Permit) -> None:
         """Keep the setpoint in force to its end, then hover, unless another motion has begun meanwhile."""
-        control = self._control
-        until = control.autopilot.now + setpoint.hold_s
-        while control.motion is motion and (left_s := until - control.autopilot.now) > 0:
-            await asyncio.sleep(min(left_s, RESEND_S))
+        control, pace = self._control, self._control.autopilot.pace
+        until = control.autopilot.now + setpoint.hold_s / pace
+        while control.motion is motion and (left_s := until - control.autopilot.now) > OVER_S:
+            await asyncio.sleep(min(left_s, RESEND_S / pace))
             try:
                 permit()
             except Refused as refusal:

@@ -15,6 +15,7 @@ from fractus_services.errors import AutopilotError, Refused, Unavailable
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.permits import tour_permit
+from fractus_services.mobility.authority.readiness import not_ready_reason
 from fractus_services.mobility.flight.courses import FAULT, Courses, Trip, target_of
 
 log = logging.getLogger(__name__)
@@ -83,7 +84,7 @@ class Tours:
             return False
         if other is not None and other.key != grant.key and other.outcome is None:
             return False
-        if control.not_ready_reason(grant.key) is not None or (state.vehicle.armed and not state.flies_for(grant.key)):
+        if not_ready_reason(control, grant.key) is not None or (state.vehicle.armed and not state.flies_for(grant.key)):
             return False
         aboard = grant.spec.application.uid in self._aboard
         return aboard or mission.flown or control.autopilot.now - self._since[grant.key] >= self._boarding_s

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import AsyncGenerator
+from contextlib import aclosing
 
 from fractus_core.api.components import ControlPoint
 from fractus_core.api.geometry import Position
@@ -19,6 +20,9 @@ from fractus_services.mobility.authority.permits import transit_permit
 from fractus_services.mobility.flight.courses import FAULT, Courses, Trip, above_home_m, target_of
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import climb
+
+ARMING_TIMEOUT_S = 120.0
+"""How long the system tries to arm a drone whose autopilot refuses."""
 
 DEFAULT_ALTITUDE_M = 10.0
 """How high the system takes off, above home, when the place it flies to gives no altitude."""
@@ -89,15 +93,20 @@ class TransitFlight:
         """
         control, autopilot = self._control, self._control.autopilot
         vehicle = autopilot.vehicle
-        motion = control.begin("Takeoff")
+        motion = control.begin("Takeoff", trip.permit)
         permit = trip.permit(motion)
         try:
             # `standing` is the autopilot's own word, `in_air` counts doubt as flying: an armed drone on a raised pad is both.
             if vehicle.standing or not vehicle.in_air:
                 yield "the system arms the drone"
-                self._allow(Call("Arm"), trip)
-                if not vehicle.armed:
-                    await self._arming.arm(trip.constraints.grant, permit)
+                if vehicle.armed:
+                    self._allow(Call("Arm"), trip)
+                else:
+                    grant = trip.constraints.grant
+                    arming = self._arming.arm(grant, permit, lambda: self._allow(Call("Arm"), trip), ARMING_TIMEOUT_S)
+                    async with aclosing(arming) as waiting:
+                        async for why in waiting:
+                            yield f"the system arms the drone: {why}"
                 climbed = self._allow(Call("Takeoff", TakeoffArgs(self._height_m(place, trip))), trip)
                 yield "the system takes off"
                 await control.modes.enter_guided(permit)

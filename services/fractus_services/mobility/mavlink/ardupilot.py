@@ -6,10 +6,11 @@ import math
 from collections.abc import Mapping
 
 from fractus_core.control.values import FlightMode, ModeKind
+from fractus_core.policy.returning import ReturnBounds
 from fractus_core.policy.values import Airframe
-from fractus_mavlink.enums import COPTER_MODE, FENCE_TYPE
+from fractus_mavlink.enums import COPTER_MODE, FENCE_TYPE, MAV_AUTOPILOT, MAV_TYPE
 
-from fractus_services.mobility.mavlink.flight_stack import ParameterReader, Setting
+from fractus_services.mobility.mavlink.flight_stack import Names, ParameterReader, Setting
 from fractus_services.mobility.mavlink.link import SYSTEM_ID
 
 _KINDS = {
@@ -20,6 +21,12 @@ _KINDS = {
     COPTER_MODE.LAND: ModeKind.LANDING,
 }
 _MODES = {int(mode): FlightMode(mode.name, _KINDS.get(mode, ModeKind.OTHER)) for mode in COPTER_MODE}
+_COPTERS = frozenset(
+    {
+        MAV_TYPE.QUADROTOR, MAV_TYPE.COAXIAL, MAV_TYPE.HELICOPTER, MAV_TYPE.HEXAROTOR, MAV_TYPE.OCTOROTOR,
+        MAV_TYPE.TRICOPTER, MAV_TYPE.DODECAROTOR, MAV_TYPE.DECAROTOR, MAV_TYPE.GENERIC_MULTIROTOR,
+    }
+)  # fmt: skip
 _NUMBERS = {mode: number for number, mode in _MODES.items()}
 
 _LISTENS = "listens for the companion's heartbeats, and takes no ground station for it"
@@ -32,10 +39,21 @@ _LISTENS_TO_ONE = Setting(
 _RETURN, _RETRACE = 1.0, 3.0
 
 ENABLE, TYPE, ALTITUDE, ACTION, OPTIONS = "FENCE_ENABLE", "FENCE_TYPE", "FENCE_ALT_MAX", "FENCE_ACTION", "FENCE_OPTIONS"
+AUTOENABLE, MARGIN = "FENCE_AUTOENABLE", "FENCE_MARGIN"
 _UNION = 2
 """Bit of FENCE_OPTIONS: it is enough to be inside one of the polygons."""
 _DEFAULT_FENCES = float(FENCE_TYPE.ALT_MAX | FENCE_TYPE.CIRCLE | FENCE_TYPE.POLYGON)
 _DEFAULT_MARGIN_M = 2.0
+
+_ACCEL: Names = (("WPNAV_ACCEL", 0.01), ("WP_ACC", 1.0))
+_GAIN: Names = (("PSC_POSXY_P", 1.0), ("PSC_NE_POS_P", 1.0))
+_CLIMB: Names = (("WPNAV_ACCEL_Z", 0.01), ("WP_ACC_Z", 1.0))
+_JERK: Names = (("PSC_JERK_XY", 1.0), ("PSC_JERK_NE", 1.0))
+_RETURN_ALTITUDE: Names = (("RTL_ALT", 0.01), ("RTL_ALT_M", 1.0))
+_SPEED: Names = (("WPNAV_SPEED", 0.01), ("WP_SPD", 1.0))
+_RETURN_SPEED: Names = (("RTL_SPEED", 0.01), ("RTL_SPEED_MS", 1.0))
+_RETURN_CLIMB: Names = (("RTL_CLIMB_MIN", 0.01), ("RTL_CLIMB_MIN_M", 1.0))
+_MIN_SPEED_MPS = 0.2
 
 
 class ArduCopter:
@@ -67,9 +85,25 @@ class ArduCopter:
         Setting(("BATT_FS_LOW_ACT",), 3, frozenset({1.0, 4.0}), False, "goes back the way it came on a low battery"),
     )  # fmt: skip
     path_memory = ("SRTL_POINTS", 100.0)
+    movement: tuple[tuple[str, ...], ...] = (
+        *(tuple(name for name, _ in names) for names in (_ACCEL, _GAIN, _CLIMB, _JERK, _RETURN_ALTITUDE, _SPEED)),
+        *((name,) for name in (ENABLE, AUTOENABLE, TYPE, ALTITUDE, MARGIN)),
+    )
+
+    leg_speed = tuple(name for name, _ in _SPEED)
+    returning: tuple[tuple[str, ...], ...] = tuple(
+        tuple(name for name, _ in names) for names in (_RETURN_ALTITUDE, _RETURN_SPEED, _SPEED, _RETURN_CLIMB)
+    )
 
     fence_switch = ENABLE
+    fence_total = "FENCE_TOTAL"
     fence_parameters: tuple[str, ...] = (TYPE, ALTITUDE, ACTION, OPTIONS, ENABLE)
+
+    def foreign(self, vehicle_type: int, autopilot: int) -> str:
+        """Modes and parameters of ArduPilot's rovers and planes mean something else, as do all of other firmware."""
+        if autopilot == MAV_AUTOPILOT.ARDUPILOTMEGA and vehicle_type in _COPTERS:
+            return ""
+        return f"the vehicle is no ArduCopter (MAV_AUTOPILOT {autopilot}, MAV_TYPE {vehicle_type})"
 
     def mode(self, custom_mode: int) -> FlightMode:
         """The mode of a number; one of a later release has only that for its name, and is a pilot's."""
@@ -91,38 +125,44 @@ class ArduCopter:
         """SmartRTL ran out of memory, or of time to simplify the path."""
         return text.startswith("SmartRTL deactivated")
 
-    async def airframe(self, reader: ParameterReader, known: Airframe, speed_mps: float) -> tuple[Airframe, float]:
+    def return_values(self, owned: Mapping[str, float], bounds: ReturnBounds) -> dict[str, float]:
+        """RTL_ALT; RTL_SPEED, which is WPNAV_SPEED when it is 0; WPNAV_SPEED for SmartRTL; and no climb above all of that."""
+        speed_mps = max(bounds.speed_mps, _MIN_SPEED_MPS)
+        climb_m = math.inf if math.isinf(bounds.height_m) else 0.0
+        found = {}
+        for names, most in (
+            (_RETURN_ALTITUDE, bounds.height_m), (_RETURN_SPEED, speed_mps), (_SPEED, speed_mps), (_RETURN_CLIMB, climb_m),
+        ):  # fmt: skip
+            for name, scale in names:
+                if name in owned:
+                    # Centimetres are whole numbers.
+                    limit = most if scale == 1.0 or math.isinf(most) else math.floor(round(most / scale, 3))
+                    found[name] = min(owned[name], float(limit))
+        return found
+
+    def airframe(self, reader: ParameterReader, known: Airframe, speed_mps: float) -> tuple[Airframe, float]:
         """Accelerations and gains of its position controller; releases before 4.7 have centimetres, later ones metres."""
         read = reader.read
-        accel = await read((("WPNAV_ACCEL", 0.01), ("WP_ACC", 1.0)), known.accel_mps2)
-        gain = await read((("PSC_POSXY_P", 1.0), ("PSC_NE_POS_P", 1.0)), known.position_gain)
-        climb = await read((("WPNAV_ACCEL_Z", 0.01), ("WP_ACC_Z", 1.0)), known.climb_accel_mps2)
-        jerk = await read((("PSC_JERK_XY", 1.0), ("PSC_JERK_NE", 1.0)), known.jerk_mps3)
-        height_m = await self.return_altitude_m(reader, known.return_altitude_m)
-        speed = await read((("WPNAV_SPEED", 0.01), ("WP_SPD", 1.0)), speed_mps)
         airframe = Airframe(
-            accel_mps2=max(accel, 0.1),
-            position_gain=max(gain, 0.1),
-            climb_accel_mps2=max(climb, 0.1),
-            jerk_mps3=max(jerk, 0.5),
-            return_altitude_m=height_m,
+            accel_mps2=max(read(_ACCEL, known.accel_mps2), 0.1),
+            position_gain=max(read(_GAIN, known.position_gain), 0.1),
+            climb_accel_mps2=max(read(_CLIMB, known.climb_accel_mps2), 0.1),
+            jerk_mps3=max(read(_JERK, known.jerk_mps3), 0.5),
+            return_altitude_m=self.return_altitude_m(reader, known.return_altitude_m),
         )
-        return airframe, speed
+        return airframe, read(_SPEED, speed_mps)
 
-    async def return_altitude_m(self, reader: ParameterReader, known_m: float) -> float:
+    def return_altitude_m(self, reader: ParameterReader, known_m: float) -> float:
         """RTL_ALT, but never above its own fence's ceiling, less the fence's margin."""
 
-        async def read(name: str, default: float) -> float:
-            return await reader.read(((name, 1.0),), default)
+        def read(name: str, otherwise: float, *, needed: bool = False) -> float:
+            return reader.read(((name, 1.0),), otherwise, needed=needed)
 
         wrong = len(reader.problems)
-        height_m = await reader.read((("RTL_ALT", 0.01), ("RTL_ALT_M", 1.0)), known_m)
-        fenced = await read(ENABLE, 0.0) or await read("FENCE_AUTOENABLE", 0.0)
-        if fenced and int(await read(TYPE, _DEFAULT_FENCES)) & FENCE_TYPE.ALT_MAX:
-            ceiling_m = await read(ALTITUDE, math.inf)
-            if math.isinf(ceiling_m) and len(reader.problems) == wrong:
-                reader.problems.append(f"{ALTITUDE} cannot be read")
-            height_m = min(height_m, ceiling_m - await read("FENCE_MARGIN", _DEFAULT_MARGIN_M))
+        height_m = reader.read(_RETURN_ALTITUDE, known_m)
+        fenced = read(ENABLE, 0.0) or read(AUTOENABLE, 0.0)
+        if fenced and int(read(TYPE, _DEFAULT_FENCES)) & FENCE_TYPE.ALT_MAX:
+            height_m = min(height_m, read(ALTITUDE, known_m, needed=True) - read(MARGIN, _DEFAULT_MARGIN_M))
         return known_m if len(reader.problems) > wrong else height_m
 
     def fence_values(

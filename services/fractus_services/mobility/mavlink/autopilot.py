@@ -1,4 +1,4 @@
-"""Commands and parameters of the autopilot: each is acknowledged, or sent again, or fails with a reason."""
+"""Commands of the autopilot: each is acknowledged, or sent again, or fails with a reason."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import asyncio
 import logging
 import math
 from collections.abc import Callable
+from contextlib import suppress
 
 from fractus_core.control.values import FlightMode
 from fractus_mavlink import Message, Value, layout_named, message
@@ -13,22 +14,24 @@ from fractus_mavlink.enums import (
     MAV_CMD,
     MAV_FRAME,
     MAV_MODE_FLAG,
-    MAV_PARAM_TYPE,
     MAV_RESULT,
     POSITION_TARGET_TYPEMASK,
     SPEED_TYPE,
 )
 
 from fractus_services.errors import AutopilotError
-from fractus_services.mobility.autopilot import Permit, always
+from fractus_services.mobility.autopilot import COURSE_S, Permit, always
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
 from fractus_services.mobility.mavlink.link import SYSTEM_ID, Link
+from fractus_services.mobility.mavlink.orders import Orders, Velocity, moves
+from fractus_services.mobility.mavlink.parameters import Parameters
 
 log = logging.getLogger(__name__)
 
 ACK_TIMEOUT_S = 0.7
 MODE_TIMEOUT_S = 2.0
 REJECTED_RETRY_S = 0.3
+TAKEOFF_TIMEOUT_S = 3.0
 ATTEMPTS = 4
 
 # Messages and their rates in Hz on the ground and in the air.
@@ -37,6 +40,7 @@ STREAMS = {
     "ATTITUDE": (2.0, 10.0),
     "EXTENDED_SYS_STATE": (2.0, 5.0),
     "SYS_STATUS": (1.0, 1.0),
+    "EKF_STATUS_REPORT": (1.0, 1.0),
     "GPS_RAW_INT": (1.0, 2.0),
     "HOME_POSITION": (0.2, 0.2),
 }
@@ -66,10 +70,12 @@ class MavlinkAutopilot(Link):
         alive: see `Link`.
         on_found: see `Link`.
         on_heartbeat: see `Link`.
+        on_parameter: called with the name of a parameter that someone else changed.
         sysid: see `Link`.
 
     Attributes:
         starting: held by the one who prepares to start the motors.
+        vehicle_parameters: reads and writes the vehicle's parameters.
     """
 
     def __init__(
@@ -80,15 +86,46 @@ class MavlinkAutopilot(Link):
         alive: Callable[[], bool] = lambda: True,
         on_found: Callable[[], None] = lambda: None,
         on_heartbeat: Callable[[], None] = lambda: None,
+        on_parameter: Callable[[str], None] = lambda _name: None,
         sysid: int = SYSTEM_ID,
     ) -> None:
         super().__init__(url, stack, alive=alive, on_found=on_found, on_heartbeat=on_heartbeat, sysid=sysid)
         self.starting = asyncio.Lock()
-        self._locks: dict[int | str, asyncio.Lock] = {}
+        self.vehicle_parameters = Parameters(self, on_parameter)
+        self._locks: dict[int, asyncio.Lock] = {}
         self._flying_rates: bool | None = None
+        self._probing: asyncio.Task[None] | None = None
+        self._orders = Orders()
+
+    @property
+    def pending(self) -> tuple[Velocity, ...]:
+        """What the vehicle was told of late; its acceleration is known from velocities that go back further."""
+        return self._orders.since(self.now - (self.latency_s + COURSE_S) / self.pace)
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the vehicle surely stands, and was told nothing else."""
+        return self.vehicle.at_rest(self.now) and not any(map(moves, self.pending))
+
+    def _probe(self, due: float) -> None:
+        """A vehicle that answers no TIMESYNC acknowledges a command that changes nothing."""
+        super()._probe(due)
+        if self.timing.unanswering and self.connected and (self._probing is None or self._probing.done()):
+            self._probing = asyncio.get_running_loop().create_task(self._probe_by_command())
+
+    async def _probe_by_command(self) -> None:
+        with suppress(AutopilotError):
+            await self.command(MAV_CMD.REQUEST_MESSAGE, layout_named("HEARTBEAT").msgid, attempts=1)
 
     def _lost(self) -> None:
         self._flying_rates = None
+        self.vehicle_parameters.forget()
+
+    def take(self, incoming: Message) -> None:
+        """Hand on a message of the vehicle."""
+        if incoming.name == "PARAM_VALUE":
+            self.vehicle_parameters.take(incoming)
+        super().take(incoming)
 
     async def command(
         self,
@@ -114,6 +151,7 @@ class MavlinkAutopilot(Link):
         """
         # An acknowledgement names the command, not the sending: two of one kind at a time would take each other's.
         async with self._locks.setdefault(command, asyncio.Lock()):
+            sent_at = self.now
             for attempt in range(attempts):
                 permit()
                 result = await self._attempt(
@@ -121,6 +159,7 @@ class MavlinkAutopilot(Link):
                 )
                 if result is None:
                     continue
+                self.timing.acknowledged(sent_at, self.now)
                 if result == MAV_RESULT.ACCEPTED:
                     return
                 if result == MAV_RESULT.TEMPORARILY_REJECTED and attempt + 1 < attempts:
@@ -174,7 +213,23 @@ class MavlinkAutopilot(Link):
 
     async def take_off(self, altitude_m: float, permit: Permit = always) -> None:
         """Begin to climb to an altitude above home."""
-        await self.command(MAV_CMD.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m, permit=permit)
+        for attempt in range(ATTEMPTS):
+            try:
+                await self.command(MAV_CMD.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m, permit=permit, attempts=1)
+            except AutopilotError as error:
+                # A vehicle that takes off already, though its acknowledgement was lost, refuses to do so again.
+                if attempt and not error.link and await self._takes_off():
+                    return
+                if not error.link or attempt + 1 == ATTEMPTS:
+                    raise
+            else:
+                return
+
+    async def _takes_off(self) -> bool:
+        deadline = self.now + TAKEOFF_TIMEOUT_S
+        while not self.vehicle.in_air and self.now < deadline:
+            await self.update(ACK_TIMEOUT_S)
+        return self.vehicle.in_air
 
     async def go_to(
         self, lat: float, lon: float, altitude_m: float, yaw_deg: float | None, permit: Permit = always
@@ -184,7 +239,12 @@ class MavlinkAutopilot(Link):
         The autopilot falls back to its own speed when it was not flying to a place before: see `set_speed`.
         """
         yaw = math.nan if yaw_deg is None else yaw_deg
-        await self.command(MAV_CMD.DO_REPOSITION, -1, 0, 0, yaw, place=(lat, lon, altitude_m), permit=permit)
+
+        def ordered() -> None:
+            permit()
+            self._orders.go_to(lat, lon, altitude_m, self.vehicle, self.now)
+
+        await self.command(MAV_CMD.DO_REPOSITION, -1, 0, 0, yaw, place=(lat, lon, altitude_m), permit=ordered)
 
     async def turn(self, yaw_deg: float, permit: Permit = always) -> None:
         """Point the nose, on the leg under way."""
@@ -201,6 +261,7 @@ class MavlinkAutopilot(Link):
     def fly(self, north_mps: float, east_mps: float, down_mps: float, yaw_deg: float | None = None) -> None:
         """Fly with a velocity over ground, which the autopilot gives up by itself after GUID_TIMEOUT."""
         if self.found:
+            self._orders.fly((north_mps, east_mps, down_mps), self.now)
             self.send(
                 message(
                     "SET_POSITION_TARGET_LOCAL_NED",
@@ -215,7 +276,10 @@ class MavlinkAutopilot(Link):
             )
 
     async def set_rates(self, flying: bool) -> None:
-        """Ask for the streams, more often in the air; one that is refused comes at the autopilot's own rate."""
+        """Ask for the streams, more often in the air; one that is refused comes at the autopilot's own rate.
+
+        When an answer was lost, the next call asks again.
+        """
         if self._flying_rates is flying:
             return
         self._flying_rates = flying
@@ -224,43 +288,13 @@ class MavlinkAutopilot(Link):
                 interval_us = 1e6 / rates[flying]
                 await self.command(MAV_CMD.SET_MESSAGE_INTERVAL, layout_named(name).msgid, interval_us, attempts=2)
             except AutopilotError as error:
+                if error.link and self._flying_rates is flying:
+                    self._flying_rates = None
                 log.warning("autopilot: a stream keeps its own rate (message=%s, error=%s)", name, error)
 
     async def ask_home(self) -> None:
         """Ask for the home position now."""
         await self.command(MAV_CMD.REQUEST_MESSAGE, layout_named("HOME_POSITION").msgid)
-
-    async def read_parameter(self, name: str, attempts: int = ATTEMPTS) -> float | None:
-        """A parameter's value; None when the vehicle does not have it."""
-        # An index of -1 asks by name.
-        request = message("PARAM_REQUEST_READ", param_index=-1, param_id=name.encode(), **self.recipient())
-        return await self._exchange(name, request, attempts)
-
-    async def write_parameter(self, name: str, value: float) -> float | None:
-        """Set a parameter; returns what the vehicle says it is now."""
-        request = message(
-            "PARAM_SET",
-            param_id=name.encode(),
-            param_value=value,
-            param_type=MAV_PARAM_TYPE.REAL32,
-            **self.recipient(),
-        )
-        return await self._exchange(name, request, ATTEMPTS)
-
-    async def _exchange(self, name: str, request: Message, attempts: int) -> float | None:
-        # PARAM_VALUE answers reading and writing alike, so that one at a time asks for a parameter.
-        async with self._locks.setdefault(name, asyncio.Lock()):
-            with self.listening("PARAM_VALUE") as answers:
-                for _ in range(attempts):
-                    self.send(request)
-                    try:
-                        async with asyncio.timeout(ACK_TIMEOUT_S):
-                            while (answer := await answers.get()).text("param_id") != name:
-                                pass
-                            return answer.real("param_value")
-                    except TimeoutError:
-                        continue
-        return None
 
 
 def _outgoing(

@@ -5,17 +5,19 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from fractus_core.api.plans import GrantSpec
-from fractus_storage import write_file
+from fractus_storage import remove_temporary, write_file
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
-from fractus_services.mobility.mavlink.bounds import Bounds, Item, bounds_of
-from fractus_services.mobility.mavlink.itemlists import NoLists, download, upload
+from fractus_services.mobility.mavlink.bounds import MAX_VERTICES, Bounds, Item, bounds_of
+from fractus_services.mobility.mavlink.itemlists import NoLists, NoSpace, download, upload
+from fractus_services.mobility.mavlink.parameters import same
 
 log = logging.getLogger(__name__)
 
@@ -31,10 +33,12 @@ class Owned:
     Attributes:
         parameters: those that the vehicle has.
         items: its polygons and circles.
+        raised: the parameters of the mission's fence, once that stands.
     """
 
     parameters: dict[str, float]
     items: tuple[Item, ...]
+    raised: dict[str, float] = field(default_factory=dict)
 
 
 class MissionFence:
@@ -53,8 +57,10 @@ class MissionFence:
     def __init__(self, autopilot: MavlinkAutopilot, directory: Path) -> None:
         self._autopilot = autopilot
         self._stack = autopilot.stack
+        self._parameters = autopilot.vehicle_parameters
         self._path = directory / "fence.json"
         self._lock = asyncio.Lock()
+        self._standing: tuple[Bounds, bool] | None = None
         self.missing = ""
 
     @property
@@ -82,7 +88,7 @@ class MissionFence:
             if not await self._offered():
                 return
             try:
-                await self._raise(bounds, retraces)
+                await self._raise(spec, bounds, retraces)
             except NoLists as error:
                 self._lacks(str(error))
 
@@ -101,13 +107,33 @@ class MissionFence:
                 return
             await self._put_back(owned)
 
+    async def hold(self) -> tuple[str, ...]:
+        """Set back what another station changed of the fence that is raised; what that was, in sentences.
+
+        Raises:
+            AutopilotError: it cannot be, or the vehicle has other fence items by now.
+        """
+        async with self._lock:
+            owned = await asyncio.to_thread(self._load)
+            if owned is None or not owned.raised:
+                return ()
+            return await self._keep(owned.raised)
+
+    async def _keep(self, raised: Mapping[str, float]) -> tuple[str, ...]:
+        changed, total = await self._set(raised), self._stack.fence_total
+        if total in raised:
+            items = (await self._parameters.read([(total,)])).get(total, 0.0)
+            if items != raised[total]:
+                raise AutopilotError(
+                    f"another station changed its fence, which has {items:g} items and had {raised[total]:g}"
+                )
+        return changed
+
     async def _offered(self) -> bool:
-        """Whether the autopilot knows fences; only one that answers other questions surely does not."""
-        if await self._autopilot.read_parameter(self._stack.fence_switch) is not None:
+        """Whether the autopilot knows fences."""
+        if await self._parameters.read([(self._stack.fence_switch,)]):
             self.missing = ""
             return True
-        if await self._autopilot.read_parameter(self._stack.witness) is None:
-            raise AutopilotError("the autopilot stopped answering while its fence was asked for", link=True)
         self._lacks(f"the autopilot has no {self._stack.fence_switch}")
         return False
 
@@ -115,7 +141,7 @@ class MissionFence:
         self.missing = why
         log.warning("fence: the vehicle has none of its own as a last line (reason=%s)", why)
 
-    async def _raise(self, bounds: Bounds, retraces: bool) -> None:
+    async def _raise(self, spec: GrantSpec, bounds: Bounds, retraces: bool) -> None:
         owned = await asyncio.to_thread(self._load)
         if owned is None:
             owned = await self._read()
@@ -124,19 +150,52 @@ class MissionFence:
         kept = owned.items if owned.parameters.get(switch, 0.0) else ()
         if self._autopilot.vehicle.armed:
             raise AutopilotError("the motors run; the fence stays as it is")
+        if self._standing == (bounds, retraces) and await self._stands(owned):
+            return
+        self._standing = None
         # ArduPilot works out which kinds of fence are in force when it is switched on, and not again: so off first.
         try:
             await self._set({switch: 0.0})
-            await self._write((*kept, *bounds.items))
-            await self._set(
-                self._stack.fence_values(
-                    owned.parameters, ceiling_m=bounds.altitude_m, polygon=bool(bounds.items), retraces=retraces
-                )
+            vertices = await self._load_around(spec, kept)
+            values = self._stack.fence_values(
+                owned.parameters, ceiling_m=bounds.altitude_m, polygon=bool(bounds.items), retraces=retraces
             )
+            await self._set(values)
+            total = await self._parameters.read([(self._stack.fence_total,)])
+            await asyncio.to_thread(self._store, replace(owned, raised=values | total))
+            self._standing = bounds, retraces
         except (AutopilotError, asyncio.CancelledError):
             await self._recover(owned)
             raise
-        log.info("fence: raised (vertices=%d, ceiling_m=%s)", len(bounds.items), bounds.altitude_m)
+        log.info("fence: raised (vertices=%d, ceiling_m=%s)", vertices, bounds.altitude_m)
+
+    async def _load_around(self, spec: GrantSpec, kept: Sequence[Item]) -> int:
+        """Load the outer bounds beside what is kept, with fewer vertices where the vehicle has no space; how many it has."""
+        tried = -1
+        for vertices in MAX_VERTICES:
+            bounds = bounds_of(spec, vertices)
+            items = bounds.items if bounds is not None else ()
+            if len(items) == tried:
+                continue
+            tried = len(items)
+            try:
+                await self._write((*kept, *items))
+            except NoSpace as error:
+                log.warning("fence: too many items (vertices=%d, kept=%d, error=%s)", tried, len(kept), error)
+                refused = error
+            else:
+                return tried
+        raise refused
+
+    async def _stands(self, owned: Owned) -> bool:
+        """Whether the fence is as it was raised before: arming that is tried again need not load it again."""
+        try:
+            await self._keep(owned.raised)
+        except AutopilotError as error:
+            if error.link:
+                raise
+            return False
+        return True
 
     async def _recover(self, owned: Owned) -> None:
         """After a failure, put back what the owner had if that is possible at once; `lower` tries again later."""
@@ -147,6 +206,7 @@ class MissionFence:
             log.warning("fence: the owner's is not put back yet (error=%s)", str(error) or "it takes too long")
 
     async def _put_back(self, owned: Owned) -> None:
+        self._standing = None
         await self._set({self._stack.fence_switch: 0.0})
         await self._write(owned.items)
         await self._set(owned.parameters)
@@ -154,8 +214,7 @@ class MissionFence:
         log.info("fence: as its owner left it")
 
     async def _read(self) -> Owned:
-        found = {name: await self._autopilot.read_parameter(name) for name in self._stack.fence_parameters}
-        parameters = {name: value for name, value in found.items() if value is not None}
+        parameters = await self._parameters.read([(name,) for name in self._stack.fence_parameters])
         return Owned(parameters, await download(self._autopilot))
 
     async def _write(self, items: Sequence[Item]) -> None:
@@ -166,20 +225,32 @@ class MissionFence:
                 f"the autopilot stores {len(stored)} fence items that are not the {len(items)} it was sent"
             )
 
-    async def _set(self, values: dict[str, float]) -> None:
+    async def _set(self, values: Mapping[str, float]) -> tuple[str, ...]:
+        """Set parameters of the fence in their order, those that differ; which, in sentences.
+
+        Raises:
+            AutopilotError: one cannot be set, or the motors run and the fence would be switched off.
+        """
+        told = await self._parameters.read([(name,) for name in values])
+        changed = []
         for name in self._stack.fence_parameters:
-            if name not in values or await self._autopilot.read_parameter(name) == values[name]:
+            if name not in values or same(told.get(name, math.nan), values[name]):
                 continue
             if name == self._stack.fence_switch and not values[name] and self._autopilot.vehicle.armed:
                 raise AutopilotError("the motors run; the fence is not switched off")
-            after = await self._autopilot.write_parameter(name, values[name])
-            if after is None or abs(after - values[name]) > 1e-3 * max(1.0, abs(values[name])):
-                raise AutopilotError(f"{name} cannot be set to {values[name]:g}; it stays {after}")
+            after = await self._parameters.write(name, values[name])
+            if not same(after, values[name]):
+                raise AutopilotError(f"{name} cannot be set to {values[name]:g}; it stays {after:g}")
+            changed.append(f"{name} was {told.get(name, math.nan):g} and is {after:g}")
+        return tuple(changed)
 
     def _load(self) -> Owned | None:
+        remove_temporary(self._path)
         try:
             stored = json.loads(self._path.read_bytes())
-            return Owned(dict(stored["parameters"]), tuple(Item(**item) for item in stored["items"]))
+            return Owned(
+                dict(stored["parameters"]), tuple(Item(**item) for item in stored["items"]), stored.get("raised", {})
+            )
         except FileNotFoundError:
             return None
         except (ValueError, KeyError, TypeError) as error:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from fractus_core.control.values import FlightMode
+from fractus_core.policy.returning import ReturnBounds
 from fractus_core.policy.values import Airframe
 
 
@@ -40,16 +41,16 @@ Names = tuple[tuple[str, float], ...]
 
 
 class ParameterReader(Protocol):
-    """Reads parameters, and keeps what is wrong with them.
+    """Figures from the parameters that the vehicle told, and what is wrong with them.
 
     Attributes:
-        problems: which are not numbers, or lost.
+        problems: which are not numbers, or missing.
     """
 
     problems: list[str]
 
-    async def read(self, names: Names, default: float) -> float:
-        """A parameter's value; the default when it has none that can be used."""
+    def read(self, names: Names, otherwise: float, *, needed: bool = True) -> float:
+        """A figure; another when the vehicle tells none that can be used, which is a problem if it is needed."""
 
 
 class FlightStack(Protocol):
@@ -66,7 +67,11 @@ class FlightStack(Protocol):
         retracing: failsafes that bring it home on its own path; the first one tells in flight which of both was chosen.
         path_memory: the parameter with the number of points of its path that it remembers, and how many are enough to rely
             on that.
+        movement: parameters that tell how it moves, by their spellings.
+        leg_speed: the parameter with the speed of its legs, by its spellings.
+        returning: parameters that tell how high and how fast it flies home by itself, by their spellings.
         fence_switch: the parameter that switches the fence on.
+        fence_total: the parameter that counts the fence's items.
         fence_parameters: those of the fence in the order in which they are set, the switch last.
     """
 
@@ -79,8 +84,15 @@ class FlightStack(Protocol):
     straight: tuple[Setting, ...]
     retracing: tuple[Setting, ...]
     path_memory: tuple[str, float]
+    movement: tuple[tuple[str, ...], ...]
+    leg_speed: tuple[str, ...]
+    returning: tuple[tuple[str, ...], ...]
     fence_switch: str
+    fence_total: str
     fence_parameters: tuple[str, ...]
+
+    def foreign(self, vehicle_type: int, autopilot: int) -> str:
+        """What flies instead, by MAV_TYPE and MAV_AUTOPILOT of its heartbeat; empty when it is this firmware's."""
 
     def mode(self, custom_mode: int) -> FlightMode:
         """The flight mode of a heartbeat's `custom_mode`."""
@@ -97,10 +109,18 @@ class FlightStack(Protocol):
     def tells_path_lost(self, text: str) -> bool:
         """Whether a status text says that the vehicle forgot the path that it came."""
 
-    async def airframe(self, reader: ParameterReader, known: Airframe, speed_mps: float) -> tuple[Airframe, float]:
-        """How the vehicle moves, and the speed of its legs; what cannot be read is as it is known."""
+    def return_values(self, owned: Mapping[str, float], bounds: ReturnBounds) -> dict[str, float]:
+        """Parameters with which it flies home by itself no higher and no faster than it may.
 
-    async def return_altitude_m(self, reader: ParameterReader, known_m: float) -> float:
+        Args:
+            owned: the owner's, as far as the vehicle has them.
+            bounds: how high and how fast it may fly.
+        """
+
+    def airframe(self, reader: ParameterReader, known: Airframe, speed_mps: float) -> tuple[Airframe, float]:
+        """How the vehicle moves, and the speed of its legs; what cannot be used is as it is known."""
+
+    def return_altitude_m(self, reader: ParameterReader, known_m: float) -> float:
         """How high it climbs to fly home by itself, under the fence that it has by now."""
 
     def fence_values(

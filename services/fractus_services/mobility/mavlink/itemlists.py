@@ -13,6 +13,7 @@ from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.bounds import Item
 
 ANSWER_TIMEOUT_S = 1.0
+TEXT_TIMEOUT_S = 0.3
 ATTEMPTS = 4
 
 _REASONS: dict[int, str] = {
@@ -30,27 +31,38 @@ class NoLists(AutopilotError):
     """The autopilot keeps no lists of this kind."""
 
 
+class NoSpace(AutopilotError):
+    """The list is longer than what the autopilot can hold."""
+
+
 async def upload(
     autopilot: MavlinkAutopilot, items: Sequence[Item], kind: MAV_MISSION_TYPE = MAV_MISSION_TYPE.FENCE
 ) -> None:
-    """Replace a list.
+    """Replace a list; it is to be read back.
 
     Raises:
         NoLists: the autopilot has no such list.
+        NoSpace: it is too long for it.
         AutopilotError: it refuses, or falls silent.
     """
     begin = message("MISSION_COUNT", count=len(items), mission_type=kind, **autopilot.address())
-    with autopilot.listening("MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_ACK") as answers:
-        outgoing, silent = begin, 0
+    kinds = "MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_ACK"
+    with autopilot.listening(*kinds) as answers, autopilot.listening("STATUSTEXT") as texts:
+        outgoing, silent, ended = begin, 0, 0
         while True:
             autopilot.send(outgoing)
+            ended += outgoing.values.get("seq") == len(items) - 1
             answer = await _answer(answers, kind)
             if answer is None:
                 silent += 1
                 if silent == ATTEMPTS:
                     raise AutopilotError("the autopilot stopped answering while its fence was written", link=True)
             elif answer.name == "MISSION_ACK":
-                _check(answer.integer("type"))
+                if answer.integer("type") == MAV_MISSION_RESULT.ERROR and ended > 1:
+                    return  # it awaits no item any more: its answer to the last one was lost, and reading back tells which
+                if answer.integer("type") != MAV_MISSION_RESULT.ACCEPTED:
+                    await asyncio.sleep(TEXT_TIMEOUT_S)  # the texts that say why may follow the answer
+                _check(answer.integer("type"), [texts.get_nowait().text("text") for _ in range(texts.qsize())])
                 return
             # The vehicle says which item it lacks: one that was lost is asked for again, and so is one whose request was.
             elif (seq := answer.integer("seq")) < len(items):
@@ -102,11 +114,13 @@ async def _answer(answers: asyncio.Queue[Message], kind: int) -> Message | None:
         return None
 
 
-def _check(result: int) -> None:
+def _check(result: int, texts: Sequence[str] = ()) -> None:
     if result == MAV_MISSION_RESULT.UNSUPPORTED:
         raise NoLists("the autopilot keeps no fence items")
     if result != MAV_MISSION_RESULT.ACCEPTED:
-        raise AutopilotError(f"the autopilot refused the fence: {_REASONS.get(result, f'result {result}')}")
+        why = ": ".join(filter(None, (_REASONS.get(result, f"result {result}"), "; ".join(texts))))
+        kind = NoSpace if result == MAV_MISSION_RESULT.NO_SPACE else AutopilotError
+        raise kind(f"the autopilot refused the fence: {why}")
 
 
 def _item(autopilot: MavlinkAutopilot, item: Item, seq: int, kind: MAV_MISSION_TYPE) -> Message:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import random
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_COMPONENT, MAV_STATE, MAV_T
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
+from fractus_services.mobility.mavlink.timing import PROBE_S, Timing
 from fractus_services.mobility.mavlink.transport import BadUrl, Transport, open_link
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 
@@ -43,6 +45,7 @@ class Link:
 
     Attributes:
         vehicle: the streamed state.
+        timing: how late that comes, and how late commands take effect.
         target: system and component of the vehicle, from its first heartbeat until the connection breaks.
     """
 
@@ -63,6 +66,7 @@ class Link:
         self._on_found = on_found
         self._on_heartbeat = on_heartbeat
         self.vehicle = Vehicle(stack=stack)
+        self.timing = Timing()
         self._endpoint = Endpoint(sysid, COMPONENT_ID)
         self._transport: Transport | None = None
         self.target: tuple[int, int] | None = None
@@ -84,6 +88,21 @@ class Link:
     def connected(self) -> bool:
         """Whether the vehicle is heard."""
         return self.target is not None and self.now - self.vehicle.heartbeat_at < SILENCE_S
+
+    @property
+    def pace(self) -> float:
+        """How many of the vehicle's seconds go by in one of ours."""
+        return self.timing.pace
+
+    @property
+    def latency_s(self) -> float:
+        """See `Autopilot`."""
+        return self.timing.latency_s(self.now)
+
+    @property
+    def link_problem(self) -> str:
+        """Why the link lets nothing arm; empty when nothing is wrong."""
+        return self.timing.problem(self.now)
 
     async def run(self) -> None:
         """Keep the link open until cancelled."""
@@ -113,12 +132,18 @@ class Link:
 
     async def _serve(self) -> None:
         """Heartbeats until the link breaks or falls silent."""
-        opened = self.now
+        opened = due = self.now
+        beat_at = -math.inf
         try:
             while not self._broken.is_set():
-                self.beat()
+                # The failsafe that heartbeats hold off counts the vehicle's seconds.
+                if self.now - beat_at >= HEARTBEAT_S / self.timing.pace - PROBE_S / 2:
+                    beat_at = self.now
+                    self.beat()
+                self._probe(due)
+                due = max(due + PROBE_S, self.now - PROBE_S)
                 try:
-                    async with asyncio.timeout(HEARTBEAT_S):
+                    async with asyncio.timeout_at(due):
                         await self._broken.wait()
                 except TimeoutError:
                     if self.now - max(opened, self.vehicle.heartbeat_at) > RECONNECT_AFTER_S:
@@ -129,7 +154,14 @@ class Link:
                 self._transport.close()
             self._transport = None
             self.target = None
+            self.timing.reset()
             self._lost()
+
+    def _probe(self, due: float) -> None:
+        """Measure the delay of the link."""
+        number = self.timing.request(due) if self.found else None
+        if number is not None:
+            self.send(message("TIMESYNC", ts1=number))
 
     def beat(self) -> None:
         """Send a heartbeat now, if the companion does its duty."""
@@ -179,7 +211,15 @@ class Link:
 
     def take(self, incoming: Message) -> None:
         """Hand on a message of the vehicle."""
-        self.vehicle.take(incoming, self.now)
+        at = self.now
+        if incoming.name == "GLOBAL_POSITION_INT":
+            late_s = self.timing.sampled(incoming.integer("time_boot_ms"), at)
+            if late_s is None:
+                return
+            at -= late_s
+        elif incoming.name == "TIMESYNC":
+            self.timing.replied(incoming.integer("tc1"), incoming.integer("ts1"), at)
+        self.vehicle.take(incoming, at)
         for kinds, queue in self._listeners:
             if incoming.name in kinds:
                 queue.put_nowait(incoming)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from fractus_core.policy.values import Home
 from fractus_mavlink import Message
 from fractus_mavlink.enums import (
+    EKF_STATUS_FLAGS,
     GPS_FIX_TYPE,
     MAV_MODE_FLAG,
     MAV_STATE,
@@ -20,6 +21,8 @@ from fractus_services.mobility.mavlink.flight_stack import FlightStack
 _UNKNOWN_U16 = 0xFFFF
 """What 16 bits say of a value that is not known."""
 
+_POSITIONED = EKF_STATUS_FLAGS.POS_HORIZ_ABS | EKF_STATUS_FLAGS.PRED_POS_HORIZ_ABS
+
 MIN_ERROR_M, MAX_ERROR_M = 0.5, 10.0
 """A GPS that says it is better is not believed; one that is worse gives no position."""
 
@@ -30,9 +33,11 @@ class Vehicle(VehicleState):
 
     Attributes:
         stack: the firmware that says it.
+        foreign: what flies instead of a vehicle with this firmware; empty when nothing does.
     """
 
     stack: FlightStack = field(kw_only=True)
+    foreign: str = ""
 
     def take(self, message: Message, now: float) -> None:
         """Update from one message."""
@@ -43,6 +48,7 @@ class Vehicle(VehicleState):
 
 def _heartbeat(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.heartbeat_at = now
+    vehicle.foreign = vehicle.stack.foreign(message.integer("type"), message.integer("autopilot"))
     vehicle.mode = vehicle.stack.mode(message.integer("custom_mode"))
     vehicle.armed = bool(message.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED)
     vehicle.path_lost = vehicle.path_lost and vehicle.armed
@@ -59,8 +65,10 @@ def _position(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.lat, vehicle.lon = lat_e7 / 1e7, lon_e7 / 1e7
     vehicle.altitude_m, vehicle.amsl_m = message.integer("relative_alt") / 1e3, message.integer("alt") / 1e3
     vehicle.north_mps, vehicle.east_mps, vehicle.down_mps = (message.integer(name) / 100 for name in ("vx", "vy", "vz"))
-    vehicle.courses.append((now, vehicle.north_mps, vehicle.east_mps))
-    while vehicle.courses[0][0] < now - COURSE_S:
+    told_s = message.integer("time_boot_ms") / 1e3
+    vehicle.courses.append((told_s, vehicle.north_mps, vehicle.east_mps))
+    # Also those of before a restart.
+    while not told_s - COURSE_S <= vehicle.courses[0][0] <= told_s:
         vehicle.courses.popleft()
     heading_cdeg = message.integer("hdg")
     if heading_cdeg != _UNKNOWN_U16:
@@ -77,6 +85,8 @@ def _attitude(vehicle: Vehicle, message: Message, now: float) -> None:
 
 def _home(vehicle: Vehicle, message: Message, _now: float) -> None:
     lat, lon = message.integer("latitude") / 1e7, message.integer("longitude") / 1e7
+    if lat == 0.0 and lon == 0.0:
+        return  # as of the position: home is not set
     vehicle.home = Home(lat, lon, message.integer("altitude") / 1e3)
 
 
@@ -84,7 +94,7 @@ def _landed(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.landed_state, vehicle.landed_at = message.integer("landed_state"), now
 
 
-def _status(vehicle: Vehicle, message: Message, _now: float) -> None:
+def _status(vehicle: Vehicle, message: Message, now: float) -> None:
     # -1 and 0xFFFF: the autopilot does not measure it.
     percent, millivolts = message.integer("battery_remaining"), message.integer("voltage_battery")
     centiamperes = message.integer("current_battery")
@@ -94,6 +104,13 @@ def _status(vehicle: Vehicle, message: Message, _now: float) -> None:
     present = message.integer("onboard_control_sensors_present") & MAV_SYS_STATUS_SENSOR.PREARM_CHECK
     healthy = message.integer("onboard_control_sensors_health") & MAV_SYS_STATUS_SENSOR.PREARM_CHECK
     vehicle.ready = bool(healthy) if present else vehicle.fix_type >= GPS_FIX_TYPE.TYPE_3D_FIX
+    vehicle.checks_at = now
+
+
+def _estimator(vehicle: Vehicle, message: Message, now: float) -> None:
+    # The checks pass without a position in modes that need none; the flags tell whether GUIDED has what it needs.
+    vehicle.estimated = message.integer("flags") & _POSITIONED == _POSITIONED
+    vehicle.estimated_at = now
 
 
 def _gps(vehicle: Vehicle, message: Message, _now: float) -> None:
@@ -121,6 +138,7 @@ _HANDLERS = {
     "HOME_POSITION": _home,
     "EXTENDED_SYS_STATE": _landed,
     "SYS_STATUS": _status,
+    "EKF_STATUS_REPORT": _estimator,
     "GPS_RAW_INT": _gps,
     "STATUSTEXT": _text,
 }

@@ -20,6 +20,7 @@ from fractus_services.errors import AutopilotError, PreconditionFailed, Refused,
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.readiness import ready
 from fractus_services.mobility.flight.service import MobilityService, Progress
 from fractus_services.mobility.rpc.arguments import (
     acceptance_radius_m,
@@ -35,6 +36,9 @@ from fractus_services.mobility.rpc.telemetry import located, position_of, teleme
 from fractus_services.replies import decision
 
 MIN_INTERVAL_S, DEFAULT_INTERVAL_S = 0.05, 0.2
+ANSWER_S = 1.0
+"""How long before its deadline a call is answered that waits for the autopilot."""
+
 JUDGE_INTERVAL_S = 0.5
 """How often a stream of telemetry is judged again: a grant that is revoked ends it within a second."""
 
@@ -69,11 +73,11 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         self._heard = heard
         self._node = node_identity(node)
         self._clock = clock
-        self._admission = CallAdmission(grants, clock, _known, self._failed)
+        self.admission = CallAdmission(grants, clock, _known, self._failed)
 
     def _grant_of(self, caller: Caller) -> ActiveGrant:
         """The grant of a caller; a call also tells tours that a component of its application is there."""
-        grant = self._admission.grant_of(caller)
+        grant = self.admission.grant_of(caller)
         self._heard(grant)
         return grant
 
@@ -86,23 +90,23 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def GetControl(self, _request: Any, context: Any) -> None:  # noqa: N802 - the protocol's name
         """See mobility.proto."""
-        async with self._admission.call(context, lasting=True) as caller:
+        async with self.admission.call(context, lasting=True) as caller:
             grant = self._grant_of(caller)
             self._service.calls.allow(Call("GetControl"), grant)
             try:
                 # A stream lives no longer than the certificate that its connection was authenticated with.
                 async with (
-                    asyncio.timeout(max(caller.valid_until_s - self._clock(), 0.0)),
+                    asyncio.timeout(caller.left_s),
                     aclosing(self._streams.follow(grant)) as events,
                 ):
                     async for event in events:
                         await context.write(control_event(event))
             except TimeoutError:
-                caller.check(self._clock())
+                caller.check()
 
     async def ReturnControl(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._admission.call(context, urgent=True) as caller:
+        async with self.admission.call(context, urgent=True) as caller:
             grant = self._grant_of(caller)
             self._service.calls.supersede(grant)
             self._service.calls.allow(Call("ReturnControl"), grant)
@@ -113,36 +117,40 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def Arm(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._admission.call(context) as caller:
-            return mobility_pb2.ArmResponse(decision=decision(await self._service.arm(self._grant_of(caller))))
+        async with self.admission.call(context) as caller:
+            # The refusal must be there before the caller stops waiting for it.
+            patience_s = (context.time_remaining() or 0.0) - ANSWER_S
+            return mobility_pb2.ArmResponse(
+                decision=decision(await self._service.arm(self._grant_of(caller), patience_s))
+            )
 
     async def Disarm(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._admission.call(context) as caller:
+        async with self.admission.call(context) as caller:
             return mobility_pb2.DisarmResponse(decision=decision(await self._service.disarm(self._grant_of(caller))))
 
     async def Hover(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._admission.call(context, urgent=True) as caller:
+        async with self.admission.call(context, urgent=True) as caller:
             return mobility_pb2.HoverResponse(decision=decision(await self._service.hover(self._grant_of(caller))))
 
     async def SetSpeed(self, request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._admission.call(context) as caller:
+        async with self.admission.call(context) as caller:
             await self._service.calls.turn(self._grant_of(caller))
             verdict, speed = await self._service.set_speed(self._grant_of(caller), SetSpeedArgs(request.speed_mps))
             return mobility_pb2.SetSpeedResponse(decision=decision(verdict), speed_mps=speed)
 
     async def GetSpeed(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._admission.call(context) as caller:
+        async with self.admission.call(context) as caller:
             verdict = self._service.calls.allow(Call("GetSpeed"), self._grant_of(caller))
             speed = self._control.autopilot.vehicle.speed_mps
             return mobility_pb2.GetSpeedResponse(decision=decision(verdict), speed_mps=speed)
 
     async def SetVelocity(self, request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._admission.call(context) as caller:
+        async with self.admission.call(context) as caller:
             args = velocity_args(request)
             await self._service.calls.turn_to_move(self._grant_of(caller))
             verdict, flown = await self._service.set_velocity(self._grant_of(caller), args)
@@ -153,14 +161,14 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def CheckCall(self, request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._admission.call(context) as caller:
+        async with self.admission.call(context) as caller:
             call = call_of(request)
             await self._service.calls.turn(self._grant_of(caller))
             return checked(self._service.calls.check(call, self._grant_of(caller)))
 
     async def GetPosition(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
-        async with self._admission.call(context) as caller:
+        async with self.admission.call(context) as caller:
             verdict = self._service.calls.allow(Call("GetPosition"), self._grant_of(caller))
             vehicle = self._control.autopilot.vehicle
             if not located(self._control):
@@ -173,14 +181,14 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def Takeoff(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._admission.call(context, lasting=True) as caller:
+        async with self.admission.call(context, lasting=True) as caller:
             await self._service.calls.turn_to_move(self._grant_of(caller))
             progress = self._service.take_off(self._grant_of(caller), TakeoffArgs(request.altitude_m))
             await self._report(progress, context)
 
     async def Goto(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._admission.call(context, lasting=True) as caller:
+        async with self.admission.call(context, lasting=True) as caller:
             args, reached_m = goto_args(request), acceptance_radius_m(request)
             await self._service.calls.turn_to_move(self._grant_of(caller))
             progress = self._service.goto(self._grant_of(caller), args, reached_m)
@@ -188,12 +196,12 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def Land(self, _request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._admission.call(context, urgent=True) as caller:
+        async with self.admission.call(context, urgent=True) as caller:
             await self._report(self._service.land(self._grant_of(caller)), context)
 
     async def ReturnToLaunch(self, _request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._admission.call(context, urgent=True) as caller:
+        async with self.admission.call(context, urgent=True) as caller:
             await self._report(self._service.return_to_launch(self._grant_of(caller)), context)
 
     async def _report(self, progress: AsyncGenerator[Progress, None], context: Any) -> None:
@@ -209,7 +217,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     async def SubscribeTelemetry(self, request: Any, context: Any) -> None:  # noqa: N802
         """See mobility.proto."""
-        async with self._admission.call(context, lasting=True) as caller:
+        async with self.admission.call(context, lasting=True) as caller:
             node = caller.identity == self._node
             wanted = request.interval_s
             interval = max(wanted, MIN_INTERVAL_S) if math.isfinite(wanted) and wanted > 0 else DEFAULT_INTERVAL_S
@@ -218,12 +226,13 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
             while True:
                 if loop.time() - judged >= JUDGE_INTERVAL_S:
                     judged = loop.time()
-                    caller.check(self._clock())
+                    caller.check()
                     if not node:
                         self._service.calls.allow(Call("GetPosition"), self._grant_of(caller))
                 if loop.time() >= due:
                     due = loop.time() + interval
-                    await context.write(telemetry_of(self._control, self._clock(), missions=node))
+                    control = self._control
+                    await context.write(telemetry_of(control, self._clock(), missions=node, ready=ready(control)))
                 await asyncio.sleep(max(min(due - loop.time(), JUDGE_INTERVAL_S), 0.0))
 
 

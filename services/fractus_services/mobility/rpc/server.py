@@ -5,24 +5,26 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from pathlib import Path
+from functools import partial
 from typing import Any
 
-import grpc
 from fractus_core.api.nodes import Drone
 from fractus_proto.v1 import mobility_pb2_grpc
 
 from fractus_services.audit import AuditLog
 from fractus_services.auth import TlsFiles
 from fractus_services.clock import Clock
+from fractus_services.description import NodeDescription
+from fractus_services.errors import CannotServe
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import GrantFiles
-from fractus_services.hosting import read_description, run_until, serve_grpc
+from fractus_services.hosting import run_until, serve_grpc
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.fence import MissionFence
+from fractus_services.mobility.mavlink.returning import MavlinkReturn
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from fractus_services.mobility.rpc.wiring import Parts
 from fractus_services.options import MobilityOptions
@@ -32,17 +34,25 @@ log = logging.getLogger(__name__)
 DEFAULT_LINK = "tcp:127.0.0.1:5760"
 
 
-def describe(path: Path) -> tuple[str, str]:
-    """Name and autopilot link of this node, from its description where there is one.
+def _link(description: NodeDescription) -> str:
+    """The autopilot's link."""
+    features = description.value.spec.services.mobility if isinstance(description.value, Drone) else None
+    return features.connection if features is not None else DEFAULT_LINK
+
+
+async def _follow(description: NodeDescription, url: str, heard: asyncio.Event) -> None:
+    """Watch for a description with another link.
 
     Raises:
-        CannotServe: the description is no Drone manifest.
+        CannotServe: there is one, and no vehicle was ever heard on the present link.
     """
-    drone = read_description(path, Drone)
-    if not isinstance(drone, Drone):
-        return socket.gethostname(), DEFAULT_LINK
-    features = drone.spec.services.mobility
-    return drone.name, features.connection if features is not None else DEFAULT_LINK
+    while True:
+        await description.changed()
+        if _link(description) == url:
+            continue
+        if not heard.is_set():
+            raise CannotServe(f"the node's description tells another autopilot ({_link(description)}); starting again")
+        log.warning("mobility: another autopilot is described, used after a restart (url=%s)", _link(description))
 
 
 async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
@@ -52,24 +62,34 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
         CannotServe: an option is wrong; also within an ExceptionGroup.
     """
     clock = Clock()
-    name, link = describe(options.description)
-    node, url = options.node or name, options.autopilot or link
+    description = NodeDescription(options.node, options.node_object, options.description, Drone)
+    name = description.value.name if description.value is not None else socket.gethostname()
+    node, url = options.node or name, options.autopilot or _link(description)
     tls = TlsFiles(options.tls)
-    audit = AuditLog(options.audit, clock)
+    audit = AuditLog(options.audit, clock, tls=options.tls)
+    clock.stepped = audit.clock_stepped
     verifier = GrantVerifier(options.tls, options.grant_memory)
     grants = GrantFiles(options.grants, node, verifier, options.flat_terrain, audit.refused_grant)
+    heard = asyncio.Event()
+
+    def found() -> None:
+        heard.set()
+        parts.observer.found()
+
     autopilot = MavlinkAutopilot(
         url,
         ARDUCOPTER,
         # The parts need the autopilot first: they are looked up when it calls.
         alive=lambda: parts.supervisor.alive(),  # noqa: PLW0108
-        on_found=lambda: parts.observer.found(),  # noqa: PLW0108
+        on_found=found,
         on_heartbeat=lambda: parts.observer.heartbeat(),  # noqa: PLW0108
+        on_parameter=lambda name: parts.observer.parameter(name),  # noqa: PLW0108
     )
     parts = Parts(
         autopilot,
         MavlinkFailsafes(autopilot),
         MissionFence(autopilot, options.state),
+        MavlinkReturn(autopilot, options.state),
         journal=Journal(options.state),
         grants=grants,
         audit=audit,
@@ -85,11 +105,15 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
         parts.service, control, parts.streams, grants=grants, node=node, clock=clock, heard=tours.heard
     )
 
-    def register(server: grpc.aio.Server) -> None:
-        mobility_pb2_grpc.add_MobilityServiceServicer_to_server(handlers, server)
-
-    serving = serve_grpc("mobility", options.listen, tls, register)
-    await run_until(stop, autopilot.run(), grants.run(), monitor.run(), monitor.record(), tours.run(), serving)
+    register = partial(mobility_pb2_grpc.add_MobilityServiceServicer_to_server, handlers)
+    serving = serve_grpc("mobility", options.listen, tls, register, handlers.admission)
+    running = [autopilot.run(), grants.run(), monitor.run(), monitor.record(), tours.run(), serving]
+    if not options.autopilot:
+        running.append(_follow(description, url, heard))
+    try:
+        await run_until(stop, *running)
+    finally:
+        control.close()
     log.info("mobility: stopped, a drone in flight goes home by its autopilot's failsafe")
     await audit.close()
 

@@ -14,6 +14,7 @@ from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import Lease
+from fractus_services.mobility.authority.readiness import not_ready_reason
 
 CHECK_S = 0.5
 """How often a waiting caller looks whether it can go on when nothing wakes it: the autopilot's readiness wakes no one."""
@@ -54,7 +55,8 @@ class Streams:
                 async with aclosing(self._until_ready(lease)) as waiting:
                     async for reason in waiting:
                         yield ControlEvent(StreamState.WAITING, control.mission(grant).points_done, reason)
-                drivers.grant_control(control, lease)
+                if not_ready_reason(control, lease.key) is None:
+                    drivers.grant_control(control, lease)
             while True:
                 try:
                     event = await lease.next(EVENT_TIMEOUT_S)
@@ -71,7 +73,7 @@ class Streams:
     async def _until_ready(self, lease: Lease) -> AsyncGenerator[str, None]:
         control, said = self._control, ""
         while control.lease is lease:
-            reason = control.not_ready_reason(lease.key)
+            reason = not_ready_reason(control, lease.key)
             if control.state.taken(lease.key):
                 raise PreconditionFailed("ControlHeld", "another application has the drone; try again when it is back")
             if reason is None:
@@ -115,5 +117,5 @@ class Streams:
             return ControlEvent(StreamState.LOST, done, str(outcome), done)
         if self._control.state.touring == grant.key:
             return ControlEvent(StreamState.RIDING, done, "the system flies through the points of interest", done)
-        reason = self._control.not_ready_reason(grant.key) or "the system is about to take off"
+        reason = not_ready_reason(self._control, grant.key) or "the system is about to take off"
         return ControlEvent(StreamState.WAITING, done, reason, done)

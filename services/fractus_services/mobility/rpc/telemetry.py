@@ -46,13 +46,14 @@ def _ended(outcome: Outcome) -> mobility_pb2.MissionOutcome:
     return mobility_pb2.MissionOutcome(kind=_KINDS[outcome.kind], reason=outcome.reason)
 
 
-def telemetry_of(control: Control, time_s: float, missions: bool) -> Any:
+def telemetry_of(control: Control, time_s: float, *, missions: bool, ready: bool) -> Any:
     """The message that subscribers get.
 
     Args:
         control: who flies, and what.
         time_s: Unix time.
         missions: whether the subscriber may know of the missions of all applications.
+        ready: whether the motors could be started now.
     """
     vehicle = control.autopilot.vehicle
     message = mobility_pb2.Telemetry(
@@ -64,7 +65,7 @@ def telemetry_of(control: Control, time_s: float, missions: bool) -> Any:
         armed=vehicle.armed,
         in_air=vehicle.in_air,
         mode=vehicle.mode.name,
-        ready=vehicle.ready and control.checked is not None and not control.checked.problem,
+        ready=ready,
         flight_state=vehicle.flight_state,
         controller=control.state.controller,
         autopilot_connected=control.autopilot.connected,

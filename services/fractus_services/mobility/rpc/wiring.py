@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from functools import partial
 
 from fractus_core.control import ControlState
+from fractus_core.policy.returning import return_bounds
 
 from fractus_services.audit import AuditLog
-from fractus_services.grants import GrantFiles
+from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.arming import Arming
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.drivers import require
@@ -17,7 +18,7 @@ from fractus_services.mobility.authority.mode_controller import ModeController
 from fractus_services.mobility.authority.observer import Observer
 from fractus_services.mobility.authority.situation import situation_of
 from fractus_services.mobility.authority.supervisor import Supervisor
-from fractus_services.mobility.autopilot import Autopilot, Failsafes, Fence
+from fractus_services.mobility.autopilot import Autopilot, Failsafes, Fence, ReturnLimits
 from fractus_services.mobility.flight.calls import CallJudge
 from fractus_services.mobility.flight.courses import Courses
 from fractus_services.mobility.flight.guard import Guard
@@ -36,6 +37,7 @@ class Parts:
         autopilot: the link.
         failsafes: the autopilot's own.
         fence: the vehicle's own.
+        limits: of the autopilot's own way home.
         journal: what survives a restart.
         grants: grants of this node.
         audit: where decisions are written.
@@ -50,6 +52,7 @@ class Parts:
         autopilot: Autopilot,
         failsafes: Failsafes,
         fence: Fence,
+        limits: ReturnLimits,
         *,
         journal: Journal,
         grants: GrantFiles,
@@ -72,14 +75,18 @@ class Parts:
             state=state,
         )
         guard = self.guard = Guard(lambda: situation_of(control, clock()), audit)
-        homing, courses = Homing(control, guard), Courses(control, guard)
-        arming = Arming(control, failsafes, fence)
+        courses = Courses(control, guard)
+        homing = Homing(control, guard, courses)
+
+        def limit_return(grant: ActiveGrant) -> Awaitable[tuple[str, ...]]:
+            return limits.limit(return_bounds(guard.situation(), control.for_transit(grant)))
+
+        arming = Arming(control, failsafes, fence, limit_return)
         transit = TransitFlight(control, arming, guard, courses)
-        self.service = MobilityService(
-            control, arming, CallJudge(control, guard, partial(require, control)), homing.around
-        )
+        self.service = MobilityService(control, arming, CallJudge(control, guard, partial(require, control)), homing)
         self.streams = Streams(control, transit.bring)
         self.tours = Tours(control, grants, transit.launch, courses, boarding_s)
-        self.supervisor = Supervisor(control, fence)
-        self.monitor = MotionMonitor(control, guard, audit, self.supervisor)
-        self.observer = Observer(control, failsafes)
+        self.supervisor = Supervisor(control, fence, limits)
+        self.monitor = MotionMonitor(control, guard, audit, self.supervisor, homing)
+        self.observer = Observer(control, failsafes, fence, limit_return)
+        grants.listen(self.observer.grant_changed)

@@ -1,0 +1,26 @@
+"""Whether the drone can fly for a mission now, and why not."""
+
+from __future__ import annotations
+
+from fractus_core import control as core
+from fractus_core.control.values import Readiness
+
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.autopilot import BEING_SET
+
+
+def not_ready_reason(control: Control, key: str) -> str | None:
+    """Why the drone cannot fly for a mission now; None when it can."""
+    autopilot, checked = control.autopilot, control.checked
+    vehicle = autopilot.vehicle
+    located = vehicle.lat is not None and vehicle.home is not None
+    # In flight what was known before stands for what cannot be verified at the moment.
+    unverified = BEING_SET if checked is None else "" if vehicle.armed else checked.problem
+    readiness = Readiness(unverified, vehicle.unready(autopilot.now), located, autopilot.link_problem)
+    return core.not_ready_reason(control.state, key, readiness)
+
+
+def ready(control: Control) -> bool:
+    """Whether the motors could be started now."""
+    verified = control.checked is not None and not control.checked.problem
+    return verified and not control.autopilot.vehicle.unready(control.autopilot.now)

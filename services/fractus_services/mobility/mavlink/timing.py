@@ -1,0 +1,201 @@
+"""How late the vehicle's state comes and how late it obeys: measured upper bounds, in seconds of the vehicle's own clock.
+
+The autopilot stamps its positions and the TIMESYNC requests that it hears with one clock, whose offset to ours is not
+known. Let E be the latest reading of that clock that its positions prove. A request that is sent at E and heard at H
+took the vehicle at most H - E longer than the fastest position takes to come: the way there and that way back together.
+A position stamped S is E - S older than the fastest one would be. Their sum, E - S + max(H - E), bounds the time from a
+position to the effect of a command that is sent now: the unknown offset cancels, whichever way is the slower one.
+"""
+
+from __future__ import annotations
+
+import math
+import secrets
+from collections import deque
+
+from fractus_services.mobility.autopilot import MAX_POSITION_AGE_S
+
+PROBE_S = 0.2
+"""How often the delay is measured."""
+
+WINDOW_S = 10.0
+"""The longest delay of this time counts."""
+
+ENVELOPE_S = 2.0
+"""Positions of this time tell what the vehicle's clock shows now."""
+
+STALE_S = 3.0
+"""Without an answer for this time, in which fifteen were due, the delay is not known."""
+
+UNANSWERED = 10
+"""A vehicle that leaves this number of requests in a row without an answer is measured by its acknowledgements of commands."""
+
+RATE_S = (1.0, 10.0)
+"""The vehicle's clock is compared with ours over at least the first and at most the second time."""
+
+REACTION_S = 0.25
+"""What comes on top: the autopilot's loops, the time to tilt, and one command that was lost or overtaken and is sent again."""
+
+MAX_ARMING_DELAY_S, MAX_DELAY_S = 1.2, 1.8
+"""A link that delays by more than the first, there and back, lets nothing arm; above the second a flying drone hovers."""
+
+MAX_PACE = 6.0
+"""A simulator that runs faster than this multiple of real time cannot be followed."""
+
+OVERTAKEN_S = 5.0
+"""A position that is older than the last by less than this was overtaken on its way; by more: the vehicle has restarted."""
+
+_WRAP_MS = 1 << 32
+_SLACK_S = 0.5
+"""Positions may wait in the autopilot before they are sent; a reply that contradicts them by more is of another clock."""
+
+
+class Timing:
+    """Measures one link; times are our monotonic seconds unless they are said to be the vehicle's."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: another link, or a vehicle that has restarted."""
+        self._boot_ms = 0
+        self._sampled = self._arrived_at = self._resumed_at = -math.inf
+        self._samples: deque[tuple[float, float]] = deque()
+        self._history: deque[tuple[float, float]] = deque()
+        self._asked: dict[int, tuple[float, float]] = {}
+        self._delays: deque[tuple[float, float]] = deque()
+        self._unanswered = 0
+        self._heard_at = -math.inf
+        self.pace = 1.0
+
+    def sampled(self, boot_ms: int, now: float) -> float | None:
+        """Take the time stamp of a position.
+
+        Args:
+            boot_ms: the vehicle's clock; it wraps after 49 days.
+            now: when it arrived.
+
+        Returns:
+            How much later it came than the fastest of the last ones, in our seconds; None for a position that came
+            twice, or that a later one has overtaken.
+        """
+        if self._samples:
+            later_s = self._since(boot_ms)
+            if -OVERTAKEN_S < later_s <= 0.0:
+                return None
+            if later_s <= 0.0 or self._present(now) + OVERTAKEN_S < self._sampled + later_s:
+                self.reset()
+        if now - self._arrived_at > MAX_POSITION_AGE_S:
+            # What was sent while nothing came measures the gap, not the link that is back.
+            self._asked.clear()
+            self._resumed_at = now
+        self._sampled, self._boot_ms = (self._sampled + self._since(boot_ms) if self._samples else 0.0), boot_ms
+        self._arrived_at = now
+        while self._samples and self._at(self._samples[-1], now) <= self._sampled:
+            self._samples.pop()
+        self._samples.append((now, self._sampled))
+        while self._samples[0][0] < now - ENVELOPE_S:
+            self._samples.popleft()
+        self._compare(now)
+        return (self._present(now) - self._sampled) / self.pace
+
+    def _since(self, boot_ms: float) -> float:
+        """The vehicle's seconds from the last position to a reading of its clock, which may have wrapped between."""
+        return ((boot_ms - self._boot_ms + _WRAP_MS / 2) % _WRAP_MS - _WRAP_MS / 2) / 1e3
+
+    def _present(self, at: float) -> float:
+        """The latest reading of the vehicle's clock that its positions prove for a moment."""
+        return max(self._at(sample, at) for sample in self._samples)
+
+    def _at(self, sample: tuple[float, float], at: float) -> float:
+        arrived, stamp = sample
+        return stamp + self.pace * (at - arrived)
+
+    def _compare(self, now: float) -> None:
+        """How fast the vehicle's clock runs: as fast as ours, unless that is certainly wrong."""
+        if not self._history or now - self._history[-1][0] >= RATE_S[0] / 4:
+            self._history.append((now, self._sampled))
+        while self._history[0][0] < now - RATE_S[1]:
+            self._history.popleft()
+        begun, first = self._history[0]
+        if now - begun < RATE_S[0]:
+            return
+        rate, error = (self._sampled - first) / (now - begun), (max(self.delay_s, 0.0) + 0.1) / (now - begun)
+        # The error grows with what is measured by it: a delay that is not known does not count.
+        self.pace = rate + min(error, 0.1 * rate) if rate > 1.0 + min(error, 1.0) else 1.0
+
+    def request(self, due: float) -> int | None:
+        """Begin a measurement that was due at a moment: that it is sent late counts. The `ts1` of its TIMESYNC, if any.
+
+        Its number is random: replies to the requests of others are heard as well.
+        """
+        if not self._samples:
+            return None
+        for number in [number for number, (sent, _) in self._asked.items() if sent < due - STALE_S]:
+            del self._asked[number]
+        number = secrets.randbits(62) + 1
+        self._asked[number] = due, self._present(due)
+        self._unanswered += 1
+        return number
+
+    def replied(self, tc1_ns: int, ts1: int, now: float) -> None:
+        """Take a TIMESYNC message: a reply to ours once, nothing else."""
+        asked = self._asked.pop(ts1, None) if tc1_ns != 0 else None
+        if asked is None or not self._samples:
+            return
+        sent, present = asked
+        heard = self._sampled + self._since(tc1_ns / 1e6)
+        delay_s = heard - present
+        if -_SLACK_S <= delay_s <= self.pace * (now - sent) + _SLACK_S:
+            self._unanswered = 0
+            self._take(max(delay_s, 0.0), now)
+
+    def acknowledged(self, sent: float, now: float) -> None:
+        """Take the acknowledgement of a command: of a vehicle that answers no TIMESYNC its round trip is the bound.
+
+        A command that was sent again until the link was back measures the gap.
+        """
+        resumed = sent >= self._resumed_at and now - self._arrived_at <= MAX_POSITION_AGE_S
+        if self.unanswering and resumed:
+            self._take(self.pace * (now - sent), now)
+
+    @property
+    def unanswering(self) -> bool:
+        """Whether the vehicle answers no TIMESYNC."""
+        return self._unanswered >= UNANSWERED
+
+    def _take(self, delay_s: float, now: float) -> None:
+        self._heard_at = now
+        self._delays.append((now, delay_s))
+        while self._delays[0][0] < now - WINDOW_S:
+            self._delays.popleft()
+
+    @property
+    def delay_s(self) -> float:
+        """The longest delay of late, there and back, in the vehicle's seconds; infinite while there is none."""
+        return max((delay_s for _, delay_s in self._delays), default=math.inf)
+
+    def latency_s(self, now: float) -> float:
+        """The vehicle's seconds from its last position to the effect of a command that is sent now; infinite: not known."""
+        if now - self._heard_at > STALE_S or self.delay_s > MAX_DELAY_S:
+            return math.inf
+        age_s = self._present(now) - self._sampled
+        return age_s + self.delay_s + REACTION_S if age_s <= MAX_POSITION_AGE_S else math.inf
+
+    def problem(self, now: float) -> str:
+        """Why nothing may arm over this link; empty when nothing is wrong."""
+        if self.pace > MAX_PACE:
+            return (
+                f"the autopilot's clock runs {self.pace:.1f} times as fast as real time, and more than {MAX_PACE:g} times"
+                " cannot be followed; run the simulator slower"
+            )
+        if now - self._heard_at > STALE_S:
+            return (
+                "the delay of the autopilot's link is not known: it answers neither TIMESYNC nor commands at the moment"
+            )
+        if self.delay_s > MAX_ARMING_DELAY_S:
+            return (
+                f"the autopilot's link delays by {self.delay_s:.1f} s there and back, and only up to {MAX_ARMING_DELAY_S} s"
+                " can be flown with; use a faster link"
+            )
+        return ""

@@ -1,0 +1,608 @@
+"""The mobility service and the simulated vehicle in one loop of virtual time, on a link that delays and loses frames.
+
+Everything but the driver is the product: parameters, failsafes and the vehicle's own fence are set over the link, calls are
+judged, motions flown, monitored and ended. A flight is a seed: a scene of zones and limits, a driver's programme, the link's
+figures, the wind, and what goes wrong on the way. An oracle watches the vehicle's true position, which no part of the service
+sees, and shares no code with the policy engine but the names of things.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import shapely
+from fractus_core.api.plans import GrantSpec
+from fractus_core.control import ControlEvent, ControlState, StreamState
+from fractus_core.policy.values import SetSpeedArgs, TakeoffArgs, VelocityArgs
+from fractus_mavlink import Parser
+from fractus_services.errors import AutopilotError, Refused
+from fractus_services.grants import ActiveGrant
+from fractus_services.mobility.authority.journal import Journal
+from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
+from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
+from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
+from fractus_services.mobility.mavlink.fence import MissionFence
+from fractus_services.mobility.mavlink.returning import MavlinkReturn
+from fractus_services.mobility.rpc.wiring import Parts
+from fractus_vehicle.earth import Place
+from fractus_vehicle.simulation import Simulation
+from fractus_vehicle.state import CONTROL_STEP_S, VehicleConfig, VehicleState
+from mobility_world import FRAME, Grants, Loop, area, goto, spec, zone
+
+LIMIT_S = 400.0
+"""No flight takes longer."""
+
+HALF_M = 130.0
+"""The operation area reaches this far from home, to each side."""
+
+WATCH_S = 0.05
+HEIGHT_SLACK_M, SPEED_SLACK_MPS = 2.0, 0.6
+"""What docs/policies.md promises of heights; and what gusts and the autopilot's own overshoot add to a speed."""
+
+REACTION_S = 0.4
+"""Until what has changed is acted on: 0.2 s is promised; a vehicle that has turned its motors needs as long again."""
+
+BRAKING_SHARE, MAX_BRAKING_MPS2 = 0.64, 1.6
+"""ArduCopter's BRAKE from 6.4 m/s takes 10.6 m, from 9.6 m/s 19.6 m with WPNAV_ACCEL 250: the mean of it, with some wind from
+behind; a vehicle that accelerates less brakes less."""
+
+
+@dataclass(frozen=True)
+class Weather:
+    """What a flight meets.
+
+    Attributes:
+        there_s: from the companion to the vehicle; jitter adds up to half of it.
+        back_s: from the vehicle to the companion.
+        loss: share of frames that are lost, in each direction.
+        wind_mps: mean wind.
+        gusts_mps: of the wind.
+        speedup: the vehicle's time in seconds a second.
+        cut: when the link is cut, and for how long; None: never.
+    """
+
+    there_s: float = 0.0
+    back_s: float = 0.0
+    loss: float = 0.0
+    wind_mps: float = 0.0
+    gusts_mps: float = 0.0
+    speedup: int = 1
+    cut: tuple[float, float] | None = None
+
+
+TURN_S = 1e-7
+"""What a turn of the loop takes: without it, who waits for the rest of a rounded period would never see its end."""
+
+
+class Wire(asyncio.Transport):
+    """The companion's end of a link: whole frames, late and in order, or lost."""
+
+    def __init__(self, loop: Sky, protocol: asyncio.Protocol) -> None:
+        super().__init__()
+        self._loop, self._protocol = loop, protocol
+        self._channel = loop.craft.open("companion")
+        self._parser = Parser()
+        self._arrivals = {True: 0.0, False: 0.0}
+        self._open = True
+
+    def write(self, data: Any) -> None:
+        self._carry(bytes(data), self._loop.weather.there_s, self._to_vehicle, there=True)
+
+    def _to_vehicle(self, data: bytes) -> None:
+        if self._open:
+            self._loop.craft.receive(self._channel, data)
+
+    def _to_companion(self, data: bytes) -> None:
+        if self._open:
+            self._protocol.data_received(data)
+
+    def flush(self) -> None:
+        """Send what the vehicle has said."""
+        for message in self._parser.feed(self._channel.take()):
+            self._carry(message.frame, self._loop.weather.back_s, self._to_companion, there=False)
+
+    def _carry(self, data: bytes, delay_s: float, deliver: Callable[[bytes], None], *, there: bool) -> None:
+        loop = self._loop
+        if not self._open or loop.severed or loop.chance.random() < loop.weather.loss:
+            return
+        arrives = max(loop.time() + delay_s * loop.chance.uniform(1.0, 1.5), self._arrivals[there])
+        self._arrivals[there] = arrives
+        loop.call_at(arrives, deliver, data)
+
+    def close(self) -> None:
+        self._open = False
+        self._loop.craft.close(self._channel)
+
+    def is_closing(self) -> bool:
+        return not self._open
+
+
+class Sky(Loop):
+    """An event loop whose only network is a link to a simulated vehicle."""
+
+    def __init__(self, seed: int, weather: Weather, parameters: dict[str, float]) -> None:
+        super().__init__()
+        self.chance = random.Random(seed)
+        self.weather = weather
+        self.severed = False
+        place = Place.from_degrees(39.36, 22.95, 10.0)
+        wind = {"SIM_WIND_SPD": weather.wind_mps, "SIM_WIND_DIR": float(seed % 360), "SIM_WIND_TURB": weather.gusts_mps}
+        config = VehicleConfig(start=place, seed=seed, ready_after_s=2.0, parameters=wind | parameters)
+        self.simulation = Simulation([config])
+        self.craft = self.simulation.crafts[0]
+        self.wires: list[Wire] = []
+
+    def _run_once(self) -> None:
+        self._now += TURN_S
+        super()._run_once()  # type: ignore[misc]
+
+    @property
+    def truth(self) -> VehicleState:
+        """What the vehicle is, not what it says."""
+        return self.craft.vehicle.state
+
+    async def create_connection(self, factory: Any, *_: Any, **__: Any) -> Any:  # type: ignore[override]
+        protocol = factory()
+        if self.severed:
+            raise OSError("unreachable")
+        wire = Wire(self, protocol)
+        self.wires = [each for each in self.wires if not each.is_closing()] + [wire]
+        protocol.connection_made(wire)
+        return wire, protocol
+
+    async def turn(self) -> None:
+        """The vehicle's time, until cancelled."""
+        while True:
+            for _ in range(self.weather.speedup):
+                self.simulation.step()
+            for wire in self.wires:
+                wire.flush()
+            await asyncio.sleep(CONTROL_STEP_S)
+
+
+@dataclass
+class Wall:
+    """A zone as the oracle sees it.
+
+    Attributes:
+        box: where it is not allowed, metres around home.
+        low_m: above home.
+        high_m: above home.
+        excused: the drone could not help entering it when it appeared; until it has left.
+    """
+
+    box: shapely.Geometry
+    low_m: float
+    high_m: float
+    excused: bool = False
+
+
+@dataclass
+class Rules:
+    """What holds at a moment.
+
+    Attributes:
+        walls: where the drone must not be.
+        ceiling_m: above home.
+        top_mps: over ground.
+        since_s: when ceiling or speed became what they are.
+    """
+
+    walls: list[Wall] = field(default_factory=list)
+    ceiling_m: float = 60.0
+    top_mps: float = 12.0
+    since_s: float = -math.inf
+
+
+@dataclass
+class Account:
+    """What became of a flight.
+
+    Attributes:
+        seed: of it.
+        wrong: what must not be, in words.
+        events: what happened, for people.
+        flew: whether it left the ground.
+        down: whether it is back there, with its motors off.
+        depth_m: the deepest that it was in a zone.
+    """
+
+    seed: int
+    wrong: list[str] = field(default_factory=list)
+    events: list[str] = field(default_factory=list)
+    flew: bool = False
+    down: bool = False
+    depth_m: float = 0.0
+
+
+class Oracle:
+    """Watches the true position."""
+
+    def __init__(self, sky: Sky, account: Account) -> None:
+        self._sky, self._account = sky, account
+        self.rules = Rules()
+        self.arena = shapely.box(-HALF_M, -HALF_M, HALF_M, HALF_M)
+        self._said: set[str] = set()
+
+    def place(self) -> tuple[float, float, float]:
+        """East, north and height in metres, truly."""
+        truth = self._sky.truth.true_place
+        x, y = FRAME.xy(truth.lat_e7 / 1e7, truth.lon_e7 / 1e7)
+        return float(x), float(y), -self._sky.truth.body.down
+
+    def speeds(self) -> tuple[float, float]:
+        """Over ground, and up."""
+        body = self._sky.truth.body
+        return math.hypot(body.vn, body.ve), -body.vd
+
+    def unavoidable_m(self) -> float:
+        """How far a drone flies that is told to stop at this moment."""
+        weather, (speed, _) = self._sky.weather, self.speeds()
+        late_s = REACTION_S + 1.5 * (weather.there_s + weather.back_s)
+        if weather.loss:
+            late_s += 0.4  # two frames lost in a row
+        accel_mps2 = self._sky.truth.params["WPNAV_ACCEL"] / 100.0
+        return speed * late_s + speed * speed / (2 * min(BRAKING_SHARE * accel_mps2, MAX_BRAKING_MPS2)) + 1.0
+
+    def appears(self, wall: Wall) -> None:
+        """A zone is in force from now on."""
+        x, y, height = self.place()
+        _, climb = self.speeds()
+        near = wall.box.distance(shapely.Point(x, y)) < self.unavoidable_m()
+        reach = 4.0 + 2.0 * abs(climb)
+        wall.excused = near and wall.low_m - reach < height < wall.high_m + reach
+        self.rules.walls.append(wall)
+
+    async def run(self) -> None:
+        while True:
+            self._look()
+            await asyncio.sleep(WATCH_S)
+
+    def _look(self) -> None:
+        truth = self._sky.truth
+        x, y, height = self.place()
+        if height < 0.7 or not truth.armed:
+            return
+        self._account.flew = True
+        here = shapely.Point(x, y)
+        for number, wall in enumerate(self.rules.walls):
+            inside = wall.low_m < height < wall.high_m and wall.box.contains(here)
+            if wall.excused:
+                wall.excused = inside or wall.box.distance(here) < 0.5 * self.unavoidable_m() + 2.0
+            elif inside:
+                depth = float(wall.box.exterior.distance(here))
+                self._account.depth_m = max(self._account.depth_m, depth)
+                self._wrong(f"zone {number}", f"{depth:.1f} m deep at ({x:.0f}, {y:.0f}, {height:.0f})")
+        if not self.arena.contains(here):
+            self._wrong("area", f"outside by {self.arena.distance(here):.1f} m")
+        speed, climb = self.speeds()
+        settled = self._sky.time() - self.rules.since_s
+        high = height > self.rules.ceiling_m + HEIGHT_SLACK_M
+        if high and settled > 4.0 + abs(climb) and (climb > 0.3 or settled > 60.0):
+            self._wrong("height", f"{height:.1f} m above a limit of {self.rules.ceiling_m:.1f}")
+        excess = speed - self.rules.top_mps - SPEED_SLACK_MPS - 0.3 * self._sky.weather.gusts_mps
+        if excess > 0.0 and settled > 5.0 + self.unavoidable_m() / 4.0:
+            self._wrong("speed", f"{speed:.1f} m/s above a limit of {self.rules.top_mps:.1f}")
+
+    def _wrong(self, kind: str, what: str) -> None:
+        if kind in self._said:
+            return
+        self._said.add(kind)
+        mode = self._sky.truth.mode.name
+        self._account.wrong.append(f"{kind}: {what} at {self._sky.time() - 1000:.1f} s in {mode}")
+
+
+class Drone:
+    """The mobility service of one drone, without its gRPC server."""
+
+    def __init__(self, directory: Path, account: Account, *, grace_s: float = 10.0) -> None:
+        self.grants = Grants()
+        self._account = account
+        self.audit = SimpleNamespace(append=self._append, failure="")
+        self.autopilot = MavlinkAutopilot(
+            "tcp:vehicle:1",
+            ARDUCOPTER,
+            # The parts need the autopilot first: they are looked up when it calls.
+            alive=lambda: self.parts.supervisor.alive(),  # noqa: PLW0108
+            on_found=lambda: self.parts.observer.found(),  # noqa: PLW0108
+            on_heartbeat=lambda: self.parts.observer.heartbeat(),  # noqa: PLW0108
+            on_parameter=lambda name: self.parts.observer.parameter(name),  # noqa: PLW0108
+        )
+        self.journal = Journal(directory)
+        self.journal._write = lambda _data: None  # type: ignore[method-assign]
+        self.parts = Parts(
+            self.autopilot, MavlinkFailsafes(self.autopilot), MissionFence(self.autopilot, directory), MavlinkReturn(self.autopilot, directory),
+            journal=self.journal, grants=self.grants, audit=self.audit,  # type: ignore[arg-type]
+            clock=lambda: 1_790_000_000.0 + self.autopilot.now, grace_s=grace_s, boarding_s=0.0, state=ControlState(),
+        )  # fmt: skip
+        parts = self.parts
+        self.control, self.service, self.streams = parts.control, parts.service, parts.streams
+        work = (self.autopilot.run(), parts.monitor.run(), parts.tours.run())
+        self.tasks = [asyncio.ensure_future(part) for part in work]
+        self.state = StreamState.WAITING
+        self._last = ""
+
+    def _append(self, kind: str, content: dict[str, Any], **_: Any) -> None:
+        if kind != "state":
+            now = asyncio.get_running_loop().time() - 1000
+            told = {key: value for key, value in content.items() if key in _TOLD and value}
+            line = f"{kind} {told}"
+            if line != self._last:
+                self._account.events.append(f"{now:7.2f} {line}")
+            self._last = line
+
+    async def close(self) -> None:
+        self.control.close()
+        while tasks := [task for task in (*self.tasks, *self.control.tasks._tasks) if not task.done()]:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def follow(self, grant: ActiveGrant) -> None:
+        """A driver's stream, to its end."""
+        with contextlib.suppress(Refused):
+            async for event in self.streams.follow(grant):
+                self.heard(event)
+
+    def heard(self, event: ControlEvent) -> None:
+        self.state = event.state
+        self._account.events.append(f"{self.autopilot.now - 1000:7.2f} stream {event.state.name} {event.reason}")
+
+
+_TOLD = frozenset({"method", "action", "code", "reason", "takeover", "change", "controller", "outcome"})
+
+
+class Flight:
+    """One seeded flight."""
+
+    def __init__(self, seed: int, directory: Path, weather: Weather, sky: Sky) -> None:
+        self.chance = random.Random(seed)
+        self.weather, self.sky = weather, sky
+        self.account = Account(seed)
+        self.oracle = Oracle(sky, self.account)
+        self.drone = Drone(directory, self.account)
+        self.policies: list[dict[str, Any]] = []
+        self.changed = False
+
+    def _box(self) -> tuple[float, float, float, float]:
+        """A box that leaves home, and ways around it, alone."""
+        chance = self.chance
+        while True:
+            x, y = chance.uniform(-100, 100), chance.uniform(-100, 100)
+            wide, high = chance.uniform(6, 35), chance.uniform(6, 35)
+            box = x - wide, y - high, x + wide, y + high
+            if shapely.box(*box).distance(shapely.Point(0, 0)) > 18.0 and max(map(abs, box)) < HALF_M - 12.0:
+                return box
+
+    def _box_ahead(self) -> tuple[float, float, float, float]:
+        """A box in the way of a drone that can still stop before it: on its course, or between it and home."""
+        chance, body = self.chance, self.sky.truth.body
+        x, y, _ = self.oracle.place()
+        speed, _ = self.oracle.speeds()
+        east, north = (body.ve / speed, body.vn / speed) if speed > 1.0 else (-x, -y)
+        length = math.hypot(east, north) or 1.0
+        wide, high = chance.uniform(4, 20), chance.uniform(4, 20)
+        away = self.oracle.unavoidable_m() + chance.uniform(0.5, 20)
+        for _ in range(100):
+            cx, cy = x + east / length * away, y + north / length * away
+            box = cx - wide, cy - high, cx + wide, cy + high
+            if shapely.box(*box).distance(shapely.Point(x, y)) > self.oracle.unavoidable_m():
+                home_m = shapely.box(*box).distance(shapely.Point(0, 0))
+                return box if home_m > 12.0 and max(map(abs, box)) < HALF_M - 12.0 else self._box()
+            away += 1.0
+        return self._box()
+
+    def add_zone(self, *, ahead: bool = False) -> None:
+        """One more zone, now."""
+        chance, box = self.chance, self._box_ahead() if ahead else self._box()
+        if any(wall.box.distance(shapely.box(*box)) < 25.0 for wall in self.oracle.rules.walls):
+            return
+        action = chance.choice(["ignore", "adjust", "hover", "returnToLaunch", "land"])
+        name = f"z{len(self.policies)}"
+        policy = zone(name, action, *box)
+        low, high = -math.inf, math.inf
+        if chance.random() < 0.25:
+            low, high = chance.choice([(-5.0, 14.0), (18.0, 60.0)])
+            policy["zones"][0]["altitude"] = {"lower": low, "upper": high, "reference": "home"}
+        self.policies.append(policy)
+        self.account.events.append(
+            f"{self.sky.time() - 1000:7.2f} zone {name} {action} {[round(e) for e in box]} {low}..{high}"
+        )
+        self.oracle.appears(Wall(shapely.box(*box), low, high))
+
+    def add_limit(self) -> None:
+        """A limit of height or of speed, now."""
+        chance, rules = self.chance, self.oracle.rules
+        name = f"l{len(self.policies)}"
+        kind = chance.choice(["altitude", "speed"])
+        value = round(chance.uniform(9, 25) if kind == "altitude" else chance.uniform(2.5, 7), 1)
+        spec = {"type": "LimitControl", "kind": kind, "upperLimit": value}
+        self.policies.append({"name": name, "spec": spec})
+        if kind == "altitude" and value < rules.ceiling_m:
+            rules.ceiling_m, rules.since_s = value, self.sky.time()
+        elif kind == "speed" and value < rules.top_mps:
+            rules.top_mps, rules.since_s = value, self.sky.time()
+        self.account.events.append(f"{self.sky.time() - 1000:7.2f} limit {kind} {value}")
+
+    def spec(self) -> GrantSpec:
+        half = HALF_M
+        return spec(*self.policies, operationArea=[area(-half, -half, half, half)])
+
+    @property
+    def grant(self) -> ActiveGrant:
+        """The driver's, as it is now: every call is judged by what holds when it comes."""
+        (grant,) = self.drone.grants.active.values()
+        return grant
+
+    async def fly(self) -> Account:
+        chance, drone = self.chance, self.drone
+        for _ in range(chance.randrange(4)):
+            self.add_zone()
+        for _ in range(chance.randrange(3)):
+            self.add_limit()
+        turning = [asyncio.ensure_future(self.sky.turn()), asyncio.ensure_future(self.oracle.run())]
+        grant = drone.grants.put(self.spec())
+        following = asyncio.ensure_future(drone.follow(grant))
+        trouble = asyncio.ensure_future(self._trouble())
+        try:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(LIMIT_S):
+                    await self._drive(following)
+                    await self._landed()
+                    self.account.down = True
+            if not self.account.down:
+                self.account.wrong.append(f"not down after {LIMIT_S:.0f} s, in {self.sky.truth.mode.name}")
+        finally:
+            for task in (following, trouble, *turning):
+                task.cancel()
+            await asyncio.gather(following, trouble, *turning, return_exceptions=True)
+            await drone.close()
+        return self.account
+
+    async def _landed(self) -> None:
+        await self._until(lambda: not self.sky.truth.armed)
+
+    async def _until(self, condition: Callable[[], object]) -> None:
+        while not condition():  # noqa: ASYNC110 - the simulation tells no one
+            await asyncio.sleep(0.2)
+
+    async def _drive(self, following: asyncio.Task[None]) -> None:
+        """The driver's programme: it tries what comes to its mind, and gives up when the drone is not its own."""
+        drone, chance = self.drone, self.chance
+        try:
+            async with asyncio.timeout(90):
+                await self._until(lambda: drone.state is StreamState.GRANTED and drone.autopilot.vehicle.ready)
+                while True:
+                    try:
+                        await drone.service.arm(self.grant)
+                        break
+                    except (Refused, AutopilotError) as error:
+                        self.account.events.append(f"{drone.autopilot.now - 1000:7.2f} arm {error}")
+                        await asyncio.sleep(2.0)
+        except TimeoutError:
+            return
+        with contextlib.suppress(Refused, AutopilotError):
+            await self._finish(drone.service.take_off(self.grant, TakeoffArgs(chance.uniform(8, 30))))
+        for _ in range(chance.randrange(3, 9)):
+            if drone.state is not StreamState.GRANTED or following.done():
+                break
+            try:
+                await self._leg()
+            except (Refused, AutopilotError) as error:
+                self.account.events.append(f"{drone.autopilot.now - 1000:7.2f} refused {error}")
+                await asyncio.sleep(0.3)
+        if drone.state is StreamState.GRANTED and not following.done():
+            with contextlib.suppress(Refused, AutopilotError):
+                if chance.random() < 0.5:
+                    await self._finish(drone.service.return_to_launch(self.grant))
+        following.cancel()  # A driver that dies, or has landed: the system brings home what still flies.
+
+    async def _leg(self) -> None:
+        chance, service = self.chance, self.drone.service
+        kind = chance.random()
+        x, y = chance.uniform(-1, 1) * (HALF_M + 5), chance.uniform(-1, 1) * (HALF_M + 5)
+        if kind < 0.5:
+            speed = chance.choice([None, chance.uniform(1, 14)])
+            leg = goto(x, y, chance.uniform(4, 40), speed_mps=speed)
+            self._tells(f"goto ({x:.0f}, {y:.0f}, {leg.alt:.0f}) at {speed}")
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(chance.uniform(3, 60) if chance.random() < 0.4 else None):
+                    await self._finish(service.goto(self.grant, leg, 0.0))
+        elif kind < 0.85:
+            angle, speed = chance.uniform(0, 2 * math.pi), chance.uniform(0.5, 14)
+            up = chance.choice([0.0, 0.0, chance.uniform(-1.5, 2.0)])
+            self._tells(f"velocity {speed:.1f} toward {math.degrees(angle):.0f} deg, up {up:.1f}")
+            end = self.drone.autopilot.now + chance.uniform(1, 20)
+            while self.drone.autopilot.now < end:
+                args = VelocityArgs(
+                    speed * math.cos(angle), speed * math.sin(angle), -up, None, chance.choice([0.5, 1.5])
+                )
+                with contextlib.suppress(Refused):
+                    await service.set_velocity(self.grant, args)
+                angle += chance.uniform(-0.1, 0.1)
+                await asyncio.sleep(chance.choice([0.1, 0.2, 0.4]))
+        elif kind < 0.93:
+            await service.hover(self.grant)
+            await asyncio.sleep(chance.uniform(0, 4))
+        else:
+            await service.set_speed(self.grant, SetSpeedArgs(chance.uniform(1, 14)))
+
+    def _tells(self, what: str) -> None:
+        self.account.events.append(f"{self.drone.autopilot.now - 1000:7.2f} asks {what}")
+
+    async def _finish(self, motion: Any) -> None:
+        async with contextlib.aclosing(motion):
+            async for _ in motion:
+                pass
+
+    async def _trouble(self) -> None:
+        """Zones and limits that appear at any moment, also on the way home, and a link that is cut."""
+        chance = self.chance
+        await self._until(lambda: self.account.flew)
+        if self.weather.cut is not None:
+            asyncio.get_running_loop().call_later(self.weather.cut[0], self._sever)
+        for _ in range(chance.randrange(6)):
+            await asyncio.sleep(chance.uniform(2, 30))
+            if chance.random() < 0.75:
+                self.add_zone(ahead=chance.random() < 0.7)
+            else:
+                self.add_limit()
+            self.drone.grants.put(self.spec())
+
+    def _sever(self) -> None:
+        assert self.weather.cut is not None
+        self.sky.severed = True
+        self.account.events.append(f"{self.sky.time() - 1000:7.2f} link cut")
+        self.sky.call_later(self.weather.cut[1], self._reconnect)
+
+    def _reconnect(self) -> None:
+        self.sky.severed = False
+        self.account.events.append(f"{self.sky.time() - 1000:7.2f} link back")
+
+
+def weather_of(seed: int) -> Weather:
+    """What the flight of a seed meets."""
+    chance = random.Random(seed * 7 + 1)
+    bad = chance.random() < 0.7
+    cut = (chance.uniform(3, 60), chance.uniform(0.5, 8)) if chance.random() < 0.15 else None
+    return Weather(
+        there_s=chance.uniform(0, 0.25) if bad else 0.0,
+        back_s=chance.uniform(0, 0.25) if bad else 0.0,
+        loss=chance.choice([0.0, 0.03, 0.1]) if bad else 0.0,
+        wind_mps=chance.choice([0.0, 0.0, 3.0, 6.0]),
+        gusts_mps=chance.choice([0.0, 1.0]),
+        cut=cut,
+    )
+
+
+def parameters_of(seed: int) -> dict[str, float]:
+    """Another owner's vehicle: how it accelerates and how it comes home."""
+    chance = random.Random(seed * 11 + 5)
+    if chance.random() < 0.5:
+        return {}
+    return {
+        "WPNAV_ACCEL": float(chance.choice([100, 150, 250, 400])),
+        "WPNAV_SPEED": float(chance.choice([300, 800, 1200])),
+        "RTL_ALT": float(chance.choice([0, 1500, 4000])),
+        "RTL_SPEED": float(chance.choice([0, 0, 800])),
+    }
+
+
+def flight(seed: int, directory: Path, weather: Weather | None = None) -> Account:
+    """Fly one seed."""
+    weather = weather or weather_of(seed)
+    sky = Sky(seed, weather, parameters_of(seed))
+
+    async def flying() -> Account:
+        return await Flight(seed, directory, weather, sky).fly()
+
+    with asyncio.Runner(loop_factory=lambda: sky) as runner:
+        return runner.run(flying())

@@ -1,0 +1,186 @@
+"""Drivers that fly at a wall as fast as they are let, over links of every delay: how far from it the drone stays.
+
+The service and the vehicle are those of `closed_loop`; the distance is the true one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import random
+import tempfile
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import shapely
+from closed_loop import HALF_M, Account, Drone, Oracle, Sky, Weather
+from fractus_core.api.plans import GrantSpec
+from fractus_core.control import StreamState
+from fractus_core.policy.values import TakeoffArgs, VelocityArgs
+from fractus_services.errors import AutopilotError, Refused
+from fractus_services.grants import ActiveGrant
+from mobility_world import area, goto, spec, zone
+
+WALL = shapely.box(-120.0, 60.0, 120.0, 90.0)
+
+
+@dataclass
+class Attempt:
+    """One driver, one wall.
+
+    Attributes:
+        kept_m: the least true distance from the wall; negative inside.
+        permitted: how many setpoints were.
+        denied: how many were not.
+        problem: why the drone did not fly at all.
+    """
+
+    kept_m: float = math.inf
+    permitted: int = 0
+    denied: int = 0
+    problem: str = ""
+    account: Account | None = None
+
+
+Pilot = Callable[["Flown"], Awaitable[None]]
+
+
+@dataclass
+class Flown:
+    """What a driver has in its hands."""
+
+    drone: Drone
+    chance: random.Random
+    attempt: Attempt
+    oracle: Oracle
+    walls: list[shapely.Polygon]
+    grant: ActiveGrant = field(init=False)
+
+    def spec(self) -> GrantSpec:
+        """The grant as the walls are by now."""
+        zones = [zone(f"wall-{number}", "ignore", *wall.bounds) for number, wall in enumerate(self.walls)]
+        return spec(*zones, operationArea=[area(-HALF_M, -HALF_M, HALF_M, HALF_M)])
+
+    def put(self) -> ActiveGrant:
+        """Let the walls hold."""
+        self.grant = self.drone.grants.put(self.spec())
+        return self.grant
+
+    async def fly(self, north: float, east: float, hold_s: float) -> bool:
+        """Ask for a velocity."""
+        try:
+            await self.drone.service.set_velocity(self.grant, VelocityArgs(north, east, 0.0, None, hold_s))
+        except (Refused, AutopilotError):
+            self.attempt.denied += 1
+            return False
+        self.attempt.permitted += 1
+        return True
+
+    async def to(self, x: float, y: float, speed: float = 10.0) -> None:
+        """Fly to a place."""
+        async with contextlib.aclosing(
+            self.drone.service.goto(self.grant, goto(x, y, 15, speed_mps=speed), 0.0)
+        ) as leg:
+            async for _ in leg:
+                pass
+
+
+async def straight(flown: Flown) -> None:
+    """As fast as it goes, again and again after each refusal."""
+    chance = flown.chance
+    speed, hold_s, every_s = chance.uniform(6, 12), chance.choice([0.5, 1.0, 2.0]), chance.choice([0.05, 0.1, 0.2])
+    for _ in range(int(14 / every_s)):
+        await flown.fly(speed, chance.uniform(-0.5, 0.5), hold_s)
+        await asyncio.sleep(every_s)
+
+
+async def bursts(flown: Flown) -> None:
+    """Setpoints of all directions in quick succession, more of them toward the wall."""
+    chance = flown.chance
+    for _ in range(100):
+        angle = chance.gauss(0.0, 1.2)
+        speed = chance.uniform(2, 12)
+        await flown.fly(speed * math.cos(angle), speed * math.sin(angle), chance.choice([0.3, 0.5, 1.0]))
+        await asyncio.sleep(chance.choice([0.02, 0.05, 0.09, 0.3]))
+
+
+async def both(flown: Flown) -> None:
+    """First the one, then the other."""
+    await straight(flown)
+    await flown.to(0, 15)
+    await bursts(flown)
+
+
+def appears(away_m: float) -> Pilot:
+    """A leg under way on which a wall appears so far ahead."""
+
+    async def pilot(flown: Flown) -> None:
+        flown.walls.clear()
+        flown.put()
+        await flown.to(0, -110)
+        flying = asyncio.ensure_future(flown.to(0, 110))
+        while flown.oracle.speeds()[0] < 9.5 or flown.oracle.place()[1] < -40:  # noqa: ASYNC110
+            await asyncio.sleep(0.05)
+        y = flown.oracle.place()[1]
+        flown.walls.append(shapely.box(-120, y + away_m, 120, y + away_m + 15))
+        flown.attempt.kept_m = math.inf
+        flown.put()
+        with contextlib.suppress(Refused, AutopilotError):
+            await flying
+        while flown.oracle.speeds()[0] > 0.2:  # noqa: ASYNC110 - the simulation tells no one
+            await asyncio.sleep(0.1)
+
+    return pilot
+
+
+async def _fly(sky: Sky, pilot: Pilot, seed: int, directory: Path) -> Attempt:
+    attempt = Attempt(account=Account(seed))
+    assert attempt.account is not None
+    oracle = Oracle(sky, attempt.account)
+    drone = Drone(directory, attempt.account)
+    flown = Flown(drone, random.Random(seed), attempt, oracle, [WALL])
+    grant = flown.put()
+
+    async def look() -> None:
+        while True:
+            x, y, height = oracle.place()
+            here = shapely.Point(x, y)
+            for wall in flown.walls if height > 1.0 else ():
+                away = -wall.exterior.distance(here) if wall.contains(here) else wall.distance(here)
+                attempt.kept_m = min(attempt.kept_m, float(away))
+            await asyncio.sleep(0.05)
+
+    turning = [asyncio.ensure_future(sky.turn()), asyncio.ensure_future(look())]
+    following = asyncio.ensure_future(drone.follow(grant))
+    try:
+        async with asyncio.timeout(120):
+            while not (drone.state is StreamState.GRANTED and drone.autopilot.vehicle.ready):  # noqa: ASYNC110
+                await asyncio.sleep(0.2)
+            while True:
+                try:
+                    await drone.service.arm(grant)
+                    break
+                except (Refused, AutopilotError) as error:
+                    attempt.problem = str(error)
+                    await asyncio.sleep(1.0)
+            attempt.problem = ""
+            async for _ in drone.service.take_off(grant, TakeoffArgs(15.0)):
+                pass
+            await pilot(flown)
+    except TimeoutError:
+        pass
+    finally:
+        for task in (following, *turning):
+            task.cancel()
+        await asyncio.gather(following, *turning, return_exceptions=True)
+        await drone.close()
+    return attempt
+
+
+def attempt(pilot: Pilot, seed: int, weather: Weather, parameters: dict[str, float] | None = None) -> Attempt:
+    """Fly once."""
+    sky = Sky(seed, weather, parameters or {})
+    with tempfile.TemporaryDirectory() as directory, asyncio.Runner(loop_factory=lambda: sky) as runner:
+        return runner.run(_fly(sky, pilot, seed, Path(directory)))

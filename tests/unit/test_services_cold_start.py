@@ -1,0 +1,52 @@
+"""The service and a vehicle that was just switched on, in virtual time over links that lose frames."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from closed_loop import Account, Drone, Sky, Weather
+from fractus_core.control import StreamState
+from fractus_services.mobility.autopilot import Checked
+from mobility_world import spec
+
+SLOW = {"WPNAV_ACCEL": 100.0, "PSC_JERK_XY": 3.0, "WPNAV_SPEED": 600.0, "GUID_TIMEOUT": 3.0, "FS_GCS_ENABLE": 0.0}
+
+
+async def until(condition: Callable[[], object]) -> None:
+    while not condition():  # noqa: ASYNC110 - the simulation tells no one
+        await asyncio.sleep(0.1)
+
+
+async def armed(sky: Sky, directory: Path) -> Checked:
+    """What the service takes the vehicle for when the motors start."""
+    drone = Drone(directory, Account(0))
+    turning = asyncio.ensure_future(sky.turn())
+    grant = drone.grants.put(spec())
+    following = asyncio.ensure_future(drone.follow(grant))
+    try:
+        async with asyncio.timeout(300):
+            await until(lambda: drone.state is StreamState.GRANTED)
+            assert sky.truth.home is not None, "granted before it is ready"
+            await drone.service.arm(grant, 120.0)
+        assert drone.control.checked is not None
+        return drone.control.checked
+    finally:
+        for task in (following, turning):
+            task.cancel()
+        await asyncio.gather(following, turning, return_exceptions=True)
+        await drone.close()
+
+
+@pytest.mark.parametrize(("loss", "seed"), [(0.0, 1), (0.1, 2), (0.1, 3), (0.3, 4)])
+def test_nothing_arms_with_figures_that_are_not_the_vehicles(tmp_path: Path, loss: float, seed: int) -> None:
+    sky = Sky(seed, Weather(there_s=0.03, back_s=0.03, loss=loss), SLOW)
+    with asyncio.Runner(loop_factory=lambda: sky) as runner:
+        checked = runner.run(armed(sky, tmp_path))
+    assert not checked.problem
+    assert (checked.airframe.accel_mps2, checked.airframe.jerk_mps3, checked.speed_mps) == (1.0, 3.0, 6.0)
+    params = sky.truth.params
+    assert (params["GUID_TIMEOUT"], params["FENCE_ENABLE"]) == (1.0, 1.0)
+    assert params["FS_GCS_ENABLE"] in {1.0, 3.0}

@@ -1,0 +1,188 @@
+"""Parameters over links that lose frames: what the vehicle does not have is told apart from what was not heard."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import pytest
+from fractus_core.policy.values import Airframe
+from fractus_mavlink import message
+from fractus_services.mobility.autopilot import Checked
+from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
+from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes, Reader
+from fractus_services.mobility.mavlink.parameters import ParameterLost
+from mobility_world import Loop
+from parameter_vehicle import BY_NAME, ParameterVehicle
+
+T = TypeVar("T")
+
+OTHERS = {f"P{number:04}": float(number) for number in range(1380)}
+"""As many parameters as a real vehicle has."""
+
+AS_4_6 = {
+    "SYSID_MYGCS": 255.0, "FS_GCS_ENABLE": 0.0, "FS_GCS_TIMEOUT": 5.0, "GUID_TIMEOUT": 3.0, "BATT_FS_CRT_ACT": 0.0,
+    "BATT_FS_LOW_ACT": 0.0, "FS_EKF_ACTION": 1.0, "SRTL_POINTS": 300.0, "FENCE_ENABLE": 0.0, "FENCE_TYPE": 7.0,
+    "FENCE_ALT_MAX": 100.0, "FENCE_ACTION": 1.0, "FENCE_MARGIN": 2.0, "FENCE_AUTOENABLE": 0.0, "FENCE_OPTIONS": 0.0,
+    "WPNAV_ACCEL": 100.0, "PSC_POSXY_P": 0.6, "WPNAV_ACCEL_Z": 70.0, "PSC_JERK_XY": 3.0, "RTL_ALT": 4200.0,
+    "WPNAV_SPEED": 700.0, "RTL_SPEED": 0.0, "RTL_CLIMB_MIN": 0.0,
+}  # fmt: skip
+SPELT_4_7 = {
+    "SYSID_MYGCS": ("MAV_GCS_SYSID", 1.0), "WPNAV_ACCEL": ("WP_ACC", 0.01), "PSC_POSXY_P": ("PSC_NE_POS_P", 1.0),
+    "WPNAV_ACCEL_Z": ("WP_ACC_Z", 0.01), "PSC_JERK_XY": ("PSC_JERK_NE", 1.0), "RTL_ALT": ("RTL_ALT_M", 0.01),
+    "WPNAV_SPEED": ("WP_SPD", 0.01), "RTL_SPEED": ("RTL_SPEED_MS", 0.01), "RTL_CLIMB_MIN": ("RTL_CLIMB_MIN_M", 0.01),
+}  # fmt: skip
+AS_4_7 = {
+    SPELT_4_7.get(name, (name, 1.0))[0]: value * SPELT_4_7.get(name, (name, 1.0))[1] for name, value in AS_4_6.items()
+} | {"MAV_GCS_SYSID_HI": 0.0}
+FIGURES = Airframe(
+    accel_mps2=1.0, position_gain=0.6, climb_accel_mps2=0.7, jerk_mps3=3.0, return_altitude_m=42.0, retraces=True
+)
+
+
+def run(work: Coroutine[Any, Any, T]) -> T:
+    """The outcome of work in a loop whose time jumps."""
+    with asyncio.Runner(loop_factory=Loop) as runner:
+        return runner.run(work)
+
+
+async def started(vehicle: ParameterVehicle) -> Checked:
+    return await MavlinkFailsafes(vehicle).configure()
+
+
+def rounded(airframe: Airframe) -> Airframe:
+    return replace(
+        airframe,
+        **{name: round(getattr(airframe, name), 4) for name in ("accel_mps2", "position_gain", "climb_accel_mps2")},
+        return_altitude_m=round(airframe.return_altitude_m, 3),
+    )
+
+
+@pytest.mark.parametrize("release", [AS_4_6, AS_4_7])
+@pytest.mark.parametrize(("loss", "starts"), [(0.1, 60), (0.3, 40)])
+def test_no_start_takes_a_figure_that_is_not_the_vehicles(loss: float, starts: int, release: dict[str, float]) -> None:
+    verified = 0
+    for seed in range(starts):
+        vehicle = ParameterVehicle(release | OTHERS, loss=loss, seed=seed, delay_s=0.05)
+        checked = run(started(vehicle))
+        if not checked.problem:
+            verified += 1
+            assert rounded(checked.airframe) == FIGURES, f"seed {seed}"
+            assert checked.speed_mps == pytest.approx(7.0)
+            settings = {name: vehicle.values[name] for name in ("FS_GCS_ENABLE", "GUID_TIMEOUT", "BATT_FS_CRT_ACT")}
+            assert settings == {"FS_GCS_ENABLE": 3.0, "GUID_TIMEOUT": 1.0, "BATT_FS_CRT_ACT": 1.0}, f"seed {seed}"
+    assert verified >= 0.8 * starts, "a lossy link is slow, and seldom stops a start"
+
+
+@pytest.mark.parametrize("lost", sorted({"WPNAV_ACCEL", "SRTL_POINTS", "FENCE_ALT_MAX", "RTL_ALT", "FS_GCS_ENABLE"}))
+def test_a_parameter_that_does_not_answer_forbids_arming_and_is_named(lost: str) -> None:
+    class Deaf(ParameterVehicle):
+        def send(self, outgoing: Any) -> None:
+            named = outgoing.name == "PARAM_REQUEST_READ" and outgoing.text("param_id") == lost
+            if not named:
+                super().send(outgoing)
+
+        def take(self, incoming: Any) -> None:
+            if incoming.name != "PARAM_VALUE" or incoming.text("param_id") != lost or listing:
+                super().take(incoming)
+
+    for listing in (False, True):
+        problem = run(started(Deaf(AS_4_6 | OTHERS))).problem
+        # While nothing of it is heard the list stays incomplete; a value of the list counts as any other.
+        assert ("cannot be read" in problem and lost in problem) is not listing, problem
+
+
+def test_a_list_that_stays_incomplete_names_what_it_was_asked_for() -> None:
+    class Mute(ParameterVehicle):
+        def take(self, incoming: Any) -> None:
+            if incoming.name != "PARAM_VALUE" or incoming.text("param_id") not in {"WPNAV_ACCEL", "P0100"}:
+                super().take(incoming)
+
+    problem = run(started(Mute(AS_4_6 | OTHERS))).problem
+    assert "WPNAV_ACCEL or WP_ACC cannot be read" in problem
+
+
+def test_what_is_absent_is_found_out_by_the_list_and_only_once() -> None:
+    async def asked() -> None:
+        vehicle = ParameterVehicle({name: value for name, value in AS_4_6.items() if name != "GUID_TIMEOUT"} | OTHERS)
+        checked = await started(vehicle)
+        assert not checked.problem
+        assert checked.missing == ("GUID_TIMEOUT",)
+        assert vehicle.asked.count("PARAM_REQUEST_LIST") == 1
+        begun = vehicle.now
+        assert (await started(vehicle)).missing == ("GUID_TIMEOUT",)
+        assert vehicle.now - begun < 0.1
+
+    run(asked())
+
+
+def test_a_vehicle_that_tells_all_is_not_asked_for_its_list() -> None:
+    for release in (AS_4_6, AS_4_7):
+        vehicle = ParameterVehicle(release | OTHERS, delay_s=0.02)
+        assert not run(started(vehicle)).problem
+        assert "PARAM_REQUEST_LIST" not in vehicle.asked
+
+
+def test_what_is_hidden_from_the_list_is_heard_by_name() -> None:
+    async def asked() -> None:
+        values = {name: value for name, value in AS_4_6.items() if name != "FS_EKF_ACTION"} | OTHERS
+        vehicle = ParameterVehicle(values, hidden=("BATT_FS_LOW_ACT", "BATT_FS_CRT_ACT"), loss=0.1, seed=3)
+        checked = await started(vehicle)
+        assert not checked.problem
+        assert checked.missing == ("FS_EKF_ACTION",)
+        assert vehicle.values["BATT_FS_CRT_ACT"] == 1.0
+
+    run(asked())
+
+
+def test_a_list_that_grows_while_it_is_read_is_read_again() -> None:
+    class Growing(ParameterVehicle):
+        def send(self, outgoing: Any) -> None:
+            super().send(outgoing)
+            if outgoing.name == "PARAM_REQUEST_LIST" and self.asked.count("PARAM_REQUEST_LIST") == 1:
+                self.values = {"A_FIRST": 1.0} | self.values
+
+    async def asked() -> None:
+        vehicle = Growing({"WPNAV_ACCEL": 100.0} | OTHERS, loss=0.02, seed=5)
+        assert await vehicle.vehicle_parameters.read([("NEVER",), ("WPNAV_ACCEL",)]) == {"WPNAV_ACCEL": 100.0}
+
+    run(asked())
+
+
+def test_no_answer_is_no_refusal_and_a_late_answer_none_either() -> None:
+    async def written() -> None:
+        fixed = ParameterVehicle({"RTL_ALT": 1500.0}, fixed=("RTL_ALT",))
+        assert await fixed.vehicle_parameters.write("RTL_ALT", 3000.0) == 1500.0
+        silent = ParameterVehicle({"RTL_ALT": 1500.0}, loss=1.0)
+        with pytest.raises(ParameterLost, match="RTL_ALT cannot be set to 3000: the autopilot does not answer"):
+            await silent.vehicle_parameters.write("RTL_ALT", 3000.0)
+        late = ParameterVehicle({"RTL_ALT": 1500.0}, delay_s=0.5)
+        before = message("PARAM_VALUE", param_id=b"RTL_ALT", param_value=1500.0, param_count=1, param_index=BY_NAME)
+        asyncio.get_running_loop().call_later(0.1, late.take, before)
+        assert await late.vehicle_parameters.write("RTL_ALT", 3000.0) == 3000.0
+
+    run(written())
+
+
+def test_two_that_use_one_parameter_both_hear_it() -> None:
+    async def used() -> None:
+        parameters = ParameterVehicle({"FENCE_TYPE": 1.0}, loss=0.2, seed=1).vehicle_parameters
+        read, written = await asyncio.gather(parameters.read([("FENCE_TYPE",)]), parameters.write("FENCE_TYPE", 2.0))
+        assert written == 2.0
+        assert read["FENCE_TYPE"] in {1.0, 2.0}
+
+    run(used())
+
+
+def test_every_figure_is_asked_for() -> None:
+    class Asking(dict[str, float]):
+        def __contains__(self, name: object) -> bool:
+            used.add(str(name))
+            return super().__contains__(name)
+
+    for release in (AS_4_6, AS_4_7):
+        used: set[str] = set()
+        ARDUCOPTER.airframe(Reader(Asking(release | {"FENCE_ENABLE": 1.0})), Airframe(), 5.0)
+        assert used <= {name for names in ARDUCOPTER.movement for name in names}

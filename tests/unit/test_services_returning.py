@@ -1,0 +1,153 @@
+"""Height and speed of the autopilot's own way home: as limits allow while a mission lasts, and as the owner chose after it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fractus_core.policy.returning import ReturnBounds, return_bounds
+from fractus_services.mobility.authority import drivers
+from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
+from mobility_world import World, area, end, fly, goto, refusal, spec
+from policy_world import altitude, at, box, compiled, speed, zone
+
+OWNED = {"RTL_ALT": 4000.0, "RTL_SPEED": 0.0, "WPNAV_SPEED": 1000.0, "RTL_CLIMB_MIN": 500.0}
+LOW = {"RTL_ALT": 1200.0, "RTL_SPEED": 0.0, "WPNAV_SPEED": 350.0, "RTL_CLIMB_MIN": 0.0}
+LIMITS = {"maxAltitude": 12, "maxSpeed": 3.5}
+
+
+def limited(kind: str, upper: float, *box_m: float) -> dict[str, Any]:
+    body = {"type": "LimitControl", "kind": kind, "upperLimit": upper, "selector": {"zones": ["there"]}}
+    return {"name": kind, "spec": body, "zones": [{"name": "there", "area": area(*box_m)}]}
+
+
+def held(world: World) -> dict[str, float]:
+    return {name: world.plane.parameters[name] for name in OWNED}
+
+
+def test_the_strictest_limit_between_home_and_the_operation_area_counts() -> None:
+    everywhere = compiled(altitude(upperLimit=30), speed(upperLimit=10))
+    assert return_bounds(at(), everywhere) == ReturnBounds(30.0, 10.0)
+    near, far = box(20, 20, 40, 40), box(5000, 5000, 5100, 5100)
+    zoned = compiled(
+        altitude("near", [zone("a", near)], upperLimit=30),
+        altitude("far", [zone("b", far)], upperLimit=3),
+        speed("slow", [zone("c", near)], upperLimit=4),
+    )
+    assert return_bounds(at(), zoned) == ReturnBounds(30.0, 4.0)
+    assert return_bounds(at(), compiled(limits=None)) == ReturnBounds()
+    unknown = compiled(altitude(upperLimit=30, altitudeReference="terrain"), limits=None)
+    assert return_bounds(at(), unknown).height_m == math.inf
+
+
+@pytest.mark.parametrize(
+    ("owned", "bounds", "expected"),
+    [
+        (OWNED, ReturnBounds(12.0, 3.5), LOW),
+        (OWNED, ReturnBounds(60.0, 12.0), OWNED | {"RTL_CLIMB_MIN": 0.0}),
+        (OWNED, ReturnBounds(), OWNED),
+        (OWNED, ReturnBounds(12.345678, 0.0), LOW | {"RTL_ALT": 1234.0, "WPNAV_SPEED": 20.0}),
+        ({"RTL_ALT_M": 40.0, "RTL_SPEED_MS": 9.0, "WP_SPD": 8.0}, ReturnBounds(12.5, 3.5),
+         {"RTL_ALT_M": 12.5, "RTL_SPEED_MS": 3.5, "WP_SPD": 3.5}),
+        ({}, ReturnBounds(12.0, 3.5), {}),
+    ],
+)  # fmt: skip
+def test_parameters_follow_from_bounds(
+    owned: dict[str, float], bounds: ReturnBounds, expected: dict[str, float]
+) -> None:
+    assert ARDUCOPTER.return_values(owned, bounds) == expected
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+def test_it_is_limited_while_a_mission_lasts(tmp_path: Path, restarted: bool) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.plane.parameters |= OWNED
+            grant = world.grants.put(spec(limits=LIMITS))
+            await world.up(grant, 8.0)
+            assert held(world) == LOW
+            assert world.guard.situation().airframe.return_altitude_m == 12.0
+            await end(world.service.goto(grant, goto(0, 30, 8.0), 0))
+            if not restarted:
+                await drivers.give_back(world.control, grant)
+                await world.until(lambda: not world.plane.vehicle.armed)
+                await world.until(lambda: held(world) == OWNED, 30)
+        if restarted:
+            async with World(tmp_path, after=world, known=False) as again:
+                again.observer.found()
+                await again.until(lambda: not again.plane.vehicle.armed)
+                await again.until(lambda: held(again) == OWNED, 30)
+        assert not (tmp_path / "return.json").exists()
+
+    fly(flight)
+
+
+def test_it_is_put_back_although_the_fence_is_not(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.plane.parameters |= OWNED
+            grant = world.grants.put(spec(limits=LIMITS))
+            await world.up(grant, 8.0)
+
+            async def fails(_idle: object) -> None:
+                raise OSError("no space left on device")
+
+            world.fence.lower = fails  # type: ignore[method-assign]
+            await drivers.give_back(world.control, grant)
+            await world.until(lambda: not world.plane.vehicle.armed)
+            await world.until(lambda: held(world) == OWNED, 30)
+            assert world.fence.raised
+
+    fly(flight)
+
+
+def test_it_follows_the_limits_in_flight_and_legs_keep_their_speed(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.plane.parameters |= OWNED
+            grant = world.grants.put(spec())
+            world.observer.found()
+            await world.up(grant, 8.0)
+            world.grants.put(spec(limited("altitude", 12.0, 50, 50, 60, 60), limited("speed", 3.5, 50, 50, 60, 60)))
+            await world.until(lambda: held(world) == LOW, 5)
+            assert world.guard.situation().airframe.return_altitude_m == 12.0
+            assert world.control.cruise_mps == 10.0, "the zone of the limits is far from where the leg leads"
+            world.plane.parameters["RTL_ALT"] = 3000.0  # by a station whose message was lost
+            await world.until(lambda: held(world) == LOW, 15)
+            world.grants.put(spec())
+            await world.until(lambda: held(world) == OWNED | {"RTL_CLIMB_MIN": 0.0}, 5)
+            codes = [entry["code"] for entry in world.kinds("control")]
+            assert codes.count("ReturnLimited") >= 3
+
+    fly(flight)
+
+
+def test_what_cannot_be_limited_does_not_arm(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.plane.parameters |= OWNED
+            world.plane.fixed = ("WPNAV_SPEED",)
+            grant = world.grants.put(spec(limits=LIMITS))
+            await world.drive(grant)
+            why = await refusal(world.service.arm(grant))
+            assert why.verdict.code == "ReturnNotLimited"
+            assert "WPNAV_SPEED cannot be set to 350; it stays 1000" in str(why)
+            assert not world.plane.vehicle.armed
+            await world.until(lambda: held(world) == OWNED, 30)
+
+    fly(flight)
+
+
+def test_a_file_of_garbage_limits_all_the_same(tmp_path: Path) -> None:
+    (tmp_path / "return.json").write_text("[")
+
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.plane.parameters |= OWNED
+            grant = world.grants.put(spec(limits=LIMITS))
+            await world.up(grant, 8.0)
+            assert held(world) == LOW
+
+    fly(flight)

@@ -1,0 +1,278 @@
+"""The delay of the autopilot's link: an upper bound, whatever the link does and whatever the two clocks show."""
+
+from __future__ import annotations
+
+import heapq
+import math
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import pytest
+from fractus_services.mobility.mavlink.timing import (
+    MAX_ARMING_DELAY_S,
+    MAX_PACE,
+    PROBE_S,
+    REACTION_S,
+    STALE_S,
+    WINDOW_S,
+    Timing,
+)
+
+Delay = Callable[[], float]
+
+
+@dataclass
+class Bench:
+    """A link in our time, and a vehicle whose clock runs as it likes.
+
+    Attributes:
+        up, down: seconds that a message takes; infinite for one that is lost.
+        clock: the vehicle's seconds since its start, of ours.
+        worst: how much less than the truth was ever told: positive is an error.
+    """
+
+    up: Delay
+    down: Delay
+    clock: Callable[[float], float] = lambda t: t + 1000.0
+    every_s: float = 0.05
+    answers: bool = True
+    copies: int = 1
+    timing: Timing = field(default_factory=Timing)
+    now: float = 50.0
+    worst: float = -math.inf
+    told: list[float] = field(default_factory=list)
+    _queue: list[tuple[float, int, Callable[[], None]]] = field(default_factory=list)
+    _number: int = 0
+    _told_at: float = -math.inf
+
+    def later(self, delay_s: float, what: Callable[[], None]) -> None:
+        if math.isfinite(delay_s):
+            self._number += 1
+            heapq.heappush(self._queue, (self.now + delay_s, self._number, what))
+
+    def fly(self, seconds: float) -> None:
+        """Let time pass: positions come, delays are measured, and the bound is compared with the truth."""
+        end = self.now + seconds
+        for event in (self._state, self._probe, self._judge):
+            self.later(0.0, event)
+        while self._queue and self._queue[0][0] <= end:
+            self.now, _, what = heapq.heappop(self._queue)
+            what()
+        self._queue = [item for item in self._queue if item[2] not in (self._state, self._probe, self._judge)]
+        self.now = end
+
+    def _state(self) -> None:
+        stamp = self.clock(self.now)
+        for _ in range(self.copies):
+            self.later(self.down(), lambda: self._arrives(stamp))
+        self.later(self.every_s, self._state)
+
+    def _arrives(self, stamp: float) -> None:
+        if self.timing.sampled(round(stamp * 1e3) % (1 << 32), self.now) is not None:
+            self._told_at = stamp
+
+    def _probe(self) -> None:
+        number, sent = self.timing.request(self.now), self.now
+        if number is not None and self.answers:
+            up = self.up()
+            tc1 = round(self.clock(self.now + min(up, 1e6)) * 1e9)
+            for _ in range(self.copies):
+                self.later(up + self.down(), lambda: self.timing.replied(tc1, number, self.now))
+        elif number is not None and self.timing.unanswering:
+            self.later(self.up() + self.down(), lambda: self.timing.acknowledged(sent, self.now))
+        self.later(PROBE_S, self._probe)
+
+    def _judge(self) -> None:
+        told = self.timing.latency_s(self.now)
+        if math.isfinite(told):
+            up = self.up()
+            if math.isfinite(up):
+                true = self.clock(self.now + up) - self._told_at
+                self.worst = max(self.worst, true - told)
+                self.told.append(told - true)
+        self.later(0.013, self._judge)
+
+
+def steady(seconds: float) -> Delay:
+    return lambda: seconds
+
+
+def wild(rng: random.Random, least: float, most: float, lost: float = 0.0) -> Delay:
+    return lambda: math.inf if rng.random() < lost else rng.uniform(least, most)
+
+
+@pytest.mark.parametrize(("up", "down"), [(0.0, 0.0), (0.15, 0.15), (0.25, 0.25), (0.5, 0.0), (0.0, 0.5)])
+def test_both_ways_are_counted_once(up: float, down: float) -> None:
+    """Whichever way is the slower one: the bound is what it takes, and little more."""
+    bench = Bench(steady(up), steady(down))
+    bench.fly(30)
+    assert bench.worst <= -REACTION_S + 0.01
+    assert max(bench.told) <= REACTION_S + 0.01
+    assert bench.timing.delay_s == pytest.approx(up + down, abs=0.01)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_lost_late_doubled_and_overtaken_messages_leave_an_upper_bound(seed: int) -> None:
+    rng = random.Random(seed)
+    least, most = rng.uniform(0, 0.2), rng.uniform(0.2, 0.4)
+    bench = Bench(wild(rng, least, most, 0.1), wild(rng, least, most, 0.1), copies=2)
+    bench.fly(15)
+    bench.worst = -math.inf
+    bench.fly(60)
+    assert bench.worst <= 0.0, "REACTION_S covers what no request happened to meet"
+
+
+@pytest.mark.parametrize("rate", [0.999, 1.001, 1.5, 2.0, 3.0, 5.0])
+def test_a_clock_of_another_rate_is_followed(rate: float) -> None:
+    bench = Bench(steady(0.01), steady(0.01), clock=lambda t: rate * t + 7)
+    bench.fly(15)
+    bench.worst = -math.inf
+    bench.fly(30)
+    assert bench.worst <= -REACTION_S + 0.05
+    assert rate <= max(bench.timing.pace, 1.001) <= max(rate, 1.0) * 1.06
+    assert not bench.timing.problem(bench.now)
+
+
+def test_a_clock_that_runs_too_fast_is_refused() -> None:
+    bench = Bench(steady(0.005), steady(0.005), clock=lambda t: 9 * t, every_s=0.01)
+    bench.fly(15)
+    assert "9.0 times as fast as real time" in bench.timing.problem(bench.now)
+    assert f"more than {MAX_PACE:g}" in bench.timing.problem(bench.now)
+
+
+def test_a_slow_link_lets_nothing_arm_and_says_why() -> None:
+    bench = Bench(steady(0.65), steady(0.6))
+    bench.fly(15)
+    assert "delays by 1.2 s there and back" in bench.timing.problem(bench.now) or "1.3 s" in bench.timing.problem(
+        bench.now
+    )
+    assert bench.timing.delay_s > MAX_ARMING_DELAY_S
+    assert math.isfinite(bench.timing.latency_s(bench.now)), "who flies may land with it"
+    worse = Bench(steady(1.0), steady(0.9))
+    worse.fly(15)
+    assert math.isinf(worse.timing.latency_s(worse.now))
+
+
+def test_a_link_that_becomes_slow_is_noticed_and_forgotten_when_it_is_over() -> None:
+    slow = 0.0
+    bench = Bench(lambda: 0.02 + slow, steady(0.02))
+    bench.fly(15)
+    slow = 0.6
+    bench.fly(1.5)
+    assert bench.timing.delay_s == pytest.approx(0.64, abs=0.02)
+    slow = 0.0
+    bench.fly(WINDOW_S - 2)
+    assert bench.timing.delay_s > 0.6
+    bench.fly(4)
+    assert bench.timing.delay_s < 0.1
+
+
+def test_without_answers_nothing_is_known() -> None:
+    bench = Bench(steady(0.02), steady(0.02))
+    assert math.isinf(bench.timing.latency_s(bench.now))
+    assert "not known" in bench.timing.problem(bench.now)
+    bench.fly(5)
+    bench.up = steady(math.inf)
+    bench.fly(STALE_S + 0.5)
+    assert math.isinf(bench.timing.latency_s(bench.now))
+
+
+def test_a_vehicle_that_answers_no_timesync_is_measured_by_acknowledgements() -> None:
+    bench = Bench(steady(0.2), steady(0.1), answers=False)
+    bench.fly(1.5)
+    assert math.isinf(bench.timing.latency_s(bench.now))
+    bench.fly(20)
+    assert bench.worst <= -REACTION_S + 0.01
+    assert max(bench.told) <= REACTION_S + 0.02
+
+
+def test_replies_to_others_and_replies_again_mean_nothing() -> None:
+    timing = Timing()
+    for i in range(40):
+        timing.sampled(5000 + 50 * i, 1.0 + 0.05 * i)
+    for foreign in (0, 1, 2**62, -1, 10**18):
+        timing.replied(10**9, foreign, 3.0)
+    assert math.isinf(timing.latency_s(3.0))
+    number = timing.request(3.0)
+    assert number is not None
+    timing.replied(0, number, 3.02)
+    assert math.isinf(timing.latency_s(3.02)), "a request of the vehicle's own"
+    number = timing.request(3.04)
+    assert number is not None
+    timing.replied(round(7.01e9), number, 3.06)
+    measured = timing.delay_s
+    timing.replied(round(9.9e9), number, 3.5)
+    assert timing.delay_s == measured
+
+
+def test_a_command_that_was_sent_again_over_a_gap_measures_no_delay() -> None:
+    bench = Bench(steady(0.02), steady(0.02))
+    bench.fly(10)
+    sent = bench.now + 0.1
+    bench.up = bench.down = steady(math.inf)
+    bench.fly(2.5)
+    assert bench.timing.unanswering
+    bench.timing.acknowledged(sent, bench.now)
+    assert bench.timing.delay_s < 0.1, "its answer comes before the first position"
+    bench.up = bench.down = steady(0.02)
+    bench.timing.sampled(round(bench.clock(bench.now) * 1e3), bench.now + 0.02)
+    bench.timing.acknowledged(sent, bench.now + 0.03)
+    assert bench.timing.delay_s < 0.1
+    bench.now += 0.03
+    bench.fly(1)
+    assert math.isfinite(bench.timing.latency_s(bench.now))
+
+
+def test_a_reply_by_another_clock_than_the_positions_is_no_measurement() -> None:
+    bench = Bench(steady(0.02), steady(0.02), answers=False)
+    bench.fly(3)
+    number = bench.timing.request(bench.now)
+    assert number is not None
+    bench.timing.replied(1_790_000_000 * 10**9, number, bench.now + 0.04)
+    assert bench.timing.unanswering
+
+
+def test_the_clock_of_the_vehicle_wraps_after_49_days() -> None:
+    bench = Bench(steady(0.1), steady(0.1), clock=lambda t: t - 60 + 2**32 / 1e3)
+    bench.fly(40)
+    assert bench.worst <= -REACTION_S + 0.01
+    assert max(bench.told) <= REACTION_S + 0.01
+
+
+def test_a_restart_of_the_vehicle_begins_again() -> None:
+    boot = 0.0
+    bench = Bench(steady(0.05), steady(0.05), clock=lambda t: t - boot + 100.0)
+    bench.fly(5)
+    boot = bench.now + 100.0
+    bench.fly(0.2)
+    bench.worst = -math.inf
+    bench.fly(10)
+    assert bench.worst <= -REACTION_S + 0.01
+    assert math.isfinite(bench.timing.latency_s(bench.now))
+
+
+def test_a_vehicle_that_freezes_is_not_known_and_then_known_again() -> None:
+    frozen = 0.0
+    bench = Bench(steady(0.02), steady(0.02), clock=lambda t: t - frozen)
+    bench.fly(10)
+    bench.now += 5.0
+    frozen = 5.0
+    assert math.isinf(bench.timing.latency_s(bench.now))
+    bench._queue.clear()
+    bench.fly(0.3)
+    bench.worst = -math.inf
+    bench.fly(10)
+    assert bench.worst <= -REACTION_S + 0.01
+    assert max(bench.told[-100:]) <= REACTION_S + 0.02
+
+
+def test_what_our_own_loop_delays_counts() -> None:
+    timing = Timing()
+    for i in range(60):
+        timing.sampled(5000 + 50 * i, 1.0 + 0.05 * i)
+    number = timing.request(3.5)
+    assert number is not None
+    # It was due at 3.5, sent at 3.9 by a loop that was busy, and heard at once.
+    timing.replied(round((5.0 + 3.9 - 1.0) * 1e9), number, 3.95)
+    assert timing.delay_s == pytest.approx(0.4, abs=0.01)

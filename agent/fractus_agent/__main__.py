@@ -10,6 +10,8 @@ import signal
 import sys
 from collections.abc import Mapping
 
+from fractus_storage import logs
+
 from fractus_agent.cluster.store import Store, Unconfigured, connect
 from fractus_agent.daemon import Agent
 from fractus_agent.settings import MissingSetting, Settings
@@ -42,7 +44,7 @@ def main(environment: Mapping[str, str] = os.environ) -> int:
     except MissingSetting as error:
         print(error, file=sys.stderr)
         return 2
-    logging.basicConfig(level=settings.log_level, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    logs.configure(settings.log_level)
     LOG.info("agent: started (node=%s)", settings.node)
     try:
         asyncio.run(serve(settings))

@@ -11,6 +11,8 @@ from fractus_agent.cluster.store import Object, Store
 from fractus_agent.grants.keeper import GrantDirectory, GrantKeeper
 from fractus_agent.grants.verifier import GrantVerifier
 from fractus_agent.identity.identity import Identity
+from fractus_agent.registration.evidence import audit_heads
+from fractus_agent.registration.handover import Handover
 from fractus_agent.registration.registration import Registration
 from fractus_agent.registration.status import Observed, StatusReporter
 from fractus_agent.settings import Settings
@@ -41,7 +43,8 @@ class Agent:
             refresh_authority=self._identity.refresh_authority,
         )
         self._certificates = 0
-        self._registration = Registration(store, settings.description, node, changed=self._changed)
+        self._handover = Handover(settings.node_object)
+        self._registration = Registration(store, settings.description, node, self._handover, changed=self._changed)
         self._mobility = asyncio.Event()
         self._feed: TelemetryFeed | None = None
         self._reporter = StatusReporter(
@@ -99,6 +102,8 @@ class Agent:
             snapshot=self._feed.latest if self._feed else None,
             problem=self._feed.problem if self._feed else None,
             described=self._registration.described,
+            handed=self._handover.condition,
+            audit=audit_heads(self._settings.audit),
         )
 
     def _telemetry_changed(self) -> None:

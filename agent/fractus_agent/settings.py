@@ -27,6 +27,16 @@ class Settings:
         return self.state / "grants"
 
     @property
+    def node_object(self) -> Path:
+        """The node's Drone or EdgeNode, which the node's services watch."""
+        return self.state / "node.json"
+
+    @property
+    def audit(self) -> Path:
+        """Directory of the services' audit logs."""
+        return self.state / "audit"
+
+    @property
     def tls(self) -> Path:
         """Directory of the node's certificate, key and authority."""
         return self.state / "tls"

@@ -28,8 +28,9 @@ COMMAND_BYTES = 8192
 FRAMES_A_TURN = 32
 """Frames read from one device before the others have their turn."""
 
-_STATION = {"position": list, "off": bool, "silent": bool, "loss_db": (int, float), "network": str}
-_UPLINK = {"off": bool, "rate_bps": (int, float), "delay_s": (int, float)}
+_NUMBER = (int, float)
+_STATION = {"position": list, "off": bool, "silent": bool, "loss_db": _NUMBER, "network": str}
+_UPLINK = {"off": bool, "rate_bps": _NUMBER, "delay_s": _NUMBER}
 
 
 class BadCommand(ValueError):
@@ -68,13 +69,13 @@ class Radio:
         """Put a device on the air."""
         self._medium.add(name, station)
         self._taps[name] = tap
-        self._selector.register(tap, selectors.EVENT_READ, lambda now_s: self._sent(name, tap, now_s))
+        self._listen(tap, lambda frame, now_s: self._medium.offer(name, frame, now_s))
 
     def add_uplink(self, name: str, ends: tuple[Tap, Tap], directions: tuple[Uplink, Uplink]) -> None:
         """Join two devices by an uplink; the first direction is from the first to the second."""
         self._wires[name] = Wire(ends, directions)
         for tap, uplink in zip(ends, directions, strict=True):
-            self._selector.register(tap, selectors.EVENT_READ, lambda now_s, t=tap, u=uplink: _offered(t, u, now_s))
+            self._listen(tap, uplink.offer)
 
     def turn(self, max_wait_s: float = 0.5) -> None:
         """Wait for the next event, and handle what is due."""
@@ -93,17 +94,26 @@ class Radio:
                 for frame in uplink.advance(now_s):
                     end.write(frame)
 
-    def _sent(self, name: str, tap: Tap, now_s: float) -> None:
-        for _ in range(FRAMES_A_TURN):
-            frame = tap.read()
-            if frame is None:
-                return
-            self._medium.offer(name, frame, now_s)
+    def _listen(self, tap: Tap, offer: Callable[[bytes, float], None]) -> None:
+        """Hand on the frames of a device, until it is gone: one node's must not end the air of the others."""
+
+        def sent(now_s: float) -> None:
+            try:
+                for _ in range(FRAMES_A_TURN):
+                    frame = tap.read()
+                    if frame is None:
+                        return
+                    offer(frame, now_s)
+            except OSError as error:
+                log.warning("radio: a device is gone (device=%s, error=%s)", tap.device, error)
+                self._selector.unregister(tap)
+
+        self._selector.register(tap, selectors.EVENT_READ, sent)
 
     def _commanded(self, _now_s: float) -> None:
         try:
             self.command(json.loads(self._control.recv(COMMAND_BYTES)))
-        except (BadCommand, ValueError) as error:
+        except (BadCommand, ValueError, RecursionError) as error:
             log.warning("radio: command refused (error=%s)", error)
 
     def command(self, command: Mapping[str, Any]) -> None:
@@ -115,7 +125,7 @@ class Radio:
         if not isinstance(command, dict):
             raise BadCommand("a command is a JSON object")
         if name := command.get("station"):
-            station = self._medium.stations.get(name)
+            station = self._medium.stations.get(name) if isinstance(name, str) else None
             if station is None:
                 raise BadCommand(f"there is no station {name}; there are {', '.join(self._medium.stations)}")
             changes = _checked(command, "station", _STATION)
@@ -124,7 +134,7 @@ class Radio:
             for field, value in changes.items():
                 setattr(station, field, value)
         elif name := command.get("uplink"):
-            wire = self._wires.get(name)
+            wire = self._wires.get(name) if isinstance(name, str) else None
             if wire is None:
                 raise BadCommand(f"there is no uplink {name}; there are {', '.join(self._wires) or 'none'}")
             for field, value in _checked(command, "uplink", _UPLINK).items():
@@ -141,28 +151,32 @@ class Radio:
         self._selector.close()
 
 
-def _offered(tap: Tap, uplink: Uplink, now_s: float) -> None:
-    for _ in range(FRAMES_A_TURN):
-        frame = tap.read()
-        if frame is None:
-            return
-        uplink.offer(frame, now_s)
-
-
 def _checked(command: Mapping[str, Any], subject: str, known: Mapping[str, Any]) -> dict[str, Any]:
     changes = {field: value for field, value in command.items() if field != subject}
     for field, value in changes.items():
         if field not in known:
             raise BadCommand(f"{field} is not known of a {subject}; known are {', '.join(known)}")
         if not isinstance(value, known[field]) or (isinstance(value, bool) and known[field] is not bool):
-            raise BadCommand(f"{field} has a wrong type: {value!r}")
-        if isinstance(value, float) and not math.isfinite(value):
-            raise BadCommand(f"{field} is not a finite number")
+            raise BadCommand(f"{field} has a wrong type: {str(value)[:80]}")
+        if known[field] == _NUMBER:
+            changes[field] = _number(field, value)
+    if not changes.get("rate_bps", 1.0) > 0.0 or changes.get("delay_s", 0.0) < 0.0:
+        raise BadCommand("rate_bps is positive, and delay_s is not negative")
     return changes
 
 
+def _number(field: str, value: Any) -> float:
+    try:
+        number = float(value)
+    except (OverflowError, TypeError, ValueError):
+        number = math.nan
+    if isinstance(value, bool) or not math.isfinite(number):
+        raise BadCommand(f"{field}: {str(value)[:80]} is not a finite number")
+    return number
+
+
 def _position(value: list[Any]) -> tuple[float, float, float]:
-    if len(value) != 3 or not all(isinstance(v, int | float) and math.isfinite(v) for v in value):
-        raise BadCommand("position takes three finite numbers: east, north and up in metres")
-    east, north, up = value
-    return float(east), float(north), float(up)
+    if len(value) != 3:
+        raise BadCommand("position takes three numbers: east, north and up in metres")
+    east, north, up = (_number("position", each) for each in value)
+    return east, north, up

@@ -48,16 +48,24 @@ class Tap:
 
         self._number = in_namespace(namespace, make)
         inside = ["nsenter", f"--net={namespace}", "ip", "link", "set", device]
-        subprocess.run(
-            [*inside, "address", address.hex(":"), "mtu", str(mtu)], check=True, capture_output=True, timeout=10
-        )
+        try:
+            subprocess.run(
+                [*inside, "address", address.hex(":"), "mtu", str(mtu)], check=True, capture_output=True, timeout=10
+            )
+        except (OSError, subprocess.SubprocessError):
+            os.close(self._number)
+            raise
 
     def fileno(self) -> int:
         """For a selector."""
         return self._number
 
     def read(self) -> bytes | None:
-        """A frame that the node sends; None when there is none."""
+        """A frame that the node sends; None when there is none.
+
+        Raises:
+            OSError: the device is gone.
+        """
         try:
             return os.read(self._number, FRAME_BYTES)
         except BlockingIOError:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from fractus_agent.links.acceptor import Acceptor
 from fractus_agent.links.addressing import link_address
-from fractus_agent.links.beacons import Beacons, beacon_socket
+from fractus_agent.links.beacons import Beacons
 from fractus_agent.links.connector import Connector
 from fractus_agent.links.pairing import Session
 
@@ -49,7 +49,7 @@ async def main(node: str, files: Path, max_peers: int) -> None:
     acceptor = Acceptor(files, lambda _peer: refusal, serves, max_peers=max_peers)
     tasks = [
         asyncio.create_task(acceptor.run(link_address(node))),
-        asyncio.create_task(Beacons(node, hear).run(beacon_socket("wlan0"))),
+        asyncio.create_task(Beacons(node, hear).run("wlan0")),
     ]
     loop = asyncio.get_running_loop()
     commands = asyncio.StreamReader()

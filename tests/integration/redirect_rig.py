@@ -101,7 +101,7 @@ class Rig:
         run(*self.inside("cloud"), "ip", "route", "add", "default", "via", "10.90.0.1")
         for node in ("drone", "edge"):
             create("fxl*", self.inside(node))
-        Maps(self.netlink("edge")).redirect([Redirect(DIRECT, POD)], 600.0)
+        self.maps("edge").write([Redirect(DIRECT, POD)], (), 600.0)
 
     def _link(self, left: str, device: str, address: str, right: str, other: str, peer: str) -> None:
         run(
@@ -111,6 +111,10 @@ class Rig:
         for node, link, ip in ((left, device, address), (right, other, peer)):
             run(*self.inside(node), "ip", "addr", "add", ip, "dev", link)
             run(*self.inside(node), "ip", "link", "set", link, "up")
+
+    def maps(self, node: str) -> Maps:
+        """The maps of a node, whose table is made again when it is gone."""
+        return Maps(self.netlink(node), lambda: create("fxl*", self.inside(node)))
 
     def netlink(self, node: str, protocol: int = NETLINK_NETFILTER) -> Netlink:
         """A netlink socket in a namespace."""

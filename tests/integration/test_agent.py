@@ -229,7 +229,7 @@ def test_a_drones_life(server: ApiServer, drone: Node) -> None:
     wait_for(lambda: drone.condition("Ready").get("reason") == "MobilityUnreachable", "lost service", timeout_s=15)
     body = drone.object()
     assert body is not None
-    assert body["status"]["flightState"] == "flying"
+    assert (body["status"]["flightState"], body["status"]["lastFlightState"]) == ("unknown", "flying")
     assert drone.stop() == 0
     assert "Traceback" not in drone.log()
 

@@ -253,6 +253,9 @@ def test_beacons_are_no_more_than_names() -> None:
         b'{"fractus": 2, "node": "e1"}',
         b'{"fractus": 1, "node": 3}',
         b'{"fractus": 1, "node": ""}',
+        b'{"fractus": 1, "node": "e1\\nlinks: up"}',
+        b'{"fractus": 1, "node": "\\ud800"}',
+        b"[" * 512,
     ):
         assert decode(data) is None
     assert decode(encode("x" * 254)) is None

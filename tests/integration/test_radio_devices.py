@@ -135,7 +135,11 @@ def test_bad_commands_change_nothing(air: Air) -> None:
         ({"station": "c"}, "no station c"),
         ({"station": "a", "speed": 3}, "speed is not known"),
         ({"station": "a", "off": 1}, "wrong type"),
-        ({"station": "a", "position": [1.0, float("nan"), 0.0]}, "three finite numbers"),
+        ({"station": "a", "position": [1.0, float("nan"), 0.0]}, "position: nan is not a finite number"),
+        ({"station": "a", "position": [10**400, 0, 0]}, "is not a finite number"),
+        ({"station": "a", "position": [1.0, 2.0]}, "three numbers"),
+        ({"station": ["a"]}, "no station"),
+        ({"uplink": "a", "rate_bps": 0}, "rate_bps is positive"),
         ({"uplink": "a", "rate_bps": float("inf")}, "finite"),
         ({}, "names a station"),
     ):

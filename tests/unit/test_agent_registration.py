@@ -7,13 +7,15 @@ from typing import Any
 import pytest
 import yaml
 from fractus_agent.cluster.store import Invalid
+from fractus_agent.registration.handover import Handover
 from fractus_agent.registration.registration import (
     HASH_ANNOTATION,
     Registration,
     description_hash,
     own_description,
 )
-from fractus_core.api.descriptions import InvalidDescription
+from fractus_core.api.descriptions import InvalidDescription, parse_description
+from fractus_core.api.nodes import CameraMount, Drone
 
 MANIFEST: dict[str, Any] = {
     "apiVersion": "fractus.dev/v1alpha1",
@@ -78,10 +80,14 @@ def edited(**spec: Any) -> str:
     return yaml.safe_dump(MANIFEST | {"spec": MANIFEST["spec"] | spec})
 
 
+def registration_of(store: FakeStore, path: Path) -> Registration:
+    return Registration(store, path, "drone-1", Handover(path.with_name("node.json")))  # type: ignore[arg-type]
+
+
 async def test_registers_once(path: Path) -> None:
     store = FakeStore()
     for _ in range(3):
-        await Registration(store, path, "drone-1").step()
+        await registration_of(store, path).step()
     assert store.writes == 1
     assert store.object is not None
     assert store.object["metadata"]["labels"] == {"fleet": "north"}
@@ -90,21 +96,21 @@ async def test_registers_once(path: Path) -> None:
 
 async def test_the_owners_edits_stay(path: Path) -> None:
     store = FakeStore()
-    registration = Registration(store, path, "drone-1")
+    registration = registration_of(store, path)
     await registration.step()
     assert store.object is not None
     store.object["spec"]["depot"] = "harbour"
     store.object["metadata"]["generation"] += 1
     write(path, "# a comment\n" + yaml.safe_dump(MANIFEST, default_flow_style=True))
     await registration.step()
-    await Registration(store, path, "drone-1").step()
+    await registration_of(store, path).step()
     assert store.writes == 1
     assert store.object["spec"]["depot"] == "harbour"
 
 
 async def test_a_changed_description_is_taken_over_once(path: Path) -> None:
     store = FakeStore()
-    registration = Registration(store, path, "drone-1")
+    registration = registration_of(store, path)
     await registration.step()
     write(path, edited(depot="airfield", interfaces=[]))
     await registration.step()
@@ -123,14 +129,14 @@ async def test_an_owners_object_is_adopted_unchanged(path: Path) -> None:
         "metadata": {"name": "drone-1", "generation": 4, "resourceVersion": "9"},
         "spec": {"depot": "mine"},
     }
-    await Registration(store, path, "drone-1").step()
+    await registration_of(store, path).step()
     assert store.object["spec"] == {"depot": "mine"}
     assert HASH_ANNOTATION in store.object["metadata"]["annotations"]
 
 
 async def test_without_a_description_the_owners_object_is_awaited(tmp_path: Path) -> None:
     store = FakeStore()
-    registration = Registration(store, tmp_path / "node.yaml", "drone-1")
+    registration = registration_of(store, tmp_path / "node.yaml")
     await registration.step()
     assert registration.body is None
     assert store.writes == 0
@@ -147,7 +153,7 @@ async def test_without_a_description_the_owners_object_is_awaited(tmp_path: Path
 
 async def test_a_deleted_object_is_registered_again(path: Path) -> None:
     store = FakeStore()
-    registration = Registration(store, path, "drone-1")
+    registration = registration_of(store, path)
     await registration.step()
     store.object = None
     registration.seen(None)
@@ -158,7 +164,7 @@ async def test_a_deleted_object_is_registered_again(path: Path) -> None:
 
 async def test_a_bad_description_is_reported_and_the_object_kept(path: Path) -> None:
     store = FakeStore()
-    registration = Registration(store, path, "drone-1")
+    registration = registration_of(store, path)
     await registration.step()
     before = copy.deepcopy(store.object)
     write(path, edited(depot="No Such Name!"))
@@ -174,7 +180,7 @@ async def test_a_bad_description_is_reported_and_the_object_kept(path: Path) -> 
 async def test_a_refused_object_is_said(path: Path) -> None:
     store = FakeStore()
     store.refuse = True
-    registration = Registration(store, path, "drone-1")
+    registration = registration_of(store, path)
     with pytest.raises(Invalid):
         await registration.step()
     assert registration.described is not None
@@ -185,7 +191,7 @@ async def test_a_refused_object_is_said(path: Path) -> None:
 async def test_a_description_of_the_other_class_is_refused(path: Path) -> None:
     store = FakeStore()
     store.labels = {"fractus.dev/class": "edge"}
-    registration = Registration(store, path, "drone-1")
+    registration = registration_of(store, path)
     await registration.step()
     assert store.object is None
     assert registration.described is not None
@@ -212,3 +218,87 @@ def test_hash_is_of_what_is_said() -> None:
     again = own_description("# x\n" + yaml.safe_dump(MANIFEST, sort_keys=False, default_flow_style=True), "drone-1")
     other = own_description(edited(depot="x"), "drone-1")
     assert description_hash(first) == description_hash(again) != description_hash(other)
+
+
+CAMERA = {"methods": ["CaptureImage"], "horizontalFieldOfView": 62.2, "mount": {"pitch": -60}}
+
+
+def described_camera(camera: dict[str, Any]) -> str:
+    return edited(services={**MANIFEST["spec"]["services"], "camera": camera})
+
+
+async def test_hands_the_object_over_as_its_owner_has_it_now(path: Path) -> None:
+    store, handed = FakeStore(), path.with_name("node.json")
+    write(path, described_camera(CAMERA))
+    registration = registration_of(store, path)
+    await registration.step()
+    first = parse_description(handed.read_text(), Drone)
+    assert first is not None
+    assert first.spec.services.camera is not None
+    assert (first.spec.services.camera.mount, first.status) == (CameraMount(pitch=-60), None)
+    assert store.object is not None
+    store.object["spec"]["services"]["camera"]["mount"]["pitch"] = -30
+    store.object["metadata"]["generation"] += 1
+    registration.seen(copy.deepcopy(store.object) | {"status": {"flightState": "flying"}})
+    second = parse_description(handed.read_text(), Drone)
+    assert registration.resource is not None
+    assert second is not None
+    assert second.spec == registration.resource.spec
+    assert "depot" in handed.read_text()
+    written = handed.stat()
+    await registration.step()
+    assert handed.stat().st_ino == written.st_ino, "nothing changed"
+
+
+@pytest.mark.parametrize(
+    ("camera", "missing"),
+    [
+        ({"methods": ["CaptureImage"]}, "has no horizontalFieldOfView, mount: "),
+        ({**CAMERA, "horizontalFieldOfView": None}, "has no horizontalFieldOfView: "),
+        ({**CAMERA, "mount": None}, "has no mount: "),
+    ],
+)
+async def test_a_camera_whose_view_is_unknown_is_told_of(path: Path, camera: dict[str, Any], missing: str) -> None:
+    write(path, described_camera({key: value for key, value in camera.items() if value is not None}))
+    handover = Handover(path.with_name("node.json"))
+    registration = Registration(FakeStore(), path, "drone-1", handover)  # type: ignore[arg-type]
+    await registration.step()
+    assert handover.condition is not None
+    assert (handover.condition.type, handover.condition.status) == ("CameraDescribed", "False")
+    assert missing in handover.condition.message
+    write(path, described_camera(CAMERA))
+    await registration.step()
+    assert handover.condition is None
+
+
+async def test_what_cannot_be_read_or_stored_is_not_handed_over(
+    path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    handed = tmp_path / "handed" / "node.json"
+    handover, store = Handover(handed), FakeStore()
+    registration = Registration(store, path, "drone-1", handover)  # type: ignore[arg-type]
+    await registration.step()
+    assert handed.exists()
+
+    def seen(generation: int, **changes: Any) -> None:
+        assert store.object is not None
+        body = copy.deepcopy(store.object)
+        body["metadata"]["generation"] = generation
+        body["spec"] |= changes
+        registration.seen(body)
+
+    seen(2, services={"camera": {"mount": "above"}})
+    assert handed.read_bytes() == b"", "services would go on with what held before, and without a file by the owner's"
+    assert handover.condition is not None
+    assert "cannot read the object" in handover.condition.message
+    seen(3)
+    assert (handed.read_bytes() != b"", handover.condition) == (True, None)
+
+    def full(*_args: object, **_named: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("fractus_agent.registration.handover.write_file", full)
+    seen(4, depot="other")
+    assert handed.read_bytes() == b""
+    assert handover.condition is not None
+    assert "cannot store its description" in handover.condition.message

@@ -9,10 +9,12 @@ from fractus_agent.conditions import Condition
 from fractus_agent.registration.status import (
     DRONE_PACE,
     EDGE_PACE,
+    FLIGHT_PACE,
     Observed,
     StatusReporter,
     due_s,
     node_status,
+    pace_of,
     readiness,
 )
 from fractus_agent.telemetry.feed import snapshot
@@ -110,12 +112,26 @@ def test_edge_node_without_services_is_ready_without_certificate() -> None:
     assert readiness(bare).is_true
 
 
-def test_what_cannot_be_seen_is_kept() -> None:
-    before = node_status(observed(), {}, 1, NOW)
-    blind = node_status(observed(snapshot=None, problem="gone"), before, 1, NOW + timedelta(seconds=9))
-    for key in ("flightState", "position", "battery", "controller"):
-        assert blind[key] == before[key]
-    assert blind["conditions"][0]["status"] == "False"
+@pytest.mark.parametrize("blind", [{"snapshot": None, "problem": "gone"}, {"snapshot": seen(connected=False)}])
+def test_what_cannot_be_seen_is_unknown_and_where_it_was_is_kept(blind: dict[str, Any]) -> None:
+    status = node_status(observed(), {}, 1, NOW)
+    assert (status["flightState"], status["lastFlightState"]) == ("flying", "flying")
+    place = status["position"]
+    for second in (9, 18):
+        status = node_status(observed(**blind), status, 1, NOW + timedelta(seconds=second))
+        assert (status["flightState"], status["lastFlightState"]) == ("unknown", "flying")
+        assert status["position"] == place
+        assert DroneStatus.model_validate(status).in_air
+        assert pace_of("Drone", status) is FLIGHT_PACE
+        assert status["conditions"][0]["status"] == "False"
+    assert "controller" not in node_status(observed(snapshot=None), status, 1, NOW), "who flies is not known either"
+
+
+def test_a_drone_that_was_never_seen_is_not_said_to_stand() -> None:
+    status = node_status(observed(snapshot=None), {}, 1, NOW)
+    assert status["flightState"] == "unknown"
+    assert "lastFlightState" not in status
+    assert pace_of("Drone", status) is DRONE_PACE
 
 
 def test_transition_time_moves_only_with_the_status() -> None:
@@ -186,11 +202,26 @@ class Bench:
         await self.reporter.step()
 
 
-async def test_flying_straight_writes_every_ten_seconds() -> None:
+async def test_an_agent_that_has_just_started_waits_for_the_first_telemetry() -> None:
+    bench = Bench()
+    for _ in range(4):
+        bench.seconds += 1.0
+        bench.observed = observed(snapshot=None)
+        await bench.reporter.step()
+    assert not bench.store.writes, "a flight is not called unknown for an agent that is replaced"
+    await bench.second(seen())
+    assert bench.store.writes[0]["flightState"] == "flying"
+    deaf = Bench()
+    deaf.seconds, deaf.observed = 5.0, observed(snapshot=None)
+    await deaf.reporter.step()
+    assert deaf.store.writes[0]["flightState"] == "unknown"
+
+
+async def test_flying_straight_writes_every_five_seconds() -> None:
     bench = Bench()
     for second in range(60):
         await bench.second(seen(position=(39.36 + second * 1e-4, 22.94, 20.0, "home")))
-    assert len(bench.store.writes) == 6
+    assert len(bench.store.writes) == 12
 
 
 async def test_a_change_of_flight_state_is_written_at_once() -> None:
@@ -238,3 +269,13 @@ async def test_an_object_made_again_gets_its_status_at_once() -> None:
     bench.body = {"kind": "Drone", "metadata": {"name": "d", "uid": "2", "generation": 1}}
     await bench.second(seen())
     assert len(bench.store.writes) == 2
+
+
+@pytest.mark.parametrize(("kind", "model"), [("Drone", DroneStatus), ("EdgeNode", EdgeNodeStatus)])
+def test_how_far_the_audit_logs_have_come_is_reported_and_kept(kind: str, model: Any) -> None:
+    heads = ["mobility:7:" + "a" * 64]
+    first = node_status(observed(kind=kind, audit=heads), {}, 1, NOW)
+    assert model.model_validate(first).audit == tuple(heads)
+    assert node_status(observed(kind=kind), first, 1, NOW)["audit"] == heads, "logs that are gone are missed"
+    assert "audit" not in node_status(observed(kind=kind), {}, 1, NOW)
+    assert due_s(first, first | {"audit": ["mobility:8:" + "b" * 64]}, 0.0, EDGE_PACE) == EDGE_PACE.idle_s

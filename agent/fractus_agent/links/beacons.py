@@ -11,12 +11,13 @@ import logging
 import socket
 from collections.abc import Callable
 
+from fractus_core.api.names import is_subdomain
+
 log = logging.getLogger(__name__)
 
 PORT = 46810
 INTERVAL_S = 0.5
 MAX_BYTES = 512
-MAX_NAME = 253
 SO_BINDTODEVICE = 25
 
 
@@ -47,10 +48,10 @@ def decode(data: bytes) -> str | None:
     """Whose beacon this is; None for anything else."""
     try:
         content = json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     node = content.get("node") if isinstance(content, dict) and content.get("fractus") == 1 else None
-    return node if isinstance(node, str) and 0 < len(node) <= MAX_NAME else None
+    return node if isinstance(node, str) and is_subdomain(node) else None
 
 
 class Beacons(asyncio.DatagramProtocol):
@@ -64,12 +65,7 @@ class Beacons(asyncio.DatagramProtocol):
     def __init__(self, node: str, heard: Callable[[str], None]) -> None:
         self._node = node
         self._heard = heard
-        self._transport: asyncio.DatagramTransport | None = None
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Keep the transport."""
-        if isinstance(transport, asyncio.DatagramTransport):
-            self._transport = transport
+        self._broken = asyncio.Event()
 
     def datagram_received(self, data: bytes, _addr: object) -> None:
         """Tell of a beacon."""
@@ -78,16 +74,24 @@ class Beacons(asyncio.DatagramProtocol):
             self._heard(node)
 
     def error_received(self, exc: Exception) -> None:
-        """A beacon was not sent: the device may be down for a moment."""
+        """A beacon was not sent: the device may be down for a moment, or have been replaced by one of its name."""
         log.debug("links: beacon not sent (error=%s)", exc)
+        self._broken.set()
 
-    async def run(self, own: socket.socket) -> None:
-        """Send and hear beacons until cancelled."""
+    async def run(self, device: str) -> None:
+        """Send and hear beacons on a device until cancelled; also on one that comes later, or comes back."""
         loop = asyncio.get_running_loop()
-        transport, _ = await loop.create_datagram_endpoint(lambda: self, sock=own)
-        try:
-            while True:
-                transport.sendto(encode(self._node), ("255.255.255.255", PORT))
+        while True:
+            try:
+                transport, _ = await loop.create_datagram_endpoint(lambda: self, sock=beacon_socket(device))
+            except OSError as error:
+                log.debug("links: no beacons (device=%s error=%s)", device, error)
                 await asyncio.sleep(INTERVAL_S)
-        finally:
-            transport.close()
+                continue
+            self._broken.clear()
+            try:
+                while not self._broken.is_set():
+                    transport.sendto(encode(self._node), ("255.255.255.255", PORT))
+                    await asyncio.sleep(INTERVAL_S)
+            finally:
+                transport.close()

@@ -147,6 +147,10 @@ class Session:
                 before = self.latency_ms
                 self.latency_ms = way_ms if before is None else before + SMOOTHING * (way_ms - before)
 
+    def abort(self) -> None:
+        """End the session at once."""
+        self._writer.transport.abort()
+
     async def close(self) -> None:
         """End the session, politely if the link still works."""
         self._writer.close()

@@ -117,11 +117,14 @@ class Netlink:
             yield kind, sequence, data[_HEADER.size : length]
             data = data[(length + 3) & ~3 :]
 
-    def acknowledged(self, sequences: set[int], *, ignore: frozenset[int] = frozenset()) -> None:
+    def acknowledged(
+        self, sequences: set[int], *, refusals: frozenset[int] = frozenset(), ignore: frozenset[int] = frozenset()
+    ) -> None:
         """Wait until messages that asked for it are acknowledged.
 
         Args:
             sequences: of these messages.
+            refusals: of messages that are answered only when the kernel refuses them, and all that follow.
             ignore: errno values that are no errors here, such as ENOENT of a deletion.
 
         Raises:
@@ -131,10 +134,12 @@ class Netlink:
         refused: int | None = None
         while waiting:
             for kind, sequence, payload in self.receive():
-                if kind != NLMSG_ERROR or sequence not in waiting:
+                if kind != NLMSG_ERROR or sequence not in waiting | refusals:
                     continue
-                waiting.discard(sequence)
                 number = -struct.unpack_from("=i", payload)[0]
+                if sequence in refusals and number:
+                    raise NetlinkError(number, f"netlink: the kernel refused a batch: {os.strerror(number)}")
+                waiting.discard(sequence)
                 if number and number not in ignore:
                     refused = refused or number
         if refused:

@@ -10,22 +10,23 @@ falls through to kube-proxy, and so to the cloud path. Elements time out, so tha
 
 from __future__ import annotations
 
+import errno
 import socket
 import struct
 import subprocess
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from ipaddress import IPv4Address
 
-from fractus_agent.redirector.netlink import NLM_F_ACK, NLM_F_CREATE, Netlink, attribute, message, nested
+from fractus_agent.redirector.netlink import NLM_F_ACK, NLM_F_CREATE, Netlink, NetlinkError, attribute, message, nested
 
 TABLE = "fractus"
 TARGETS, MARKS, COUNTERS = "targets", "marks", "counters"
 
 MARK_MASK, MARK_BASE = 0xFFF00000, 0xF6A00000
-"""Connections that we redirect carry a mark of this range; the lower bits number the service."""
+"""Connections that we redirect carry a mark of this range; the lower bits number a service's stay on one path."""
 
-MAX_SERVICES = 0xFFFFF
+MAX_NUMBER = 0xFFFFF
 
 COMMAND_TIMEOUT_S = 10.0
 
@@ -152,57 +153,65 @@ class Maps:
 
     Args:
         netlink: a netfilter socket in the node's network namespace.
+        make_table: makes our table again where someone has removed it, as `nft flush ruleset` does.
     """
 
-    def __init__(self, netlink: Netlink) -> None:
+    def __init__(self, netlink: Netlink, make_table: Callable[[], None]) -> None:
         self._netlink = netlink
+        self._make_table = make_table
 
-    def redirect(self, redirects: Iterable[Redirect], timeout_s: float) -> None:
-        """Replace all redirects in one transaction: every packet sees either the old ones or the new.
+    def write(
+        self, redirects: Iterable[Redirect], marks: Iterable[tuple[Endpoint, int]] | None, timeout_s: float
+    ) -> None:
+        """Replace the elements in one transaction: every packet sees either the old ones or the new.
 
         All are replaced, also when few change: that costs 0.6 ms with 64, refreshes the time-outs of those that stay without
         a gap, and does not fail when one of the old ones timed out a moment ago, as a deletion by name would.
 
         Args:
             redirects: all that hold from now on.
-            timeout_s: for how long, unless they are set again.
+            marks: all services, where clients connect to, and the number that their new connections carry; None leaves the
+                marks as they are.
+            timeout_s: for how long redirects hold, unless they are set again.
 
         Raises:
             NetlinkError: nothing was changed.
+            RedirectFailed: the table was gone, and cannot be made again.
         """
         lives = attribute(_ELEMENT_TIMEOUT, struct.pack(">Q", round(timeout_s * 1000)))
-        self._replace(
+        changes = _replaced(
             TARGETS, [nested(_LIST_ELEMENT, _key(r.virtual), _data(_endpoint(r.target)), lives) for r in redirects]
         )
+        if marks is not None:
+            changes += _replaced(
+                MARKS, [nested(_LIST_ELEMENT, _key(v), _data(struct.pack("=I", MARK_BASE | n))) for v, n in marks]
+            )
+        try:
+            self._transact(changes)
+        except NetlinkError as error:
+            if error.errno != errno.ENOENT:
+                raise
+            self._make_table()
+            self._transact(changes)
 
-    def mark(self, services: Iterable[tuple[Endpoint, int]]) -> None:
-        """Number services, so that the connections to them can be found, and their bytes counted.
-
-        Args:
-            services: all of them: where clients connect to, and the number of the service, from 0.
-
-        Raises:
-            NetlinkError: nothing was changed.
-        """
-        self._replace(
-            MARKS,
-            [nested(_LIST_ELEMENT, _key(virtual), _data(struct.pack("=I", MARK_BASE | n))) for virtual, n in services],
-        )
-
-    def _replace(self, name: str, elements: Sequence[bytes]) -> None:
-        header = struct.pack(">BBH", socket.AF_INET, 0, 0)
-        header += attribute(_LIST_TABLE, TABLE.encode() + b"\0") + attribute(_LIST_SET, name.encode() + b"\0")
-        bodies = [(_DELETE_ELEMENTS, header)]  # without elements: all of them
-        for first in range(0, len(elements), ELEMENTS_A_MESSAGE):
-            some = nested(_LIST_ELEMENTS, *elements[first : first + ELEMENTS_A_MESSAGE])
-            bodies.append((_NEW_ELEMENTS, header + some))
-        numbered = [(kind, self._netlink.sequence(), body) for kind, body in bodies]
+    def _transact(self, changes: Sequence[tuple[int, bytes]]) -> None:
+        numbered = [(kind, self._netlink.sequence(), body) for kind, body in changes]
         fence = struct.pack(">BBH", socket.AF_UNSPEC, 0, _SUBSYSTEM >> 8)
         batch = [message(kind, NLM_F_ACK | NLM_F_CREATE, number, body) for kind, number, body in numbered]
-        begin = message(_BEGIN, 0, self._netlink.sequence(), fence)
+        first = self._netlink.sequence()
+        begin = message(_BEGIN, 0, first, fence)
         end = message(_END, 0, self._netlink.sequence(), fence)
         self._netlink.send(b"".join((begin, *batch, end)))
-        self._netlink.acknowledged({number for _, number, _ in numbered})
+        self._netlink.acknowledged({number for _, number, _ in numbered}, refusals=frozenset({first}))
+
+
+def _replaced(name: str, elements: Sequence[bytes]) -> list[tuple[int, bytes]]:
+    """The messages that put these elements in place of all others of a map."""
+    header = struct.pack(">BBH", socket.AF_INET, 0, 0)
+    header += attribute(_LIST_TABLE, TABLE.encode() + b"\0") + attribute(_LIST_SET, name.encode() + b"\0")
+    all_of_them = (_DELETE_ELEMENTS, header)
+    batches = (elements[first : first + ELEMENTS_A_MESSAGE] for first in range(0, len(elements), ELEMENTS_A_MESSAGE))
+    return [all_of_them, *((_NEW_ELEMENTS, header + nested(_LIST_ELEMENTS, *some)) for some in batches)]
 
 
 def _endpoint(endpoint: Endpoint) -> bytes:

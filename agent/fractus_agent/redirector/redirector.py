@@ -16,7 +16,7 @@ from pathlib import Path
 
 from fractus_agent.redirector.conntrack import Conntrack
 from fractus_agent.redirector.netlink import NETLINK_SOCK_DIAG, Netlink, NetlinkError, in_namespace
-from fractus_agent.redirector.nft import Endpoint, Maps, Redirect
+from fractus_agent.redirector.nft import MAX_NUMBER, Endpoint, Maps, Redirect, RedirectFailed
 from fractus_agent.redirector.sockets import JIFFY_MS, Connection, DestroyUnsupported, Sockets
 
 log = logging.getLogger(__name__)
@@ -84,8 +84,26 @@ class Namespaces:
         self._open.clear()
 
 
+@dataclass(frozen=True, slots=True)
+class _Left:
+    """A path that a service has left.
+
+    Attributes:
+        service: where clients connect to.
+        number: carried by the connections that were opened on it, and by no others.
+        connections: those that were there when it was left.
+    """
+
+    service: Endpoint
+    number: int
+    connections: frozenset[bytes]
+
+
 class Redirector:
     """Holds the redirects of this node, and switches them.
+
+    Each switch gives the services that it moves new numbers: so connections that clients open while the old ones are drained
+    are not forgotten with these, and what a switch could not clean up can be cleaned up later.
 
     Args:
         maps: our table.
@@ -98,9 +116,11 @@ class Redirector:
         self._conntrack = conntrack
         self._namespaces = namespaces
         self._redirects: dict[Endpoint, Endpoint] = {}
-        self._services: dict[Endpoint, int] = {}
+        self._numbers: dict[Endpoint, int] = {}
+        self._left: list[_Left] = []
+        self._draining: set[int] = set()
+        self._last_number = 0
         self._worked_ms: dict[Endpoint, float] = {}
-        self._switching = asyncio.Lock()
 
     @property
     def redirects(self) -> Mapping[Endpoint, Endpoint]:
@@ -111,17 +131,17 @@ class Redirector:
         """Number the services that clients on this node connect to; redirects of others end.
 
         Raises:
-            NetlinkError: the kernel refused.
+            NetlinkError: the kernel refused; nothing was changed.
+            RedirectFailed: our table cannot be made.
         """
-        wanted = set(services)
-        free = iter(sorted(set(range(len(wanted) + len(self._services))) - set(self._services.values())))
-        # A number stays with its service, for connections that are there carry it.
-        self._services = {
-            service: self._services[service] if service in self._services else next(free) for service in sorted(wanted)
-        }
-        self._maps.mark(self._services.items())
-        self._redirects = {virtual: to for virtual, to in self._redirects.items() if virtual in wanted}
-        self._write()
+        numbers: dict[Endpoint, int] = {}
+        for service in sorted(set(services)):
+            # A number stays with its service, for connections that are there carry it.
+            numbers[service] = self._numbers.get(service) or self._fresh(numbers)
+        ended = self._paths({service: n for service, n in self._numbers.items() if service not in numbers})
+        self._write({virtual: to for virtual, to in self._redirects.items() if virtual in numbers}, numbers)
+        self._left += ended
+        self._leave(ended)
 
     async def run(self) -> None:
         """Keep the redirects alive until cancelled; then new connections take the cloud path at once."""
@@ -131,49 +151,97 @@ class Redirector:
                     await asyncio.sleep(LEARN_S)
                     self.learn()
                 try:
-                    self._write()
-                except NetlinkError as error:
+                    # Marks as well: someone may have removed the table, and with it what the kernel knew of them.
+                    self._write(self._redirects, self._numbers)
+                    self._leave([left for left in self._left if left.number not in self._draining])
+                except (NetlinkError, RedirectFailed) as error:
                     log.warning("redirector: redirects not refreshed (error=%s)", error)
         finally:
-            self._redirects = {}
-            with suppress(NetlinkError):
-                self._write()
+            with suppress(NetlinkError, RedirectFailed):
+                self._write({}, None)
 
     async def switch(self, targets: Mapping[Endpoint, Endpoint | None], *, planned: bool) -> Switched:
-        """Lead services elsewhere.
+        """Lead services elsewhere. A switch may begin while an older one drains: it waits for nothing.
 
         Args:
-            targets: virtual endpoints and where their connections go; None for the cloud path.
+            targets: virtual endpoints that are served and where their connections go; None for the cloud path.
             planned: whether the old path still works, so that calls under way may finish on it.
 
         Raises:
             NetlinkError: the kernel refused; nothing was changed.
+            RedirectFailed: our table is gone and cannot be made again.
         """
-        async with self._switching:
-            before = dict(self._redirects)
-            self._redirects = {v: t for v, t in (before | dict(targets)).items() if t is not None}
-            moved = {virtual for virtual in targets if before.get(virtual) != self._redirects.get(virtual)}
-            if not moved:
-                return Switched()
-            try:
-                self._write()
-            except NetlinkError:
-                self._redirects = before
-                raise
-            done = await self._drain(moved) if planned else Switched(cut=self._cut(moved))
-            for virtual in moved:
-                if virtual in self._services:
-                    self._conntrack.forget(self._services[virtual])
-            log.info(
-                "redirector: switched (services=%d planned=%s drained=%d cut=%d)",
-                len(moved), planned, done.drained, done.cut,
-            )  # fmt: skip
-            return done
+        before = self._redirects
+        after = {v: t for v, t in (before | dict(targets)).items() if t is not None and v in self._numbers}
+        moved = sorted(v for v in targets if before.get(v) != after.get(v))
+        if not moved:
+            return Switched()
+        old = {virtual: self._numbers[virtual] for virtual in moved}
+        numbers = dict(self._numbers)
+        for virtual in moved:
+            numbers[virtual] = self._fresh(numbers)
+        self._write(after, numbers)
+        # Connections that clients open from here on take the new path, and have the new number.
+        left = self._paths(old)
+        self._left += left
+        drained = 0
+        try:
+            if planned:
+                self._draining |= set(old.values())
+                drained = await self._drain({c for each in left for c in each.connections}, moved)
+        finally:
+            self._draining -= set(old.values())
+            cut = self._leave(left)
+        log.info("redirector: switched (services=%d planned=%s drained=%d cut=%d)", len(moved), planned, drained, cut)
+        return Switched(drained, cut)
+
+    def _fresh(self, taken: Mapping[Endpoint, int]) -> int:
+        """A number that no service has, and none that was left."""
+        used = {*taken.values(), *self._numbers.values(), *(left.number for left in self._left)}
+        while True:
+            self._last_number = self._last_number % MAX_NUMBER + 1
+            if self._last_number not in used:
+                return self._last_number
+
+    def _write(self, redirects: Mapping[Endpoint, Endpoint], numbers: Mapping[Endpoint, int] | None) -> None:
+        self._maps.write(
+            (Redirect(virtual, to) for virtual, to in redirects.items()),
+            numbers.items() if numbers is not None else None,
+            LEASE_S,
+        )
+        self._redirects = dict(redirects)
+        self._numbers = dict(numbers) if numbers is not None else self._numbers
+
+    def _paths(self, numbers: Mapping[Endpoint, int]) -> list[_Left]:
+        """What is left of services with these numbers, as it is now; without connections where the kernel does not tell."""
+        found: dict[Endpoint, set[bytes]] = {service: set() for service in numbers}
+        try:
+            for connection in (c for sockets in self._namespaces.refresh() for c in sockets.to(found)):
+                found[connection.peer].add(connection.identity)
+        except NetlinkError as error:
+            log.warning("redirector: connections not looked at (error=%s)", error)
+        return [_Left(service, number, frozenset(found[service])) for service, number in numbers.items()]
+
+    def _leave(self, paths: Iterable[_Left]) -> int:
+        """Close the connections that are left on paths, and forget them; how many were closed.
+
+        What fails is tried again with the next refresh.
+        """
+        paths = [left for left in paths if left in self._left]
+        try:
+            cut = self._cut({left.service for left in paths}, {c for left in paths for c in left.connections})
+            for left in paths:
+                self._conntrack.forget(left.number)
+                self._left.remove(left)
+        except NetlinkError as error:
+            log.warning("redirector: old paths are not cleaned up yet (paths=%d error=%s)", len(paths), error)
+            return 0
+        return cut
 
     def learn(self) -> None:
         """Look at the connections to the services, and learn how long these work for a request."""
         try:
-            found = [c for sockets in self._namespaces.refresh() for c in sockets.to(self._services)]
+            found = [c for sockets in self._namespaces.refresh() for c in sockets.to(self._numbers)]
         except NetlinkError as error:
             log.debug("redirector: connections not looked at (error=%s)", error)
             return
@@ -187,15 +255,10 @@ class Redirector:
         worked_ms = max(self._worked_ms.get(connection.peer, 0.0), connection.worked_ms)
         return max(min(WORK_MARGIN * worked_ms, MAX_IDLE_MS) * min(2 * left, 1.0), MIN_IDLE_MS)
 
-    def _write(self) -> None:
-        self._maps.redirect((Redirect(virtual, to) for virtual, to in self._redirects.items()), LEASE_S)
-
-    async def _drain(self, moved: Collection[Endpoint]) -> Switched:
-        """Close old connections as they become idle; the rest when the time is over."""
+    async def _drain(self, old: Collection[bytes], moved: Collection[Endpoint]) -> int:
+        """Close old connections as they become idle, until the time is over; how many."""
         loop = asyncio.get_running_loop()
         begun, drained = loop.time(), 0
-        # Only connections of before the switch: those that clients open from now on take the new path.
-        old = {c.identity for sockets in self._namespaces.refresh() for c in sockets.to(moved)}
         while old and (left := 1 - (loop.time() - begun) / DRAIN_TIMEOUT_S) > 0:
             there: set[bytes] = set()
             for sockets in self._namespaces.refresh():
@@ -204,21 +267,21 @@ class Redirector:
                         continue
                     if connection.idle_ms >= self._enough_ms(connection, left):
                         if not _destroy(sockets, connection):
-                            return Switched(drained)
+                            return drained
                         drained += 1
                     else:
                         there.add(connection.identity)
             old = there
             if old:
                 await asyncio.sleep(DRAIN_POLL_S)
-        return Switched(drained, self._cut(moved, old) if old else 0)
+        return drained
 
-    def _cut(self, moved: Collection[Endpoint], only: Collection[bytes] | None = None) -> int:
+    def _cut(self, services: Collection[Endpoint], only: Collection[bytes]) -> int:
         """Close connections, whatever they do."""
         cut = 0
         for sockets in self._namespaces.refresh():
-            for connection in sockets.to(moved):
-                if only is None or connection.identity in only:
+            for connection in sockets.to(services):
+                if connection.identity in only:
                     if not _destroy(sockets, connection):
                         return cut
                     cut += 1

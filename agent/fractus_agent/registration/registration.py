@@ -16,6 +16,7 @@ from fractus_core.api.nodes import Drone, EdgeNode
 
 from fractus_agent.cluster.store import Invalid, KubeError, Object, Store
 from fractus_agent.conditions import Condition
+from fractus_agent.registration.handover import Handover
 from fractus_agent.supervisor import repeat
 
 LOG = logging.getLogger(__name__)
@@ -56,10 +57,13 @@ class Registration:
     taken over (annotation fractus.dev/description-hash). The owner's edits of an object stay.
     """
 
-    def __init__(self, store: Store, path: Path, node: str, *, changed: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self, store: Store, path: Path, node: str, handover: Handover, *, changed: Callable[[], None] = lambda: None
+    ) -> None:
         self._store = store
         self._path = path
         self._node = node
+        self._handover = handover
         self._changed = changed
         self._stamp: object = None
         self._gone = asyncio.Event()
@@ -160,6 +164,9 @@ class Registration:
             self.resource = _KINDS[body["kind"]].from_body({k: v for k, v in body.items() if k != "status"})
         except InvalidObject as error:
             LOG.warning("registration: the node's object cannot be read: %s", error)
+            self._handover.drop(f"The agent cannot read the object: {error}.")
+        else:
+            self._handover.put(self.resource)
         self._changed()
 
     def _file_changed(self) -> bool:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, get_args
 
-from fractus_core.api.nodes import FlightState
+from fractus_core.api.nodes import DRONE_REPORT_S, EDGE_REPORT_S, FLIGHT_REPORT_S, FlightState, is_airborne
 
 from fractus_agent.cluster.store import Object, Store
 from fractus_agent.conditions import Condition, timestamp, to_kubernetes
@@ -21,6 +21,8 @@ LOG = logging.getLogger(__name__)
 
 _FLIGHT_STATES = get_args(FlightState)
 _DEGREE_M = 111_320.0
+SETTLING_S = 5.0
+"""Seconds after its start in which an agent that has heard nothing of the drone yet says nothing of it either."""
 STILL_M = 2.0
 """Metres that the position of a drone on the ground wanders by GPS noise: not worth a write."""
 
@@ -33,12 +35,13 @@ class Pace:
     """After a change of flight state, controller or a condition."""
     moving_s: float = 10.0
     """After a change of position or battery."""
-    idle_s: float = 30.0
+    idle_s: float = DRONE_REPORT_S
     """When nothing changed: lastSeen only."""
 
 
+FLIGHT_PACE = Pace(moving_s=FLIGHT_REPORT_S, idle_s=FLIGHT_REPORT_S)
 DRONE_PACE = Pace()
-EDGE_PACE = Pace(idle_s=60.0)
+EDGE_PACE = Pace(idle_s=EDGE_REPORT_S)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +55,8 @@ class Observed:
     snapshot: Snapshot | None = None
     problem: str | None = None
     described: Condition | None = None
+    handed: Condition | None = None
+    audit: Sequence[str] = ()
 
 
 def readiness(observed: Observed) -> Condition:
@@ -75,25 +80,38 @@ def readiness(observed: Observed) -> Condition:
 
 
 def node_status(observed: Observed, previous: Object, generation: int | None, now: datetime) -> dict[str, Any]:
-    """The status to write; what cannot be seen now is kept from the previous one."""
+    """The status to write.
+
+    What cannot be seen now is unknown, not what it was: the last flight state is kept beside it, and where the drone was.
+    """
     conditions = [readiness(observed), observed.certified]
-    if observed.described is not None:
-        conditions.append(observed.described)
+    conditions += [problem for problem in (observed.described, observed.handed) if problem is not None]
     status: dict[str, Any] = {
         "lastSeen": timestamp(now),
         "conditions": to_kubernetes(conditions, previous.get("conditions") or (), generation, now),
     }
+    if audit := list(observed.audit) or previous.get("audit"):
+        status["audit"] = audit
     if observed.kind == "Drone":
-        kept = {key: previous[key] for key in ("flightState", "position", "battery", "controller") if key in previous}
-        status |= {"flightState": "inactive"} | kept
-        if observed.snapshot is not None and observed.problem is None:
-            status |= _flight(observed.snapshot)
+        seen = observed.snapshot if observed.problem is None else None
+        status |= {key: previous[key] for key in ("position", "battery") if key in previous}
+        status |= {"flightState": "unknown"} | (_flight(seen) if seen is not None else {})
+        if status["flightState"] != "unknown":
+            status["lastFlightState"] = status["flightState"]
+        elif (last := _last_known(previous)) is not None:
+            status["lastFlightState"] = last
     return status
+
+
+def _last_known(previous: Object) -> str | None:
+    now, last = previous.get("flightState", "unknown"), previous.get("lastFlightState")
+    return last if now == "unknown" else now
 
 
 def _flight(seen: Snapshot) -> dict[str, Any]:
     flight: dict[str, Any] = {}
-    if seen.flight_state in _FLIGHT_STATES:
+    # Without its autopilot the mobility service knows no more than before.
+    if seen.connected and seen.flight_state in _FLIGHT_STATES:
         flight["flightState"] = seen.flight_state
     if seen.controller:
         flight["controller"] = seen.controller
@@ -109,6 +127,13 @@ def _flight(seen: Snapshot) -> dict[str, Any]:
             "current": round(seen.battery_current_a, 1),
         }
     return flight
+
+
+def pace_of(kind: str, status: Object) -> Pace:
+    """How often a status is written: most often that of a drone in the air, so that its silence is noticed soon."""
+    if kind != "Drone":
+        return EDGE_PACE
+    return FLIGHT_PACE if is_airborne(status["flightState"], status.get("lastFlightState")) else DRONE_PACE
 
 
 def due_s(old: Object | None, new: Object, since_s: float, pace: Pace) -> float:
@@ -179,6 +204,7 @@ class StatusReporter:
         self._last: Object | None = None
         self._last_uid: str | None = None
         self._last_s = 0.0
+        self._settled_s = monotonic() + SETTLING_S
         self._changed = asyncio.Event()
 
     def changed(self) -> None:
@@ -195,12 +221,15 @@ class StatusReporter:
         if body is None:
             return 5.0
         observed = self._observe(body)
+        settling_s = self._settled_s - self._monotonic()
+        if observed.has_mobility and observed.snapshot is None and settling_s > 0:
+            return settling_s
         metadata = body["metadata"]
         if metadata.get("uid") != self._last_uid:
             self._last = None
         previous = self._last or body.get("status") or {}
         status = node_status(observed, previous, metadata.get("generation"), self._wall())
-        pace = DRONE_PACE if observed.kind == "Drone" else EDGE_PACE
+        pace = pace_of(observed.kind, status)
         wait_s = due_s(self._last, status, self._monotonic() - self._last_s, pace)
         if wait_s > 0:
             return wait_s

@@ -1,7 +1,7 @@
 """Deploying on 100 to 5,000 simulated nodes: the operator against a real API server, scheduler and kwok.
 
 The traffic-monitoring example is applied as it stands, beside thousands of nodes elsewhere: how long until every pod is
-bound, until the application is Running with all that was made for it, what the operator takes in CPU and memory, how soon
+bound, until the application is Waiting with all that was made for it, what the operator takes in CPU and memory, how soon
 after its start it plans, and that 50 applications applied at once all end bound or queued. The comparator creates the same
 Deployments without Fractus: what Kubernetes takes anyway.
 
@@ -319,12 +319,12 @@ class Bench:
         return (self.operator.cpu_s() - before) / seconds
 
     def _deploy(self) -> tuple[float, float]:
-        """From apply to the last pod bound, and to the phase Running, with every Grant, Service and Secret."""
+        """From apply to the last pod bound, and to the phase Waiting, with every Grant, Service and Secret."""
         namespace = self._namespace()
         began = time.monotonic()
         self._api.apply(path_of(application("traffic", namespace), namespace), application("traffic", namespace))
         taken = self._all_bound(namespace, began)
-        self._phase(namespace, {"traffic"}, {"Running"}, pause_s=0.02)
+        self._phase(namespace, {"traffic"}, {"Waiting"}, pause_s=0.02)
         running = time.monotonic() - began
         if len(self._bound.at[namespace]) != self._pods():
             raise RuntimeError(f"{namespace}: {len(self._bound.at[namespace])} pods, expected {self._pods()}")
@@ -343,7 +343,7 @@ class Bench:
         """What the operator makes of the example."""
         namespace = self._namespace()
         self._api.apply(path_of(application("traffic", namespace), namespace), application("traffic", namespace))
-        self._phase(namespace, {"traffic"}, {"Running"})
+        self._phase(namespace, {"traffic"}, {"Waiting"})
         made = self._api.list(f"/apis/apps/v1/namespaces/{namespace}/deployments")
         self._gone(namespace, ["traffic"])
         return made
@@ -381,7 +381,7 @@ class Bench:
                 names,
             ):
                 pass
-        self._phase(namespace, set(names), {"Running", "Queued"})
+        self._phase(namespace, set(names), {"Waiting", "Queued"})
         found.at_once_s = max(self._bound.at[namespace].values()) - began
         found.at_once_cpu_s = self.operator.cpu_s() - cpu
         found.faults = self._audit(namespace, names, found)
@@ -401,7 +401,7 @@ class Bench:
         if set(applications) != set(names):
             faults.append("applications were lost")
         drones = [plan["drone"]["node"] for plan in plans.values()]
-        if len(drones) != len(set(drones)) or len(drones) != found.at_once.get("Running", 0):
+        if len(drones) != len(set(drones)) or len(drones) != found.at_once.get("Waiting", 0):
             faults.append(f"{len(drones)} plans have {len(set(drones))} drones")
         wanted = {
             (p["instance"], p.get("node")): p.get("replicas", 1) for plan in plans.values() for p in plan["placements"]
@@ -417,7 +417,7 @@ class Bench:
         if seen != wanted:
             faults.append(f"{sum(seen.values())} pods for {sum(wanted.values())} planned")
         expected = min(AT_ONCE, sum(i % 6 == 0 for i in range(self.scene.nodes)), AT_DEPOT)
-        if found.at_once.get("Running", 0) < expected - 1:
+        if found.at_once.get("Waiting", 0) < expected - 1:
             faults.append(f"{found.at_once} with {expected} drones")
         return faults
 

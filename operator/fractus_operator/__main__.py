@@ -23,12 +23,17 @@ from fractus_operator.cluster.store import KubeError, Lease, LostLease, Store, U
 from fractus_operator.identity.ca_secret import open_authority
 from fractus_operator.identity.node_requests import NodeSigning
 from fractus_operator.inventory.live import LiveInventory
+from fractus_operator.reconcile import service_rollout, silence
 from fractus_operator.reconcile.applications import Applications
 from fractus_operator.reconcile.location import Locations
+from fractus_operator.reconcile.node_reports import NodeReports
 from fractus_operator.reconcile.orphans import Orphans
 from fractus_operator.reconcile.readiness import Readiness
-from fractus_operator.reconcile.worklist import Worklist
+from fractus_operator.reconcile.service_rollout import ServiceRollout
+from fractus_operator.reconcile.silence import SilenceWatch
+from fractus_operator.reconcile.worklist import Worklist, regularly
 from fractus_operator.settings import BadSetting, Settings
+from fractus_operator.standby import standing_by
 
 logger = logging.getLogger("fractus_operator")
 
@@ -56,13 +61,19 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
     store = await Store.connect(may_write_s=lambda: lease.left_s)
     keeping = asyncio.create_task(lease.run())
     try:
-        await _leading(lease, keeping)
+        async with standing_by(settings.health):
+            await _leading(lease, keeping)
         authority = await open_authority(store, settings.namespace)
-        live = LiveInventory(store)
+        live = LiveInventory(store, settings.namespace)
         applications = Applications(store, live, authority, _now, settings.planning)
         signing = NodeSigning(store, live.signing_requests.get, authority, settings.agent_user, _now)
         background: list[Coroutine[Any, Any, None]] = [reflector.run() for reflector in live.reflectors()]
         background += [worklist.run() for worklist in worklists(store, live, signing)]
+        reports = NodeReports(store, live, _now)
+        watch = SilenceWatch(live, reports, time.monotonic)
+        rollout = ServiceRollout(store, live, reports)
+        background += [regularly("silence", watch.step, silence.PERIOD_S)]
+        background += [regularly("services", rollout.step, service_rollout.PERIOD_S)]
         # Cancelling what waits for the lease must not cancel the lease: the last writes need it.
         background += [_wait_for(asyncio.shield(keeping)), _settled(live)]
         await _together(handlers.operator(applications, live.silence_s, settings.health, stop), background)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from fractus_core.api import InvalidObject
+from fractus_core.planning.inventory import PolicyConflicts
 from fractus_core.planning.inventory import Settings as PlanningSettings
 from fractus_core.planning.plugins import UnknownPlugin, load_plugin
 
@@ -31,7 +32,7 @@ _TEXTS = {
 """Which variable sets what is taken as it is."""
 
 
-DEFAULT_LEASE_S = 15.0
+DEFAULT_LEASE_S = 10.0
 MIN_LEASE_S = 1.0
 
 
@@ -77,6 +78,8 @@ class Settings:
         planning = PlanningSettings(
             score_drone=_plugin(environment, "FRACTUS_PLANNING_RANKING"),
             cover=_plugin(environment, "FRACTUS_PLANNING_COVERING"),
+            policy_conflicts=_policy_conflicts(environment, "FRACTUS_PLANNING_POLICY_CONFLICTS"),
+            flat_terrain=environment.get("FRACTUS_PLANNING_FLAT_TERRAIN") == "true",
         )
         for name, variable in _PLANNING.items():
             change: dict[str, Any] = {name: _number(environment, variable, getattr(planning, name))}
@@ -97,6 +100,14 @@ def _plugin(environment: Mapping[str, str], name: str) -> Any:
         return load_plugin(environment.get(name))
     except UnknownPlugin as error:
         raise BadSetting(f"{name}: {error}") from None
+
+
+def _policy_conflicts(environment: Mapping[str, str], name: str) -> PolicyConflicts:
+    match environment.get(name) or "warn":
+        case "warn" | "forbid" as chosen:
+            return chosen
+        case other:
+            raise BadSetting(f"{name}: {other!r} is neither warn nor forbid")
 
 
 def _number(environment: Mapping[str, str], name: str, default: float) -> float:

@@ -6,7 +6,7 @@ import asyncio
 import sys
 from collections.abc import Sequence
 
-from fractus_core.api.nodes import GROUNDED
+from fractus_core.api.nodes import is_airborne
 
 from fractus_operator.cluster.kinds import APPLICATION, DRONE, Body, key_of
 from fractus_operator.cluster.labels import FINALIZER
@@ -26,8 +26,12 @@ def objection(applications: Sequence[Body], drones: Sequence[Body]) -> str:
             f"Fractus still has to take down {_listed(kept)}: delete all Applications first "
             "(kubectl delete applications.fractus.dev --all -A), then uninstall"
         )
-    states = {body["metadata"]["name"]: body.get("status", {}).get("flightState") for body in drones}
-    flying = [f"{name} ({state})" for name, state in states.items() if state and state not in GROUNDED]
+    states = {body["metadata"]["name"]: body.get("status") or {} for body in drones}
+    flying = [
+        f"{name} ({status['flightState']})"
+        for name, status in states.items()
+        if is_airborne(status.get("flightState"), status.get("lastFlightState"))
+    ]
     if flying:
         return (
             f"Fractus still flies {_listed(flying)}: wait until kubectl get drones.fractus.dev says inactive or charging, "

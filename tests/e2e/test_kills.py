@@ -20,27 +20,23 @@ PARTS: dict[str, tuple[str, str, str | None]] = {
 @pytest.mark.parametrize("part", PARTS)
 def test_kill_in_flight(grounded: Kube, part: str) -> None:
     kube = grounded
-    name = f"kill-{part}"
+    application = f"kill-{part}"
     entries = len(audit_log(kube))
-    kube.apply(short_flight(name))
+    kube.apply(short_flight(application))
     kube.wait("the drone flies", lambda: flight_state(kube) == "flying", timeout_s=120)
     kube.wait("the first waypoint is near", in_midleg(kube, entries), timeout_s=60)
     selector, namespace, node = PARTS[part]
-    pod = kube.pod(selector, namespace, node)
-    before = restarts(pod)
+    pod = leader(kube) if part == "operator" else kube.pod(selector, namespace, node)
+    name, before = pod["metadata"]["name"], restarts(pod)
     kube.kill_pod(pod)
-    kube.wait(
-        f"{part} runs again",
-        lambda: restarts(kube.pod(selector, namespace, node)) > before,
-        timeout_s=60,
-    )
-    kube.wait("the mission is over", lambda: phase(kube, name) in {"Completed", "Failed"}, timeout_s=240)
+    kube.wait(f"{part} runs again", lambda: restarts(kube.get("pod", name, namespace)) > before, timeout_s=60)
+    kube.wait("the mission is over", lambda: phase(kube, application) in {"Completed", "Failed"}, timeout_s=240)
     kube.wait("the drone is home", lambda: flight_state(kube) == "inactive", timeout_s=150)
     kube.wait("the landing is on record", landed(kube, entries), timeout_s=30)
     log = audit_log(kube)[entries:]
     assert_supervised(log)
     if part in {"operator", "agent"}:
-        assert phase(kube, name) == "Completed"
+        assert phase(kube, application) == "Completed"
         assert not [e for e in log if e["kind"] == "takeover"]
 
 
@@ -62,6 +58,12 @@ def landed(kube: Kube, entries: int) -> Callable[[], bool]:
         return any(e["kind"] == "control" and e["action"] == "landed" for e in audit_log(kube)[entries:])
 
     return seen
+
+
+def leader(kube: Kube) -> Object:
+    """The pod of the operator that acts."""
+    lease = kube.get("lease", "fractus-operator", SYSTEM)
+    return kube.get("pod", lease["spec"]["holderIdentity"], SYSTEM)
 
 
 def restarts(pod: Object) -> int:

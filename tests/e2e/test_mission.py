@@ -32,7 +32,7 @@ def audit_log(kube: Kube) -> list[Object]:
 
 
 def children(kube: Kube, namespace: str = "default") -> list[str]:
-    kinds = "deployments,replicasets,pods,services,secrets,endpointslices"
+    kinds = "deployments,replicasets,pods,services,secrets,endpointslices,poddisruptionbudgets"
     found = kube.all(kinds, namespace, "fractus.dev/application")
     grants = kube.all("grants.fractus.dev")
     return [f"{o['kind']}/{o['metadata']['name']}" for o in (*found, *grants)]
@@ -104,7 +104,7 @@ def test_deleting_while_the_operator_is_down_leaves_nothing(grounded: Kube) -> N
         kube.wait("the operator is gone", lambda: not kube.all("pods", SYSTEM, "app.kubernetes.io/component=operator"))
         kube.must("delete", "application.fractus.dev", "orphan", "--wait=false")
     finally:
-        kube.must("scale", "deployment/fractus-operator", "-n", SYSTEM, "--replicas=1")
+        kube.must("scale", "deployment/fractus-operator", "-n", SYSTEM, "--replicas=2")
     kube.wait("the application is gone", lambda: kube.get("application.fractus.dev", "orphan") is None, timeout_s=90)
     kube.wait("nothing is left", lambda: not children(kube), timeout_s=60)
 

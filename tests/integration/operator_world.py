@@ -202,14 +202,31 @@ class World:
 
     def clear(self) -> None:
         """Remove what tests leave that is not in a namespace, and pods, which no kubelet ends here."""
+        for drone in self.api.list(f"{FRACTUS}/drones"):
+            state = {"status": {"flightState": "inactive"}}
+            self.api.merge(f"{FRACTUS}/drones/{drone['metadata']['name']}/status", state)
         for pod in self.api.list("/api/v1/pods"):
             path = f"/api/v1/namespaces/{pod['metadata']['namespace']}/pods/{pod['metadata']['name']}"
-            self.api.delete(path, grace_s=0)
+            self._delete(path, grace_s=0)
         for plural in ("drones", "edgenodes", "depots", "zones", "policies", "grants"):
             for item in self.api.list(f"{FRACTUS}/{plural}"):
-                self.api.delete(f"{FRACTUS}/{plural}/{item['metadata']['name']}")
+                self._delete(f"{FRACTUS}/{plural}/{item['metadata']['name']}")
         for node in self.api.list("/api/v1/nodes"):
-            self.api.delete(f"/api/v1/nodes/{node['metadata']['name']}")
+            self._delete(f"/api/v1/nodes/{node['metadata']['name']}")
+
+    def _delete(self, path: str, grace_s: int | None = None) -> None:
+        """Delete an object; what flew a moment ago is refused until admission knows of the landing."""
+
+        def done() -> bool:
+            try:
+                self.api.delete(path, grace_s)
+            except KubeError as error:
+                if error.status != 403:
+                    raise
+                return False
+            return True
+
+        wait_for(done, f"{path} to be deleted")
 
 
 def _namespace(name: str) -> Body:
@@ -228,13 +245,14 @@ class OperatorProcess:
         # As a pod does, it keeps its identity when it is started again.
         self._settings = {"FRACTUS_IDENTITY": identity, **settings}
         self._log = log
+        self.health = f"http://127.0.0.1:{free_port()}/healthz"
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
         env = {
             **os.environ,
             "KUBECONFIG": str(self._kubeconfig),
-            "FRACTUS_HEALTH": f"http://127.0.0.1:{free_port()}/healthz",
+            "FRACTUS_HEALTH": self.health,
             **self._settings,
         }
         with self._log.open("ab") as log:

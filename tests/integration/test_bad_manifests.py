@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import copy
+import json
 import random
+import re
+import ssl
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from control_plane import ControlPlane
+from corpus import CASES
+from fractus_cli.manifests import BadManifest, read_manifests
 from fractus_core.api import KINDS, InvalidObject
 from fractus_core.api.crd import crd
 from fractus_kube import KubeError
@@ -53,7 +61,11 @@ def driver(**point: Any) -> Body:
 
 
 def volume(**source: Any) -> Body:
-    return app(CLOUD | {"container": CONTAINER | {"volumes": [{"name": "v", "mountPath": "/v", **source}]}})
+    return app(CLOUD | {"container": CONTAINER | {"volumes": [{"name": "v", "mountPath": "/v"} | source]}})
+
+
+def resources(**given: Body) -> Body:
+    return app(CLOUD | {"container": CONTAINER | {"resources": given}})
 
 
 def policy(type_: str, kind: str, **more: Any) -> Body:
@@ -74,6 +86,7 @@ BAD: list[tuple[str, Body, str]] = [
     ("driver and points of interest", app(DRIVER, GUIDED), "the driver says where the drone flies; remove pointsOfInterest"),
     ("two guides", app(GUIDED, GUIDED | {"name": "Second"}), "only one passenger gives pointsOfInterest"),
     ("driver without control points", app({k: v for k, v in DRIVER.items() if k != "controlPoints"}), "a driver needs controlPoints"),
+    ("full control at two control points", app(DRIVER | {"controlPoints": [PATH, PATH]}), "a driver with full control has one control point"),
     ("driver without mobility", app(DRIVER | {"services": [CAMERA]}), "a driver needs the mobility service with the methods it will call"),
     ("drone component without class", app({k: v for k, v in GUIDED.items() if k != "class"}), "class (driver or passenger) is needed for placement drone, and only there"),
     ("path without waypoints", driver(path=[]), "spec.components[0].controlPoints[0].path"),
@@ -88,7 +101,7 @@ BAD: list[tuple[str, Body, str]] = [
     ("hybrid to nothing", app({k: v for k, v in HYBRID.items() if k != "hybridTo"}), "hybridTo is needed for placement hybrid, and only there"),
     ("hybrid to the cloud", app(CLOUD, HYBRID | {"hybridTo": ["Store"]}), "hybridTo takes components placed on a drone or at the edge"),
     ("heuristic in the cloud", app(CLOUD | {"heuristic": {"kind": "preferDirect"}}), "heuristic is for placement hybrid"),
-    ("heuristic without metric", app(EDGE, HYBRID | {"heuristic": {"kind": "max"}}), "kinds max and min need a metric"),
+    ("heuristic without metric", app(EDGE, HYBRID | {"heuristic": {"kind": "max"}}), "kinds max and min need a metric, preferDirect takes none"),
     ("replicas at the edge", app(EDGE | {"replicas": 2}), "replicas are for placement cloud"),
     ("services in the cloud", app(CLOUD | {"services": [CAMERA]}), "services are for placements drone and edge"),
     ("mobility at the edge", app(EDGE | {"services": [MOBILITY]}), "the mobility service is on drones only; use placement drone"),
@@ -138,6 +151,27 @@ BAD: list[tuple[str, Body, str]] = [
     ("heavier than much", selecting({"key": "mtom", "operator": "Gt", "values": ["much"]}), "Gt and Lt compare numbers"),
     ("drone of class C9", body("Drone", {"class": "C9"}), 'Unsupported value: "C9"'),
     ("edge node in no place", body("EdgeNode", {}), "spec.location: Required value"),
+    ("time before times", policy("LimitControl", "speed", upperLimit=1, validUntil="1970-01-01T00:00:00+05:00"), "validFrom and validUntil must be times since 1970"),
+    ("access with a limit", policy("AccessControl", "denial", methods=["Arm"], upperLimit=5), "lowerLimit and upperLimit go with type LimitControl"),
+    ("access with a datum", policy("AccessControl", "denial", methods=["Arm"], altitudeReference="amsl"), "altitudeReference goes with type LimitControl and kind altitude"),
+    ("limit of methods", policy("LimitControl", "speed", upperLimit=5, methods=["Arm"]), "methods go with type AccessControl"),
+    ("access that acts", policy("AccessControl", "denial", methods=["Arm"], action="refuse"), "AccessControl takes no action"),
+    ("names alike", app(CLOUD | {"name": "DataStore"}, CLOUD | {"name": "data-store"}), "names of components differ in more than capitals and hyphens"),
+    ("control of a passenger", app(GUIDED | {"control": "full"}), "control is for a component of class driver"),
+    ("port of a system name", app(CLOUD | {"container": {"image": "app", "ports": [{"port": 1, "name": "port-2"}]}}), "ports without a name get one that begins with port-"),
+    ("ports of one name", app(CLOUD | {"container": {"image": "app", "ports": [{"port": 1, "name": "a"}, {"port": 2, "name": "a"}]}}), "each port needs a name of its own"),
+    ("variable of the system", app(CLOUD | {"container": {"image": "app", "env": [{"name": "FRACTUS_NODE"}]}}), "names that begin with FRACTUS_ are set by the system"),
+    ("unknown resource", resources(requests={"disk": 1}), "resources are cpu, memory"),
+    ("request above the limit", resources(requests={"cpu": 2}, limits={"cpu": "1500m"}), "a request must not be above the limit"),
+    ("extended resource without limit", resources(requests={"a.b/c": 2}), "an extended resource needs a limit that is equal to its request"),
+    ("half a device", resources(limits={"a.b/c": "500m"}), "extended resources are whole"),
+    ("volume of the pod", volume(claim="c", name="tls"), "the pod has volumes tls and tmp of its own"),
+    ("volumes at one place", app(CLOUD | {"container": CONTAINER | {"volumes": [{"name": n, "mountPath": "/v", "claim": "c"} for n in "vw"]}}), "each volume needs a mountPath of its own"),
+    ("edge node that flies", body("EdgeNode", {"location": HERE, "services": {"mobility": {"maxAltitude": 1, "maxFlightTime": 1, "maxSpeed": 1, "methods": ["Arm"]}}}), "an edge node does not fly"),
+    ("drone on a mast", body("Drone", {"services": {"camera": {"methods": ["CaptureImage"], "mount": {"height": 5}}}}), "height is for the camera of an edge node"),
+    ("fisheye with polynomials", body("Drone", {"services": {"camera": {"methods": ["CaptureImage"], "lens": {"model": "equidistant", "k1": 0.1}}}}), "distortion coefficients belong to model brownConrady"),
+    ("depot that no one can name", body("Depot", {"location": HERE}) | {"metadata": {"name": "a.b"}}, "the name of a Depot has at most 63"),
+    ("zone that no one can name", zone() | {"metadata": {"name": "a.b"}}, "the name of a Zone has at most 63"),
     ("depot without radius", body("Depot", {"location": HERE, "radius": 0}), "should be greater than 0"),
 ]  # fmt: skip
 
@@ -149,7 +183,7 @@ def test_bad_manifest_is_refused_at_apply_with_its_sentence(
     model = MODELS[manifest["kind"]]
     place = f"namespaces/default/{model.PLURAL}" if model.NAMESPACED else model.PLURAL
     with pytest.raises(KubeError) as refused:
-        control_plane.admin.apply(f"{API}/{place}/bad", copy.deepcopy(manifest))
+        control_plane.admin.apply(f"{API}/{place}/{manifest['metadata']['name']}", copy.deepcopy(manifest))
     assert sentence.lower() in str(refused.value).lower()
 
 
@@ -181,6 +215,73 @@ def test_every_rule_has_a_manifest_that_breaks_it() -> None:
     assert [rule for rule in RULES if not any(rule.startswith(sentence) for _, _, sentence in BAD)] == []
 
 
+@pytest.fixture(scope="module")
+def https(control_plane: ControlPlane) -> urllib.request.OpenerDirector:
+    """What sends text to the API server as it is; its YAML is read there."""
+    credential = control_plane.authority.issue("corpus", common_name="corpus", organizations=("system:masters",))
+    context = ssl.create_default_context(cafile=control_plane.ca)
+    context.load_cert_chain(credential.certificate, credential.key)
+    return urllib.request.build_opener(urllib.request.HTTPSHandler(context=context))
+
+
+def test_the_api_server_judges_the_corpus_as_fractus_plan_does(
+    control_plane: ControlPlane, https: urllib.request.OpenerDirector
+) -> None:
+    """As the unit tests have it: each case is taken, or refused."""
+    taken = {case: all(not _refusal(control_plane, https, text) for text in case.documents) for case in CASES}
+    assert [case for case, was in taken.items() if was == bool(case.refused)] == []
+
+
+TOKENS = [
+    *["0178", "9", "x", "o", "b", "_", ".", "e", "E", "+", "-", ":", "n", "y", "Y", "~", "T", "Z", "a", "#", "&", "*", ",", "%", "@", "=", "0x", "0b", "0o"], "on", "true", "null", "inf", "nan",
+    "2026-01-01", "00:00:00", "<<", " ", "'", '"', "|", "<",
+]  # fmt: skip
+"""What plain scalars are made of; tags of others are refused by `fractus plan` alone."""
+
+
+def test_scalars_are_typed_as_the_api_server_types_them(
+    control_plane: ControlPlane, https: urllib.request.OpenerDirector, tmp_path: Path
+) -> None:
+    """A number is taken for a radius and no annotation, a text the other way round."""
+    rng = random.Random(1)
+    head = "apiVersion: fractus.dev/v1alpha1\nkind: Depot\nmetadata:\n  name: x\n  annotations:\n    a: "
+    taken = 0
+    for _ in range(300):
+        scalar = "".join(rng.choices(TOKENS, k=rng.randint(1, 4)))
+        for note, radius in ((scalar, "5"), ('"t"', scalar)):
+            text = f"{head}{note}\nspec:\n  location: {{lat: 1, lon: 2}}\n  radius: {radius}\n"
+            ours = judged(text, tmp_path / "m.yaml")
+            theirs = _refusal(control_plane, https, text)
+            assert bool(ours) == bool(theirs), (scalar, ours, theirs)
+            taken += not ours
+    assert 100 < taken < 500
+
+
+def judged(text: str, file: Path) -> str:
+    """What `fractus plan` says against a manifest."""
+    file.write_text(text)
+    try:
+        read_manifests([file])
+    except BadManifest as error:
+        return str(error)
+    return ""
+
+
+def _refusal(control_plane: ControlPlane, https: urllib.request.OpenerDirector, text: str) -> str:
+    kind = (re.search(r"^kind: (\w+)$", text, re.MULTILINE) or [""] * 2)[1]
+    if kind not in MODELS:
+        return "no such kind"
+    place = f"namespaces/default/{MODELS[kind].PLURAL}" if MODELS[kind].NAMESPACED else MODELS[kind].PLURAL
+    url = f"{control_plane.server}{API}/{place}?dryRun=All&fieldValidation=Strict"
+    request = urllib.request.Request(url, text.encode(), {"Content-Type": "application/yaml"}, method="POST")
+    try:
+        with https.open(request, timeout=10):
+            return ""
+    except urllib.error.HTTPError as error:
+        assert error.code in {400, 422}
+        return str(json.loads(error.read())["message"])
+
+
 def test_unknown_fields_are_refused(control_plane: ControlPlane) -> None:
     """As kubectl does by default: --validate=strict."""
     with pytest.raises(KubeError, match="unknown field"):
@@ -191,6 +292,7 @@ GOOD = [
     app(DRIVER | {"egress": ["Checker"]}, PASSENGER, EDGE, HYBRID | {"ingress": ["Navigator"]}, CLOUD | {"replicas": 2}),
     app(GUIDED, HYBRID | {"hybridTo": ["Viewer"], "heuristic": {"kind": "max", "metric": "ingress-bandwidth"}}),
     driver(path=[HERE], point={"depot": "base"}),
+    app(DRIVER | {"control": "partial", "controlPoints": [PATH, PATH]}),
     app(DRIVER | {"controlPoints": [{"navigation": "regionBased", "region": DISC, "duration": 5}]}),
     volume(secret="key"),
     policy("AccessControl", "denial", methods=["Arm"], validFrom="2026-01-01T00:00:00Z", validUntil="2026-02-01T00:00:00Z"),
@@ -198,6 +300,10 @@ GOOD = [
     policy("GeofenceControl", "exclusion", selector={"zones": ["z"]}, action="land"),
     policy("PrivacyControl", "camera", action="blurFaces", faces="gaussian", fallback="black"),
     selecting({"key": "mtom", "operator": "Gt", "values": ["1.5"]}, {"key": "class", "operator": "Exists"}),
+    app(CLOUD | {"container": CONTAINER | {"env": [{"name": "A", "value": "b"}], "resources": {"requests": {"cpu": 1, "a.b/c": 2}, "limits": {"cpu": "1", "a.b/c": 2}}, "volumes": [{"name": "v", "mountPath": "/v", "emptyDir": {"sizeLimit": "1Gi"}}, {"name": "w", "mountPath": "/w", "claim": "c"}]}}, MUTE),
+    body("Drone", {"class": "C2", "physicalFeatures": {"mtom": 900}, "interfaces": [{"technology": "WiFi", "range": 100, "pairing": {"networkId": "n"}}], "services": {"mobility": {"maxAltitude": 120, "maxFlightTime": 20, "maxSpeed": 10, "methods": ["Arm"]}, "camera": {"methods": ["CaptureImage"], "resolution": "640x480", "mount": {"pitch": -45}}}, "depot": "base", "home": HERE}),
+    body("EdgeNode", {"location": HERE, "services": {"camera": {"methods": ["CaptureImage"], "mount": {"height": 5}}}}),
+    body("Depot", {"location": HERE, "radius": 20}),
     zone(altitude={"lower": 1, "upper": 2}, schedule=[{"start": "08:00", "end": "17:00", "days": ["Mon"]}]),
 ]  # fmt: skip
 
@@ -218,17 +324,45 @@ CHOICES: dict[str, list[Any]] = {
     "instances": [0, 1, 10000, 10001, "*", "many"],
     "lower": [1, 5], "upper": [1, 5], "lowerLimit": [1, 5], "upperLimit": [1, 5],
     "validFrom": ["2026-01-01T00:00:00Z", "2026-03-01T00:00:00Z"],
-    "validUntil": ["2026-02-01T00:00:00Z"],
+    "validUntil": ["2026-02-01T00:00:00Z", "2026-02-01T00:00:00", ["2026-02-01T00:00:00Z"]],
     "start": ["08:00", "25:00"], "end": ["09:00"],
     "path": [[HERE], []], "region": [DISC], "duration": [5], "depot": ["base"], "position": [HERE],
     "replicas": [1], "heuristic": [{"kind": "max"}, {"kind": "preferDirect"}],
-    "controlPoints": [[PATH], []], "pointsOfInterest": [{"points": [HERE]}],
+    "controlPoints": [[PATH], [PATH, PATH], []], "control": ["full", "partial"], "pointsOfInterest": [{"points": [HERE]}],
     "locations": [[{"center": HERE, "radius": 5}], []],
     "services": [[MOBILITY], [CAMERA], [MOBILITY, CAMERA], [CAMERA, CAMERA], []],
     "faces": ["pixelate"], "fallback": ["black"], "zones": [["z"], []],
     "secret": ["key", "viewer-tls"], "claim": ["c"], "circle": [DISC["circle"]], "polygon": [RING],
+    "altitudeReference": ["home", "amsl"], "priority": [5, -1001],
+    "name": ["a", "port-1", "FRACTUS_A", "DataStore", "data-store", "tls", "", "a" * 41],
+    "port": [80, 81, 65536], "protocol": ["TCP", "UDP"], "mountPath": ["/v", "/w", "/tmp", "v"],
+    "env": [[{"name": "A"}, {"name": "A"}], [{"name": "A"}, {"name": "B"}]],
+    "ports": [[{"port": 80}, {"port": 80, "protocol": "UDP"}], [{"port": 1, "name": "a"}, {"port": 2, "name": "a"}]],
+    "requests": [{"cpu": 2}, {"cpu": "1500m", "memory": "1Gi"}, {"disk": "1"}, {"a.b/c": 1}, {"cpu": "x"}, {"cpu": 0.5}],
+    "limits": [{"cpu": "1.5"}, {"cpu": 1}, {"a.b/c": "1"}, {"a.b/c": "0.5"}, {"memory": "1G"}],
+    "mount": [{"height": 5}, {"pitch": -90}], "mobility": [{"maxSpeed": 5}], "resolution": ["640x480", "640"],
 }  # fmt: skip
 """What a field may become: allowed or not, alone or with what is beside it."""
+
+ODD: list[Any] = [
+    "5",
+    "",
+    "A b",
+    True,
+    None,
+    -1,
+    0,
+    1.5,
+    1e300,
+    2**63,
+    [],
+    {},
+    [None],
+    ["a"],
+    {"a": 1},
+    "2026-01-01T00:00:00Z",
+]
+"""What any field may become: of another type, empty, too large."""
 
 
 def objects(value: Any) -> Iterator[Body]:
@@ -244,8 +378,11 @@ def mutated(rng: random.Random, manifest: Body) -> Body:
     for _ in range(rng.randint(1, 3)):
         place = rng.choice([changed["spec"], *objects(changed["spec"])])
         schema = schema_of(place)
-        if place and rng.random() < 0.4:
+        chance = rng.random()
+        if place and chance < 0.3:
             place.pop(rng.choice(sorted(place)))
+        elif place and chance < 0.6:
+            place[rng.choice([*sorted(place), "unknown"])] = copy.deepcopy(rng.choice(ODD))
         elif known := sorted(schema & CHOICES.keys()):
             field = rng.choice(known)
             place[field] = copy.deepcopy(rng.choice(CHOICES[field]))
@@ -272,7 +409,7 @@ def shapes(schema: Body) -> Iterator[set[str]]:
 
 SHAPES = [
     fields
-    for kind in ("Application", "Policy", "Zone")
+    for kind in ("Application", "Policy", "Zone", "Drone", "EdgeNode", "Depot")
     for fields in shapes(crd(MODELS[kind])["spec"]["versions"][0]["schema"]["openAPIV3Schema"]["properties"]["spec"])
 ]
 

@@ -27,10 +27,11 @@ INSTANCES = {
 
 
 def deployed(world: World, namespace: str, name: str = "traffic", pods: int = 7) -> dict[str, Any]:
-    """Play scheduler and kubelet until the application is Running."""
+    """Play scheduler and kubelet until the application is ready."""
     wait_for(lambda: len(world.pods(namespace)) >= pods, lambda: f"{pods} pods; {world.status(namespace, name)}")
     world.run_pods(namespace)
-    return world.phase(namespace, "Running", name)
+    wait_for(lambda: world.condition(namespace, "Ready", name).get("status") == "True", "all pods to be ready")
+    return world.status(namespace, name)
 
 
 def running(world: World, namespace: str) -> dict[str, Any]:
@@ -187,10 +188,39 @@ def test_a_complete_mission_leaves_only_its_plan(world: World, operator: Operato
     running(world, namespace)
     world.drone_status("drone-1", "flying")
     end_mission(world, namespace, "Complete", "all control points were returned")
+    status = world.phase(namespace, "Returning")
+    assert status["message"] == "all control points were returned; drone-1 is on its way home"
+    wait_for(lambda: set(world.children(namespace)) == {"deploymentplans/traffic"}, "children to go")
+    world.drone_status("drone-1", "inactive")
     status = world.phase(namespace, "Completed")
     assert world.condition(namespace, "MissionComplete")["status"] == "True"
     assert status["message"] == "all control points were returned"
     wait_for(lambda: set(world.children(namespace)) == {"deploymentplans/traffic"}, "children to go")
+
+
+def test_the_phase_is_what_the_drone_does(world: World, operator: OperatorProcess, namespace: str) -> None:
+    status = running(world, namespace)
+    assert "flies" not in status["message"]
+    assert "drone-1 stands, its mission has not begun" in status["message"]
+    assert world.condition(namespace, "MissionComplete")["reason"] == "MissionWaiting"
+    navigator = f"spiffe://fractus.dev/ns/{namespace}/app/traffic/component/Navigator/instance/traffic-navigator"
+    path = f"{FRACTUS}/drones/drone-1/status"
+    world.api.merge(path, {"status": {"flightState": "takingOff", "controller": navigator}})
+    assert world.phase(namespace, "TakingOff")["controller"] == "Navigator"
+    world.drone_status("drone-1", "flying")
+    assert world.condition(namespace, "MissionComplete")["reason"] == "MissionBegun"
+    world.phase(namespace, "Flying")
+    world.api.merge(path, {"status": {"controller": "system"}})
+    wait_for(lambda: world.status(namespace).get("controller") == "system", "the system to fly")
+    world.api.merge(path, {"status": {"flightState": "unknown", "lastFlightState": "flying", "controller": None}})
+    lost = world.phase(namespace, "Unknown")
+    assert "controller" not in lost
+    ready = world.condition(namespace, "Ready")
+    assert (ready["status"], ready["reason"]) == ("Unknown", "TelemetryLost")
+    assert "drone-1 was flying when it was last heard of" in ready["message"]
+    world.drone_status("drone-1", "inactive")
+    assert "has landed" in world.phase(namespace, "Landed")["message"]
+    assert {"MissionBegun", "TelemetryLost"} <= set(events(world, namespace))
 
 
 @pytest.mark.parametrize(("phase", "reason"), [("Failed", "MissionFailed"), ("Revoked", "MissionRevoked")])
@@ -233,7 +263,7 @@ def test_one_drone_is_for_one_application_until_it_is_home(
     world.drone_status("drone-1", "flying")
     name = f"{namespace}.{first}-navigator"
     world.api.merge(f"{FRACTUS}/grants/{name}/status", {"status": {"phase": "Complete"}})
-    world.phase(namespace, "Completed", first)
+    world.phase(namespace, "Returning", first)
     wait_for(lambda: not world.grants(namespace, first), "the first one's grants to go")
     assert world.status(namespace, second)["phase"] == "Queued"
     world.drone_status("drone-1", "inactive")
@@ -395,7 +425,7 @@ def test_a_new_policy_reaches_the_grants_of_a_running_application(
         lambda: all("low" in [p["name"] for p in g["spec"].get("policies", [])] for g in world.grants(namespace)),
         "the policy",
     )
-    assert world.status(namespace)["phase"] == "Running"
+    assert world.status(namespace)["phase"] == "Waiting"
 
 
 def test_grants_are_signed_and_a_signature_that_is_changed_is_made_again(
@@ -453,6 +483,65 @@ def test_a_small_change_moves_nothing_else(world: World, operator: OperatorProce
     changed = {name for name in before if before[name] != after.get(name)}
     assert changed <= {"deployments/traffic-data-store", "deploymentplans/traffic", "application"}
     assert "deployments/traffic-data-store" in changed
+
+
+def driver_env(world: World, namespace: str) -> dict[str, Any]:
+    path = f"/apis/apps/v1/namespaces/{namespace}/deployments/traffic-navigator"
+    spec = (world.api.get(path) or {})["spec"]["template"]["spec"]
+    return {v["name"]: v.get("value") for v in spec["containers"][0]["env"]}
+
+
+def test_a_change_in_flight_waits_for_the_landing(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    world.drone_status("drone-1", "flying")
+    world.phase(namespace, "Flying")
+    before = {n: v for n, v in versions(world, namespace).items() if n != "application"}
+    manifest = traffic(namespace)
+    manifest["spec"]["components"][0]["container"]["env"] = [{"name": "COLOUR", "value": "red"}]
+    world.put(manifest)
+    waits = wait_for(lambda: world.condition(namespace, "Updated"), "the change to wait")
+    assert (waits["status"], waits["reason"]) == ("False", "WaitsForLanding")
+    assert "once drone-1 has landed" in waits["message"]
+    assert world.status(namespace)["phase"] == "Flying"
+    world.put(ours("Policy", "low", {"type": "LimitControl", "kind": "altitude", "upperLimit": 15}))
+    wait_for(
+        lambda: all("low" in [p["name"] for p in g["spec"].get("policies", [])] for g in world.grants(namespace)),
+        "the policy, which waits for nothing",
+    )
+    after = versions(world, namespace)
+    assert {n for n in before if before[n] != after[n] and not n.startswith("grants/")} == set()
+    world.drone_status("drone-1", "inactive")
+    wait_for(lambda: driver_env(world, namespace).get("COLOUR") == "red", "the change")
+    wait_for(lambda: not world.condition(namespace, "Updated"), "the condition to go")
+
+
+def test_a_change_that_is_to_be_immediate_is(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    world.drone_status("drone-1", "flying")
+    world.phase(namespace, "Flying")
+    manifest = traffic(namespace)
+    manifest["spec"]["updatePolicy"] = "Immediate"
+    manifest["spec"]["components"][0]["container"]["env"] = [{"name": "COLOUR", "value": "red"}]
+    world.put(manifest)
+    wait_for(lambda: driver_env(world, namespace).get("COLOUR") == "red", "the change")
+
+
+def test_a_change_that_waits_when_the_mission_ends_is_another_mission(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    running(world, namespace)
+    world.drone_status("drone-1", "flying")
+    world.phase(namespace, "Flying")
+    manifest = traffic(namespace)
+    manifest["spec"]["components"][0]["container"]["env"] = [{"name": "COLOUR", "value": "red"}]
+    world.put(manifest)
+    wait_for(lambda: world.condition(namespace, "Updated"), "the change to wait")
+    end_mission(world, namespace, "Complete", "done")
+    world.phase(namespace, "Queued")
+    world.drone_status("drone-1", "inactive")
+    world.phase(namespace, "Deploying")
+    assert driver_env(world, namespace).get("COLOUR") == "red"
+    assert world.grants(namespace)
 
 
 def test_what_a_spec_does_not_say_any_more_is_taken_away(

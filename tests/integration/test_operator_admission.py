@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import copy
-import subprocess
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 
 import pytest
 import yaml
+from chart import operator_token
 from control_plane import ControlPlane, wait_for
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
@@ -21,7 +21,6 @@ from fractus_kube import BlockingClient, KubeError
 from operator_world import FRACTUS, SYSTEM, OperatorProcess, World, at, component, navigator, ours, traffic
 
 Body = dict[str, Any]
-CHARTS = Path(__file__).parents[2] / "charts"
 REQUESTS = "/apis/certificates.k8s.io/v1/certificatesigningrequests"
 
 
@@ -138,39 +137,6 @@ def test_a_corrected_application_is_deployed(world: World, operator: OperatorPro
 
 
 # -- what agents may do --
-
-
-@pytest.fixture(scope="module")
-def chart(control_plane: ControlPlane) -> Iterator[None]:
-    """What the chart fractus makes, but its workloads: accounts, roles, the admission policy."""
-    world = World(control_plane)
-    world.api.apply(
-        f"/api/v1/namespaces/{SYSTEM}", {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": SYSTEM}}
-    )
-    for body in render():
-        if body["kind"] not in {"Deployment", "DaemonSet"}:
-            world.api.apply(_path(body), body)
-    yield
-
-
-def render(*arguments: str) -> list[Body]:
-    """The objects of the chart fractus, rendered by helm."""
-    caches = sorted((Path.home() / ".cache" / "fractus").glob("*/bin/helm"), reverse=True)
-    helm = str(caches[0]) if caches else "helm"
-    argv = [helm, "template", "fractus", str(CHARTS / "fractus"), "--namespace", SYSTEM, "--kube-version", "1.35.4"]
-    done = subprocess.run([*argv, *arguments], capture_output=True, text=True, timeout=60, check=True)
-    return [body for body in yaml.safe_load_all(done.stdout) if body]
-
-
-_PLURALS = {"PriorityClass": "priorityclasses", "ValidatingAdmissionPolicy": "validatingadmissionpolicies"}
-
-
-def _path(body: Body) -> str:
-    plural = _PLURALS.get(body["kind"], f"{body['kind'].lower()}s")
-    root = "/apis/" if "/" in body["apiVersion"] else "/api/"
-    namespace = body["metadata"].get("namespace")
-    scope = f"/namespaces/{namespace}" if namespace else ""
-    return f"{root}{body['apiVersion']}{scope}/{plural}/{body['metadata']['name']}"
 
 
 @pytest.fixture
@@ -369,12 +335,6 @@ def test_no_other_gets_a_certificate_of_a_node(
 # -- the operator's own permissions --
 
 
-def operator_token(world: World) -> str:
-    path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-operator/token"
-    request = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest", "spec": {"expirationSeconds": 600}}
-    return str(world.api.call("POST", path, request)["status"]["token"])
-
-
 def test_the_operator_writes_nothing_that_it_has_not_made(
     control_plane: ControlPlane, world: World, chart: None, namespace: str
 ) -> None:
@@ -429,7 +389,7 @@ def test_the_operator_does_its_work_with_the_chart_s_permissions(
         world.put(traffic(namespace))
         wait_for(lambda: len(world.pods(namespace)) == 7, operator.log)
         world.run_pods(namespace)
-        world.phase(namespace, "Running")
+        world.phase(namespace, "Waiting")
         grant = f"{FRACTUS}/grants/{namespace}.traffic-navigator/status"
         world.api.merge(grant, {"status": {"phase": "Complete"}})
         world.phase(namespace, "Completed")

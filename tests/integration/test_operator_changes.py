@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+import time
+import urllib.request
 from pathlib import Path
 from typing import Any
 
@@ -53,11 +55,13 @@ def test_a_guest_comes_along_and_is_done_when_its_host_is(
     world.put(guest(namespace, "late", [at(90, 90)]))
     world.phase(namespace, "Queued", "late")
     assert f"{namespace}/traffic" in world.status(namespace, "late")["message"]
-    assert world.status(namespace)["phase"] == "Running"
+    world.phase(namespace, "Flying")
     end_mission(world, namespace, "Complete", "done")
+    world.phase(namespace, "Returning", "guest")
+    wait_for(lambda: not world.grants(namespace, "guest"), "the guest's grants to go")
+    world.drone_status("drone-1", "inactive")
     status = world.phase(namespace, "Completed", "guest")
     assert status["message"] == f"{namespace}/traffic has flown drone-1 past all points of interest"
-    wait_for(lambda: not world.grants(namespace, "guest"), "the guest's grants to go")
 
 
 def test_a_guest_whose_ride_fails_gets_another_drone(world: World, operator: OperatorProcess, namespace: str) -> None:
@@ -66,7 +70,7 @@ def test_a_guest_whose_ride_fails_gets_another_drone(world: World, operator: Ope
     world.phase(namespace, "Deploying", "guest")
     world.drone_status("drone-1", "flying")
     end_mission(world, namespace, "Failed", "driver lost")
-    world.phase(namespace, "Failed")
+    world.phase(namespace, "Returning")
     wait_for(lambda: world.status(namespace, "guest").get("phase") == "Queued", "the guest to wait")
     wait_for(lambda: "SharedFlightLost" in events(world, namespace), "an Event")
     wait_for(lambda: not world.grants(namespace, "guest"), "the guest's grants to go")
@@ -158,6 +162,26 @@ def test_new_nodes_make_a_plan_grow(world: World, operator: OperatorProcess, nam
     )
 
 
+def test_a_zone_across_the_way_is_told_before_takeoff_until_it_goes(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    running(world, namespace)
+    fence = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["across"]}}
+    world.put(ours("Zone", "across", {"area": {"circle": {"center": at(30, 30), "radius": 5}}}))
+    policy = ours("Policy", "across", fence)
+    world.put(policy)
+    told = wait_for(lambda: world.condition(namespace, "PolicyConflict"), "the condition PolicyConflict")
+    assert told["status"] == "True"
+    assert "crosses zone across for 10.0 m of policy across" in told["message"]
+    wait_for(lambda: "policyConflict" in drone_of(world, namespace, "traffic"), "the plan to say so")
+    leg = drone_of(world, namespace, "traffic")["legality"][0]
+    assert (leg["flownBy"], leg["outcome"], leg["policies"]) == ("driver", "Denied", ["across"])
+    assert world.status(namespace)["phase"] == "Waiting"
+    wait_for(lambda: "PolicyConflict" in events(world, namespace), "the Event")
+    world.api.delete(world.path(policy))
+    wait_for(lambda: not world.condition(namespace, "PolicyConflict"), "the condition to go")
+
+
 # -- releases --
 
 
@@ -212,3 +236,38 @@ def test_of_two_operators_one_acts_and_the_other_takes_over(
         if second.running:
             # It gives the Lease back: the next test's operator need not wait until that has run out.
             second.stop()
+
+
+def test_the_second_operator_is_healthy_and_acts_within_15_s_of_the_end_of_the_first(
+    control_plane: ControlPlane, world: World, namespace: str, tmp_path: Path
+) -> None:
+    first, second = (
+        OperatorProcess(control_plane.kubeconfig, tmp_path / f"{name}.log", name) for name in ("lost", "next")
+    )
+    first.start()
+    try:
+        wait_for(lambda: "became leader" in first.log(), first.log)
+        second.start()
+        wait_for(lambda: "waiting for the leader to end" in second.log(), second.log)
+        for operator in (first, second):
+            wait_for(lambda operator=operator: healthy(operator), operator.log)  # type: ignore[misc]
+        assert "became leader" not in second.log()
+        first.stop(signal.SIGKILL)
+        lost_s = time.monotonic()
+        world.put(traffic(namespace))
+        world.phase(namespace, "Deploying")
+        assert time.monotonic() - lost_s < 15
+        assert healthy(second)
+    finally:
+        if first.running:
+            first.stop(signal.SIGKILL)
+        if second.running:
+            second.stop()
+
+
+def healthy(operator: OperatorProcess) -> bool:
+    try:
+        with urllib.request.urlopen(operator.health, timeout=5) as answer:
+            return bool(answer.status == 200)
+    except OSError:
+        return False

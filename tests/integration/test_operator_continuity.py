@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
 from control_plane import wait_for
+from fractus_kube import KubeError
 from operator_world import FRACTUS, OperatorProcess, World, at, ours, traffic
 from test_operator import end_mission, gone, running
 
 Body = dict[str, Any]
 LOW = {"type": "LimitControl", "kind": "altitude", "upperLimit": 15}
 UNREADABLE = LOW | {"validFrom": "0000-01-01T00:00:00Z"}
-"""The API server knows a year 0."""
+"""What an older release let in: a year 0."""
 
 
 def granted(world: World, namespace: str, instance: str = "traffic-navigator") -> list[str]:
@@ -32,9 +35,37 @@ def reason(world: World, namespace: str, wanted: str, name: str = "traffic") -> 
     return wait_for(reached, lambda: f"{wanted}, but it is {world.status(namespace, name)}")
 
 
+@contextmanager
+def older_policies(world: World) -> Iterator[None]:
+    """Policies of an older release, whose times were not looked at."""
+    path = "/apis/apiextensions.k8s.io/v1/customresourcedefinitions/policies.fractus.dev"
+    present = world.api.get(path)
+    assert present is not None
+    older = copy.deepcopy(present["spec"])
+    spec = older["versions"][0]["schema"]["openAPIV3Schema"]["properties"]["spec"]
+    spec["properties"]["validFrom"] = {"type": "string"}
+    spec["x-kubernetes-validations"] = [
+        each for each in spec["x-kubernetes-validations"] if "validFrom" not in each["rule"]
+    ]
+    world.api.merge(path, {"spec": older})
+    try:
+        yield
+    finally:
+        world.api.merge(path, {"spec": present["spec"]})
+
+
 def policy_ready(world: World, name: str) -> Body:
     status = (world.api.get(f"{FRACTUS}/policies/{name}") or {}).get("status") or {}
     return next((c for c in status.get("conditions") or () if c["type"] == "Ready"), {})
+
+
+def let_in(world: World, body: Body) -> bool:
+    """Put an object, unless the API server refuses it."""
+    try:
+        world.put(body)
+    except KubeError:
+        return False
+    return True
 
 
 def _infeasible(world: World, namespace: str) -> None:
@@ -81,14 +112,15 @@ def test_a_broken_policy_stays_as_granted_and_blocks_no_other(
     running(world, namespace)
     assert granted(world, namespace) == ["fence", "odd"]
     world.api.delete(f"{FRACTUS}/zones/school")
-    world.put(ours("Policy", "odd", UNREADABLE))
+    with older_policies(world):
+        wait_for(lambda: let_in(world, ours("Policy", "odd", UNREADABLE)), "the API server to let it in")
     condition = wait_for(
         lambda: policy_ready(world, "odd").get("status") == "False" and policy_ready(world, "odd"), "it"
     )
     assert (condition["reason"], "validFrom" in condition["message"]) == ("Invalid", True)
     world.put(ours("Policy", "slow", {"type": "LimitControl", "kind": "speed", "upperLimit": 3}))
     wait_for(lambda: granted(world, namespace) == ["fence", "odd", "slow"], "the third policy beside the broken ones")
-    assert world.status(namespace)["phase"] == "Running"
+    assert world.status(namespace)["phase"] == "Waiting"
     # What is new is granted nothing while it is unknown for which grants that policy holds.
     world.add_drone("drone-2")
     world.put(traffic(namespace, "second"))
@@ -106,7 +138,7 @@ def test_a_drone_on_its_way_home_is_nobodys(world: World, operator: OperatorProc
     running(world, namespace)
     world.drone_status("drone-1", "flying")
     end_mission(world, namespace, "Complete", "done")
-    world.phase(namespace, "Completed")
+    world.phase(namespace, "Returning")
     again = traffic(namespace)
     again["spec"]["components"][4]["replicas"] = 2
     world.put(again)

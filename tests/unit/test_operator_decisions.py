@@ -18,9 +18,10 @@ from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile import status
 from fractus_operator.reconcile.conditions import ConditionUpdate, merge
 from fractus_operator.reconcile.difference import contains, is_current, stamped
+from fractus_operator.reconcile.flight_status import flight
 from fractus_operator.reconcile.location import geohash, location_labels
 from fractus_operator.reconcile.missions import mission_outcome
-from fractus_operator.reconcile.replanning import replan_reason, stuck_nodes
+from fractus_operator.reconcile.replanning import _with_names_of, replan_reason, stuck_nodes, waits_for_landing
 from fractus_operator.reconcile.status import Blocked
 from fractus_operator.settings import BadSetting, Settings
 
@@ -131,6 +132,26 @@ def test_a_drone_in_the_air_keeps_its_plan() -> None:
     assert replan_reason(application(2), PLAN, without, {}, in_flight="edge-1") == "SpecChanged"
 
 
+def test_a_changed_manifest_waits_while_the_drone_flies() -> None:
+    assert waits_for_landing(application(2), PLAN, "d")
+    assert not waits_for_landing(application(1), PLAN, "d")
+    assert not waits_for_landing(application(2), PLAN, None)
+    now = application(2)
+    now = now.model_copy(update={"spec": now.spec.model_copy(update={"update_policy": "Immediate"})})
+    assert not waits_for_landing(now, PLAN, "d")
+
+
+def test_in_flight_what_stays_keeps_the_name_that_another_release_gave_it() -> None:
+    named = PLAN.model_copy(update={"placements": (placed("old-1", "edge-1"), placed("old-c", None, replicas=2))})
+    fresh = (placed("new-1", "edge-1"), placed("new-c", None, replicas=2), placed("new-2", "edge-2"))
+    kept = _with_names_of(named, PLAN.model_copy(update={"placements": fresh}))
+    assert [p.instance for p in kept.placements] == ["old-1", "old-c", "new-2"]
+    clash = (*fresh[:2], placed("old-1", "edge-2"))
+    assert [p.instance for p in _with_names_of(named, PLAN.model_copy(update={"placements": clash})).placements] == [
+        "new-1", "new-c", "old-1",
+    ]  # fmt: skip
+
+
 def view(instance: str, **more: object) -> PodView:
     values: dict[str, object] = {"ready": True, "finished": False, "terminating": False, "ip": None}
     values |= {"deployment": instance, **more}
@@ -167,6 +188,24 @@ def test_readiness_counts_each_instance_up_to_its_replicas() -> None:
     assert old.pods == "2/3"
 
 
+def test_a_failed_component_is_named_with_its_exit_code_and_last_lines() -> None:
+    ended = {"exitCode": 1, "message": "Traceback\nValueError: no route\n"}
+    again = {"state": {"running": {}}, "lastState": {"terminated": ended}}
+    never = {"state": {"waiting": {"reason": "ImagePullBackOff", "message": "no such image"}}}
+    well = {"state": {"running": {}}, "lastState": {"terminated": {"exitCode": 0}}}
+    body = {"metadata": {"name": "p", "namespace": "ns"}, "spec": {}}
+    failures = [read_pod(body | {"status": {"containerStatuses": [c]}}).failure for c in (again, never, well)]
+    assert failures == ["exit code 1: Traceback | ValueError: no route", "ImagePullBackOff: no such image", ""]
+    pods = [view("a-c"), view("a-c"), view("a-1", ready=False, failure=failures[0])]
+    update = status.deployed(PLAN, pods, 0)
+    ready = next(c for c in update.conditions if c.type == "Ready")
+    assert (ready.reason, ready.warning) == ("ComponentFailed", True)
+    assert update.message == "waiting for a-1; a-1 failed with exit code 1: Traceback | ValueError: no route"
+    lost = status.finished(Outcome(OutcomeKind.FAILED, "driver lost"), "d", None, pods)
+    assert lost.message == "driver lost; a-1 failed with exit code 1: Traceback | ValueError: no route"
+    assert status.finished(Outcome(OutcomeKind.COMPLETE, "done"), "d", None, pods).message == "done"
+
+
 def grant(phase: str | None, uid: str = "u1", class_: str = "driver") -> Grant:
     owner = {"namespace": "ns", "name": "app", "uid": uid}
     spec = {"node": "d", "application": owner, "component": "N", "instance": "n", "class": class_}
@@ -184,11 +223,54 @@ def test_only_the_driver_of_this_application_ends_the_mission() -> None:
 
 @pytest.mark.parametrize("kind", OutcomeKind)
 def test_every_outcome_is_reported(kind: OutcomeKind) -> None:
-    update = status.finished(Outcome(kind, "because"), None)
+    update = status.finished(Outcome(kind, "because"), "d", None)
     complete = kind is OutcomeKind.COMPLETE
     assert (update.phase, update.message) == ("Completed" if complete else "Failed", "because")
     assert [c.status for c in update.conditions] == ["False", "True" if complete else "False"]
     assert update.conditions[0].warning is not complete
+
+
+def flown(state: str, last: str | None = None, controller: str | None = None) -> Drone:
+    said = {"flightState": state, "lastFlightState": last or state, "controller": controller}
+    body = {"apiVersion": V1, "kind": "Drone", "metadata": {"name": "d"}, "spec": {}}
+    return Drone.from_body({**body, "status": {name: value for name, value in said.items() if value}})
+
+
+def test_a_mission_that_is_over_is_returning_until_the_drone_has_landed() -> None:
+    update = status.finished(Outcome(OutcomeKind.FAILED, "driver lost"), "d", flown("flying", controller="system"))
+    assert (update.phase, update.controller) == ("Returning", "system")
+    conditions = [{"type": c.type, "status": c.status, "reason": c.reason, "message": c.message,
+                   "lastTransitionTime": NOW} for c in update.conditions]  # fmt: skip
+    reported = {"drone": "d", "conditions": conditions}
+    silent = status.still_over(reported, flown("unknown", "flying"))
+    assert (silent.phase, "last heard of" in silent.message) == ("Returning", True)
+    for landed in (flown("inactive"), None):
+        update = status.still_over(reported, landed)
+        assert (update.phase, update.message, update.controller) == ("Failed", "driver lost", None)
+
+
+@pytest.mark.parametrize(
+    ("drone", "begun", "phase"),
+    [
+        (flown("inactive"), False, "Waiting"),
+        (flown("inactive"), True, "Landed"),
+        (flown("takingOff"), False, "TakingOff"),
+        (flown("landing"), False, "Flying"),
+        (flown("unknown", "flying"), True, "Unknown"),
+        (None, True, "Unknown"),
+    ],
+)
+def test_the_phase_of_a_flight_is_what_its_drone_does(drone: Drone | None, begun: bool, phase: str) -> None:
+    mission = {"type": "MissionComplete", "reason": "MissionBegun" if begun else "MissionWaiting"}
+    found = flight("d", drone, {"drone": "d", "conditions": [mission]})
+    assert found.phase == phase
+    update = status.deployed(PLAN, [view("a-1")], 0, found)
+    assert update.phase == ("Deploying" if phase in {"Waiting", "Landed"} else phase), "a pod is missing"
+
+
+def test_the_flight_of_another_drone_began_nothing() -> None:
+    mission = {"type": "MissionComplete", "reason": "MissionBegun"}
+    assert flight("d", flown("inactive"), {"drone": "other", "conditions": [mission]}).phase == "Waiting"
 
 
 def test_what_blocks_is_reported_at_its_stage() -> None:
@@ -279,6 +361,7 @@ def test_settings_come_from_the_environment() -> None:
         {"FRACTUS_PLANNING_CRUISE_SPEED": "0"},
         {"FRACTUS_PLANNING_BATTERY_RESERVE": "20"},
         {"FRACTUS_PLANNING_RANKING": "best"},
+        {"FRACTUS_PLANNING_POLICY_CONFLICTS": "ignore"},
         {"FRACTUS_LEASE": "0.5"},
     ],
 )

@@ -7,7 +7,10 @@ from dataclasses import replace
 import pytest
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning import Infeasible, Inventory, Settings
+from fractus_core.planning.legality import with_legality
 from fractus_operator.reconcile.replanning import Choice, choose_plan
+from fractus_operator.reconcile.status import Blocked, blocked, deployed
+from test_plan_legality import FORBID, WARN, fenced
 from test_planning import PATH, STORE, VIEWER, application, drone, host, inventory, navigator
 
 APPLICATION = application(navigator(PATH), VIEWER | {"egress": ["DataStore"]}, STORE)
@@ -69,3 +72,34 @@ def test_a_node_that_the_scheduler_refuses_is_not_chosen_again(plan: DeploymentP
     assert other.plan.drone.node == "two"
     with pytest.raises(Infeasible, match="no cpu"):
         choose(plan, TWO, stuck={"one": "no cpu", "two": "no cpu"})
+
+
+def test_a_conflict_with_policies_moves_a_plan_only_where_that_is_forbidden(plan: DeploymentPlanSpec) -> None:
+    fences = fenced(200, 0)
+    closed = replace(TWO, policies=fences.policies, zones=fences.zones)
+    present = with_legality(APPLICATION, plan, closed, WARN)
+    assert present.drone is not None
+    assert present.drone.policy_conflict is not None
+
+    def choosing(settings: Settings, in_flight: str | None = None) -> Choice:
+        return choose_plan(APPLICATION, present, closed, settings, stuck={}, in_flight=in_flight)
+
+    assert choosing(WARN) == Choice(present, fits=True)
+    assert choosing(FORBID, in_flight="one") == Choice(present, fits=True)
+    with pytest.raises(Infeasible, match="crosses zone z") as caught:
+        choosing(FORBID)
+    assert caught.value.reason == "PolicyConflict"
+
+
+def test_a_conflict_is_a_condition_that_warns(plan: DeploymentPlanSpec) -> None:
+    fences = fenced(200, 0)
+    present = with_legality(APPLICATION, plan, replace(TWO, policies=fences.policies, zones=fences.zones), WARN)
+    (condition,) = [c for c in deployed(present, [], 1).conditions if c.type == "PolicyConflict"]
+    assert condition.status == "True"
+    assert condition.warning
+    assert "crosses zone z" in condition.message
+    assert not [c for c in deployed(plan, [], 1).conditions if c.type == "PolicyConflict"]
+    refused = blocked(Blocked("Pending", "Planned", "PolicyConflict", "no drone may fly"), None)
+    assert [(c.type, c.status) for c in refused.conditions] == [
+        ("Planned", "False"), ("Ready", "False"), ("PolicyConflict", "True"),
+    ]  # fmt: skip

@@ -33,7 +33,8 @@ def flown(state: str = "inactive", x: float = 0.0, **more: Any) -> Flown:
 
 
 def submitted(phase: str | None) -> Any:
-    status = {"phase": phase, "observedGeneration": 1} if phase else {}
+    complete = {"type": "MissionComplete", "status": str(phase in {"Completed", "Returning"})}
+    status = {"phase": phase, "observedGeneration": 1, "conditions": [complete]} if phase else {}
     body = {**manifest("Application", "traffic", {"components": []}), "status": status}
     return read_submitted(body)
 
@@ -57,7 +58,13 @@ def test_a_host_whose_manifest_was_changed_is_not_offered() -> None:
 
 @pytest.mark.parametrize(
     ("phase", "host_plan", "done"),
-    [("Completed", None, True), ("Completed", OWN, False), ("Failed", None, False), ("Running", OWN, False)],
+    [
+        ("Completed", None, True),
+        ("Returning", None, True),
+        ("Completed", OWN, False),
+        ("Failed", None, False),
+        ("Running", OWN, False),
+    ],
 )
 def test_a_guest_is_done_when_its_host_has_completed(phase: str, host_plan: Any, done: bool) -> None:
     outcome = shared_flight_outcome(RIDE, submitted(phase), host_plan)

@@ -29,11 +29,18 @@ def test_applications_to_take_down_are_named() -> None:
     assert "kubectl delete applications" in said
 
 
-@pytest.mark.parametrize("state", ["flying", "returning", "unknown"])
+@pytest.mark.parametrize("state", ["flying", "returning"])
 def test_drones_in_the_air_are_named(state: str) -> None:
     said = objection([], [drone("drone-1", state), drone("drone-2", "inactive")])
     assert f"drone-1 ({state})" in said
     assert "drone-2" not in said
+
+
+def test_a_silent_drone_is_where_it_was() -> None:
+    silent = {"metadata": {"name": "drone-1"}, "status": {"flightState": "unknown", "lastFlightState": "landing"}}
+    assert "drone-1 (unknown)" in objection([], [silent])
+    silent["status"]["lastFlightState"] = "inactive"
+    assert objection([], [silent]) == ""
 
 
 def test_long_lists_are_cut() -> None:

@@ -8,7 +8,7 @@ import pytest
 from fractus_kube import KubeError
 from fractus_operator.cluster.kinds import Key
 from fractus_operator.reconcile import worklist as worklist_module
-from fractus_operator.reconcile.worklist import Worklist
+from fractus_operator.reconcile.worklist import Worklist, regularly
 
 
 async def test_an_unforeseen_failure_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,3 +98,22 @@ async def test_a_failure_is_tried_again_and_holds_up_no_one(monkeypatch: pytest.
     task.cancel()
     assert attempts == {("", "bad"): 4, ("", "good"): 1}
     assert worklist.failures == {}
+
+
+@pytest.mark.parametrize("failure", [ValueError("no time"), KubeError(500, "InternalError", "not now")])
+async def test_a_step_that_fails_is_made_again(failure: Exception, caplog: pytest.LogCaptureFixture) -> None:
+    steps: list[int] = []
+    done = asyncio.Event()
+
+    async def step() -> None:
+        steps.append(1)
+        if len(steps) == 1:
+            raise failure
+        done.set()
+
+    task = asyncio.create_task(regularly("test", step, 0.001))
+    async with asyncio.timeout(5):
+        await asyncio.wait((task, asyncio.ensure_future(done.wait())), return_when=asyncio.FIRST_COMPLETED)
+    assert not task.done()
+    task.cancel()
+    assert ("Traceback" in caplog.text) == isinstance(failure, ValueError)

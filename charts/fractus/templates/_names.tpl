@@ -79,6 +79,13 @@ affinity:
             - key: fractus.dev/class
               operator: NotIn
               values: [drone, edge]
+  podAntiAffinity:
+    preferredDuringSchedulingIgnoredDuringExecution:
+      - weight: 100
+        podAffinityTerm:
+          topologyKey: kubernetes.io/hostname
+          labelSelector:
+            matchLabels: {{- include "fractus.selector" (dict "root" . "part" "operator") | nindent 14 }}
 {{- with .Values.operator.nodeSelector }}
 nodeSelector: {{- toYaml . | nindent 2 }}
 {{- end }}

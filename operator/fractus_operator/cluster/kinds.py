@@ -39,8 +39,10 @@ SECRET = Kind("v1", "Secret", "secrets", namespaced=True)
 CONFIG_MAP = Kind("v1", "ConfigMap", "configmaps", namespaced=True)
 EVENT = Kind("v1", "Event", "events", namespaced=True)
 DEPLOYMENT = Kind("apps/v1", "Deployment", "deployments", namespaced=True)
+DISRUPTION_BUDGET = Kind("policy/v1", "PodDisruptionBudget", "poddisruptionbudgets", namespaced=True)
+CONTROLLER_REVISION = Kind("apps/v1", "ControllerRevision", "controllerrevisions", namespaced=True)
 ENDPOINT_SLICE = Kind("discovery.k8s.io/v1", "EndpointSlice", "endpointslices", namespaced=True)
 SIGNING_REQUEST = Kind("certificates.k8s.io/v1", "CertificateSigningRequest", "certificatesigningrequests", False)
 
-CHILDREN: tuple[Kind, ...] = (GRANT, DEPLOYMENT_PLAN, SECRET, SERVICE, ENDPOINT_SLICE, DEPLOYMENT)
+CHILDREN: tuple[Kind, ...] = (GRANT, DEPLOYMENT_PLAN, SECRET, SERVICE, ENDPOINT_SLICE, DISRUPTION_BUDGET, DEPLOYMENT)
 """What the operator makes for an Application, in the order in which it is applied."""

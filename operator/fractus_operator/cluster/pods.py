@@ -15,6 +15,9 @@ from fractus_core.planning.quantities import amount_of
 from fractus_operator.cluster.kinds import Body, Key
 from fractus_operator.cluster.labels import APPLICATION_LABEL, COMPONENT_LABEL, INSTANCE_LABEL, MANAGED_LABEL
 
+_MAX_LOG = 400
+"""Characters of a failed container's last log lines that are kept."""
+_CANNOT_START = frozenset({"ImagePullBackOff", "ErrImagePull", "InvalidImageName", "CreateContainerConfigError"})
 _KEPT_LABELS = (APPLICATION_LABEL, COMPONENT_LABEL, INSTANCE_LABEL, MANAGED_LABEL)
 
 
@@ -29,6 +32,8 @@ class PodView:
     Attributes:
         requests: what it asks of its node, in base units.
         deployment: name of the Deployment that made it, through a ReplicaSet; None for a pod of other making.
+        daemon_set: name of the DaemonSet that made it, and `revision`, which of its templates it was made from.
+        failure: how its container failed last: exit code and last log lines; empty if it never did.
         unschedulable_since: since when the scheduler has found no node for it, if so.
         unschedulable_message: what the scheduler said.
     """
@@ -43,6 +48,9 @@ class PodView:
     terminating: bool
     ip: str | None
     deployment: str | None = None
+    daemon_set: str | None = None
+    revision: str = ""
+    failure: str = ""
     unschedulable_since: datetime | None = None
     unschedulable_message: str = ""
 
@@ -82,16 +90,48 @@ def read_pod(body: Body) -> PodView:
         terminating="deletionTimestamp" in metadata,
         ip=status.get("podIP"),
         deployment=_deployment(metadata),
+        daemon_set=daemon_set(metadata),
+        revision=revision_hash(metadata),
+        failure=_failure(status),
         unschedulable_since=datetime.fromisoformat(since) if since else None,
         unschedulable_message=scheduled.get("message", "") if unschedulable else "",
     )
 
 
+def _failure(status: Body) -> str:
+    for container in status.get("containerStatuses") or ():
+        ended = (container.get("state") or {}).get("terminated") or (container.get("lastState") or {}).get("terminated")
+        if ended and ended.get("exitCode"):
+            lines = " | ".join(str(ended.get("message") or ended.get("reason") or "").split("\n"))[-_MAX_LOG:].strip(
+                " |"
+            )
+            return f"exit code {ended['exitCode']}" + (f": {lines}" if lines else "")
+        waiting = (container.get("state") or {}).get("waiting") or {}
+        if waiting.get("reason") in _CANNOT_START:
+            return f"{waiting['reason']}: {waiting.get('message', '')}".rstrip(": ")
+    return ""
+
+
 def _deployment(metadata: Body) -> str | None:
     """ReplicaSets are named after their Deployment: NAME-HASH."""
+    owner = _controller(metadata, "ReplicaSet")
+    return owner.rpartition("-")[0] if owner is not None else None
+
+
+def daemon_set(metadata: Body) -> str | None:
+    """The DaemonSet that controls an object."""
+    return _controller(metadata, "DaemonSet")
+
+
+def revision_hash(metadata: Body) -> str:
+    """Which of its controller's templates a pod was made from, or a ControllerRevision keeps."""
+    return str((metadata.get("labels") or {}).get("controller-revision-hash", ""))
+
+
+def _controller(metadata: Body, kind: str) -> str | None:
     for owner in metadata.get("ownerReferences") or ():
-        if owner.get("controller") and (owner.get("apiVersion"), owner.get("kind")) == ("apps/v1", "ReplicaSet"):
-            return str(owner["name"]).rpartition("-")[0]
+        if owner.get("controller") and (owner.get("apiVersion"), owner.get("kind")) == ("apps/v1", kind):
+            return str(owner["name"])
     return None
 
 

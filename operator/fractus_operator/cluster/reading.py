@@ -32,8 +32,8 @@ T_co = TypeVar("T_co", covariant=True)
 
 _MAX_PARTS = 10_000
 
-SETTLED = frozenset({"Completed", "Failed"})
-"""Phases of an application whose mission is over."""
+SETTLED = frozenset({"Returning", "Completed", "Failed"})
+"""Phases of an application whose mission is over, also while its drone comes home."""
 
 
 class Copies(Protocol[T_co]):
@@ -80,9 +80,10 @@ class Submitted(_Object):
         return self.body["metadata"].get("namespace", ""), self.body["metadata"]["name"]
 
     @property
-    def phase(self) -> str:
-        """The phase of its status; empty before it has one."""
-        return str((self.body.get("status") or {}).get("phase") or "")
+    def completed(self) -> bool:
+        """Whether its mission was completed, also while its drone comes home."""
+        conditions = (self.body.get("status") or {}).get("conditions") or ()
+        return any(c["type"] == "MissionComplete" and c["status"] == "True" for c in conditions)
 
     @property
     def settled_generation(self) -> int | None:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
 from fractus_core.api import Application, Drone, Grant
-from fractus_core.api.nodes import GROUNDED
 from fractus_core.api.plans import DeploymentPlanSpec
 
 from fractus_operator.cluster.kinds import Key
@@ -100,12 +99,12 @@ class Fleet:
 
     def changed(self, drone: Drone) -> None:
         """Follow a drone's flight state."""
-        (self._in_flight.add if is_flying(drone) else self._in_flight.discard)(drone.name)
+        (self._in_flight.add if drone.in_air else self._in_flight.discard)(drone.name)
 
     def is_in_flight(self, node: str) -> bool:
         """Whether a drone flies; one whose object went while it flew still does, for all that is known."""
         drone = self._drones.get(("", node))
-        return is_flying(drone) if drone is not None else node in self._in_flight
+        return drone.in_air if drone is not None else node in self._in_flight
 
     def in_flight(self, plan: DeploymentPlanSpec | None) -> str | None:
         """The drone of a plan, while it flies."""
@@ -116,7 +115,7 @@ class Fleet:
         """Which application has which drone: from the plan on, until its grants are gone and the drone has come home."""
         found = claims(plans, grants)
         for drone in self._drones.values():
-            if drone is not None and drone.name not in found and is_flying(drone):
+            if drone is not None and drone.name not in found and drone.in_air:
                 last = self._last_claims.get(drone.name) or self._claim_on_record(drone.name)
                 found[drone.name] = replace(last, over=True)
         self._last_claims.update(found)
@@ -131,7 +130,7 @@ class Fleet:
                 continue
             drone = self._drones.get(("", choice.node))
             if drone is not None and submitted is not None and submitted.application is not None:
-                yield Flown(submitted.application, plan.spec, drone, is_flying(drone))
+                yield Flown(submitted.application, plan.spec, drone, drone.in_air)
 
     def _claim_on_record(self, drone: str) -> Claim:
         """The application that flew the drone last, from the applications' statuses: an operator that restarted has no other."""
@@ -139,8 +138,3 @@ class Fleet:
             if (submitted.body.get("status") or {}).get("drone") == drone:
                 return Claim(key, submitted.uid)
         return Claim(("fractus-system", "flight-home"), "")
-
-
-def is_flying(drone: Drone) -> bool:
-    """Whether the drone is on its way."""
-    return drone.status is not None and drone.status.flight_state not in GROUNDED

@@ -18,17 +18,26 @@ from fractus_operator.cluster.pods import PodView, read_host, read_pod
 from fractus_operator.cluster.reading import PartPool, Submitted, Unreadable, read_submitted, reader, tolerant_reader
 from fractus_operator.cluster.store import Reflector, Store
 from fractus_operator.inventory.bookings import BookedHosts, Bookings, ByName, corrections
-from fractus_operator.inventory.claims import Claim, Fleet, is_flying
+from fractus_operator.inventory.claims import Claim, Fleet
+from fractus_operator.inventory.node_services import NodeServices, read_revision
 from fractus_operator.inventory.observed import Observed
 from fractus_operator.inventory.plans import Plans
 from fractus_operator.inventory.subscriptions import Subscriptions
 
 
 class LiveInventory:
-    """What the operator knows of the cluster, current within a watch event's delay."""
+    """What the operator knows of the cluster, current within a watch event's delay; the system lives in `namespace`."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, namespace: str = "fractus-system") -> None:
         parts = PartPool()
+        self.services = NodeServices(namespace)
+        self.revisions = Reflector(
+            store,
+            kinds.CONTROLLER_REVISION,
+            read_revision,
+            self.services.revision_changed,
+            namespace=namespace,
+        )
         self.hosts = Reflector(store, kinds.NODE, read_host, self._host_changed)
         self.pods = Reflector(store, kinds.POD, read_pod, self._pod_changed)
         self.drones = Reflector(store, kinds.DRONE, parts.sharing(reader(Drone)), self._drone_changed)
@@ -174,6 +183,7 @@ class LiveInventory:
 
     def _pod_changed(self, key: Key, old: PodView | None, new: PodView | None) -> None:
         self._bookings.changed(old, new)
+        self.services.pod_changed(key, old, new)
         for pod in (old, new):
             if pod is not None and pod.application is not None:
                 owner = (pod.namespace, pod.application)
@@ -196,6 +206,10 @@ class LiveInventory:
             self._rules_changed()
         elif old is not None and new is not None and _planning_view(old) != _planning_view(new):
             self.subscriptions.wake_all()
+        elif old is not None and new is not None and _flight_view(old) != _flight_view(new):
+            for application, plan in self.plans.in_force().items():
+                if plan.spec.drone is not None and plan.spec.drone.node == new.name:
+                    self.subscriptions.wake(application)
 
     def _edge_node_changed(self, key: Key, old: EdgeNode | None, new: EdgeNode | None) -> None:
         self._report(kinds.EDGE_NODE, key)
@@ -267,7 +281,12 @@ def _rules_differ(old: Drone | EdgeNode | None, new: Drone | EdgeNode | None) ->
 
 def _planning_view(drone: Drone) -> tuple[object, ...]:
     """What of a drone's status decides over plans; its position does not."""
-    return is_flying(drone), _ready(drone)
+    return drone.in_air, _ready(drone)
+
+
+def _flight_view(drone: Drone) -> tuple[object, ...]:
+    """What of a drone's status the application that it flies for reports."""
+    return (drone.status.flight_state, drone.status.controller) if drone.status is not None else ()
 
 
 def _ready(node: Drone | EdgeNode) -> str | None:

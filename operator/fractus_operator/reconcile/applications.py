@@ -13,6 +13,7 @@ from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.identity.authority import Authority
 from fractus_core.identity.grant_signer import GrantSigner
 from fractus_core.planning.inventory import Inventory, Settings
+from fractus_core.planning.legality import with_legality
 from fractus_core.planning.plan import Infeasible
 from fractus_core.validation import check_application
 
@@ -26,9 +27,10 @@ from fractus_operator.inventory.observed import Observed
 from fractus_operator.reconcile import status
 from fractus_operator.reconcile.children import Children, NameTaken
 from fractus_operator.reconcile.contention import planning_input
+from fractus_operator.reconcile.flight_status import flight
 from fractus_operator.reconcile.grants import REFUSALS, ApplicationGrants
 from fractus_operator.reconcile.missions import mission_outcome
-from fractus_operator.reconcile.replanning import choose_plan, stuck_nodes
+from fractus_operator.reconcile.replanning import choose_plan, stuck_nodes, waits_for_landing
 from fractus_operator.reconcile.reporting import StatusReporter
 from fractus_operator.reconcile.rollout import Rollout
 from fractus_operator.reconcile.shared_flights import shared_flight_outcome
@@ -45,7 +47,17 @@ _REST_FACTOR = 2.0
 EXCLUSION = timedelta(minutes=5)
 """How long a node that the scheduler refused is left out of an application's plans."""
 
-_OF_A_MISSION = (kinds.GRANT, kinds.DEPLOYMENT, kinds.ENDPOINT_SLICE, kinds.SERVICE, kinds.SECRET)
+JUDGED_AGAIN = timedelta(minutes=1)
+"""How old it may be what the policies say of a way: zones and policies begin and end by the clock, too."""
+
+_OF_A_MISSION = (
+    kinds.GRANT,
+    kinds.DEPLOYMENT,
+    kinds.DISRUPTION_BUDGET,
+    kinds.ENDPOINT_SLICE,
+    kinds.SERVICE,
+    kinds.SECRET,
+)
 """What is removed when a mission is over, in this order. The plan stays, as its record."""
 
 
@@ -59,6 +71,14 @@ class _Memory:
 
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     excluded: dict[str, tuple[datetime, str]] = field(default_factory=dict)
+    judged: tuple[DeploymentPlanSpec, int, datetime] | None = None
+
+    def is_judged(self, plan: DeploymentPlanSpec, rules: int, now: datetime) -> bool:
+        """Whether what a plan says of policies is that of these rules."""
+        if self.judged is None:
+            return False
+        known, revision, then = self.judged
+        return known is plan and revision == rules and abs(now - then) < JUDGED_AGAIN
 
     def exclude(self, stuck: dict[str, str], now: datetime) -> dict[str, str]:
         """Leave nodes out of plans for a while; returns all that are, with the reason."""
@@ -165,13 +185,19 @@ class Applications:
         again_s = await self._settle(seen)
         if again_s is not None:
             return again_s
-        present = self._present(seen)
         outcome = mission_outcome(seen.uid, seen.grants) or shared_flight_outcome(seen.plan, *seen.host)
         if outcome is not None:
             # Reported before anything is removed: the grants are the only other record of it.
-            await self._reporter.report(submitted, status.finished(outcome, present))
+            flown = seen.plan.drone if seen.plan is not None else None
+            name = flown.node if flown is not None else self._reporter.last(submitted).get("drone")
+            drone = self._live.drone(name) if name is not None else None
+            # A change that still waits for the landing is another mission.
+            generation = seen.plan.application_generation if seen.plan is not None else None
+            update = status.finished(outcome, name, drone, seen.pods)
+            await self._reporter.report(submitted, update, generation)
             await self._clear(seen.key)
             return RESYNC_S
+        present = self._present(seen)
         try:
             await self._grants.refresh(seen)
             update, again_s = await self._deploy(self._live.observe(submitted), memory)
@@ -188,6 +214,9 @@ class Applications:
         if reported.get("observedGeneration") == seen.submitted.metadata.generation:
             if seen.plan is None:
                 await self._clear(seen.key)
+            if reported["phase"] == "Returning":
+                drone = self._live.drone(reported.get("drone") or "")
+                await self._reporter.report(seen.submitted, status.still_over(reported, drone))
             return RESYNC_S
         if seen.plan is not None:
             return None
@@ -212,6 +241,9 @@ class Applications:
         application = seen.submitted.application
         if application is None:
             raise Blocked("Invalid", "Planned", "Invalid", str(seen.submitted.error))
+        if seen.plan is not None and waits_for_landing(application, seen.plan, seen.in_flight):
+            await self._rollout.renew_certificates(application, seen.plan)
+            return status.waiting(self._deployed(seen, seen.plan, len(seen.grants)), seen.in_flight or ""), RESYNC_S
         try:
             check_application(application, inventory.depots)
             plan, again_s = self._plan(application, seen, inventory, memory)
@@ -232,7 +264,7 @@ class Applications:
             if error.status not in REFUSALS:
                 raise
             raise Blocked("Pending", "Deployed", error.reason, str(error), retry_s=10.0) from error
-        return status.deployed(plan, seen.pods, len(grants)), again_s if complete else 0.0
+        return self._deployed(seen, plan, len(grants)), again_s if complete else 0.0
 
     def _plan(
         self, application: Application, seen: Observed, inventory: Inventory, memory: _Memory
@@ -241,12 +273,19 @@ class Applications:
         now = self._clock()
         stuck, recheck_s = stuck_nodes(seen.plan, seen.pods, now)
         stuck = {node: why for node, why in stuck.items() if node != seen.in_flight}
-        settings = replace(self._settings, excluded=memory.exclude(stuck, now))
-        choice = choose_plan(application, seen.plan, inventory, settings, stuck=stuck, in_flight=seen.in_flight)
-        if choice.reason is not None:
+        settings = replace(self._settings, excluded=memory.exclude(stuck, now), time_s=now.timestamp())
+        present = seen.plan
+        if present is not None and not memory.is_judged(present, seen.rules, now):
+            present = with_legality(application, present, inventory, settings)
+            memory.judged = (present, seen.rules, now)
+        choice = choose_plan(application, present, inventory, settings, stuck=stuck, in_flight=seen.in_flight)
+        drone = choice.plan.drone
+        if choice.plan is not seen.plan:
             self._live.plans.decide(seen.key, seen.uid, choice.plan)
-            drone = choice.plan.drone.node if choice.plan.drone is not None else "none"
-            logger.info("applications: planned (application=%s/%s reason=%s drone=%s)", *seen.key, choice.reason, drone)
+            why, node = choice.reason or "PoliciesChanged", drone.node if drone is not None else "none"
+            logger.info("applications: planned (application=%s/%s reason=%s drone=%s)", *seen.key, why, node)
+        if choice.reason is not None:
+            memory.judged = (choice.plan, seen.rules, now)
         return choice.plan, (recheck_s or RESYNC_S) if choice.fits else RESYNC_S
 
     async def _begin_again(self, key: Key) -> bool:
@@ -267,4 +306,10 @@ class Applications:
         """What is deployed by the plan in force, if anything."""
         if seen.plan is None or not self._children.of(seen.key, kinds.DEPLOYMENT):
             return None
-        return status.deployed(seen.plan, seen.pods, 0)
+        return self._deployed(seen, seen.plan, 0)
+
+    def _deployed(self, seen: Observed, plan: DeploymentPlanSpec, granted: int) -> StatusUpdate:
+        node = plan.drone.node if plan.drone is not None else None
+        reported = self._reporter.last(seen.submitted)
+        flown = flight(node, self._live.drone(node), reported) if node is not None else None
+        return status.deployed(plan, seen.pods, granted, flown)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, assert_never
 
 from fractus_core.api import API_VERSION, Application, Component, Drone
+from fractus_core.api.containers import TLS_DIR
 from fractus_core.api.names import CLASS_LABEL, address_variable
 from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec, PlannedInstance
 
@@ -17,7 +18,6 @@ from fractus_operator.cluster.labels import grant_name, label_value, service_nam
 from fractus_operator.cluster.pods import PodView
 
 COMPONENT_USER = 10001
-TLS_DIR = "/var/run/fractus/tls"
 MOBILITY_PORT = 50051
 CAMERA_PORT = 50052
 
@@ -47,6 +47,8 @@ def children(
             bases = {p.instance for p in plan.placements if p.component == component.name and p.role == "cloud"}
             ready = [pod for pod in pods if pod.instance in bases]
             wanted[kinds.ENDPOINT_SLICE].append(endpoint_slice(application, component, ready))
+    if plan.drone is not None:
+        wanted[kinds.DISRUPTION_BUDGET] = [disruption_budget(application)]
     for placed in plan.placements:
         node = drone(placed.node) if placed.node is not None else None
         wanted[kinds.DEPLOYMENT].append(deployment(application, placed, node))
@@ -117,8 +119,8 @@ def service(application: Application, component: Component) -> Body:
     spec: Body = {
         "type": "ClusterIP",
         "ports": [
-            {"name": _port_name(component, i), "port": p.port, "targetPort": p.port, "protocol": p.protocol}
-            for i, p in enumerate(component.container.ports)
+            {"name": p.label, "port": p.port, "targetPort": p.port, "protocol": p.protocol}
+            for p in component.container.ports
         ],
     }
     if component.placement != "hybrid":
@@ -154,11 +156,15 @@ def endpoint_slice(application: Application, component: Component, pods: Iterabl
             }
             for pod in ready
         ],
-        ports=[
-            {"name": _port_name(component, i), "port": p.port, "protocol": p.protocol}
-            for i, p in enumerate(component.container.ports)
-        ],
+        ports=[{"name": p.label, "port": p.port, "protocol": p.protocol} for p in component.container.ports],
     )
+
+
+def disruption_budget(application: Application) -> Body:
+    """Keeps evictions, such as those of kubectl drain, from what runs on the drone."""
+    aboard = {labels.APPLICATION_LABEL: label_value(application.name), labels.PLACEMENT_LABEL: "drone"}
+    spec = {"maxUnavailable": 0, "selector": {"matchLabels": aboard}}
+    return _child(kinds.DISRUPTION_BUDGET, application, application.name, {}, spec=spec)
 
 
 def deployment(application: Application, placed: PlannedInstance, drone: Drone | None = None) -> Body:
@@ -229,6 +235,7 @@ def _pod_spec(application: Application, component: Component, placed: PlannedIns
                 "image": container.image,
                 "env": _environment(application, component, placed),
                 "resources": container.resources.to_dict(),
+                "terminationMessagePolicy": "FallbackToLogsOnError",
                 "securityContext": {
                     "allowPrivilegeEscalation": False,
                     "capabilities": {"drop": ["ALL"]},
@@ -248,10 +255,7 @@ def _pod_spec(application: Application, component: Component, placed: PlannedIns
     if container.args:
         main["args"] = list(container.args)
     if container.ports:
-        main["ports"] = [
-            {"name": _port_name(component, i), "containerPort": p.port, "protocol": p.protocol}
-            for i, p in enumerate(container.ports)
-        ]
+        main["ports"] = [{"name": p.label, "containerPort": p.port, "protocol": p.protocol} for p in container.ports]
     return spec
 
 
@@ -285,9 +289,7 @@ def _environment(application: Application, component: Component, placed: Planned
         if other.container.ports:
             address = f"{service_name(name, other)}.{namespace}.svc:{other.container.ports[0].port}"
             env.append({"name": address_variable(other.name), "value": address})
-    ours = {variable["name"] for variable in env}
-    env += [v.to_dict() for v in component.container.env if v.name not in ours]
-    return env
+    return [*env, *(v.to_dict() for v in component.container.env)]
 
 
 def _affinity(placed: PlannedInstance) -> Body:
@@ -309,11 +311,6 @@ def _tolerations(placed: PlannedInstance, drone: Drone | None) -> list[Body]:
         {"key": "node.kubernetes.io/not-ready", "operator": "Exists", "effect": "NoExecute", **bound},
         {"key": "node.kubernetes.io/unreachable", "operator": "Exists", "effect": "NoExecute", **bound},
     ]
-
-
-def _port_name(component: Component, index: int) -> str:
-    port = component.container.ports[index]
-    return port.name or f"port-{port.port}"
 
 
 def _labels(application: Application) -> dict[str, str]:

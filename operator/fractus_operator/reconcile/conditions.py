@@ -18,6 +18,7 @@ class ConditionUpdate:
         reason: CamelCase.
         message: one sentence.
         progress: whether a status other than True is only a step on the way, not a problem.
+        adverse: whether True is the problem.
     """
 
     type: str
@@ -25,11 +26,12 @@ class ConditionUpdate:
     reason: str
     message: str = ""
     progress: bool = False
+    adverse: bool = False
 
     @property
     def warning(self) -> bool:
         """Whether people should be warned of it."""
-        return self.status != "True" and not self.progress
+        return (self.status == "True") == self.adverse and not self.progress
 
 
 def merge(

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from fractus_core.api import Application, Grant
 from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec
 from fractus_core.identity.grant_signer import GrantSigner
+from fractus_core.planning.grants import compile_grants, refresh
 from fractus_core.planning.inventory import Inventory, Settings
-from fractus_core.policy.grants import compile_grants, refresh
 
 from fractus_operator.cluster.kinds import Key
 from fractus_operator.cluster.store import Conflict, KubeError, NotFound

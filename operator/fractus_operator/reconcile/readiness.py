@@ -60,7 +60,8 @@ class Readiness:
         try:
             check_policy(policy, zones.keys())
         except InvalidObject as error:
-            return ConditionUpdate("Ready", "False", "ZoneMissing", str(error))
+            reason = "AttributeUnknown" if ".nodes[" in error.field else "ZoneMissing"
+            return ConditionUpdate("Ready", "False", reason, str(error))
         for i, name in enumerate(policy.spec.selector.zones):
             update = self._check_zone(zones[name])
             if update.status != "True":

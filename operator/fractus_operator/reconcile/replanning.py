@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 
 from fractus_core.api import Application
@@ -49,9 +49,9 @@ def choose_plan(
 
     Args:
         application: As submitted.
-        previous: The plan in force.
+        previous: The plan in force, with what the policies of now say of its way.
         inventory: As of now.
-        settings: Of the planning; with the nodes that are excluded.
+        settings: Of the planning; with the time, and the nodes that are excluded.
         stuck: Nodes on which the scheduler refuses a pod of the application.
         in_flight: The drone of the plan in force while it flies.
 
@@ -59,7 +59,12 @@ def choose_plan(
         Infeasible: there is no plan, and the one in force does not fit either.
         InvalidObject: the application contradicts itself.
     """
+    if in_flight is not None:
+        # What flies is judged call by call; no plan takes its drone away.
+        settings = replace(settings, policy_conflicts="warn")
     reason = replan_reason(application, previous, inventory, stuck, in_flight)
+    if reason is None and settings.policy_conflicts == "forbid" and _conflict(previous) is not None:
+        reason = "PolicyConflict"
     if previous is not None and reason is None:
         if room_to_grow(application, inventory, settings, previous) is None:
             return Choice(previous, fits=True)
@@ -74,7 +79,36 @@ def choose_plan(
     if previous is not None and in_flight is not None and reason != "SpecChanged" and flies != in_flight:
         # A problem on another node is no reason to leave a drone that flies.
         return Choice(previous)
+    if previous is not None and in_flight is not None:
+        decided = _with_names_of(previous, decided)
     return Choice(decided, reason)
+
+
+def waits_for_landing(application: Application, plan: DeploymentPlanSpec, in_flight: str | None) -> bool:
+    """Whether a changed manifest is not carried out yet, because it would change what flies.
+
+    Args:
+        application: As submitted.
+        plan: In force.
+        in_flight: Its drone while it flies.
+    """
+    changed = plan.application_generation != application.metadata.generation
+    return changed and in_flight is not None and application.spec.update_policy == "OnGround"
+
+
+def _with_names_of(previous: DeploymentPlanSpec, decided: DeploymentPlanSpec) -> DeploymentPlanSpec:
+    """A plan whose instances that stay keep their names, also where another release named them: a new name restarts them."""
+    names = {(p.component, p.node, p.location): p.instance for p in previous.placements}
+    kept = tuple(
+        p.model_copy(update={"instance": names.get((p.component, p.node, p.location), p.instance)})
+        for p in decided.placements
+    )
+    distinct = len({p.instance for p in kept}) == len(kept)
+    return decided.model_copy(update={"placements": kept}) if distinct else decided
+
+
+def _conflict(plan: DeploymentPlanSpec | None) -> str | None:
+    return plan.drone.policy_conflict if plan is not None and plan.drone is not None else None
 
 
 def replan_reason(

@@ -17,7 +17,7 @@ from fractus_operator.reconcile.status import StatusUpdate
 
 logger = logging.getLogger(__name__)
 
-_SILENT = frozenset({"MissionUnderway", "PodsNotReady"})
+_SILENT = frozenset({"MissionWaiting", "PodsNotReady"})
 """Reasons without an Event: what is merely in progress is in the status."""
 
 
@@ -39,11 +39,17 @@ class StatusReporter:
         """Drop what is remembered of an application."""
         self._written.pop(key, None)
 
-    async def report(self, submitted: Submitted, update: StatusUpdate) -> None:
-        """Write the status if it differs from the present one, then an Event for each transition."""
+    async def report(self, submitted: Submitted, update: StatusUpdate, generation: int | None = None) -> None:
+        """Write the status if it differs from the present one, then an Event for each transition.
+
+        Args:
+            submitted: The application.
+            update: What is to be said of it.
+            generation: Of which generation that is true; None: the present one.
+        """
         now = self._clock()
         before = self.last(submitted)
-        generation = submitted.metadata.generation
+        generation = submitted.metadata.generation if generation is None else generation
         previous = [Condition.model_validate(c) for c in before.get("conditions") or ()]
         conditions, transitions = merge(previous, update.conditions, generation, now)
         status: Body = {
@@ -52,7 +58,8 @@ class StatusReporter:
             "message": update.message,
             "conditions": [condition.to_dict() for condition in conditions],
         }
-        status |= {name: value for name, value in (("drone", update.drone), ("pods", update.pods)) if value is not None}
+        facts = {"drone": update.drone, "controller": update.controller, "pods": update.pods}
+        status |= {name: value for name, value in facts.items() if value is not None}
         if status == before:
             return
         namespace, name = submitted.key

@@ -84,7 +84,7 @@ class Rollout:
         async def after() -> bool:
             if starts:
                 await self._scheduled(application.key, decided, made, rules)
-            last = {kind: wanted[kind] for kind in (kinds.SERVICE, kinds.ENDPOINT_SLICE)}
+            last = {kind: wanted[kind] for kind in (kinds.SERVICE, kinds.ENDPOINT_SLICE, kinds.DISRUPTION_BUDGET)}
             # Rules that changed meanwhile are in no Grant that was compiled before.
             valid = rules == self._live.rules_revision
             if valid:
@@ -125,6 +125,15 @@ class Rollout:
         cause = str(desired["metadata"]["annotations"][CAUSE_ANNOTATION])
         present = (observed["metadata"].get("annotations") or {}).get(CAUSE_ANNOTATION)
         return cause == present and cause.rpartition("@")[2] == drone
+
+    async def renew_certificates(self, application: Application, plan: DeploymentPlanSpec) -> None:
+        """Renew the certificates of what runs by a plan, and change nothing else.
+
+        Raises:
+            KubeError: the API server refuses one, or cannot be reached.
+        """
+        renewed = [self._certificate(application, placed) for placed in plan.placements]
+        await self._children.apply(application, {kinds.SECRET: renewed})
 
     def _certificate(self, application: Application, placed: PlannedInstance) -> Body:
         """The Secret of an instance: the present certificate while it is good, so that a restart renews nothing."""

@@ -65,7 +65,7 @@ def shared_flight_outcome(
     """
     if plan is None or plan.drone is None or plan.drone.shared_with is None:
         return None
-    if host is None or host_plan is not None or host.phase != "Completed":
+    if host is None or host_plan is not None or not host.completed:
         return None
     name = plan.drone.shared_with
     return Outcome(OutcomeKind.COMPLETE, f"{name} has flown {plan.drone.node} past all points of interest")

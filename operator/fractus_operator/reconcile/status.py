@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
+from fractus_core.api import Condition, Drone
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.control import Outcome, OutcomeKind
 
 from fractus_operator.cluster.pods import PodView
 from fractus_operator.reconcile.conditions import ConditionUpdate
+from fractus_operator.reconcile.flight_status import Flight, FlightPhase, mission_condition, pilot_of
 
 _REASONS = {
     OutcomeKind.COMPLETE: "MissionComplete",
@@ -21,7 +23,7 @@ _STAGES = ("Planned", "Granted", "Deployed")
 _NAMED = 3
 """Instances that a message names; the others are counted."""
 
-Phase = Literal["Pending", "Queued", "Deploying", "Running", "Completed", "Failed", "Invalid"]
+Phase = Literal["Pending", "Queued", "Deploying", "Running", FlightPhase, "Completed", "Failed", "Invalid"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +40,7 @@ class StatusUpdate:
     conditions: tuple[ConditionUpdate, ...]
     drone: str | None = None
     pods: str | None = None
+    controller: str | None = None
 
 
 class Blocked(Exception):
@@ -60,8 +63,17 @@ class Blocked(Exception):
         super().__init__(message)
 
 
-def deployed(plan: DeploymentPlanSpec, pods: Sequence[PodView], granted: int) -> StatusUpdate:
-    """The status of an application whose children are all applied."""
+def deployed(
+    plan: DeploymentPlanSpec, pods: Sequence[PodView], granted: int, flown: Flight | None = None
+) -> StatusUpdate:
+    """The status of an application whose children are all applied.
+
+    Args:
+        plan: The plan in force.
+        pods: Its pods as they are.
+        granted: How many instances have Grants.
+        flown: How far the flight is, where the plan has a drone.
+    """
     alive = [pod for pod in pods if not pod.terminating and not pod.finished]
     missing: list[str] = []
     ready = 0
@@ -75,21 +87,43 @@ def deployed(plan: DeploymentPlanSpec, pods: Sequence[PodView], granted: int) ->
     if missing:
         more = f" and {len(missing) - _NAMED} more" if len(missing) > _NAMED else ""
         message = f"waiting for {', '.join(missing[:_NAMED])}{more}"
-        readiness = ConditionUpdate("Ready", "False", "PodsNotReady", message, progress=True)
+        failed = _failures(pod for pod in alive if pod.instance in missing and not pod.ready)
+        message += f"; {failed}" if failed else ""
+        reason = "ComponentFailed" if failed else "PodsNotReady"
+        readiness = ConditionUpdate("Ready", "False", reason, message, progress=not failed)
     else:
-        message = f"all {wanted} pods are ready" + (f"; {drone} flies" if drone else "")
+        message = f"all {wanted} pods are ready"
         readiness = ConditionUpdate("Ready", "True", "PodsReady", message)
+    phase: Phase = "Deploying" if missing else "Running"
+    if flown is not None:
+        message = f"{message}; {flown.does}"
+        # What a drone in the air does is more urgent than a pod that starts again.
+        phase = phase if missing and flown.phase in {"Waiting", "Landed"} else flown.phase
+        if flown.phase == "Unknown":
+            readiness = ConditionUpdate("Ready", "Unknown", "TelemetryLost", flown.does)
     conditions = [
         ConditionUpdate("Planned", "True", "Planned", _plan_sentence(plan)),
         ConditionUpdate("Granted", "True", "Granted", f"{granted} instances may use services of their nodes"),
         ConditionUpdate("Deployed", "True", "Deployed", f"{len(plan.placements)} instances are deployed"),
         readiness,
     ]
-    if drone is not None:
-        under_way = "the mission is not over"
-        conditions.append(ConditionUpdate("MissionComplete", "False", "MissionUnderway", under_way, progress=True))
-    phase: Phase = "Deploying" if missing else "Running"
-    return StatusUpdate(phase, message, tuple(conditions), drone=drone, pods=f"{ready}/{wanted}")
+    if plan.drone is not None and plan.drone.policy_conflict is not None:
+        conditions.append(_policy_conflict(plan.drone.policy_conflict))
+    if flown is not None:
+        conditions.append(mission_condition(flown))
+    controller = flown.controller if flown is not None else None
+    return StatusUpdate(phase, message, tuple(conditions), drone, f"{ready}/{wanted}", controller)
+
+
+def waiting(present: StatusUpdate, drone: str) -> StatusUpdate:
+    """The status of an application whose changed manifest waits until its drone has landed."""
+    why = f"the changed manifest is carried out once {drone} has landed; spec.updatePolicy: Immediate does not wait"
+    update = ConditionUpdate("Updated", "False", "WaitsForLanding", why, progress=True)
+    return replace(present, message=f"{present.message}; {why}", conditions=(*present.conditions, update))
+
+
+def _policy_conflict(why: str) -> ConditionUpdate:
+    return ConditionUpdate("PolicyConflict", "True", "PolicyConflict", why, adverse=True)
 
 
 def _plan_sentence(plan: DeploymentPlanSpec) -> str:
@@ -98,16 +132,49 @@ def _plan_sentence(plan: DeploymentPlanSpec) -> str:
     return f"{plan.drone.node} flies; {text}" if plan.drone is not None else text
 
 
-def finished(outcome: Outcome, present: StatusUpdate | None) -> StatusUpdate:
-    """The status of an application whose mission is over."""
+def finished(outcome: Outcome, name: str | None, drone: Drone | None, pods: Sequence[PodView] = ()) -> StatusUpdate:
+    """The status of an application whose mission is over, also while its drone comes home.
+
+    Args:
+        outcome: How it ended.
+        name: Of its drone.
+        drone: As it is now.
+        pods: Its pods: where the mission did not complete, how they failed is kept, for they are removed now.
+    """
     complete = outcome.kind is OutcomeKind.COMPLETE
     reason, message = _REASONS[outcome.kind], outcome.reason
+    failed = "" if complete else _failures(pods)
+    message += f"; {failed}" if failed else ""
     conditions = (
         ConditionUpdate("Ready", "False", reason, message, progress=complete),
         ConditionUpdate("MissionComplete", "True" if complete else "False", reason, message),
     )
-    phase: Phase = "Completed" if complete else "Failed"
-    return StatusUpdate(phase, message, conditions, drone=present.drone if present is not None else None)
+    return _over(conditions, name, drone)
+
+
+def _failures(pods: Iterable[PodView]) -> str:
+    return "; ".join(sorted(f"{pod.instance} failed with {pod.failure}" for pod in pods if pod.failure)[:_NAMED])
+
+
+def still_over(reported: Mapping[str, Any], drone: Drone | None) -> StatusUpdate:
+    """The status of an application whose mission was reported to be over: its drone may have come home since."""
+    kept = (Condition.model_validate(c) for c in reported.get("conditions") or ())
+    conditions = tuple(ConditionUpdate(c.type, c.status, c.reason, c.message) for c in kept)
+    return _over(conditions, reported.get("drone"), drone)
+
+
+def _over(conditions: tuple[ConditionUpdate, ...], name: str | None, drone: Drone | None) -> StatusUpdate:
+    mission = next(c for c in conditions if c.type == "MissionComplete")
+    phase: Phase = "Completed" if mission.status == "True" else "Failed"
+    message, controller = mission.message, None
+    if drone is not None and drone.status is not None and drone.in_air:
+        phase = "Returning"
+        known = drone.status.flight_state != "unknown"
+        message += (
+            f"; {name} is on its way home" if known else f"; {name} was on its way home when it was last heard of"
+        )
+        controller = pilot_of(drone.status.controller)
+    return StatusUpdate(phase, message, conditions, drone=name, controller=controller)
 
 
 def blocked(by: Blocked, present: StatusUpdate | None) -> StatusUpdate:
@@ -118,5 +185,7 @@ def blocked(by: Blocked, present: StatusUpdate | None) -> StatusUpdate:
         ConditionUpdate(by.stage, "False", by.reason, by.message, progress=queued),
         ConditionUpdate("Ready", "False", by.reason, by.message, progress=queued),
     )
-    drone, pods = (present.drone, present.pods) if present is not None else (None, None)
-    return StatusUpdate(by.phase, by.message, conditions, drone=drone, pods=pods)
+    if by.reason == "PolicyConflict":
+        conditions = (*conditions, _policy_conflict(by.message))
+    kept = (present.drone, present.pods, present.controller) if present is not None else ()
+    return StatusUpdate(by.phase, by.message, conditions, *kept)

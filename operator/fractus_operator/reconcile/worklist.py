@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
 
 from fractus_operator.cluster.kinds import Key
 from fractus_operator.cluster.store import Backoff, KubeError
@@ -12,6 +13,53 @@ from fractus_operator.cluster.store import Backoff, KubeError
 logger = logging.getLogger(__name__)
 
 _BACKOFF_S = (1.0, 60.0)
+
+
+async def regularly(name: str, step: Callable[[], Awaitable[None]], period_s: float) -> None:
+    """Repeat a step until cancelled; one that fails is made again later, with growing pauses.
+
+    Args:
+        name: Of the step, for the log.
+        step: Looks at everything, and changes what is not as it should be.
+        period_s: From the end of one to the next.
+    """
+    backoff = Backoff(period_s, _BACKOFF_S[1])
+    while True:
+        pause_s = period_s
+        try:
+            await step()
+            backoff.succeeded()
+        except Exception as error:
+            pause_s = backoff.delay_s()
+            expected = isinstance(error, KubeError)
+            logger.log(
+                logging.INFO if expected else logging.WARNING,
+                "%s: step failed (retry_s=%.1f): %s",
+                name,
+                pause_s,
+                error if expected else repr(error),
+                exc_info=None if expected else error,
+            )
+        await asyncio.sleep(pause_s)
+
+
+@contextmanager
+def one_of_many(name: str, node: str) -> Iterator[None]:
+    """One node's part of a step: what the API server refuses for one node keeps no other from its turn.
+
+    Args:
+        name: Of the step, for the log.
+        node: Of the drone or edge node.
+
+    Raises:
+        KubeError: the API server gave no answer, so that it gives none for the others.
+    """
+    try:
+        yield
+    except (KubeError, ValueError) as error:
+        if isinstance(error, KubeError) and not error.status:
+            raise
+        logger.warning("%s: failed for one node (node=%s): %s", name, node, error)
 
 
 class Worklist:

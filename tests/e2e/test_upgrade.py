@@ -1,0 +1,83 @@
+"""helm upgrade while a drone is in the air: its services stay, the operator goes on, and both are replaced on the ground."""
+
+from __future__ import annotations
+
+import subprocess
+
+from conftest import DRONE, ROOT, SYSTEM, flight_state, short_flight
+from kubectl import Kube, condition
+from test_mission import audit_log, phase
+from test_uninstall import helm
+
+CHART = str(ROOT / "charts" / "fractus")
+
+
+def services(kube: Kube) -> dict[str, str]:
+    """The drone's service pods and how often their containers started."""
+    found = {}
+    for pod in kube.all("pods", SYSTEM):
+        if pod["spec"].get("nodeName") == DRONE and "deletionTimestamp" not in pod["metadata"]:
+            restarts = sum(c["restartCount"] for c in pod["status"].get("containerStatuses", ()))
+            found[pod["metadata"]["name"]] = f"{pod['metadata']['uid']} {restarts}"
+    return found
+
+
+def upgrade(kube: Kube, *values: str) -> subprocess.CompletedProcess[str]:
+    return helm(kube, "upgrade", "fractus", CHART, *(f"--set={value}" for value in values))
+
+
+def refused(kube: Kube, *command: str) -> None:
+    done = kube.run(*command)
+    assert done.returncode, command
+    assert f"{DRONE} is in the air: wait until it has landed" in done.stderr, done.stderr
+
+
+def test_an_upgrade_in_flight_harms_no_flight(grounded: Kube) -> None:
+    kube = grounded
+    entries = len(audit_log(kube))
+    kube.apply(short_flight("upgraded"))
+    kube.wait("the drone flies", lambda: flight_state(kube) == "flying", timeout_s=120)
+    assert phase(kube, "upgraded") == "Flying"
+    before = services(kube)
+    assert len(before) == 3
+
+    # What would take them away is refused, before anything is changed.
+    done = upgrade(kube, "mobility.enabled=false")
+    assert done.returncode
+    assert f"mobility.enabled: {DRONE} is in the air and keeps its services" in done.stderr
+    refused(kube, "label", "node", DRONE, "fractus.dev/class-")
+    refused(kube, "delete", "node", DRONE)
+    refused(kube, "delete", "daemonset", "fractus-mobility", "-n", SYSTEM)
+    mobility = next(name for name in before if "mobility" in name)
+    refused(kube, "delete", "pod", mobility, "-n", SYSTEM, "--force", "--grace-period=0")
+    # An upgrade with other values and an image that does not exist goes through, and waits.
+    operators = {p["metadata"]["name"] for p in kube.all("pods", SYSTEM, "app.kubernetes.io/component=operator")}
+    assert upgrade(kube, "image.tag=missing", "camera.resources.requests.cpu=21m").returncode == 0
+    waits = kube.wait(
+        "the camera service waits",
+        lambda: condition(kube.get("drone", DRONE), "ServicesCurrent") or None,
+        timeout_s=60,
+    )
+    assert waits["status"] == "False", waits
+    assert waits["reason"] in {"InTheAir", "OnMission"}, waits
+    running = {
+        p["metadata"]["name"]
+        for p in kube.all("pods", SYSTEM, "app.kubernetes.io/component=operator")
+        if condition(p, "Ready").get("status") == "True"
+    }
+    assert operators <= running, "the running operators are not stopped for an image that does not start"
+    assert services(kube) == before
+    assert upgrade(kube, "camera.resources.requests.cpu=21m", "image.tag=dev").returncode == 0
+
+    kube.wait("the mission is over", lambda: phase(kube, "upgraded") in {"Completed", "Failed"}, timeout_s=240)
+    assert phase(kube, "upgraded") == "Completed"
+    assert not [e for e in audit_log(kube)[entries:] if e["kind"] == "takeover"]
+    # On the ground the operator replaces what is outdated, and the drone is ready again.
+    camera = next(name for name in before if "camera" in name)
+    kube.wait("the camera service is replaced", lambda: camera not in services(kube), timeout_s=120)
+    kube.wait(
+        "all services are current",
+        lambda: condition(kube.get("drone", DRONE), "ServicesCurrent").get("status") == "True",
+        timeout_s=180,
+    )
+    kube.wait("the drone is Ready", lambda: condition(kube.get("drone", DRONE), "Ready").get("status") == "True")

@@ -1,0 +1,56 @@
+"""The chart fractus on a bare control plane: what it makes, but its workloads."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import yaml
+from operator_world import SYSTEM, World
+
+Body = dict[str, Any]
+CHARTS = Path(__file__).parents[2] / "charts"
+_PLURALS = {"PriorityClass": "priorityclasses", "ValidatingAdmissionPolicy": "validatingadmissionpolicies"}
+
+
+def install(world: World) -> None:
+    """Make accounts, roles and admission policies."""
+    world.api.apply(
+        f"/api/v1/namespaces/{SYSTEM}", {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": SYSTEM}}
+    )
+    for body in render():
+        if body["kind"] not in {"Deployment", "DaemonSet"}:
+            world.api.apply(path_of(body), body)
+
+
+def uninstall(world: World) -> None:
+    """Lift what would keep later tests from removing drones that fly."""
+    for body in render():
+        if body["kind"] == "ValidatingAdmissionPolicyBinding" and "flight" in body["metadata"]["name"]:
+            world.api.delete(path_of(body))
+
+
+def render(*arguments: str) -> list[Body]:
+    """The objects of the chart, rendered by helm."""
+    caches = sorted((Path.home() / ".cache" / "fractus").glob("*/bin/helm"), reverse=True)
+    helm = str(caches[0]) if caches else "helm"
+    argv = [helm, "template", "fractus", str(CHARTS / "fractus"), "--namespace", SYSTEM, "--kube-version", "1.35.4"]
+    done = subprocess.run([*argv, *arguments], capture_output=True, text=True, timeout=60, check=True)
+    return [body for body in yaml.safe_load_all(done.stdout) if body]
+
+
+def operator_token(world: World) -> str:
+    """A token of the operator's account."""
+    path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-operator/token"
+    request = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest", "spec": {"expirationSeconds": 600}}
+    return str(world.api.call("POST", path, request)["status"]["token"])
+
+
+def path_of(body: Body) -> str:
+    """Where the API server keeps an object."""
+    plural = _PLURALS.get(body["kind"], f"{body['kind'].lower()}s")
+    root = "/apis/" if "/" in body["apiVersion"] else "/api/"
+    namespace = body["metadata"].get("namespace")
+    scope = f"/namespaces/{namespace}" if namespace else ""
+    return f"{root}{body['apiVersion']}{scope}/{plural}/{body['metadata']['name']}"

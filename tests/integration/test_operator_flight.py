@@ -1,0 +1,269 @@
+"""What flies a drone stays as it is while the drone is in the air: what the API server refuses to every client."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from chart import operator_token, render
+from control_plane import ControlPlane, wait_for
+from fractus_kube import KubeError
+from operator_world import FRACTUS, SYSTEM, OperatorProcess, World
+
+Body = dict[str, Any]
+PODS = f"/api/v1/namespaces/{SYSTEM}/pods"
+DAEMON_SETS = f"/apis/apps/v1/namespaces/{SYSTEM}/daemonsets"
+NODE = "/api/v1/nodes/drone-1"
+
+
+@pytest.fixture
+def guarded(world: World, chart: None) -> Iterator[World]:
+    """Two drones with their services, under the chart's admission policies; drone-1 flies."""
+    world.add_drone("drone-2")
+    world.drone_status("drone-1", "flying")
+    for body in render():
+        if body["kind"] == "DaemonSet":
+            world.api.apply(f"{DAEMON_SETS}/{body['metadata']['name']}", body)
+    for drone in ("drone-1", "drone-2"):
+        for part in ("agent", "camera", "mobility"):
+            service(world, part, drone)
+    wait_for(lambda: refusal(lambda: try_delete(world, f"{PODS}/fractus-mobility-drone-1")), "the policies")
+    yield world
+    world.clear()
+    for body in world.api.list(DAEMON_SETS):
+        world.api.delete(f"{DAEMON_SETS}/{body['metadata']['name']}")
+
+
+def service(world: World, part: str, node: str, revision: str = "old") -> None:
+    name = f"fractus-{part}-{node}"
+    owner = (world.api.get(f"{DAEMON_SETS}/fractus-{part}") or {})["metadata"]["uid"]
+    reference = {
+        "apiVersion": "apps/v1",
+        "kind": "DaemonSet",
+        "name": f"fractus-{part}",
+        "uid": owner,
+        "controller": True,
+    }
+    labels = {"app.kubernetes.io/name": "fractus", "app.kubernetes.io/component": part}
+    metadata = {"name": name, "labels": labels | {"controller-revision-hash": revision}, "ownerReferences": [reference]}
+    spec = {"nodeName": node, "containers": [{"name": part, "image": "services:1"}]}
+    world.api.apply(f"{PODS}/{name}", {"apiVersion": "v1", "kind": "Pod", "metadata": metadata, "spec": spec})
+    state = {"running": {"startedAt": "2026-01-01T00:00:00Z"}}
+    container = {"name": part, "image": "services:1", "imageID": "", "ready": True, "restartCount": 0, "state": state}
+    ready = {"type": "Ready", "status": "True"}
+    status = {"phase": "Running", "conditions": [ready], "containerStatuses": [container]}
+    world.api.merge(f"{PODS}/{name}/status", {"status": status})
+
+
+def refusal(attempt: Callable[[], object]) -> str:
+    """What the API server says against it; empty when it lets it pass."""
+    try:
+        attempt()
+    except KubeError as error:
+        assert error.status == 403, error
+        return str(error)
+    return ""
+
+
+def whole(world: World, path: str) -> Body:
+    return world.api.get(path) or {}
+
+
+def try_delete(world: World, path: str, **options: object) -> object:
+    return world.api.call("DELETE", path, {"dryRun": ["All"], **options})
+
+
+def evict(world: World, pod: str) -> object:
+    body = {"apiVersion": "policy/v1", "kind": "Eviction", "metadata": {"name": pod, "namespace": SYSTEM}}
+    return world.api.call("POST", f"{PODS}/{pod}/eviction?dryRun=All", body)
+
+
+def attempts(world: World, drone: str) -> dict[str, Callable[[], object]]:
+    """What would take a service from a drone, or end it; none is carried out."""
+    api, pod, node = world.api, f"{PODS}/fractus-mobility-{drone}", f"/api/v1/nodes/{drone}"
+    dry = "?dryRun=All"
+    return {
+        "delete a pod": lambda: try_delete(world, pod),
+        "delete a pod by force": lambda: try_delete(world, pod, gracePeriodSeconds=0),
+        "delete the agent's pod": lambda: try_delete(world, f"{PODS}/fractus-agent-{drone}"),
+        "delete all pods": lambda: try_delete(world, PODS),
+        "change a pod's image": lambda: api.merge(
+            pod + dry, {"spec": {"containers": [{**whole(world, pod)["spec"]["containers"][0], "image": "bad"}]}}
+        ),
+        "give a pod a deadline": lambda: api.merge(pod + dry, {"spec": {"activeDeadlineSeconds": 1}}),
+        "hide a pod": lambda: api.merge(pod + dry, {"metadata": {"labels": {"app.kubernetes.io/component": "x"}}}),
+        "remove the node's label": lambda: api.merge(node + dry, {"metadata": {"labels": {"fractus.dev/class": None}}}),
+        "change the node's label": lambda: api.merge(
+            node + dry, {"metadata": {"labels": {"fractus.dev/class": "edge"}}}
+        ),
+        "taint the node": lambda: api.merge(node + dry, {"spec": {"taints": [{"key": "x", "effect": "NoExecute"}]}}),
+        "delete the node": lambda: try_delete(world, node),
+        "delete the Drone": lambda: try_delete(world, f"{FRACTUS}/drones/{drone}"),
+    }
+
+
+def together(world: World) -> dict[str, Callable[[], object]]:
+    """What would take services from all drones."""
+    api, dry = world.api, "?dryRun=All"
+    affinity = {"spec": {"template": {"spec": {"nodeSelector": {"a": "b"}}}}}
+    kinds = "/apis/apiextensions.k8s.io/v1/customresourcedefinitions"
+    return {
+        "evict a pod": lambda: evict(world, "fractus-mobility-drone-1"),
+        "delete a DaemonSet": lambda: try_delete(world, f"{DAEMON_SETS}/fractus-mobility"),
+        "move a DaemonSet": lambda: api.merge(f"{DAEMON_SETS}/fractus-camera{dry}", affinity),
+        "roll a DaemonSet": lambda: api.merge(
+            f"{DAEMON_SETS}/fractus-agent{dry}", {"spec": {"updateStrategy": {"type": "RollingUpdate"}}}
+        ),
+        "delete the namespace": lambda: try_delete(world, f"/api/v1/namespaces/{SYSTEM}"),
+        "delete the kind": lambda: try_delete(world, f"{kinds}/drones.fractus.dev"),
+        "delete all DaemonSets": lambda: try_delete(world, DAEMON_SETS),
+        "delete all kinds": lambda: try_delete(world, kinds),
+    }
+
+
+def test_nothing_takes_a_service_from_a_drone_in_the_air(guarded: World) -> None:
+    for name, attempt in {**attempts(guarded, "drone-1"), **together(guarded)}.items():
+        said = refusal(attempt)
+        assert "drone-1 is in the air: wait until it has landed" in said, name
+    for name, attempt in attempts(guarded, "drone-2").items():
+        if name != "delete all pods":
+            assert not refusal(attempt), name
+
+
+def test_what_harms_no_flight_goes_on(guarded: World) -> None:
+    api, dry = guarded.api, "?dryRun=All"
+    api.merge(f"{NODE}{dry}", {"spec": {"unschedulable": True}})
+    api.merge(f"{NODE}{dry}", {"metadata": {"labels": {"fractus.dev/geohash": "u1"}}})
+    unreachable = [{"key": "node.kubernetes.io/unreachable", "effect": "NoExecute"}]
+    api.merge(f"{NODE}{dry}", {"spec": {"taints": unreachable}})
+    api.merge(f"{PODS}/fractus-mobility-drone-1{dry}", {"metadata": {"annotations": {"a": "b"}}})
+    template = {"spec": {"template": {"metadata": {"annotations": {"a": "b"}}}}}
+    api.merge(f"{DAEMON_SETS}/fractus-agent{dry}", template)
+    # A service that does not run may be replaced by one that does.
+    waiting = {"name": "camera", "image": "bad", "imageID": "", "ready": False, "restartCount": 9}
+    waiting["state"] = {"waiting": {"reason": "CrashLoopBackOff"}}
+    api.merge(f"{PODS}/fractus-camera-drone-1/status", {"status": {"containerStatuses": [waiting]}})
+    try_delete(guarded, f"{PODS}/fractus-camera-drone-1")
+
+
+def test_on_the_ground_all_of_it_is_allowed(guarded: World) -> None:
+    guarded.drone_status("drone-1", "inactive")
+    wait_for(lambda: not refusal(attempts(guarded, "drone-1")["delete a pod"]), "the landing to be known")
+    for name, attempt in {**attempts(guarded, "drone-1"), **together(guarded)}.items():
+        assert not refusal(attempt), name
+
+
+def test_a_silent_drone_is_in_the_air_until_someone_sees_it_on_the_ground(guarded: World) -> None:
+    path = f"{FRACTUS}/drones/drone-1"
+    seen = "2026-01-01T00:00:00Z"
+    status = {"flightState": "unknown", "lastFlightState": "landing", "lastSeen": seen}
+    guarded.api.merge(f"{path}/status", {"status": status})
+    attempt = attempts(guarded, "drone-1")["delete a pod"]
+    told = wait_for(lambda: "last heard of" in refusal(attempt) and refusal(attempt), "the silence to be known")
+    assert f"kubectl annotate drone drone-1 fractus.dev/grounded={seen} --overwrite" in told
+    guarded.api.merge(path, {"metadata": {"annotations": {"fractus.dev/grounded": "2025-12-31T00:00:00Z"}}})
+    assert refusal(attempt), "said of an earlier flight"
+    guarded.api.merge(path, {"metadata": {"annotations": {"fractus.dev/grounded": seen}}})
+    wait_for(lambda: not refusal(attempt), "the annotation to count")
+    guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-01T00:00:05Z"}})
+    wait_for(lambda: refusal(attempt), "the drone to be heard of again")
+
+
+def test_a_drone_that_was_never_heard_of_can_be_set_up(guarded: World) -> None:
+    guarded.api.merge(
+        f"{FRACTUS}/drones/drone-1/status", {"status": {"flightState": "unknown", "lastFlightState": None}}
+    )
+    wait_for(lambda: not refusal(attempts(guarded, "drone-1")["delete a pod"]), "the status to be known")
+
+
+# -- the operator --
+
+
+def condition(world: World, drone: str, type_: str) -> Body:
+    found = world.api.get(f"{FRACTUS}/drones/{drone}") or {}
+    return next((c for c in found.get("status", {}).get("conditions", ()) if c["type"] == type_), {})
+
+
+@pytest.fixture
+def permitted(control_plane: ControlPlane, guarded: World, tmp_path: Path) -> Iterator[OperatorProcess]:
+    """The operator, with no more than the chart's permissions."""
+    config = yaml.safe_load(control_plane.kubeconfig.read_text())
+    config["users"][0]["user"] = {"token": operator_token(guarded)}
+    kubeconfig = tmp_path / "operator.kubeconfig"
+    kubeconfig.write_text(yaml.safe_dump(config))
+    process = OperatorProcess(kubeconfig, tmp_path / "operator.log")
+    process.start()
+    yield process
+    process.stop()
+    print(process.log())
+    assert "ERROR" not in process.log()
+
+
+def release(world: World, number: int, revision: str) -> None:
+    """What the controller of DaemonSets does with a new template: it keeps it, under the next number."""
+    owner = world.api.get(f"{DAEMON_SETS}/fractus-mobility") or {}
+    reference = {"apiVersion": "apps/v1", "kind": "DaemonSet", "name": "fractus-mobility", "controller": True}
+    metadata = {
+        "name": f"fractus-mobility-{revision}",
+        "labels": {"controller-revision-hash": revision},
+        "ownerReferences": [{**reference, "uid": owner["metadata"]["uid"]}],
+    }
+    path = f"/apis/apps/v1/namespaces/{SYSTEM}/controllerrevisions/{metadata['name']}"
+    body = {"apiVersion": "apps/v1", "kind": "ControllerRevision", "metadata": metadata, "revision": number, "data": {}}
+    world.api.apply(path, body)
+
+
+def test_services_are_replaced_on_the_ground_drone_by_drone(guarded: World, permitted: OperatorProcess) -> None:
+    release(guarded, 1, "old")
+    release(guarded, 2, "new")
+
+    def alive() -> set[str]:
+        pods = guarded.api.list(PODS)
+        return {
+            p["metadata"]["name"]
+            for p in pods
+            if "mobility" in p["metadata"]["name"] and "deletionTimestamp" not in p["metadata"]
+        }
+
+    wait_for(lambda: alive() == {"fractus-mobility-drone-1"}, permitted.log)
+    waits = wait_for(lambda: condition(guarded, "drone-1", "ServicesCurrent"), permitted.log)
+    assert (waits["status"], waits["reason"]) == ("False", "InTheAir")
+    assert "fractus-mobility-drone-1: drone-1 is in the air" in waits["message"]
+    wait_for(lambda: condition(guarded, "drone-2", "ServicesCurrent").get("reason") == "Starting", permitted.log)
+    guarded.api.delete(f"{PODS}/fractus-mobility-drone-2", grace_s=0)
+    service(guarded, "mobility", "drone-2", revision="new")
+    wait_for(lambda: condition(guarded, "drone-2", "ServicesCurrent").get("reason") == "Current", permitted.log)
+    assert alive() == {"fractus-mobility-drone-1", "fractus-mobility-drone-2"}
+    guarded.drone_status("drone-1", "inactive")
+    wait_for(lambda: alive() == {"fractus-mobility-drone-2"}, permitted.log)
+
+
+def test_a_drone_that_is_not_heard_of_any_more_is_unknown(guarded: World, permitted: OperatorProcess) -> None:
+    path = f"{FRACTUS}/drones/drone-1"
+    guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-01T00:00:00Z", "controller": "system"}})
+    wait_for(lambda: condition(guarded, "drone-1", "Ready").get("status") == "Unknown", permitted.log, timeout_s=40)
+    assert condition(guarded, "drone-1", "Ready")["reason"] == "AgentSilent"
+    assert (
+        "last heard of at 2026-01-01 00:00:00 UTC, when the drone was flying"
+        in condition(guarded, "drone-1", "Ready")["message"]
+    )
+    status = (guarded.api.get(path) or {})["status"]
+    assert (status["flightState"], status["lastFlightState"]) == ("unknown", "flying")
+    assert "controller" not in status
+    events = wait_for(lambda: guarded.api.list("/api/v1/namespaces/default/events"), "an Event")
+    assert {("drone-1", "AgentSilent")} <= {(e["involvedObject"]["name"], e["reason"]) for e in events}
+    assert "drone-1" in refusal(attempts(guarded, "drone-1")["delete a pod"])
+
+
+def test_the_operator_does_not_say_that_a_drone_has_landed(control_plane: ControlPlane, guarded: World) -> None:
+    with control_plane.with_token(operator_token(guarded)) as client:
+        path = f"{FRACTUS}/drones/drone-1"
+        for lie in ({"flightState": "inactive"}, {"flightState": "unknown", "lastFlightState": "inactive"}):
+            body = guarded.api.get(path) or {}
+            body["status"] |= lie
+            assert "does not say what a drone does" in refusal(
+                lambda body=body: client.call("PUT", f"{path}/status", body)
+            )

@@ -1,0 +1,254 @@
+"""Services of nodes: which are replaced when, and which nodes are not heard of any more."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
+
+import pytest
+from fractus_core.api import Drone, EdgeNode
+from fractus_operator.cluster.pods import PodView, read_pod
+from fractus_operator.cluster.store import KubeError, Store
+from fractus_operator.inventory.live import LiveInventory
+from fractus_operator.inventory.node_services import NodeServices, Revision, read_revision
+from fractus_operator.reconcile.node_reports import NodeReports
+from fractus_operator.reconcile.service_rollout import ServiceRollout, ServicesOfNode, next_step
+from fractus_operator.reconcile.silence import Silence, SilenceWatch
+
+V1 = "fractus.dev/v1alpha1"
+
+
+def pod(node: str = "d1", revision: str = "new", **changes: Any) -> PodView:
+    labels = {"controller-revision-hash": revision}
+    owner = {"apiVersion": "apps/v1", "kind": "DaemonSet", "name": "fractus-mobility", "controller": True}
+    metadata = {
+        "namespace": "fractus-system",
+        "name": f"m-{node}-{revision}",
+        "labels": labels,
+        "ownerReferences": [owner],
+    }
+    return read_pod({"metadata": metadata | changes, "spec": {"nodeName": node}})
+
+
+def node(name: str, *, outdated: bool = True, starting: bool = False, obstacle: str = "") -> ServicesOfNode:
+    pods = (pod(name, "old"),) if outdated else ()
+    return ServicesOfNode(name, pods, ("m",) if starting else (), (obstacle, f"{name} is so") if obstacle else None)
+
+
+def test_one_node_is_replaced_at_a_time() -> None:
+    chosen, said = next_step([node("d1"), node("d2"), node("d3")])
+    assert [n.node for n in chosen] == ["d1"]
+    assert [said[n].reason for n in ("d1", "d2", "d3")] == ["Replacing", "Queued", "Queued"]
+    assert "once the services of d1 are ready" in said["d2"].message
+    assert "m-d2-old" in said["d2"].message
+
+
+def test_a_release_that_does_not_start_stops_at_the_first_node() -> None:
+    chosen, said = next_step([node("d1", outdated=False, starting=True), node("d2")])
+    assert not chosen
+    assert said["d1"].reason == "Starting"
+    assert "once the services of d1 are ready" in said["d2"].message
+
+
+@pytest.mark.parametrize("obstacle", ["InTheAir", "OnMission", "NodeUnreachable"])
+def test_a_drone_that_flies_may_fly_or_is_out_of_reach_keeps_its_services(obstacle: str) -> None:
+    chosen, said = next_step([node("d1", obstacle=obstacle), node("d2")])
+    assert [n.node for n in chosen] == ["d2"], "and no other waits for it"
+    assert (said["d1"].status, said["d1"].reason) == ("False", obstacle)
+    assert "d1 is so" in said["d1"].message
+
+
+def test_a_node_out_of_reach_holds_no_other_up() -> None:
+    chosen, _ = next_step([node("d1", outdated=False, starting=True, obstacle="NodeUnreachable"), node("d2")])
+    assert [n.node for n in chosen] == ["d2"]
+
+
+def test_large_fleets_take_one_of_twenty() -> None:
+    chosen, _ = next_step([node(f"d{i:03}") for i in range(100)])
+    assert len(chosen) == 5
+
+
+def test_what_is_asked_for_is_the_revision_with_the_highest_number() -> None:
+    services = NodeServices("fractus-system")
+    old, new = pod(revision="old"), pod(revision="new")
+    for one in (old, new):
+        services.pod_changed((one.namespace, one.name), None, one)
+    assert services.is_current(old), "no revision is known yet"
+    services.revision_changed(("", "a"), None, Revision("fractus-mobility", 1, "old"))
+    services.revision_changed(("", "b"), None, Revision("fractus-mobility", 2, "new"))
+    services.revision_changed(("", "c"), None, Revision("fractus-camera", 9, "else"))
+    assert (services.is_current(old), services.is_current(new)) == (False, True)
+    services.revision_changed(("", "a"), None, Revision("fractus-mobility", 3, "old"))
+    assert (services.is_current(old), services.is_current(new)) == (True, False), "rolled back"
+    services.pod_changed((old.namespace, old.name), old, None)
+    assert [(name, list(pods)) for name, pods in services.nodes()] == [("d1", [new])]
+
+
+def test_pods_and_revisions_of_others_are_no_services() -> None:
+    services = NodeServices("fractus-system")
+    for other in (pod(ownerReferences=[]), pod(namespace="default")):
+        services.pod_changed((other.namespace, other.name), None, other)
+    assert not list(services.nodes())
+    assert read_revision({"metadata": {"name": "x", "namespace": "fractus-system"}, "revision": 1}) is None
+
+
+# -- silence --
+
+
+def drone(seen: str | None, state: str = "flying") -> Drone:
+    status = {"flightState": state, "lastFlightState": state} | ({"lastSeen": seen} if seen else {})
+    return Drone.from_body({"apiVersion": V1, "kind": "Drone", "metadata": {"name": "d"}, "spec": {}, "status": status})
+
+
+def at(second: int) -> str:
+    return datetime(2026, 1, 1, 0, 0, second, tzinfo=UTC).isoformat()
+
+
+def test_a_drone_in_the_air_is_silent_after_fifteen_seconds() -> None:
+    silence = Silence()
+    assert not silence.silent([drone(at(0))], 100.0)
+    assert not silence.silent([drone(at(0))], 115.0)
+    assert silence.silent([drone(at(0))], 115.1)
+    assert not silence.silent([drone(at(5))], 116.0), "it reports again"
+
+
+@pytest.mark.parametrize("jump", ["2020-01-01T00:00:00Z", "2031-01-01T00:00:00Z"])
+def test_the_clock_of_a_node_counts_for_nothing(jump: str) -> None:
+    silence = Silence()
+    silence.silent([drone(at(0))], 100.0)
+    assert not silence.silent([drone(jump)], 114.0)
+    assert not silence.silent([drone(jump)], 129.0)
+    assert silence.silent([drone(jump)], 129.1)
+
+
+def test_what_reports_rarely_is_silent_later() -> None:
+    silence, standing = Silence(), drone(at(0), "inactive")
+    spec = {"location": {"lat": 1, "lon": 2}}
+    body = {"apiVersion": V1, "kind": "EdgeNode", "metadata": {"name": "e"}, "spec": spec}
+    edge = EdgeNode.from_body({**body, "status": {"lastSeen": at(0)}})
+    assert not silence.silent([standing, edge], 0.0)
+    assert not silence.silent([standing, edge], 90.0)
+    assert silence.silent([standing, edge], 91.0) == [standing]
+    assert silence.silent([standing, edge], 181.0) == [standing, edge]
+
+
+def test_a_node_that_never_reported_is_not_silent() -> None:
+    silence = Silence()
+    for now_s in (0.0, 1000.0):
+        assert not silence.silent([drone(None)], now_s)
+
+
+# -- steps --
+
+
+class Api(Store):
+    """What the API server has of drones; it refuses writes of some."""
+
+    def __init__(self) -> None:
+        # Without a connection: `request` answers.
+        self.field_manager = "test"
+        self.objects: dict[str, dict[str, Any]] = {}
+        self.refused: set[str] = set()
+        self.asked: list[tuple[str, str]] = []
+
+    async def request(self, method: str, path: str, body: Any = None, **_: Any) -> Any:
+        name = path.removesuffix("/status").rpartition("/")[2]
+        if method != "GET":
+            self.asked.append((method, name))
+        if name in self.refused:
+            raise KubeError(422, "Invalid", f"{name} is refused")
+        if method == "PUT":
+            self.objects[name] = body
+        return json.loads(json.dumps(self.objects.get(name, {})))
+
+
+@pytest.fixture
+async def live() -> LiveInventory:
+    """Three drones on the ground, with one outdated service each; all of it is known."""
+    found = LiveInventory(Api())
+    for reflector in found.reflectors():
+        reflector.synced.set()
+    for name in ("d1", "d2", "d3"):
+        body = drone(at(0), "inactive").to_dict()
+        body["metadata"]["name"] = name
+        found.drones.note(("", name), body)
+        ready = {"conditions": [{"type": "Ready", "status": "True"}]}
+        found.hosts.note(("", name), {"metadata": {"name": name}, "spec": {}, "status": ready})
+        shown(found, pod(name, "old"))
+    found.services.revision_changed(("", "b"), None, Revision("fractus-mobility", 2, "new"))
+    return found
+
+
+def shown(live: LiveInventory, new: PodView) -> None:
+    live.services.pod_changed((new.namespace, new.name), None, new)
+
+
+def removed(live: LiveInventory, old: PodView) -> None:
+    live.services.pod_changed((old.namespace, old.name), old, None)
+
+
+def reported(live: LiveInventory, api: Api) -> NodeReports:
+    for body in live.drones.values():
+        api.objects.setdefault(body.name, body.to_dict())
+    return NodeReports(api, live, lambda: datetime(2026, 1, 1, tzinfo=UTC))
+
+
+def told(api: Api, name: str, type_: str) -> str:
+    conditions = api.objects[name]["status"].get("conditions", ())
+    return next((c["reason"] for c in conditions if c["type"] == type_), "")
+
+
+async def test_a_pod_that_gets_no_successor_stops_the_rollout(live: LiveInventory) -> None:
+    api = Api()
+    rollout = ServiceRollout(api, live, reported(live, api))
+
+    async def step() -> list[str]:
+        api.asked.clear()
+        await rollout.step()
+        for name, body in api.objects.items():
+            if name in {"d1", "d2", "d3"}:
+                live.drones.note(("", name), json.loads(json.dumps(body)))
+        return [name for method, name in api.asked if method == "DELETE"]
+
+    assert await step() == ["m-d1-old"]
+    removed(live, pod("d1", "old"))
+    assert not await step(), "no other is deleted before the first has its successor"
+    assert told(api, "d1", "ServicesCurrent") == "Starting"
+    starting = pod("d1", "new")
+    shown(live, starting)
+    assert not await step()
+    shown(live, replace(starting, ready=True))
+    assert await step() == ["m-d2-old"]
+    removed(live, pod("d2", "old"))
+    live.hosts._drop(("", "d2"))
+    assert await step() == ["m-d3-old"], "a node that is gone is owed nothing"
+
+
+async def test_a_pod_that_may_not_be_deleted_holds_no_other_back(live: LiveInventory) -> None:
+    api = Api()
+    for name in map(str, range(40)):
+        shown(live, pod(f"e{name}", "old"))
+        live.hosts.note(
+            ("", f"e{name}"),
+            {"metadata": {"name": f"e{name}"}, "status": {"conditions": [{"type": "Ready", "status": "True"}]}},
+        )
+    api.refused = {"m-d1-old", "d2"}
+    await ServiceRollout(api, live, reported(live, api)).step()
+    assert [name for method, name in api.asked if method == "DELETE"] == ["m-d1-old", "m-d2-old"]
+    assert told(api, "d1", "ServicesCurrent") == "Refused"
+    assert told(api, "d3", "ServicesCurrent") == "Queued", "after d2, whose status is refused"
+
+
+@pytest.mark.parametrize("seen", [None, "2026-01-01T00:00:00z", "yesterday"])
+async def test_any_time_of_a_report_can_be_compared(live: LiveInventory, seen: str | None) -> None:
+    api, now_s = Api(), [0.0]
+    watch = SilenceWatch(live, reported(live, api), lambda: now_s[0])
+    await watch.step()
+    api.objects["d1"]["status"] = {"lastSeen": seen} if seen else {}
+    api.refused = {"d2"}
+    now_s[0] = 1000.0
+    await watch.step()
+    assert told(api, "d1", "Ready") == ("AgentSilent" if seen and seen.endswith("z") else "")
+    assert told(api, "d3", "Ready") == "AgentSilent", "after d2, whose status is refused"

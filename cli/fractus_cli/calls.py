@@ -92,7 +92,9 @@ def parse_call(method: str, text: str) -> Call:
     if method not in METHODS:
         raise BadManifest(f"--method: there is no method {method} (there are {', '.join(sorted(METHODS))})")
     try:
-        given = json.loads(text, parse_int=float)  # an integer of any length is a number out of range
+        given = json.loads(
+            text, parse_int=float, object_pairs_hook=_once
+        )  # an integer of any length is a number out of range
     except json.JSONDecodeError as error:
         raise BadManifest(f"--args: this is no JSON: {error.msg} at character {error.pos + 1}") from None
     except RecursionError:
@@ -121,6 +123,15 @@ def parse_call(method: str, text: str) -> Call:
         raise BadManifest(f"--args: {method} needs {' and '.join(missing)}")
     args: Args = takes(**found)
     return Call(method, args)
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in found:
+            raise BadManifest(f"--args: {name} is given twice; give it once")
+        found[name] = value
+    return found
 
 
 def _plain(name: str) -> str:

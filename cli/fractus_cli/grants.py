@@ -54,10 +54,10 @@ def sign(files: tuple[Path, ...], tls: Path, to: Path, days: int) -> None:
                 raise BadManifest(f"{file}: holds no Grant")
             for manifest in manifests:
                 try:
-                    identity = Grant.from_body(manifest).spec.identity
+                    identity = Grant.from_body(manifest.body).spec.identity
+                    path = pki.grant(manifest.body, to)
                 except InvalidObject as error:
-                    raise BadManifest(f"{file}: {error}") from None
-                path = pki.grant(manifest, to)
+                    raise manifest.bad(error) from None
                 click.echo(f"{path}    FRACTUS_TLS_DIR={pki.component(identity)}")
     except (BadManifest, BrokenAuthority, InvalidObject) as error:
         raise click.ClickException(str(error)) from None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import difflib
 import math
 import pathlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, TypeVar
 
-import yaml
 from fractus_core.api import (
     API_VERSION,
     GROUP,
+    KINDS,
     Application,
     Condition,
     DeploymentPlan,
@@ -27,6 +27,7 @@ from fractus_core.api import (
 )
 from fractus_core.api.names import CLASS_LABEL
 from fractus_core.api.nodes import DroneStatus
+from fractus_core.documents import MAX_BYTES, BadDocument, Documents, parse_documents
 from fractus_core.planning import Host, Inventory
 from fractus_core.planning.quantities import amount_of
 from fractus_core.validation import check_policy, check_zone
@@ -37,17 +38,51 @@ _SUFFIXES = frozenset({".yaml", ".yml", ".json"})
 _ASSUMED_CLOUD = "cloud"
 _READ: tuple[type[Resource], ...] = (Application, DeploymentPlan, Depot, Drone, EdgeNode, Policy, Zone)
 _KINDS: dict[str, type[Resource]] = {kind.KIND: kind for kind in _READ}
+_EVERY = frozenset(kind.KIND for kind in KINDS)
+_METADATA = frozenset(
+    {
+        "name", "generateName", "namespace", "labels", "annotations", "finalizers", "ownerReferences", "managedFields",
+        "uid", "generation", "resourceVersion", "selfLink", "creationTimestamp", "deletionTimestamp",
+        "deletionGracePeriodSeconds",
+    }
+)  # fmt: skip
+"""The fields of ObjectMeta."""
 
 
 class BadManifest(Exception):
-    """A manifest cannot be used; one sentence that names the file, the object and the field."""
+    """A manifest cannot be used; one sentence that names the file, the line, the object and the field."""
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """An object as a file has it."""
+
+    file: pathlib.Path
+    body: dict[str, Any]
+    _documents: Documents
+
+    def bad(self, problem: InvalidObject, *, described: str = "") -> BadManifest:
+        """That something is wrong with it, and where.
+
+        Args:
+            problem: what, and the field.
+            described: how the object is called in the sentence; by default by its kind and name.
+        """
+        metadata = self.body.get("metadata")
+        name = metadata.get("name", "") if isinstance(metadata, dict) else ""
+        about = described or f"{self.body.get('kind')} {name}".strip()
+        return BadManifest(f"{self.where(problem.field)}: {about}: {problem}")
+
+    def where(self, path: str = "") -> str:
+        """FILE:LINE of a field."""
+        return self._documents.where(self.body, path)
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """An object and the file it was read from."""
+    """An object and the manifest it was read from."""
 
-    origin: str
+    manifest: Manifest
     resource: Resource | Host
 
 
@@ -79,9 +114,9 @@ class Manifests:
             None,
         )
 
-    def origin(self, application: Application) -> str:
-        """The file an application is from."""
-        return self.found[(Application.KIND, *application.key)].origin
+    def bad(self, application: Application, problem: InvalidObject) -> BadManifest:
+        """That something is wrong with an application, and where."""
+        return self.found[(Application.KIND, *application.key)].manifest.bad(problem)
 
     def inventory(self) -> Inventory:
         """What applications can be planned on.
@@ -128,10 +163,10 @@ def read_manifests(paths: Iterable[pathlib.Path]) -> Manifests:
     """
     manifests = Manifests()
     for file, strict in _files(paths):
-        for document in documents(file, strict=strict):
-            resource = _resource(document, str(file))
+        for manifest in documents(file, strict=strict):
+            resource = _resource(manifest)
             if resource is not None:
-                _add(manifests, resource, str(file))
+                _add(manifests, Found(manifest, resource))
     _check(manifests)
     return manifests
 
@@ -147,7 +182,7 @@ def _files(paths: Iterable[pathlib.Path]) -> Iterator[tuple[pathlib.Path, bool]]
             yield path, True
 
 
-def documents(file: pathlib.Path, *, strict: bool = True) -> Iterator[dict[str, Any]]:
+def documents(file: pathlib.Path, *, strict: bool = True) -> Iterator[Manifest]:
     """The objects of a file, also those in Lists.
 
     Args:
@@ -158,46 +193,71 @@ def documents(file: pathlib.Path, *, strict: bool = True) -> Iterator[dict[str, 
         BadManifest: the file cannot be read or parsed, or, if strict, holds something else.
     """
     try:
-        text = file.read_text(encoding="utf-8-sig")
-        found = [json.loads(text)] if file.suffix == ".json" else list(yaml.safe_load_all(text))
+        found = parse_documents(read_file(file), str(file), is_json=file.suffix == ".json")
+    except BadDocument as error:
+        raise BadManifest(str(error)) from None
+    for body in found.values:
+        if not isinstance(body, dict) or not isinstance(body.get("kind"), str):
+            if strict:
+                raise BadManifest(f"{found.where(body)}: a document has no kind; it is no Kubernetes object")
+            continue
+        items = body.get("items")
+        if body["kind"].endswith("List") and isinstance(items, list):
+            yield from (Manifest(file, item, found) for item in items if isinstance(item, dict))
+        else:
+            yield Manifest(file, body, found)
+
+
+def read_file(file: pathlib.Path) -> bytes:
+    """The content of a file, as far as it may be long: also of a device or pipe that never ends.
+
+    Raises:
+        BadManifest: it cannot be read, or is too long.
+    """
+    try:
+        with file.open("rb") as opened:
+            content = opened.read(MAX_BYTES + 1)
     except OSError as error:
         raise BadManifest(f"{file}: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise BadManifest(f"{file}: this is no text file in UTF-8") from None
-    except RecursionError:
-        raise BadManifest(f"{file}: it is nested too deeply; flatten it") from None
-    except json.JSONDecodeError as error:
-        raise BadManifest(f"{file}:{error.lineno}: {error.msg[:1].lower()}{error.msg[1:]}") from None
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f":{mark.line + 1}" if mark is not None else ""
-        raise BadManifest(f"{file}{line}: {getattr(error, 'problem', None) or 'this is no YAML'}") from None
-    for document in (document for document in found if document is not None):
-        if not isinstance(document, dict) or not isinstance(document.get("kind"), str):
-            if strict:
-                raise BadManifest(f"{file}: a document has no kind; it is no Kubernetes object")
-            continue
-        items = document.get("items")
-        if document["kind"].endswith("List") and isinstance(items, list):
-            yield from (item for item in items if isinstance(item, dict))
-        else:
-            yield document
+    if len(content) > MAX_BYTES:
+        raise BadManifest(f"{file}: it has more than {MAX_BYTES // 2**20} MiB; split it")
+    return content
 
 
-def _resource(document: dict[str, Any], origin: str) -> Resource | Host | None:
-    kind = document.get("kind")
-    if kind in _KINDS and str(document.get("apiVersion", API_VERSION)).partition("/")[0] != GROUP:
-        return None  # another project's kind of the same name
-    metadata = document.get("metadata")
-    name = metadata.get("name") if isinstance(metadata, dict) else None
-    if kind != "Node" and kind not in _KINDS:
-        return None
-    if not isinstance(name, str):
-        raise BadManifest(f"{origin}: {kind}: metadata.name: give the object a name")
+def _resource(manifest: Manifest) -> Resource | Host | None:
+    body = manifest.body
+    kind = body.get("kind")
     try:
-        return _host(document) if kind == "Node" else _KINDS[str(kind)].from_body(document)
+        if not _is_ours(body):
+            return None
+        metadata = body.get("metadata")
+        if not isinstance(metadata, dict) or not isinstance(metadata.get("name"), str):
+            raise InvalidObject("metadata.name", "must be a text; give the object a name")
+        unknown = sorted(metadata.keys() - _METADATA)
+        if unknown:
+            raise InvalidObject(f"metadata.{unknown[0]}", "there is no such field; remove it, or correct its name")
+        return _host(body) if kind == "Node" else _KINDS[str(kind)].from_body(body)
     except InvalidObject as error:
-        raise BadManifest(f"{origin}: {kind} {name}: {error}") from None
+        raise manifest.bad(error) from None
+
+
+def _is_ours(body: Mapping[str, Any]) -> bool:
+    """Whether this is an object that is read, rather than one of another project or of another use.
+
+    Raises:
+        InvalidObject: it says that it is one of Fractus' kinds, and there is no such kind.
+    """
+    kind, version = str(body.get("kind")), body.get("apiVersion")
+    if version is None and kind in _EVERY:
+        raise InvalidObject("apiVersion", f"is missing; write {API_VERSION}")
+    group, _, _ = str(version).rpartition("/")
+    if kind in _EVERY and group != GROUP and (not group or difflib.get_close_matches(group, [GROUP], cutoff=0.7)):
+        raise InvalidObject("apiVersion", f"{version} has no kind {kind}; write {API_VERSION}")
+    if group == GROUP and kind not in _EVERY:
+        near = difflib.get_close_matches(kind, _EVERY, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(sorted(_EVERY))}"
+        raise InvalidObject("kind", f"{GROUP} has no kind {kind}; {hint}")
+    return kind == "Node" or (kind in _KINDS and group == GROUP)
 
 
 def _host(document: dict[str, Any]) -> Host:
@@ -238,15 +298,17 @@ def _part(document: dict[str, Any], key: str, name: str = "") -> dict[str, Any]:
     return part or {}
 
 
-def _add(manifests: Manifests, resource: Resource | Host, origin: str) -> None:
+def _add(manifests: Manifests, found: Found) -> None:
+    resource = found.resource
     kind = "Node" if isinstance(resource, Host) else resource.kind
     namespace = ""
     if isinstance(resource, Resource) and resource.NAMESPACED:
         namespace = resource.metadata.namespace or "default"
     key = (kind, namespace, resource.name)
     if key in manifests.found:
-        raise BadManifest(f"{origin}: {kind} {resource.name}: metadata.name: {manifests.found[key].origin} has it too")
-    manifests.found[key] = Found(origin, resource)
+        there = manifests.found[key].manifest.where("metadata.name")
+        raise found.manifest.bad(InvalidObject("metadata.name", f"{there} has it too; remove one of them"))
+    manifests.found[key] = found
 
 
 def _check(manifests: Manifests) -> None:
@@ -260,7 +322,7 @@ def _check(manifests: Manifests) -> None:
             elif isinstance(resource, Policy):
                 check_policy(resource, zones)
         except InvalidObject as error:
-            raise BadManifest(f"{found.origin}: {resource.name}: {error}") from None
+            raise found.manifest.bad(error) from None
 
 
 def _reported(drone: Drone) -> Drone:

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import json
 import pathlib
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import click
-import yaml
 from fractus_core.api import API_VERSION, GROUP, DeploymentPlan
 from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.documents import dump_documents
 from fractus_core.planning import Inventory, Settings
 from fractus_core.planning.plugins import GROUP as PLUGINS
 from fractus_core.planning.plugins import UnknownPlugin, load_plugin
 
 from fractus_cli import EXIT_INFEASIBLE
+from fractus_cli.calls import parse_time
 from fractus_cli.manifests import BadManifest, read_manifests
 from fractus_cli.plan_map import plan_map
 from fractus_cli.plan_table import infeasible_table, plan_table
@@ -55,6 +57,14 @@ def _tunable(command: Callable[..., None]) -> Callable[..., None]:
 @click.argument("more", type=_PATH, nargs=-1)
 @click.option("-o", "--output", type=click.Choice(["table", "yaml", "json", "geojson"]), default="table")
 @_tunable
+@click.option(
+    "--policy-conflicts", type=click.Choice(["warn", "forbid"]), default="warn", show_default=True,
+    help="What becomes of a mission whose way policies do not let be flown, where no drone has another one.",
+)  # fmt: skip
+@click.option(
+    "--time", "time_s", callback=parse_time, metavar="RFC3339", help="When it begins, with its zone; else now."
+)
+@click.option("--flat-terrain", is_flag=True, help="Take the ground for as high as home everywhere.")
 @click.option("--ranking", help=f"Name of a plug-in (entry point group {PLUGINS}) that scores drones.")
 @click.option("--covering", help=f"Name of a plug-in (entry point group {PLUGINS}) that chooses nodes along the way.")
 @click.pass_context
@@ -76,10 +86,14 @@ def plan(
 
     Exit code: 0 if all are feasible, 2 if one is not, 1 if the input is bad. In yaml and json, what is infeasible has the
     annotation fractus.dev/infeasible, no placements, and the nodes that were rejected; the operator writes no such plan.
+
+    The way of each drone is judged by the policies and zones among the manifests, as they hold at --time and when the
+    mission ends: the plan says which legs they deny, correct or lead around.
     """
     try:
         manifests = read_manifests([*paths, *more])
         score, cover = _plugin(ranking, "--ranking"), _plugin(covering, "--covering")
+        tuned["time_s"] = time.time() if tuned["time_s"] is None else tuned["time_s"]
         settings = Settings(**tuned, score_drone=score, cover=cover)
         decided = plan_all(manifests, settings)
     except BadManifest as error:
@@ -119,8 +133,8 @@ def _bodies(decided: Sequence[Decided]) -> list[dict[str, Any]]:
 
 def _without_placements(answer: Decided) -> DeploymentPlanSpec:
     """What yaml and json say of an application that is infeasible."""
-    rejected = answer.refusal.rejected if answer.refusal is not None else ()
-    omitted = max(len(rejected) - _DEFAULTS.rejections_listed, 0)
+    rejected, far = (answer.refusal.rejected, answer.refusal.omitted) if answer.refusal is not None else ((), 0)
+    omitted = max(len(rejected) - _DEFAULTS.rejections_listed, 0) + far
     return DeploymentPlanSpec(
         application=answer.application.name,
         rejected=rejected[: _DEFAULTS.rejections_listed],
@@ -129,8 +143,7 @@ def _without_placements(answer: Decided) -> DeploymentPlanSpec:
 
 
 def _as_yaml(decided: Sequence[Decided]) -> str:
-    bodies = _bodies(decided)
-    return yaml.safe_dump_all(bodies, sort_keys=False, width=120, explicit_start=len(bodies) > 1)
+    return dump_documents(_bodies(decided))
 
 
 def _as_json(decided: Sequence[Decided]) -> str:

@@ -16,7 +16,7 @@ def plan_table(application: Application, plan: DeploymentPlanSpec) -> str:
     """Which instance goes where, and which nodes were rejected."""
     lines = [f"{'/'.join(application.key)}: feasible"]
     if plan.drone is not None:
-        lines.append(_drone(plan.drone))
+        lines += [_drone(plan.drone), *_legality(plan.drone)]
     lines += ["", *_columns(("COMPONENT", "INSTANCE", "NODE", "ROLE", "SERVES", "ADDS"), map(_row, plan.placements))]
     covered = sum(p.coverage or 0.0 for p in plan.placements if p.role == "hybrid-drone")
     if covered:
@@ -27,7 +27,7 @@ def plan_table(application: Application, plan: DeploymentPlanSpec) -> str:
 def infeasible_table(application: Application, refusal: Infeasible) -> str:
     """Why there is no plan."""
     lines = [f"{'/'.join(application.key)}: infeasible ({refusal.reason})", refusal.message]
-    return "\n".join([*lines, *_rejections(refusal.rejected, 0), ""])
+    return "\n".join([*lines, *_rejections(refusal.rejected, refusal.omitted), ""])
 
 
 def _drone(choice: DroneChoice) -> str:
@@ -43,6 +43,20 @@ def _drone(choice: DroneChoice) -> str:
     if choice.alternatives:
         text += f"; then {', '.join(a.node for a in choice.alternatives[:3])}"
     return text
+
+
+def _legality(choice: DroneChoice) -> list[str]:
+    """The conflict with policies, and the legs that they change."""
+    lines = [f"policy conflict: {choice.policy_conflict}"] if choice.policy_conflict is not None else []
+    if choice.legality:
+        rows = [
+            (f"{leg.end.lat:.6f}, {leg.end.lon:.6f}", leg.flown_by, leg.outcome, leg.reason, leg.message)
+            for leg in choice.legality[:_LISTED]
+        ]
+        lines += ["", *_columns(("LEG TO", "FLOWN BY", "OUTCOME", "REASON", "MESSAGE"), rows)]
+        hidden = len(choice.legality) - len(rows) + (choice.legality_omitted or 0)
+        lines += [f"and {hidden} more; see -o yaml"] if hidden else []
+    return lines
 
 
 def _row(placed: PlannedInstance) -> tuple[str, ...]:

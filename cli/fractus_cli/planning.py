@@ -10,7 +10,7 @@ from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning import Flight, Host, Infeasible, Inventory, Settings, flight_of
 from fractus_core.planning import plan as decide
 from fractus_core.planning.candidates import requests
-from fractus_core.policy.grants import compile_grants
+from fractus_core.planning.grants import compile_grants
 from fractus_core.validation import check_application
 
 from fractus_cli.manifests import BadManifest, Manifests
@@ -51,8 +51,7 @@ def plan_all(manifests: Manifests, settings: Settings) -> list[Decided]:
             found = decide(application, left, settings, previous)
             compile_grants(application, found, stock, settings)
         except InvalidObject as error:
-            origin = manifests.origin(application)
-            raise BadManifest(f"{origin}: Application {application.name}: {error}") from None
+            raise manifests.bad(application, error) from None
         except Infeasible as refusal:
             decided.append(Decided(application, None, refusal))
         else:

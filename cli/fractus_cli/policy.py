@@ -16,10 +16,10 @@ from fractus_core.api.methods import METHODS_OF
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.plans import GrantApplication, GrantedLimits, GrantSpec
 from fractus_core.planning import Settings
+from fractus_core.planning.grants import compile_grants, refresh
 from fractus_core.policy.compiled import compile_grant
 from fractus_core.policy.engine import judge
-from fractus_core.policy.footprint import lens_of
-from fractus_core.policy.grants import compile_grants, refresh
+from fractus_core.policy.lenses import lens_of
 from fractus_core.policy.values import Airframe, Attitude, Call, Home, Situation, Verdict
 
 from fractus_cli.calls import figures, parse_call, parse_time
@@ -133,7 +133,7 @@ def _from(manifests: Manifests, path: pathlib.Path, kind: type[R]) -> list[R]:
     return [
         found.resource
         for found in manifests.found.values()
-        if isinstance(found.resource, kind) and pathlib.Path(found.origin).resolve().is_relative_to(inside)
+        if isinstance(found.resource, kind) and found.manifest.file.resolve().is_relative_to(inside)
     ]
 
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 
 import click
-import yaml
 from fractus_core.api import InvalidObject, Zone
+from fractus_core.documents import BadDocument, dump_documents, parse_documents
 from fractus_core.geo import formats
+from fractus_core.validation import check_zone
 
-from fractus_cli.manifests import BadManifest, read_manifests
+from fractus_cli.manifests import BadManifest, read_file, read_manifests
 
-_READERS: dict[str, Callable[[str], formats.Imported]] = {
+_READERS: dict[str, Callable[[str, Collection[str]], formats.Imported]] = {
     "geojson": formats.read_geojson,
     "kml": formats.read_kml,
     "qgc-plan": formats.read_qgc_plan,
@@ -34,19 +35,43 @@ def zones() -> None:
 @click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=pathlib.Path))
 @click.option("--from", "source", type=click.Choice(sorted(_READERS)), required=True, help="The format of the file.")
 @click.option("--prefix", default="", help="Put before the name of every zone.")
-def import_(file: pathlib.Path, source: str, prefix: str) -> None:
-    """Print a Zone manifest for each zone in a file; what does not map is listed on standard error."""
+@click.option("--leave-out", "without", multiple=True, metavar="NAME", help="A feature to leave out; may be repeated.")
+def import_(file: pathlib.Path, source: str, prefix: str, without: tuple[str, ...]) -> None:
+    """Print a Zone manifest for each zone in a file.
+
+    What a Zone cannot keep exactly (where, how high and when it counts) is refused, feature by feature: correct it, or
+    leave it out. What means nothing for that, and does not map, is listed on standard error.
+    """
     try:
-        found = _READERS[source](file.read_text(encoding="utf-8"))
+        content = read_file(file)
+    except BadManifest as error:
+        raise click.ClickException(str(error)) from None
+    try:
+        found = _READERS[source](content.decode("utf-8-sig"), without)
         named = [_renamed(zone, prefix) for zone in found.zones]
+        for zone in named:
+            check_zone(zone)
     except UnicodeDecodeError:
         raise click.ClickException(f"{file}: this is no text file in UTF-8") from None
+    except formats.Inexact as error:
+        *most, last = (f"{_where(file, content, one)}: {one}" for one in error.every)
+        _tell(most)
+        raise click.ClickException(last) from None
     except InvalidObject as error:
         raise click.ClickException(f"{file}: {error}") from None
     _tell(found.notes)
     if not named:
         raise click.ClickException(f"{file}: there is no zone in the file")
-    click.echo(yaml.safe_dump_all(map(_manifest, named), sort_keys=False, width=120), nl=False)
+    click.echo(dump_documents(map(_manifest, named)), nl=False)
+
+
+def _where(file: pathlib.Path, content: bytes, problem: InvalidObject) -> str:
+    """The line of a field, in formats that are JSON."""
+    try:
+        found = parse_documents(content, str(file))
+    except BadDocument:
+        return str(file)
+    return found.where(found.values[0], problem.field) if found.values else str(file)
 
 
 @zones.command("export")
@@ -64,7 +89,10 @@ def export(paths: tuple[pathlib.Path, ...], target: str, inclusion: bool) -> Non
     if not every:
         raise click.ClickException("there is no Zone in the manifests")
     write = _WRITERS.get(target)
-    found = write(every) if write is not None else formats.write_qgc_plan(every, inclusion=inclusion)
+    try:
+        found = write(every) if write is not None else formats.write_qgc_plan(every, inclusion=inclusion)
+    except InvalidObject as error:
+        raise click.ClickException(str(error)) from None
     _tell(found.notes)
     click.echo(found.text, nl=False)
 

@@ -33,6 +33,9 @@ from fractus.values import (
     VelocityResult,
 )
 
+ARM_TIMEOUT_S = 60.0
+"""An autopilot is ready some 40 s after it was switched on."""
+
 R = TypeVar("R", bound=Result)
 OnProgress = Callable[[Progress], Awaitable[None] | None]
 
@@ -172,9 +175,13 @@ class Mobility(ServiceClient):
         self._control = Control(self._channel, timeout_s=timeout_s)
         return self._control
 
-    async def arm(self) -> Result:
-        """Start the motors."""
-        return await self._unary("Arm", mobility_pb2.ArmRequest())
+    async def arm(self, *, timeout_s: float = ARM_TIMEOUT_S) -> Result:
+        """Start the motors.
+
+        Args:
+            timeout_s: how long the service asks an autopilot again that is not ready yet.
+        """
+        return await self._unary("Arm", mobility_pb2.ArmRequest(), timeout_s=timeout_s)
 
     async def disarm(self) -> Result:
         """Stop the motors; refused in the air."""
@@ -341,14 +348,14 @@ class Mobility(ServiceClient):
             timeout_s=timeout_s,
         )
 
-    async def _unary(self, method: str, request: Any) -> Result:
-        reply = await self._call(method, request)
+    async def _unary(self, method: str, request: Any, *, timeout_s: float | None = None) -> Result:
+        reply = await self._call(method, request, timeout_s=timeout_s)
         return self._judged(Result(decision=Decision.from_proto(reply.decision)))
 
-    async def _call(self, method: str, request: Any) -> Any:
+    async def _call(self, method: str, request: Any, *, timeout_s: float | None = None) -> Any:
         if self._control is not None and self._control.lost is not None:
             raise self._control.lost
-        return await self._channel.unary(method, request)
+        return await self._channel.unary(method, request, timeout_s=timeout_s)
 
     def _judged(self, result: R) -> R:
         if self._strict and result.corrected:

@@ -135,10 +135,14 @@ def translate(error: Any, what: str, address: str) -> FractusError:
     if code in {grpc.StatusCode.INVALID_ARGUMENT, grpc.StatusCode.NOT_FOUND, grpc.StatusCode.OUT_OF_RANGE}:
         return InvalidRequest(f"{what}: {text}")
     if code in {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED}:
-        return Unavailable(f"{what}: no answer from {address} ({text or code.name})")
+        return Unavailable(f"{what}: no answer from {address} ({text or code.name}){_remedy(text)}")
     if code is grpc.StatusCode.RESOURCE_EXHAUSTED:
         return Busy(f"{what}: {text or code.name}", _retry_after_s(error))
-    return FractusError(f"{what}: {text or code.name}")
+    return FractusError(f"{what}: {text or code.name}{_remedy(text)}")
+
+
+def _remedy(text: str) -> str:
+    return next((f"; {remedy}" for sign, remedy in _REMEDIES.items() if sign in text.lower()), "")
 
 
 def _refusal(code: grpc.StatusCode, text: str, what: str, decision: Decision | None) -> FractusError:
@@ -150,6 +154,15 @@ def _refusal(code: grpc.StatusCode, text: str, what: str, decision: Decision | N
         return PolicyDenied(decision or Decision(Action.DENY, reason=text or f"{what} is not allowed"))
     return FractusError(f"{what}: {text}")
 
+
+_REMEDIES = {
+    "hostname verification": "it is another node's: correct FRACTUS_NODE, or the address",
+    "not in peer certificate": "it is another node's: correct FRACTUS_NODE, or the address",
+    "certificate_verify_failed": "another authority signed its certificate: correct FRACTUS_TLS_DIR, or the address",
+    "wrong_version_number": "it speaks no TLS: correct the address",
+    "method not found": "another service listens there, or another version: correct the address",
+}
+"""What to correct, by what gRPC says of a connection that failed."""
 
 _CONTROL_CODES = frozenset({"NotInControl", "ControlLost", "NoControl"})
 """Codes of refusals that say who flies, not what is forbidden."""

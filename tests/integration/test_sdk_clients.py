@@ -71,8 +71,12 @@ async def test_a_driver_flies_and_returns_control(stage: Stage) -> None:
 async def test_every_unary_call_has_a_deadline(stage: Stage) -> None:
     async with stage.client(timeout_s=3.0) as drone:
         await drone.arm()
+        await drone.arm(timeout_s=2.0)
         await drone.position()
-    assert all(left is not None and 0 < left < 3.5 for left in stage.drone.deadlines)
+    # Arming may wait for an autopilot that is not ready yet.
+    assert [left is not None and 0 < left < most for left, most in zip(stage.drone.deadlines, (60.5, 2.5, 3.5), strict=True)] == [
+        True, True, True,
+    ]  # fmt: skip
 
 
 async def test_a_correction_shows_in_the_result(stage: Stage) -> None:

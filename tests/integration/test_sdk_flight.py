@@ -22,7 +22,7 @@ from fractus_core.api import Application, Depot, Drone, Grant, Policy, Zone
 from fractus_core.api.model import Metadata
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
 from fractus_core.planning import Inventory
-from fractus_core.policy.grants import compile_grants
+from fractus_core.planning.grants import compile_grants
 from fractus_core.policy.signatures import sign
 from fractus_services.chain import verify
 from mobility_rig import issue_signer
@@ -93,7 +93,7 @@ class Stage:
         depot = documents("depot.yaml")[0]["spec"]["location"]
         self._start(
             "vehicle", "-m", "fractus_vehicle", "--listen", self.autopilot, "--speedup", str(speedup),
-            "--ready-after", "2", "--home", f"{depot['lat']},{depot['lon']},25",
+            "--ready-after", "2", "--throttle", "1500", "--home", f"{depot['lat']},{depot['lon']},25",
         )  # fmt: skip
 
     def start_service(self) -> None:

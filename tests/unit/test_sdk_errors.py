@@ -45,3 +45,30 @@ async def test_a_refusal_carries_who_decided() -> None:
     found = translate(await failed(missing), "GetSpeed", "there")
     assert isinstance(found, InvalidRequest)
     assert "set a timeout" in str(found)
+
+
+@pytest.mark.parametrize(
+    ("code", "text", "remedy"),
+    [
+        (
+            "UNAVAILABLE",
+            "failed to connect: Hostname Verification Check failed.",
+            "another node's: correct FRACTUS_NODE",
+        ),
+        (
+            "UNAVAILABLE",
+            "Peer name d2.node.fractus.dev is not in peer certificate",
+            "another node's: correct FRACTUS_NODE",
+        ),
+        ("UNAVAILABLE", "SSL_ERROR_SSL: CERTIFICATE_VERIFY_FAILED: unable to get", "correct FRACTUS_TLS_DIR"),
+        ("UNAVAILABLE", "SSL routines:OPENSSL_internal:WRONG_VERSION_NUMBER", "it speaks no TLS: correct the address"),
+        (
+            "UNIMPLEMENTED",
+            "Method not found!",
+            "another service listens there, or another version: correct the address",
+        ),
+    ],
+)
+def test_what_grpc_says_comes_with_a_remedy(code: str, text: str, remedy: str) -> None:
+    error = grpc.aio.AioRpcError(grpc.StatusCode[code], grpc.aio.Metadata(), grpc.aio.Metadata(), details=text)
+    assert remedy in str(translate(error, "Goto", "there"))

@@ -45,24 +45,26 @@ async def fly(
     waypoints: Sequence[fractus.Position],
     first: int,
     reached: int,
-    detours: Mapping[int, fractus.Position],
+    detours: Mapping[int, tuple[fractus.Position, float]],
 ) -> None:
     """Visit what is left of some waypoints, which are numbered from `first` on, and what is asked for in between."""
     for number, waypoint in enumerate(waypoints, start=first):
         if number - first >= reached:
             await go(drone, f"WP{number}", waypoint)
         if number in detours:
-            await go(drone, f"a detour after WP{number}", detours[number])
+            place, stay_s = detours[number]
+            await go(drone, f"a detour after WP{number}", place, stay_s)
 
 
-async def go(drone: fractus.Mobility, what: str, to: fractus.Position) -> None:
-    """Fly somewhere; what policies forbid is passed over."""
+async def go(drone: fractus.Mobility, what: str, to: fractus.Position, stay_s: float = 0.0) -> None:
+    """Fly somewhere, and hover there for a while; what policies forbid is passed over."""
     try:
         done = await drone.goto(to.lat, to.lon, to.alt)
     except fractus.PolicyDenied as refusal:
         log.info("%s refused, going on: %s", what, refusal)
     else:
         log.info("%s reached%s", what, f", corrected: {done.decision.reason}" if done.corrected else "")
+        await asyncio.sleep(stay_s)
 
 
 def _at(
@@ -86,10 +88,14 @@ def _altitudes() -> dict[int, float]:
     return {int(number): float(altitude) for number, altitude in pairs}
 
 
-def _detours() -> dict[int, fractus.Position]:
-    """DETOURS, such as `2:39.3711,22.9307,10; 7:...`: where to go after some waypoints."""
-    pairs = (part.split(":") for part in os.environ.get("DETOURS", "").split(";") if part.strip())
-    return {int(number): _position(place) for number, place in pairs}
+def _detours() -> dict[int, tuple[fractus.Position, float]]:
+    """DETOURS, such as `2:39.3711,22.9307,10; 6:39.3704,22.9318,10,20`: where to go after some waypoints, and how many seconds to stay."""
+    found = {}
+    for pair in filter(str.strip, os.environ.get("DETOURS", "").split(";")):
+        number, place = pair.split(":")
+        where, stay = place.split(",")[:3], place.split(",")[3:]
+        found[int(number)] = _position(",".join(where)), float(stay[0]) if stay else 0.0
+    return found
 
 
 if __name__ == "__main__":

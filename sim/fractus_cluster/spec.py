@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
-import yaml
 from fractus_core.api import API_VERSION, Drone, EdgeNode, InvalidObject, Resource
 from fractus_core.api.geometry import Home
 from fractus_core.api.names import DNS_LABEL
+from fractus_core.documents import BadDocument, Documents, dump_documents, parse_document
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from fractus_cluster.errors import ClusterError
@@ -248,15 +248,16 @@ class ClusterSpec(_Value):
 
     def to_yaml(self) -> str:
         """Return the cluster as a file that `load_spec` reads back to an equal value."""
-        return yaml.safe_dump(self.model_dump(mode="json", by_alias=True), sort_keys=False)
+        return dump_documents([self.model_dump(mode="json", by_alias=True)])
 
 
-def parse_spec(content: object, *, source: str) -> ClusterSpec:
+def parse_spec(content: object, *, source: str, found: Documents | None = None) -> ClusterSpec:
     """Return the cluster that parsed YAML describes.
 
     Args:
         content: What the YAML parser returned.
         source: Where it came from, for messages.
+        found: What knows the lines of it.
 
     Raises:
         ClusterError: A field is missing or wrong; the message names it.
@@ -264,11 +265,12 @@ def parse_spec(content: object, *, source: str) -> ClusterSpec:
     try:
         return ClusterSpec.model_validate(content)
     except ValidationError as error:
-        found = [(".".join(str(part) for part in fault["loc"]), fault["msg"]) for fault in error.errors()]
+        wrong = [(".".join(str(part) for part in fault["loc"]), fault["msg"]) for fault in error.errors()]
         # A list with a bad entry counts as too short as well; the entry says it all.
-        real = [(place, text) for place, text in found if not any(other.startswith(f"{place}.") for other, _ in found)]
+        real = [(place, text) for place, text in wrong if not any(other.startswith(f"{place}.") for other, _ in wrong)]
         faults = "; ".join(f"{place or 'file'}: {text.removeprefix('Value error, ')}" for place, text in real)
-        raise ClusterError(f"{source}: {faults}") from error
+        where = found.where(content, real[0][0]) if found is not None else source
+        raise ClusterError(f"{where}: {faults}") from error
 
 
 def load_spec(path: Path) -> ClusterSpec:
@@ -278,12 +280,12 @@ def load_spec(path: Path) -> ClusterSpec:
         ClusterError: The file is missing, not YAML, or a field is wrong.
     """
     try:
-        content = yaml.safe_load(path.read_text())
+        content, found = parse_document(path.read_bytes(), str(path))
     except OSError as error:
         raise ClusterError(f"cannot read {path}: {error.strerror}") from error
-    except yaml.YAMLError as error:
-        raise ClusterError(f"{path} is not YAML: {error}") from error
-    return parse_spec(content, source=str(path))
+    except BadDocument as error:
+        raise ClusterError(str(error)) from None
+    return parse_spec(content, source=str(path), found=found)
 
 
 def camera_address(url: str) -> tuple[str, int] | None:

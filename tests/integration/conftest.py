@@ -8,6 +8,7 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 
+import chart as fractus_chart
 import pytest
 from control_plane import ControlPlane, programs
 from operator_world import OperatorProcess, World, fresh_namespace
@@ -49,6 +50,15 @@ def world(control_plane: ControlPlane) -> Iterator[World]:
     world.furnish()
     yield world
     world.clear()
+
+
+@pytest.fixture(scope="module")
+def chart(control_plane: ControlPlane) -> Iterator[None]:
+    """What the chart fractus makes, but its workloads: accounts, roles, the admission policies."""
+    world = World(control_plane)
+    fractus_chart.install(world)
+    yield
+    fractus_chart.uninstall(world)
 
 
 @pytest.fixture

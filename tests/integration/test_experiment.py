@@ -100,7 +100,7 @@ def test_bad_input_is_one_sentence_and_exit_code_1(tmp_path: Path) -> None:
     file.write_text(json.dumps(content(faults=[{"fault": "gpsLoss"}])))
     done = play(str(file), "--out", str(tmp_path / "out"))
     assert done.exit_code == 1
-    assert "faults[0].gpsLoss.at: field required" in done.output
+    assert "faults[0].gpsLoss.at: is missing; give it" in done.output
     unknown = {"name": "d", "home": HOME, "parameters": {"NO_SUCH": 1}}
     file.write_text(json.dumps(content(vehicles=[unknown])))
     done = play(str(file), "--out", str(tmp_path / "out"))

@@ -16,21 +16,34 @@ from fractus_cluster.ports import free_port
 from vehicle_process import running_vehicle
 
 SLOW = ("WPNAV_SPEED=450", "WPNAV_ACCEL=150", "WPNAV_SPEED_UP=200", "RTL_ALT=1300", "LAND_SPEED=70")
-SPEEDUP = "3"
+SPEEDUP = "2"
 
 
-@pytest.mark.timeout(240)
+@pytest.mark.timeout(320)
 def test_a_violating_program_is_corrected_refused_and_brought_home(tmp_path: Path):
     link = f"tcp:127.0.0.1:{free_port()}"
     parameters = [part for setting in SLOW for part in ("--param", setting)]
-    options = ("--sysid", "7", "--heading", "250", "--ready-after", "5", "--speedup", SPEEDUP, "--seed", "9")
+    options = (
+        "--sysid",
+        "7",
+        "--heading",
+        "250",
+        "--ready-after",
+        "5",
+        "--throttle",
+        "1500",
+        "--speedup",
+        SPEEDUP,
+        "--seed",
+        "9",
+    )
     elsewhere = ("--home", "-35.3632621,149.1652374,584", "--wind", "3,10,1")
     out = tmp_path / "field"
     with running_vehicle(*options, *elsewhere, *parameters, links=(link,)):
         done = subprocess.run(
             [sys.executable, "-m", "fractus_sim.scenarios.field", "--out", str(out), "--run", "guarded",
              "--autopilot", link, "--speedup", SPEEDUP],
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=220, check=False,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=300, check=False,
             cwd=Path(__file__).parents[2],
         )  # fmt: skip
     assert done.returncode == 0, done.stdout[-4000:]

@@ -16,9 +16,9 @@ from fractus_cluster.spec import load_spec
 from fractus_core.api import KINDS, Application, Depot, Drone, EdgeNode, Policy, Resource, Zone
 from fractus_core.geo import geodesic_m
 from fractus_core.planning import Host, Inventory, plan
+from fractus_core.planning.grants import compile_grants
 from fractus_core.policy.compiled import compile_grant
 from fractus_core.policy.engine import judge
-from fractus_core.policy.grants import compile_grants
 from fractus_core.policy.values import Call, GotoArgs, Home, SetSpeedArgs, Situation
 from fractus_core.validation import check_application, check_policy, check_zone
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-import yaml
 from fractus_cluster.binaries import ensure_binaries
 from fractus_cluster.cluster import Cluster
 from fractus_cluster.images.build import build_images
 from fractus_core.api.names import CLASS_LABEL
+from fractus_core.documents import BadDocument, parse_documents
 
 from fractus_sim.demo.kube import DemoError, Kube, Object
 
@@ -29,12 +29,14 @@ def documents(path: Path) -> list[Object]:
     """The objects of a manifest.
 
     Raises:
-        DemoError: there is no such file.
+        DemoError: there is no such file, or it is not YAML.
     """
     try:
-        return [body for body in yaml.safe_load_all(path.read_text()) if body]
+        return [body for body in parse_documents(path.read_bytes(), str(path)).values if body]
     except OSError as error:
         raise DemoError(f"cannot read {path}: {error.strerror}; run this in a checkout of Fractus") from None
+    except BadDocument as error:
+        raise DemoError(str(error)) from None
 
 
 class DemoCluster(Protocol):

@@ -15,6 +15,7 @@ from fractus_sim.demo.kube import NAMESPACE, SYSTEM, DemoError, Kube, Object
 
 POLL_S = 0.5
 LANDING_TIMEOUT_S = 180.0
+_DEPLOYED = {"Running", "Waiting", "TakingOff", "Flying", "Landed"}
 Say = Callable[[str], None]
 _LOG_LINE = re.compile(rb"\[pod/(?P<pod>[^/]+)/(?P<container>[^\]]+)\] (?P<text>.*)")
 
@@ -57,13 +58,13 @@ class Mission:
 
     @property
     def ended(self) -> bool:
-        """Whether the Application is over."""
-        return self.phase in {"Completed", "Failed", "Invalid"}
+        """Whether the Application's mission is over, also while the drone comes home."""
+        return self.phase in {"Returning", "Completed", "Failed", "Invalid"}
 
     @property
     def grounded(self) -> bool:
-        """Whether the drone is not in the air, as far as its agent says."""
-        return self.flight_state in GROUNDED or not self.drone
+        """Whether the drone is not in the air, as far as its agent and the operator say."""
+        return self.phase != "Returning" and (self.flight_state in GROUNDED or not self.drone)
 
     def _see_application(self, body: Object, now_s: float, say: Say) -> None:
         status = body.get("status") or {}
@@ -89,7 +90,7 @@ class Mission:
         if running > self._running:
             say(f"pods Running: {running} of {len(self.pods)}")
         self._running = running
-        if self.phase == "Running" and running == len(self.pods) > 0 and "running" not in self.times:
+        if self.phase in _DEPLOYED and running == len(self.pods) > 0 and "running" not in self.times:
             self.times["running"] = now_s
             say(f"all pods Running after {now_s - self.times['applied']:.1f} s")
 

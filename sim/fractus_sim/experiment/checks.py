@@ -154,7 +154,7 @@ class ApplicationPhase(Model):
 
     check: Literal["phase"]
     application: Name
-    phase: Literal["Running", "Completed", "Failed", "Invalid"]
+    phase: Literal["Running", "Waiting", "Flying", "Returning", "Landed", "Completed", "Failed", "Invalid"]
 
 
 class Detections(Model):

@@ -212,7 +212,7 @@ def _prepared(node: NodeSpec, setup: VehicleSetup, experiment: Experiment) -> No
     home, _, arguments = found
     wind, entry = experiment.wind, setup.entry
     given = [
-        "--seed", str(experiment.seed), "--sysid", str(setup.system_id), "--ready-after", f"{entry.ready_after:g}",
+        "--seed", str(experiment.seed), "--sysid", str(setup.system_id), "--ready-after", f"{entry.ready_after:g}", "--throttle", "1500",
         "--wind", f"{wind.speed},{wind.direction},{wind.turbulence}",
     ]  # fmt: skip
     for name, value in entry.parameters.items():

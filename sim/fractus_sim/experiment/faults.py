@@ -51,7 +51,7 @@ class GpsLoss(TimedFault):
     """The receiver loses its fix."""
 
     TITLE = "GPS lost"
-    PARAMETERS: ClassVar[Mapping[str, str | float]] = {"SIM_GPS1_ENABLE": 0.0}
+    PARAMETERS: ClassVar[Mapping[str, str | float]] = {"SIM_GPS_DISABLE": 1.0}
     fault: Literal["gpsLoss"]
 
 
@@ -59,7 +59,7 @@ class GpsNoise(TimedFault):
     """Positions scatter."""
 
     TITLE = "GPS noise {fault.noise:g} m"
-    PARAMETERS: ClassVar[Mapping[str, str | float]] = {"SIM_GPS1_NOISE": "noise"}
+    PARAMETERS: ClassVar[Mapping[str, str | float]] = {"SIM_GPS_NOISE": "noise"}
     fault: Literal["gpsNoise"]
     noise: float = Field(gt=0, le=50, description="Standard deviation, metres.")
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-import yaml
 from fractus_core.api.geometry import AltitudeBand, Area, Home
 from fractus_core.api.model import InvalidObject, Model
 from fractus_core.api.names import Name
+from fractus_core.documents import BadDocument, parse_document
 from fractus_vehicle.earth import Place
 from pydantic import Field, ValidationError, model_validator
 
@@ -200,15 +200,15 @@ def load(path: Path) -> Experiment:
         InvalidObject: the file is missing, not YAML, or a field is wrong; the message names it.
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content, found = parse_document(path.read_bytes(), str(path))
     except OSError as error:
         raise InvalidObject("", f"cannot read {path}: {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InvalidObject("", f"{path} is not YAML: {' '.join(str(error).split())}") from None
+    except BadDocument as error:
+        raise InvalidObject("", str(error)) from None
     try:
         return parse(content)
     except InvalidObject as error:
-        raise InvalidObject("", f"{path}: {error}") from None
+        raise InvalidObject("", f"{found.where(content, error.field)}: {error}") from None
 
 
 def parse(content: object) -> Experiment:

@@ -13,7 +13,7 @@ from fractus_cli.planning import plan_all
 from fractus_core.api import API_VERSION, Drone
 from fractus_core.api.plans import GrantSpec
 from fractus_core.planning import Settings
-from fractus_core.policy.grants import compile_grants
+from fractus_core.planning.grants import compile_grants
 
 from fractus_sim.experiment.audits import read_audit
 from fractus_sim.experiment.detections import FILE, VARIABLE, TruthWatch, read_detections

@@ -182,6 +182,7 @@ class RunningDrone:
             camera.setdefault("methods", list(_CAMERA_METHODS))
             # The camera world's own, unless it is told otherwise.
             camera.setdefault("horizontalFieldOfView", 62.2)
+            camera.setdefault("lens", {"model": "pinhole"})
             camera.setdefault("mount", {"pitch": -90, "stabilised": True})
             camera.update(self.setup.camera.features)
             if self.world_url is not None:
@@ -204,7 +205,7 @@ class RunningDrone:
             "--listen", self.guest_link,
             "--home", ",".join(f"{value:.7f}" for value in setup.home), "--heading", f"{setup.heading_deg:g}",
             "--sysid", str(setup.system_id), "--seed", str(setup.seed), "--speedup", f"{setup.speedup:g}",
-            "--ready-after", f"{setup.ready_after_s:g}",
+            "--ready-after", f"{setup.ready_after_s:g}", "--throttle", "1500",
         ]  # fmt: skip
         for name, value in setup.parameters.items():
             command += ["--param", f"{name}={value:.9g}"]

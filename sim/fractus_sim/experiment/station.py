@@ -12,6 +12,7 @@ from typing import Protocol
 from fractus_mavlink import Endpoint, Message, Value, layout_named
 from fractus_mavlink.enums import (
     COPTER_MODE,
+    EKF_STATUS_FLAGS,
     MAV_AUTOPILOT,
     MAV_CMD,
     MAV_COMPONENT,
@@ -149,7 +150,8 @@ class State:
     heard: bool = False
     mode: str = ""
     armed: bool = False
-    ready: bool = False
+    checked: bool = False  # its checks before arming pass, in its present mode
+    located: bool = False  # its estimator has a position, which flights by the autopilot need
     flying: bool = False
     lat: float = 0.0
     lon: float = 0.0
@@ -165,6 +167,11 @@ class State:
     satellites: int = 0
     home: tuple[float, float] | None = None
     texts: list[tuple[float, int, str]] = field(default_factory=list)
+
+    @property
+    def ready(self) -> bool:
+        """Whether it would arm for a flight by the autopilot."""
+        return self.checked and self.located and self.home is not None
 
 
 class Station:
@@ -279,7 +286,7 @@ def _position(station: Station, message: Message) -> None:
 
 def _sys_status(station: Station, message: Message) -> None:
     state = station.state
-    state.ready = bool(message.integer("onboard_control_sensors_health") & MAV_SYS_STATUS_SENSOR.PREARM_CHECK)
+    state.checked = bool(message.integer("onboard_control_sensors_health") & MAV_SYS_STATUS_SENSOR.PREARM_CHECK)
     state.voltage_v = message.integer("voltage_battery") / 1000.0
     state.current_a = message.integer("current_battery") / 100.0
     remaining = message.integer("battery_remaining")
@@ -288,6 +295,11 @@ def _sys_status(station: Station, message: Message) -> None:
 
 def _extended(station: Station, message: Message) -> None:
     station.state.flying = message.integer("landed_state") in FLYING_STATES
+
+
+def _estimate(station: Station, message: Message) -> None:
+    known = EKF_STATUS_FLAGS.POS_HORIZ_ABS | EKF_STATUS_FLAGS.PRED_POS_HORIZ_ABS
+    station.state.located = message.integer("flags") & known == known
 
 
 def _gps(station: Station, message: Message) -> None:
@@ -316,6 +328,7 @@ _READERS: Mapping[str, Callable[[Station, Message], None]] = {
     "GLOBAL_POSITION_INT": _position,
     "SYS_STATUS": _sys_status,
     "EXTENDED_SYS_STATE": _extended,
+    "EKF_STATUS_REPORT": _estimate,
     "GPS_RAW_INT": _gps,
     "HOME_POSITION": _home,
     "STATUSTEXT": _text,

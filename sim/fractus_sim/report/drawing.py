@@ -18,11 +18,11 @@ FAULT = {"marker": "D", "markersize": 8, "color": PURPLE, "markeredgecolor": INK
 TRACK_COLOURS = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, "#8C6D1F", "#444444", "#7A4FA3", "#00685A")
 
 
-def legend(figure: Figure, *every: Any) -> None:
+def legend(figure: Figure, *every: Any, columns: int = 5) -> None:
     """One legend below the picture for all axes, each label once."""
     entries = [entry for axes in every for entry in zip(*axes.get_legend_handles_labels(), strict=True)]
     unique = {label: handle for handle, label in entries}
-    figure.legend(unique.values(), unique.keys(), loc="outside lower center", ncols=5, fontsize=8, frameon=False)
+    figure.legend(unique.values(), unique.keys(), loc="outside lower center", ncols=columns, fontsize=8, frameon=False)
 
 
 def canvas(width_in: float, height_in: float) -> tuple[Figure, Any]:

@@ -21,7 +21,8 @@ _STYLES: Mapping[str, Mapping[str, Any]] = {
     "unguarded": {"color": VERMILION, "linewidth": 1.5, "linestyle": (0, (5, 2))},
     "guarded": {"color": GREEN, "linewidth": 2.2},
 }
-_STAR = {"marker": "*", "linestyle": "none", "markersize": 12, "markeredgecolor": "white", "markeredgewidth": 0.6}
+_PICTURE = {"linestyle": "none", "markersize": 11, "markeredgecolor": "white", "markeredgewidth": 0.6}
+_ARROW_M = 35.0
 _MARGIN_M = 14.0
 _YELLOW = "#F0E442"
 
@@ -41,7 +42,8 @@ def draw_ground(field: Field, area: Sequence[Any], runs: Sequence[Evidence]) -> 
             axes.plot(
                 points[:, 0], points[:, 1], label=run.title, zorder=4, solid_capstyle="round", **_STYLES[run.name]
             )
-    _stars(axes, field, runs)
+            _direction(axes, points, _STYLES[run.name]["color"])
+        _pictures(axes, field, run)
     _names(axes, field)
     axes.set_aspect("equal")
     low_x, low_y, high_x, high_y = axes.dataLim.extents
@@ -52,7 +54,7 @@ def draw_ground(field: Field, area: Sequence[Any], runs: Sequence[Evidence]) -> 
     axes.grid(color="#EEEEEE", linewidth=0.6, zorder=0)
     axes.set_axisbelow(True)
     axes.set_title("The field experiment from above", fontsize=11, loc="left")
-    legend(figure, axes)
+    legend(figure, axes, columns=3)
     return figure
 
 
@@ -66,15 +68,23 @@ def _fill(axes: Any, shape: Any, colour: str, alpha: float, label: str) -> None:
     axes.update_datalim(corners)
 
 
-def _stars(axes: Any, field: Field, runs: Sequence[Evidence]) -> None:
-    """Where pictures were taken, and where they were refused for what they would have shown."""
-    for run in runs:
-        if not run.policies:
-            continue
-        for taken, colour, words in ((True, BLUE, "picture taken"), (False, VERMILION, "picture refused")):
-            at = [field.frame.xy(c.at.lat, c.at.lon) for c in run.pictures(taken=taken) if c.at is not None]
-            if at:
-                axes.plot(*np.array(at).T, color=colour, label=words, zorder=7, **_STAR)
+def _pictures(axes: Any, field: Field, run: Evidence) -> None:
+    """Where a run took pictures, and where they were refused for what they would have shown, in the colour of its way."""
+    for taken, marker, words in ((True, "*", "picture taken"), (False, "X", "picture refused")):
+        at = [field.frame.xy(c.at.lat, c.at.lon) for c in run.pictures(taken=taken) if c.at is not None]
+        if at:
+            colour, label = _STYLES[run.name]["color"], f"{words}, {run.title}"
+            axes.plot(*np.array(at).T, color=colour, marker=marker, label=label, zorder=7, **_PICTURE)
+
+
+def _direction(axes: Any, points: Any, colour: str) -> None:
+    """Arrowheads along a way, one every `_ARROW_M`."""
+    flown_m = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))))
+    for at in np.searchsorted(flown_m, np.arange(_ARROW_M / 2, flown_m[-1], _ARROW_M)):
+        axes.annotate(
+            "", points[at], xytext=points[at - 1], zorder=6,
+            arrowprops={"arrowstyle": "-|>", "color": colour, "mutation_scale": 13, "shrinkA": 0, "shrinkB": 0},
+        )  # fmt: skip
 
 
 def _names(axes: Any, field: Field) -> None:
@@ -106,6 +116,7 @@ def _offset(name: str) -> tuple[float, float]:
         "WP8": (0.0, -14.0),
         "WP-E1": (30.0, 0.0),
         "WP-E2": (30.0, 0.0),
+        "WP-S": (24.0, 0.0),
     }.get(name, (0.0, 13.0))
 
 

@@ -6,7 +6,7 @@ import bisect
 import json
 import struct
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -155,6 +155,9 @@ def _flight(path: Path) -> tuple[tuple[Sample, ...], _Clock, list[str]]:
             speed = (message.integer("vx") ** 2 + message.integer("vy") ** 2) ** 0.5 / 100.0
             in_air = armed and (landed in FLYING_STATES if landed else height > 0.5)
             samples.append(Sample(boot_s, place, speed, mode, in_air, battery))
+    if samples and not armed:
+        # The motors may have stopped after the last position that was taken.
+        samples[-1] = replace(samples[-1], in_air=False)
     return tuple(samples), clock, texts
 
 

@@ -11,15 +11,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fractus_vehicle.estimator import FULL_START_S
+
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.standalone import Standalone
 from fractus_sim.experiment.standalone_drone import CameraSetup, DroneSetup, RunningDrone
 from fractus_sim.scenarios.field.evidence import Evidence, read_evidence
-from fractus_sim.scenarios.field.place import DRONE, EXAMPLE, NAVIGATOR, VIEWER, ZIGZAG, Field, as_text
+from fractus_sim.scenarios.field.place import ABOVE_STRIPE, DRONE, EXAMPLE, NAVIGATOR, VIEWER, ZIGZAG, Field, as_text
 
 PERIOD_S = 10.0
+STAY_S = 2 * PERIOD_S
 FLIGHT_TIMEOUT_S = 600.0
-READY_TIMEOUT_S = 90.0
+READY_TIMEOUT_S = 180.0
 POLL_S = 0.25
 # Of our own vehicle: as fast as the drone's description says, so that the service has nothing to correct there.
 PARAMETERS: Mapping[str, float] = {"WPNAV_SPEED": 500.0}
@@ -73,7 +76,7 @@ def fly(run: Run, field: Field, autopilot: Autopilot, folder: Path, tell: Callab
     with Standalone(folder) as ground:
         drone = ground.add_drone(_setup(field, autopilot))
         identities = {grant["spec"]["component"]: ground.grant(grant) for grant in grants}
-        extra = _environment(run, field)
+        extra = _environment(run, field, STAY_S / autopilot.speedup)
         programs = {NAVIGATOR: "navigator", VIEWER: "aerial_viewer"}
         period = {"PERIOD_S": f"{PERIOD_S / autopilot.speedup:.3f}"}
         for component, program in programs.items():
@@ -85,14 +88,15 @@ def fly(run: Run, field: Field, autopilot: Autopilot, folder: Path, tell: Callab
     return read_evidence(run.name, run.title, policies=run.policies, tlog=drone.tlog, audits=audits)
 
 
-def _environment(run: Run, field: Field) -> dict[str, str]:
-    """What the Navigator is told: the manifest's own, and what makes it ask for too much."""
-    own = {ZIGZAG: field.environment[ZIGZAG]}
+def _environment(run: Run, field: Field, stay_s: float) -> dict[str, str]:
+    """What the Navigator is told: the manifest's own, to hover above the stripe, and what makes it ask for too much."""
+    places = field.places
+    above = f"6:{as_text(places[ABOVE_STRIPE])},{stay_s:.1f}"
+    told = {ZIGZAG: field.environment[ZIGZAG], "DETOURS": above}
     if not run.violates:
-        return own
-    outside = field.places
-    detours = f"2:{as_text(outside['WP-E1'])}; 7:{as_text(outside['WP-E2'])}"
-    return {**own, "ALTITUDES": "1:20,3:20,6:4", "DETOURS": detours}
+        return told
+    detours = f"2:{as_text(places['WP-E1'])}; {above}; 7:{as_text(places['WP-E2'])}"
+    return {**told, "ALTITUDES": "1:20,3:20,6:4", "DETOURS": detours}
 
 
 def _setup(field: Field, autopilot: Autopilot) -> DroneSetup:
@@ -101,6 +105,7 @@ def _setup(field: Field, autopilot: Autopilot) -> DroneSetup:
         DRONE,
         field.home,
         speedup=autopilot.speedup,
+        ready_after_s=FULL_START_S,
         parameters=PARAMETERS,
         description=field.drone.spec.to_dict(),
         # A camera world follows the drone over a link of its own, which an autopilot that runs already may not have.

@@ -11,14 +11,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import yaml
+import shapely
 from fractus_cli.manifests import BadManifest, read_manifests
 from fractus_cli.planning import plan_all
 from fractus_core.api import API_VERSION, Application, Drone, Policy, Zone
 from fractus_core.api.plans import GrantSpec
+from fractus_core.documents import BadDocument, dump_documents, parse_documents
 from fractus_core.geo import LocalFrame, polygon
 from fractus_core.planning import Settings
-from fractus_core.policy.grants import compile_grants
+from fractus_core.planning.grants import compile_grants
 
 from fractus_sim.experiment.errors import ExperimentError
 
@@ -30,6 +31,9 @@ ZIGZAG = "ZIGZAG"
 EVERYWHERE_M = 1000.0
 # Metres east and north of home of what the violating program asks for.
 ASKED_OUTSIDE = {"WP-E1": (62.0, 130.0), "WP-E2": (226.0, 60.0)}
+ABOVE_STRIPE = "WP-S"
+"""Where every run hovers for longer than the time between two pictures: one of them is asked for above the stripe."""
+
 ALTITUDE_M = 10.0
 Place = tuple[float, float, float]
 
@@ -56,8 +60,8 @@ class Field:
         documents: list[Any] = []
         for path in sorted(folder.glob("*.yaml")):
             try:
-                documents += [d for d in yaml.safe_load_all(path.read_text()) if d]
-            except (OSError, yaml.YAMLError) as error:
+                documents += parse_documents(path.read_bytes(), str(path)).values
+            except (OSError, BadDocument) as error:
                 raise ExperimentError(f"{path}: {error}") from None
         depot = next((d["spec"]["location"] for d in documents if d["kind"] == "Depot"), None)
         if depot is None:
@@ -71,7 +75,7 @@ class Field:
         """Write the manifests as they are flown; the file's path."""
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / "manifests.yaml"
-        path.write_text(yaml.safe_dump_all(self.documents, sort_keys=False, width=120))
+        path.write_text(dump_documents(self.documents))
         return path
 
     def objects(self, kind: str) -> list[Mapping[str, Any]]:
@@ -111,7 +115,7 @@ class Field:
 
     @cached_property
     def places(self) -> dict[str, Place]:
-        """CTRL1, WP1 to WP9, CTRL2, WP-E1, WP-E2: degrees, and metres above home."""
+        """CTRL1, WP1 to WP9, CTRL2, WP-E1, WP-E2, WP-S: degrees, and metres above home."""
         component = next(c for c in self.application.spec.components if c.name == NAVIGATOR)
         found: dict[str, Place] = {}
         waypoints: list[Place] = []
@@ -127,7 +131,14 @@ class Field:
         for name, (east, north) in ASKED_OUTSIDE.items():
             lat, lon = self.frame.latlon(east, north)
             found[name] = (lat, lon, ALTITUDE_M)
+        found[ABOVE_STRIPE] = self._above_stripe(found)
         return found
+
+    def _above_stripe(self, places: Mapping[str, Place]) -> Place:
+        """Where the way from WP6 to WP7 is deepest in the stripe of which no pictures are allowed."""
+        way = shapely.LineString([self.frame.xy(*places[name][:2]) for name in ("WP6", "WP7")])
+        middle = way.intersection(self.zone("no-photo")).centroid
+        return (*self.frame.latlon(middle.x, middle.y), ALTITUDE_M)
 
     def grants(self, manifests: Path, *, policies: bool) -> list[dict[str, Any]]:
         """The Grants that the operator would write; without policies they allow everything everywhere.

@@ -35,11 +35,15 @@ scenario-field: env ## Fly the field experiment and leave its report in out/fiel
 	$(RUN) python -m fractus_sim.scenarios.field --out $(OUT)/field --speedup $(SPEEDUP) \
 		$(if $(AUTOPILOT),--autopilot $(AUTOPILOT))
 
+.PHONY: compare-vehicle
+compare-vehicle: env ## Play the script of a real ArduCopter's answers on the simulated vehicle (AUTOPILOT=tcp:HOST:PORT: on that one)
+	PYTHONPATH=tests/unit $(RUN) python tests/unit/vehicle_script.py --all $(if $(AUTOPILOT),--autopilot $(AUTOPILOT))
+
 .PHONY: test
 test: packages env lint ## Everything: lint, types, unit, integration and end-to-end tests
 	$(RUN) fractus cluster binaries
 	$(RUN) pytest -q -n 2 --dist loadfile tests/unit
-	$(RUN) pytest -n 4 --dist loadgroup tests/integration tests/e2e/test_cluster.py
+	$(RUN) pytest -n 3 --dist loadgroup tests/integration tests/e2e/test_cluster.py
 	$(RUN) pytest $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),,-n 2 --dist loadgroup) tests/e2e --ignore tests/e2e/test_cluster.py
 
 .PHONY: test-fast

@@ -60,6 +60,7 @@ class Bench:
             self.now, _, what = heapq.heappop(self._queue)
             what()
         self._queue = [item for item in self._queue if item[2] not in (self._state, self._probe, self._judge)]
+        heapq.heapify(self._queue)
         self.now = end
 
     def _state(self) -> None:
@@ -265,6 +266,24 @@ def test_a_vehicle_that_freezes_is_not_known_and_then_known_again() -> None:
     bench.fly(10)
     assert bench.worst <= -REACTION_S + 0.01
     assert max(bench.told[-100:]) <= REACTION_S + 0.02
+
+
+@pytest.mark.parametrize("rate", [1.0, 3.0])
+@pytest.mark.parametrize("stall_s", [0.3, 0.8, 2.0, 3.0])
+def test_a_stalled_connection_that_hands_over_all_at_once_runs_no_faster(stall_s: float, rate: float) -> None:
+    """What TCP has kept comes late, in order, at one moment: the vehicle's clock seems to catch up."""
+    until = -math.inf
+    in_order = 1 - 1e-6
+    bench = Bench(steady(0.01), lambda: max(0.01, (until - bench.now) * in_order), clock=lambda t: rate * t + 7)
+    bench.fly(15)
+    until = bench.now + stall_s
+    paces = []
+    for _ in range(round(15 / 0.05)):
+        bench.fly(0.05)
+        paces.append(bench.timing.pace)
+    assert min(paces) >= max(rate - 0.001, 1.0)
+    assert max(paces) <= (1.0 if rate == 1.0 else rate * 1.1)
+    assert bench.worst <= 0.0, "what is late counts meanwhile"
 
 
 def test_what_our_own_loop_delays_counts() -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import secrets
 from collections import deque
+from itertools import islice
 
 from fractus_services.mobility.autopilot import MAX_POSITION_AGE_S
 
@@ -59,7 +60,7 @@ class Timing:
     def reset(self) -> None:
         """Forget everything: another link, or a vehicle that has restarted."""
         self._boot_ms = 0
-        self._sampled = self._arrived_at = self._resumed_at = -math.inf
+        self._sampled = self._arrived_at = self._resumed_at = self._compared_from = -math.inf
         self._samples: deque[tuple[float, float]] = deque()
         self._history: deque[tuple[float, float]] = deque()
         self._asked: dict[int, tuple[float, float]] = {}
@@ -86,9 +87,12 @@ class Timing:
             if later_s <= 0.0 or self._present(now) + OVERTAKEN_S < self._sampled + later_s:
                 self.reset()
         if now - self._arrived_at > MAX_POSITION_AGE_S:
-            # What was sent while nothing came measures the gap, not the link that is back.
+            # What was sent while nothing came measures the gap, not the link that is back. And what a connection kept
+            # meanwhile comes all at once: nothing of it says how fast the vehicle's clock runs.
             self._asked.clear()
             self._resumed_at = now
+            self._history.clear()
+            self._compared_from = now + ENVELOPE_S if self._samples else now
         self._sampled, self._boot_ms = (self._sampled + self._since(boot_ms) if self._samples else 0.0), boot_ms
         self._arrived_at = now
         while self._samples and self._at(self._samples[-1], now) <= self._sampled:
@@ -113,14 +117,18 @@ class Timing:
 
     def _compare(self, now: float) -> None:
         """How fast the vehicle's clock runs: as fast as ours, unless that is certainly wrong."""
+        if now < self._compared_from:
+            return
         if not self._history or now - self._history[-1][0] >= RATE_S[0] / 4:
             self._history.append((now, self._sampled))
         while self._history[0][0] < now - RATE_S[1]:
             self._history.popleft()
-        begun, first = self._history[0]
-        if now - begun < RATE_S[0]:
+        since_s = now - self._history[0][0]
+        if since_s < RATE_S[0]:
             return
-        rate, error = (self._sampled - first) / (now - begun), (max(self.delay_s, 0.0) + 0.1) / (now - begun)
+        # A position that came late makes the clock seem fast as long as it is the first; its neighbour was in time.
+        rate = min((self._sampled - first) / (now - begun) for begun, first in islice(self._history, 2))
+        error = (max(self.delay_s, 0.0) + 0.1) / since_s
         # The error grows with what is measured by it: a delay that is not known does not count.
         self.pace = rate + min(error, 0.1 * rate) if rate > 1.0 + min(error, 1.0) else 1.0
 

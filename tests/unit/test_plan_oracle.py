@@ -15,3 +15,8 @@ def test_plans_are_those_of_the_oracle(batch):
         except Undecided:
             undecided += 1
     assert undecided < count / 8
+
+
+@pytest.mark.parametrize("seed", [980, 1442, 2326, 4215])
+def test_drones_with_a_way_around_or_a_home_inside_the_operation_area_are_planned(seed):
+    assert deviation(seed) is None

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from fractus_core.policy.motion import stopping_distance_m
-from fractus_core.policy.values import Call, CaptureArgs, Filter, GotoArgs, Home, SetSpeedArgs, TakeoffArgs
+from fractus_core.policy.values import Airframe, Call, CaptureArgs, Filter, GotoArgs, Home, SetSpeedArgs, TakeoffArgs
 from policy_world import (
     CAMERA,
     FRAME,
@@ -261,6 +261,24 @@ def test_the_way_to_the_operation_area_and_home() -> None:
     partial = compiled(operationArea=[box(50, -20, 150, 20)], corridor=[box(-30, -30, 150, 30)], control="partial")
     assert ask(partial, goto(100, 0), at(0, 0)).action == "allow", "leading in"
     assert ask(partial, Call("Arm"), at(0, 0, 0)).code == "OutsideOperationArea"
+
+
+def test_the_way_from_home_is_not_bound_to_an_operation_area_that_home_happens_to_lie_in() -> None:
+    bend = ring([(-10, -5), (60, -5), (60, 60), (50, 60), (50, 5), (-10, 5)])
+    grant = compiled(operationArea=[bend], corridor=[box(-30, -30, 100, 100)])
+    assert ask(grant, goto(55, 50), at(0, 0)).action == "allow"
+    assert ask(grant, goto(55, 50), at(20, 0)).code == "OutsideOperationArea", "at work it stays inside"
+    partial = compiled(operationArea=[bend], corridor=[box(-30, -30, 100, 100)], control="partial")
+    assert ask(partial, goto(55, 50), at(0, 0)).code == "OutsideOperationArea", "the system flies there"
+
+
+def test_a_driver_with_partial_control_works_where_the_system_can_fly_home_around_a_zone() -> None:
+    fields = {"operationArea": [box(50, -20, 150, 20)], "corridor": [box(-30, -60, 150, 60)], "control": "partial"}
+    retracing = at(60, 0, airframe=Airframe(retraces=True))
+    beside, across = exclusion(box(20, -10, 40, 10)), exclusion(box(20, -70, 40, 70))
+    assert ask(compiled(beside, **fields), goto(100, 0), retracing).action == "allow"
+    assert ask(compiled(across, **fields), goto(100, 0), retracing).code == "WayHomeBlocked"
+    assert ask(compiled(beside, **fields), goto(100, 0), at(60, 0)).code == "WayHomeBlocked", "it flies home straight"
 
 
 def test_exclusion_zones() -> None:

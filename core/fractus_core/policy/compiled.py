@@ -173,7 +173,9 @@ class CompiledGrant:
         allowances: per method, policies that say where and when it is granted; a method that none of them names is
             granted by the grant itself.
         operation: where services may be used; None: anywhere.
-        passage: operation area and the way between it and home; None: anywhere.
+        passage: where the instance may fly: operation area and the way between it and home, or under partial control the
+            operation area alone; None: anywhere.
+        homeward: where the system flies the drone home: operation area and the way between it and home; None: anywhere.
     """
 
     identity: str
@@ -193,6 +195,8 @@ class CompiledGrant:
     operation_border: BaseGeometry | None
     passage: BaseGeometry | None
     passage_border: BaseGeometry | None
+    homeward: BaseGeometry | None
+    homeward_border: BaseGeometry | None
     flat_terrain: bool
 
     def locate(self, now: Situation) -> tuple[float, float] | None:
@@ -216,9 +220,10 @@ def compile_grant(spec: GrantSpec, origin: Point | None = None, flat_terrain: bo
     zoned = [(_rule(policy), policy) for policy in spec.policies]
     methods = frozenset().union(*(spec.methods(service) for service in METHODS_OF))
     operation = _union(frame, spec.operation_area)
-    passage = operation
-    if operation is not None and spec.corridor and spec.control != "partial":
-        passage = shapely.union(operation, _union(frame, spec.corridor))
+    homeward = operation
+    if operation is not None and spec.corridor:
+        homeward = shapely.union(operation, _union(frame, spec.corridor))
+    passage = operation if spec.control == "partial" else homeward
     return CompiledGrant(
         identity=spec.identity,
         frame=frame,
@@ -237,6 +242,8 @@ def compile_grant(spec: GrantSpec, origin: Point | None = None, flat_terrain: bo
         operation_border=_prepared(operation.boundary) if operation is not None else None,
         passage=_prepared(passage) if passage is not None else None,
         passage_border=_prepared(passage.boundary) if passage is not None else None,
+        homeward=_prepared(homeward) if homeward is not None else None,
+        homeward_border=_prepared(homeward.boundary) if homeward is not None else None,
         flat_terrain=flat_terrain,
     )
 

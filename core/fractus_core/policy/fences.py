@@ -21,7 +21,8 @@ SEVERITY: dict[GeofenceAction, int] = exhaustive(
 """The more a reaction takes from the application, the more restrictive it is."""
 
 HOME_RADIUS_M = 5.0
-"""A target this near to home is the way home, wherever the operation area lies."""
+"""A target this near to home is the way home, and a leg that begins this near to it the way from there, wherever the operation
+area lies."""
 
 INSIDE_M = 0.25
 """A corrected target keeps this much more than the margin, so that it never lies on a border."""
@@ -105,9 +106,10 @@ def _operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: fl
     if operation is None or border is None or grant.passage is None or grant.passage_border is None:
         return
     target = shapely.points(leg.target)
-    homeward = False
+    homeward = outward = False
     if now.home is not None:
-        homeward = math.dist(leg.target, grant.frame.xy(now.home.lat, now.home.lon)) <= HOME_RADIUS_M
+        home = grant.frame.xy(now.home.lat, now.home.lon)
+        homeward, outward = (math.dist(end, home) <= HOME_RADIUS_M for end in (leg.target, leg.start))
     vertical = leg.start == leg.target
     within = operation.covers(target) and not border.dwithin(target, margin_m)
     homeward = homeward or (leg.drifts and _approaches(leg, now, grant, operation))
@@ -121,7 +123,7 @@ def _operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: fl
         )
         yield _area_breach(reason, not inside)
         return
-    working = operation.covers(leg.unavoidable) and not homeward and not vertical
+    working = operation.covers(leg.unavoidable) and not homeward and not outward and not vertical
     shape, edge = (operation, border) if working else (grant.passage, grant.passage_border)
     if not _stays_inside(shape, edge, leg, now, margin_m):
         reason = f"the leg leaves the {'operation area' if working else 'way to the operation area'} or comes within {margin_m:.1f} m of its border"

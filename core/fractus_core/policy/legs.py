@@ -218,7 +218,8 @@ def way_home_blocked(target: XY, altitude_m: float, now: Situation, grant: Compi
     if not now.airframe.retraces:
         return problem
     home = grant.frame.xy(now.home.lat, now.home.lon)
-    if leads(target, home, now, grant, altitude_m):
+    system = replace(grant, passage=grant.homeward, passage_border=grant.homeward_border)
+    if leads(target, home, now, system, altitude_m):
         return None
     return replace(problem, reason=f"{problem.reason}, and no legal way is found around it")
 

@@ -94,6 +94,7 @@ BAD: list[tuple[str, Body, str]] = [
     ("region without region", app(DRIVER | {"controlPoints": [{"navigation": "regionBased"}]}), "regionBased navigation needs region"),
     ("stay on a path", driver(duration=5), "duration is for regionBased navigation"),
     ("start twice", driver(point={"depot": "base", "position": HERE}), "give either depot or position, and only one of them"),
+    ("datum of no altitude", driver(path=[{"lat": 1, "lon": 2, "altitudeReference": "amsl"}]), "altitudeReference says what alt is measured from; give alt, or remove it"),
     ("latitude of 95", driver(path=[HERE | {"lat": 95}]), "should be less than or equal to 90"),
     ("edge component without locations", app({k: v for k, v in EDGE.items() if k != "locations"}), "locations are needed for placement edge, and only there"),
     ("radius of 0", app(EDGE | {"locations": [{"center": HERE, "radius": 0}]}), "radius: Invalid value: 0: spec.components[0].locations[0].radius in body should be greater than 0"),

@@ -153,7 +153,7 @@ class Component(Model):
         description="For a driver: control from arming to landing (full, the default), or only at its control points (partial).",
     )
     control_points: tuple[ControlPoint, ...] = Field(
-        default=(), max_length=100, description="Where a driver takes over, in the order flown."
+        default=(), max_length=30, description="Where a driver takes over, in the order flown."
     )
     points_of_interest: PointsOfInterest | None = None
     locations: tuple[EdgeLocation, ...] = Field(

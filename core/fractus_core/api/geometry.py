@@ -41,6 +41,14 @@ class Position(Point):
         default="home", description="What alt is measured from: the drone's home, mean sea level, or the terrain below."
     )
 
+    # The API server fills in home where nothing is said.
+    @rule(
+        "has(self.alt) || !has(self.altitudeReference) || self.altitudeReference == 'home'",
+        "altitudeReference says what alt is measured from; give alt, or remove it",
+    )
+    def _datum_of_alt(self) -> Broken:
+        return "altitudeReference" if self.alt is None and self.altitude_reference != "home" else None
+
 
 class Circle(Model):
     """A disc on the ground."""

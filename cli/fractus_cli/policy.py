@@ -14,7 +14,7 @@ import click
 from fractus_core.api import Application, Drone, Policy, Resource
 from fractus_core.api.methods import METHODS_OF
 from fractus_core.api.model import InvalidObject
-from fractus_core.api.plans import GrantApplication, GrantedLimits, GrantSpec
+from fractus_core.api.plans import ApplicationReference, GrantedLimits, GrantSpec
 from fractus_core.planning import Settings
 from fractus_core.planning.grants import compile_grants, refresh
 from fractus_core.policy.compiled import compile_grant
@@ -183,7 +183,7 @@ def _anything(manifests: Manifests, drone: Drone) -> GrantSpec:
     grant = GrantSpec.model_validate(
         {
             "node": drone.name,
-            "application": GrantApplication(namespace="", name="", uid=""),
+            "application": ApplicationReference(namespace="", name="", uid=""),
             "component": "",
             "instance": "",
             "class": "driver",

@@ -23,10 +23,10 @@ FRACTUS = "/apis/fractus.dev/v1alpha1"
 REQUESTS = "/apis/certificates.k8s.io/v1/certificatesigningrequests"
 RULES: list[dict[str, list[str]]] = [
     {"apiGroups": ["fractus.dev"], "resources": ["drones", "edgenodes"], "verbs": ["get", "create", "update"]},
-    {"apiGroups": ["fractus.dev"], "resources": ["grants"], "verbs": ["get", "list", "watch"]},
+    {"apiGroups": ["fractus.dev"], "resources": ["grants", "directlinks"], "verbs": ["get", "list", "watch"]},
     {
         "apiGroups": ["fractus.dev"],
-        "resources": ["drones/status", "edgenodes/status", "grants/status"],
+        "resources": ["drones/status", "edgenodes/status", "grants/status", "directlinks/status"],
         "verbs": ["patch"],
     },
     {"apiGroups": [""], "resources": ["nodes"], "verbs": ["get"]},

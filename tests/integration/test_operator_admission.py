@@ -230,6 +230,30 @@ def test_an_agent_reports_on_grants_of_its_node_only(world: World, agents: dict[
     denied(lambda: agents["drone-1"].merge(f"{FRACTUS}/zones/any", {"spec": {}}), "cannot patch")
 
 
+def _direct_link(world: World, drone: str, node: str) -> str:
+    name = f"t.{uuid.uuid4().hex[:8]}"
+    spec = {
+        "drone": drone, "node": node, "application": {"namespace": "t", "name": "a", "uid": "u"}, "technology": "WiFi",
+        "pairing": {"networkId": "n"}, "range": 120, "bandwidth": 12, "position": at(0, 0),
+        "heuristic": {"kind": "preferDirect"},
+    }  # fmt: skip
+    world.put(ours("DirectLink", name, spec))
+    return f"{FRACTUS}/directlinks/{name}"
+
+
+def test_an_agent_reports_on_direct_links_of_its_node_only(world: World, agents: dict[str, BlockingClient]) -> None:
+    ours, other = _direct_link(world, "drone-1", "edge-1"), _direct_link(world, "drone-2", "edge-1")
+    agents["drone-1"].merge(f"{ours}/status", {"status": {"phase": "Up"}, "spec": {"range": 1000}})
+    agents["edge-1"].merge(f"{ours}/status", {"status": {"switches": 1}})
+    agents["edge-1"].merge(f"{other}/status", {"status": {"phase": "Idle"}})
+    written = world.api.get(ours)
+    assert written is not None
+    assert (written["status"], written["spec"]["range"]) == ({"phase": "Up", "switches": 1}, 120)
+    denied(lambda: agents["drone-1"].merge(f"{other}/status", {"status": {"phase": "Up"}}), "drone-1 only")
+    denied(lambda: agents["drone-1"].merge(ours, {"spec": {"range": 1000}}), "cannot patch")
+    denied(lambda: agents["drone-1"].delete(ours), "cannot delete")
+
+
 def test_a_token_that_is_bound_to_no_node_writes_nothing(
     control_plane: ControlPlane, world: World, agents: dict[str, BlockingClient]
 ) -> None:

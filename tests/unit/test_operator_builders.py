@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 from fractus_core.api import Application, Drone
-from fractus_core.api.plans import DeploymentPlanSpec, GrantApplication, GrantSpec
+from fractus_core.api.plans import ApplicationReference, DeploymentPlanSpec, GrantSpec
 from fractus_operator.cluster.pods import PodView
 from fractus_operator.reconcile import builders
 
@@ -29,7 +29,7 @@ def built() -> dict[str, Any]:
     placed = {p.instance: p for p in PLAN.placements}
     grant = GrantSpec(
         node="drone-1",
-        application=GrantApplication(namespace="city", name="traffic", uid=APPLICATION.metadata.uid or ""),
+        application=ApplicationReference(namespace="city", name="traffic", uid=APPLICATION.metadata.uid or ""),
         component="Navigator",
         instance="traffic-navigator",
         class_="driver",

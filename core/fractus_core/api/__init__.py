@@ -2,6 +2,7 @@
 
 from fractus_core.api.applications import Application as Application
 from fractus_core.api.components import Component as Component
+from fractus_core.api.links import DirectLink as DirectLink
 from fractus_core.api.model import API_VERSION as API_VERSION
 from fractus_core.api.model import GROUP as GROUP
 from fractus_core.api.model import VERSION as VERSION
@@ -20,4 +21,14 @@ from fractus_core.api.plans import Grant as Grant
 from fractus_core.api.policies import Policy as Policy
 from fractus_core.api.policies import Zone as Zone
 
-KINDS: tuple[type[Resource], ...] = (Drone, EdgeNode, Depot, Zone, Policy, Application, DeploymentPlan, Grant)
+KINDS: tuple[type[Resource], ...] = (
+    Drone,
+    EdgeNode,
+    Depot,
+    Zone,
+    Policy,
+    Application,
+    DeploymentPlan,
+    Grant,
+    DirectLink,
+)

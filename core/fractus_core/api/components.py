@@ -10,7 +10,7 @@ from fractus_core.api.containers import Container
 from fractus_core.api.geometry import Area, Circle, Position
 from fractus_core.api.methods import METHODS_OF, Method, Service
 from fractus_core.api.model import Model
-from fractus_core.api.names import ComponentName, Name, slug
+from fractus_core.api.names import ComponentName, HeuristicKind, Name, slug
 from fractus_core.api.rules import Broken, one_of, rule
 
 Placement = Literal["drone", "edge", "hybrid", "cloud"]
@@ -124,18 +124,17 @@ class EdgeLocation(Circle):
 class Heuristic(Model):
     """How the active instance of a hybrid component is chosen."""
 
-    kind: Literal["max", "min", "preferDirect"] = Field(
-        description="max and min: the instance whose metric is largest or smallest; preferDirect: one with a direct link."
+    kind: HeuristicKind = Field(
+        description="max and min: the instance whose metric is largest or smallest; preferDirect: one with a direct link;"
+        " else the name of a plug-in in the agents' image (entry point of the group fractus.linking)."
     )
     metric: Literal["ingress-bandwidth", "egress-bandwidth", "ingress-latency", "egress-latency"] | None = Field(
         default=None, description="What max and min compare: of the traffic from (ingress) or to (egress) its peers."
     )
 
-    @rule(
-        "(self.kind == 'preferDirect') != has(self.metric)", "kinds max and min need a metric, preferDirect takes none"
-    )
+    @rule("(self.kind in ['max', 'min']) == has(self.metric)", "kinds max and min need a metric, all others take none")
     def _measured(self) -> Broken:
-        return "metric" if (self.kind == "preferDirect") == (self.metric is not None) else None
+        return "metric" if (self.kind in {"max", "min"}) != (self.metric is not None) else None
 
 
 class Component(Model):

@@ -33,6 +33,10 @@ PORT_NAME = r"^([a-z0-9]-?)*[a-z](-?[a-z0-9])*$"
 PortName = Annotated[str, Field(min_length=1, max_length=15, pattern=PORT_NAME)]
 """A port's name (RFC 6335), as pods and Services take it."""
 
+HEURISTIC_KIND = r"^[A-Za-z]([-A-Za-z0-9_.]*[A-Za-z0-9])?$"
+HeuristicKind = Annotated[str, Field(max_length=63, pattern=HEURISTIC_KIND)]
+"""How heuristics are named: as entry points of Python packages are."""
+
 LABEL_KEY = r"^([a-z0-9]([-a-z0-9.]*[a-z0-9])?/)?[A-Za-z0-9]([-A-Za-z0-9_.]*[A-Za-z0-9])?$"
 LabelKey = Annotated[str, Field(max_length=317, pattern=LABEL_KEY)]
 LABEL_VALUE = r"^([A-Za-z0-9]([-A-Za-z0-9_.]*[A-Za-z0-9])?)?$"
@@ -42,6 +46,7 @@ SHAPES = {
     DNS_LABEL: "small letters, digits and hyphens, with a letter or digit first and last",
     DNS_SUBDOMAIN: "small letters, digits, hyphens and dots, with a letter or digit beside each dot, first and last",
     COMPONENT_NAME: "letters, digits and hyphens, with a letter first and no hyphen last",
+    HEURISTIC_KIND: "letters, digits, hyphens, underscores and dots, with a letter first and a letter or digit last",
     LABEL_KEY: "letters, digits, hyphens, underscores and dots, perhaps after a DNS name and a slash",
     LABEL_VALUE: "letters, digits, hyphens, underscores and dots, with a letter or digit first and last",
     PORT_NAME: "small letters, digits and single hyphens between them, with at least one letter",

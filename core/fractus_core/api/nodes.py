@@ -18,11 +18,14 @@ FlightState = Literal["unknown", "inactive", "charging", "takingOff", "flying", 
 GROUNDED: frozenset[FlightState] = frozenset({"inactive", "charging"})
 """Flight states of a drone on the ground."""
 
+BANDWIDTH_MBPS: dict[Technology, float] = {"Ethernet": 100.0, "4G": 8.0, "5G": 50.0, "WiFi": 12.0, "BLE": 0.7}
+"""What applications get of an interface in a good place, where its node does not say: Mbit/s."""
+
 FLIGHT_REPORT_S, DRONE_REPORT_S, EDGE_REPORT_S = 5.0, 30.0, 60.0
 """Seconds between two reports of an agent at most: of a drone in the air, of one on the ground, of an edge node."""
 
 
-_BY_TYPE: dict[str, JsonValue] = {"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["type"]}
+CONDITIONS_BY_TYPE: dict[str, JsonValue] = {"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["type"]}
 """Agent and operator each write conditions of their own."""
 
 
@@ -55,6 +58,19 @@ class Interface(Model):
         default=None, gt=0, le=100_000, description="Reach of a direct link in metres; unset: no direct links."
     )
     pairing: Pairing | None = Field(default=None, description="Needed for direct links.")
+    bandwidth: float | None = Field(
+        default=None,
+        gt=0,
+        le=100_000,
+        description="Mbit/s that applications get of it in a good place; unset: "
+        + ", ".join(f"{mbps:g} for {technology}" for technology, mbps in BANDWIDTH_MBPS.items())
+        + ".",
+    )
+
+    @property
+    def bandwidth_mbps(self) -> float:
+        """The bandwidth, declared or usual for its technology."""
+        return self.bandwidth if self.bandwidth is not None else BANDWIDTH_MBPS[self.technology]
 
 
 class Dimensions(Model):
@@ -247,7 +263,7 @@ class DroneStatus(OpenModel):
     controller: str | None = Field(default=None, description="Who flies: system, pilot, or the driver's identity.")
     last_seen: datetime | None = None
     audit: tuple[str, ...] = _AUDIT
-    conditions: tuple[Condition, ...] = Field(default=(), json_schema_extra=_BY_TYPE)
+    conditions: tuple[Condition, ...] = Field(default=(), json_schema_extra=CONDITIONS_BY_TYPE)
 
     @property
     def in_air(self) -> bool:
@@ -296,7 +312,7 @@ class EdgeNodeStatus(OpenModel):
 
     last_seen: datetime | None = None
     audit: tuple[str, ...] = _AUDIT
-    conditions: tuple[Condition, ...] = Field(default=(), json_schema_extra=_BY_TYPE)
+    conditions: tuple[Condition, ...] = Field(default=(), json_schema_extra=CONDITIONS_BY_TYPE)
 
 
 class EdgeNode(Resource, plural="edgenodes", short="edn"):

@@ -172,8 +172,8 @@ class GrantedPolicy(Model):
         return self
 
 
-class GrantApplication(Model):
-    """Whose grant it is."""
+class ApplicationReference(Model):
+    """The application that it is for; its uid tells it from another one of its name."""
 
     namespace: str
     name: str
@@ -191,7 +191,7 @@ class GrantSpec(Model):
     """The policy configuration of one component instance on one node."""
 
     node: str
-    application: GrantApplication
+    application: ApplicationReference
     component: str
     instance: str
     class_: ComponentClass | None = Field(default=None, alias="class")

@@ -11,7 +11,7 @@ from pydantic.alias_generators import to_camel
 
 from fractus_core.api import Application, Component, Drone, EdgeNode
 from fractus_core.api.nodes import DroneSpec, EdgeNodeSpec
-from fractus_core.api.plans import GrantApplication
+from fractus_core.api.plans import ApplicationReference
 from fractus_core.api.policies import NodeExpression, PolicySpec
 
 
@@ -22,7 +22,7 @@ def selects(
     return holds(policy, owner_of(application), component.name, attributes)
 
 
-def holds(policy: PolicySpec, owner: GrantApplication, component: str, attributes: Mapping[str, object]) -> bool:
+def holds(policy: PolicySpec, owner: ApplicationReference, component: str, attributes: Mapping[str, object]) -> bool:
     """As `selects`, by what a grant keeps of its application and component."""
     wanted = policy.selector.applications
     unknown = policy.kind != "grant"
@@ -109,7 +109,7 @@ def _paths(prefix: str, model: type[BaseModel]) -> Iterable[str]:
                 yield from _paths(path, part)
 
 
-def owner_of(application: Application) -> GrantApplication:
+def owner_of(application: Application) -> ApplicationReference:
     """The application as its grants name it."""
     namespace, name = application.key
-    return GrantApplication(namespace=namespace, name=name, uid=application.metadata.uid or "")
+    return ApplicationReference(namespace=namespace, name=name, uid=application.metadata.uid or "")

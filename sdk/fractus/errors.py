@@ -13,15 +13,83 @@ from fractus.values import Action, Decision, Result
 
 
 class FractusError(Exception):
-    """Root of everything that the SDK raises; its text is one sentence for people."""
+    """Root of everything that the SDK raises; its text is one sentence for people.
+
+    Attributes:
+        remedy: what a program, or its author, does about it; empty where the text says so.
+    """
+
+    remedy = ""
 
 
 class InvalidRequest(FractusError):
     """The service cannot make sense of an argument: a NaN, a latitude of 95, an unknown picture."""
 
+    remedy = "correct the argument"
+
+
+class StateError(FractusError):
+    """The state of the drone, its autopilot or its node does not permit the call now; nothing of it was carried out.
+
+    Attributes:
+        code: CamelCase reason for programs.
+    """
+
+    def __init__(self, code: str, message: str) -> None:
+        self.code = code
+        super().__init__(message)
+
+
+class NotReady(StateError):
+    """The motors cannot be started yet: a check of the autopilot, its failsafes, its fence, the link, or a log."""
+
+    remedy = "wait and try again; `control(progress=print)` tells what is waited for"
+
+
+class NotAtHome(StateError):
+    """The drone stands too far from the home of its Grant to begin there."""
+
+    remedy = "carry the drone to its home, or correct the home"
+
+
+class NotArmed(StateError):
+    """The motors are off."""
+
+    remedy = "`await drone.arm()` first"
+
+
+class NotFlying(StateError):
+    """The drone is on the ground."""
+
+    remedy = "`await drone.takeoff(...)` first"
+
+
+class AlreadyFlying(StateError):
+    """The drone is in the air, where this cannot begin."""
+
+    remedy = "`await drone.goto(...)` instead"
+
+
+class NoLegalWay(StateError):
+    """The system finds no way there that policies permit."""
+
+    remedy = "ask for another place"
+
+
+class ControlHeld(StateError):
+    """Another application has the drone."""
+
+    remedy = "try again when it is back; `fractus.run` does"
+
+
+class AutopilotRefused(StateError):
+    """The autopilot heard the command and refused it."""
+
+    remedy = "see the reason; `drone.telemetry()` has its texts"
+
 
 class PolicyDenied(FractusError):
-    """Policies forbid the call and nothing of it was carried out.
+    """Policies forbid the call and nothing of it was carried out: the drone hovers, and is still yours.
 
     Attributes:
         decision: what the policy checker answered.
@@ -29,6 +97,8 @@ class PolicyDenied(FractusError):
         reason: one sentence for people.
         policies: names of the policies that decided, most restrictive first.
     """
+
+    remedy = "ask for something else, or go on without it; `drone.can_i` asks beforehand"
 
     def __init__(self, decision: Decision) -> None:
         self.decision = decision
@@ -55,13 +125,23 @@ class Corrected(FractusError):
 class ControlLost(FractusError):
     """The system or a human pilot took the drone, or this component never had it."""
 
+    remedy = "ask for control again: it comes when the drone is free; `fractus.run` does"
+
+
+class MissionEnded(ControlLost):
+    """The mission is over before its end: a policy took the drone for good, its driver was lost, or its Grant was removed."""
+
+    remedy = "apply the application again, or give the Grant another uid, for another flight"
+
 
 class Interrupted(FractusError):
-    """A motion was begun and then stopped before it was complete.
+    """A motion was begun and then stopped before it was complete; the drone hovers, and is still yours.
 
     Attributes:
         decision: why, and by which policies, if any.
     """
+
+    remedy = "ask for the motion again; `fractus.run` begins the program again"
 
     def __init__(self, message: str, decision: Decision | None) -> None:
         self.decision = decision or Decision(Action.UNSPECIFIED, reason=message)
@@ -71,9 +151,13 @@ class Interrupted(FractusError):
 class MissionComplete(FractusError):
     """Every control point of this component is done; the drone is home or on its way there."""
 
+    remedy = "nothing is left to do"
+
 
 class Unavailable(FractusError):
     """The service cannot be reached, or did not answer in time."""
+
+    remedy = "see that the service runs, and begin again: the drone goes on where it was"
 
 
 class Busy(FractusError):
@@ -83,6 +167,8 @@ class Busy(FractusError):
         retry_after_s: in how many seconds to try again; None where waiting alone does not help.
     """
 
+    remedy = "wait for `retry_after_s`, and call less often"
+
     def __init__(self, message: str, retry_after_s: float | None = None) -> None:
         self.retry_after_s = retry_after_s
         super().__init__(message)
@@ -90,6 +176,8 @@ class Busy(FractusError):
 
 class NotConfigured(FractusError):
     """The environment lacks what Fractus gives the pods of a component."""
+
+    remedy = "run it as a component of an application, or set the variable"
 
 
 def decision_of(error: Any) -> Decision | None:
@@ -148,11 +236,14 @@ def _remedy(text: str) -> str:
 def _refusal(code: grpc.StatusCode, text: str, what: str, decision: Decision | None) -> FractusError:
     if (decision is not None and decision.code == "MissionComplete") or "mission is complete" in text:
         return MissionComplete(text)
+    if decision is not None and decision.code == "MissionEnded":
+        return MissionEnded(decision.reason or text)
     if decision is not None and decision.code in _CONTROL_CODES:
         return ControlLost(decision.reason or text)
     if code is grpc.StatusCode.PERMISSION_DENIED:
         return PolicyDenied(decision or Decision(Action.DENY, reason=text or f"{what} is not allowed"))
-    return FractusError(f"{what}: {text}")
+    state = decision.code if decision is not None else ""
+    return _STATE_ERRORS.get(state, StateError)(state, f"{what}: {text}")
 
 
 _REMEDIES = {
@@ -166,3 +257,21 @@ _REMEDIES = {
 
 _CONTROL_CODES = frozenset({"NotInControl", "ControlLost", "NoControl"})
 """Codes of refusals that say who flies, not what is forbidden."""
+
+_STATE_ERRORS: dict[str, type[StateError]] = {
+    **dict.fromkeys(
+        (
+            "NotReady", "PositionUnknown", "FailsafesNotVerified", "FenceNotRaised", "ReturnNotLimited", "LinkTooSlow",
+            "AuditUnavailable", "JournalUnavailable",
+        ),
+        NotReady,
+    ),
+    **dict.fromkeys(("NoLegalWay", "ControlPointUnreachable", "NoStart", "TerrainUnknown"), NoLegalWay),
+    "NotAtHome": NotAtHome,
+    "NotArmed": NotArmed,
+    "NotFlying": NotFlying,
+    "AlreadyFlying": AlreadyFlying,
+    "ControlHeld": ControlHeld,
+    "AutopilotRefused": AutopilotRefused,
+}  # fmt: skip
+"""Refusals by the state of the drone, by their code."""

@@ -104,7 +104,7 @@ async def test_a_service_that_stays_dead_leaves_it_to_the_autopilot(rig: Rig) ->
     late = Driver(rig)
     code, why = await denied(first(late))
     assert code == grpc.StatusCode.FAILED_PRECONDITION
-    assert why.code == "ControlLost"
+    assert why.code == "MissionEnded"
     state = await rig.telemetry()
     assert state.mode == "SMART_RTL" or not state.armed
     assert outcome(state).startswith("failed:")

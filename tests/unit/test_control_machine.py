@@ -54,7 +54,7 @@ EVENTS: tuple[told.Event, ...] = (
     told.TransitRequested(1), told.TransitFailed(1, "fault"),
     told.GrantControl(1), told.GrantControl(2), told.GrantControl(3),
     told.ControlReturned("a", 1), told.ControlReturned("a", 9), told.ControlReturned("b", 1),
-    told.WaypointReached("a"), told.CruiseSpeedSet(3.0),
+    told.WaypointsDone("a", 1), told.CruiseSpeedSet(3.0),
     told.MotionBegan(1, "Goto"), told.MotionBegan(2, "Land"), told.MotionFinished(1), told.MotionFailed(1),
     told.MotionCancelled(1), told.MotionCancelled(2), told.MotionStopped("Slower", "it is too fast"),
     told.TakeoverDemanded("hover", "X", "x"), told.TakeoverDemanded("land", "X", "x"),
@@ -460,5 +460,5 @@ def test_a_waiting_driver_that_loses_its_grant_ends_no_other_mission() -> None:
 
 def test_a_mission_that_is_over_is_refused_with_what_begins_another() -> None:
     code, reason = ended_refusal(Outcome(OutcomeKind.FAILED, "the driver did not come back"))
-    assert code == "ControlLost"
+    assert code == "MissionEnded"
     assert reason.endswith("; another flight needs a Grant with another uid")

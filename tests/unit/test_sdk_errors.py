@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import grpc
 import pytest
-from fractus import Busy, InvalidRequest, PolicyDenied
+from fractus import Busy, ControlLost, FractusError, InvalidRequest, MissionEnded, PolicyDenied, StateError
 from fractus.errors import translate
+from fractus_core.control import Outcome, OutcomeKind
+from fractus_core.control.values import ended_refusal
 from fractus_core.policy.values import Verdict
 from fractus_services import errors
 from fractus_services.errors import Refused, ResourceExhausted, denied
@@ -72,3 +77,26 @@ async def test_a_refusal_carries_who_decided() -> None:
 def test_what_grpc_says_comes_with_a_remedy(code: str, text: str, remedy: str) -> None:
     error = grpc.aio.AioRpcError(grpc.StatusCode[code], grpc.aio.Metadata(), grpc.aio.Metadata(), details=text)
     assert remedy in str(translate(error, "Goto", "there"))
+
+
+ROOT = Path(__file__).parents[2]
+RAISED = re.compile(r'PreconditionFailed\(\s*(?:\*ended_refusal|"([A-Z]\w+)")')
+
+
+async def test_every_state_that_refuses_a_call_has_a_type_of_its_own() -> None:
+    sources = [path.read_text() for path in (ROOT / "services").rglob("*.py")]
+    codes = {code for source in sources for code in RAISED.findall(source) if code} | {"AutopilotRefused"}
+    assert {"NotArmed", "NotFlying", "NoLegalWay", "ControlHeld", "NotAtHome"} <= codes
+    for code in codes:
+        found = translate(await failed(errors.PreconditionFailed(code, "why")), "Goto", "there")
+        assert type(found) not in {FractusError, StateError}, code
+        assert found.remedy, code
+
+
+async def test_a_mission_that_is_over_says_what_another_flight_needs() -> None:
+    refusal = ended_refusal(Outcome(OutcomeKind.FAILED, "driver lost"))
+    found = translate(await failed(errors.PreconditionFailed(*refusal)), "GetControl", "there")
+    assert isinstance(found, MissionEnded)
+    assert isinstance(found, ControlLost)
+    assert "driver lost" in str(found)
+    assert "another uid" in found.remedy

@@ -95,7 +95,7 @@ def ended_refusal(outcome: Outcome) -> tuple[str, str]:
     """Code and reason with which a mission that is over is refused."""
     if outcome.kind is OutcomeKind.COMPLETE:
         return "MissionComplete", "the mission is complete"
-    return "ControlLost", f"the mission has ended ({outcome}); another flight needs a Grant with another uid"
+    return "MissionEnded", f"the mission has ended ({outcome}); another flight needs a Grant with another uid"
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
-import signal
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import fractus
@@ -14,43 +12,14 @@ import fractus
 log = logging.getLogger("navigator")
 
 
-async def main() -> None:
-    """Take control at each control point in turn, fly, give it back; SIGTERM breaks off."""
-    flight = asyncio.current_task()
-    assert flight is not None
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, flight.cancel)
+async def fly(drone: fractus.Mobility, control: fractus.Control) -> None:
+    """Visit what is left of the waypoints of a control point, and what is asked for in between."""
     altitudes, detours = _altitudes(), _detours()
     tasks = [task.path or _positions(os.environ["ZIGZAG"]) for task in fractus.control_points()]
-    async with fractus.mobility() as drone:
-        complete = False
-        while not complete:
-            try:
-                async with drone.control() as control:
-                    at = control.control_point
-                    log.info("in control at CTRL%d", at + 1)
-                    first = 1 + sum(len(task) for task in tasks[:at])
-                    await fly(drone, _at(tasks[at], first, altitudes), first, control.waypoints_reached, detours)
-                log.info("control returned at CTRL%d", at + 1)
-                complete = control.mission_complete
-            except fractus.MissionComplete:
-                complete = True
-            except fractus.ControlLost as lost:
-                log.info("control lost: %s", lost)
-                break
-    await asyncio.Event().wait()
-
-
-async def fly(
-    drone: fractus.Mobility,
-    waypoints: Sequence[fractus.Position],
-    first: int,
-    reached: int,
-    detours: Mapping[int, tuple[fractus.Position, float]],
-) -> None:
-    """Visit what is left of some waypoints, which are numbered from `first` on, and what is asked for in between."""
-    for number, waypoint in enumerate(waypoints, start=first):
-        if number - first >= reached:
-            await go(drone, f"WP{number}", waypoint)
+    first = 1 + sum(len(task) for task in tasks[: control.control_point])
+    async for waypoint in control.remaining(tasks[control.control_point]):
+        number = first + control.waypoints_reached
+        await go(drone, f"WP{number}", replace(waypoint, alt=altitudes.get(number, waypoint.alt)))
         if number in detours:
             place, stay_s = detours[number]
             await go(drone, f"a detour after WP{number}", place, stay_s)
@@ -65,12 +34,6 @@ async def go(drone: fractus.Mobility, what: str, to: fractus.Position, stay_s: f
     else:
         log.info("%s reached%s", what, f", corrected: {done.decision.reason}" if done.corrected else "")
         await asyncio.sleep(stay_s)
-
-
-def _at(
-    waypoints: Sequence[fractus.Position], first: int, altitudes: Mapping[int, float]
-) -> tuple[fractus.Position, ...]:
-    return tuple(replace(w, alt=altitudes.get(number, w.alt)) for number, w in enumerate(waypoints, start=first))
 
 
 def _position(text: str) -> fractus.Position:
@@ -99,10 +62,4 @@ def _detours() -> dict[int, tuple[fractus.Position, float]]:
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    try:
-        asyncio.run(main())
-    except (asyncio.CancelledError, KeyboardInterrupt):
-        log.info("told to stop")
-    except fractus.FractusError as error:
-        raise SystemExit(f"navigator: {error}") from None
+    fractus.run(fly)

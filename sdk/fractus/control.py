@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import AsyncGenerator, Callable, Sequence
 from types import TracebackType
 from typing import Any, Self
 
@@ -13,12 +14,18 @@ from fractus_proto.v1 import mobility_pb2
 
 from fractus.channel import Retries, ServiceChannel
 from fractus.errors import ControlLost, FractusError, MissionComplete, Unavailable
+from fractus.tasks import ControlPoint
+from fractus.values import Position
 
 _log = logging.getLogger("fractus")
 _Event = mobility_pb2.ControlEvent
 
 MAX_RETRY_DELAY_S = 0.5
 """The longest pause between requests for control while the service restarts: the drone hovers meanwhile, and not for long."""
+
+
+OnWait = Callable[[str], None]
+"""Told what is waited for: "the autopilot is not ready to arm: ..."."""
 
 
 class Control:
@@ -31,9 +38,12 @@ class Control:
     exception does not, so that the system, or this component after a restart, decides what comes next.
     """
 
-    def __init__(self, channel: ServiceChannel, *, timeout_s: float | None = None) -> None:
+    def __init__(
+        self, channel: ServiceChannel, *, timeout_s: float | None = None, progress: OnWait | None = None
+    ) -> None:
         self._channel = channel
         self._timeout_s = timeout_s
+        self._progress = progress
         self._granted = asyncio.Event()
         self._lost: FractusError | None = None
         self._watcher: asyncio.Task[None] | None = None
@@ -45,8 +55,10 @@ class Control:
         self._cancellations = 0
         self.control_point = 0
         """Index of the control point that this is for."""
+        self.task = ControlPoint("")
+        """What is to be done there: path or region, as the application declares them; known once control is ours."""
         self.waypoints_reached = 0
-        """How many of its waypoints were reached before, by an earlier life of this component."""
+        """How many of its waypoints are done with, in this life of the component and in earlier ones."""
         self.mission_complete = False
         """After control was returned: whether that was the last control point."""
 
@@ -107,6 +119,26 @@ class Control:
             await self.abandon()
         self.mission_complete = bool(reply.mission_complete)
         return self.mission_complete
+
+    async def report(self, waypoints: int) -> None:
+        """Remember, on the drone, how many waypoints of the task are done with: a restart goes on after them.
+
+        Args:
+            waypoints: reached or passed over; a number below the one before changes nothing.
+        """
+        await self._channel.unary("ReportProgress", mobility_pb2.ReportProgressRequest(waypoints=waypoints))
+        self.waypoints_reached = max(self.waypoints_reached, waypoints)
+
+    async def remaining(self, waypoints: Sequence[Position] | None = None) -> AsyncGenerator[Position, None]:
+        """The waypoints that no life of this component is done with; each is reported when the next one is asked for.
+
+        Args:
+            waypoints: the same ones in each life; by default the task's path.
+        """
+        todo = self.task.path if waypoints is None else waypoints
+        for number in range(self.waypoints_reached, len(todo)):
+            yield todo[number]
+            await self.report(number + 1)
 
     async def abandon(self) -> None:
         """Let the stream break without returning control: the system hovers, then flies home."""
@@ -176,8 +208,12 @@ class Control:
                 if event.state == _Event.STATE_GRANTED:
                     self.control_point = event.control_point
                     self.waypoints_reached = event.waypoints_reached
+                    self.task = ControlPoint.from_proto(event.task)
                     self._held = True
                     self._granted.set()
+                elif event.state == _Event.STATE_WAITING:
+                    if self._progress is not None and event.reason:
+                        self._progress(event.reason)
                 elif event.state == _Event.STATE_LOST:
                     self._lose(ControlLost(event.reason or "the system took the drone"))
                     return

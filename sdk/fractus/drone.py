@@ -13,7 +13,7 @@ import grpc.aio
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
 from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, Retries, ServiceChannel, ServiceClient
-from fractus.control import Control
+from fractus.control import Control, OnWait
 from fractus.dry_runs import CanI
 from fractus.environment import Endpoint, endpoint
 from fractus.errors import ControlLost, Corrected, FractusError
@@ -166,13 +166,14 @@ class Mobility(ServiceClient):
             await self._control.abandon()
         await super().close()
 
-    def control(self, *, timeout_s: float | None = None) -> Control:
+    def control(self, *, timeout_s: float | None = None, progress: OnWait | None = None) -> Control:
         """Control of the drone for the next control point, as a context manager.
 
         Args:
             timeout_s: how long to wait for it; by default as long as the drone takes to get there.
+            progress: called with what is waited for, each time that changes.
         """
-        self._control = Control(self._channel, timeout_s=timeout_s)
+        self._control = Control(self._channel, timeout_s=timeout_s, progress=progress)
         return self._control
 
     async def arm(self, *, timeout_s: float = ARM_TIMEOUT_S) -> Result:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fractus.errors import NotConfigured
-from fractus.values import ControlPoint
+from fractus.tasks import ControlPoint
 
 MOBILITY_PORT = 50051
 CAMERA_PORT = 50052
@@ -72,17 +72,26 @@ def egress(component: str, env: Mapping[str, str] | None = None) -> str:
 
 
 def control_points(env: Mapping[str, str] | None = None) -> tuple[ControlPoint, ...]:
-    """The driver's control points, in the order flown.
+    """The driver's control points, in the order flown: from FRACTUS_CONTROL_POINTS, or from the Grant of FRACTUS_GRANT.
+
+    A driver that has control finds its own in `control.task`, without any of these.
 
     Raises:
-        NotConfigured: the variable is missing or is not what Fractus writes.
+        NotConfigured: both variables are missing, or what they give is not what Fractus writes.
     """
     values = os.environ if env is None else env
-    text = _needed(values, "FRACTUS_CONTROL_POINTS")
+    source, points = "FRACTUS_CONTROL_POINTS", None
     try:
-        return tuple(ControlPoint.from_manifest(point) for point in json.loads(text))
-    except (ValueError, AttributeError, TypeError) as error:
-        raise NotConfigured(f"FRACTUS_CONTROL_POINTS is not a JSON list of control points: {error}") from None
+        if not values.get(source) and values.get("FRACTUS_GRANT"):
+            source = f"FRACTUS_GRANT ({values['FRACTUS_GRANT']})"
+            points = json.loads(Path(values["FRACTUS_GRANT"]).read_bytes())["spec"].get("controlPoints") or []
+        else:
+            points = json.loads(_needed(values, source))
+        return tuple(ControlPoint.from_manifest(point) for point in points)
+    except OSError as error:
+        raise NotConfigured(f"{source} cannot be read: {error.strerror}; name a signed Grant's file") from None
+    except (ValueError, AttributeError, TypeError, KeyError) as error:
+        raise NotConfigured(f"{source} does not hold control points as Fractus writes them: {error}") from None
 
 
 def _needed(values: Mapping[str, str], name: str) -> str:

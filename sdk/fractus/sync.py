@@ -19,6 +19,7 @@ from fractus import dry_runs as _dry_runs
 from fractus import pictures as _pictures
 from fractus.environment import Endpoint
 from fractus.errors import FractusError
+from fractus.tasks import ControlPoint
 
 JOIN_TIMEOUT_S = 10.0
 """How long `close` waits for the thread of the event loop to end."""
@@ -142,8 +143,16 @@ class Control(_Wrapper[_control.Control]):
 
     @property
     def waypoints_reached(self) -> int:
-        """How many of its waypoints were reached before, by an earlier life of this component."""
+        """How many of its waypoints are done with, in this life of the component and in earlier ones."""
         return self._async.waypoints_reached
+
+    @property
+    def task(self) -> ControlPoint:
+        """What is to be done there: path or region, as the application declares them."""
+        return self._async.task
+
+    report = _waiting(_control.Control.report)
+    remaining = _iterating(_control.Control.remaining)
 
     @property
     def mission_complete(self) -> bool:
@@ -194,9 +203,9 @@ class Mobility(_Client[_drone.Mobility]):
         self.can_i = CanI(self._loop, self._async.can_i)
         """Dry runs: `drone.can_i.goto(lat, lon, 20)`."""
 
-    def control(self, *, timeout_s: float | None = None) -> Control:
+    def control(self, *, timeout_s: float | None = None, progress: _control.OnWait | None = None) -> Control:
         """Control of the drone for the next control point: `with drone.control() as control`."""
-        return Control(self._loop, self._async.control(timeout_s=timeout_s))
+        return Control(self._loop, self._async.control(timeout_s=timeout_s, progress=progress))
 
     arm = _waiting(_drone.Mobility.arm)
     disarm = _waiting(_drone.Mobility.disarm)

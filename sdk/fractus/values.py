@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any
 
 from fractus_proto.v1 import camera_pb2, mobility_pb2, types_pb2
 
@@ -305,39 +303,3 @@ class ImageInfo(Result):
             media_type=message.media_type,
             position=Position.from_proto(message.position) if message.HasField("position") else None,
         )
-
-
-@dataclass(frozen=True, slots=True)
-class ControlPoint:
-    """One of the driver's control points, as its application declares it.
-
-    Attributes:
-        navigation: `pathBased` or `regionBased`.
-        path: waypoints in the order to fly; empty for a region.
-        region: the area as the manifest spells it (`{"polygon": ...}` or `{"circle": ...}`), or None.
-    """
-
-    navigation: str
-    path: tuple[Position, ...] = ()
-    region: Mapping[str, Any] | None = None
-
-    @classmethod
-    def from_manifest(cls, value: Mapping[str, Any]) -> ControlPoint:
-        """Read a control point from the JSON of the pod's environment.
-
-        Raises:
-            ValueError: a position lacks lat or lon, or navigation is missing.
-        """
-        try:
-            path = tuple(
-                Position(
-                    float(point["lat"]),
-                    float(point["lon"]),
-                    float(point.get("alt") or 0.0),
-                    AltitudeReference[str(point.get("altitudeReference", "home")).upper()],
-                )
-                for point in value.get("path") or ()
-            )
-            return cls(str(value["navigation"]), path, value.get("region"))
-        except KeyError as error:
-            raise ValueError(f"a control point lacks {error.args[0]}") from None

@@ -90,6 +90,7 @@ class Drone(mobility_pb2_grpc.MobilityServiceServicer):
         self.release: asyncio.Event | None = None
         self.refuse_control: tuple[grpc.StatusCode, str] | None = None
         self.waypoints_reached = 0
+        self.interruptions = 0
 
     def _note(self, method: str, context: grpc.aio.ServicerContext) -> None:
         self.calls.append(method)
@@ -104,8 +105,12 @@ class Drone(mobility_pb2_grpc.MobilityServiceServicer):
             await context.abort(*self.refuse_control)
         self.stream_closed.clear()
         try:
-            yield Event(state=Event.STATE_WAITING)
-            yield Event(state=Event.STATE_GRANTED, control_point=0, waypoints_reached=self.waypoints_reached)
+            yield Event(state=Event.STATE_WAITING, reason="the autopilot is not ready to arm: it has no home yet")
+            path = [
+                types_pb2.Position(latitude_deg=40.0, longitude_deg=22.0 + i / 1000, altitude_m=20) for i in range(3)
+            ]
+            task = types_pb2.ControlPoint(navigation="pathBased", path=path)
+            yield Event(state=Event.STATE_GRANTED, waypoints_reached=self.waypoints_reached, task=task)
             self.stream_open.set()
             while True:
                 event = await self.control.get()
@@ -120,6 +125,11 @@ class Drone(mobility_pb2_grpc.MobilityServiceServicer):
         self._note("ReturnControl", context)
         self.control.put_nowait(Event(state=Event.STATE_COMPLETE))
         return mobility_pb2.ReturnControlResponse(mission_complete=True)
+
+    async def ReportProgress(self, request, context):  # noqa: N802
+        self._note("ReportProgress", context)
+        self.waypoints_reached = request.waypoints
+        return mobility_pb2.ReportProgressResponse()
 
     async def Arm(self, request, context):  # noqa: N802
         self._note("Arm", context)
@@ -141,6 +151,9 @@ class Drone(mobility_pb2_grpc.MobilityServiceServicer):
         self._note("Goto", context)
         if request.target.latitude_deg > 40.01:
             await _refuse(context)
+        if self.interruptions:
+            self.interruptions -= 1
+            await context.abort(grpc.StatusCode.ABORTED, "a zone appeared ahead")
         target = types_pb2.Position()
         target.CopyFrom(request.target)
         target.altitude_m = min(target.altitude_m, 60.0)

@@ -12,6 +12,7 @@ import fractus
 import grpc
 import pytest
 from cryptography import x509
+from fractus import running
 from fractus.drone import Mobility
 from fractus.pictures import Camera
 from fractus_proto.v1 import mobility_pb2
@@ -174,6 +175,56 @@ async def test_a_body_may_catch_the_loss_itself(stage: Stage) -> None:
                 except fractus.ControlLost as loss:
                     seen.append(str(loss))
     assert seen == ["revoked"]
+
+
+async def test_what_is_waited_for_is_told(stage: Stage) -> None:
+    told: list[str] = []
+    async with stage.client() as drone, drone.control(progress=told.append):
+        assert told == ["the autopilot is not ready to arm: it has no home yet"]
+
+
+async def visit(drone: Mobility, control: fractus.Control) -> None:
+    async for waypoint in control.remaining():
+        await drone.goto(waypoint.lat, waypoint.lon, waypoint.alt)
+
+
+async def test_another_life_goes_on_where_the_one_before_was(stage: Stage) -> None:
+    stage.drone.waypoints_reached = 1
+    async with stage.client() as drone:
+        await running.fly(visit, drone)
+    assert [round(target.longitude_deg, 3) for target in stage.drone.targets] == [22.001, 22.002]
+    assert stage.drone.waypoints_reached == 3
+    assert stage.drone.calls[-1] == "ReturnControl"
+
+
+async def test_an_interrupted_program_begins_again_and_not_for_ever(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(running, "RETRY_S", 0.0)
+    stage.drone.interruptions = 2
+    async with stage.client() as drone:
+        await running.fly(visit, drone)
+    assert len(stage.drone.targets) == 3
+    assert stage.drone.calls.count("GetControl") == 1
+
+    stage.drone.interruptions, stage.drone.waypoints_reached = 1000, 0
+    async with stage.client() as drone:
+        with pytest.raises(fractus.Interrupted, match="a zone appeared ahead"):
+            await running.fly(visit, drone)
+
+
+async def test_control_that_was_lost_is_asked_for_again(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(running, "RETRY_S", 0.0)
+    stage.drone.release = asyncio.Event()
+    async with stage.client() as drone:
+        flight = asyncio.create_task(running.fly(visit, drone))
+        await asyncio.wait_for(stage.drone.moving.wait(), WAIT_S)
+        stage.drone.control.put_nowait(Event(state=Event.STATE_LOST, reason="a human pilot changed the mode to LOITER"))
+        await asyncio.wait_for(stage.drone.hovering.wait(), WAIT_S)
+        stage.drone.release.set()
+        await asyncio.wait_for(flight, WAIT_S)
+    assert stage.drone.calls.count("GetControl") == 2
+    assert stage.drone.waypoints_reached == 3
 
 
 async def test_an_error_in_the_body_does_not_return_control(stage: Stage) -> None:

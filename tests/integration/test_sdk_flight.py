@@ -111,7 +111,8 @@ class Stage:
         self._start(
             "navigator", str(EXAMPLE / "navigator.py"),
             FRACTUS_NODE="drone-1", FRACTUS_MOBILITY_ADDRESS=self.address, FRACTUS_CONTROL_POINTS=points,
-            FRACTUS_TLS_DIR=str(self.folder / "driver-tls"), **{e.name: e.value for e in driver.container.env},
+            FRACTUS_TLS_DIR=str(self.folder / "driver-tls"), KUBERNETES_SERVICE_HOST="as in a pod",
+            **{e.name: e.value for e in driver.container.env},
         )  # fmt: skip
 
     def _start(self, name: str, *arguments: str, **environment: str) -> None:
@@ -226,16 +227,39 @@ def test_a_navigator_that_is_killed_goes_on_where_it_was_and_rests_after_its_mis
     short.start_navigator()
     short.wait("return", lambda: "control returned" in short.log("navigator"))
     log = short.log("navigator")
-    assert "in control; 1 of 2 waypoints reached before" in log
+    assert "in control at control point 1 (waypoints reached=1)" in log
     assert log.count("waypoint 1/2 reached") == 1
-    assert log.count("taking off") == 1
     assert "waypoint 2/2 reached" in log
     assert short.noted("driver lost")
 
     short.kill("navigator")
     short.start_navigator()
-    short.wait("word of it", lambda: "the mission is over; nothing left to fly" in short.log("navigator"), 20)
+    short.wait("word of it", lambda: "the mission is over; nothing is left to fly" in short.log("navigator"), 20)
     assert short.processes["navigator"].poll() is None
+
+
+def test_a_navigator_that_is_killed_at_each_stage_of_its_flight_completes_it(short: Stage) -> None:
+    def begun(method: str, times: int) -> bool:
+        return [entry["method"] for entry in short.entries() if entry["kind"] == "call"].count(method) >= times
+
+    stages: dict[str, Callable[[], bool]] = {
+        "control": lambda: "in control" in short.log("navigator"),
+        "armed": lambda: "armed; taking off" in short.log("navigator"),
+        "climb": lambda: any(e["kind"] == "state" and e["alt"] > 5 for e in short.entries()),
+        "first leg": lambda: begun("Goto", 1),
+        "second leg": lambda: "waypoint 1/2 reached" in short.log("navigator"),
+    }
+    for stage, at in stages.items():
+        short.start_navigator()
+        short.wait(stage, at)
+        short.kill("navigator")
+    short.start_navigator()
+    short.wait("return", lambda: "the mission is over" in short.log("navigator"))
+    log = short.log("navigator")
+    assert log.count("waypoint 1/2 reached") == 1
+    assert log.count("waypoint 2/2 reached") == 1
+    assert "in control at control point 1 (waypoints reached=1)" in log
+    short.wait("landing", lambda: short.noted("landed"))
 
 
 def test_a_service_that_is_killed_is_found_again_by_the_navigator(slow: Stage) -> None:

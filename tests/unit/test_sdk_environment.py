@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import fractus
 import pytest
@@ -66,8 +67,20 @@ def test_control_points_are_read_as_the_manifest_spells_them() -> None:
     assert path.path[1].reference is fractus.AltitudeReference.AMSL
     assert path.path[2].alt == 0.0
     assert region.path == ()
-    assert region.region is not None
-    assert region.region["circle"]["radius"] == 50
+    assert region.region == fractus.Circle(fractus.Position(1.0, 2.0), 50.0)
+
+
+def test_control_points_of_a_grant_are_those_of_its_driver(tmp_path: Path) -> None:
+    corners = [{"lat": 0, "lon": 0}, {"lat": 0, "lon": 1}, {"lat": 1, "lon": 1}]
+    points = [{"navigation": "regionBased", "region": {"polygon": {"exterior": corners, "holes": [corners]}}}]
+    path = tmp_path / "grant.json"
+    path.write_text(json.dumps({"kind": "Grant", "spec": {"controlPoints": points}}))
+    (point,) = control_points({"FRACTUS_GRANT": str(path)})
+    assert isinstance(point.region, fractus.Polygon)
+    assert point.region.holes == (point.region.exterior,)
+    assert point.region.exterior[1] == fractus.Position(0.0, 1.0)
+    with pytest.raises(fractus.NotConfigured, match=r"FRACTUS_GRANT .* cannot be read"):
+        control_points({"FRACTUS_GRANT": str(tmp_path / "none.json")})
 
 
 @pytest.mark.parametrize("text", ["{", "3", '[{"path": []}]', '[{"navigation": "pathBased", "path": [{"lat": 1}]}]'])

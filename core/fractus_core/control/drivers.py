@@ -21,7 +21,7 @@ from fractus_core.control.events import (
     StreamOpened,
     TransitFailed,
     TransitRequested,
-    WaypointReached,
+    WaypointsDone,
 )
 from fractus_core.control.step import DRIVER_LOST, Step
 from fractus_core.control.values import (
@@ -60,10 +60,10 @@ def on_driver(step: Step, event: DriverEvent) -> None:
             _grant(step, lease_id)
         case ControlReturned():
             _return(step, event)
-        case WaypointReached(key):
+        case WaypointsDone(key, waypoints):
             mission = step.state.missions.get(key)
-            if mission is not None:
-                step.update_mission(mission, waypoints=mission.waypoints + 1)
+            if mission is not None and waypoints > mission.waypoints:
+                step.update_mission(mission, waypoints=waypoints)
                 step.act(SaveJournal())
         case CruiseSpeedSet(speed_mps):
             step.set(speed_mps=speed_mps)

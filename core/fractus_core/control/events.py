@@ -57,10 +57,11 @@ class ControlReturned:
 
 
 @dataclass(frozen=True, slots=True)
-class WaypointReached:
-    """A leg of the driver ended at the next waypoint of its path."""
+class WaypointsDone:
+    """The driver is done with the first `waypoints` waypoints of its control point's task, reached or passed over."""
 
     key: str
+    waypoints: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,7 +330,7 @@ class Tick:
 
 
 DriverEvent = (
-    StreamOpened | StreamClosed | TransitRequested | TransitFailed | GrantControl | ControlReturned | WaypointReached
+    StreamOpened | StreamClosed | TransitRequested | TransitFailed | GrantControl | ControlReturned | WaypointsDone
     | CruiseSpeedSet
 )  # fmt: skip
 MotionEvent = MotionBegan | MotionFinished | MotionFailed | MotionCancelled | MotionStopped

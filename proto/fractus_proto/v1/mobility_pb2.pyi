@@ -16,7 +16,7 @@ class GetControlRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class ControlEvent(_message.Message):
-    __slots__ = ("state", "control_point", "reason", "waypoints_reached")
+    __slots__ = ("state", "control_point", "reason", "waypoints_reached", "task")
     class State(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
         __slots__ = ()
         STATE_UNSPECIFIED: _ClassVar[ControlEvent.State]
@@ -35,11 +35,23 @@ class ControlEvent(_message.Message):
     CONTROL_POINT_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
     WAYPOINTS_REACHED_FIELD_NUMBER: _ClassVar[int]
+    TASK_FIELD_NUMBER: _ClassVar[int]
     state: ControlEvent.State
     control_point: int
     reason: str
     waypoints_reached: int
-    def __init__(self, state: _Optional[_Union[ControlEvent.State, str]] = ..., control_point: _Optional[int] = ..., reason: _Optional[str] = ..., waypoints_reached: _Optional[int] = ...) -> None: ...
+    task: _types_pb2.ControlPoint
+    def __init__(self, state: _Optional[_Union[ControlEvent.State, str]] = ..., control_point: _Optional[int] = ..., reason: _Optional[str] = ..., waypoints_reached: _Optional[int] = ..., task: _Optional[_Union[_types_pb2.ControlPoint, _Mapping]] = ...) -> None: ...
+
+class ReportProgressRequest(_message.Message):
+    __slots__ = ("waypoints",)
+    WAYPOINTS_FIELD_NUMBER: _ClassVar[int]
+    waypoints: int
+    def __init__(self, waypoints: _Optional[int] = ...) -> None: ...
+
+class ReportProgressResponse(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
 
 class ReturnControlRequest(_message.Message):
     __slots__ = ()

@@ -44,6 +44,11 @@ class MobilityServiceStub(object):
                 request_serializer=fractus__proto_dot_v1_dot_mobility__pb2.ReturnControlRequest.SerializeToString,
                 response_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.ReturnControlResponse.FromString,
                 _registered_method=True)
+        self.ReportProgress = channel.unary_unary(
+                '/fractus.v1.MobilityService/ReportProgress',
+                request_serializer=fractus__proto_dot_v1_dot_mobility__pb2.ReportProgressRequest.SerializeToString,
+                response_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.ReportProgressResponse.FromString,
+                _registered_method=True)
         self.Arm = channel.unary_unary(
                 '/fractus.v1.MobilityService/Arm',
                 request_serializer=fractus__proto_dot_v1_dot_mobility__pb2.ArmRequest.SerializeToString,
@@ -124,6 +129,13 @@ class MobilityServiceServicer(object):
 
     def ReturnControl(self, request, context):
         """Gives control back at the end of a control point's task; at the last one the system brings the drone home.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ReportProgress(self, request, context):
+        """Tells how far the caller is with the task of its control point; it is told again with GRANTED after a restart. Needs control.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -223,6 +235,11 @@ def add_MobilityServiceServicer_to_server(servicer, server):
                     servicer.ReturnControl,
                     request_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.ReturnControlRequest.FromString,
                     response_serializer=fractus__proto_dot_v1_dot_mobility__pb2.ReturnControlResponse.SerializeToString,
+            ),
+            'ReportProgress': grpc.unary_unary_rpc_method_handler(
+                    servicer.ReportProgress,
+                    request_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.ReportProgressRequest.FromString,
+                    response_serializer=fractus__proto_dot_v1_dot_mobility__pb2.ReportProgressResponse.SerializeToString,
             ),
             'Arm': grpc.unary_unary_rpc_method_handler(
                     servicer.Arm,
@@ -344,6 +361,33 @@ class MobilityService(object):
             '/fractus.v1.MobilityService/ReturnControl',
             fractus__proto_dot_v1_dot_mobility__pb2.ReturnControlRequest.SerializeToString,
             fractus__proto_dot_v1_dot_mobility__pb2.ReturnControlResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ReportProgress(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/fractus.v1.MobilityService/ReportProgress',
+            fractus__proto_dot_v1_dot_mobility__pb2.ReportProgressRequest.SerializeToString,
+            fractus__proto_dot_v1_dot_mobility__pb2.ReportProgressResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -24,23 +24,33 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1c\x66ractus_proto/v1/types.proto\x12\nfractus.v1\"\x86\x01\n\x08Position\x12\x14\n\x0clatitude_deg\x18\x01 \x01(\x01\x12\x15\n\rlongitude_deg\x18\x02 \x01(\x01\x12\x12\n\naltitude_m\x18\x03 \x01(\x01\x12\x39\n\x12\x61ltitude_reference\x18\x04 \x01(\x0e\x32\x1d.fractus.v1.AltitudeReference\"A\n\x08Velocity\x12\x11\n\tnorth_mps\x18\x01 \x01(\x01\x12\x10\n\x08\x65\x61st_mps\x18\x02 \x01(\x01\x12\x10\n\x08\x64own_mps\x18\x03 \x01(\x01\"@\n\x08\x41ttitude\x12\x10\n\x08roll_deg\x18\x01 \x01(\x01\x12\x11\n\tpitch_deg\x18\x02 \x01(\x01\x12\x0f\n\x07yaw_deg\x18\x03 \x01(\x01\"\xd5\x01\n\x08\x44\x65\x63ision\x12+\n\x06\x61\x63tion\x18\x01 \x01(\x0e\x32\x1b.fractus.v1.Decision.Action\x12\x0e\n\x06reason\x18\x02 \x01(\t\x12\x0c\n\x04\x63ode\x18\x03 \x01(\t\x12\x10\n\x08policies\x18\x04 \x03(\t\"l\n\x06\x41\x63tion\x12\x16\n\x12\x41\x43TION_UNSPECIFIED\x10\x00\x12\x10\n\x0c\x41\x43TION_ALLOW\x10\x01\x12\x12\n\x0e\x41\x43TION_CORRECT\x10\x02\x12\x0f\n\x0b\x41\x43TION_DENY\x10\x03\x12\x13\n\x0f\x41\x43TION_TAKEOVER\x10\x04*m\n\x11\x41ltitudeReference\x12\x1b\n\x17\x41LTITUDE_REFERENCE_HOME\x10\x00\x12\x1b\n\x17\x41LTITUDE_REFERENCE_AMSL\x10\x01\x12\x1e\n\x1a\x41LTITUDE_REFERENCE_TERRAIN\x10\x02\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1c\x66ractus_proto/v1/types.proto\x12\nfractus.v1\"\x86\x01\n\x08Position\x12\x14\n\x0clatitude_deg\x18\x01 \x01(\x01\x12\x15\n\rlongitude_deg\x18\x02 \x01(\x01\x12\x12\n\naltitude_m\x18\x03 \x01(\x01\x12\x39\n\x12\x61ltitude_reference\x18\x04 \x01(\x0e\x32\x1d.fractus.v1.AltitudeReference\"\xb2\x02\n\x04\x41rea\x12)\n\x06\x63ircle\x18\x01 \x01(\x0b\x32\x17.fractus.v1.Area.CircleH\x00\x12+\n\x07polygon\x18\x02 \x01(\x0b\x32\x18.fractus.v1.Area.PolygonH\x00\x1a@\n\x06\x43ircle\x12$\n\x06\x63\x65nter\x18\x01 \x01(\x0b\x32\x14.fractus.v1.Position\x12\x10\n\x08radius_m\x18\x02 \x01(\x01\x1a-\n\x04Ring\x12%\n\x07\x63orners\x18\x01 \x03(\x0b\x32\x14.fractus.v1.Position\x1aX\n\x07Polygon\x12\'\n\x08\x65xterior\x18\x01 \x01(\x0b\x32\x15.fractus.v1.Area.Ring\x12$\n\x05holes\x18\x02 \x03(\x0b\x32\x15.fractus.v1.Area.RingB\x07\n\x05shape\"h\n\x0c\x43ontrolPoint\x12\x12\n\nnavigation\x18\x01 \x01(\t\x12\"\n\x04path\x18\x02 \x03(\x0b\x32\x14.fractus.v1.Position\x12 \n\x06region\x18\x03 \x01(\x0b\x32\x10.fractus.v1.Area\"A\n\x08Velocity\x12\x11\n\tnorth_mps\x18\x01 \x01(\x01\x12\x10\n\x08\x65\x61st_mps\x18\x02 \x01(\x01\x12\x10\n\x08\x64own_mps\x18\x03 \x01(\x01\"@\n\x08\x41ttitude\x12\x10\n\x08roll_deg\x18\x01 \x01(\x01\x12\x11\n\tpitch_deg\x18\x02 \x01(\x01\x12\x0f\n\x07yaw_deg\x18\x03 \x01(\x01\"\xd5\x01\n\x08\x44\x65\x63ision\x12+\n\x06\x61\x63tion\x18\x01 \x01(\x0e\x32\x1b.fractus.v1.Decision.Action\x12\x0e\n\x06reason\x18\x02 \x01(\t\x12\x0c\n\x04\x63ode\x18\x03 \x01(\t\x12\x10\n\x08policies\x18\x04 \x03(\t\"l\n\x06\x41\x63tion\x12\x16\n\x12\x41\x43TION_UNSPECIFIED\x10\x00\x12\x10\n\x0c\x41\x43TION_ALLOW\x10\x01\x12\x12\n\x0e\x41\x43TION_CORRECT\x10\x02\x12\x0f\n\x0b\x41\x43TION_DENY\x10\x03\x12\x13\n\x0f\x41\x43TION_TAKEOVER\x10\x04*m\n\x11\x41ltitudeReference\x12\x1b\n\x17\x41LTITUDE_REFERENCE_HOME\x10\x00\x12\x1b\n\x17\x41LTITUDE_REFERENCE_AMSL\x10\x01\x12\x1e\n\x1a\x41LTITUDE_REFERENCE_TERRAIN\x10\x02\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'fractus_proto.v1.types_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_ALTITUDEREFERENCE']._serialized_start=530
-  _globals['_ALTITUDEREFERENCE']._serialized_end=639
+  _globals['_ALTITUDEREFERENCE']._serialized_start=945
+  _globals['_ALTITUDEREFERENCE']._serialized_end=1054
   _globals['_POSITION']._serialized_start=45
   _globals['_POSITION']._serialized_end=179
-  _globals['_VELOCITY']._serialized_start=181
-  _globals['_VELOCITY']._serialized_end=246
-  _globals['_ATTITUDE']._serialized_start=248
-  _globals['_ATTITUDE']._serialized_end=312
-  _globals['_DECISION']._serialized_start=315
-  _globals['_DECISION']._serialized_end=528
-  _globals['_DECISION_ACTION']._serialized_start=420
-  _globals['_DECISION_ACTION']._serialized_end=528
+  _globals['_AREA']._serialized_start=182
+  _globals['_AREA']._serialized_end=488
+  _globals['_AREA_CIRCLE']._serialized_start=278
+  _globals['_AREA_CIRCLE']._serialized_end=342
+  _globals['_AREA_RING']._serialized_start=344
+  _globals['_AREA_RING']._serialized_end=389
+  _globals['_AREA_POLYGON']._serialized_start=391
+  _globals['_AREA_POLYGON']._serialized_end=479
+  _globals['_CONTROLPOINT']._serialized_start=490
+  _globals['_CONTROLPOINT']._serialized_end=594
+  _globals['_VELOCITY']._serialized_start=596
+  _globals['_VELOCITY']._serialized_end=661
+  _globals['_ATTITUDE']._serialized_start=663
+  _globals['_ATTITUDE']._serialized_end=727
+  _globals['_DECISION']._serialized_start=730
+  _globals['_DECISION']._serialized_end=943
+  _globals['_DECISION_ACTION']._serialized_start=835
+  _globals['_DECISION_ACTION']._serialized_end=943
 # @@protoc_insertion_point(module_scope)

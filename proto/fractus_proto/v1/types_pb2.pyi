@@ -2,7 +2,7 @@ from google.protobuf.internal import containers as _containers
 from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
-from collections.abc import Iterable as _Iterable
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
 from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
@@ -27,6 +27,43 @@ class Position(_message.Message):
     altitude_m: float
     altitude_reference: AltitudeReference
     def __init__(self, latitude_deg: _Optional[float] = ..., longitude_deg: _Optional[float] = ..., altitude_m: _Optional[float] = ..., altitude_reference: _Optional[_Union[AltitudeReference, str]] = ...) -> None: ...
+
+class Area(_message.Message):
+    __slots__ = ("circle", "polygon")
+    class Circle(_message.Message):
+        __slots__ = ("center", "radius_m")
+        CENTER_FIELD_NUMBER: _ClassVar[int]
+        RADIUS_M_FIELD_NUMBER: _ClassVar[int]
+        center: Position
+        radius_m: float
+        def __init__(self, center: _Optional[_Union[Position, _Mapping]] = ..., radius_m: _Optional[float] = ...) -> None: ...
+    class Ring(_message.Message):
+        __slots__ = ("corners",)
+        CORNERS_FIELD_NUMBER: _ClassVar[int]
+        corners: _containers.RepeatedCompositeFieldContainer[Position]
+        def __init__(self, corners: _Optional[_Iterable[_Union[Position, _Mapping]]] = ...) -> None: ...
+    class Polygon(_message.Message):
+        __slots__ = ("exterior", "holes")
+        EXTERIOR_FIELD_NUMBER: _ClassVar[int]
+        HOLES_FIELD_NUMBER: _ClassVar[int]
+        exterior: Area.Ring
+        holes: _containers.RepeatedCompositeFieldContainer[Area.Ring]
+        def __init__(self, exterior: _Optional[_Union[Area.Ring, _Mapping]] = ..., holes: _Optional[_Iterable[_Union[Area.Ring, _Mapping]]] = ...) -> None: ...
+    CIRCLE_FIELD_NUMBER: _ClassVar[int]
+    POLYGON_FIELD_NUMBER: _ClassVar[int]
+    circle: Area.Circle
+    polygon: Area.Polygon
+    def __init__(self, circle: _Optional[_Union[Area.Circle, _Mapping]] = ..., polygon: _Optional[_Union[Area.Polygon, _Mapping]] = ...) -> None: ...
+
+class ControlPoint(_message.Message):
+    __slots__ = ("navigation", "path", "region")
+    NAVIGATION_FIELD_NUMBER: _ClassVar[int]
+    PATH_FIELD_NUMBER: _ClassVar[int]
+    REGION_FIELD_NUMBER: _ClassVar[int]
+    navigation: str
+    path: _containers.RepeatedCompositeFieldContainer[Position]
+    region: Area
+    def __init__(self, navigation: _Optional[str] = ..., path: _Optional[_Iterable[_Union[Position, _Mapping]]] = ..., region: _Optional[_Union[Area, _Mapping]] = ...) -> None: ...
 
 class Velocity(_message.Message):
     __slots__ = ("north_mps", "east_mps", "down_mps")

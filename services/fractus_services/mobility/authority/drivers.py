@@ -5,7 +5,13 @@ from __future__ import annotations
 import math
 
 from fractus_core.control.actions import RefuseStream
-from fractus_core.control.events import ControlReturned, GrantControl, StreamClosed, StreamOpened, WaypointReached
+from fractus_core.control.events import (
+    ControlReturned,
+    GrantControl,
+    StreamClosed,
+    StreamOpened,
+    WaypointsDone,
+)
 from fractus_core.geo import LocalFrame
 
 from fractus_services.errors import PreconditionFailed, Unavailable
@@ -89,6 +95,17 @@ async def give_back(control: Control, grant: ActiveGrant) -> bool:
     return last
 
 
+async def report(control: Control, grant: ActiveGrant, waypoints: int) -> None:
+    """A driver is done with the first waypoints of its task; on disk when this returns.
+
+    Raises:
+        PreconditionFailed: it does not have the drone.
+    """
+    require(control, grant)
+    control.dispatch(WaypointsDone(grant.key, waypoints))
+    await control.save()
+
+
 def reached(control: Control, grant: ActiveGrant, lat: float, lon: float) -> None:
     """A goto of the driver is complete: count the waypoint."""
     mission, points = control.mission(grant), grant.spec.control_points
@@ -96,4 +113,4 @@ def reached(control: Control, grant: ActiveGrant, lat: float, lon: float) -> Non
     if path and mission.waypoints < len(path):
         ahead = path[mission.waypoints]
         if math.hypot(*LocalFrame(ahead.lat, ahead.lon).xy(lat, lon)) <= WAYPOINT_M:
-            control.dispatch(WaypointReached(grant.key))
+            control.dispatch(WaypointsDone(grant.key, mission.waypoints + 1))

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, assert_never
+from collections.abc import Callable, Sequence
+from typing import Any, assert_never, cast
 
-from fractus_core.api.geometry import Reference
+from fractus_core.api.components import ControlPoint
+from fractus_core.api.geometry import Area, Point, Reference
 from fractus_core.api.methods import CONTROL_METHODS, MOBILITY_METHODS, Method
 from fractus_core.control import ControlEvent, StreamState
 from fractus_core.exhaustive import exhaustive
@@ -127,14 +128,50 @@ def checked(verdict: Verdict) -> mobility_pb2.CheckCallResponse:
     return reply
 
 
-def control_event(event: ControlEvent) -> mobility_pb2.ControlEvent:
-    """An event of a control stream."""
-    return mobility_pb2.ControlEvent(
+def control_event(event: ControlEvent, points: Sequence[ControlPoint]) -> mobility_pb2.ControlEvent:
+    """An event of a control stream; a driver that is granted control reads what its task is.
+
+    Args:
+        event: what happened.
+        points: the caller's control points.
+    """
+    message = mobility_pb2.ControlEvent(
         state=_STATES[event.state],
         control_point=event.control_point,
         reason=event.reason,
         waypoints_reached=event.waypoints_reached,
     )
+    if event.state is StreamState.GRANTED and event.control_point < len(points):
+        message.task.CopyFrom(_task(points[event.control_point]))
+    return message
+
+
+def _task(point: ControlPoint) -> types_pb2.ControlPoint:
+    message = types_pb2.ControlPoint(navigation=point.navigation)
+    for waypoint in point.path or ():
+        message.path.add(
+            latitude_deg=waypoint.lat,
+            longitude_deg=waypoint.lon,
+            altitude_m=waypoint.alt or 0.0,
+            altitude_reference=cast("Any", _WIRE[waypoint.altitude_reference]),
+        )
+    if point.region is not None:
+        _write_area(message.region, point.region)
+    return message
+
+
+def _write_area(message: types_pb2.Area, area: Area) -> None:
+    if area.circle is not None:
+        message.circle.center.CopyFrom(_place(area.circle.center))
+        message.circle.radius_m = area.circle.radius
+    elif area.polygon is not None:
+        message.polygon.exterior.corners.extend(map(_place, area.polygon.exterior))
+        for hole in area.polygon.holes:
+            message.polygon.holes.add().corners.extend(map(_place, hole))
+
+
+def _place(point: Point) -> types_pb2.Position:
+    return types_pb2.Position(latitude_deg=point.lat, longitude_deg=point.lon)
 
 
 def motion_progress(step: Step, vehicle: VehicleState, verdict: Verdict | None) -> mobility_pb2.MotionProgress:

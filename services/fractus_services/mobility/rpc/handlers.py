@@ -100,7 +100,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
                     aclosing(self._streams.follow(grant)) as events,
                 ):
                     async for event in events:
-                        await context.write(control_event(event))
+                        await context.write(control_event(event, grant.spec.control_points))
             except TimeoutError:
                 caller.check()
 
@@ -112,6 +112,12 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
             self._service.calls.allow(Call("ReturnControl"), grant)
             last = await drivers.give_back(self._control, grant)
             return mobility_pb2.ReturnControlResponse(mission_complete=last)
+
+    async def ReportProgress(self, request: Any, context: Any) -> Any:  # noqa: N802
+        """See mobility.proto."""
+        async with self.admission.call(context) as caller:
+            await drivers.report(self._control, self._grant_of(caller), request.waypoints)
+            return mobility_pb2.ReportProgressResponse()
 
     # Calls that answer at once
 

@@ -78,10 +78,11 @@ def status(name: str | None) -> None:
     """Show how the cluster's nodes are; exit code 1 unless all are well."""
     found = Cluster.existing(name)
     states = found.status()
-    click.echo(f"cluster {found.name}: control plane {'runs' if found.running else 'is down'}")
+    radio_words = {True: ", radio runs", False: ", radio dead", None: ""}[found.radio.running]
+    click.echo(f"cluster {found.name}: control plane {'runs' if found.running else 'is down'}{radio_words}")
     for node in states:
         click.echo(f"  {node.name:<20} {node.node_class:<6} {node.address:<15} {_words(node)}")
-    if not found.running or not all(_well(node) for node in states):
+    if not found.running or found.radio.running is False or not all(_well(node) for node in states):
         sys.exit(1)
 
 
@@ -147,6 +148,29 @@ def link(state: str, node: str, name: str | None) -> None:
         target.cut_link()
     else:
         target.heal_link()
+
+
+@cluster.command()
+@click.argument("node")
+@click.option("--wifi", type=click.Choice(["on", "off", "silent"]), help="silent: hears, but sends nothing.")
+@click.option("--fade", type=float, metavar="DB", help="Loss between it and all others beyond that of the way.")
+@click.option("--uplink", type=click.Choice(["on", "off"]), help="Its mobile uplink.")
+@_name_option
+@_one_line_errors
+def radio(node: str, wifi: str | None, fade: float | None, uplink: str | None, name: str | None) -> None:
+    """Disturb a node's simulated WiFi or mobile uplink, or restore it."""
+    found = Cluster.existing(name)
+    hardware = found.node(node).spec.hardware
+    if (wifi is not None or fade is not None) and hardware.wifi is None:
+        raise ClusterError(f"node {node} has no simulated WiFi")
+    if uplink is not None and hardware.uplink is None:
+        raise ClusterError(f"node {node} has no mobile uplink; `fractus cluster link cut {node}` cuts its wire")
+    if wifi is not None:
+        found.radio.command(station=node, off=wifi == "off", silent=wifi == "silent")
+    if fade is not None:
+        found.radio.command(station=node, loss_db=fade)
+    if uplink is not None:
+        found.radio.command(uplink=node, off=uplink == "off")
 
 
 @cluster.command("exec", context_settings={"ignore_unknown_options": True})

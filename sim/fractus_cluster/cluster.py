@@ -26,17 +26,13 @@ from fractus_cluster.pki import Authority
 from fractus_cluster.prerequisites import check_prerequisites, check_root
 from fractus_cluster.prerequisites import machine as describe_machine
 from fractus_cluster.processes import running
+from fractus_cluster.radio import Radio
 from fractus_cluster.spec import ClusterSpec, load_spec
 from fractus_cluster.startup import CONTROL_PLANE, Startup, claim, wiring_of
 from fractus_cluster.state import Memory, StateDirectory, only_cluster, state_of
 
 _LOCK_TIMEOUT_S = 300.0
 _API_TIMEOUT_S = 120.0
-_READY_TIMEOUT_S = 90.0
-_DNS_TIMEOUT_S = 90.0
-_POLL_S = 0.1
-_CONFLICTS = 5
-_CONTROL_PLANE = "control-plane"
 Report = Callable[[str], None]
 
 
@@ -195,6 +191,7 @@ class Cluster:
             store = ImageStore.default(report=self._report)
             wanted = store.fetch(images)
             startup.place_nodes(nodes, binaries, store, wanted)
+            self.radio.start(nodes, self.spec.air)
             with startup.api() as api:
                 api.wait_ready(_API_TIMEOUT_S)
                 startup.apply_objects(api, nodes)
@@ -259,6 +256,11 @@ class Cluster:
                 chosen.power_off()
                 return
             chosen.power_on()
+
+    @property
+    def radio(self) -> Radio:
+        """The radio of its nodes."""
+        return Radio(self.name, self._state)
 
     @property
     def running(self) -> bool:

@@ -16,6 +16,10 @@ CAMERA_LINKS = ("tcp:127.0.0.1:5762", "tcp:127.0.0.1:5763")
 """Where a camera follows its vehicle: a link of its own, the second if the first is the autopilot's."""
 
 
+RADIO_LINK = "tcp:127.0.0.1:5765"
+"""Where the radio follows a vehicle that carries a station."""
+
+
 def hardware_commands(node: NodeSpec, origin: Place | None) -> dict[str, list[str]]:
     """Return the commands that run what stands beside a node, by the names of their logs.
 
@@ -44,7 +48,9 @@ def vehicle_command(node: NodeSpec) -> list[str] | None:
     links = ["--listen", listen]
     if node.hardware.camera is not None:
         links += ["--listen", _camera_link(listen)]
-    return [_program("fractus-vehicle"), *links, "--home", f"{home.lat},{home.lon},{home.alt}", *arguments]
+    if node.hardware.wifi is not None:
+        links += ["--listen", RADIO_LINK]
+    return [program("fractus-vehicle"), *links, "--home", f"{home.lat},{home.lon},{home.alt}", *arguments]
 
 
 def camera_command(node: NodeSpec, origin: Place | None) -> list[str] | None:
@@ -64,7 +70,7 @@ def camera_command(node: NodeSpec, origin: Place | None) -> list[str] | None:
         return None
     mount = features.mount or CameraMount(stabilised=True)
     host = f"[{address[0]}]" if ":" in address[0] else address[0]
-    command = [_program("fractus-camera-world"), "--listen", f"{host}:{address[1]}", "--seed", str(camera.seed)]
+    command = [program("fractus-camera-world"), "--listen", f"{host}:{address[1]}", "--seed", str(camera.seed)]
     middle = camera.origin or origin
     if middle is not None:
         command += ["--origin", f"{middle.lat},{middle.lon}"]
@@ -94,7 +100,12 @@ def hardware_environment() -> dict[str, str]:
     }
 
 
-def _program(name: str) -> str:
+def program(name: str) -> str:
+    """Return the path of one of the simulators' programs.
+
+    Raises:
+        ClusterError: It is not installed.
+    """
     beside = Path(sys.executable).with_name(name)
     found = str(beside) if os.access(beside, os.X_OK) else shutil.which(name)
     if found is None:

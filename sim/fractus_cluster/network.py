@@ -52,10 +52,11 @@ class Wiring:
 
 @dataclass(frozen=True, slots=True)
 class _Mark:
-    """A namespace that was set up completely: its identity, and that of the one it is wired to."""
+    """A namespace that was set up completely: its identity, that of the one it is wired to, and by what."""
 
     inode: int
     hub: int
+    mobile: bool = False
 
 
 def host_link(cluster: str) -> str:
@@ -113,24 +114,36 @@ def wire_control_plane(wiring: Wiring) -> None:
     _write_mark(wiring, None, _Mark(_inode(path), 0))
 
 
-def wire_node(wiring: Wiring, node: str, index: int) -> None:
-    """Set up a node's namespace and its uplink; a no-op when that was done and its link is not cut."""
+def wire_node(wiring: Wiring, node: str, index: int, *, mobile: bool = False) -> None:
+    """Set up a node's namespace and its uplink; a no-op when that was done and its link is not cut.
+
+    Args:
+        wiring: The cluster's network.
+        node: Its name.
+        index: Its place in the addressing.
+        mobile: Whether the radio carries the uplink, between a device at each end, instead of a wire.
+    """
     path, hub = wiring.namespace_path(node), _inode(wiring.namespace_path())
     inode = _inode(path)
-    if inode and _read_mark(wiring, node) == _Mark(inode, hub):
+    if inode and _read_mark(wiring, node) == _Mark(inode, hub, mobile):
         heal_link(wiring, index)
         return
     _mark_path(wiring, node).unlink(missing_ok=True)
     if not inode:
         run(["ip", "netns", "add", wiring.namespace(node)])
     place = wiring.addressing
-    port = _port(index)
+    own = port(index)
     _delete_link(UPLINK, wiring.namespace(node))
-    _delete_link(port, wiring.namespace())
+    _delete_link(own, wiring.namespace())
+    if mobile:
+        # They stay when the radio's process ends; only then there is no carrier.
+        _ip(wiring.namespace(node), f"tuntap add dev {UPLINK} mode tap")
+        _ip(wiring.namespace(), f"tuntap add dev {own} mode tap")
+    else:
+        _ip(wiring.namespace(), f"link add {own} type veth peer name {UPLINK} netns {wiring.namespace(node)}")
     _ip(
         wiring.namespace(),
-        f"link add {port} type veth peer name {UPLINK} netns {wiring.namespace(node)}",
-        f"link set {port} master {_BRIDGE} up",
+        f"link set {own} master {_BRIDGE} up",
         f"route replace {place.pods(index)} via {place.node(index)} dev {_BRIDGE}",
     )
     _ip(
@@ -141,13 +154,13 @@ def wire_node(wiring: Wiring, node: str, index: int) -> None:
         f"route add default via {place.control_plane} dev {UPLINK}",
     )
     _settings(path, {"ip_forward": "1", "conf/all/rp_filter": "0", "conf/default/rp_filter": "0"})
-    _write_mark(wiring, node, _Mark(_inode(path), hub))
+    _write_mark(wiring, node, _Mark(_inode(path), hub, mobile))
 
 
 def unwire_node(wiring: Wiring, node: str, index: int) -> None:
     """Remove a node's namespace and its port on the bridge."""
     if wiring.namespace_path().exists():
-        _delete_link(_port(index), wiring.namespace())
+        _delete_link(port(index), wiring.namespace())
         run(["ip", "-n", wiring.namespace(), "route", "del", str(wiring.addressing.pods(index))], check=False)
     if wiring.namespace_path(node).exists():
         run(["ip", "netns", "delete", wiring.namespace(node)])
@@ -166,12 +179,12 @@ def unwire(cluster: str) -> None:
 
 def cut_link(wiring: Wiring, index: int) -> None:
     """Take a node's uplink down at the far end, as when radio contact is lost."""
-    _ip(wiring.namespace(), f"link set {_port(index)} down")
+    _ip(wiring.namespace(), f"link set {port(index)} down")
 
 
 def heal_link(wiring: Wiring, index: int) -> None:
     """Take a node's uplink up again."""
-    _ip(wiring.namespace(), f"link set {_port(index)} up")
+    _ip(wiring.namespace(), f"link set {port(index)} up")
 
 
 def links_cut(wiring: Wiring) -> set[int]:
@@ -179,7 +192,7 @@ def links_cut(wiring: Wiring) -> set[int]:
     if not wiring.namespace_path().exists():
         return set()
     down: set[int] = set()
-    for link in _json(["ip", "-n", wiring.namespace(), "-j", "link", "show", "type", "veth"]):
+    for link in _json(["ip", "-n", wiring.namespace(), "-j", "link", "show", "master", _BRIDGE]):
         name = str(link["ifname"])
         if name.startswith("node") and "UP" not in link["flags"]:
             down.add(int(name.removeprefix("node")))
@@ -191,7 +204,8 @@ def flush_firewall(wiring: Wiring, node: str) -> None:
     run(["ip", "netns", "exec", wiring.namespace(node), "nft", "flush", "ruleset"])
 
 
-def _port(index: int) -> str:
+def port(index: int) -> str:
+    """Return the name of the bridge's end of a node's uplink."""
     return f"node{index}"
 
 

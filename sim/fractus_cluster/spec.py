@@ -88,11 +88,49 @@ class CameraHardware(_Value):
     arguments: tuple[str, ...] = ()
 
 
+class WifiHardware(_Value):
+    """A WiFi device of a node on the cluster's simulated air.
+
+    Attributes:
+        device: Its name on the node.
+        range: How far it really reaches, metres; as far as `description.interfaces` declares when absent.
+    """
+
+    device: Annotated[str, Field(max_length=15)] = "wlan0"
+    range: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+
+
+class UplinkHardware(_Value):
+    """A mobile uplink in place of a wire.
+
+    Attributes:
+        rate: Mbit/s each way.
+        delay: Milliseconds each way.
+    """
+
+    rate: Annotated[float, Field(gt=0, le=100)] = 8.0
+    delay: Annotated[float, Field(ge=0, le=10_000)] = 60.0
+
+
 class Hardware(_Value):
     """What stands beside a node and does not lose power with it."""
 
     vehicle: VehicleHardware | None = None
     camera: CameraHardware | None = None
+    wifi: WifiHardware | None = None
+    uplink: UplinkHardware | None = None
+
+
+class AirSpec(_Value):
+    """What all WiFi devices of a cluster share.
+
+    Attributes:
+        fading: Shape of Nakagami fading, 0.5 or more: the smaller the softer the edge of a range; hard when absent.
+        seed: Of fading.
+    """
+
+    fading: Annotated[float, Field(ge=0.5, le=100)] | None = None
+    seed: int = 1
 
 
 class NodeSpec(_Value):
@@ -135,6 +173,14 @@ class NodeSpec(_Value):
             raise ValueError(f"node {self.name}: hardware.vehicle is for nodes of class drone")
         if self.hardware.camera is not None:
             self._camera_fits()
+        if self.hardware.wifi is not None:
+            if self.wifi() is None:
+                raise ValueError(
+                    f"node {self.name}: hardware.wifi reaches nowhere; give its range, or describe "
+                    f"{self.hardware.wifi.device} with one in description.interfaces"
+                )
+            if self.vehicle() is None and self.place() is None:
+                raise ValueError(f"node {self.name}: hardware.wifi needs a vehicle or description.location")
         return self
 
     def _camera_fits(self) -> None:
@@ -201,6 +247,16 @@ class NodeSpec(_Value):
             )
         return home, listen, given.arguments
 
+    def wifi(self) -> tuple[str, float] | None:
+        """Name and range in metres of the node's device on the simulated air; None when it has none."""
+        given = self.hardware.wifi
+        if given is None:
+            return None
+        described = self.description.get("interfaces") or []
+        own = (each for each in described if isinstance(each, dict) and each.get("device") == given.device)
+        range_m = given.range or next((each["range"] for each in own if each.get("range")), None)
+        return None if range_m is None else (given.device, float(range_m))
+
     @property
     def camera_url(self) -> str:
         """Where the node's camera service gets its pictures from."""
@@ -220,9 +276,10 @@ class NodeSpec(_Value):
 
 
 class ClusterSpec(_Value):
-    """A cluster: its name and its nodes."""
+    """A cluster: its name, its nodes, and the air between them."""
 
     name: Annotated[str, Field(pattern=DNS_LABEL, max_length=30)]
+    air: AirSpec = AirSpec()
     nodes: Annotated[tuple[NodeSpec, ...], Field(min_length=1, max_length=100)]
 
     @model_validator(mode="after")

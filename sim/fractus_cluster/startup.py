@@ -91,7 +91,7 @@ class Startup:
     def place_nodes(self, nodes: list[Node], binaries: Binaries, store: ImageStore, images: Sequence[Image]) -> None:
         """Wire the nodes and write their files; new ones get their images on disk before they ever start."""
         for node in nodes:
-            network.wire_node(node.wiring, node.name, node.index)
+            network.wire_node(node.wiring, node.name, node.index, mobile=node.spec.hardware.uplink is not None)
             node.write_files(node.files(binaries, self.authority))
         fresh = [node for node in nodes if not has_storage(node)]
         if fresh:

@@ -61,6 +61,11 @@ class StateDirectory:
         return self.path / "control-plane"
 
     @property
+    def radio(self) -> Path:
+        """The radio's files: `layout.json`, and its socket `control`."""
+        return self.path / "radio"
+
+    @property
     def logs(self) -> Path:
         """Logs, a directory each for the control plane and every node."""
         return self.path / "logs"
@@ -80,7 +85,7 @@ class StateDirectory:
         return self.path / "nodes" / name
 
     def process(self, name: str) -> Path:
-        """Return the record of a process: `control-plane`, `node.NAME`, `vehicle.NAME` or `camera.NAME`."""
+        """Return the record of a process: `control-plane`, `node.NAME`, `vehicle.NAME`, `camera.NAME` or `radio`."""
         return self.path / "processes" / f"{name}.json"
 
     def read_memory(self) -> Memory | None:

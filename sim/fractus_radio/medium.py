@@ -47,6 +47,7 @@ class Station:
         silent: hears, but sends nothing: a peer that pairs and never answers.
         off: neither hears nor sends.
         loss_db: loss beyond the path's, by a fade or interference.
+        reach: how far it reaches in units of the medium's range; a link reaches as far as the lesser of its ends.
     """
 
     position: Position
@@ -55,6 +56,7 @@ class Station:
     silent: bool = False
     off: bool = False
     loss_db: float = 0.0
+    reach: float = 1.0
     queue: deque[bytes] = field(default_factory=deque)
     dropped: int = 0
 
@@ -160,8 +162,7 @@ class Medium:
         a, b = self.stations[sender], self.stations[receiver]
         if a.off or b.off or a.network != b.network:
             return False
-        distance_m = math.dist(a.position, b.position)
-        return self._propagation.receives(distance_m, self._chance, loss_db=a.loss_db + b.loss_db)
+        return self._propagation.receives(_distance_m(a, b), self._chance, loss_db=a.loss_db + b.loss_db)
 
     def neighbours(self, name: str) -> Mapping[str, float]:
         """The stations of the same network that a station hears, and their mean power in dBm: what a scan finds."""
@@ -169,8 +170,12 @@ class Medium:
         found = {}
         for other, station in self.stations.items():
             if other != name and not own.off and not station.off and station.network == own.network:
-                distance_m = math.dist(own.position, station.position)
-                power = self._propagation.received_dbm(distance_m) - own.loss_db - station.loss_db
+                power = self._propagation.received_dbm(_distance_m(own, station)) - own.loss_db - station.loss_db
                 if power >= SENSITIVITY_DBM:
                     found[other] = power
         return found
+
+
+def _distance_m(a: Station, b: Station) -> float:
+    """The distance at which stations that reach as far as the medium would hear each other as well as these do."""
+    return math.dist(a.position, b.position) / min(a.reach, b.reach)

@@ -29,7 +29,7 @@ FRAMES_A_TURN = 32
 """Frames read from one device before the others have their turn."""
 
 _NUMBER = (int, float)
-_STATION = {"position": list, "off": bool, "silent": bool, "loss_db": _NUMBER, "network": str}
+_STATION = {"position": list, "off": bool, "silent": bool, "loss_db": _NUMBER, "reach": _NUMBER, "network": str}
 _UPLINK = {"off": bool, "rate_bps": _NUMBER, "delay_s": _NUMBER}
 
 
@@ -160,8 +160,8 @@ def _checked(command: Mapping[str, Any], subject: str, known: Mapping[str, Any])
             raise BadCommand(f"{field} has a wrong type: {str(value)[:80]}")
         if known[field] == _NUMBER:
             changes[field] = _number(field, value)
-    if not changes.get("rate_bps", 1.0) > 0.0 or changes.get("delay_s", 0.0) < 0.0:
-        raise BadCommand("rate_bps is positive, and delay_s is not negative")
+    if min(changes.get("rate_bps", 1.0), changes.get("reach", 1.0)) <= 0.0 or changes.get("delay_s", 0.0) < 0.0:
+        raise BadCommand("rate_bps and reach are positive, and delay_s is not negative")
     return changes
 
 

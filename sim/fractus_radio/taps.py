@@ -19,23 +19,23 @@ FRAME_BYTES = 2048
 class Tap:
     """A network device whose frames this process reads and writes.
 
-    It is made in a namespace, and stays there and open wherever the process is; it goes with the process.
+    It is made in a namespace, and stays there and open wherever the process is; it goes with the process, unless it was
+    there before as a persistent one.
 
     Args:
         namespace: of the node, /run/netns/NAME or /proc/PID/ns/net.
         device: its name there.
-        address: its MAC address.
+        address: its MAC address; None leaves it as it is.
         mtu: of the device.
 
     Raises:
         OSError: it cannot be made: no /dev/net/tun, no right, or the name is taken.
     """
 
-    def __init__(self, namespace: Path, device: str, address: bytes, *, mtu: int = 1500) -> None:
+    def __init__(self, namespace: Path, device: str, address: bytes | None, *, mtu: int = 1500) -> None:
         if len(device) > MAX_NAME:
             raise ValueError(f"a device's name has at most {MAX_NAME} characters: {device}")
         self.device = device
-        self.address = address
 
         def make() -> int:
             number = os.open(TUN, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -48,10 +48,10 @@ class Tap:
 
         self._number = in_namespace(namespace, make)
         inside = ["nsenter", f"--net={namespace}", "ip", "link", "set", device]
+        if address is not None:
+            inside += ["address", address.hex(":")]
         try:
-            subprocess.run(
-                [*inside, "address", address.hex(":"), "mtu", str(mtu)], check=True, capture_output=True, timeout=10
-            )
+            subprocess.run([*inside, "mtu", str(mtu)], check=True, capture_output=True, timeout=10)
         except (OSError, subprocess.SubprocessError):
             os.close(self._number)
             raise

@@ -43,8 +43,9 @@ class Air:
         for number, name in enumerate(self.names, 1):
             subprocess.run(["ip", "netns", "add", name], check=True)
             path = Path("/run/netns", name)
-            wifi = Tap(path, "wlan0", bytes([2, 0, 0, 0, 0, number]))
-            self.radio.add_station(name[-1], wifi, Station((0.0, 0.0, 0.0), wifi.address, "net"))
+            address = bytes([2, 0, 0, 0, 0, number])
+            wifi = Tap(path, "wlan0", address)
+            self.radio.add_station(name[-1], wifi, Station((0.0, 0.0, 0.0), address, "net"))
             ends.append(Tap(path, "lte0", bytes([2, 0, 0, 0, 1, number])))
             for device, network in (("wlan0", "10.77.0"), ("lte0", "10.78.0")):
                 self.run(name, "ip", "addr", "add", f"{network}.{number}/24", "dev", device)
@@ -113,6 +114,8 @@ def test_nodes_talk_while_they_are_in_reach(air: Air) -> None:
     assert not air.ping("10.77.0", 1)
     air.command(station="b", position=[79.0, 0.0, 0.0])
     assert air.ping("10.77.0", 2)
+    air.command(station="b", reach=0.9)
+    assert not air.ping("10.77.0", 1)
 
 
 @pytest.mark.parametrize("fault", [{"off": True}, {"silent": True}, {"loss_db": 90}, {"network": "other"}])
@@ -139,7 +142,7 @@ def test_bad_commands_change_nothing(air: Air) -> None:
         ({"station": "a", "position": [10**400, 0, 0]}, "is not a finite number"),
         ({"station": "a", "position": [1.0, 2.0]}, "three numbers"),
         ({"station": ["a"]}, "no station"),
-        ({"uplink": "a", "rate_bps": 0}, "rate_bps is positive"),
+        ({"uplink": "a", "rate_bps": 0}, "rate_bps and reach are positive"),
         ({"uplink": "a", "rate_bps": float("inf")}, "finite"),
         ({}, "names a station"),
     ):

@@ -1,0 +1,99 @@
+"""`fractus-radio LAYOUT`: carries what the nodes of a layout send, until it is ended."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import sys
+from pathlib import Path
+
+import click
+from fractus_core.geo import LocalFrame
+from pydantic import ValidationError
+
+from fractus_radio.follower import Follower, parse_address
+from fractus_radio.layout import Layout, Place, StationEntry
+from fractus_radio.medium import Medium, Position, Station
+from fractus_radio.propagation import Propagation
+from fractus_radio.radio import Radio
+from fractus_radio.taps import Tap
+from fractus_radio.uplink import Uplink
+
+REAL_TIME_PRIORITY = 10
+
+
+class Frame:
+    """Metres east, north and up of a layout's origin."""
+
+    def __init__(self, origin: Place) -> None:
+        self._ground = LocalFrame(origin.lat, origin.lon)
+        self._alt = origin.alt
+
+    def position(self, lat: float, lon: float, alt: float) -> Position:
+        """Of degrees and metres above mean sea level."""
+        east, north = self._ground.xy(lat, lon)
+        return east, north, alt - self._alt
+
+
+def make_radio(layout: Layout) -> tuple[Radio, list[Follower]]:
+    """The radio of a layout with all its devices, and what follows its vehicles.
+
+    Raises:
+        OSError: a device cannot be made.
+        ValueError: a vehicle's address is wrong.
+    """
+    range_m = max((entry.range_m for entry in layout.stations), default=1.0)
+    radio = Radio(Medium(Propagation.reaching(range_m, fading=layout.fading), layout.seed), layout.control)
+    frame, followers = Frame(layout.origin), []
+    for entry in layout.stations:
+        at = frame.position(entry.place.lat, entry.place.lon, entry.place.alt)
+        station = Station(at, entry.address, reach=entry.range_m / range_m)
+        radio.add_station(entry.name, Tap(entry.namespace, entry.device, entry.address), station)
+        if entry.vehicle is not None:
+            followers.append(_follower(entry, entry.vehicle, station, frame))
+    for uplink in layout.uplinks:
+        near, far = (Tap(end.namespace, end.device, None) for end in (uplink.near, uplink.far))
+        up, down = (Uplink(uplink.rate_bps, uplink.delay_s) for _ in range(2))
+        radio.add_uplink(uplink.name, (near, far), (up, down))
+    return radio, followers
+
+
+def _follower(entry: StationEntry, vehicle: str, station: Station, frame: Frame) -> Follower:
+    def moved(lat: float, lon: float, alt: float) -> None:
+        station.position = frame.position(lat, lon, alt)
+
+    return Follower(entry.namespace, parse_address(vehicle), moved)
+
+
+@click.command()
+@click.argument("layout", type=click.Path(path_type=Path, dir_okay=False, exists=True))
+def radio(layout: Path) -> None:
+    """Carry what the nodes of a LAYOUT file send over the air and their uplinks."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    try:
+        carrier, followers = make_radio(Layout.model_validate_json(layout.read_bytes()))
+    except (ValidationError, ValueError, OSError) as error:
+        raise click.ClickException(f"{layout}: {error}") from error
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: sys.exit(0))
+    for follower in followers:
+        follower.start()
+    # On a busy machine frames would else wait for their turn longer than they travel.
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REAL_TIME_PRIORITY))
+    try:
+        while True:
+            carrier.turn()
+    finally:
+        carrier.close()
+
+
+def main() -> None:
+    """Entry point of `fractus-radio`."""
+    radio.main(args=sys.argv[1:], prog_name="fractus-radio")
+
+
+if __name__ == "__main__":
+    main()

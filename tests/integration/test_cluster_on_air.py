@@ -1,0 +1,201 @@
+"""A cluster's nodes on the simulated radio: real namespaces, devices, vehicle and radio process, without Kubernetes."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fractus_agent.redirector.netlink import in_namespace
+from fractus_cluster import network
+from fractus_cluster.addressing import Addressing, choose_block
+from fractus_cluster.cgroups import cluster_branch
+from fractus_cluster.errors import ClusterError
+from fractus_cluster.network import Wiring, networks_in_use
+from fractus_cluster.node import Node
+from fractus_cluster.processes import read_record
+from fractus_cluster.radio import Radio
+from fractus_cluster.spec import ClusterSpec, parse_spec
+from fractus_cluster.state import state_of
+
+pytestmark = [pytest.mark.root, pytest.mark.skipif(os.geteuid() != 0, reason="needs root")]
+
+PORT = 7777
+NAME = f"cr{os.getpid()}"
+WIFI = {"technology": "WiFi", "device": "wlan0", "range": 120}
+
+
+def spec_of(edge_lat: float) -> ClusterSpec:
+    return parse_spec(
+        {
+            "name": NAME,
+            "nodes": [
+                {
+                    "name": "drone-1",
+                    "class": "drone",
+                    "hardware": {
+                        "vehicle": {"home": {"lat": 50.0, "lon": 4.0, "alt": 25}},
+                        "wifi": {"range": 120},
+                        "uplink": {"rate": 8, "delay": 60},
+                    },
+                },
+                {
+                    "name": "edge-1",
+                    "class": "edge",
+                    "hardware": {"wifi": {}},
+                    "description": {"location": {"lat": edge_lat, "lon": 4.0, "alt": 25}, "interfaces": [WIFI]},
+                },
+            ],
+        },
+        source="test",
+    )
+
+
+def _udp() -> socket.socket:
+    found = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    found.settimeout(1.0)
+    return found
+
+
+class Site:
+    """Two wired nodes with their radio."""
+
+    def __init__(self, edge_lat: float) -> None:
+        self.spec = spec_of(edge_lat)
+        self.state = state_of(NAME)
+        self.branch = cluster_branch(NAME)
+        self.wiring = Wiring(NAME, Addressing(choose_block(networks_in_use())), self.state.marks)
+        self.radio = Radio(NAME, self.state)
+        network.wire_control_plane(self.wiring)
+        self.wire()
+        self._over, self._echoes = threading.Event(), list[threading.Thread]()
+        for node in (None, "edge-1"):
+            self.echo(node)
+
+    def wire(self) -> None:
+        self.nodes = [Node(s, i, self.wiring, self.state, self.branch) for i, s in enumerate(self.spec.nodes)]
+        for node in self.nodes:
+            network.wire_node(self.wiring, node.name, node.index, mobile=node.spec.hardware.uplink is not None)
+        self.radio.start(self.nodes, self.spec.air)
+
+    def run(self, node: str, *words: str) -> str:
+        command = ["nsenter", f"--net={self.wiring.namespace_path(node)}", *words]
+        return subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
+
+    def address_wifi(self) -> None:
+        for number, node in enumerate(("drone-1", "edge-1"), 1):
+            self.run(node, "ip", "address", "replace", f"169.254.9.{number}/16", "dev", "wlan0")
+            self.run(node, "ip", "link", "set", "wlan0", "up")
+
+    def ping(self, node: str, address: str, count: int = 1) -> list[float]:
+        """Round-trip times of the datagrams that come back, ms."""
+        found = []
+        with in_namespace(self.wiring.namespace_path(node), _udp) as asking:
+            for number in range(count):
+                begun = time.monotonic()
+                with contextlib.suppress(OSError):
+                    asking.sendto(b"%d" % number, (address, PORT))
+                    while asking.recv(100) != b"%d" % number:
+                        pass
+                    found.append((time.monotonic() - begun) * 1e3)
+        return found
+
+    def echo(self, node: str | None) -> None:
+        """Send back what comes in a namespace, until the end."""
+        answering = in_namespace(self.wiring.namespace_path(node), _udp)
+        answering.bind(("", PORT))
+
+        def answer() -> None:
+            with answering:
+                while not self._over.is_set():
+                    with contextlib.suppress(OSError):
+                        data, sender = answering.recvfrom(100)
+                        answering.sendto(data, sender)
+
+        self._echoes.append(threading.Thread(target=answer))
+        self._echoes[-1].start()
+
+    def until(self, node: str, address: str, *, answers: bool, timeout_s: float = 30.0) -> None:
+        deadline = time.monotonic() + timeout_s
+        while bool(self.ping(node, address)) != answers:
+            assert time.monotonic() < deadline, f"{address} {'does not answer' if answers else 'still answers'}"
+
+    def close(self) -> None:
+        self._over.set()
+        for thread in self._echoes:
+            thread.join()
+        self.branch.kill_all()
+        self.branch.remove()
+        network.unwire(NAME)
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[Site]:
+    monkeypatch.setenv("FRACTUS_STATE", str(tmp_path))
+    found = Site(getattr(request, "param", 50.0005))
+    yield found
+    found.close()
+
+
+def test_a_mobile_uplink_delays_and_is_cut_like_a_wire(site: Site) -> None:
+    hub = str(site.wiring.addressing.control_plane)
+    assert min(site.ping("drone-1", hub, 4)) >= 120.0
+    assert min(site.ping("edge-1", hub, 8)) < 120.0
+    site.nodes[0].cut_link()
+    assert network.links_cut(site.wiring) == {0}
+    site.until("drone-1", hub, answers=False)
+    site.wire()
+    assert network.links_cut(site.wiring) == set()
+    site.until("drone-1", hub, answers=True)
+    site.radio.command(uplink="drone-1", off=True)
+    site.until("drone-1", hub, answers=False)
+    site.radio.command(uplink="drone-1", off=False)
+    site.until("drone-1", hub, answers=True)
+
+
+def test_neighbours_hear_each_other_until_a_fault(site: Site) -> None:
+    site.address_wifi()
+    site.until("drone-1", "169.254.9.2", answers=True)
+    for fault, cure in (({"silent": True}, {"silent": False}), ({"loss_db": 90}, {"loss_db": 0})):
+        site.radio.command(station="edge-1", **fault)
+        site.until("drone-1", "169.254.9.2", answers=False)
+        site.radio.command(station="edge-1", **cure)
+        site.until("drone-1", "169.254.9.2", answers=True)
+
+
+@pytest.mark.parametrize("site", [50.002], indirect=True)
+def test_the_radio_knows_where_the_vehicle_is(site: Site) -> None:
+    """The edge node stands 222 m from the drone's home as the file has it, and the vehicle is put beside it."""
+    site.address_wifi()
+    assert not site.ping("drone-1", "169.254.9.2", 2)
+    moved = site.spec.model_dump(by_alias=True)
+    moved["nodes"][0]["hardware"]["vehicle"]["home"] = {"lat": 50.0019, "lon": 4.0, "alt": 25}
+    elsewhere = parse_spec(moved, source="test")
+    Node(elsewhere.nodes[0], 0, site.wiring, site.state, site.branch).start_hardware()
+    site.until("drone-1", "169.254.9.2", answers=True, timeout_s=60.0)
+
+
+def test_a_radio_that_died_is_replaced(site: Site) -> None:
+    hub = str(site.wiring.addressing.control_plane)
+    record = read_record(site.state.process("radio"))
+    assert record is not None
+    site.wire()
+    assert read_record(site.state.process("radio")) == record
+    os.kill(record.pid, signal.SIGKILL)
+    deadline = time.monotonic() + 20
+    while site.radio.running:
+        assert time.monotonic() < deadline
+        threading.Event().wait(0.05)
+    assert not site.ping("drone-1", hub)
+    with pytest.raises(ClusterError, match="radio does not run"):
+        site.radio.command(uplink="drone-1", off=True)
+    site.wire()
+    site.until("drone-1", hub, answers=True)
+    assert "default via" in site.run("drone-1", "ip", "route")

@@ -130,6 +130,17 @@ def test_altitude_and_speed_are_corrected() -> None:
     assert monitor(at(north_mps=5.5), grant) is None
 
 
+def test_an_altitude_limit_that_is_known_holds_beside_one_of_unknown_datum() -> None:
+    grant = compiled(altitude(upperLimit=15), altitude("terrain", lowerLimit=5, altitudeReference="terrain"))
+    high = monitor(at(alt=18), grant)
+    assert high is not None
+    assert (high.action, high.code, high.policies) == ("correct", "AltitudeAboveLimit", ("altitudes",))
+    assert monitor(at(alt=10), grant) is None
+    climbing = monitor(at(alt=10, down_mps=-2), grant)
+    assert climbing is not None
+    assert (climbing.action, climbing.code, climbing.takeover) == ("deny", "TerrainUnknown", "hover")
+
+
 def test_an_unknown_position_is_no_position() -> None:
     for state in (replace(at(), lat=None), at(north_mps=math.nan)):
         verdict = monitor(state, compiled())

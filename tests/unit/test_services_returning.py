@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_core.policy.returning import ReturnBounds, return_bounds
+from fractus_core.policy.returning import ReturnBounds, homeward_heights_m, return_bounds
+from fractus_core.policy.values import Airframe
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from mobility_world import World, area, end, fly, goto, refusal, spec
@@ -38,8 +39,22 @@ def test_the_strictest_limit_between_home_and_the_operation_area_counts() -> Non
     )
     assert return_bounds(at(), zoned) == ReturnBounds(30.0, 4.0)
     assert return_bounds(at(), compiled(limits=None)) == ReturnBounds()
-    unknown = compiled(altitude(upperLimit=30, altitudeReference="terrain"), limits=None)
-    assert return_bounds(at(), unknown).height_m == math.inf
+
+
+def test_a_limit_of_unknown_datum_lets_the_autopilot_climb_nowhere_and_leaves_the_others_as_they_are() -> None:
+    above_terrain = {"altitudeReference": "terrain"}
+    unknown = altitude("terrain", upperLimit=30, **above_terrain)
+    assert return_bounds(at(), compiled(unknown, limits=None)).height_m == 0.0
+    assert return_bounds(at(), compiled(unknown, flat_terrain=True, limits=None)).height_m == 30.0
+    floor = altitude("floor", lowerLimit=3, **above_terrain)
+    assert return_bounds(at(), compiled(floor, limits=None)).height_m == math.inf
+    assert return_bounds(at(), compiled(altitude(upperLimit=20), floor, limits=None)).height_m == 20.0
+    both = compiled(altitude(upperLimit=20), unknown)
+    now = at(alt=25, airframe=Airframe(return_altitude_m=40))
+    assert all(height <= 25 for height in homeward_heights_m(now, both, 100.0))
+    assert homeward_heights_m(now, both, 100.0)[0] == 20.0
+    limited = compiled(altitude(upperLimit=20), floor)
+    assert homeward_heights_m(at(alt=10, airframe=Airframe(return_altitude_m=40)), limited, 100.0)[0] == 20.0
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from fractus_core.policy.limits import (
     altitude_bounds,
     clamp,
     corrected,
+    datum_unknown,
     height_on_entry,
     lower_is_fine,
     speed_bounds,
@@ -171,9 +172,9 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Clamped])
     """The aim inside the limits of altitude and speed, or the verdict that forbids it."""
     now, grant = request.now, request.grant
     air = Air(leg.ground, margin_m(now), leg.lower_m, leg.upper_m)
-    bounds = altitude_bounds(grant, now, air)
-    if isinstance(bounds, Verdict):
-        return bounds
+    bounds, unknown = altitude_bounds(grant, now, air)
+    if unknown:
+        return datum_unknown(unknown[0])
     height = clamp("Altitude", "m above home", aim.altitude_m, bounds)
     if isinstance(height, Verdict):
         return height

@@ -53,9 +53,9 @@ def corrected(args: Args, notes: Sequence[Clamped]) -> Verdict:
     return Verdict("correct", args, done[0].code, "; ".join(note.reason for note in done), names)
 
 
-def altitude_bounds(grant: CompiledGrant, now: Situation, air: Air) -> list[Bound] | Verdict:
-    """Altitude limits, in metres above home, in a piece of air; a denial when one cannot be worked out."""
-    bounds = []
+def altitude_bounds(grant: CompiledGrant, now: Situation, air: Air) -> tuple[list[Bound], list[Rule]]:
+    """Altitude limits, in metres above home, in a piece of air; and the rules whose datum lies at no known height."""
+    bounds, unknown = [], list[Rule]()
     if grant.max_altitude_m is not None:
         bounds.append(Bound("", 0, None, grant.max_altitude_m, refuses=False))
     for rule, zone in _in_force(grant.altitude_limits, grant, now, air):
@@ -64,22 +64,23 @@ def altitude_bounds(grant: CompiledGrant, now: Situation, air: Air) -> list[Boun
         for edge in (spec.lower_limit, spec.upper_limit):
             height = None if edge is None else height_m(edge, spec.altitude_reference, now.home, grant.flat_terrain)
             if edge is not None and height is None:
-                return _datum_unknown(rule)
+                unknown.append(rule)
+                break
             edges.append(height)
-        bounds.append(
-            Bound(
-                rule.name,
-                spec.priority,
-                edges[0],
-                edges[1],
-                _REFUSES[spec.limit_action],
-                zone.shape if zone else None,
-            )
-        )
-    return bounds
+        else:
+            shape = zone.shape if zone else None
+            bounds.append(Bound(rule.name, spec.priority, edges[0], edges[1], _REFUSES[spec.limit_action], shape))
+    return bounds, unknown
 
 
-def _datum_unknown(rule: Rule) -> Verdict:
+def ceiling_m(bounds: Sequence[Bound], unknown: Sequence[Rule], here_m: float) -> float:
+    """The lowest upper limit above home; where one of them lies at no known height, a drone does not climb from `here_m`."""
+    ceiling = min((bound.upper for bound in bounds if bound.upper is not None), default=math.inf)
+    return min(ceiling, here_m) if any(rule.spec.upper_limit is not None for rule in unknown) else ceiling
+
+
+def datum_unknown(rule: Rule) -> Verdict:
+    """The denial of a motion by a limit of altitude whose datum lies at no known height."""
     terrain = rule.spec.altitude_reference == "terrain"
     what, code = ("no terrain model is loaded", "TerrainUnknown") if terrain else ("home is unknown", "HomeUnknown")
     return deny(

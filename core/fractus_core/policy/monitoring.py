@@ -11,7 +11,7 @@ from shapely.geometry.base import BaseGeometry
 from fractus_core.api.policies import GeofenceAction
 from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, PolicyZone
 from fractus_core.policy.fences import SEVERITY, TAKEOVERS, breaches, signed_depth_m
-from fractus_core.policy.limits import Bound, altitude_bounds, can_be_kept, speed_bounds, strictest
+from fractus_core.policy.limits import Bound, altitude_bounds, can_be_kept, datum_unknown, speed_bounds, strictest
 from fractus_core.policy.motion import XY, margin_m, moving, outlooks, reaction_s, standing, stop_altitude_m, stop_point
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Situation, Verdict
 
@@ -231,10 +231,7 @@ def _heights(now: Situation, grant: CompiledGrant, start: XY, stop: XY, *, sinks
     """
     if grant.max_altitude_m is None and not grant.altitude_limits:
         return None
-    bounds = altitude_bounds(grant, now, Air(shapely.points(start), 0.0, now.altitude_m, now.altitude_m))
-    if isinstance(bounds, Verdict):
-        sinking = now.down_mps > -SINKING_MPS
-        return None if sinking else Verdict("deny", None, bounds.code, bounds.reason, bounds.policies, "hover")
+    bounds, unknown = altitude_bounds(grant, now, Air(shapely.points(start), 0.0, now.altitude_m, now.altitude_m))
     slack, rest_m = now.altitude_error_m + now.airframe.tracking_m, stop_altitude_m(now)
     sinks_back = sinks_back and now.down_mps > SINKING_MPS
     over, under = strictest(bounds, above=True), strictest(bounds, above=False)
@@ -242,6 +239,9 @@ def _heights(now: Situation, grant: CompiledGrant, start: XY, stop: XY, *, sinks
     if over is not None and over.upper is not None and high > over.upper + slack and not sinks_back:
         reason = f"the drone climbs to {high:.1f} m, above the limit of {over.upper:.1f} m"
         return _changed_height(_Trespass(over, over.upper, "AltitudeAboveLimit", reason), now, grant, stop)
+    if unknown:
+        sinking = now.down_mps > -SINKING_MPS
+        return None if sinking else replace(datum_unknown(unknown[0]), takeover="hover")
     if under is not None and under.lower is not None and low < under.lower - slack and not now.vertical:
         if over is not None and over.upper is not None and over.upper < under.lower:
             return None

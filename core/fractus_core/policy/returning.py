@@ -9,7 +9,7 @@ import shapely
 
 from fractus_core.policy.compiled import REACH_M, Air, CompiledGrant
 from fractus_core.policy.fences import breaches
-from fractus_core.policy.limits import altitude_bounds, speed_bounds
+from fractus_core.policy.limits import altitude_bounds, ceiling_m, speed_bounds
 from fractus_core.policy.motion import XY, Leg, height_margin_m, margin_m, standing
 from fractus_core.policy.values import Situation, Verdict, deny
 
@@ -33,13 +33,10 @@ def homeward_heights_m(now: Situation, grant: CompiledGrant, worth_m: float) -> 
     best = max(now.altitude_m, min(now.airframe.return_altitude_m, worth_m))
     found = []
     for ground in (lane, shapely.points(at), shapely.Point()):
-        bounds = altitude_bounds(grant, now, Air(ground, margin_m(now), -math.inf, math.inf))
-        if isinstance(bounds, Verdict):
-            continue
-        for height_m in (best, now.altitude_m):
-            lowest = max((b.lower for b in bounds if b.lower is not None), default=-math.inf)
-            highest = min((b.upper for b in bounds if b.upper is not None), default=math.inf)
-            found.append(min(max(height_m, lowest), highest))
+        bounds, unknown = altitude_bounds(grant, now, Air(ground, margin_m(now), -math.inf, math.inf))
+        lowest = max((b.lower for b in bounds if b.lower is not None), default=-math.inf)
+        highest = ceiling_m(bounds, unknown, now.altitude_m)
+        found += [min(max(height_m, lowest), highest) for height_m in (best, now.altitude_m)]
     return (*dict.fromkeys(found), now.altitude_m)
 
 
@@ -54,14 +51,13 @@ class ReturnBounds:
 def return_bounds(now: Situation, grant: CompiledGrant) -> ReturnBounds:
     """The strictest limits of altitude and speed in force anywhere between home and the operation area.
 
-    A limit of altitude whose datum is not known is left out.
+    Where the datum of a limit is not known, it may not climb at all: then the height is 0, as for an autopilot that returns
+    at the altitude it has.
     """
     anywhere = shapely.box(-REACH_M, -REACH_M, REACH_M, REACH_M)
     air = Air(anywhere if grant.passage is None else grant.passage, margin_m(now), -math.inf, math.inf)
-    heights = altitude_bounds(grant, now, air)
-    known = [] if isinstance(heights, Verdict) else heights
     return ReturnBounds(
-        min((bound.upper for bound in known if bound.upper is not None), default=math.inf),
+        ceiling_m(*altitude_bounds(grant, now, air), here_m=0.0),
         min((bound.upper for bound in speed_bounds(grant, now, air) if bound.upper is not None), default=math.inf),
     )
 

@@ -20,6 +20,7 @@ from fractus_core.policy.limits import (
     clamp,
     conflict,
     corrected,
+    datum_unknown,
     height_on_entry,
     lower_is_fine,
     speed_bounds,
@@ -139,9 +140,9 @@ def _within_speed(setpoint: _Setpoint) -> Verdict | None:
 def _within_heights(setpoint: _Setpoint) -> Verdict | None:
     """Bring the vertical part within the limits of altitude, or deny."""
     now, grant = setpoint.now, setpoint.grant
-    bounds = altitude_bounds(grant, now, setpoint.air)
-    if isinstance(bounds, Verdict):
-        return bounds
+    bounds, unknown = altitude_bounds(grant, now, setpoint.air)
+    if unknown:
+        return datum_unknown(unknown[0])
     problem = conflict("Altitude", "m", bounds) or height_on_entry(
         shapely.points(setpoint.at), (now.altitude_m, stop_altitude_m(now)), bounds, height_margin_m(now)
     )

@@ -8,7 +8,7 @@ from fractus_core.policy.compiled import Air, CompiledGrant
 from fractus_core.policy.corrections import caused
 from fractus_core.policy.fences import breaches
 from fractus_core.policy.legs import way_home_blocked
-from fractus_core.policy.limits import altitude_bounds, clamp, corrected
+from fractus_core.policy.limits import altitude_bounds, clamp, corrected, datum_unknown
 from fractus_core.policy.motion import XY, height_margin_m, margin_m, standing, stop_point
 from fractus_core.policy.values import POSITION_UNKNOWN, Call, Situation, TakeoffArgs, Verdict, deny, distinct
 
@@ -19,8 +19,10 @@ def judge_takeoff(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     if at is None or not isinstance(args, TakeoffArgs):
         return POSITION_UNKNOWN if at is None else deny("InvalidArgument", "Takeoff needs its arguments")
     lower, upper = sorted((now.altitude_m, args.altitude_m))
-    bounds = altitude_bounds(grant, now, Air(shapely.points(at), margin_m(now), lower, upper))
-    clamped = bounds if isinstance(bounds, Verdict) else clamp("Altitude", "m above home", args.altitude_m, bounds)
+    bounds, unknown = altitude_bounds(grant, now, Air(shapely.points(at), margin_m(now), lower, upper))
+    if unknown:
+        return datum_unknown(unknown[0])
+    clamped = clamp("Altitude", "m above home", args.altitude_m, bounds)
     if isinstance(clamped, Verdict):
         return clamped
     correction = corrected(TakeoffArgs(clamped.value), [clamped])

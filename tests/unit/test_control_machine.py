@@ -328,6 +328,28 @@ def test_transits_that_are_refused_begin_no_grace_again() -> None:
     assert home.task.kind is TaskKind.RETURN
 
 
+@pytest.mark.parametrize("again", [told.VehicleFound(), told.TakeoverDemanded("hover", "Code", "why")])
+def test_what_is_found_or_taken_again_and_again_gets_no_more_time_for_its_driver(again: told.Event) -> None:
+    state, _ = told_of(*FLIES, told.StreamClosed(1))
+    for now in (1.0, 3.0, 4.5):
+        state, _ = transition(state, again, now)
+        assert state.deadline == 5.0
+    home, _ = transition(state, told.Tick(), 5.0)
+    assert home.task is not None
+    assert home.task.kind is TaskKind.RETURN
+    assert home.missions["a"].outcome is not None
+
+
+def test_a_driver_that_waits_for_anothers_vehicle_takes_none_of_its_time() -> None:
+    other = told.GrantRef("b", leads=True)
+    waits = (told.GrantChanged(None, other), told.StreamOpened(2, "b", "B"))
+    landed = (told.VehicleObserved(GROUND), told.Heartbeat(), told.StreamClosed(1))
+    waiting, _ = told_of(*FLIES, *landed, *waits)
+    assert (waiting.lease is not None, waiting.deadline) == (True, 5.0)
+    gone, _ = transition(waiting, told.GrantChanged(other, None), 1.0)
+    assert (gone.lease, gone.deadline) == (None, 5.0)
+
+
 def test_a_grace_waits_for_the_end_of_a_transit_and_a_driver_that_gets_the_vehicle_ends_it() -> None:
     state, _ = told_of(*FLIES, told.StreamClosed(1))
     asks = (told.StreamOpened(2, "a", "A"), told.TransitRequested(2), told.TransitBegan(9, "a", "A"))

@@ -149,11 +149,7 @@ def _close(step: Step, event: StreamClosed) -> None:
     step.stop_motion(StopKind.LOST, "ControlLost", "the driver's stream broke")
     if step.state.vehicle.armed and not descends:
         step.start(TaskKind.HOVER)
-    before = step.state.grace
     step.begin_grace(mission, DRIVER_LOST)
-    grace = step.state.grace
-    if not lease.granted and grace is not None and before is not None and before.key == grace.key:
-        step.set(grace=replace(grace, until=min(before.until, grace.until)))
 
 
 def _fail_transit(step: Step, event: TransitFailed) -> None:

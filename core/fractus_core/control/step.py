@@ -89,9 +89,11 @@ class Step:
         return changed
 
     def end_mission(self, mission: Mission | None, kind: OutcomeKind, reason: str) -> Mission | None:
-        """Give a mission its outcome and keep it, unless it has one."""
+        """Give a mission its outcome and keep it, unless it has one; no one is waited for any more."""
         if mission is None or mission.outcome is not None:
             return mission
+        if self.state.grace is not None and self.state.grace.key == mission.key:
+            self.set(grace=None)
         self.act(SaveJournal())
         return self.update_mission(mission, outcome=Outcome(kind, reason))
 
@@ -111,11 +113,10 @@ class Step:
             self.set(motion=None)
 
     def lose_lease(self, reason: str) -> None:
-        """Take the vehicle from the driver, or from who waits for it, and say why; a grace is over."""
+        """Take the vehicle from the driver, or from who waits for it, and say why."""
         lease = self.state.lease
         self.stop_motion(StopKind.LOST, "ControlLost", reason)
         self.drop_lease()
-        self.set(grace=None)
         if lease is not None:
             self.act(SendEvent(lease.lease_id, ControlEvent(StreamState.LOST, reason=reason)))
         self.act(WakeWaiters())
@@ -150,10 +151,15 @@ class Step:
             self.set(task=None)
 
     def begin_grace(self, mission: Mission, reason: str, code: str = "DriverLost") -> None:
-        """Give a lost driver or position its time to come back; on the ground, before any flight, there is nothing to save."""
+        """Give a lost driver or position its time to come back; on the ground, before any flight, there is nothing to save.
+
+        A mission that is waited for already gets no more time: what is lost and found again and again comes home.
+        """
+        before, until = self.state.grace, self.now + self.state.grace_s
+        if before is not None and before.key == mission.key:
+            until = min(before.until, until)
         waits = mission.flown or self.state.vehicle.armed
-        grace = Grace(self.now + self.state.grace_s, mission.key, reason, code) if waits else None
-        self.set(grace=grace)
+        self.set(grace=Grace(until, mission.key, reason, code) if waits else None)
 
     def follow_descent(self, kind: TaskKind, *, found: bool = False) -> None:
         """The autopilot comes down by itself: the system watches it to the ground, and does the rest if it stops."""
@@ -192,4 +198,4 @@ class Step:
         self.stop_task()
         self.set(returning=False)
         self.lose_lease(reason)
-        self.set(authority=Authority.PILOT)
+        self.set(authority=Authority.PILOT, grace=None)

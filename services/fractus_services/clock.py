@@ -35,7 +35,7 @@ class Clock:
     """
 
     def __init__(self, stepped: Callable[[float, bool], None] = lambda _step_s, _trusted: None) -> None:
-        self.stepped = stepped
+        self._stepped = stepped
         self._offset_s = self._stepped_to_s = time.time() - steady_s()
         self._doubted_since_s: float | None = None
 
@@ -48,17 +48,17 @@ class Clock:
             if self._doubted_since_s is not None:
                 self._doubted_since_s = None
                 log.warning("clock: the step was taken back")
-                self.stepped(0.0, True)
+                self._stepped(0.0, True)
             self._offset_s = offset_s
             return now_s + offset_s
         if self._doubted_since_s is None or abs(offset_s - self._stepped_to_s) > MAX_SLEW_S:
             self._doubted_since_s, self._stepped_to_s = now_s, offset_s
             log.warning("clock: stepped, both readings count for now (seconds=%.0f for_s=%.0f)", step_s, TRUST_AFTER_S)
-            self.stepped(step_s, False)
+            self._stepped(step_s, False)
         if now_s - self._doubted_since_s < TRUST_AFTER_S:
             readings = now_s + self._offset_s, now_s + offset_s
             return Moment(max(readings), min(readings))
         self._offset_s, self._doubted_since_s = offset_s, None
         log.warning("clock: the step lasted, the new reading counts (seconds=%.0f)", step_s)
-        self.stepped(step_s, True)
+        self._stepped(step_s, True)
         return now_s + offset_s

@@ -61,20 +61,28 @@ async def run(options: CameraOptions, stop: asyncio.Event) -> None:
     Raises:
         CannotServe: an option is wrong; also within an ExceptionGroup.
     """
-    clock = Clock()
+    # The log has its times from the clock, and is looked up when that is stepped.
+    clock = Clock(lambda step_s, trusted: audit.clock_stepped(step_s, trusted))  # noqa: PLW0108
     description = NodeDescription(options.node, options.node_object, options.description, Drone, EdgeNode)
     node = options.node or (description.value.name if description.value is not None else socket.gethostname())
     tls = TlsFiles(options.tls)
     audit = AuditLog(options.audit, clock, tls=options.tls)
-    clock.stepped = audit.clock_stepped
     grants = GrantFiles(
         options.grants, node, GrantVerifier(options.tls, options.grant_memory), refused=audit.refused_grant
     )
     grants.scan()
     judge = PictureJudge(audit, detector_of(options))
+    # One for all descriptions: a second one would tidy away what the first is still writing.
+    album = Album(
+        options.state,
+        options.keep,
+        options.keep_mb * 1_000_000,
+        options.keep_total_mb * 1_000_000,
+        lambda: [owner_of(grant) for grant in grants.active.values()],
+    )
     while not stop.is_set():
         audit.append("started", {"node": node})
-        await _serve(options, description, node, stop, tls=tls, grants=grants, clock=clock, judge=judge)
+        await _serve(options, description, node, stop, tls=tls, grants=grants, clock=clock, judge=judge, album=album)
     await audit.close()
 
 
@@ -88,6 +96,7 @@ async def _serve(
     grants: GrantFiles,
     clock: Clock,
     judge: PictureJudge,
+    album: Album,
 ) -> None:
     """Serve until `stop` is set, or the description changes."""
     described = description.value.spec.services.camera if description.value is not None else None
@@ -97,13 +106,6 @@ async def _serve(
         log.warning("camera: what it sees is not described, it counts as seeing everything (missing=%s)", missing)
     camera = CameraProperties.of(description.value)
     shutter = Shutter(driver_for(options.camera or (described.connection if described is not None else "test:")))
-    album = Album(
-        options.state,
-        options.keep,
-        options.keep_mb * 1_000_000,
-        options.keep_total_mb * 1_000_000,
-        lambda: [owner_of(grant) for grant in grants.active.values()],
-    )
     queue = FairQueue(MAX_PER_OWNER, MAX_FILTERING)
     ended = asyncio.Event()
     parts = [grants.run(), _set_after(stop.wait(), ended), _set_after(description.changed(), ended)]

@@ -61,13 +61,13 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     Raises:
         CannotServe: an option is wrong; also within an ExceptionGroup.
     """
-    clock = Clock()
+    # The log has its times from the clock, and is looked up when that is stepped.
+    clock = Clock(lambda step_s, trusted: audit.clock_stepped(step_s, trusted))  # noqa: PLW0108
     description = NodeDescription(options.node, options.node_object, options.description, Drone)
     name = description.value.name if description.value is not None else socket.gethostname()
     node, url = options.node or name, options.autopilot or _link(description)
     tls = TlsFiles(options.tls)
     audit = AuditLog(options.audit, clock, tls=options.tls)
-    clock.stepped = audit.clock_stepped
     verifier = GrantVerifier(options.tls, options.grant_memory)
     grants = GrantFiles(options.grants, node, verifier, options.flat_terrain, audit.refused_grant)
     heard = asyncio.Event()

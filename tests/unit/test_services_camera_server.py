@@ -1,0 +1,52 @@
+"""The camera service as a whole: what it keeps when its node is described otherwise."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+from fractus_services import description
+from fractus_services.camera.rpc import server
+from fractus_services.options import CameraOptions
+
+
+class Counted(server.Album):
+    """Counts how many are made."""
+
+    made = 0
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        type(self).made += 1
+
+
+async def told(caplog: pytest.LogCaptureFixture, text: str) -> None:
+    while text not in caplog.text:  # noqa: ASYNC110 - a log wakes no one
+        await asyncio.sleep(0.01)
+
+
+async def test_a_node_that_is_described_otherwise_keeps_its_album(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A second album would tidy away the picture that is still being written through the first."""
+    monkeypatch.setattr(server, "Album", Counted)
+    monkeypatch.setattr(description, "POLL_INTERVAL_S", 0.01)
+    node = tmp_path / "node.json"
+    options = CameraOptions(
+        grants=tmp_path / "grants", tls=tmp_path / "tls", state=tmp_path / "state", audit=tmp_path / "audit", node="n",
+        node_object=node, description=tmp_path / "none.yaml", listen="127.0.0.1:0", lock_timeout=0.0, mobility="unix:none",
+        keep=10, keep_mb=10, keep_total_mb=10, camera=None, face_model=None, face_px=20.0, relief=0.0,
+    )  # fmt: skip
+    stop = asyncio.Event()
+    serving = asyncio.ensure_future(server.run(options, stop))
+    place = '{"apiVersion": "fractus.dev/v1alpha1", "kind": "EdgeNode", "metadata": {"name": "n"}, "spec": {"location": %s}}'
+    async with asyncio.timeout(30):
+        for lat in (50.0, 51.0):
+            await told(caplog, "what it sees is not described")
+            caplog.clear()
+            node.write_text(place % f'{{"lat": {lat}, "lon": 8.0}}')
+        await told(caplog, "described=True")
+        stop.set()
+        await serving
+    assert Counted.made == 1

@@ -23,6 +23,9 @@ RETRY_S, MAX_RETRY_S = 0.5, 30.0
 VERIFY_S = 10.0
 """In flight the failsafes and the fence are read again after this time: the news of a change by another station may be lost."""
 
+UNVERIFIED_TIMEOUT_S = 60.0
+"""How long a flying vehicle that is heard may leave open whether its failsafes still hold; then the system brings it home."""
+
 
 class Observer:
     """Follows the autopilot's link, heartbeats and parameters.
@@ -48,6 +51,7 @@ class Observer:
         self._preparing: asyncio.Task[None] | None = None
         self._changed = asyncio.Event()
         self._verified_at = -math.inf
+        self._unverified_since: float | None = None
 
     def found(self) -> None:
         """The autopilot is there, for the first time or again."""
@@ -56,10 +60,16 @@ class Observer:
         self._control.dispatch(VehicleFound())
         self._control.tasks.drop(self._preparing)
         self._preparing = self._control.tasks.spawn(self._prepare())
+        self._unverified_since = None
 
     def heartbeat(self) -> None:
         """The autopilot told its mode, and whether it is armed."""
         self._control.dispatch(Heartbeat())
+        autopilot, since = self._control.autopilot, self._unverified_since
+        if not autopilot.vehicle.armed:
+            self._unverified_since = None
+        elif since is not None and autopilot.now - since > UNVERIFIED_TIMEOUT_S:
+            self._come_home(f"it has not told its parameters for {UNVERIFIED_TIMEOUT_S:.0f} s")
 
     def grant_changed(self, _old: ActiveGrant | None, _new: ActiveGrant | None) -> None:
         """Limits may be others by now: what follows for the autopilot's own way home is set at once."""
@@ -108,31 +118,51 @@ class Observer:
         control, before = self._control, self._control.checked
         flying = control.autopilot.vehicle.armed
         self._verified_at = -math.inf
+        if flying and self._unverified_since is None:
+            self._unverified_since = control.autopilot.now
         checked = await self._failsafes.configure(flying=flying, before=before)
         if not flying:
             control.set_checked(checked)
             return
-        refused, changed = "" if checked.lost else checked.problem, checked.changed
-        try:
-            if control.last_grant is not None:
-                for what in await self._limit_return(control.last_grant):
-                    control.note("limited", f"how the autopilot flies home: {what}", "ReturnLimited")
-            if self._fence.raised:
-                changed += await self._fence.hold()
-        except AutopilotError as error:
-            if error.link:
-                raise
-            refused = str(error)
+        refused, changed, broken = ["" if checked.lost else checked.problem], checked.changed, None
+        for keep in (self._keep_return, self._keep_fence):
+            # What one of them finds must not hide what the others do.
+            try:
+                changed += await keep()
+            except AutopilotError as error:
+                broken = broken or (error if error.link else None)
+                refused.append("" if error.link else str(error))
+            except OSError as error:
+                refused.append(f"what its owner had cannot be stored: {error}")
         checked = self._failsafes.learn(checked)
         control.set_checked(checked)
         for what in changed:
             control.note("restored", f"set back in flight: {what}", "SettingChanged")
         if before is not None and before.airframe != checked.airframe:
             control.note("airframe", f"the vehicle moves otherwise by now: {checked.airframe}", "SettingChanged")
-        if refused and not control.state.returning:
-            why = f"the autopilot would not keep the drone safe by itself any more: {refused}"
-            control.take_over(Verdict("takeover", None, "FailsafeLost", why, (), "returnToLaunch"))
+        if any(refused):
+            self._come_home("; ".join(filter(None, refused)))
+        if broken is not None:
+            raise broken
         self._verified_at = control.autopilot.now
+        if not checked.lost:
+            self._unverified_since = None
+
+    def _come_home(self, why: str) -> None:
+        """Take over a drone whose autopilot alone would not bring it home, unless the system does so already."""
+        if not self._control.state.returning:
+            reason = f"the autopilot would not keep the drone safe by itself any more: {why}"
+            self._control.take_over(Verdict("takeover", None, "FailsafeLost", reason, (), "returnToLaunch"))
+
+    async def _keep_return(self) -> tuple[str, ...]:
+        control = self._control
+        if control.last_grant is not None:
+            for what in await self._limit_return(control.last_grant):
+                control.note("limited", f"how the autopilot flies home: {what}", "ReturnLimited")
+        return ()
+
+    async def _keep_fence(self) -> tuple[str, ...]:
+        return await self._fence.hold() if self._fence.raised else ()
 
     def _due(self) -> bool:
         control, checked = self._control, self._control.checked

@@ -65,6 +65,17 @@ def test_an_airframe_that_is_not_a_number_forbids_arming() -> None:
     assert checked.airframe == Airframe()
 
 
+def test_legs_are_flown_with_the_owners_speed_where_the_vehicle_spells_it_so() -> None:
+    for stored, expected in (({"WPNAV_SPEED": 1000.0}, 10.0), ({"WP_SPD": 7.0}, 3.0)):
+        vehicle = Parameters({"SYSID_MYGCS": 255.0, "WPNAV_SPEED": 300.0})
+        vehicle.vehicle_parameters.leg_speed = stored
+        assert configured(vehicle).speed_mps == expected
+    newer = Parameters({"SYSID_MYGCS": 255.0, "WP_SPD": 4.0})
+    del newer.values["WPNAV_SPEED"]
+    newer.vehicle_parameters.leg_speed = {"WPNAV_SPEED": 1000.0}
+    assert configured(newer).speed_mps == 4.0
+
+
 RETRACING = {"SYSID_MYGCS": 244.0, "SRTL_POINTS": 300.0}
 
 

@@ -155,6 +155,40 @@ def test_what_cannot_be_limited_does_not_arm(tmp_path: Path) -> None:
     fly(flight)
 
 
+def test_values_of_a_release_with_other_names_are_left_alone(tmp_path: Path) -> None:
+    """Since the file was written, the vehicle got firmware that spells its parameters otherwise."""
+    (tmp_path / "return.json").write_text('{"RTL_ALT_M": 40.0, "WP_SPD": 10.0, "RTL_SPEED_MS": 0.0}')
+
+    async def flight() -> None:
+        world = World(tmp_path)
+        world.plane.parameters |= OWNED
+        async with world:
+            grant = world.grants.put(spec(limits=LIMITS))
+            await world.up(grant, 8.0)
+            assert held(world) == LOW
+            await drivers.give_back(world.control, grant)
+            await world.until(lambda: not world.plane.vehicle.armed)
+            await world.until(lambda: held(world) == OWNED, 30)
+        assert "WP_SPD" not in world.plane.parameters
+        assert not (tmp_path / "return.json").exists()
+
+    fly(flight)
+
+
+def test_only_values_of_another_release_are_forgotten(tmp_path: Path) -> None:
+    (tmp_path / "return.json").write_text('{"RTL_ALT_M": 40.0, "WP_SPD": 3.0}')
+
+    async def flight() -> None:
+        world = World(tmp_path)
+        world.plane.parameters |= OWNED
+        async with world:
+            world.observer.found()
+            await world.until(lambda: not (tmp_path / "return.json").exists(), 60)
+            assert held(world) == OWNED
+
+    fly(flight)
+
+
 def test_a_file_of_garbage_limits_all_the_same(tmp_path: Path) -> None:
     (tmp_path / "return.json").write_text("[")
 

@@ -174,7 +174,7 @@ class MavlinkFailsafes:
         parameter, least_points = stack.path_memory
         remembers = settings.told.get(parameter, 0.0) >= least_points
         retraces = await self._choose(settings, retrace=remembers and (not flying or self._chosen(settings, before)))
-        reader = Reader(settings.told | self._parameters.leg_speed)
+        reader = self._reader(settings.told)
         known, speed = (before.airframe, before.speed_mps) if before is not None else (Airframe(), _DEFAULT_SPEED_MPS)
         airframe, speed = stack.airframe(reader, known, speed)
         problem = "; ".join(settings.problems + reader.problems)
@@ -183,10 +183,12 @@ class MavlinkFailsafes:
 
     def learn(self, checked: Checked) -> Checked:
         """How the vehicle moves by what it has told until now."""
-        airframe, speed = self._stack.airframe(
-            Reader(self._parameters.told | self._parameters.leg_speed), checked.airframe, checked.speed_mps
-        )
+        airframe, speed = self._stack.airframe(self._reader(self._parameters.told), checked.airframe, checked.speed_mps)
         return replace(checked, airframe=replace(airframe, retraces=checked.airframe.retraces), speed_mps=speed)
+
+    def _reader(self, told: Mapping[str, float]) -> Reader:
+        """Figures with the owner's speed of legs, as far as it has a name that the vehicle knows."""
+        return Reader({name: self._parameters.leg_speed.get(name, value) for name, value in told.items()})
 
     async def choose_return(self, checked: Checked, *, retrace: bool) -> Checked:
         """Let the failsafes bring the drone home straight, or, where the vehicle can, on the path that it came.

@@ -48,7 +48,8 @@ class MavlinkReturn:
         """
         async with self._lock:
             told = await self._parameters.read(self._stack.returning)
-            owned = told | self._owned
+            # What the file says of another release's names is not this vehicle's.
+            owned = told | {name: value for name, value in self._owned.items() if name in told}
             wanted = self._stack.return_values(owned, bounds)
             changed = {name: value for name, value in wanted.items() if not same(told[name], value)}
             if changed:
@@ -70,7 +71,8 @@ class MavlinkReturn:
         async with self._lock:
             if not idle() or not self._owned:
                 return
-            await self._set(self._owned)
+            told = await self._parameters.read(self._stack.returning)
+            await self._set({name: value for name, value in self._owned.items() if name in told})
             await asyncio.to_thread(self._path.unlink, True)
             self._owned = {}
             self._remember()

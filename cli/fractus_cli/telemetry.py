@@ -13,7 +13,7 @@ from typing import Any
 import click
 from fractus.drone import Mobility
 from fractus.environment import DEFAULT_TLS_DIR, MOBILITY_PORT, Endpoint
-from fractus.values import Telemetry
+from fractus.telemetry import Telemetry
 
 
 @click.command()

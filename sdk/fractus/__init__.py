@@ -36,6 +36,15 @@ from fractus.running import run as run
 from fractus.tasks import Circle as Circle
 from fractus.tasks import ControlPoint as ControlPoint
 from fractus.tasks import Polygon as Polygon
+from fractus.telemetry import Battery as Battery
+from fractus.telemetry import Fix as Fix
+from fractus.telemetry import Gps as Gps
+from fractus.telemetry import Health as Health
+from fractus.telemetry import Severity as Severity
+from fractus.telemetry import StatusText as StatusText
+from fractus.telemetry import Telemetry as Telemetry
+from fractus.telemetry import Watch as Watch
+from fractus.telemetry import Wind as Wind
 from fractus.values import Action as Action
 from fractus.values import AltitudeReference as AltitudeReference
 from fractus.values import Attitude as Attitude
@@ -48,6 +57,5 @@ from fractus.values import Progress as Progress
 from fractus.values import Result as Result
 from fractus.values import Ride as Ride
 from fractus.values import SpeedResult as SpeedResult
-from fractus.values import Telemetry as Telemetry
 from fractus.values import Velocity as Velocity
 from fractus.values import VelocityResult as VelocityResult

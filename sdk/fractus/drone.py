@@ -18,6 +18,7 @@ from fractus.dry_runs import CanI
 from fractus.environment import Endpoint, endpoint
 from fractus.errors import ControlLost, Corrected, FractusError
 from fractus.requests import goto_request, speed_request, takeoff_request, velocity_request
+from fractus.telemetry import Telemetry, Watch
 from fractus.values import (
     AltitudeReference,
     Check,
@@ -28,7 +29,6 @@ from fractus.values import (
     Result,
     Ride,
     SpeedResult,
-    Telemetry,
     Velocity,
     VelocityResult,
 )
@@ -159,6 +159,8 @@ class Mobility(ServiceClient):
         self._control: Control | None = None
         self.can_i = CanI(self._check)
         """Dry runs: `await drone.can_i.goto(lat, lon, 20)`."""
+        self.watch = Watch(self.telemetry)
+        """One thing of the drone's state, each time it changes: `async for gps in drone.watch.gps()`."""
 
     async def close(self) -> None:
         """Close the connection; control that is still held breaks off."""

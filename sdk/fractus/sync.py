@@ -17,6 +17,7 @@ from fractus import control as _control
 from fractus import drone as _drone
 from fractus import dry_runs as _dry_runs
 from fractus import pictures as _pictures
+from fractus import telemetry as _telemetry
 from fractus.environment import Endpoint
 from fractus.errors import FractusError
 from fractus.tasks import ControlPoint
@@ -195,6 +196,17 @@ class CanI(_Wrapper[_dry_runs.CanI]):
     speed = _waiting(_dry_runs.CanI.speed)
 
 
+class Watch(_Wrapper[_telemetry.Watch]):
+    """One thing of the drone's state, each time it changes; see `fractus.Watch`."""
+
+    gps = _iterating(_telemetry.Watch.gps)
+    battery = _iterating(_telemetry.Watch.battery)
+    health = _iterating(_telemetry.Watch.health)
+    attitude = _iterating(_telemetry.Watch.attitude)
+    wind = _iterating(_telemetry.Watch.wind)
+    status_texts = _iterating(_telemetry.Watch.status_texts)
+
+
 class Mobility(_Client[_drone.Mobility]):
     """The mobility service of this node; see `fractus.Mobility`."""
 
@@ -202,6 +214,8 @@ class Mobility(_Client[_drone.Mobility]):
         super().__init__(_drone.mobility(endpoint, strict=strict))
         self.can_i = CanI(self._loop, self._async.can_i)
         """Dry runs: `drone.can_i.goto(lat, lon, 20)`."""
+        self.watch = Watch(self._loop, self._async.watch)
+        """One thing of the drone's state, each time it changes: `for gps in drone.watch.gps()`."""
 
     def control(self, *, timeout_s: float | None = None, progress: _control.OnWait | None = None) -> Control:
         """Control of the drone for the next control point: `with drone.control() as control`."""

@@ -230,54 +230,6 @@ class Ride:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class Telemetry:
-    """One sample of the drone's state; altitudes of `position` and `home` are above home and AMSL.
-
-    `attitude` is None while it is unknown. `position_error_m` bounds the horizontal error; None: the position is unknown, and
-    `position` and `velocity` are zeros that mean nothing. `ready` says that the autopilot would arm.
-    """
-
-    time: datetime
-    position: Position
-    altitude_amsl_m: float
-    velocity: Velocity
-    yaw_deg: float
-    battery_remaining: float
-    armed: bool
-    in_air: bool
-    mode: str
-    ready: bool
-    home: Position
-    flight_state: str
-    controller: str
-    attitude: Attitude | None = None
-    position_error_m: float | None = None
-    autopilot_connected: bool = False
-
-    @classmethod
-    def from_proto(cls, message: mobility_pb2.Telemetry) -> Telemetry:
-        """Read the wire form."""
-        return cls(
-            time=message.time.ToDatetime(tzinfo=UTC),
-            position=Position.from_proto(message.position),
-            altitude_amsl_m=message.altitude_amsl_m,
-            velocity=Velocity.from_proto(message.velocity),
-            yaw_deg=message.yaw_deg,
-            battery_remaining=message.battery_remaining,
-            armed=message.armed,
-            in_air=message.in_air,
-            mode=message.mode,
-            ready=message.ready,
-            home=Position.from_proto(message.home),
-            flight_state=message.flight_state,
-            controller=message.controller,
-            attitude=Attitude.from_proto(message.attitude) if message.HasField("attitude") else None,
-            position_error_m=message.position_error_m if message.HasField("position") else None,
-            autopilot_connected=message.autopilot_connected,
-        )
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImageInfo(Result):
     """A picture in the camera's store."""

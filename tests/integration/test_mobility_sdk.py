@@ -6,8 +6,9 @@ import asyncio
 import contextlib
 import math
 import signal
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
 from fractus import sync
@@ -28,6 +29,8 @@ from mobility_rig import (
     outcomes,
     passenger_grant,
 )
+
+T = TypeVar("T")
 
 
 @pytest.fixture
@@ -106,6 +109,32 @@ async def test_control_returned_through_the_sdk(rig: Rig) -> None:
         with pytest.raises(MissionComplete):
             async with drone.control():
                 raise AssertionError("control after the mission")
+
+
+async def test_what_a_component_watches(rig: Rig) -> None:
+    rig.write_grant(grant())
+    rig.start_service()
+    rig.start_vehicle()
+    async with Mobility(endpoint(rig)) as drone, asyncio.timeout(60):
+        async with contextlib.aclosing(drone.watch.health()) as healths:
+            told = [health async for health in _until(healths, lambda health: health.ready)]
+        assert all(health.problem for health in told[:-1])
+        assert told[-1].problem == ""
+        assert (await anext(drone.watch.gps())).satellites >= 6
+        assert (await anext(drone.watch.battery())).voltage_v > 10
+        assert abs((await anext(drone.watch.attitude())).roll_deg) < 5
+        assert (await anext(drone.watch.wind())).speed_mps < 30
+        async with drone.control():
+            await drone.arm()
+            assert (await anext(drone.watch.status_texts())).text
+            await drone.disarm()
+
+
+async def _until(items: AsyncIterator[T], over: Callable[[T], bool]) -> AsyncIterator[T]:
+    async for item in items:
+        yield item
+        if over(item):
+            return
 
 
 async def test_asking_first_and_riding_along(rig: Rig) -> None:

@@ -8,7 +8,12 @@ import fractus
 import pytest
 from fractus import sync
 
-PAIRS = [(fractus.Mobility, sync.Mobility), (fractus.Camera, sync.Camera), (fractus.CanI, sync.CanI)]
+PAIRS = [
+    (fractus.Mobility, sync.Mobility),
+    (fractus.Camera, sync.Camera),
+    (fractus.CanI, sync.CanI),
+    (fractus.Watch, sync.Watch),
+]
 
 
 @pytest.mark.parametrize(("theirs", "ours"), PAIRS, ids=lambda kind: kind.__name__)

@@ -43,12 +43,12 @@ def test_an_accuracy_that_is_not_told_any_more_is_not_the_last_one() -> None:
     assert vehicle.position_error_m == 1.5
 
 
-def told(vehicle: Vehicle, now: float, missions: bool = False) -> Any:
+def told(vehicle: Vehicle, now: float, missions: bool = False, heard: int = 0) -> Any:
     autopilot = SimpleNamespace(vehicle=vehicle, now=now, connected=True)
     ended = Mission("uid", "identity", outcome=Outcome(OutcomeKind.REVOKED, "why"))
     state = ControlState(missions={"uid": ended, "other": Mission("other", "identity")})
     control: Any = SimpleNamespace(autopilot=autopilot, checked=None, state=state)
-    return telemetry_of(control, 0.0, missions=missions, ready=True)
+    return telemetry_of(control, 0.0, missions=missions, not_ready_reason="", heard=heard)
 
 
 def test_telemetry_carries_no_stale_position() -> None:
@@ -79,3 +79,20 @@ def test_missions_are_for_the_node_alone() -> None:
     missions = dict(told(Vehicle(stack=ARDUCOPTER), 0.0, missions=True).missions)
     assert missions == {"uid": MissionOutcome(kind=MissionOutcome.KIND_REVOKED, reason="why")}
     assert not told(Vehicle(stack=ARDUCOPTER), 0.0).missions
+
+
+def test_telemetry_tells_of_satellites_wind_and_new_texts() -> None:
+    vehicle = Vehicle(stack=ARDUCOPTER)
+    empty = told(vehicle, 10.0)
+    assert not empty.HasField("gps")
+    assert not empty.HasField("wind")
+    vehicle.take(message("GPS_RAW_INT", fix_type=4, satellites_visible=12), 10.0)
+    vehicle.take(message("WIND", direction=90.0, speed=5.0), 10.0)
+    for text in (b"PreArm: a", b"PreArm: b"):
+        vehicle.take(message("STATUSTEXT", severity=2, text=text), 10.0)
+    full = told(vehicle, 11.0)
+    assert (full.gps.fix_type, full.gps.satellites) == (4, 12)
+    assert (full.wind.from_deg, full.wind.speed_mps) == (90.0, 5.0)
+    assert [(text.number, text.text) for text in full.texts] == [(1, "PreArm: a"), (2, "PreArm: b")]
+    assert [text.text for text in told(vehicle, 11.0, heard=1).texts] == ["PreArm: b"]
+    assert not told(vehicle, 21.0).HasField("wind")

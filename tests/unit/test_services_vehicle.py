@@ -79,3 +79,19 @@ def test_a_home_of_zeroes_is_none() -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     vehicle.take(message("HOME_POSITION"), 1.0)
     assert vehicle.home is None
+
+
+def test_it_tells_of_satellites_wind_and_what_it_says() -> None:
+    vehicle = Vehicle(stack=ARDUCOPTER)
+    vehicle.take(message("GPS_RAW_INT", fix_type=3, satellites_visible=14), 1.0)
+    assert vehicle.satellites == 14
+    vehicle.take(message("GPS_RAW_INT", fix_type=3, satellites_visible=255), 2.0)
+    assert vehicle.satellites == 0, "255: it does not say"
+    vehicle.take(message("WIND", direction=-90.0, speed=6.0), 3.0)
+    assert (vehicle.wind_from_deg, vehicle.wind_mps, vehicle.wind_at) == (270.0, 6.0, 3.0)
+    vehicle.take(message("WIND", direction=float("nan"), speed=6.0), 4.0)
+    assert vehicle.wind_at == 3.0
+    for number in range(60):
+        vehicle.take(message("STATUSTEXT", severity=4, text=f"text {number}".encode()), 5.0)
+    assert len(vehicle.reports) == 50
+    assert vehicle.reports[-1] == (60, 4, "text 59")

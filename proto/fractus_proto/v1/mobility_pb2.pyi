@@ -6,7 +6,7 @@ from google.protobuf.internal import containers as _containers
 from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
-from collections.abc import Mapping as _Mapping
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
 from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
@@ -263,8 +263,34 @@ class MissionOutcome(_message.Message):
     reason: str
     def __init__(self, kind: _Optional[_Union[MissionOutcome.Kind, str]] = ..., reason: _Optional[str] = ...) -> None: ...
 
+class Gps(_message.Message):
+    __slots__ = ("fix_type", "satellites")
+    FIX_TYPE_FIELD_NUMBER: _ClassVar[int]
+    SATELLITES_FIELD_NUMBER: _ClassVar[int]
+    fix_type: int
+    satellites: int
+    def __init__(self, fix_type: _Optional[int] = ..., satellites: _Optional[int] = ...) -> None: ...
+
+class Wind(_message.Message):
+    __slots__ = ("from_deg", "speed_mps")
+    FROM_DEG_FIELD_NUMBER: _ClassVar[int]
+    SPEED_MPS_FIELD_NUMBER: _ClassVar[int]
+    from_deg: float
+    speed_mps: float
+    def __init__(self, from_deg: _Optional[float] = ..., speed_mps: _Optional[float] = ...) -> None: ...
+
+class StatusText(_message.Message):
+    __slots__ = ("number", "severity", "text")
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    SEVERITY_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
+    number: int
+    severity: int
+    text: str
+    def __init__(self, number: _Optional[int] = ..., severity: _Optional[int] = ..., text: _Optional[str] = ...) -> None: ...
+
 class Telemetry(_message.Message):
-    __slots__ = ("time", "position", "altitude_amsl_m", "velocity", "yaw_deg", "battery_remaining", "battery_voltage_v", "battery_current_a", "armed", "in_air", "mode", "ready", "home", "flight_state", "controller", "autopilot_connected", "missions", "position_error_m", "attitude", "position_age_s", "attitude_age_s")
+    __slots__ = ("time", "position", "altitude_amsl_m", "velocity", "yaw_deg", "battery_remaining", "battery_voltage_v", "battery_current_a", "armed", "in_air", "mode", "ready", "home", "flight_state", "controller", "autopilot_connected", "missions", "position_error_m", "attitude", "position_age_s", "attitude_age_s", "gps", "wind", "not_ready_reason", "texts")
     class MissionsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -293,6 +319,10 @@ class Telemetry(_message.Message):
     ATTITUDE_FIELD_NUMBER: _ClassVar[int]
     POSITION_AGE_S_FIELD_NUMBER: _ClassVar[int]
     ATTITUDE_AGE_S_FIELD_NUMBER: _ClassVar[int]
+    GPS_FIELD_NUMBER: _ClassVar[int]
+    WIND_FIELD_NUMBER: _ClassVar[int]
+    NOT_READY_REASON_FIELD_NUMBER: _ClassVar[int]
+    TEXTS_FIELD_NUMBER: _ClassVar[int]
     time: _timestamp_pb2.Timestamp
     position: _types_pb2.Position
     altitude_amsl_m: float
@@ -314,4 +344,8 @@ class Telemetry(_message.Message):
     attitude: _types_pb2.Attitude
     position_age_s: float
     attitude_age_s: float
-    def __init__(self, time: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., position: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., altitude_amsl_m: _Optional[float] = ..., velocity: _Optional[_Union[_types_pb2.Velocity, _Mapping]] = ..., yaw_deg: _Optional[float] = ..., battery_remaining: _Optional[float] = ..., battery_voltage_v: _Optional[float] = ..., battery_current_a: _Optional[float] = ..., armed: bool = ..., in_air: bool = ..., mode: _Optional[str] = ..., ready: bool = ..., home: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., flight_state: _Optional[str] = ..., controller: _Optional[str] = ..., autopilot_connected: bool = ..., missions: _Optional[_Mapping[str, MissionOutcome]] = ..., position_error_m: _Optional[float] = ..., attitude: _Optional[_Union[_types_pb2.Attitude, _Mapping]] = ..., position_age_s: _Optional[float] = ..., attitude_age_s: _Optional[float] = ...) -> None: ...
+    gps: Gps
+    wind: Wind
+    not_ready_reason: str
+    texts: _containers.RepeatedCompositeFieldContainer[StatusText]
+    def __init__(self, time: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., position: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., altitude_amsl_m: _Optional[float] = ..., velocity: _Optional[_Union[_types_pb2.Velocity, _Mapping]] = ..., yaw_deg: _Optional[float] = ..., battery_remaining: _Optional[float] = ..., battery_voltage_v: _Optional[float] = ..., battery_current_a: _Optional[float] = ..., armed: bool = ..., in_air: bool = ..., mode: _Optional[str] = ..., ready: bool = ..., home: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., flight_state: _Optional[str] = ..., controller: _Optional[str] = ..., autopilot_connected: bool = ..., missions: _Optional[_Mapping[str, MissionOutcome]] = ..., position_error_m: _Optional[float] = ..., attitude: _Optional[_Union[_types_pb2.Attitude, _Mapping]] = ..., position_age_s: _Optional[float] = ..., attitude_age_s: _Optional[float] = ..., gps: _Optional[_Union[Gps, _Mapping]] = ..., wind: _Optional[_Union[Wind, _Mapping]] = ..., not_ready_reason: _Optional[str] = ..., texts: _Optional[_Iterable[_Union[StatusText, _Mapping]]] = ...) -> None: ...

@@ -35,6 +35,9 @@ DEFAULT_ERROR_M = 1.5
 MAX_POSITION_AGE_S = 1.0
 """A position older than this is no position: at 20 Hz in flight, twenty in a row were lost."""
 
+WIND_MAX_AGE_S = 10.0
+"""The wind was estimated longer ago than this by an autopilot that has stopped to tell."""
+
 READY_MAX_AGE_S = 5.0
 """What the autopilot told of its readiness longer ago says nothing: at 1 Hz, four messages in a row were lost."""
 
@@ -60,6 +63,9 @@ class VehicleState:
         estimated: whether its estimator has an absolute position, and predicts one.
         estimated_at: when it told that.
         path_lost: whether the autopilot has given up remembering its path since it was armed.
+        satellites: that the receiver sees; None until it has told.
+        wind_at: when the autopilot told of the wind.
+        reports: number, MAV_SEVERITY and text of what the autopilot said of late.
         located: whether GPS has a three-dimensional fix of some accuracy; positions without one are not taken.
     """
 
@@ -94,7 +100,12 @@ class VehicleState:
     located: bool = False
     position_error_m: float = DEFAULT_ERROR_M
     courses: deque[tuple[float, float, float]] = field(default_factory=deque)
+    satellites: int | None = None
+    wind_from_deg: float = 0.0
+    wind_mps: float = 0.0
+    wind_at: float = -math.inf
     texts: list[str] = field(default_factory=list)
+    reports: deque[tuple[int, int, str]] = field(default_factory=lambda: deque(maxlen=50))
     path_lost: bool = False
     failsafe_text: str = ""
     failsafe_text_at: float = -math.inf

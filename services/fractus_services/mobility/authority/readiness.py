@@ -20,7 +20,12 @@ def not_ready_reason(control: Control, key: str) -> str | None:
     return core.not_ready_reason(control.state, key, readiness)
 
 
-def ready(control: Control) -> bool:
-    """Whether the motors could be started now."""
-    verified = control.checked is not None and not control.checked.problem
-    return verified and not control.autopilot.vehicle.unready(control.autopilot.now)
+def arming_problem(control: Control) -> str:
+    """Why the motors could not be started now, for any caller; empty when they could."""
+    autopilot, checked = control.autopilot, control.checked
+    if not autopilot.connected:
+        return "the autopilot is not connected"
+    unverified = BEING_SET if checked is None else checked.problem
+    if unverified:
+        return f"the autopilot's failsafes are not verified: {unverified}"
+    return autopilot.vehicle.unready(autopilot.now) or autopilot.link_problem

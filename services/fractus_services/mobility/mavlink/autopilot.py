@@ -43,6 +43,7 @@ STREAMS = {
     "EKF_STATUS_REPORT": (1.0, 1.0),
     "GPS_RAW_INT": (1.0, 2.0),
     "HOME_POSITION": (0.2, 0.2),
+    "WIND": (0.2, 1.0),
 }
 
 _RESULTS: dict[int, str] = {

@@ -18,8 +18,9 @@ from fractus_mavlink.enums import (
 from fractus_services.mobility.autopilot import COURSE_S, DEFAULT_ERROR_M, VehicleState
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
 
+_UNKNOWN_U8 = 0xFF
 _UNKNOWN_U16 = 0xFFFF
-"""What 16 bits say of a value that is not known."""
+"""What 8 and 16 bits say of a value that is not known."""
 
 _POSITIONED = EKF_STATUS_FLAGS.POS_HORIZ_ABS | EKF_STATUS_FLAGS.PRED_POS_HORIZ_ABS
 
@@ -115,6 +116,8 @@ def _estimator(vehicle: Vehicle, message: Message, now: float) -> None:
 
 def _gps(vehicle: Vehicle, message: Message, _now: float) -> None:
     vehicle.fix_type, accuracy_mm = message.integer("fix_type"), message.integer("h_acc")
+    satellites = message.integer("satellites_visible")
+    vehicle.satellites = satellites if satellites != _UNKNOWN_U8 else 0
     error = accuracy_mm / 1e3 if accuracy_mm else DEFAULT_ERROR_M
     vehicle.located = vehicle.fix_type >= GPS_FIX_TYPE.TYPE_3D_FIX and error <= MAX_ERROR_M
     if vehicle.located:
@@ -125,10 +128,18 @@ def _text(vehicle: Vehicle, message: Message, now: float) -> None:
     text = message.text("text")
     vehicle.texts.append(text)
     del vehicle.texts[:-20]
+    number = vehicle.reports[-1][0] + 1 if vehicle.reports else 1
+    vehicle.reports.append((number, message.integer("severity"), text))
     if vehicle.stack.tells_path_lost(text):
         vehicle.path_lost = True
     if vehicle.stack.tells_failsafe(text):
         vehicle.failsafe_text, vehicle.failsafe_text_at = text, now
+
+
+def _wind(vehicle: Vehicle, message: Message, now: float) -> None:
+    from_deg, speed_mps = message.real("direction"), message.real("speed")
+    if math.isfinite(from_deg) and math.isfinite(speed_mps):
+        vehicle.wind_from_deg, vehicle.wind_mps, vehicle.wind_at = from_deg % 360.0, speed_mps, now
 
 
 _HANDLERS = {
@@ -141,4 +152,5 @@ _HANDLERS = {
     "EKF_STATUS_REPORT": _estimator,
     "GPS_RAW_INT": _gps,
     "STATUSTEXT": _text,
+    "WIND": _wind,
 }

@@ -20,7 +20,7 @@ from fractus_services.errors import AutopilotError, PreconditionFailed, Refused,
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.authority.readiness import ready
+from fractus_services.mobility.authority.readiness import arming_problem
 from fractus_services.mobility.flight.service import MobilityService, Progress
 from fractus_services.mobility.rpc.arguments import (
     acceptance_radius_m,
@@ -229,6 +229,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
             interval = max(wanted, MIN_INTERVAL_S) if math.isfinite(wanted) and wanted > 0 else DEFAULT_INTERVAL_S
             loop = asyncio.get_running_loop()
             judged = due = -math.inf
+            heard = 0
             while True:
                 if loop.time() - judged >= JUDGE_INTERVAL_S:
                     judged = loop.time()
@@ -237,9 +238,16 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
                         self._service.calls.allow(Call("GetPosition"), self._grant_of(caller))
                 if loop.time() >= due:
                     due = loop.time() + interval
-                    control = self._control
-                    await context.write(telemetry_of(control, self._clock(), missions=node, ready=ready(control)))
+                    sample = self._sample(missions=node, heard=heard)
+                    heard = sample.texts[-1].number if sample.texts else heard
+                    await context.write(sample)
                 await asyncio.sleep(max(min(due - loop.time(), JUDGE_INTERVAL_S), 0.0))
+
+    def _sample(self, *, missions: bool, heard: int) -> mobility_pb2.Telemetry:
+        control = self._control
+        return telemetry_of(
+            control, self._clock(), missions=missions, not_ready_reason=arming_problem(control), heard=heard
+        )
 
 
 def _known(error: Exception) -> Refused | None:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_proto.v1 import mobility_pb2, types_pb2
 
 from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.autopilot import MAX_POSITION_AGE_S, VehicleState
+from fractus_services.mobility.autopilot import MAX_POSITION_AGE_S, WIND_MAX_AGE_S, VehicleState
 
 
 def position_of(vehicle: VehicleState) -> types_pb2.Position:
@@ -46,14 +45,17 @@ def _ended(outcome: Outcome) -> mobility_pb2.MissionOutcome:
     return mobility_pb2.MissionOutcome(kind=_KINDS[outcome.kind], reason=outcome.reason)
 
 
-def telemetry_of(control: Control, time_s: float, *, missions: bool, ready: bool) -> Any:
+def telemetry_of(
+    control: Control, time_s: float, *, missions: bool, not_ready_reason: str, heard: int
+) -> mobility_pb2.Telemetry:
     """The message that subscribers get.
 
     Args:
         control: who flies, and what.
         time_s: Unix time.
         missions: whether the subscriber may know of the missions of all applications.
-        ready: whether the motors could be started now.
+        not_ready_reason: why the motors could not be started now; empty when they could.
+        heard: number of the last of the autopilot's texts that the subscriber has.
     """
     vehicle = control.autopilot.vehicle
     message = mobility_pb2.Telemetry(
@@ -65,7 +67,8 @@ def telemetry_of(control: Control, time_s: float, *, missions: bool, ready: bool
         armed=vehicle.armed,
         in_air=vehicle.in_air,
         mode=vehicle.mode.name,
-        ready=ready,
+        ready=not not_ready_reason,
+        not_ready_reason=not_ready_reason,
         flight_state=vehicle.flight_state,
         controller=control.state.controller,
         autopilot_connected=control.autopilot.connected,
@@ -82,6 +85,13 @@ def telemetry_of(control: Control, time_s: float, *, missions: bool, ready: bool
         message.attitude_age_s = max(attitude_age_s, 0.0)
         message.attitude.roll_deg, message.attitude.pitch_deg = vehicle.roll_deg, vehicle.pitch_deg
         message.attitude.yaw_deg = vehicle.heading_deg
+    if vehicle.satellites is not None:
+        message.gps.fix_type, message.gps.satellites = vehicle.fix_type, vehicle.satellites
+    if control.autopilot.now - vehicle.wind_at <= WIND_MAX_AGE_S:
+        message.wind.from_deg, message.wind.speed_mps = vehicle.wind_from_deg, vehicle.wind_mps
+    for number, severity, text in vehicle.reports:
+        if number > heard:
+            message.texts.add(number=number, severity=severity, text=text)
     if vehicle.home is not None:
         message.home.latitude_deg, message.home.longitude_deg = vehicle.home.lat, vehicle.home.lon
         message.home.altitude_m = vehicle.home.amsl_m

@@ -5,7 +5,7 @@ from fractus_kube.blocking import BlockingClient
 from fractus_kube.client import Client, Page
 from fractus_kube.connection import ContentType
 from fractus_kube.errors import Conflict, Expired, Invalid, KubeError, NotFound
-from fractus_kube.lease import LEASE, Lease, LostLease
+from fractus_kube.lease import LEASE, Lease, LeaseThread, LostLease
 from fractus_kube.objects import Body, Key, Kind, key_of
 from fractus_kube.pace import Backoff
 from fractus_kube.reflector import Reflector
@@ -25,6 +25,7 @@ __all__ = [
     "Kind",
     "KubeError",
     "Lease",
+    "LeaseThread",
     "LostLease",
     "NotFound",
     "Page",

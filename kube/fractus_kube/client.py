@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 
 from fractus_kube.connection import Connection, ContentType, translated
 from fractus_kube.errors import Conflict, NotFound, from_status
@@ -93,6 +93,7 @@ class Client(Connection):
         selectors: Mapping[str, str] | None = None,
         timeout_s: int,
         silence_s: float,
+        opened: Callable[[], None] = lambda: None,
     ) -> AsyncIterator[tuple[str, Body]]:
         """Follow a collection: (ADDED | MODIFIED | DELETED | BOOKMARK, object), until the server ends it.
 
@@ -104,6 +105,7 @@ class Client(Connection):
             timeout_s: The server ends the watch after this time.
             silence_s: The connection counts as dead after this time without a byte (the server sends a
                 bookmark about every minute).
+            opened: Called once the API server has begun to answer, which may be long before the first event.
 
         Raises:
             Expired: the resource version is too old.
@@ -117,6 +119,7 @@ class Client(Connection):
         }
         with translated(f"watch of {kind.plural}"):
             async with self.answer("GET", kind.path(namespace), params, silence_s=silence_s) as response:
+                opened()
                 rest = b""
                 while True:
                     # aiohttp's own time-out ends with the connection, also where that never tells the reader.

@@ -7,8 +7,10 @@ this one never lets two act at once.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
-from collections.abc import Callable
+import threading
+from collections.abc import Awaitable, Callable
 from datetime import UTC, datetime, timedelta
 
 from fractus_kube.client import Client
@@ -162,3 +164,74 @@ class Lease:
                     await self._client.replace(LEASE, self._wanted(body, free=True))
         except (KubeError, TimeoutError) as error:
             logger.info("lease: not released: %s", error)
+
+
+class LeaseThread:
+    """A Lease that is kept in a thread with an event loop of its own: what keeps the caller's loop busy delays no renewal.
+
+    Args:
+        connect: Makes the client, in that thread.
+        key: Namespace and name of the Lease.
+        identity: Who asks.
+        duration_s: How long no other process may act after the holder was last heard of.
+        time: Monotonic seconds, which go on while the process is frozen.
+    """
+
+    def __init__(
+        self,
+        connect: Callable[[], Awaitable[Client]],
+        key: Key,
+        identity: str,
+        duration_s: float,
+        time: Callable[[], float],
+    ) -> None:
+        self._connect = connect
+        self._rest = (key, identity, duration_s, time)
+        self._lease: Lease | None = None
+        self._acquired = asyncio.Event()
+
+    @property
+    def left_s(self) -> float:
+        """Seconds for which this process may still act; none where it does not hold the Lease. Any thread may ask."""
+        return self._lease.left_s if self._lease is not None else 0.0
+
+    async def held(self) -> None:
+        """Wait until this process may act for the first time."""
+        await self._acquired.wait()
+
+    async def run(self) -> None:
+        """Take the Lease and keep it, until cancelled; it is given back then, before this returns.
+
+        Raises:
+            LostLease: another process has held it since.
+            Unconfigured: there are no credentials.
+        """
+        caller, stop, cancelled = asyncio.get_running_loop(), asyncio.Event(), threading.Event()
+        inside: list[asyncio.AbstractEventLoop] = []
+
+        async def keep() -> None:
+            inside.append(asyncio.get_running_loop())
+            if cancelled.is_set():
+                return
+            async with contextlib.aclosing(await self._connect()) as client:
+                self._lease = Lease(client, *self._rest)
+                parts = [asyncio.create_task(part) for part in (self._lease.run(), stop.wait(), self._lease.held())]
+                parts[2].add_done_callback(lambda _: caller.call_soon_threadsafe(self._acquired.set))
+                try:
+                    await asyncio.wait(parts[:2], return_when=asyncio.FIRST_COMPLETED)
+                    if not stop.is_set():
+                        parts[0].result()
+                finally:
+                    for part in parts:
+                        part.cancel()
+                    await asyncio.gather(*parts, return_exceptions=True)
+
+        thread = asyncio.ensure_future(asyncio.to_thread(asyncio.run, keep()))
+        try:
+            await asyncio.shield(thread)
+        except asyncio.CancelledError:
+            cancelled.set()
+            if inside and not thread.done():
+                inside[0].call_soon_threadsafe(stop.set)
+            await asyncio.gather(thread, return_exceptions=True)
+            raise

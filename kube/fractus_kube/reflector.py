@@ -48,6 +48,8 @@ class Reflector(Generic[T]):
         self._namespace = namespace
         self.synced = asyncio.Event()
         self.restarts = 0
+        self.watching = False
+        """Whether a watch is open: what changes at the API server is heard of, as far as the connection holds."""
         self._client = client
         self._parse = parse
         self._on_change = on_change
@@ -114,12 +116,17 @@ class Reflector(Generic[T]):
                 ended = False
             else:
                 ended = True
+            self.watching = False
             steady = loop.time() - opened_s >= _STEADY_S
             if steady:
                 self._backoff.succeeded()
             if not (steady and ended):
                 await asyncio.sleep(self._backoff.delay_s())
             self.restarts += 1
+
+    def _opened(self) -> None:
+        self.watching = True
+        self._heard()
 
     def _heard(self) -> None:
         self._last_contact = asyncio.get_running_loop().time()
@@ -157,6 +164,7 @@ class Reflector(Generic[T]):
             selectors=self._selectors,
             timeout_s=timeout_s,
             silence_s=_SILENCE_S,
+            opened=self._opened,
         ):
             self._heard()
             if type_ != "BOOKMARK":

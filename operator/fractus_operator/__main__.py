@@ -19,7 +19,7 @@ from fractus_core.identity.authority import BrokenAuthority
 from fractus_operator import handlers
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Key, Kind
-from fractus_operator.cluster.store import KubeError, Lease, LostLease, Store, Unconfigured
+from fractus_operator.cluster.store import KubeError, LeaseThread, LostLease, Store, Unconfigured
 from fractus_operator.identity.ca_secret import open_authority
 from fractus_operator.identity.node_requests import NodeSigning
 from fractus_operator.inventory.live import LiveInventory
@@ -30,7 +30,7 @@ from fractus_operator.reconcile.node_reports import NodeReports
 from fractus_operator.reconcile.orphans import Orphans
 from fractus_operator.reconcile.readiness import Readiness
 from fractus_operator.reconcile.service_rollout import ServiceRollout
-from fractus_operator.reconcile.silence import SilenceWatch
+from fractus_operator.reconcile.silence import HearingClock, SilenceWatch
 from fractus_operator.reconcile.worklist import Worklist, regularly
 from fractus_operator.settings import BadSetting, Settings
 from fractus_operator.standby import standing_by
@@ -54,10 +54,9 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         settings: How to run.
         stop: Set it to end the operator; signals do so as well.
     """
-    # The Lease has a connection of its own: no burst of other requests keeps a renewal waiting.
-    beside = await Store.connect()
     identity = settings.identity or f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
-    lease = Lease(beside, (settings.namespace, LEASE_NAME), identity, settings.lease_s, time.monotonic)
+    # The Lease has a thread and a connection of its own: neither a long plan nor a burst of requests keeps a renewal waiting.
+    lease = LeaseThread(Store.connect, (settings.namespace, LEASE_NAME), identity, settings.lease_s, time.monotonic)
     store = await Store.connect(may_write_s=lambda: lease.left_s)
     keeping = asyncio.create_task(lease.run())
     try:
@@ -70,8 +69,11 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         background: list[Coroutine[Any, Any, None]] = [reflector.run() for reflector in live.reflectors()]
         background += [worklist.run() for worklist in worklists(store, live, signing)]
         reports = NodeReports(store, live, _now)
-        watch = SilenceWatch(live, reports, time.monotonic)
-        rollout = ServiceRollout(store, live, reports)
+        # The Lease tells sooner than a watch that the API server is out of reach.
+        watched = (live.drones, live.edge_nodes)
+        hearing = HearingClock(time.monotonic, lambda: all(r.watching for r in watched) and lease.left_s > 0)
+        watch = SilenceWatch(live, reports, hearing.now_s)
+        rollout = ServiceRollout(store, live, reports, time.monotonic)
         background += [regularly("silence", watch.step, silence.PERIOD_S)]
         background += [regularly("services", rollout.step, service_rollout.PERIOD_S)]
         # Cancelling what waits for the lease must not cancel the lease: the last writes need it.
@@ -82,10 +84,9 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         keeping.cancel()
         await asyncio.gather(keeping, return_exceptions=True)
         await store.aclose()
-        await beside.aclose()
 
 
-async def _leading(lease: Lease, keeping: asyncio.Task[None]) -> None:
+async def _leading(lease: LeaseThread, keeping: asyncio.Task[None]) -> None:
     """Wait until this operator is the leader, or the election failed."""
     held = asyncio.create_task(lease.held())
     done, _ = await asyncio.wait((held, keeping), return_when=asyncio.FIRST_COMPLETED)

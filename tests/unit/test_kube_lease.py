@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import copy
+import time
 from typing import Any, cast
 
 import pytest
-from fractus_kube import Body, Client, Conflict, Kind, KubeError, Lease, LostLease, NotFound, key_of
+from fractus_kube import Body, Client, Conflict, Kind, KubeError, Lease, LeaseThread, LostLease, NotFound, key_of
 from fractus_kube import lease as lease_module
 
 DURATION_S = 10.0
@@ -228,3 +229,57 @@ async def test_a_renewal_whose_answer_never_came_is_given_back() -> None:
     writes = shelf.writes
     await first._give_back()
     assert shelf.writes == writes, "what another holds is not given back"
+
+
+class _Closable(Shelf):
+    closed = False
+
+    async def aclose(self) -> None:
+        self.closed = True
+
+
+def _kept_in_a_thread(shelf: _Closable, identity: str, duration_s: float) -> LeaseThread:
+    async def connect() -> Client:
+        return cast(Client, shelf)
+
+    return LeaseThread(connect, ("system", "fractus-operator"), identity, duration_s, time.monotonic)
+
+
+async def test_a_busy_loop_loses_no_lease() -> None:
+    shelf = _Closable()
+    kept = _kept_in_a_thread(shelf, "busy", 1.0)
+    task = asyncio.create_task(kept.run())
+    async with asyncio.timeout(20.0):
+        await kept.held()
+    end = time.monotonic() + 3.0
+    while time.monotonic() < end:
+        sum(range(1000))
+    assert kept.left_s > 0
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    assert kept.left_s == 0
+    assert shelf.body is not None
+    assert shelf.body["spec"]["holderIdentity"] == "", "given back"
+    assert shelf.closed
+
+
+async def test_a_lease_that_another_took_ends_what_keeps_it() -> None:
+    shelf = _Closable()
+    kept = _kept_in_a_thread(shelf, "first", 0.5)
+    task = asyncio.create_task(kept.run())
+    async with asyncio.timeout(20.0):
+        await kept.held()
+        assert shelf.body is not None
+        shelf.body["spec"] |= {"holderIdentity": "second", "leaseTransitions": 7}
+        with pytest.raises(LostLease, match="second has acted"):
+            await task
+    assert kept.left_s <= 0.5
+
+
+async def test_one_that_is_ended_at_once_ends() -> None:
+    task = asyncio.create_task(_kept_in_a_thread(_Closable(), "short", 1.0).run())
+    await asyncio.sleep(0)
+    task.cancel()
+    async with asyncio.timeout(20.0):
+        await asyncio.gather(task, return_exceptions=True)
+    assert task.cancelled()

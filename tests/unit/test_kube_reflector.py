@@ -221,3 +221,33 @@ async def test_an_answer_between_two_pages_is_no_newer_than_the_list() -> None:
 def test_paths_of_objects() -> None:
     assert ZONE.path(name="a", subresource="status") == "/apis/fractus.dev/v1alpha1/zones/a/status"
     assert POLICY.path() == "/apis/fractus.dev/v1alpha1/policies"
+
+
+async def test_it_knows_whether_a_watch_is_open() -> None:
+    ended, is_open, listed_again = asyncio.Event(), asyncio.Event(), asyncio.Event()
+
+    class Watched(Script):
+        async def watch(self, kind: Any, *, opened: Any, **_: Any) -> AsyncIterator[tuple[str, Body]]:
+            opened()
+            is_open.set()
+            await ended.wait()
+            raise KubeError(400, "Invalid", "gone")
+            yield
+
+        async def list_page(self, kind: Any, **_: Any) -> Page:
+            if ended.is_set():
+                listed_again.set()
+                await asyncio.Event().wait()
+            return Page(page(1))
+
+    kept = Reflector(Watched(), ZONE, lambda body: body, lambda *_: None)  # type: ignore[arg-type]
+    assert not kept.watching
+    task = asyncio.create_task(kept.run())
+    async with asyncio.timeout(20.0):
+        await is_open.wait()
+        assert kept.watching
+        ended.set()
+        await listed_again.wait()
+        assert not kept.watching
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)

@@ -13,9 +13,10 @@ from fractus_operator.cluster.pods import PodView, read_pod
 from fractus_operator.cluster.store import KubeError, Store
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.inventory.node_services import NodeServices, Revision, read_revision
+from fractus_operator.reconcile.conditions import ConditionUpdate
 from fractus_operator.reconcile.node_reports import NodeReports
 from fractus_operator.reconcile.service_rollout import ServiceRollout, ServicesOfNode, next_step
-from fractus_operator.reconcile.silence import Silence, SilenceWatch
+from fractus_operator.reconcile.silence import HearingClock, Silence, SilenceWatch
 
 V1 = "fractus.dev/v1alpha1"
 
@@ -32,21 +33,29 @@ def pod(node: str = "d1", revision: str = "new", **changes: Any) -> PodView:
     return read_pod({"metadata": metadata | changes, "spec": {"nodeName": node}})
 
 
-def node(name: str, *, outdated: bool = True, starting: bool = False, obstacle: str = "") -> ServicesOfNode:
+def node(
+    name: str, *, outdated: bool = True, starting: bool = False, obstacle: str = "", starting_s: float = 0.0
+) -> ServicesOfNode:
     pods = (pod(name, "old"),) if outdated else ()
-    return ServicesOfNode(name, pods, ("m",) if starting else (), (obstacle, f"{name} is so") if obstacle else None)
+    waited_for = {"fractus-mobility": "m"} if starting else {}
+    return ServicesOfNode(name, pods, waited_for, (obstacle, f"{name} is so") if obstacle else None, starting_s)
+
+
+def step_of(*nodes: ServicesOfNode, ready: int = 0) -> tuple[list[str], dict[str, ConditionUpdate]]:
+    chosen, said = next_step(nodes, len(nodes), lambda _: ready)
+    return [n.node for n in chosen], said
 
 
 def test_one_node_is_replaced_at_a_time() -> None:
-    chosen, said = next_step([node("d1"), node("d2"), node("d3")])
-    assert [n.node for n in chosen] == ["d1"]
+    chosen, said = step_of(node("d1"), node("d2"), node("d3"))
+    assert chosen == ["d1"]
     assert [said[n].reason for n in ("d1", "d2", "d3")] == ["Replacing", "Queued", "Queued"]
     assert "once the services of d1 are ready" in said["d2"].message
     assert "m-d2-old" in said["d2"].message
 
 
-def test_a_release_that_does_not_start_stops_at_the_first_node() -> None:
-    chosen, said = next_step([node("d1", outdated=False, starting=True), node("d2")])
+def test_others_wait_for_services_that_start() -> None:
+    chosen, said = step_of(node("d1", outdated=False, starting=True), node("d2"))
     assert not chosen
     assert said["d1"].reason == "Starting"
     assert "once the services of d1 are ready" in said["d2"].message
@@ -54,20 +63,42 @@ def test_a_release_that_does_not_start_stops_at_the_first_node() -> None:
 
 @pytest.mark.parametrize("obstacle", ["InTheAir", "OnMission", "NodeUnreachable"])
 def test_a_drone_that_flies_may_fly_or_is_out_of_reach_keeps_its_services(obstacle: str) -> None:
-    chosen, said = next_step([node("d1", obstacle=obstacle), node("d2")])
-    assert [n.node for n in chosen] == ["d2"], "and no other waits for it"
+    chosen, said = step_of(node("d1", obstacle=obstacle), node("d2"))
+    assert chosen == ["d2"], "and no other waits for it"
     assert (said["d1"].status, said["d1"].reason) == ("False", obstacle)
     assert "d1 is so" in said["d1"].message
 
 
 def test_a_node_out_of_reach_holds_no_other_up() -> None:
-    chosen, _ = next_step([node("d1", outdated=False, starting=True, obstacle="NodeUnreachable"), node("d2")])
-    assert [n.node for n in chosen] == ["d2"]
+    chosen, _ = step_of(node("d1", outdated=False, starting=True, obstacle="NodeUnreachable"), node("d2"))
+    assert chosen == ["d2"]
+
+
+STUCK = {"outdated": False, "starting": True, "starting_s": 601.0}
+
+
+def test_a_node_that_never_gets_ready_is_left_behind_and_said() -> None:
+    chosen, said = step_of(node("d1", **STUCK), node("d2"))
+    assert chosen == ["d2"]
+    assert (said["d1"].reason, said["d1"].warning) == ("NotReady", True)
+    assert "m: not ready for 10 minutes; other nodes go on without it" in said["d1"].message
+
+
+def test_a_release_that_does_not_start_stops_at_the_second_node() -> None:
+    failed = [node("d1", **STUCK), node("d2", **STUCK)]
+    chosen, said = step_of(*failed, node("d3"))
+    assert not chosen
+    assert "other nodes wait" in said["d1"].message
+    assert step_of(*failed, node("d3"), ready=2)[0] == ["d3"], "others run it"
+
+
+def test_what_runs_badly_already_is_replaced_last() -> None:
+    ready = replace(node("d2"), outdated=(replace(pod("d2", "old"), ready=True),))
+    assert step_of(node("d1"), ready)[0] == ["d2"]
 
 
 def test_large_fleets_take_one_of_twenty() -> None:
-    chosen, _ = next_step([node(f"d{i:03}") for i in range(100)])
-    assert len(chosen) == 5
+    assert len(step_of(*(node(f"d{i:03}") for i in range(100)))[0]) == 5
 
 
 def test_what_is_asked_for_is_the_revision_with_the_highest_number() -> None:
@@ -83,14 +114,33 @@ def test_what_is_asked_for_is_the_revision_with_the_highest_number() -> None:
     services.revision_changed(("", "a"), None, Revision("fractus-mobility", 3, "old"))
     assert (services.is_current(old), services.is_current(new)) == (True, False), "rolled back"
     services.pod_changed((old.namespace, old.name), old, None)
-    assert [(name, list(pods)) for name, pods in services.nodes()] == [("d1", [new])]
+    assert (len(services), list(services.on("d1"))) == (1, [new])
+    assert services.ready("fractus-mobility") == 0
+    for change in (replace(old, ready=True), old, replace(old, ready=True)):
+        services.pod_changed((old.namespace, old.name), services._pods["d1"].get((old.namespace, old.name)), change)
+    assert services.ready("fractus-mobility") == 1
+
+
+def test_only_what_changed_is_looked_at_again() -> None:
+    services = NodeServices("fractus-system")
+    for one in (pod("d1"), pod("d2")):
+        services.pod_changed((one.namespace, one.name), None, one)
+    assert services.take_changed() == {"d1", "d2"}
+    assert not services.take_changed()
+    services.revision_changed(("", "a"), None, Revision("fractus-mobility", 1, "old"))
+    assert services.take_changed() == {"d1", "d2"}, "another release is asked for"
+    services.revision_changed(("", "b"), None, Revision("fractus-mobility", 0, "older"))
+    assert not services.take_changed()
+    gone = pod("d2")
+    services.pod_changed((gone.namespace, gone.name), gone, None)
+    assert services.take_changed() == {"d2"}
 
 
 def test_pods_and_revisions_of_others_are_no_services() -> None:
     services = NodeServices("fractus-system")
     for other in (pod(ownerReferences=[]), pod(namespace="default")):
         services.pod_changed((other.namespace, other.name), None, other)
-    assert not list(services.nodes())
+    assert not len(services)
     assert read_revision({"metadata": {"name": "x", "namespace": "fractus-system"}, "revision": 1}) is None
 
 
@@ -138,6 +188,33 @@ def test_a_node_that_never_reported_is_not_silent() -> None:
     silence = Silence()
     for now_s in (0.0, 1000.0):
         assert not silence.silent([drone(None)], now_s)
+
+
+def test_an_outage_of_the_api_server_is_no_silence_of_nodes() -> None:
+    now_s, hears = [0.0], [True]
+    clock, silence = HearingClock(lambda: now_s[0], lambda: hears[0]), Silence()
+
+    def silent_after(seconds: int) -> bool:
+        found = False
+        for _ in range(seconds):
+            now_s[0] += 1.0
+            found = bool(silence.silent([drone(at(0))], clock.now_s()))
+        return found
+
+    assert not silent_after(5)
+    hears[0] = False
+    assert not silent_after(600)
+    hears[0] = True
+    assert not silent_after(15), "agents try again at most 15 s apart"
+    assert not silent_after(10)
+    assert silent_after(6)
+
+
+def test_an_operator_that_was_held_up_gives_nodes_their_time() -> None:
+    now_s = [0.0]
+    clock = HearingClock(lambda: now_s[0], lambda: True)
+    now_s[0] += 60.0
+    assert clock.now_s() <= 3.0
 
 
 # -- steps --
@@ -202,7 +279,8 @@ def told(api: Api, name: str, type_: str) -> str:
 
 async def test_a_pod_that_gets_no_successor_stops_the_rollout(live: LiveInventory) -> None:
     api = Api()
-    rollout = ServiceRollout(api, live, reported(live, api))
+    now_s = [0.0]
+    rollout = ServiceRollout(api, live, reported(live, api), lambda: now_s[0])
 
     async def step() -> list[str]:
         api.asked.clear()
@@ -215,6 +293,8 @@ async def test_a_pod_that_gets_no_successor_stops_the_rollout(live: LiveInventor
     assert await step() == ["m-d1-old"]
     removed(live, pod("d1", "old"))
     assert not await step(), "no other is deleted before the first has its successor"
+    now_s[0] = 600.0
+    assert not await step(), "nor before it was given its time"
     assert told(api, "d1", "ServicesCurrent") == "Starting"
     starting = pod("d1", "new")
     shown(live, starting)
@@ -226,6 +306,34 @@ async def test_a_pod_that_gets_no_successor_stops_the_rollout(live: LiveInventor
     assert await step() == ["m-d3-old"], "a node that is gone is owed nothing"
 
 
+async def test_a_node_that_never_gets_ready_keeps_no_other_from_a_release(live: LiveInventory) -> None:
+    api, now_s = Api(), [0.0]
+    rollout = ServiceRollout(api, live, reported(live, api), lambda: now_s[0])
+    await rollout.step()
+    removed(live, pod("d1", "old"))
+    shown(live, pod("d1", "new"))
+    for now_s[0] in (10.0, 605.0):
+        await rollout.step()
+        assert [name for method, name in api.asked if method == "DELETE"] == ["m-d1-old"]
+    now_s[0] = 620.0
+    await rollout.step()
+    assert [name for method, name in api.asked if method == "DELETE"] == ["m-d1-old", "m-d2-old"]
+    assert told(api, "d1", "ServicesCurrent") == "NotReady"
+
+
+async def test_a_fleet_that_is_as_it_should_be_is_not_looked_through(
+    live: LiveInventory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    live.services.revision_changed(("", "c"), None, Revision("fractus-mobility", 3, "old"))
+    for name in ("d1", "d2", "d3"):
+        shown(live, replace(pod(name, "old"), ready=True))
+    rollout = ServiceRollout(api := Api(), live, reported(live, api), lambda: 0.0)
+    await rollout.step()
+    monkeypatch.setattr(live.services, "on", None)
+    await rollout.step()
+    assert not api.asked
+
+
 async def test_a_pod_that_may_not_be_deleted_holds_no_other_back(live: LiveInventory) -> None:
     api = Api()
     for name in map(str, range(40)):
@@ -235,7 +343,7 @@ async def test_a_pod_that_may_not_be_deleted_holds_no_other_back(live: LiveInven
             {"metadata": {"name": f"e{name}"}, "status": {"conditions": [{"type": "Ready", "status": "True"}]}},
         )
     api.refused = {"m-d1-old", "d2"}
-    await ServiceRollout(api, live, reported(live, api)).step()
+    await ServiceRollout(api, live, reported(live, api), lambda: 0.0).step()
     assert [name for method, name in api.asked if method == "DELETE"] == ["m-d1-old", "m-d2-old"]
     assert told(api, "d1", "ServicesCurrent") == "Refused"
     assert told(api, "d3", "ServicesCurrent") == "Queued", "after d2, whose status is refused"

@@ -13,7 +13,6 @@ from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.identity.authority import Authority
 from fractus_core.identity.grant_signer import GrantSigner
 from fractus_core.planning.inventory import Inventory, Settings
-from fractus_core.planning.legality import with_legality
 from fractus_core.planning.plan import Infeasible
 from fractus_core.validation import check_application
 
@@ -35,6 +34,7 @@ from fractus_operator.reconcile.reporting import StatusReporter
 from fractus_operator.reconcile.rollout import Rollout
 from fractus_operator.reconcile.shared_flights import shared_flight_outcome
 from fractus_operator.reconcile.status import Blocked, Phase, StatusUpdate
+from fractus_operator.reconcile.way_notes import WayNotes
 
 logger = logging.getLogger(__name__)
 
@@ -46,9 +46,6 @@ _REST_FACTOR = 2.0
 
 EXCLUSION = timedelta(minutes=5)
 """How long a node that the scheduler refused is left out of an application's plans."""
-
-JUDGED_AGAIN = timedelta(minutes=1)
-"""How old it may be what the policies say of a way: zones and policies begin and end by the clock, too."""
 
 _OF_A_MISSION = (
     kinds.GRANT,
@@ -71,14 +68,6 @@ class _Memory:
 
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     excluded: dict[str, tuple[datetime, str]] = field(default_factory=dict)
-    judged: tuple[DeploymentPlanSpec, int, datetime] | None = None
-
-    def is_judged(self, plan: DeploymentPlanSpec, rules: int, now: datetime) -> bool:
-        """Whether what a plan says of policies is that of these rules."""
-        if self.judged is None:
-            return False
-        known, revision, then = self.judged
-        return known is plan and revision == rules and abs(now - then) < JUDGED_AGAIN
 
     def exclude(self, stuck: dict[str, str], now: datetime) -> dict[str, str]:
         """Leave nodes out of plans for a while; returns all that are, with the reason."""
@@ -106,6 +95,7 @@ class Applications:
         self._grants = ApplicationGrants(live, self._children, signer, self._settings)
         self._rollout = Rollout(self._children, live, authority, clock)
         self._reporter = StatusReporter(store, live.applications, clock)
+        self._notes = WayNotes(live.subscriptions.wake, clock)
         self._memories: dict[Key, _Memory] = {}
         self._torn_down: set[str] = set()
 
@@ -174,6 +164,7 @@ class Applications:
             await self._children.remove(key, *reversed(kinds.CHILDREN))
         self._memories.pop(key, None)
         self._grants.forget(key)
+        self._notes.forget(key)
         self._reporter.forget(key)
         self._live.forget(key)
 
@@ -275,9 +266,10 @@ class Applications:
         stuck = {node: why for node, why in stuck.items() if node != seen.in_flight}
         settings = replace(self._settings, excluded=memory.exclude(stuck, now), time_s=now.timestamp())
         present = seen.plan
-        if present is not None and not memory.is_judged(present, seen.rules, now):
-            present = with_legality(application, present, inventory, settings)
-            memory.judged = (present, seen.rules, now)
+        if present is not None:
+            present = self._notes.noted(
+                seen.key, application, present, rules=seen.rules, inventory=inventory, settings=settings
+            )
         choice = choose_plan(application, present, inventory, settings, stuck=stuck, in_flight=seen.in_flight)
         drone = choice.plan.drone
         if choice.plan is not seen.plan:
@@ -285,7 +277,7 @@ class Applications:
             why, node = choice.reason or "PoliciesChanged", drone.node if drone is not None else "none"
             logger.info("applications: planned (application=%s/%s reason=%s drone=%s)", *seen.key, why, node)
         if choice.reason is not None:
-            memory.judged = (choice.plan, seen.rules, now)
+            self._notes.put(seen.key, choice.plan, seen.rules)
         return choice.plan, (recheck_s or RESYNC_S) if choice.fits else RESYNC_S
 
     async def _begin_again(self, key: Key) -> bool:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
 
@@ -20,7 +21,9 @@ logger = logging.getLogger(__name__)
 CURRENT = "ServicesCurrent"
 PERIOD_S = 2.0
 _SHARE = 20
-"""One node of this many is replaced at a time: a release that does not start stops at the first."""
+"""One node of this many is replaced at a time."""
+STUCK_S = 600.0
+"""How long services may take to be ready, images pulled over slow links included, before others go on without their node."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,36 +32,51 @@ class ServicesOfNode:
 
     Attributes:
         outdated: pods that run another release than asked for.
-        starting: names of the others that are not ready yet, and DaemonSets that owe a pod.
+        starting: what is not ready of the release that is asked for: by DaemonSet, the pod's name, or its own where it owes one.
         obstacle: why nothing may be replaced now: a reason and a sentence.
+        starting_s: for how long that has been so, in seconds.
     """
 
     node: str
     outdated: Sequence[PodView]
-    starting: Sequence[str]
+    starting: Mapping[str, str]
     obstacle: tuple[str, str] | None
+    starting_s: float = 0.0
 
 
-def next_step(nodes: Iterable[ServicesOfNode]) -> tuple[list[ServicesOfNode], dict[str, ConditionUpdate]]:
-    """The nodes whose services are replaced now, and what is to be said of each node."""
-    nodes = tuple(nodes)
+def next_step(
+    nodes: Collection[ServicesOfNode], fleet: int, ready: Callable[[str], int]
+) -> tuple[list[ServicesOfNode], dict[str, ConditionUpdate]]:
+    """The nodes whose services are replaced now, and what is to be said of each node.
+
+    A release that does not start stops at the second node at the latest. A node that does not start it is left behind where
+    others run it.
+
+    Args:
+        nodes: All that are not as they should be; others may be among them.
+        fleet: How many nodes have services.
+        ready: How many nodes run what a DaemonSet asks for by now, and are ready.
+    """
     # A node out of reach tells nothing about the release.
-    busy = [node.node for node in nodes if node.starting and (node.obstacle or ("",))[0] != "NodeUnreachable"]
-    free = max(1, len(nodes) // _SHARE) - len(busy)
-    chosen: list[ServicesOfNode] = []
+    starting = [node for node in nodes if node.starting and (node.obstacle or ("",))[0] != "NodeUnreachable"]
+    stuck = [node for node in starting if node.starting_s > STUCK_S]
+    failed = Counter(daemon_set for node in stuck for daemon_set in node.starting)
+    skipped = {n.node for n in stuck if all(failed[d] <= max(1, ready(d)) for d in n.starting)}
+    busy = [node.node for node in starting if node.node not in skipped]
+    # What does not run well on a node already would say less of the release.
+    due = [node for node in nodes if node.outdated and node.obstacle is None]
+    due.sort(key=lambda node: not all(pod.ready for pod in node.outdated))
+    chosen = due[: max(0, max(1, fleet // _SHARE) - len(busy))]
+    replaced = {node.node for node in chosen}
     said: dict[str, ConditionUpdate] = {}
     for node in nodes:
         names = ", ".join(sorted(pod.name for pod in node.outdated))
         if not node.outdated:
-            waits = f"waiting for {', '.join(sorted(node.starting))}" if node.starting else ""
-            said[node.node] = ConditionUpdate(
-                CURRENT, "False" if waits else "True", "Starting" if waits else "Current", waits, progress=True
-            )
+            said[node.node] = _not_outdated(node, node.node in skipped)
         elif node.obstacle is not None:
             reason, why = node.obstacle
             said[node.node] = ConditionUpdate(CURRENT, "False", reason, f"{names}: {why}", progress=True)
-        elif len(chosen) < free:
-            chosen.append(node)
+        elif node.node in replaced:
             said[node.node] = ConditionUpdate(CURRENT, "False", "Replacing", f"{names}: being replaced", progress=True)
         else:
             before = (busy or [chosen[0].node])[0]
@@ -67,15 +85,31 @@ def next_step(nodes: Iterable[ServicesOfNode]) -> tuple[list[ServicesOfNode], di
     return chosen, said
 
 
+def _not_outdated(node: ServicesOfNode, skipped: bool) -> ConditionUpdate:
+    if not node.starting:
+        return ConditionUpdate(CURRENT, "True", "Current")
+    names = ", ".join(sorted(node.starting.values()))
+    if node.starting_s <= STUCK_S:
+        return ConditionUpdate(CURRENT, "False", "Starting", f"waiting for {names}", progress=True)
+    others = "other nodes go on without it" if skipped else "other nodes wait, as too few run this release"
+    why = f"{names}: not ready for {STUCK_S / 60:.0f} minutes; {others}: see kubectl -n fractus-system describe pods"
+    return ConditionUpdate(CURRENT, "False", "NotReady", why)
+
+
 class ServiceRollout:
     """Carries the steps out, and reports them in the condition ServicesCurrent of drones and edge nodes."""
 
-    def __init__(self, store: Store, live: LiveInventory, reports: NodeReports) -> None:
+    def __init__(self, store: Store, live: LiveInventory, reports: NodeReports, monotonic: Callable[[], float]) -> None:
         self._store = store
         self._live = live
         self._reports = reports
+        self._monotonic = monotonic
+        self._unsettled: set[str] = set()
+        """Nodes to look at; of the others everything is as it should be, and said."""
         self._owed: dict[str, set[str]] = {}
         """By node, the DaemonSets whose pods were deleted and have no ready successor yet, if they ever get one."""
+        self._starting: dict[str, tuple[Mapping[str, str], float]] = {}
+        """By node, what is starting, and since when."""
 
     async def step(self) -> None:
         """Replace what may be replaced now.
@@ -84,7 +118,11 @@ class ServiceRollout:
             KubeError: the API server cannot be reached.
         """
         await self._live.synced()
-        chosen, said = next_step(self._observe())
+        services = self._live.services
+        self._unsettled |= services.take_changed()
+        if not self._unsettled:
+            return
+        chosen, said = next_step(list(self._observe()), len(services), services.ready)
         for node in chosen:
             try:
                 await self._replace(node)
@@ -99,19 +137,30 @@ class ServiceRollout:
 
     def _observe(self) -> Iterable[ServicesOfNode]:
         held, services = self._live.claims(), self._live.services
-        found = dict(services.nodes())
-        for node in sorted({*found, *self._owed}):
-            pods = found.get(node, ())
+        for node in sorted(self._unsettled):
+            pods = services.on(node)
             outdated = tuple(p for p in pods if not p.terminating and not services.is_current(p))
             present = [p for p in pods if not p.terminating and p not in outdated]
             self._settle(node, {p.daemon_set for p in present if p.ready})
             if not pods and node not in self._owed:
+                self._unsettled.discard(node)
                 continue
             shown = {p.daemon_set for p in (*present, *outdated)}
-            starting = tuple(p.name for p in pods if p.terminating or (p not in outdated and not p.ready))
-            starting += tuple(sorted(self._owed.get(node, set()) - shown))
+            starting = {name: name for name in self._owed.get(node, set()) - shown}
+            starting |= {
+                str(p.daemon_set): p.name for p in pods if p.terminating or (p not in outdated and not p.ready)
+            }
             holder = held.get(node)
-            yield ServicesOfNode(node, outdated, starting, self._obstacle(node, holder.key if holder else None))
+            obstacle = self._obstacle(node, holder.key if holder else None)
+            yield ServicesOfNode(node, outdated, starting, obstacle, self._starting_s(node, starting))
+
+    def _starting_s(self, node: str, starting: Mapping[str, str]) -> float:
+        """For how long these have been starting."""
+        now_s = self._monotonic()
+        known, since_s = self._starting.pop(node, (starting, now_s))
+        if starting:
+            self._starting[node] = (starting, since_s if known == starting else now_s)
+        return now_s - since_s if known == starting else 0.0
 
     def _settle(self, node: str, ready: set[str | None]) -> None:
         """Forget the pods that a node is not owed any more: they are there, or their DaemonSet or the node is gone."""
@@ -139,7 +188,10 @@ class ServiceRollout:
 
     async def _report(self, said: Mapping[str, ConditionUpdate]) -> None:
         for name, update in said.items():
+            known = self._reports.condition(name, CURRENT)
             # Where nothing was ever outdated there is nothing to say.
-            if update.reason not in {"Current", "Starting"} or self._reports.condition(name, CURRENT) is not None:
+            if update.reason not in {"Current", "Starting"} or known is not None:
                 with one_of_many("services", name):
                     await self._reports.say(name, update)
+            if update.status == "True" and (known is None or known.status == "True"):
+                self._unsettled.discard(name)

@@ -24,6 +24,36 @@ PERIOD_S = 1.0
 _TIME = TypeAdapter(datetime)
 _MISSED = 3
 """Reports that are missed before a node counts as silent."""
+_COMES_BACK_S = 15.0
+"""How long after an outage of the API server an agent may pause before it tries again."""
+_MAX_STEP_S = 3 * PERIOD_S
+"""A step that comes later was held up, and so was what reflectors had to read."""
+
+
+class HearingClock:
+    """Seconds in which nodes could be heard: it stands still while the API server is out of reach, and until agents are back.
+
+    Args:
+        monotonic: Seconds that never jump.
+        hears: Whether reports that reach the API server are heard of here.
+    """
+
+    def __init__(self, monotonic: Callable[[], float], hears: Callable[[], bool]) -> None:
+        self._monotonic = monotonic
+        self._hears = hears
+        self._last_s = monotonic()
+        self._deaf_until_s = float("-inf")
+        self._heard_s = 0.0
+
+    def now_s(self) -> float:
+        """Its reading; asked for about once every PERIOD_S."""
+        now_s = self._monotonic()
+        if not self._hears():
+            self._deaf_until_s = now_s + _COMES_BACK_S
+        if now_s > self._deaf_until_s:
+            self._heard_s += min(now_s - self._last_s, _MAX_STEP_S)
+        self._last_s = now_s
+        return self._heard_s
 
 
 def patience_s(node: Drone | EdgeNode) -> float:
@@ -40,7 +70,7 @@ class Silence:
         self._heard: dict[tuple[str, str], tuple[datetime, float]] = {}
 
     def silent(self, nodes: Iterable[Drone | EdgeNode], now_s: float) -> list[Drone | EdgeNode]:
-        """The nodes that are not heard of any more, at a moment by a clock that never jumps.
+        """The nodes that are not heard of any more, at a moment by a HearingClock.
 
         One that never reported is not silent: nothing is shown of it that could be old.
         """
@@ -62,10 +92,10 @@ class Silence:
 class SilenceWatch:
     """Marks silent nodes: their state is unknown, and they are ready for nothing."""
 
-    def __init__(self, live: LiveInventory, reports: NodeReports, monotonic: Callable[[], float]) -> None:
+    def __init__(self, live: LiveInventory, reports: NodeReports, now_s: Callable[[], float]) -> None:
         self._live = live
         self._reports = reports
-        self._monotonic = monotonic
+        self._now_s = now_s
         self._silence = Silence()
 
     async def step(self) -> None:
@@ -76,10 +106,9 @@ class SilenceWatch:
         """
         await self._live.synced()
         nodes = [n for n in (*self._live.drones.values(), *self._live.edge_nodes.values()) if n is not None]
-        for node in self._silence.silent(nodes, self._monotonic()):
+        for node in self._silence.silent(nodes, self._now_s()):
             ready = readiness(node.status)
             if ready is None or ready.reason != SILENT:
-                logger.warning("silence: agent is not heard of any more (node=%s)", node.name)
                 with one_of_many("silence", node.name):
                     await self._mark(node)
 
@@ -94,6 +123,7 @@ class SilenceWatch:
             # The watch may be behind: what counts is what the API server has.
             if seen is None or _time(status.get("lastSeen")) != seen:
                 return False
+            logger.warning("silence: agent is not heard of any more (node=%s)", node.name)
             if isinstance(node, Drone):
                 if status.get("flightState", "unknown") != "unknown":
                     status["lastFlightState"] = status["flightState"]

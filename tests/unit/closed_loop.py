@@ -67,6 +67,7 @@ class Weather:
         gusts_mps: of the wind.
         speedup: the vehicle's time in seconds a second.
         cut: when the link is cut, and for how long; None: never.
+        stall: a busy machine lets no one of these run for so long, every few seconds: "service" or "vehicle".
     """
 
     there_s: float = 0.0
@@ -76,7 +77,11 @@ class Weather:
     gusts_mps: float = 0.0
     speedup: int = 1
     cut: tuple[float, float] | None = None
+    stall: tuple[str, float] | None = None
 
+
+STALL_EVERY_S = (2.0, 6.0)
+"""How often a process is stalled, if any is."""
 
 TURN_S = 1e-7
 """What a turn of the loop takes: without it, who waits for the rest of a rounded period would never see its end."""
@@ -139,6 +144,7 @@ class Sky(Loop):
         self.simulation = Simulation([config])
         self.craft = self.simulation.crafts[0]
         self.wires: list[Wire] = []
+        self.witnesses: list[Callable[[], object]] = []
 
     def _run_once(self) -> None:
         self._now += TURN_S
@@ -160,12 +166,31 @@ class Sky(Loop):
 
     async def turn(self) -> None:
         """The vehicle's time, until cancelled."""
+        stalls_at = self.time() + self.chance.uniform(*STALL_EVERY_S)
         while True:
-            for _ in range(self.weather.speedup):
-                self.simulation.step()
-            for wire in self.wires:
-                wire.flush()
+            self._go_on()
             await asyncio.sleep(CONTROL_STEP_S)
+            if self.weather.stall is not None and self.time() >= stalls_at:
+                await self._stall(*self.weather.stall)
+                stalls_at = self.time() + self.chance.uniform(*STALL_EVERY_S)
+
+    def _go_on(self, steps: int = 1) -> None:
+        for _ in range(steps * self.weather.speedup):
+            self.simulation.step()
+        for wire in self.wires:
+            wire.flush()
+        for witness in self.witnesses:
+            witness()
+
+    async def _stall(self, who: str, duration_s: float) -> None:
+        steps = round(duration_s / CONTROL_STEP_S)
+        if who == "vehicle":
+            await asyncio.sleep(duration_s)
+            self._go_on(steps)  # It makes up for the time that it lost.
+            return
+        for _ in range(steps):
+            self._now += CONTROL_STEP_S
+            self._go_on()
 
 
 @dataclass

@@ -10,16 +10,17 @@ import contextlib
 import math
 import random
 import tempfile
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncGenerator, Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import shapely
 from closed_loop import HALF_M, Account, Drone, Oracle, Sky, Weather
 from fractus_core.api.plans import GrantSpec
 from fractus_core.control import StreamState
 from fractus_core.policy.values import TakeoffArgs, VelocityArgs
-from fractus_services.errors import AutopilotError, Refused
+from fractus_services.errors import AutopilotError, Refused, Unavailable
 from fractus_services.grants import ActiveGrant
 from mobility_world import area, goto, spec, zone
 
@@ -34,12 +35,14 @@ class Attempt:
         kept_m: the least true distance from the wall; negative inside.
         permitted: how many setpoints were.
         denied: how many were not.
+        unavailable: how many of these because the position was not known at the moment.
         problem: why the drone did not fly at all.
     """
 
     kept_m: float = math.inf
     permitted: int = 0
     denied: int = 0
+    unavailable: int = 0
     problem: str = ""
     account: Account | None = None
 
@@ -72,19 +75,16 @@ class Flown:
         """Ask for a velocity."""
         try:
             await self.drone.service.set_velocity(self.grant, VelocityArgs(north, east, 0.0, None, hold_s))
-        except (Refused, AutopilotError):
+        except (Refused, AutopilotError) as error:
             self.attempt.denied += 1
+            self.attempt.unavailable += isinstance(error, Unavailable)
             return False
         self.attempt.permitted += 1
         return True
 
     async def to(self, x: float, y: float, speed: float = 10.0) -> None:
         """Fly to a place."""
-        async with contextlib.aclosing(
-            self.drone.service.goto(self.grant, goto(x, y, 15, speed_mps=speed), 0.0)
-        ) as leg:
-            async for _ in leg:
-                pass
+        await _again(lambda: self.drone.service.goto(self.grant, goto(x, y, 15, speed_mps=speed), 0.0))
 
 
 async def straight(flown: Flown) -> None:
@@ -135,6 +135,19 @@ def appears(away_m: float) -> Pilot:
     return pilot
 
 
+async def _again(motion: Callable[[], AsyncGenerator[Any]]) -> None:
+    """Fly a motion to its end, as often as it takes: the SDK tries again what is not available."""
+    for _ in range(20):
+        try:
+            async with contextlib.aclosing(motion()) as running:
+                async for _ in running:
+                    pass
+        except Unavailable:
+            await asyncio.sleep(0.2)
+        else:
+            return
+
+
 async def _fly(sky: Sky, pilot: Pilot, seed: int, directory: Path) -> Attempt:
     attempt = Attempt(account=Account(seed))
     assert attempt.account is not None
@@ -143,16 +156,15 @@ async def _fly(sky: Sky, pilot: Pilot, seed: int, directory: Path) -> Attempt:
     flown = Flown(drone, random.Random(seed), attempt, oracle, [WALL])
     grant = flown.put()
 
-    async def look() -> None:
-        while True:
-            x, y, height = oracle.place()
-            here = shapely.Point(x, y)
-            for wall in flown.walls if height > 1.0 else ():
-                away = -wall.exterior.distance(here) if wall.contains(here) else wall.distance(here)
-                attempt.kept_m = min(attempt.kept_m, float(away))
-            await asyncio.sleep(0.05)
+    def look() -> None:
+        x, y, height = oracle.place()
+        here = shapely.Point(x, y)
+        for wall in flown.walls if height > 1.0 else ():
+            away = -wall.exterior.distance(here) if wall.contains(here) else wall.distance(here)
+            attempt.kept_m = min(attempt.kept_m, float(away))
 
-    turning = [asyncio.ensure_future(sky.turn()), asyncio.ensure_future(look())]
+    sky.witnesses.append(look)
+    turning = [asyncio.ensure_future(sky.turn())]
     following = asyncio.ensure_future(drone.follow(grant))
     try:
         async with asyncio.timeout(120):
@@ -166,8 +178,11 @@ async def _fly(sky: Sky, pilot: Pilot, seed: int, directory: Path) -> Attempt:
                     attempt.problem = str(error)
                     await asyncio.sleep(1.0)
             attempt.problem = ""
-            async for _ in drone.service.take_off(grant, TakeoffArgs(15.0)):
-                pass
+            try:
+                async for _ in drone.service.take_off(grant, TakeoffArgs(15.0)):
+                    pass
+            except Unavailable:
+                await flown.to(0, 0)
             await pilot(flown)
     except TimeoutError:
         pass

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 from closed_loop import Weather
 from fractus_core.policy.motion import stop_point
 from fractus_core.policy.values import Situation
-from link_flights import appears, attempt, both
+from link_flights import appears, attempt, both, straight
 
 KEPT_M = 1.0
 """What docs/mobility.md promises of velocities and legs."""
@@ -43,6 +44,17 @@ def test_velocities_keep_their_distance_from_a_simulator_that_runs_faster(speedu
     flown = attempt(both, 9, weather(0.02, speedup=speedup))
     assert flown.kept_m >= KEPT_M
     assert flown.permitted > 30
+
+
+@pytest.mark.parametrize(("who", "speedup"), [("vehicle", 3), ("service", 5), ("vehicle", 5)])
+def test_velocities_keep_their_distance_on_a_machine_that_stalls_one_side(who: str, speedup: int) -> None:
+    """For a third of a second: of a fast vehicle's time more than a second, in which its position is not known."""
+    flown = attempt(straight, 10, replace(weather(0.02, speedup=speedup), stall=(who, 0.35)))
+    assert flown.kept_m >= KEPT_M
+    assert flown.permitted > 5
+    assert (flown.unavailable > 0) == (who == "vehicle")
+    assert flown.account is not None
+    assert not any("driver lost" in event for event in flown.account.events[:-3]), "who has the drone keeps it"
 
 
 NOTICED_S = 0.15

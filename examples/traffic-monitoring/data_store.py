@@ -16,10 +16,11 @@ RESULTS = Path("/tmp/results.jsonl")  # an emptyDir: survives a restart of the c
 MAX_BYTES = 32 * 2**20
 log = logging.getLogger("data-store")
 writing = threading.Lock()
+kept: set[str | None] = set()
 
 
 def keep(body: bytes, headers: Message) -> dict[str, Any]:
-    """Append a result.
+    """Append a result, unless it came before: two ImageCheckers may have looked at one picture when the path changed.
 
     Raises:
         ValueError: it is not a JSON object.
@@ -29,10 +30,15 @@ def keep(body: bytes, headers: Message) -> dict[str, Any]:
     if not isinstance(result, dict):
         raise ValueError("a result is a JSON object")  # noqa: TRY004 (the sender's mistake)
     line = json.dumps(result, separators=(",", ":")) + "\n"
+    request = result.get("request")
+    with writing:
+        if request is not None and request in kept:
+            return {"kept": False}
     with writing, RESULTS.open("a") as file:
         if file.tell() + len(line) > MAX_BYTES:
             raise OSError(f"the store is full at {MAX_BYTES} bytes")
         file.write(line)
+        kept.add(request)
     log.info("kept %s of %s", result.get("picture"), result.get("source"))
     return {"kept": True}
 
@@ -46,5 +52,7 @@ def results(body: bytes, headers: Message) -> list[Any]:
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    log.info("listening on port %d, %d results kept before", PORT, len(results(b"", Message())))
+    before = results(b"", Message())
+    kept.update(result.get("request") for result in before)
+    log.info("listening on port %d, %d results kept before", PORT, len(before))
     serve(PORT, get={"/results": results}, post={"/results": keep})

@@ -2,32 +2,34 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import json
 import logging
 import os
 import struct
-from email.message import Message
-from typing import Any
 
 import fractus
-from web import post, serve
+from web import post
 
 PORT = 8080
 log = logging.getLogger("image-checker")
 
 
-def check(picture: bytes, headers: Message) -> dict[str, Any]:
-    """What the picture is; the result goes to the DataStore.
+async def check(request: fractus.Request) -> bytes:
+    """What the picture is; the result goes to the DataStore, with the request's id, by which it knows a repeated one.
 
     Raises:
         ValueError: it is no picture.
-        OSError: the DataStore is away; the sender will come with another picture.
+        OSError: the DataStore is away; the sender repeats its request.
     """
+    line, _, picture = request.body.partition(b"\n")
+    told = json.loads(line)
     kind, width, height = measure(picture)
     result = {
-        "picture": headers.get("X-Picture", ""),
-        "source": headers.get("X-Source", ""),
+        "request": request.id,
+        "picture": str(told.get("picture", "")),
+        "source": str(told.get("source", "")),
         "by": os.environ.get("FRACTUS_INSTANCE", "") + "@" + os.environ.get("FRACTUS_NODE", ""),
         "kind": kind,
         "width": width,
@@ -36,9 +38,10 @@ def check(picture: bytes, headers: Message) -> dict[str, Any]:
         "sha256": hashlib.sha256(picture).hexdigest(),
         "summary": f"{kind} {width}x{height}, {8 * len(picture) / (width * height):.2f} bits a pixel",
     }
-    post(fractus.egress("DataStore"), "/results", json.dumps(result).encode(), {"Content-Type": "application/json"})
+    headers = {"Content-Type": "application/json"}
+    await asyncio.to_thread(post, fractus.egress("DataStore"), "/results", json.dumps(result).encode(), headers)
     log.info("%s from %s: %s", result["picture"], result["source"], result["summary"])
-    return result
+    return json.dumps(result).encode()
 
 
 def measure(picture: bytes) -> tuple[str, int, int]:
@@ -64,4 +67,4 @@ def measure(picture: bytes) -> tuple[str, int, int]:
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     log.info("listening on port %d", PORT)
-    serve(PORT, get={}, post={"/check": check})
+    asyncio.run(fractus.Responder({"check": check}, PORT).serve())

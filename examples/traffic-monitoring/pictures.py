@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
 import os
 import signal
@@ -10,7 +11,6 @@ import struct
 import zlib
 
 import fractus
-from web import post
 
 log = logging.getLogger("viewer")
 
@@ -19,21 +19,19 @@ async def watch(interval_s: float) -> None:
     """Take, fetch and send pictures until SIGTERM; what goes wrong with one of them is logged, and the next one taken."""
     stop = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
-    checker = fractus.egress("ImageChecker")
     number, said = 0, ""
-    async with fractus.camera(reconnect_timeout_s=1.0) as camera:
+    async with fractus.camera(reconnect_timeout_s=1.0) as camera, fractus.requester("ImageChecker") as checker:
         while not stop.is_set():
             number += 1
             try:
                 name, picture = await look(camera, number)
-                headers = {"X-Picture": name, "X-Source": os.environ["FRACTUS_INSTANCE"]}
-                found = await asyncio.to_thread(post, checker, "/check", picture, headers)
+                found = json.loads(await checker.ask("check", pack(name, os.environ["FRACTUS_INSTANCE"], picture)))
                 log.info("sent %s (%d bytes); %s found %s", name, len(picture), found["by"], found["summary"])
             except fractus.PolicyDenied as refusal:
                 if refusal.code != said:
                     log.info("no picture here: %s", refusal)
                 said = refusal.code
-            except (fractus.FractusError, OSError) as error:
+            except fractus.FractusError as error:
                 log.warning("picture %d: %s", number, error)
             else:
                 said = ""
@@ -50,6 +48,11 @@ async def look(camera: fractus.Camera, number: int) -> tuple[str, bytes]:
         return info.name, await camera.retrieve(info.name)
     except fractus.Unavailable:
         return f"test-{number}.png", render(160, 120, number)
+
+
+def pack(name: str, source: str, picture: bytes) -> bytes:
+    """A picture as it travels: a line of JSON that says whose it is, then its bytes."""
+    return json.dumps({"picture": name, "source": source}).encode() + b"\n" + picture
 
 
 def render(width: int, height: int, number: int) -> bytes:

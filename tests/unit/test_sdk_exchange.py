@@ -1,0 +1,142 @@
+"""Requests between components: repeated with the same id, carried out once, refused for good or for now."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+import grpc
+import pytest
+from fractus.errors import InvalidRequest, Unavailable
+from fractus.exchange import ID, SERVICE, Answers, Request, Requester, Responder
+
+
+class Worker:
+    """Counts what it carries out."""
+
+    def __init__(self) -> None:
+        self.done: list[str] = []
+        self.failures: list[Exception] = []
+        self.slow = asyncio.Event()
+        self.slow.set()
+
+    async def work(self, request: Request) -> bytes:
+        await self.slow.wait()
+        if self.failures:
+            raise self.failures.pop(0)
+        self.done.append(request.id)
+        return b"did " + request.body
+
+    @asynccontextmanager
+    async def serving(self) -> AsyncIterator[Responder]:
+        responder = Responder({"work": self.work}, 0)
+        await responder.start()
+        try:
+            yield responder
+        finally:
+            await responder.stop(0.0)
+
+
+async def until(condition: Callable[[], int]) -> None:
+    async with asyncio.timeout(20):
+        while not condition():  # noqa: ASYNC110 - what is waited for has no event
+            await asyncio.sleep(0.02)
+
+
+async def test_a_request_is_answered() -> None:
+    worker = Worker()
+    async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}") as asking:
+        assert await asking.ask("work", b"this") == b"did this"
+        assert await asking.ask("work", b"that") == b"did that"
+    assert len(set(worker.done)) == 2
+    assert asking.repeated == 0
+
+
+async def test_a_repetition_gets_the_first_answer() -> None:
+    worker = Worker()
+    async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}") as asking:
+        assert await asking.ask("work", b"this", request_id="r1") == b"did this"
+        assert await asking.ask("work", b"other", request_id="r1") == b"did this"
+        assert responder.answers.repeated == 1
+    assert worker.done == ["r1"]
+
+
+async def test_work_that_has_begun_is_waited_for_and_not_begun_again() -> None:
+    worker = Worker()
+    worker.slow.clear()
+    async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}", attempt_timeout_s=0.3) as asking:
+        answer = asyncio.ensure_future(asking.ask("work", b"slow"))
+        await until(lambda: responder.answers.repeated)
+        worker.slow.set()
+        assert await answer == b"did slow"
+    assert len(worker.done) == 1
+    assert asking.repeated >= 1
+
+
+@pytest.mark.parametrize("failure", [OSError("the store is away"), Unavailable("not yet")])
+async def test_what_fails_for_now_is_tried_again(failure: Exception) -> None:
+    worker = Worker()
+    worker.failures = [failure, failure]
+    async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}") as asking:
+        assert await asking.ask("work", b"x") == b"did x"
+    assert asking.repeated == 2
+
+
+async def test_what_is_refused_is_not_tried_again() -> None:
+    worker = Worker()
+    worker.failures = [ValueError("this is no picture")]
+    async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}") as asking:
+        with pytest.raises(InvalidRequest, match="this is no picture"):
+            await asking.ask("work", b"x")
+        with pytest.raises(InvalidRequest):
+            await asking.ask("play", b"x")
+        with pytest.raises(InvalidRequest, match="at most 16 MiB"):
+            await asking.ask("work", b"x" * (16 * 2**20 + 1))
+    assert asking.repeated == 0
+
+
+async def test_a_server_that_comes_back_is_found() -> None:
+    worker = Worker()
+    async with worker.serving() as responder:
+        port = responder.port
+    async with Requester(f"127.0.0.1:{port}") as asking:
+        answer = asyncio.ensure_future(asking.ask("work", b"x"))
+        await until(lambda: asking.repeated)
+        again = Responder({"work": worker.work}, port)
+        await again.start()
+        assert await answer == b"did x"
+        await again.stop(0.0)
+
+
+async def test_a_request_that_is_not_answered_ends_in_time() -> None:
+    worker = Worker()
+    async with worker.serving() as responder:
+        port = responder.port
+    async with Requester(f"127.0.0.1:{port}") as asking:
+        with pytest.raises(Unavailable, match="attempts"):
+            await asking.ask("work", b"x", timeout_s=0.5)
+
+
+async def test_requests_without_an_id_are_refused() -> None:
+    worker = Worker()
+    async with worker.serving() as responder, grpc.aio.insecure_channel(f"127.0.0.1:{responder.port}") as channel:
+        for metadata in ((), ((ID, "x" * 300),)):
+            with pytest.raises(grpc.aio.AioRpcError) as caught:
+                await channel.unary_unary(f"/{SERVICE}/work")(b"x", metadata=metadata)
+            assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT
+    assert not worker.done
+
+
+async def test_answers_are_forgotten_oldest_first() -> None:
+    async def echo(request: Request) -> bytes:
+        calls.append(request.id)
+        return request.body
+
+    calls: list[str] = []
+    for answers, size in ((Answers(2, 1000), 1), (Answers(1000, 20), 10)):
+        calls.clear()
+        for name in ("a", "b", "b", "c", "c", "a"):
+            assert await answers.once(Request(name, "echo", b"x" * size), echo) == b"x" * size
+            await asyncio.sleep(0)
+        assert calls == ["a", "b", "c", "a"]

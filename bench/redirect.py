@@ -19,11 +19,12 @@ from ipaddress import IPv4Address
 from pathlib import Path
 
 from fractus_agent.redirector.netlink import NETLINK_NETFILTER, Netlink, in_namespace
-from fractus_agent.redirector.nft import Endpoint, Maps, Redirect, create
+from fractus_agent.redirector.nft import Endpoint, Maps, Ports, Redirect, create
 
 SIZES = (1, 4, 16, 64)
 FOREIGN = 2000
 LEASE_S = 60.0
+PORTS = Ports(udp=46810, tcp=46811)
 
 
 class Side:
@@ -33,9 +34,9 @@ class Side:
         self.name = name
         self.inside = ["nsenter", f"--net=/run/netns/{name}"]
         subprocess.run(["ip", "netns", "add", name], check=True)
-        create("fxl*", self.inside)
+        create("fxl*", PORTS, self.inside)
         self.netlink = in_namespace(Path("/run/netns", name), lambda: Netlink(NETLINK_NETFILTER))
-        self.maps = Maps(self.netlink, lambda: create("fxl*", self.inside))
+        self.maps = Maps(self.netlink, lambda: create("fxl*", PORTS, self.inside))
 
     def run(self, *words: str) -> None:
         subprocess.run([*self.inside, *words], check=True, capture_output=True)

@@ -143,15 +143,21 @@ class Client(Connection):
         params = {"fieldManager": self.field_manager, "fieldValidation": "Strict" if strict else "Warn"}
         return await self.request("POST", kind.path(key_of(body)[0]), body, params=params)
 
-    async def apply(self, kind: Kind, body: Body, *, subresource: str = "") -> Body:
+    async def apply(self, kind: Kind, body: Body, *, subresource: str = "", field_manager: str | None = None) -> Body:
         """Make an object's fields as given, by server-side apply; fields of others stay.
 
         With metadata.uid in the body, an object that is gone, or another one of its name, is left alone.
 
+        Args:
+            kind: of the object.
+            body: the fields.
+            subresource: such as status.
+            field_manager: instead of the client's, where several programs of its name each say a part.
+
         Raises:
             Conflict: metadata.uid does not match.
         """
-        params = {"fieldManager": self.field_manager, "force": "true"}
+        params = {"fieldManager": field_manager or self.field_manager, "force": "true"}
         return await self.patch(kind, key_of(body), body, ContentType.APPLY, params=params, subresource=subresource)
 
     async def patch(

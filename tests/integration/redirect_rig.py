@@ -11,10 +11,12 @@ from ipaddress import IPv4Address
 from pathlib import Path
 
 from fractus_agent.redirector.netlink import NETLINK_NETFILTER, Netlink, in_namespace
-from fractus_agent.redirector.nft import Endpoint, Maps, Redirect, create
+from fractus_agent.redirector.nft import Endpoint, Maps, Ports, Redirect, create
 
 VIP = Endpoint(IPv4Address("10.96.0.5"), 8080)
 DIRECT = Endpoint(IPv4Address("10.77.0.2"), 9000)
+DRONE = IPv4Address("10.77.0.1")
+PORTS = Ports(udp=46810, tcp=46811)
 POD = Endpoint(IPv4Address("10.88.0.2"), 8080)
 
 SERVER = """
@@ -100,8 +102,8 @@ class Rig:
         run(*self.inside("cloud"), "ip", "addr", "add", f"{VIP.address}/32", "dev", "lo")
         run(*self.inside("cloud"), "ip", "route", "add", "default", "via", "10.90.0.1")
         for node in ("drone", "edge"):
-            create("fxl*", self.inside(node))
-        self.maps("edge").write([Redirect(DIRECT, POD)], (), 600.0)
+            create("fxl*", PORTS, self.inside(node))
+        self.maps("edge").write([Redirect(DIRECT, POD)], [(DIRECT, 1)], 600.0, [DRONE])
 
     def _link(self, left: str, device: str, address: str, right: str, other: str, peer: str) -> None:
         run(
@@ -114,7 +116,7 @@ class Rig:
 
     def maps(self, node: str) -> Maps:
         """The maps of a node, whose table is made again when it is gone."""
-        return Maps(self.netlink(node), lambda: create("fxl*", self.inside(node)))
+        return Maps(self.netlink(node), lambda: create("fxl*", PORTS, self.inside(node)))
 
     def netlink(self, node: str, protocol: int = NETLINK_NETFILTER) -> Netlink:
         """A netlink socket in a namespace."""

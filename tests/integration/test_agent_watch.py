@@ -11,12 +11,13 @@ from typing import Any
 import pytest
 from agent_pki import TestAuthority
 from agent_server import FRACTUS, ApiServer, running
+from fractus_agent.cluster import store as store_module
 from fractus_agent.cluster.store import (
     Changed,
     Conflict,
     Deleted,
+    Event,
     Expired,
-    GrantEvent,
     Invalid,
     KubeError,
     Listed,
@@ -63,11 +64,11 @@ async def store(**times: Any) -> AsyncIterator[Store]:
         await made.close()
 
 
-async def following(events: AsyncIterator[GrantEvent]) -> GrantEvent:
+async def following(events: AsyncIterator[Event]) -> Event:
     return await asyncio.wait_for(anext(events), WAIT_TIMEOUT_S)
 
 
-async def until(events: AsyncIterator[GrantEvent], wanted: type[GrantEvent]) -> GrantEvent:
+async def until(events: AsyncIterator[Event], wanted: type[Event]) -> Event:
     async with asyncio.timeout(WAIT_TIMEOUT_S):
         async for event in events:
             if isinstance(event, wanted):
@@ -84,9 +85,9 @@ async def served(watched: Store) -> None:
     assert not done
 
 
-def names(event: GrantEvent) -> set[str]:
+def names(event: Event) -> set[str]:
     assert isinstance(event, Listed)
-    return {g["metadata"]["name"] for g in event.grants}
+    return {g["metadata"]["name"] for g in event.objects}
 
 
 async def test_a_list_then_changes_of_this_node_only(server: ApiServer) -> None:
@@ -99,14 +100,15 @@ async def test_a_list_then_changes_of_this_node_only(server: ApiServer) -> None:
         server.post(f"{FRACTUS}/grants", grant("b"))
         event = await following(events)
         assert isinstance(event, Changed)
-        assert event.grant["metadata"]["name"] == "b"
+        assert event.object["metadata"]["name"] == "b"
         server.delete(f"{FRACTUS}/grants/a")
         assert await following(events) == Deleted("a")
 
 
 async def test_an_expired_version_leads_to_a_list(server: ApiServer) -> None:
     async with store() as watched:
-        _, old = await watched._list_grants()
+        grants = store_module._KINDS["Grant"], watched._own("node")
+        _, old = await watched._list(*grants)
         for number in range(3):
             server.post(f"{FRACTUS}/grants", grant(f"g{number}"))
         server.stop_apiserver()
@@ -115,16 +117,16 @@ async def test_an_expired_version_leads_to_a_list(server: ApiServer) -> None:
         # Storage of the kinds comes up a moment after the server says it is ready.
         await served(watched)
         with pytest.raises(Expired):
-            await until(watched._watch_grants(old), Deleted)
+            await until(watched._watch(*grants, old), Deleted)
 
-        real, used = watched._list_grants, []
+        real, used = watched._list, []
 
-        async def stale_at_first() -> tuple[tuple[dict[str, Any], ...], str]:
-            grants, version = await real()
+        async def stale_at_first(*of: Any) -> tuple[tuple[dict[str, Any], ...], str]:
+            objects, version = await real(*of)
             used.append(version)
-            return grants, old if len(used) == 1 else version
+            return objects, old if len(used) == 1 else version
 
-        watched._list_grants = stale_at_first  # type: ignore[method-assign]
+        watched._list = stale_at_first  # type: ignore[method-assign]
         events = watched.grants()
         assert names(await following(events)) == {"g0", "g1", "g2"}
         assert names(await following(events)) == {"g0", "g1", "g2"}

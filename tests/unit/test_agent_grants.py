@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_agent.cluster.store import Backoff, Changed, Deleted, GrantEvent, KubeError, Listed
+from fractus_agent.cluster.store import Backoff, Changed, Deleted, Event, KubeError, Listed
 from fractus_agent.grants.keeper import (
     UNVERIFIED_TIMEOUT_S,
     GrantDirectory,
@@ -52,7 +52,7 @@ class FakeStore:
         self.statuses.append((name, status))
         return {}
 
-    async def grants(self) -> AsyncIterator[GrantEvent]:
+    async def grants(self) -> AsyncIterator[Event]:
         raise NotImplementedError
         yield
 

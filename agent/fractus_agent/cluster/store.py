@@ -8,11 +8,12 @@ import contextlib
 import logging
 import os
 import time
-from collections.abc import AsyncGenerator, AsyncIterator
+from collections.abc import AsyncGenerator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
-from fractus_core.api import Drone, EdgeNode, Grant
+from fractus_core.api import DirectLink, Drone, EdgeNode, Grant
 from fractus_core.api.model import API_VERSION, GROUP
 from fractus_core.api.names import NODE_SIGNER
 from fractus_kube import (
@@ -36,6 +37,7 @@ __all__ = ["Backoff", "Conflict", "Expired", "Invalid", "KubeError", "Object", "
 LOG = logging.getLogger(__name__)
 
 Object = Body
+Selectors = Mapping[str, str]
 
 FIELD_MANAGER = "fractus-agent"
 SYSTEM_NAMESPACE = "fractus-system"
@@ -45,26 +47,28 @@ CALL_TIMEOUT_S = 20.0
 
 @dataclass(frozen=True, slots=True)
 class Listed:
-    """Every grant of the node, after a complete list."""
+    """Every object of the node, after a complete list."""
 
-    grants: tuple[Object, ...]
+    objects: tuple[Object, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Changed:
-    """A grant was made or changed."""
+    """An object was made or changed."""
 
-    grant: Object
+    object: Object
 
 
 @dataclass(frozen=True, slots=True)
 class Deleted:
-    """A grant was deleted."""
+    """An object was deleted."""
 
     name: str
 
 
-GrantEvent = Listed | Changed | Deleted
+Event = Listed | Changed | Deleted
+End = Literal["drone", "node"]
+"""Which end of its direct links a node is, as their specs name it: the one that asks, or the one that is asked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +86,8 @@ class WatchTimes:
 
 
 _KINDS = {
-    model.KIND: Kind(API_VERSION, model.KIND, model.PLURAL, namespaced=False) for model in (Drone, EdgeNode, Grant)
+    model.KIND: Kind(API_VERSION, model.KIND, model.PLURAL, namespaced=False)
+    for model in (Drone, EdgeNode, Grant, DirectLink)
 }
 _NODE = Kind("v1", "Node", "nodes", namespaced=False)
 _SIGNING_REQUEST = Kind("certificates.k8s.io/v1", "CertificateSigningRequest", "certificatesigningrequests", False)
@@ -110,7 +115,6 @@ class Store:
         self._client = client
         self._node = node
         self._times = times or WatchTimes()
-        self._selectors = {"fieldSelector": f"spec.node={node}"}
 
     async def node_labels(self) -> dict[str, str] | None:
         """Labels of the Kubernetes Node; None when there is no such node."""
@@ -137,11 +141,19 @@ class Store:
         """
         return await self._client.replace(_KINDS[body["kind"]], body)
 
-    async def apply_status(self, kind: str, name: str, status: Object) -> Object | None:
-        """Apply the agent's part of a status, server side; the whole object afterwards, None when it is absent."""
+    async def apply_status(self, kind: str, name: str, status: Object, end: End | None = None) -> Object | None:
+        """Apply the agent's part of a status, server side; the whole object afterwards, None when it is absent.
+
+        Args:
+            kind: of the object.
+            name: its name.
+            status: all that this agent says of it.
+            end: of a DirectLink, of which the agents of both ends each say a part.
+        """
         body = {**_KINDS[kind].header(name), "status": status}
+        manager = f"{FIELD_MANAGER}-{end}" if end else None
         try:
-            return await self._client.apply(_KINDS[kind], body, subresource="status")
+            return await self._client.apply(_KINDS[kind], body, subresource="status", field_manager=manager)
         except NotFound:
             return None
 
@@ -179,8 +191,19 @@ class Store:
             if name.startswith(f"fractus-{self._node}-"):
                 await self._client.delete(_SIGNING_REQUEST, ("", name))
 
-    async def grants(self) -> AsyncIterator[GrantEvent]:
-        """Grants of this node, indefinitely: a complete list, then changes, and a list again after any break.
+    def grants(self) -> AsyncGenerator[Event, None]:
+        """Grants of this node, as `_follow` tells of them."""
+        return self._follow(_KINDS["Grant"], self._own("node"))
+
+    def direct_links(self, end: End) -> AsyncGenerator[Event, None]:
+        """DirectLinks of this node, as `_follow` tells of them."""
+        return self._follow(_KINDS["DirectLink"], self._own(end))
+
+    def _own(self, field: str) -> Selectors:
+        return {"fieldSelector": f"spec.{field}={self._node}"}
+
+    async def _follow(self, kind: Kind, selectors: Selectors) -> AsyncGenerator[Event, None]:
+        """Objects, indefinitely: a complete list, then changes, and a list again after any break.
 
         A break is never taken for an empty list. After one the list is read again rather than the watch resumed: the
         list is short, and an API server restored from a backup may count versions from an earlier number.
@@ -189,18 +212,18 @@ class Store:
         while True:
             started_s = time.monotonic()
             try:
-                grants, version = await self._list_grants()
+                objects, version = await self._list(kind, selectors)
                 if backoff.attempts > 1:
-                    LOG.info("grants: the API server is back (attempts=%d)", backoff.attempts)
-                yield Listed(grants)
-                async with contextlib.aclosing(self._watch_grants(version)) as events:
+                    LOG.info("%s: the API server is back (attempts=%d)", kind.plural, backoff.attempts)
+                yield Listed(objects)
+                async with contextlib.aclosing(self._watch(kind, selectors, version)) as events:
                     async for event in events:
                         yield event
             except Expired:
-                LOG.debug("grants: the watch expired; listing again")
+                LOG.debug("%s: the watch expired; listing again", kind.plural)
             except KubeError as error:
                 level = logging.WARNING if backoff.attempts == 0 else logging.DEBUG
-                LOG.log(level, "grants: cannot be followed, keeping those on disk: %s", error)
+                LOG.log(level, "%s: cannot be followed, keeping those on disk: %s", kind.plural, error)
             if time.monotonic() - started_s > 30.0:
                 backoff.succeeded()
             await asyncio.sleep(backoff.delay_s())
@@ -215,26 +238,26 @@ class Store:
         except NotFound:
             return None
 
-    async def _list_grants(self) -> tuple[tuple[Object, ...], str]:
-        page = await self._client.list_whole(_KINDS["Grant"], selectors=self._selectors, timeout_s=CALL_TIMEOUT_S)
+    async def _list(self, kind: Kind, selectors: Selectors) -> tuple[tuple[Object, ...], str]:
+        page = await self._client.list_whole(kind, selectors=selectors, timeout_s=CALL_TIMEOUT_S)
         return tuple(page.items), page.resource_version
 
-    async def _watch_grants(self, version: str) -> AsyncGenerator[GrantEvent, None]:
+    async def _watch(self, kind: Kind, selectors: Selectors, version: str) -> AsyncGenerator[Event, None]:
         until_s = time.monotonic() + self._times.relist_s
         while time.monotonic() < until_s:
             opened_s = time.monotonic()
             events = self._client.watch(
-                _KINDS["Grant"],
+                kind,
                 resource_version=version,
-                selectors=self._selectors,
+                selectors=selectors,
                 timeout_s=self._times.server_s,
                 silence_s=self._times.silence_s,
             )
-            async for kind, body in events:
+            async for change, body in events:
                 version = body["metadata"]["resourceVersion"]
-                if kind == "DELETED":
+                if change == "DELETED":
                     yield Deleted(body["metadata"]["name"])
-                elif kind in ("ADDED", "MODIFIED"):
+                elif change in ("ADDED", "MODIFIED"):
                     yield Changed(body)
             if time.monotonic() - opened_s < 1.0:
                 raise KubeError(0, "Unreachable", "the API server closed the watch at once")

@@ -16,7 +16,7 @@ from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
 from fractus_storage import remove_file, write_file
 
-from fractus_agent.cluster.store import Changed, Deleted, GrantEvent, Listed, Object, Store
+from fractus_agent.cluster.store import Changed, Deleted, Event, Listed, Object, Store
 from fractus_agent.supervisor import repeat
 
 LOG = logging.getLogger(__name__)
@@ -166,7 +166,7 @@ class GrantKeeper:
         async for event in self._store.grants():
             self.take(event)
 
-    def take(self, event: GrantEvent) -> None:
+    def take(self, event: Event) -> None:
         """Apply one event to the disk."""
         match event:
             case Listed(grants):

@@ -83,13 +83,12 @@ class Connector:
         except (PairingFailed, OSError) as error:
             self._set(NO_LINK, str(error))
             return
-        reason = "the link was given up"
         try:
             self._set(Link(Phase.UP, peer, time.monotonic()), "paired")
-            reason = await self._hold(session)
+            # Told before the farewell: over a link that is lost it takes a while, and traffic must not wait for it.
+            self._set(NO_LINK, await self._hold(session))
         finally:
             await session.close()
-        self._set(NO_LINK, reason)
 
     async def _hold(self, session: Session) -> str:
         """Hold a session; why it is over."""

@@ -1,7 +1,8 @@
 """Pairing: both ends of a direct link prove their node certificates over TLS before any traffic moves, and stay in contact.
 
 The session is a line of JSON objects over TLS 1.3. The drone asks; the peer accepts, or refuses with a reason. After that the
-session carries heartbeats both ways, by which each end notices the loss of the link, and the routes of the other end.
+session carries heartbeats both ways, by which each end notices the loss of the link, short probes of its bandwidth, and what
+the ends tell each other of the traffic.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import asyncio
 import json
 import ssl
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,10 @@ LOSS_TIMEOUT_S = 0.4
 """Without a word for so long the link is lost; a link at the edge of its reach is no use either."""
 
 MAX_LINE_BYTES = 64 * 1024
+PROBE_BYTES = (6_000, 24_000, 48_000)
+"""Of a probe's bursts: each is sent only if the one before it was so quick that this one cannot delay heartbeats for long."""
+PROBE_TIMEOUT_S = 2.0
+BURST_LIMIT_S = 0.15
 SMOOTHING = 0.2
 
 
@@ -77,11 +82,14 @@ class Session:
     Attributes:
         peer: the node at the other end, as its certificate says.
         latency_ms: one way, half of the round trip, smoothed; None before the first answer.
+        told: called with each message of the other end that the session itself has no use for.
     """
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, peer: str) -> None:
         self.peer = peer
         self.latency_ms: float | None = None
+        self.told: Callable[[Mapping[str, Any]], None] = _ignored
+        self._arrived: asyncio.Future[None] | None = None
         self._reader = reader
         self._writer = writer
         self._heard_at = time.monotonic()
@@ -146,6 +154,36 @@ class Session:
                 way_ms = max(time.monotonic() - sent, 0.0) / 2 * 1e3
                 before = self.latency_ms
                 self.latency_ms = way_ms if before is None else before + SMOOTHING * (way_ms - before)
+            elif "probe" in message:
+                await self.send({"arrived": True})
+            elif "arrived" in message:
+                if self._arrived is not None and not self._arrived.done():
+                    self._arrived.set_result(None)
+            else:
+                self.told(message)
+
+    async def probe(self) -> float:
+        """Mbit/s towards the other end, by a few short bursts while the session is kept; what else goes over the link counts.
+
+        Raises:
+            LinkLost: they are not answered.
+        """
+        best = 0.0
+        for size in PROBE_BYTES:
+            self._arrived = asyncio.get_running_loop().create_future()
+            begun = time.monotonic()
+            await self.send({"probe": "x" * size})
+            try:
+                async with asyncio.timeout(PROBE_TIMEOUT_S):
+                    await self._arrived
+            except TimeoutError as error:
+                raise LinkLost(f"{self.peer} does not answer probes") from error
+            took_s = time.monotonic() - begun
+            on_air_s = max(took_s - 2e-3 * (self.latency_ms or 0.0), took_s / 4)
+            best = max(best, size * 8e-6 / on_air_s)
+            if took_s * PROBE_BYTES[-1] / size > BURST_LIMIT_S:
+                break
+        return best
 
     def abort(self) -> None:
         """End the session at once."""
@@ -159,6 +197,10 @@ class Session:
                 await self._writer.wait_closed()
         except (OSError, TimeoutError):
             self._writer.transport.abort()
+
+
+def _ignored(_message: Mapping[str, Any]) -> None:
+    """Nobody waits for the other end's messages yet."""
 
 
 async def ask(node: str, peer: str, address: IPv4Address, directory: Path, link: Mapping[str, Any]) -> Session:

@@ -1,4 +1,4 @@
-"""Netlink as far as the redirector needs it: raw messages, so that a switch takes a millisecond and no library.
+"""Netlink as far as the agent needs it: raw messages, so that a switch takes a millisecond and no library.
 
 A netlink socket belongs to the network namespace in which it was opened, for as long as it lives.
 """
@@ -15,8 +15,8 @@ from pathlib import Path
 from threading import Thread
 from typing import TypeVar
 
-NETLINK_SOCK_DIAG, NETLINK_NETFILTER = 4, 12
-NLM_F_REQUEST, NLM_F_ACK, NLM_F_DUMP, NLM_F_CREATE = 0x1, 0x4, 0x300, 0x400
+NETLINK_ROUTE, NETLINK_SOCK_DIAG, NETLINK_NETFILTER = 0, 4, 12
+NLM_F_REQUEST, NLM_F_ACK, NLM_F_REPLACE, NLM_F_DUMP, NLM_F_CREATE = 0x1, 0x4, 0x100, 0x300, 0x400
 NLMSG_ERROR, NLMSG_DONE = 2, 3
 NLA_F_NESTED = 0x8000
 
@@ -65,7 +65,7 @@ class Netlink:
     """A netlink socket.
 
     Args:
-        protocol: NETLINK_NETFILTER or NETLINK_SOCK_DIAG.
+        protocol: NETLINK_NETFILTER, NETLINK_SOCK_DIAG or NETLINK_ROUTE.
 
     Raises:
         NetlinkError: the kernel has no such protocol.

@@ -6,6 +6,9 @@ and libnftables slows down with the rules of kube-proxy, while one transaction t
 Our chains hook at priority -150, before those of kube-proxy, on prerouting for pods and on output for programs in the host's
 network. A connection whose first packet matches an element of `targets` goes to the direct address; without an element it
 falls through to kube-proxy, and so to the cloud path. Elements time out, so that an agent that dies leaves the cloud path.
+
+Whoever is in reach can send to a direct interface. So nothing comes in there but beacons and pairing, and what our redirects
+lead from nodes that have paired on to pods; and nothing goes out by it that we did not redirect.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from ipaddress import IPv4Address
 from fractus_agent.redirector.netlink import NLM_F_ACK, NLM_F_CREATE, Netlink, NetlinkError, attribute, message, nested
 
 TABLE = "fractus"
-TARGETS, MARKS, COUNTERS = "targets", "marks", "counters"
+TARGETS, MARKS, COUNTERS, PEERS = "targets", "marks", "counters", "peers"
 
 MARK_MASK, MARK_BASE = 0xFFF00000, 0xF6A00000
 """Connections that we redirect carry a mark of this range; the lower bits number a service's stay on one path."""
@@ -71,11 +74,25 @@ class RedirectFailed(RuntimeError):
     """The kernel did not take the rules."""
 
 
-def table(devices: str) -> str:
-    """The text of our table, for `nft -f`; it replaces an older one at once, with all its elements.
+@dataclass(frozen=True, slots=True)
+class Ports:
+    """What a node itself listens to on its direct interfaces.
+
+    Attributes:
+        udp: of beacons.
+        tcp: of pairing.
+    """
+
+    udp: int
+    tcp: int
+
+
+def table(devices: str, ports: Ports) -> str:
+    """The text of our tables, for `nft -f`; they replace older ones at once, with all their elements.
 
     Args:
         devices: pattern of the names of direct interfaces, such as fxl*.
+        ports: of the node itself that are open there.
     """
     key = "ip daddr . meta l4proto . th dport"
     rules = f"ct mark set {key} map @{MARKS}\n\t\tdnat ip to {key} map @{TARGETS}"
@@ -92,6 +109,10 @@ table ip {TABLE} {{
 	}}
 	map {COUNTERS} {{
 		type mark : counter
+	}}
+	set {PEERS} {{
+		type ipv4_addr
+		flags timeout
 	}}
 	chain prerouting {{
 		type nat hook prerouting priority -150; policy accept;
@@ -110,26 +131,58 @@ table ip {TABLE} {{
 		type filter hook postrouting priority 150; policy accept;
 		counter name ct mark map @{COUNTERS}
 	}}
+	chain arriving {{
+		type filter hook input priority -5; policy accept;
+		iifname != "{devices}" accept
+		ct state established,related accept
+		udp dport {ports.udp} accept
+		tcp dport {ports.tcp} accept
+		# Of connections whose redirect ended: their clients shall not wait for a time-out.
+		meta l4proto tcp reject with tcp reset
+		drop
+	}}
+	chain passing {{
+		type filter hook forward priority -5; policy accept;
+		iifname != "{devices}" oifname != "{devices}" accept
+		ct state established,related accept
+		{ours} oifname "{devices}" accept
+		{ours} iifname "{devices}" ip saddr @{PEERS} accept
+		drop
+	}}
+}}
+table ip6 {TABLE}
+delete table ip6 {TABLE}
+table ip6 {TABLE} {{
+	chain arriving {{
+		type filter hook input priority -5; policy accept;
+		iifname "{devices}" drop
+	}}
+	chain passing {{
+		type filter hook forward priority -5; policy accept;
+		iifname "{devices}" drop
+		oifname "{devices}" drop
+	}}
 }}
 """
 
 
-def create(devices: str, namespace: Sequence[str] = ()) -> None:
-    """Make our table, or make it again.
+def create(devices: str, ports: Ports, namespace: Sequence[str] = ()) -> None:
+    """Make our tables, or make them again.
 
     Args:
         devices: pattern of the names of direct interfaces.
+        ports: of the node itself that are open there.
         namespace: command words that run `nft` in another network namespace; for tests.
 
     Raises:
         RedirectFailed: nft is missing, or refuses.
     """
-    _nft(table(devices), namespace)
+    _nft(table(devices, ports), namespace)
 
 
 def remove(namespace: Sequence[str] = ()) -> None:
-    """Remove our table and all that it does."""
-    _nft(f"table ip {TABLE}\ndelete table ip {TABLE}\n", namespace)
+    """Remove our tables and all that they do; that there are none is no error."""
+    _nft("".join(f"table {family} {TABLE}\ndelete table {family} {TABLE}\n" for family in ("ip", "ip6")), namespace)
 
 
 def _nft(text: str, namespace: Sequence[str]) -> None:
@@ -161,7 +214,11 @@ class Maps:
         self._make_table = make_table
 
     def write(
-        self, redirects: Iterable[Redirect], marks: Iterable[tuple[Endpoint, int]] | None, timeout_s: float
+        self,
+        redirects: Iterable[Redirect],
+        marks: Iterable[tuple[Endpoint, int]] | None,
+        timeout_s: float,
+        peers: Iterable[IPv4Address] | None = None,
     ) -> None:
         """Replace the elements in one transaction: every packet sees either the old ones or the new.
 
@@ -172,7 +229,8 @@ class Maps:
             redirects: all that hold from now on.
             marks: all services, where clients connect to, and the number that their new connections carry; None leaves the
                 marks as they are.
-            timeout_s: for how long redirects hold, unless they are set again.
+            timeout_s: for how long redirects hold, and peers may use them, unless they are set again.
+            peers: whose connections over direct interfaces are led on; None leaves them as they are.
 
         Raises:
             NetlinkError: nothing was changed.
@@ -186,6 +244,8 @@ class Maps:
             changes += _replaced(
                 MARKS, [nested(_LIST_ELEMENT, _key(v), _data(struct.pack("=I", MARK_BASE | n))) for v, n in marks]
             )
+        if peers is not None:
+            changes += _replaced(PEERS, [nested(_LIST_ELEMENT, _address(peer), lives) for peer in peers])
         try:
             self._transact(changes)
         except NetlinkError as error:
@@ -222,6 +282,10 @@ def _endpoint(endpoint: Endpoint) -> bytes:
 def _key(endpoint: Endpoint) -> bytes:
     value = endpoint.address.packed + struct.pack("=Bxxx", endpoint.protocol) + struct.pack(">HH", endpoint.port, 0)
     return nested(_ELEMENT_KEY, attribute(_DATA_VALUE, value))
+
+
+def _address(address: IPv4Address) -> bytes:
+    return nested(_ELEMENT_KEY, attribute(_DATA_VALUE, address.packed))
 
 
 def _data(value: bytes) -> bytes:

@@ -12,6 +12,7 @@ import logging
 from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from ipaddress import IPv4Address
 from pathlib import Path
 
 from fractus_agent.redirector.conntrack import Conntrack
@@ -117,6 +118,7 @@ class Redirector:
         self._namespaces = namespaces
         self._redirects: dict[Endpoint, Endpoint] = {}
         self._numbers: dict[Endpoint, int] = {}
+        self._peers: frozenset[IPv4Address] = frozenset()
         self._left: list[_Left] = []
         self._draining: set[int] = set()
         self._last_number = 0
@@ -126,6 +128,20 @@ class Redirector:
     def redirects(self) -> Mapping[Endpoint, Endpoint]:
         """Where connections to virtual endpoints go now; those that are not named take the cloud path."""
         return dict(self._redirects)
+
+    def admit(self, peers: Iterable[IPv4Address]) -> None:
+        """Lead on the connections of these nodes, and of no others, that come over direct interfaces.
+
+        Raises:
+            NetlinkError: the kernel refused; nothing was changed.
+            RedirectFailed: our table cannot be made.
+        """
+        before, self._peers = self._peers, frozenset(peers)
+        try:
+            self._write(self._redirects, self._numbers)
+        except (NetlinkError, RedirectFailed):
+            self._peers = before
+            raise
 
     def serve(self, services: Iterable[Endpoint]) -> None:
         """Number the services that clients on this node connect to; redirects of others end.
@@ -208,6 +224,7 @@ class Redirector:
             (Redirect(virtual, to) for virtual, to in redirects.items()),
             numbers.items() if numbers is not None else None,
             LEASE_S,
+            self._peers,
         )
         self._redirects = dict(redirects)
         self._numbers = dict(numbers) if numbers is not None else self._numbers

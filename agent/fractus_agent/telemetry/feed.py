@@ -23,7 +23,8 @@ from fractus_agent.telemetry.snapshot import Snapshot
 
 LOG = logging.getLogger(__name__)
 
-INTERVAL_S = 1.0
+INTERVAL_S, LINKED_INTERVAL_S = 1.0, 0.25
+"""Seconds between messages: usually, and while direct links are decided by them."""
 SILENCE_TIMEOUT_S = 5.0
 """Seconds without a message after which the service counts as unreachable."""
 
@@ -69,6 +70,8 @@ def snapshot(message: Telemetry) -> Snapshot:
         battery_voltage_v=message.battery_voltage_v,
         battery_current_a=message.battery_current_a,
         missions={key: outcome(ended) for key, ended in message.missions.items()},
+        velocity_mps=(message.velocity.east_mps, message.velocity.north_mps, -message.velocity.down_mps),
+        altitude_amsl_m=message.altitude_amsl_m,
     )
 
 
@@ -91,8 +94,13 @@ class TelemetryFeed:
         self._node = node
         self._serial = serial
         self._changed = changed
+        self._interval_s = INTERVAL_S
         self.latest: Snapshot | None = None
         self.problem: str | None = "The mobility service has not answered yet."
+
+    def hasten(self, fast: bool) -> None:
+        """Ask for messages often, or as usual."""
+        self._interval_s = LINKED_INTERVAL_S if fast else INTERVAL_S
 
     async def run(self) -> None:
         """Stay subscribed until cancelled."""
@@ -105,7 +113,7 @@ class TelemetryFeed:
                     self.latest, self.problem = snapshot(message), None
                     backoff.succeeded()
                     self._changed()
-                self._lost("the certificate changed, connecting again", expected=True)
+                self._lost("asking anew", expected=True)
                 continue
             except grpc.aio.AioRpcError as error:
                 self._lost(f"{error.code().name}: {error.details()}")
@@ -119,14 +127,14 @@ class TelemetryFeed:
         files = read_set(self._tls, FILES)
         if files is None:
             raise FileNotFoundError("the node has no certificate yet")
-        serial = self._serial()
+        asked = (self._serial(), self._interval_s)
         credentials = grpc.ssl_channel_credentials(files["ca.crt"], files["tls.key"], files["tls.crt"])
         options = (("grpc.ssl_target_name_override", node_server_name(self._node)), ("grpc.enable_http_proxy", 0))
         async with grpc.aio.secure_channel(self._address, credentials, options=options) as channel:
             stub = MobilityServiceStub(channel)
-            call = stub.SubscribeTelemetry(SubscribeTelemetryRequest(interval_s=INTERVAL_S))
+            call = stub.SubscribeTelemetry(SubscribeTelemetryRequest(interval_s=self._interval_s))
             try:
-                while self._serial() == serial:
+                while (self._serial(), self._interval_s) == asked:
                     message = await asyncio.wait_for(call.read(), SILENCE_TIMEOUT_S)
                     if message is grpc.aio.EOF:
                         raise ConnectionResetError(f"the service ended the stream: {await call.details()}")

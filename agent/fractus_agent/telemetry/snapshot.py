@@ -24,3 +24,6 @@ class Snapshot:
     battery_voltage_v: float
     battery_current_a: float
     missions: Mapping[str, Outcome] = field(default_factory=dict)
+    velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """East, north and up."""
+    altitude_amsl_m: float = 0.0

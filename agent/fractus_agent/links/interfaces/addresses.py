@@ -1,0 +1,111 @@
+"""Addresses of a network device, and whether it is up, over netlink: no program to run, nothing to parse."""
+
+from __future__ import annotations
+
+import errno
+import socket
+import struct
+from collections.abc import Iterator
+from ipaddress import IPv4Address, IPv4Network
+
+from fractus_agent.redirector.netlink import (
+    NETLINK_ROUTE,
+    NLM_F_ACK,
+    NLM_F_CREATE,
+    NLM_F_REPLACE,
+    Netlink,
+    NetlinkError,
+    attribute,
+    attributes,
+    message,
+)
+
+LINK_LOCAL = IPv4Network("169.254.0.0/16")
+
+_NEW_LINK, _NEW_ADDRESS, _DELETE_ADDRESS, _LIST_ADDRESSES = 16, 20, 21, 22
+_LINK = struct.Struct("=BxHiII")
+_ADDRESS = struct.Struct("=BBBBI")
+_PEER, _LOCAL, _BROADCAST = 1, 2, 4
+_IFF_UP = 1
+
+
+class NoDevice(Exception):
+    """There is no network device of this name."""
+
+
+class Addresses:
+    """The link-local addresses of one device in the network namespace that the process is in.
+
+    Args:
+        device: its name; it may come and go.
+    """
+
+    def __init__(self, device: str) -> None:
+        self._device = device
+
+    def set(self, address: IPv4Address) -> None:
+        """Bring the device up with this link-local address and no other, so that one that a crash left does not stay.
+
+        Raises:
+            NoDevice: there is none.
+            NetlinkError: the kernel refused.
+        """
+        index = self._index()
+        netlink = Netlink(NETLINK_ROUTE)
+        try:
+            _ask(netlink, _NEW_LINK, 0, _LINK.pack(socket.AF_UNSPEC, 0, index, _IFF_UP, _IFF_UP))
+            _ask(netlink, _NEW_ADDRESS, NLM_F_CREATE | NLM_F_REPLACE, _described(index, address))
+            for other in _listed(netlink, index):
+                if other != address:
+                    _ask(netlink, _DELETE_ADDRESS, 0, _described(index, other))
+        finally:
+            netlink.close()
+
+    def clear(self) -> None:
+        """Take all link-local addresses away.
+
+        Raises:
+            NetlinkError: the kernel refused.
+        """
+        try:
+            index = self._index()
+        except NoDevice:
+            return
+        netlink = Netlink(NETLINK_ROUTE)
+        try:
+            for address in list(_listed(netlink, index)):
+                _ask(netlink, _DELETE_ADDRESS, 0, _described(index, address))
+        finally:
+            netlink.close()
+
+    def _index(self) -> int:
+        try:
+            return socket.if_nametoindex(self._device)
+        except OSError as error:
+            raise NoDevice(f"the node has no network device {self._device}") from error
+
+
+def _described(index: int, address: IPv4Address) -> bytes:
+    head = _ADDRESS.pack(socket.AF_INET, LINK_LOCAL.prefixlen, 0, 0, index)
+    packed = address.packed
+    broadcast = LINK_LOCAL.broadcast_address.packed
+    return head + attribute(_LOCAL, packed) + attribute(_PEER, packed) + attribute(_BROADCAST, broadcast)
+
+
+def _listed(netlink: Netlink, index: int) -> Iterator[IPv4Address]:
+    for body in list(netlink.dump(_LIST_ADDRESSES, _ADDRESS.pack(socket.AF_INET, 0, 0, 0, 0))):
+        if _ADDRESS.unpack_from(body)[4] != index:
+            continue
+        local = next((value for kind, value in attributes(body[_ADDRESS.size :]) if kind == _LOCAL), b"")
+        if len(local) == 4 and IPv4Address(local) in LINK_LOCAL:
+            yield IPv4Address(local)
+
+
+def _ask(netlink: Netlink, kind: int, flags: int, body: bytes) -> None:
+    sequence = netlink.sequence()
+    netlink.send(message(kind, NLM_F_ACK | flags, sequence, body))
+    # What was deleted or added by somebody else in between is as it should be.
+    netlink.acknowledged({sequence}, ignore=frozenset({errno.EADDRNOTAVAIL, errno.EEXIST}))
+
+
+__all__ = ["Addresses", "NetlinkError", "NoDevice"]

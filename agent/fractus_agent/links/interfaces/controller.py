@@ -1,0 +1,45 @@
+"""What all controllers of interfaces have in common, and which one an interface needs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+from fractus_core.api.nodes import Interface
+from fractus_core.api.model import Model
+
+
+class InterfaceProblem(Exception):
+    """The interface cannot be used now.
+
+    Args:
+        reason: CamelCase, for programs.
+        message: one sentence for people.
+    """
+
+    def __init__(self, reason: str, message: str) -> None:
+        self.reason = reason
+        super().__init__(message)
+
+
+class Controller(Protocol):
+    """Controls one interface.
+
+    Attributes:
+        device: its name.
+    """
+
+    device: str
+
+    async def up(self) -> None:
+        """Bring it up on the network of its pairing, with this node's address; called again and again while it is wanted.
+
+        Raises:
+            InterfaceProblem: it cannot be.
+        """
+
+    async def down(self) -> None:
+        """Leave the network and take the address away; what is gone already is no error."""
+
+    async def quality(self) -> float | None:
+        """Strength of the link in dBm; None where the interface does not tell."""

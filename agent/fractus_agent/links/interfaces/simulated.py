@@ -1,0 +1,46 @@
+"""A device without a radio of its own to control: a TAP of the simulated radio, or a cable."""
+
+from __future__ import annotations
+
+from ipaddress import IPv4Address
+
+from fractus_agent.links.interfaces.addresses import Addresses, NetlinkError, NoDevice
+from fractus_agent.links.interfaces.controller import InterfaceProblem
+
+
+class Plain:
+    """Gives the device an address; there is no network to join.
+
+    Args:
+        device: its name.
+        address: of this node on its direct links.
+    """
+
+    def __init__(self, device: str, address: IPv4Address) -> None:
+        self.device = device
+        self._address = address
+        self._addresses = Addresses(device)
+
+    async def up(self) -> None:
+        """Bring the device up with its address.
+
+        Raises:
+            InterfaceProblem: there is none, or the kernel refuses.
+        """
+        try:
+            self._addresses.set(self._address)
+        except NoDevice as error:
+            raise InterfaceProblem("DeviceMissing", str(error)) from error
+        except NetlinkError as error:
+            raise InterfaceProblem("DeviceFailed", f"{self.device} takes no address: {error}") from error
+
+    async def down(self) -> None:
+        """Take the address away."""
+        try:
+            self._addresses.clear()
+        except NetlinkError as error:
+            raise InterfaceProblem("DeviceFailed", f"{self.device} keeps its address: {error}") from error
+
+    async def quality(self) -> float | None:
+        """Unknown: nothing measures it."""
+        return None

@@ -1,0 +1,279 @@
+"""The drone's end of direct links: knows the flight, decides, connects, and moves the traffic."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from fractus_core.api.links import DirectLink
+from fractus_core.linking import (
+    Course,
+    Link,
+    PathMetrics,
+    Peer,
+    Phase,
+    Seen,
+    Settings,
+    TargetHeuristic,
+    Track,
+    UnknownHeuristic,
+    heuristic,
+)
+
+from fractus_agent.links.addressing import link_address
+from fractus_agent.links.connector import Connector
+from fractus_agent.links.decisions import Actions, Situation, Traffic, decide
+from fractus_agent.links.lessons import Lessons
+from fractus_agent.links.pairing import LinkLost, Session
+from fractus_agent.links.plans import route_key, virtuals
+from fractus_agent.links.reports import DroneReport
+from fractus_agent.redirector.netlink import NetlinkError
+from fractus_agent.redirector.nft import Endpoint, RedirectFailed
+from fractus_agent.redirector.redirector import Redirector
+
+log = logging.getLogger(__name__)
+
+DECIDE_S = 0.5
+PROBE_S = 10.0
+"""Seconds between two probes of a link that is up."""
+DIRECT_LATENCY_MS = 5.0
+"""What a link is expected to need before it was measured."""
+
+
+class DroneEnd:
+    """Keeps the drone's direct link and the traffic where they are best.
+
+    Args:
+        node: this node.
+        tls: its certificate, key and authority.
+        redirector: of this node.
+        cloud: what the cloud path offers.
+        seen: what telemetry says of the drone now; None while it says nothing.
+        report: takes what becomes of the links.
+        settings: of decisions.
+    """
+
+    def __init__(
+        self,
+        node: str,
+        tls: Path,
+        redirector: Redirector,
+        cloud: Callable[[], PathMetrics],
+        seen: Callable[[], Seen | None],
+        report: Callable[[DroneReport], None],
+        *,
+        settings: Settings | None = None,
+    ) -> None:
+        self._redirector = redirector
+        self._cloud = cloud
+        self._seen = seen
+        self._report = report
+        self._settings = settings or Settings()
+        self._connector = Connector(node, tls, self._use, self._link_changed)
+        self._lessons = Lessons(self._settings)
+        self._links: tuple[DirectLink, ...] = ()
+        self._courses: dict[tuple[object, ...], Course] = {}
+        self._unknown: dict[str, str] = {}
+        self._routes: dict[Endpoint, Endpoint] = {}
+        self._direct: PathMetrics | None = None
+        self._parting = False
+        self._lost = asyncio.Event()
+        self._wake = asyncio.Event()
+        self._said: dict[str, str] = {}
+
+    def plan(self, links: tuple[DirectLink, ...]) -> None:
+        """Take the DirectLinks of this drone as they are now."""
+        self._links = links
+        self._wake.set()
+
+    def heard(self, node: str) -> None:
+        """A beacon came."""
+        self._lessons.beacon(node, time.monotonic())
+
+    async def run(self) -> None:
+        """Decide until cancelled; then lead all traffic back and end the link."""
+        try:
+            while True:
+                self._wake.clear()
+                try:
+                    await self._step()
+                except (NetlinkError, RedirectFailed) as error:
+                    log.warning("links: traffic is not moved, trying again (error=%s)", error)
+                try:
+                    async with asyncio.timeout(DECIDE_S):
+                        await self._wake.wait()
+                except TimeoutError:
+                    continue
+        finally:
+            await asyncio.shield(self._part())
+
+    async def _part(self) -> None:
+        back = dict.fromkeys(self._redirector.redirects)
+        try:
+            await self._redirector.switch(back, planned=not self._lost.is_set())
+        except (NetlinkError, RedirectFailed) as error:
+            log.warning("links: traffic is not led back, its redirects end by themselves (error=%s)", error)
+        await self._want("")
+
+    async def _step(self) -> None:
+        """One decision, and what it asks for."""
+        self._redirector.serve(virtuals(self._links))
+        situation = self._situation()
+        actions = decide(situation, self._settings)
+        self._explain(actions)
+        if actions.abrupt:
+            await self._redirector.switch(actions.abrupt, planned=False)
+        if actions.planned:
+            await self._switch(actions.planned)
+        if actions.link.changes:
+            await self._want(actions.peer)
+        self._tell(actions, situation)
+
+    async def _switch(self, targets: Mapping[Endpoint, Endpoint | None]) -> None:
+        """A planned switch, which a loss of the link makes an abrupt one: what drains would never end."""
+        drain = asyncio.create_task(self._redirector.switch(targets, planned=True))
+        lost = asyncio.create_task(self._lost.wait())
+        try:
+            await asyncio.wait({drain, lost}, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            lost.cancel()
+            if not drain.done():
+                drain.cancel()
+            await asyncio.gather(lost, return_exceptions=True)
+            try:
+                await drain
+            except asyncio.CancelledError:
+                if (task := asyncio.current_task()) is not None and task.cancelling():
+                    raise
+
+    async def _want(self, peer: str) -> None:
+        self._parting = True
+        try:
+            await self._connector.want(peer)
+        finally:
+            self._parting = False
+
+    def _situation(self) -> Situation:
+        now_s = time.monotonic()
+        track, peers = self._flight()
+        self._lessons.here = track.position if track is not None else None
+        self._lessons.peers = peers
+        self._lessons.listen(now_s)
+        return Situation(
+            now_s, track, tuple(self._traffic(peers)), self._connector.link, dict(self._lessons.reaches),
+            self._cloud(), self._direct, dict(self._routes), self._redirector.redirects,
+        )  # fmt: skip
+
+    def _flight(self) -> tuple[Track | None, dict[str, Peer]]:
+        """Where the drone flies, and where its peers are, in one frame; by the path of the first application by name."""
+        seen = self._seen()
+        if seen is None or not self._links:
+            return None, {}
+        path = min(self._links, key=_application).spec.path
+        if path not in self._courses:
+            self._courses = {path: Course(path)}
+        frame, track = self._courses[path].track(seen)
+        peers = {}
+        for link in self._links:
+            spec = link.spec
+            offers = PathMetrics(spec.bandwidth, spec.bandwidth, DIRECT_LATENCY_MS, DIRECT_LATENCY_MS, direct=True)
+            peers[spec.node] = Peer(spec.node, frame.place(spec.position, seen), spec.range, offers)
+        return track, peers
+
+    def _traffic(self, peers: Mapping[str, Peer]) -> list[Traffic]:
+        found = []
+        self._unknown = {}
+        for application in sorted({_application(link) for link in self._links}):
+            links = [link for link in self._links if _application(link) == application]
+            score = self._heuristic(application, links[0])
+            if score is None:
+                continue
+            served = tuple(peers[link.spec.node] for link in links if link.spec.node in peers)
+            found.append(Traffic(application, score, served, frozenset(virtuals(links))))
+        return found
+
+    def _heuristic(self, application: str, link: DirectLink) -> TargetHeuristic | None:
+        """The heuristic of an application; None, and so the cloud path, where nobody here knows it."""
+        chosen = link.spec.heuristic
+        try:
+            return heuristic(chosen.kind, chosen.metric)
+        except UnknownHeuristic as error:
+            self._unknown[application] = str(error)
+        except Exception as error:  # a plug-in of the user's that cannot be loaded
+            self._unknown[application] = f"the heuristic {chosen.kind} cannot be loaded: {error}"
+        return None
+
+    async def _use(self, session: Session) -> None:
+        """While a session lasts: hear the peer's routes, and measure."""
+        address = link_address(session.peer)
+
+        def told(message: Mapping[str, Any]) -> None:
+            self._routes = _routes(message, address, [l for l in self._links if l.spec.node == session.peer])
+            self._wake.set()
+
+        session.told = told
+        self._lost.clear()
+        try:
+            while True:
+                while session.latency_ms is None:  # noqa: ASYNC110 (the session has no event for it)
+                    await asyncio.sleep(0.01)
+                rate = await session.probe()
+                latency_ms = session.latency_ms
+                self._direct = PathMetrics(rate, rate, latency_ms, latency_ms, direct=True)
+                self._lessons.delivered(session.peer, self._direct)
+                log.info("links: measured (peer=%s mbps=%.1f latency_ms=%.1f)", session.peer, rate, latency_ms)
+                self._wake.set()
+                await asyncio.sleep(PROBE_S)
+        finally:
+            self._routes, self._direct = {}, None
+            self._lost.set()
+            self._wake.set()
+
+    def _link_changed(self, link: Link, reason: str) -> None:
+        now_s = time.monotonic()
+        before, self._before = getattr(self, "_before", link), link
+        if link.phase is Phase.UP:
+            self._lessons.came_up(link.peer, now_s)
+        elif link.phase is Phase.NONE and not self._parting:
+            learn = self._lessons.broke if before.phase is Phase.UP else self._lessons.not_paired
+            learn(before.peer, now_s)
+        self._wake.set()
+
+    def _explain(self, actions: Actions) -> None:
+        """One line of the log for each decision that differs from the one before."""
+        said = {"link": f"{actions.link.code}: {actions.link.reason}"} if actions.link.changes else {}
+        said |= {name: f"{found.code}: {found.reason}" for name, found in actions.targets.items() if found.changes}
+        for what, why in said.items():
+            log.info("links: decided (on=%s peer=%s): %s", what, actions.peer or "-", why)
+
+    def _tell(self, actions: Actions, situation: Situation) -> None:
+        self._report(
+            DroneReport(
+                self._links, self._connector.link, actions, frozenset(self._redirector.redirects), situation.direct,
+                self._lessons.reaches, dict(self._unknown),
+            )  # fmt: skip
+        )
+
+
+def _application(link: DirectLink) -> str:
+    return f"{link.spec.application.namespace}/{link.spec.application.name}"
+
+
+def _routes(message: Mapping[str, Any], address: Any, links: list[DirectLink]) -> dict[Endpoint, Endpoint]:
+    """What a peer says of where it takes calls, as far as its DirectLinks name the services."""
+    said = message.get("routes")
+    if not isinstance(said, dict):
+        return {}
+    found = {}
+    for service in virtuals(links):
+        port = said.get(route_key(service))
+        if isinstance(port, int) and not isinstance(port, bool) and 0 < port < 65536:
+            found[service] = Endpoint(address, port, service.protocol)
+    return found
+
+
+__all__ = ["DroneEnd", "LinkLost"]

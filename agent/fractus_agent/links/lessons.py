@@ -1,0 +1,81 @@
+"""What the drone's end learns of its peers' links while it flies: from beacons, from links that came up, and from those lost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from fractus_core.linking import PathMetrics, Peer, Position, Reach, Settings
+from fractus_core.linking.learning import connected, expected, failed, heard, lost, measured
+from fractus_core.linking.prediction import strength
+
+SILENT_S = 2.0
+"""A peer of which no beacon came for so long, though it should be in reach, reaches less far than declared."""
+
+
+@dataclass(slots=True)
+class Lessons:
+    """The reaches of peers as they were learned, with where the drone and the peers are.
+
+    Attributes:
+        reaches: by peer.
+        here: the drone; None while that is not known.
+        peers: by name.
+    """
+
+    settings: Settings
+    reaches: dict[str, Reach] = field(default_factory=dict)
+    here: Position | None = None
+    peers: Mapping[str, Peer] = field(default_factory=dict)
+    _silent_since_s: dict[str, float] = field(default_factory=dict)
+
+    def beacon(self, name: str, now_s: float) -> None:
+        """A peer was heard."""
+        self._silent_since_s.pop(name, None)
+        self.reaches[name] = heard(self._own(name), self._distance(name) or 0.0, now_s)
+
+    def came_up(self, name: str, now_s: float) -> None:
+        """The link to a peer came up."""
+        self.reaches[name] = heard(connected(self._own(name)), self._distance(name) or 0.0, now_s)
+
+    def not_paired(self, name: str, now_s: float) -> None:
+        """An attempt to pair failed."""
+        self.reaches[name] = failed(self._own(name), now_s)
+
+    def broke(self, name: str, now_s: float) -> None:
+        """The link to a peer broke; one that broke well inside its reach is no sign of how far it reaches."""
+        distance = self._distance(name)
+        if distance is not None and distance / self._own(name).range_factor >= self.settings.edge / 2:
+            self.reaches[name] = lost(self._own(name), distance)
+        else:
+            self.reaches[name] = failed(self._own(name), now_s)
+
+    def delivered(self, name: str, path: PathMetrics) -> None:
+        """The link to a peer was measured."""
+        distance, peer = self._distance(name), self.peers.get(name)
+        if distance is None or peer is None or peer.offers.ingress_mbps <= 0:
+            return
+        share = strength(distance / self._own(name).range_factor, self.settings.edge)
+        if share >= 1:
+            self.reaches[name] = measured(self._own(name), path.ingress_mbps / peer.offers.ingress_mbps)
+
+    def listen(self, now_s: float) -> None:
+        """Learn from silence: which peers should be heard from here, and are not."""
+        for name in self.peers:
+            distance = self._distance(name)
+            if distance is None or distance > expected(self.reaches, name).range_factor:
+                self._silent_since_s.pop(name, None)
+                continue
+            since_s = max(self._silent_since_s.setdefault(name, now_s), self._own(name).heard_s)
+            if now_s - since_s > SILENT_S:
+                self.reaches[name] = lost(self._own(name), distance)
+                self._silent_since_s.pop(name, None)
+
+    def _own(self, name: str) -> Reach:
+        return self.reaches.get(name, Reach())
+
+    def _distance(self, name: str) -> float | None:
+        """How far a peer is, in units of its declared reach."""
+        peer = self.peers.get(name)
+        return math.dist(self.here, peer.position) / peer.range_m if self.here is not None and peer is not None else None

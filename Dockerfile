@@ -40,6 +40,14 @@ RUN mkdir -p /out/usr/bin /out/usr/sbin /out/usr/lib /out/usr/lib64 /out/etc /ou
  && chmod 755 /out/usr/local/bin/fractus && chown 10001:10001 /out/home/fractus && mkdir -m 700 /out/root \
  && python3 -m compileall -q --invalidation-mode unchecked-hash -s /out /out/usr/lib/python3.11
 
+# ---- nft: the program that makes the table of direct links, and the libraries that nothing else needs
+FROM tools AS nft
+RUN apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -qy --no-install-recommends nftables >/dev/null \
+ && rm -rf /var/lib/apt/lists/* \
+ && libraries=/out/usr/lib/$(basename "$(dirname "$(ldconfig -p | awk '/libnftables.so.1/ {print $NF; exit}')")") \
+ && mkdir -p "$libraries" /out/usr/sbin && cp /usr/sbin/nft /out/usr/sbin/ \
+ && ldd /usr/sbin/nft | awk '$2 == "=>" && $1 !~ /^libc\.so/ {print $3}' | xargs cp -L -t "$libraries"
+
 # ---- dependencies: one directory for each set, holding what the sets below it do not have already
 # Of the Kubernetes client only the asynchronous half is kept, without its 700 classes: `import kubernetes` would run the
 # synchronous one too, which with what it needs takes an agent 7 MB of memory and the image as much.
@@ -133,6 +141,7 @@ ENTRYPOINT ["python3", "-m", "fractus_operator"]
 COPY --from=code /images/operator /usr/local/lib/python3.11/dist-packages
 
 FROM model AS agent
+COPY --from=nft /out /
 COPY --from=dependencies /only-agent /usr/local/lib/python3.11/dist-packages
 ENTRYPOINT ["python3", "-m", "fractus_agent"]
 COPY --from=code /images/agent /usr/local/lib/python3.11/dist-packages

@@ -7,6 +7,8 @@ import time
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
+from fractus_core.api.nodes import direct_interface
+
 from fractus_agent.cluster.store import Object, Store
 from fractus_agent.grants.keeper import GrantDirectory, GrantKeeper
 from fractus_agent.grants.verifier import GrantVerifier
@@ -20,6 +22,10 @@ from fractus_agent.supervisor import Supervisor
 from fractus_agent.watchdog import guard
 
 if TYPE_CHECKING:
+    from fractus_core.api.nodes import Drone, EdgeNode
+    from fractus_core.linking import Seen
+
+    from fractus_agent.links.connectivity import Connectivity
     from fractus_agent.telemetry.feed import TelemetryFeed
 
 
@@ -33,6 +39,7 @@ class Agent:
 
     def __init__(self, settings: Settings, store: Store) -> None:
         self._settings = settings
+        self._store = store
         node = settings.node
         self._identity = Identity(store, settings.tls, node, _now, changed=self._changed)
         self._keeper = GrantKeeper(
@@ -45,7 +52,11 @@ class Agent:
         self._certificates = 0
         self._handover = Handover(settings.node_object)
         self._registration = Registration(store, settings.description, node, self._handover, changed=self._changed)
+        # An agent that starts without an API server in reach goes by what the node was when one was.
+        self._stored = self._handover.stored()
         self._mobility = asyncio.Event()
+        self._linking = asyncio.Event()
+        self._links: Connectivity | None = None
         self._feed: TelemetryFeed | None = None
         self._reporter = StatusReporter(
             store,
@@ -63,6 +74,8 @@ class Agent:
         self._supervisor.add("registration", self._registration.run)
         self._supervisor.add("status", self._reporter.run)
         self._supervisor.add("telemetry", self._follow_telemetry)
+        if settings.direct_links:
+            self._supervisor.add("links", self._link)
 
     async def run(self) -> None:
         """Run all parts until cancelled.
@@ -70,6 +83,7 @@ class Agent:
         Raises:
             ExceptionGroup: one of them failed.
         """
+        self._changed()
         await self._supervisor.run()
 
     async def _follow_telemetry(self) -> None:
@@ -86,11 +100,51 @@ class Agent:
             serial=lambda: self._identity.serial,
             changed=self._telemetry_changed,
         )
+        self._feed.hasten(self._links is not None and self._links.active)
         await self._feed.run()
 
+    async def _link(self) -> None:
+        """Run direct links once the node has an interface for them and a certificate."""
+        await self._linking.wait()
+        await self._identity.ready.wait()
+        # Imported here: most nodes have no such interface, and need no memory for it.
+        from fractus_agent.links.connectivity import Connectivity  # noqa: PLC0415
+
+        self._links = Connectivity(
+            self._store,
+            self._settings.node,
+            self._settings.links,
+            self._settings.tls,
+            resource=self._resource,
+            seen=self._seen,
+            wall=_now,
+            changed=self._links_changed,
+        )
+        await self._links.run()
+
+    def _links_changed(self) -> None:
+        if self._feed is not None and self._links is not None:
+            self._feed.hasten(self._links.active)
+
+    def _seen(self) -> Seen | None:
+        from fractus_core.linking import Seen  # noqa: PLC0415 (by then it is there: only direct links ask)
+
+        found = self._feed.latest if self._feed is not None and self._feed.problem is None else None
+        if found is None or found.position is None:
+            return None
+        lat, lon, above_home_m, _ = found.position
+        return Seen(lat, lon, above_home_m, found.altitude_amsl_m - above_home_m, found.velocity_mps)
+
+    def _resource(self) -> Drone | EdgeNode | None:
+        return self._registration.resource or self._stored
+
     def _has_mobility(self) -> bool:
-        resource = self._registration.resource
+        resource = self._resource()
         return resource is not None and resource.kind == "Drone" and resource.spec.services.mobility is not None
+
+    def _has_direct_interface(self) -> bool:
+        resource = self._resource()
+        return resource is not None and direct_interface(resource.spec.interfaces) is not None
 
     def _observe(self, body: Object) -> Observed:
         services = (body.get("spec") or {}).get("services") or {}
@@ -115,6 +169,8 @@ class Agent:
         """Pass on what one part found out to the parts that depend on it."""
         if self._has_mobility():
             self._mobility.set()
+        if self._has_direct_interface():
+            self._linking.set()
         if self._certificates != self._identity.serial:
             self._certificates = self._identity.serial
             self._keeper.authority_changed()

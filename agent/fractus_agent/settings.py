@@ -20,6 +20,7 @@ class Settings:
     state: Path
     mobility_address: str
     log_level: str = "INFO"
+    direct_links: bool = True
 
     @property
     def grants(self) -> Path:
@@ -37,13 +38,18 @@ class Settings:
         return self.state / "audit"
 
     @property
+    def links(self) -> Path:
+        """Directory of the stored DirectLinks."""
+        return self.state / "links"
+
+    @property
     def tls(self) -> Path:
         """Directory of the node's certificate, key and authority."""
         return self.state / "tls"
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str]) -> Settings:
-        """Read FRACTUS_NODE (needed), FRACTUS_DESCRIPTION, FRACTUS_STATE_DIR, FRACTUS_MOBILITY, FRACTUS_LOG_LEVEL.
+        """Read FRACTUS_NODE (needed), and FRACTUS_DESCRIPTION, _STATE_DIR, _MOBILITY, _LOG_LEVEL and _DIRECT_LINKS.
 
         Raises:
             MissingSetting: FRACTUS_NODE is not set.
@@ -56,5 +62,6 @@ class Settings:
             description=Path(environment.get("FRACTUS_DESCRIPTION", "/etc/fractus/node.yaml")),
             state=Path(environment.get("FRACTUS_STATE_DIR", "/var/lib/fractus")),
             mobility_address=environment.get("FRACTUS_MOBILITY", "127.0.0.1:50051"),
+            direct_links=environment.get("FRACTUS_DIRECT_LINKS", "true").lower() == "true",
             log_level=environment.get("FRACTUS_LOG_LEVEL", "INFO").upper(),
         )

@@ -6,11 +6,13 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable, Mapping
+from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
 
 from fractus_core.api.links import DirectLink
 from fractus_core.linking import (
+    NO_LINK,
     Course,
     Link,
     PathMetrics,
@@ -28,7 +30,7 @@ from fractus_agent.links.addressing import link_address
 from fractus_agent.links.connector import Connector
 from fractus_agent.links.decisions import Actions, Situation, Traffic, decide
 from fractus_agent.links.lessons import Lessons
-from fractus_agent.links.pairing import LinkLost, Session
+from fractus_agent.links.pairing import Session
 from fractus_agent.links.plans import route_key, virtuals
 from fractus_agent.links.reports import DroneReport
 from fractus_agent.redirector.netlink import NetlinkError
@@ -62,10 +64,10 @@ class DroneEnd:
         node: str,
         tls: Path,
         redirector: Redirector,
+        *,
         cloud: Callable[[], PathMetrics],
         seen: Callable[[], Seen | None],
         report: Callable[[DroneReport], None],
-        *,
         settings: Settings | None = None,
     ) -> None:
         self._redirector = redirector
@@ -83,7 +85,7 @@ class DroneEnd:
         self._parting = False
         self._lost = asyncio.Event()
         self._wake = asyncio.Event()
-        self._said: dict[str, str] = {}
+        self._before = NO_LINK
 
     def plan(self, links: tuple[DirectLink, ...]) -> None:
         """Take the DirectLinks of this drone as they are now."""
@@ -197,7 +199,7 @@ class DroneEnd:
         return found
 
     def _heuristic(self, application: str, link: DirectLink) -> TargetHeuristic | None:
-        """The heuristic of an application; None, and so the cloud path, where nobody here knows it."""
+        """The heuristic of an application; None, and so the cloud path, where it is not known here."""
         chosen = link.spec.heuristic
         try:
             return heuristic(chosen.kind, chosen.metric)
@@ -212,7 +214,7 @@ class DroneEnd:
         address = link_address(session.peer)
 
         def told(message: Mapping[str, Any]) -> None:
-            self._routes = _routes(message, address, [l for l in self._links if l.spec.node == session.peer])
+            self._routes = _routes(message, address, [link for link in self._links if link.spec.node == session.peer])
             self._wake.set()
 
         session.told = told
@@ -233,9 +235,9 @@ class DroneEnd:
             self._lost.set()
             self._wake.set()
 
-    def _link_changed(self, link: Link, reason: str) -> None:
+    def _link_changed(self, link: Link, _reason: str) -> None:
         now_s = time.monotonic()
-        before, self._before = getattr(self, "_before", link), link
+        before, self._before = self._before, link
         if link.phase is Phase.UP:
             self._lessons.came_up(link.peer, now_s)
         elif link.phase is Phase.NONE and not self._parting:
@@ -253,9 +255,14 @@ class DroneEnd:
     def _tell(self, actions: Actions, situation: Situation) -> None:
         self._report(
             DroneReport(
-                self._links, self._connector.link, actions, frozenset(self._redirector.redirects), situation.direct,
-                self._lessons.reaches, dict(self._unknown),
-            )  # fmt: skip
+                links=self._links,
+                link=self._connector.link,
+                actions=actions,
+                direct=frozenset(self._redirector.redirects),
+                measured=situation.direct,
+                reaches=self._lessons.reaches,
+                unknown=dict(self._unknown),
+            )
         )
 
 
@@ -263,7 +270,7 @@ def _application(link: DirectLink) -> str:
     return f"{link.spec.application.namespace}/{link.spec.application.name}"
 
 
-def _routes(message: Mapping[str, Any], address: Any, links: list[DirectLink]) -> dict[Endpoint, Endpoint]:
+def _routes(message: Mapping[str, Any], address: IPv4Address, links: list[DirectLink]) -> dict[Endpoint, Endpoint]:
     """What a peer says of where it takes calls, as far as its DirectLinks name the services."""
     said = message.get("routes")
     if not isinstance(said, dict):
@@ -274,6 +281,3 @@ def _routes(message: Mapping[str, Any], address: Any, links: list[DirectLink]) -
         if isinstance(port, int) and not isinstance(port, bool) and 0 < port < 65536:
             found[service] = Endpoint(address, port, service.protocol)
     return found
-
-
-__all__ = ["DroneEnd", "LinkLost"]

@@ -78,4 +78,6 @@ class Lessons:
     def _distance(self, name: str) -> float | None:
         """How far a peer is, in units of its declared reach."""
         peer = self.peers.get(name)
-        return math.dist(self.here, peer.position) / peer.range_m if self.here is not None and peer is not None else None
+        return (
+            math.dist(self.here, peer.position) / peer.range_m if self.here is not None and peer is not None else None
+        )

@@ -200,7 +200,7 @@ class Session:
 
 
 def _ignored(_message: Mapping[str, Any]) -> None:
-    """Nobody waits for the other end's messages yet."""
+    """No one waits for the other end's messages yet."""
 
 
 async def ask(node: str, peer: str, address: IPv4Address, directory: Path, link: Mapping[str, Any]) -> Session:

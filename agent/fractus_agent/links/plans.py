@@ -98,7 +98,7 @@ class LinkPlans:
             log.warning("links: a DirectLink is not stored (link=%s error=%s)", name, error)
 
     def _read(self, body: Object) -> bool:
-        """Take a DirectLink; False for one that is not this node's, or that nobody can read."""
+        """Take a DirectLink; False for one that is not this node's, or that cannot be read."""
         try:
             link = DirectLink.from_body(body)
         except InvalidObject as error:

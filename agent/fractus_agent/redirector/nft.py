@@ -7,7 +7,7 @@ Our chains hook at priority -150, before those of kube-proxy, on prerouting for 
 network. A connection whose first packet matches an element of `targets` goes to the direct address; without an element it
 falls through to kube-proxy, and so to the cloud path. Elements time out, so that an agent that dies leaves the cloud path.
 
-Whoever is in reach can send to a direct interface. So nothing comes in there but beacons and pairing, and what our redirects
+Every radio in reach can send to a direct interface. So nothing comes in there but beacons and pairing, and what our redirects
 lead from nodes that have paired on to pods; and nothing goes out by it that we did not redirect.
 """
 
@@ -137,7 +137,7 @@ table ip {TABLE} {{
 		ct state established,related accept
 		udp dport {ports.udp} accept
 		tcp dport {ports.tcp} accept
-		# Of connections whose redirect ended: their clients shall not wait for a time-out.
+		# Of connections whose redirect ended: their clients must not wait for a time-out.
 		meta l4proto tcp reject with tcp reset
 		drop
 	}}

@@ -57,17 +57,19 @@ class Namespaces:
     """Sockets of the pods on this node, through the network namespaces that the container runtime made.
 
     Args:
-        directory: where the runtime keeps them, /run/netns.
+        directory: where the runtime keeps them, /run/netns; None where no client is on this node.
         own: the node's own namespace as well, for clients in the host's network.
     """
 
-    def __init__(self, directory: Path, *, own: Path = Path("/proc/self/ns/net")) -> None:
+    def __init__(self, directory: Path | None, *, own: Path = Path("/proc/self/ns/net")) -> None:
         self._directory = directory
         self._own = own
         self._open: dict[Path, Sockets] = {}
 
     def refresh(self) -> Collection[Sockets]:
         """Open what is new, close what is gone; all that are there."""
+        if self._directory is None:
+            return ()
         there = {self._own, *(self._directory.iterdir() if self._directory.is_dir() else ())}
         for path in set(self._open) - there:
             self._open.pop(path).close()
@@ -150,14 +152,26 @@ class Redirector:
             NetlinkError: the kernel refused; nothing was changed.
             RedirectFailed: our table cannot be made.
         """
+        wanted = set(services)
+        if wanted == self._numbers.keys():
+            return
         numbers: dict[Endpoint, int] = {}
-        for service in sorted(set(services)):
+        for service in sorted(wanted):
             # A number stays with its service, for connections that are there carry it.
             numbers[service] = self._numbers.get(service) or self._fresh(numbers)
         ended = self._paths({service: n for service, n in self._numbers.items() if service not in numbers})
         self._write({virtual: to for virtual, to in self._redirects.items() if virtual in numbers}, numbers)
         self._left += ended
         self._leave(ended)
+
+    def lead(self, targets: Mapping[Endpoint, Endpoint]) -> None:
+        """Lead what comes from elsewhere to pods of this node; connections to pods that are no targets any more are forgotten.
+
+        Raises:
+            NetlinkError: the kernel refused; nothing was changed.
+            RedirectFailed: our table cannot be made.
+        """
+        self._leave(self._turn(targets)[1])
 
     async def run(self) -> None:
         """Keep the redirects alive until cancelled; then new connections take the cloud path at once."""
@@ -187,29 +201,37 @@ class Redirector:
             NetlinkError: the kernel refused; nothing was changed.
             RedirectFailed: our table is gone and cannot be made again.
         """
+        moved, left = self._turn(targets)
+        if not moved:
+            return Switched()
+        old = {each.number for each in left}
+        drained = 0
+        try:
+            if planned:
+                self._draining |= old
+                drained = await self._drain({c for each in left for c in each.connections}, moved)
+        finally:
+            self._draining -= old
+            cut = self._leave(left)
+        log.info("redirector: switched (services=%d planned=%s drained=%d cut=%d)", len(moved), planned, drained, cut)
+        return Switched(drained, cut)
+
+    def _turn(self, targets: Mapping[Endpoint, Endpoint | None]) -> tuple[list[Endpoint], list[_Left]]:
+        """Lead new connections elsewhere; which services were moved, and the paths that they left."""
         before = self._redirects
         after = {v: t for v, t in (before | dict(targets)).items() if t is not None and v in self._numbers}
         moved = sorted(v for v in targets if before.get(v) != after.get(v))
         if not moved:
-            return Switched()
-        old = {virtual: self._numbers[virtual] for virtual in moved}
+            return [], []
+        old = {virtual: self._numbers[virtual] for virtual in moved if virtual in self._numbers}
         numbers = dict(self._numbers)
-        for virtual in moved:
+        for virtual in old:
             numbers[virtual] = self._fresh(numbers)
         self._write(after, numbers)
         # Connections that clients open from here on take the new path, and have the new number.
         left = self._paths(old)
         self._left += left
-        drained = 0
-        try:
-            if planned:
-                self._draining |= set(old.values())
-                drained = await self._drain({c for each in left for c in each.connections}, moved)
-        finally:
-            self._draining -= set(old.values())
-            cut = self._leave(left)
-        log.info("redirector: switched (services=%d planned=%s drained=%d cut=%d)", len(moved), planned, drained, cut)
-        return Switched(drained, cut)
+        return moved, left
 
     def _fresh(self, taken: Mapping[Endpoint, int]) -> int:
         """A number that no service has, and none that was left."""

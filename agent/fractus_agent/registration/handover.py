@@ -7,6 +7,7 @@ import logging
 import os
 from pathlib import Path
 
+from fractus_core.api.model import InvalidObject
 from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_storage import remove_temporary, write_file
 
@@ -29,6 +30,14 @@ class Handover:
         self._path = path
         self.condition: Condition | None = None
         remove_temporary(path)
+
+    def stored(self) -> Drone | EdgeNode | None:
+        """The object as it was handed over last; None when none was, or it cannot be read."""
+        try:
+            body = json.loads(self._path.read_bytes())
+            return Drone.from_body(body) if body["kind"] == "Drone" else EdgeNode.from_body(body)
+        except (OSError, ValueError, KeyError, TypeError, RecursionError, InvalidObject):
+            return None
 
     def put(self, resource: Drone | EdgeNode) -> None:
         """Store the object."""

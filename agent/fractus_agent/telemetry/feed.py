@@ -113,7 +113,7 @@ class TelemetryFeed:
                     self.latest, self.problem = snapshot(message), None
                     backoff.succeeded()
                     self._changed()
-                self._lost("asking anew", expected=True)
+                self._lost("asking again", expected=True)
                 continue
             except grpc.aio.AioRpcError as error:
                 self._lost(f"{error.code().name}: {error.details()}")

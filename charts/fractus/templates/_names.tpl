@@ -50,7 +50,7 @@ tolerations:
 {{ include "fractus.pullSecrets" .root }}
 {{- end }}
 
-{{/* Root, to write the node's directories, and nothing beyond; take (dict "privileged" false). */}}
+{{/* Root, to write the node's directories, and nothing beyond but what is added; take (dict "privileged" false). */}}
 {{- define "fractus.nodeSecurity" -}}
 {{- if .privileged }}
 privileged: true
@@ -59,7 +59,7 @@ readOnlyRootFilesystem: true
 runAsUser: 0
 allowPrivilegeEscalation: false
 readOnlyRootFilesystem: true
-capabilities: {drop: [ALL]}
+capabilities: {drop: [ALL]{{ with .add }}, add: {{ toJson . }}{{ end }}}
 seccompProfile: {type: RuntimeDefault}
 {{- end }}
 {{- end }}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from datetime import datetime
 from typing import Any, Literal
 
@@ -71,6 +72,12 @@ class Interface(Model):
     def bandwidth_mbps(self) -> float:
         """The bandwidth, declared or usual for its technology."""
         return self.bandwidth if self.bandwidth is not None else BANDWIDTH_MBPS[self.technology]
+
+
+def direct_interface(interfaces: Iterable[Interface]) -> Interface | None:
+    """The interface that a node's agent makes direct links over: the first with a device, a range and a pairing."""
+    usable = (each for each in interfaces if each.device and each.range is not None and each.pairing is not None)
+    return next(usable, None)
 
 
 class Dimensions(Model):

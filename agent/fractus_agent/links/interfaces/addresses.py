@@ -104,7 +104,7 @@ def _listed(netlink: Netlink, index: int) -> Iterator[IPv4Address]:
 def _ask(netlink: Netlink, kind: int, flags: int, body: bytes) -> None:
     sequence = netlink.sequence()
     netlink.send(message(kind, NLM_F_ACK | flags, sequence, body))
-    # What was deleted or added by somebody else in between is as it should be.
+    # What was deleted or added by another program in between is as it should be.
     netlink.acknowledged({sequence}, ignore=frozenset({errno.EADDRNOTAVAIL, errno.EEXIST}))
 
 

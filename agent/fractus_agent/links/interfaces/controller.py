@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Protocol
-
-from fractus_core.api.nodes import Interface
-from fractus_core.api.model import Model
 
 
 class InterfaceProblem(Exception):

@@ -1,0 +1,239 @@
+"""Direct links of a node as a whole: its interface, its table, its end of the links, while DirectLinks name the node."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import datetime
+from pathlib import Path
+
+from fractus_core.api.nodes import Drone, EdgeNode, Interface, direct_interface
+from fractus_core.linking import PathMetrics, Seen
+
+from fractus_agent.cluster.store import End, Store
+from fractus_agent.links import beacons, pairing
+from fractus_agent.links.addressing import link_address
+from fractus_agent.links.beacons import Beacons
+from fractus_agent.links.drone import DroneEnd
+from fractus_agent.links.interfaces.controller import Controller, InterfaceProblem
+from fractus_agent.links.interfaces.simulated import Plain
+from fractus_agent.links.peer import PeerEnd
+from fractus_agent.links.plans import LinkPlans
+from fractus_agent.links.reports import DroneReport, LinkReports, peer_condition
+from fractus_agent.redirector import nft
+from fractus_agent.redirector.conntrack import Conntrack
+from fractus_agent.redirector.netlink import NETLINK_NETFILTER, Netlink, NetlinkError
+from fractus_agent.redirector.redirector import Namespaces, Redirector
+
+log = logging.getLogger(__name__)
+
+PODS = Path("/run/netns")
+"""Where the container runtime keeps the network namespaces of pods."""
+CHECK_S = 2.0
+"""Seconds between looks at the interface: a device may go, and come back without its address."""
+RETRY_S = 5.0
+
+_UPLINK_LATENCY_MS = {"Ethernet": 1.0, "WiFi": 5.0, "5G": 15.0, "4G": 60.0, "BLE": 60.0}
+"""One way to the cloud, by what the node is connected with."""
+_UPLINK_MBPS = 8.0
+
+Node = Drone | EdgeNode
+
+
+def cloud_path(node: Node | None) -> PathMetrics:
+    """What the path to the cloud offers, by the best of a node's other interfaces."""
+    interfaces = node.spec.interfaces if node is not None else ()
+    direct = direct_interface(interfaces)
+    others = [each for each in interfaces if each is not direct]
+    best = max(others, key=lambda each: each.bandwidth_mbps, default=None)
+    rate = best.bandwidth_mbps if best is not None else _UPLINK_MBPS
+    latency_ms = _UPLINK_LATENCY_MS[best.technology if best is not None else "4G"]
+    return PathMetrics(rate, rate, latency_ms, latency_ms)
+
+
+class Connectivity:
+    """Runs this node's end of its direct links.
+
+    Args:
+        store: the API server.
+        node: name of this node.
+        directory: where its DirectLinks are stored.
+        tls: its certificate, key and authority.
+        resource: its Drone or EdgeNode as it is now; None while that is not known.
+        seen: what telemetry says of the drone now.
+        wall: the wall clock.
+        changed: called when links begin or cease to be planned.
+        pods: directory of the pods' network namespaces.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        node: str,
+        directory: Path,
+        tls: Path,
+        *,
+        resource: Callable[[], Node | None],
+        seen: Callable[[], Seen | None],
+        wall: Callable[[], datetime],
+        changed: Callable[[], None] = lambda: None,
+        pods: Path = PODS,
+    ) -> None:
+        self._node = node
+        self._tls = tls
+        self._resource = resource
+        self._seen = seen
+        self._told = changed
+        self._pods = pods
+        self._end: End = "drone" if isinstance(resource(), Drone) else "node"
+        self._plans = LinkPlans(store, directory, node, self._end, self._planned)
+        self._reports = LinkReports(store, self._end, wall)
+        self._changed = asyncio.Event()
+        self._problem: tuple[str, str] | None = None
+        self._peer: PeerEnd | None = None
+        self._drone: DroneEnd | None = None
+
+    @property
+    def active(self) -> bool:
+        """Whether links are planned for this node."""
+        return bool(self._plans.links)
+
+    async def run(self) -> None:
+        """Run until cancelled."""
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._plans.follow())
+            tasks.create_task(self._reports.run())
+            tasks.create_task(self._hold())
+
+    def _planned(self) -> None:
+        if self._drone is not None:
+            self._drone.plan(self._plans.links)
+        if self._peer is not None:
+            self._peer.plan(self._plans.links)
+        self._say()
+        self._changed.set()
+        self._told()
+
+    def _say(self) -> None:
+        """Report what does not come from decisions: of the end that is asked, and while the interface cannot be used."""
+        if self._end == "node":
+            drones = self._peer.drones if self._peer is not None else frozenset()
+            self._reports.conditions(self._plans.links, lambda link: peer_condition(link, self._problem, drones))
+        elif self._problem is not None:
+            self._reports.unusable(self._plans.links, *self._problem)
+
+    async def _hold(self) -> None:
+        """Hold the interface while it is there to be used and links are planned."""
+        while True:
+            self._changed.clear()
+            interface = self._interface()
+            if interface is None or not self._plans.links:
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(self._changed.wait(), RETRY_S)
+                continue
+            using = asyncio.create_task(self._use(interface))
+            try:
+                while not using.done() and self._plans.links and self._interface() == interface:
+                    self._changed.clear()
+                    changed = asyncio.create_task(self._changed.wait())
+                    await asyncio.wait({using, changed}, timeout=CHECK_S, return_when=asyncio.FIRST_COMPLETED)
+                    changed.cancel()
+            finally:
+                using.cancel()
+                await asyncio.gather(using, return_exceptions=True)
+            if not using.cancelled() and (error := using.exception()) is not None:
+                self._set_problem("Failed", f"direct links failed, and are tried again: {_first(error)}")
+                await asyncio.sleep(RETRY_S)
+
+    def _interface(self) -> Interface | None:
+        node = self._resource()
+        return direct_interface(node.spec.interfaces) if node is not None else None
+
+    async def _use(self, interface: Interface) -> None:
+        """Everything that one interface takes, made new at the beginning and removed in the end."""
+        assert interface.device is not None
+        controller = Plain(interface.device, link_address(self._node))
+        ports = nft.Ports(udp=beacons.PORT, tcp=pairing.PORT)
+        device = interface.device
+        nft.create(device, ports)
+        netlink = Netlink(NETLINK_NETFILTER)
+        conntrack = Conntrack(netlink)
+        # What an agent before this one led anywhere, that knows where it is to be no more.
+        conntrack.forget_all()
+        drone = self._end == "drone"
+        redirector = Redirector(
+            nft.Maps(netlink, lambda: nft.create(device, ports)), conntrack, Namespaces(self._pods if drone else None)
+        )
+        # Outside of the group: redirects are kept alive while the end leads the traffic back.
+        keeping = asyncio.create_task(redirector.run())
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(self._keep_up(controller))
+                tasks.create_task(self._run_end(redirector, device))
+        finally:
+            keeping.cancel()
+            await asyncio.gather(keeping, return_exceptions=True)
+            redirector.close()
+            with suppress(NetlinkError):
+                conntrack.forget_all()
+            netlink.close()
+            with suppress(nft.RedirectFailed):
+                nft.remove()
+            try:
+                await controller.down()
+            except InterfaceProblem as problem:
+                log.warning("links: %s", problem)
+
+    async def _run_end(self, redirector: Redirector, device: str) -> None:
+        if self._end == "drone":
+            drone = self._drone = DroneEnd(
+                self._node,
+                self._tls,
+                redirector,
+                cloud=lambda: cloud_path(self._resource()),
+                seen=self._seen,
+                report=self._report,
+            )
+            drone.plan(self._plans.links)
+            told, run = Beacons(self._node, drone.heard), drone.run
+        else:
+            peer = self._peer = PeerEnd(self._node, self._tls, redirector, self._say)
+            peer.plan(self._plans.links)
+            told, run = Beacons(self._node, lambda _: None), peer.run
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(told.run(device))
+                tasks.create_task(run())
+        finally:
+            self._drone = self._peer = None
+            self._say()
+
+    def _report(self, report: DroneReport) -> None:
+        if self._problem is None:
+            self._reports.drone(report)
+
+    async def _keep_up(self, controller: Controller) -> None:
+        """Have the interface up, whatever becomes of its device."""
+        while True:
+            try:
+                await controller.up()
+            except InterfaceProblem as problem:
+                self._set_problem(problem.reason, str(problem))
+            else:
+                self._set_problem("", "")
+            await asyncio.sleep(CHECK_S)
+
+    def _set_problem(self, reason: str, message: str) -> None:
+        found = (reason, message) if reason else None
+        if found != self._problem:
+            log.log(logging.WARNING if found else logging.INFO, "links: %s", message or "the interface is up")
+            self._problem = found
+            self._say()
+
+
+def _first(error: BaseException) -> BaseException:
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    return error

@@ -1,0 +1,133 @@
+"""The end of direct links that is asked: takes drones that a DirectLink names, and leads their calls to its pods."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+from fractus_core.api.links import DirectLink
+
+from fractus_agent.links.acceptor import Acceptor
+from fractus_agent.links.addressing import link_address
+from fractus_agent.links.pairing import Session
+from fractus_agent.links.plans import route_key, target, virtual
+from fractus_agent.redirector.netlink import NetlinkError
+from fractus_agent.redirector.nft import Endpoint, RedirectFailed
+from fractus_agent.redirector.redirector import Redirector
+
+log = logging.getLogger(__name__)
+
+MAX_DRONES = 1
+"""Drones that are linked at one time: what a DirectLink says the link offers is for one."""
+FIRST_PORT, LAST_PORT = 30_000, 39_999
+"""Ports on the link's address that stand for pods; nothing listens there, they are translated."""
+LISTEN_RETRY_S = 1.0
+
+
+class PeerEnd:
+    """Takes drones, and leads their calls to pods of this node.
+
+    Args:
+        node: this node.
+        tls: its certificate, key and authority.
+        redirector: of this node.
+        changed: called when drones come or go.
+    """
+
+    def __init__(self, node: str, tls: Path, redirector: Redirector, changed: Callable[[], None]) -> None:
+        self._address = link_address(node)
+        self._redirector = redirector
+        self._changed = changed
+        self._links: tuple[DirectLink, ...] = ()
+        self._planned = asyncio.Event()
+        """Set by the next change; each change has one of its own."""
+        self._routes: dict[str, dict[Endpoint, Endpoint]] = {}
+        self._ports: dict[Endpoint, int] = {}
+        self._acceptor = Acceptor(tls, self._permits, self._serve, max_peers=MAX_DRONES)
+
+    @property
+    def drones(self) -> frozenset[str]:
+        """The drones that are linked now."""
+        return self._acceptor.peers
+
+    def plan(self, links: tuple[DirectLink, ...]) -> None:
+        """Take the DirectLinks of this node as they are now."""
+        self._links = links
+        self._planned.set()
+        self._planned = asyncio.Event()
+
+    async def run(self) -> None:
+        """Take drones until cancelled."""
+        while True:
+            try:
+                await self._acceptor.run(self._address)
+            except OSError as error:  # the device is not there yet, or the certificate
+                log.debug("links: not listening, trying again (error=%s)", error)
+                await asyncio.sleep(LISTEN_RETRY_S)
+
+    def _permits(self, drone: str) -> str:
+        """Why a node may not link to this one; empty when it may."""
+        return "" if any(link.spec.drone == drone for link in self._links) else f"no DirectLink names {drone}"
+
+    async def _serve(self, session: Session) -> None:
+        """While a session lasts: lead the drone's calls on, and tell it where to."""
+        told: dict[str, int] | None = None
+        self._changed()
+        try:
+            while not self._permits(session.peer):
+                planned = self._planned
+                try:
+                    routes = self._lead(session.peer)
+                except (NetlinkError, RedirectFailed) as error:
+                    log.warning("links: calls are not led on, trying again (peer=%s error=%s)", session.peer, error)
+                    await asyncio.sleep(LISTEN_RETRY_S)
+                    continue
+                if routes != told:
+                    await session.send({"routes": routes})
+                    told = routes
+                await planned.wait()
+        finally:
+            self._routes.pop(session.peer, None)
+            self._changed()
+            try:
+                self._write({})
+            except (NetlinkError, RedirectFailed) as error:
+                log.warning(
+                    "links: redirects stay until they end by themselves (peer=%s error=%s)", session.peer, error
+                )
+
+    def _lead(self, drone: str) -> dict[str, int]:
+        """Lead a drone's calls to the pods that are ready; by service, the port that stands for it.
+
+        Raises:
+            NetlinkError: the kernel refused.
+            RedirectFailed: our table cannot be made.
+        """
+        found: dict[str, int] = {}
+        routes: dict[Endpoint, Endpoint] = {}
+        for link in self._links:
+            for service in link.spec.services if link.spec.drone == drone else ():
+                called, pod = virtual(service), target(service)
+                if called is None or pod is None:
+                    continue
+                port = self._port(called)
+                found[route_key(called)] = port
+                routes[Endpoint(self._address, port, called.protocol)] = pod
+        self._routes[drone] = routes
+        self._write(routes)
+        return found
+
+    def _port(self, service: Endpoint) -> int:
+        """The port that stands for a service, the same for as long as the agent runs."""
+        if service not in self._ports:
+            taken = set(self._ports.values())
+            self._ports[service] = next(port for port in range(FIRST_PORT, LAST_PORT + 1) if port not in taken)
+        return self._ports[service]
+
+    def _write(self, targets: dict[Endpoint, Endpoint]) -> None:
+        served = {endpoint for routes in self._routes.values() for endpoint in routes}
+        self._redirector.serve(served)
+        self._redirector.admit(link_address(drone) for drone in self._routes)
+        self._redirector.lead(targets)

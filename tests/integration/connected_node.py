@@ -1,0 +1,77 @@
+"""A node of the connectivity tests: the direct links of an agent in the network namespace that it is started in.
+
+It reads the node, its DirectLinks and what telemetry says from files of its folder, whenever they change, and tells what it
+would write to the API server on its output.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import sys
+from collections.abc import AsyncGenerator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from fractus_agent.cluster.store import End, Event, Listed
+from fractus_agent.links.connectivity import Connectivity
+from fractus_core.api.nodes import Drone, EdgeNode
+from fractus_core.linking import Seen
+
+POLL_S = 0.05
+
+
+class Files:
+    """What the API server and telemetry would say."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def read(self, name: str) -> Any:
+        path = self._folder / name
+        return json.loads(path.read_text()) if path.exists() else None
+
+    async def direct_links(self, _end: End) -> AsyncGenerator[Event, None]:
+        before = None
+        while True:
+            links = self.read("links.json")
+            if links is not None and links != before:
+                before = links
+                yield Listed(tuple(links))
+            await asyncio.sleep(POLL_S)
+
+    async def apply_status(self, _kind: str, name: str, status: dict[str, Any], end: End | None = None) -> None:
+        print(json.dumps({"link": name, "end": end, "status": status}), flush=True)
+
+
+async def main(folder: Path) -> None:
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(relativeCreated)d %(message)s")
+    files = Files(folder)
+
+    def resource() -> Drone | EdgeNode:
+        body = files.read("node.json")
+        return Drone.from_body(body) if body["kind"] == "Drone" else EdgeNode.from_body(body)
+
+    def seen() -> Seen | None:
+        said = files.read("seen.json")
+        return Seen(said["lat"], said["lon"], said["up"], 0.0, tuple(said["velocity"])) if said else None
+
+    links = Connectivity(
+        files, resource().name, folder / "links", folder / "tls",  # type: ignore[arg-type]
+        resource=resource, seen=seen, wall=lambda: datetime.now(UTC), pods=folder / "pods",
+    )  # fmt: skip
+    print("ready", flush=True)
+    running = asyncio.create_task(links.run())
+    loop = asyncio.get_running_loop()
+    over = asyncio.StreamReader()
+    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(over), sys.stdin)
+    reading = asyncio.create_task(over.read())
+    await asyncio.wait({running, reading}, return_when=asyncio.FIRST_COMPLETED)
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+
+
+if __name__ == "__main__":
+    asyncio.run(main(Path(sys.argv[1])))

@@ -1,0 +1,370 @@
+"""A drone with a pod, edge nodes with a pod each, a cloud, and a radio: network namespaces in which agents run direct links."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import queue
+import re
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from ipaddress import IPv4Address
+from pathlib import Path
+from typing import Any
+
+from fractus_agent.links.addressing import link_address
+from fractus_agent.redirector.netlink import in_namespace
+from fractus_agent.redirector.nft import Endpoint
+from fractus_core.identity.authority import Authority
+from fractus_core.linking.course import Frame
+from fractus_radio.medium import Medium, Station
+from fractus_radio.propagation import Propagation
+from fractus_radio.radio import Radio
+from fractus_radio.taps import Tap
+from redirect_rig import CLIENT, SERVER, run
+
+VIP = Endpoint(IPv4Address("10.96.0.5"), 8080)
+RANGE_M = 80.0
+TIMEOUT_S = 40.0
+PROGRAM = Path(__file__).with_name("connected_node.py")
+ORIGIN = (39.36, 22.94)
+_FRAME = Frame(*ORIGIN)
+_PER_EAST, _PER_NORTH = (
+    _FRAME.position(ORIGIN[0], ORIGIN[1] + 1, 0)[0],
+    _FRAME.position(ORIGIN[0] + 1, ORIGIN[1], 0)[1],
+)
+
+
+def place(east: float, north: float, up: float = 0.0) -> dict[str, Any]:
+    """A position of a manifest."""
+    lat, lon = ORIGIN[0] + north / _PER_NORTH, ORIGIN[1] + east / _PER_EAST
+    return {"lat": lat, "lon": lon, "alt": up, "altitudeReference": "home"}
+
+
+class Agent:
+    """A node in a network namespace, with a radio, an uplink to the cloud, a pod, and an agent's direct links."""
+
+    def __init__(self, world: World, name: str, kind: str, at: tuple[float, float]) -> None:
+        self.world, self.name, self.kind, self.at = world, name, kind, at
+        self.number = len(world.agents) + 1
+        self.pod = f"10.88.{self.number}.2"
+        self.folder = world.directory / name
+        self.pods = self.folder / "pods"
+        self.pods.mkdir(parents=True)
+        world.namespace(name)
+        world.namespace(f"{name}p")
+        (self.pods / "pod").symlink_to(world.path(f"{name}p"))
+        world.cable(name, "pod0", f"10.88.{self.number}.1/24", f"{name}p", "eth0", f"{self.pod}/24")
+        world.cable(name, "lte0", f"10.90.{self.number}.1/24", "cloud", f"to{self.number}", f"10.90.{self.number}.2/24")
+        run(*world.inside(f"{name}p"), "ip", "route", "add", "default", "via", f"10.88.{self.number}.1")
+        run(*world.inside(name), "ip", "route", "add", "default", "via", f"10.90.{self.number}.2")
+        run(*world.inside("cloud"), "ip", "route", "add", f"10.88.{self.number}.0/24", "via", f"10.90.{self.number}.1")
+        self.add_radio()
+        self.certify(name)
+        interfaces = [
+            {"technology": "4G"},
+            {
+                "technology": "WiFi",
+                "device": "wlan0",
+                "range": RANGE_M,
+                "pairing": {"mode": "adhoc", "networkId": "net"},
+            },
+        ]
+        spec: dict[str, Any] = {"interfaces": interfaces}
+        if kind == "EdgeNode":
+            spec["location"] = {"lat": place(*at)["lat"], "lon": place(*at)["lon"]}
+        body = {"apiVersion": "fractus.dev/v1alpha1", "kind": kind, "metadata": {"name": name}, "spec": spec}
+        self._write("node.json", body)
+        self._process: subprocess.Popen[str] | None = None
+        self._reading: threading.Thread | None = None
+        self._said: queue.Queue[str] = queue.Queue()
+        self.statuses: dict[str, dict[str, Any]] = {}
+
+    def add_radio(self) -> None:
+        self.tap = Tap(self.world.path(self.name), "wlan0", bytes([2, 0, 0, 0, 0, self.number]))
+        with self.world.turn:
+            self.world.radio.add_station(self.name, self.tap, Station((*self.at, 0.0), self.tap.address, "net"))
+
+    def certify(self, name: str, authority: Authority | None = None) -> None:
+        """Give it a node's certificate."""
+        tls = self.folder / "tls"
+        tls.mkdir(exist_ok=True)
+        for file, content in (authority or self.world.authority).issue_node(name, datetime.now(UTC)).items():
+            (tls / file).write_bytes(base64.b64decode(content))
+
+    def _write(self, name: str, content: Any) -> None:
+        fresh = self.folder / f".{name}.new"
+        fresh.write_text(json.dumps(content))
+        fresh.replace(self.folder / name)
+
+    def plan(self, *links: dict[str, Any]) -> None:
+        """What the operator wrote."""
+        self._write("links.json", list(links))
+
+    def fly(self, east: float, north: float = 0.0, velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+        """Where the drone is and what telemetry says of it."""
+        self.see(east, north, velocity)
+        self.world.command(station=self.name, position=[east, north, 0.0])
+
+    def see(self, east: float, north: float = 0.0, velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+        """What telemetry says alone."""
+        where = place(east, north)
+        self._write("seen.json", {"lat": where["lat"], "lon": where["lon"], "up": 0.0, "velocity": velocity})
+
+    def start(self) -> None:
+        log = (self.folder / "agent.log").open("a")
+        self._process = subprocess.Popen(
+            [*self.world.inside(self.name), sys.executable, str(PROGRAM), str(self.folder)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True,
+        )  # fmt: skip
+        log.close()
+        assert self._process.stdout is not None
+        assert self._process.stdout.readline() == "ready\n"
+        self._reading = threading.Thread(target=self._read, args=(self._process.stdout,))
+        self._reading.start()
+
+    def _read(self, output: Any) -> None:
+        for line in output:
+            said = json.loads(line)
+            self.statuses[said["link"]] = said["status"]
+        output.close()
+
+    @property
+    def pid(self) -> int:
+        assert self._process is not None
+        return self._process.pid
+
+    def kill(self) -> None:
+        """As kubelet, the kernel or a loss of power would."""
+        assert self._process is not None
+        self._process.kill()
+        self._end()
+
+    def stop(self) -> None:
+        """As an upgrade would."""
+        assert self._process is not None
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._end()
+
+    def _end(self) -> None:
+        assert self._process is not None
+        self._process.wait(TIMEOUT_S)
+        if self._process.stdin is not None and not self._process.stdin.closed:
+            self._process.stdin.close()
+        if self._reading is not None:
+            self._reading.join()
+        self._process = None
+
+    def clear(self) -> None:
+        if self._process is not None:
+            self.stop()
+
+    def log(self) -> str:
+        path = self.folder / "agent.log"
+        return path.read_text() if path.exists() else ""
+
+    def status(self, link: str) -> dict[str, Any]:
+        return self.statuses.get(link, {})
+
+    def condition(self, link: str, kind: str) -> dict[str, Any]:
+        return next((c for c in self.status(link).get("conditions", ()) if c["type"] == kind), {})
+
+    def _show(self, *words: str) -> str:
+        return subprocess.run(
+            [*self.world.inside(self.name), *words], capture_output=True, text=True, timeout=30, check=False
+        ).stdout
+
+    def redirects(self) -> set[str]:
+        """Elements of the map, such as `10.96.0.5 . tcp . 8080`."""
+        return set(
+            re.findall(r"([\d.]+ \. \w+ \. \d+) timeout", self._show("nft", "list", "map", "ip", "fractus", "targets"))
+        )
+
+    def tables(self) -> set[str]:
+        return set(self._show("nft", "list", "tables").split("\n")) - {""}
+
+    def addresses(self) -> list[str]:
+        return re.findall(r"169\.254\.[\d.]+/\d+", self._show("ip", "addr", "show", "dev", "wlan0"))
+
+    def routes(self) -> list[str]:
+        return sorted(self._show("ip", "route").splitlines())
+
+
+class World:
+    """The namespaces, the radio on a thread, and an authority."""
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self.tag = f"fxw{os.getpid() % 100000}"
+        self.turn = threading.Lock()
+        self.radio = Radio(Medium(Propagation.reaching(RANGE_M), 1), directory / "radio.sock")
+        self.authority = Authority.generate(datetime.now(UTC))
+        self.agents: dict[str, Agent] = {}
+        self._namespaces: list[str] = []
+        self._processes: list[subprocess.Popen[str]] = []
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._carry)
+        self._thread.start()
+        self.namespace("cloud")
+        run(*self.inside("cloud"), "ip", "addr", "add", f"{VIP.address}/32", "dev", "lo")
+
+    def _carry(self) -> None:
+        while not self._over.is_set():
+            with self.turn:
+                self.radio.turn(0.01)
+            time.sleep(0)
+
+    def command(self, **command: object) -> None:
+        with self.turn:
+            self.radio.command(command)
+
+    def name(self, node: str) -> str:
+        return f"{self.tag}{node}"
+
+    def path(self, node: str) -> Path:
+        return Path("/run/netns", self.name(node))
+
+    def inside(self, node: str) -> list[str]:
+        return ["nsenter", f"--net={self.path(node)}"]
+
+    def namespace(self, node: str) -> None:
+        run("ip", "netns", "add", self.name(node))
+        self._namespaces.append(self.name(node))
+        run(*self.inside(node), "ip", "link", "set", "lo", "up")
+        run(*self.inside(node), "sysctl", "-qw", "net.ipv4.ip_forward=1")
+
+    def cable(self, left: str, device: str, address: str, right: str, other: str, peer: str) -> None:
+        run(
+            *self.inside(left), "ip", "link", "add", device, "type", "veth",
+            "peer", "name", other, "netns", self.name(right),
+        )  # fmt: skip
+        for node, link, ip in ((left, device, address), (right, other, peer)):
+            run(*self.inside(node), "ip", "addr", "add", ip, "dev", link)
+            run(*self.inside(node), "ip", "link", "set", link, "up")
+
+    def drone(self, name: str = "d1") -> Agent:
+        self.agents[name] = found = Agent(self, name, "Drone", (0.0, 0.0))
+        found.fly(0.0)
+        return found
+
+    def edge(self, name: str, east: float, north: float = 0.0) -> Agent:
+        self.agents[name] = Agent(self, name, "EdgeNode", (east, north))
+        return self.agents[name]
+
+    def link(self, drone: Agent, edge: Agent, **spec: Any) -> dict[str, Any]:
+        """A DirectLink, as the operator writes it."""
+        service = {
+            "component": "Server", "instance": f"server-{edge.name}",
+            "virtual": {"address": str(VIP.address), "port": VIP.port},
+            "target": {"address": edge.pod, "port": VIP.port},
+        }  # fmt: skip
+        base = {
+            "drone": drone.name, "node": edge.name, "technology": "WiFi",
+            "application": {"namespace": "default", "name": "app", "uid": "u"},
+            "pairing": {"mode": "adhoc", "networkId": "net"}, "range": RANGE_M, "bandwidth": 12.0,
+            "position": place(*edge.at), "heuristic": {"kind": "max", "metric": "ingress-bandwidth"},
+            "services": [service],
+        }  # fmt: skip
+        return {
+            "apiVersion": "fractus.dev/v1alpha1", "kind": "DirectLink",
+            "metadata": {"name": f"app-{drone.name}-{edge.name}", "uid": "u", "generation": 1}, "spec": base | spec,
+        }  # fmt: skip
+
+    def python(self, node: str, program: str, *arguments: object) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [*self.inside(node), sys.executable, "-c", program, *map(str, arguments)], stdout=subprocess.PIPE, text=True
+        )
+        self._processes.append(process)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        return process
+
+    def serve(self, work_s: float = 0.005) -> None:
+        """Start the base instance in the cloud, and one on each edge node."""
+        self.python("cloud", SERVER, "cloud", f"{VIP.address}:{VIP.port}", work_s)
+        for agent in self.agents.values():
+            if agent.kind == "EdgeNode":
+                self.python(f"{agent.name}p", SERVER, agent.name, f"{agent.pod}:{VIP.port}", work_s)
+
+    def client(self, drone: Agent, calls: int, pause_s: float = 0.02, size: int = 10) -> Client:
+        return Client(self.python(f"{drone.name}p", CLIENT, f"{VIP.address}:{VIP.port}", calls, pause_s, size))
+
+    def conntrack(self, agent: Agent) -> int:
+        """Connections of a node that carry a mark of ours."""
+        listed = in_namespace(self.path(agent.name), lambda: Path("/proc/thread-self/net/nf_conntrack"))
+        text = in_namespace(self.path(agent.name), lambda: listed.read_text() if listed.exists() else "")
+        marks = [int(found) for found in re.findall(r"mark=(\d+)", text)]
+        return len([mark for mark in marks if mark & 0xFFF00000 == 0xF6A00000])
+
+    def close(self) -> None:
+        for process in self._processes:
+            process.kill()
+            process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
+        for agent in self.agents.values():
+            agent.clear()
+        self._over.set()
+        self._thread.join()
+        self.radio.close()
+        for name in self._namespaces:
+            subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
+
+
+class Client:
+    """A client that calls the virtual address, and what it was answered."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self.answers: list[list[str]] = []
+        self._process = process
+        self._thread = threading.Thread(target=self._read)
+        self._thread.start()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self.answers.append(line.split())
+
+    def all(self) -> list[list[str]]:
+        self._thread.join(120)
+        return self.answers
+
+    @property
+    def by(self) -> str:
+        """Who answered last."""
+        return self.answers[-1][1] if self.answers else ""
+
+    @property
+    def failed(self) -> list[list[str]]:
+        return [answer for answer in self.answers if answer[1] == "FAILED"]
+
+
+def until(holds: Callable[[], object], what: str, world: World | None = None, timeout_s: float = TIMEOUT_S) -> float:
+    """Wait for something; how long it took."""
+    begun = time.monotonic()
+    while time.monotonic() - begun < timeout_s:
+        if holds():
+            return time.monotonic() - begun
+        time.sleep(0.02)
+    logs = "".join(f"\n--- {a.name}\n{a.log()[-3000:]}\n{a.statuses}" for a in world.agents.values()) if world else ""
+    raise AssertionError(f"not in {timeout_s:g} s: {what}{logs}")
+
+
+@contextmanager
+def connected_world(directory: Path) -> Iterator[World]:
+    """A world that is removed at the end."""
+    found = World(directory)
+    try:
+        yield found
+    finally:
+        found.close()
+
+
+__all__ = ["Agent", "Client", "World", "connected_world", "link_address", "place", "until"]

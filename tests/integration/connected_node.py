@@ -20,7 +20,7 @@ from fractus_agent.links.connectivity import Connectivity
 from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_core.linking import Seen
 
-POLL_S = 0.05
+POLL_S = 0.2
 
 
 class Files:

@@ -87,9 +87,35 @@ class Agent:
         self.statuses: dict[str, dict[str, Any]] = {}
 
     def add_radio(self) -> None:
-        self.tap = Tap(self.world.path(self.name), "wlan0", bytes([2, 0, 0, 0, 0, self.number]))
+        hardware = bytes([2, 0, 0, 0, 0, self.number])
+        tap = Tap(self.world.path(self.name), "wlan0", hardware)
         with self.world.turn:
-            self.world.radio.add_station(self.name, self.tap, Station((*self.at, 0.0), self.tap.address, "net"))
+            self.world.radio.add_station(self.name, tap, Station((*self.at, 0.0), hardware, "net"))
+
+    def lose_radio(self) -> None:
+        """The device goes, as one on USB does."""
+        self._rename("wlan0", "gone0")
+
+    def regain_radio(self) -> None:
+        """It comes back, without its address."""
+        self._rename("gone0", "wlan0")
+
+    def _rename(self, before: str, after: str) -> None:
+        for words in (["down"], ["name", after]):
+            run(*self.world.inside(self.name), "ip", "link", "set", before, *words)
+
+    def join(self, address: str) -> None:
+        """Be in the network of the direct links without an agent."""
+        for words in (["addr", "add", f"{address}/16", "dev", "wlan0"], ["link", "set", "wlan0", "up"]):
+            run(*self.world.inside(self.name), "ip", *words)
+
+    def reaches(self, address: str, port: int) -> bool:
+        """Whether a connection can be made from the node."""
+        program = f"import socket; socket.create_connection(({address!r}, {port}), 2).close()"
+        done = subprocess.run(
+            [*self.world.inside(self.name), sys.executable, "-c", program], capture_output=True, timeout=30, check=False
+        )
+        return done.returncode == 0
 
     def certify(self, name: str, authority: Authority | None = None) -> None:
         """Give it a node's certificate."""

@@ -333,3 +333,38 @@ def test_an_edge_node_registers(server: ApiServer, authority: TestAuthority, tmp
     finally:
         print(node.log())
         node.close()
+
+
+def test_a_direct_link_whose_device_is_missing(server: ApiServer, drone: Node) -> None:
+    """The whole agent with a DirectLink; its traffic is tried in test_connectivity.py."""
+    pairing = {"mode": "adhoc", "networkId": "fleet"}
+    drone.describe(interfaces=[{"technology": "WiFi", "device": "fxnone0", "range": 80, "pairing": pairing}])
+    drone.start()
+    drone.certify()
+    path = f"{FRACTUS}/directlinks"
+    spec = {
+        "drone": "drone-1", "node": "edge-1", "application": {"namespace": "default", "name": "app", "uid": "a"},
+        "technology": "WiFi", "pairing": pairing, "range": 80, "bandwidth": 12, "position": {"lat": 39.36, "lon": 22.94},
+        "heuristic": {"kind": "max", "metric": "ingress-bandwidth"},
+    }  # fmt: skip
+    for name, of in (("mine", "drone-1"), ("other", "drone-2")):
+        server.post(
+            path,
+            {
+                "apiVersion": "fractus.dev/v1alpha1",
+                "kind": "DirectLink",
+                "metadata": {"name": name},
+                "spec": spec | {"drone": of},
+            },
+        )
+    try:
+        status = wait_for(lambda: (server.get(f"{path}/mine") or {}).get("status"), "a status", timeout_s=40)
+        assert (status["phase"], status["traffic"], status["reason"]) == ("Idle", "cloud", "DeviceMissing")
+        assert {c["type"]: c["status"] for c in status["conditions"]} == {"Linked": "False", "TrafficDirect": "False"}
+        assert "fxnone0" in status["message"]
+        assert not (server.get(f"{path}/other") or {}).get("status")
+        assert {file.name for file in (drone.state / "links").iterdir()} == {"mine.json"}
+        server.delete(f"{path}/mine")
+        wait_for(lambda: not list((drone.state / "links").iterdir()), "the end of the stored link", timeout_s=30)
+    finally:
+        server.delete(path)

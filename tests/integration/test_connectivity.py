@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -67,3 +68,161 @@ def test_nothing_is_left_when_links_are_planned_no_more(world: World) -> None:
     assert edge.routes() == before
     assert world.conntrack(drone) == world.conntrack(edge) == 0
     assert not client.failed
+
+
+def test_an_abrupt_loss_is_over_within_a_second(world: World) -> None:
+    edge = world.edge("e1", 20.0)
+    drone = flying(world, edge)
+    client = world.client(drone, 100_000, 0.02)
+    until(lambda: client.by == "e1", "an answer over the link", world)
+    world.command(station="d1", off=True)
+    until(lambda: client.by == "cloud", "an answer of the cloud", world)
+    numbered = [(float(answer[2]), answer[1]) for answer in client.answers if answer[1] != "FAILED"]
+    last = max(moment for moment, who in numbered if who == "e1")
+    first = min(moment for moment, who in numbered if who == "cloud" and moment > last)
+    assert first - last < 1.5  # 0.4 s until the loss is noticed; a second without the load of a test machine
+    assert len(client.failed) <= 1
+    assert not drone.redirects()
+    until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "the status", world)
+    # It comes back when the radio does, and no attempt in between hurts.
+    world.command(station="d1", off=False)
+    until(lambda: client.by == "e1", "an answer over the link again", world)
+
+
+def test_an_agent_that_is_killed_leaves_the_cloud_path_and_starts_clean(world: World) -> None:
+    edge = world.edge("e1", 20.0)
+    drone = flying(world, edge)
+    client = world.client(drone, 100_000, 0.1)
+    until(lambda: client.by == "e1", "an answer over the link", world)
+    drone.kill()
+    until(lambda: client.by == "cloud", "an answer of the cloud, though no agent leads there", world)
+    until(lambda: not drone.redirects() and not edge.redirects(), "redirects that ended by themselves", world)
+    # The new one knows its links from disk: the API server may be out of reach.
+    (drone.folder / "links.json").unlink()
+    drone.start()
+    until(lambda: client.by == "e1", "an answer over the link again", world)
+    assert "restored from disk" in drone.log()
+    assert len(drone.redirects()) == 1
+    assert drone.addresses() == [f"{link_address('d1')}/16"]
+
+
+def test_the_edge_nodes_agent_is_killed_and_comes_back(world: World) -> None:
+    edge = world.edge("e1", 20.0)
+    drone = flying(world, edge)
+    client = world.client(drone, 100_000, 0.05)
+    until(lambda: client.by == "e1", "an answer over the link", world)
+    edge.kill()
+    until(lambda: client.by == "cloud", "an answer of the cloud", world)
+    edge.start()
+    until(lambda: client.by == "e1", "an answer over the link again", world)
+
+
+def test_two_drones_compete_for_one_edge_node(world: World) -> None:
+    edge, first, second = world.edge("e1", 20.0), world.drone("d1"), world.drone("d2")
+    links = [world.link(first, edge), world.link(second, edge)]
+    world.serve()
+    edge.plan(*links)
+    edge.start()
+    first.plan(links[0])
+    first.start()
+    clients = [world.client(drone, 100_000, 0.1) for drone in (first, second)]
+    until(lambda: clients[0].by == "e1", "the first drone's answer over the link", world)
+    second.plan(links[1])
+    second.start()
+    until(lambda: second.status("app-d2-e1").get("reason") == "PairingFailed", "a refusal", world)
+    assert clients[1].by == "cloud"
+    assert clients[0].by == "e1"
+    assert edge.condition("app-d2-e1", "PeerReady")["reason"] == "Busy"
+    first.plan()
+    until(lambda: clients[1].by == "e1", "the second drone's answer over the link", world)
+    assert clients[0].by == "cloud"
+    assert not [failed for client in clients for failed in client.failed]
+
+
+@pytest.mark.parametrize("fault", ["silent", "impostor"])
+def test_a_peer_that_does_not_pair_costs_nothing(world: World, fault: str) -> None:
+    edge, other = world.edge("e1", 5.0), world.edge("e2", 30.0)
+    if fault == "impostor":
+        edge.certify("e2")
+    drone = world.drone()
+    links = [world.link(drone, edge, bandwidth=13.0), world.link(drone, other)]
+    world.serve()
+    for agent, link in zip((edge, other), links, strict=True):
+        agent.plan(link)
+        agent.start()
+    drone.plan(*links)
+    drone.start()
+    client = world.client(drone, 100_000, 0.1)
+    if fault == "silent":  # it was heard, and then answers no more
+        until(lambda: "pairing" in drone.log(), "an attempt", world)
+        world.command(station="e1", silent=True)
+    until(lambda: client.by == "e2", "an answer over the link to the honest node", world)
+    assert {answer[1] for answer in client.answers} <= {"cloud", "e1", "e2"}
+    if fault == "impostor":
+        assert "e1" not in {answer[1] for answer in client.answers}
+
+
+def test_a_missing_device_is_a_condition_and_is_used_when_it_comes(world: World) -> None:
+    edge = world.edge("e1", 20.0)
+    drone = world.drone()
+    link = world.link(drone, edge)
+    world.serve()
+    edge.plan(link)
+    edge.start()
+    drone.plan(link)
+    drone.lose_radio()
+    drone.start()
+    client = world.client(drone, 100_000, 0.1)
+    until(lambda: drone.condition("app-d1-e1", "Linked").get("reason") == "DeviceMissing", "the condition", world)
+    assert client.by == "cloud"
+    drone.regain_radio()
+    until(lambda: client.by == "e1", "an answer over the link", world)
+    drone.lose_radio()
+    until(lambda: client.by == "cloud", "an answer of the cloud", world)
+    drone.regain_radio()
+    until(lambda: client.by == "e1", "an answer over the link again", world)
+
+
+def test_what_is_not_paired_reaches_nothing(world: World) -> None:
+    edge = world.edge("e1", 20.0)
+    drone = flying(world, edge)
+    stranger = world.drone("d9")
+    client = world.client(drone, 100_000, 0.1)
+    until(lambda: client.by == "e1", "an answer over the link", world)
+    stranger.join(str(link_address("d9")))
+    (route,) = edge.redirects()
+    port = int(route.split(" . ")[2])
+    assert not stranger.reaches(str(link_address("e1")), port)
+    world.python("e1", LISTENER, 10250)
+    assert not stranger.reaches(str(link_address("e1")), 10250)
+    assert drone.reaches(f"10.90.{edge.number}.1", 10250)  # over the cloud: the node's own business
+    assert client.by == "e1"
+
+
+LISTENER = """
+import socket, sys
+server = socket.create_server(("0.0.0.0", int(sys.argv[1])))
+print("ready", flush=True)
+while True:
+    server.accept()[0].close()
+"""
+
+
+def test_a_hundred_changes_in_a_minute_end_where_they_should(world: World) -> None:
+    edge = world.edge("e1", 20.0)
+    drone = flying(world, edge)
+    client = world.client(drone, 100_000, 0.05)
+    until(lambda: client.by == "e1", "an answer over the link", world)
+    for number in range(100):
+        world.command(station="d1", off=number % 2 == 0)
+        time.sleep(0.2 if number % 7 else 1.5)
+    world.command(station="d1", off=False)
+    until(lambda: client.by == "e1", "an answer over the link", world, timeout_s=120)
+    assert len(drone.redirects()) == 1
+    assert len(edge.redirects()) == 1
+    assert drone.addresses() == [f"{link_address('d1')}/16"]
+    drone.plan()
+    edge.plan()
+    until(lambda: client.by == "cloud", "an answer of the cloud", world)
+    until(lambda: not drone.tables() and not edge.tables(), "clean nodes", world)
+    assert world.conntrack(drone) == world.conntrack(edge) == 0

@@ -38,8 +38,9 @@ class Node:
         self.namespace = f"{air.tag}{name}"
         subprocess.run(["ip", "netns", "add", self.namespace], check=True)
         path = Path("/run/netns", self.namespace)
-        tap = Tap(path, "wlan0", bytes([2, 0, 0, 0, 0, len(air.nodes) + 1]))
-        air.radio.add_station(name, tap, Station((0.0, 0.0, 0.0), tap.address, "net"))
+        address = bytes([2, 0, 0, 0, 0, len(air.nodes) + 1])
+        tap = Tap(path, "wlan0", address)
+        air.radio.add_station(name, tap, Station((0.0, 0.0, 0.0), address, "net"))
         inside = ["nsenter", f"--net={path}"]
         for words in (
             ["addr", "add", f"{link_address(name)}/16", "dev", "wlan0"],

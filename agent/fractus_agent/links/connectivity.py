@@ -19,6 +19,7 @@ from fractus_agent.links.beacons import Beacons
 from fractus_agent.links.drone import DroneEnd
 from fractus_agent.links.interfaces.controller import Controller, InterfaceProblem
 from fractus_agent.links.interfaces.simulated import Plain
+from fractus_agent.links.interfaces.wifi import Wifi
 from fractus_agent.links.peer import PeerEnd
 from fractus_agent.links.plans import LinkPlans
 from fractus_agent.links.reports import DroneReport, LinkReports, peer_condition
@@ -31,6 +32,9 @@ log = logging.getLogger(__name__)
 
 PODS = Path("/run/netns")
 """Where the container runtime keeps the network namespaces of pods."""
+SUPPLICANT = Path("/run/wpa_supplicant")
+"""Where wpa_supplicant has its control sockets."""
+DEVICES = Path("/sys/class/net")
 CHECK_S = 2.0
 """Seconds between looks at the interface: a device may go, and come back without its address."""
 RETRY_S = 5.0
@@ -154,9 +158,11 @@ class Connectivity:
     async def _use(self, interface: Interface) -> None:
         """Everything that one interface takes, made new at the beginning and removed in the end."""
         assert interface.device is not None
-        controller = Plain(interface.device, link_address(self._node))
+        controller = self._controller(interface)
         ports = nft.Ports(udp=beacons.PORT, tcp=pairing.PORT)
         device = interface.device
+        await self._appeared(controller)
+        # Closed before it gets an address.
         nft.create(device, ports)
         netlink = Netlink(NETLINK_NETFILTER)
         conntrack = Conntrack(netlink)
@@ -213,6 +219,25 @@ class Connectivity:
     def _report(self, report: DroneReport) -> None:
         if self._problem is None:
             self._reports.drone(report)
+
+    def _controller(self, interface: Interface) -> Controller:
+        """What controls an interface: a radio has to join a network first."""
+        device, pairing = interface.device, interface.pairing
+        assert device is not None
+        assert pairing is not None
+        address = link_address(self._node)
+        if (DEVICES / device / "phy80211").exists():
+            return Wifi(device, address, pairing, SUPPLICANT)
+        return Plain(device, address)
+
+    async def _appeared(self, controller: Controller) -> None:
+        """Wait for the device."""
+        while True:
+            try:
+                return controller.check()
+            except InterfaceProblem as problem:
+                self._set_problem(problem.reason, str(problem))
+            await asyncio.sleep(CHECK_S)
 
     async def _keep_up(self, controller: Controller) -> None:
         """Have the interface up, whatever becomes of its device."""

@@ -43,6 +43,14 @@ class Addresses:
     def __init__(self, device: str) -> None:
         self._device = device
 
+    def there(self) -> bool:
+        """Whether the device is there."""
+        try:
+            self._index()
+        except NoDevice:
+            return False
+        return True
+
     def set(self, address: IPv4Address) -> None:
         """Bring the device up with this link-local address and no other, so that one that a crash left does not stay.
 

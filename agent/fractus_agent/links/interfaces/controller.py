@@ -1,4 +1,4 @@
-"""What all controllers of interfaces have in common, and which one an interface needs."""
+"""What all controllers of interfaces have in common."""
 
 from __future__ import annotations
 
@@ -27,6 +27,13 @@ class Controller(Protocol):
 
     device: str
 
+    def check(self) -> None:
+        """Look whether the device is there, without doing anything to it.
+
+        Raises:
+            InterfaceProblem: it is not.
+        """
+
     async def up(self) -> None:
         """Bring it up on the network of its pairing, with this node's address; called again and again while it is wanted.
 
@@ -36,6 +43,3 @@ class Controller(Protocol):
 
     async def down(self) -> None:
         """Leave the network and take the address away; what is gone already is no error."""
-
-    async def quality(self) -> float | None:
-        """Strength of the link in dBm; None where the interface does not tell."""

@@ -21,6 +21,15 @@ class Plain:
         self._address = address
         self._addresses = Addresses(device)
 
+    def check(self) -> None:
+        """Look whether the device is there.
+
+        Raises:
+            InterfaceProblem: it is not.
+        """
+        if not self._addresses.there():
+            raise InterfaceProblem("DeviceMissing", f"the node has no network device {self.device}")
+
     async def up(self) -> None:
         """Bring the device up with its address.
 
@@ -40,7 +49,3 @@ class Plain:
             self._addresses.clear()
         except NetlinkError as error:
             raise InterfaceProblem("DeviceFailed", f"{self.device} keeps its address: {error}") from error
-
-    async def quality(self) -> float | None:
-        """Unknown: nothing measures it."""
-        return None

@@ -7,7 +7,7 @@ from ipaddress import IPv4Address
 
 import pytest
 from fractus_agent.links.decisions import Actions, Situation, Traffic, decide
-from fractus_agent.links.lessons import SILENT_S, Lessons
+from fractus_agent.links.lessons import Lessons
 from fractus_agent.redirector.nft import Endpoint
 from fractus_core.linking import NO_LINK, Link, PathMetrics, Peer, Phase, Reach, Settings, Track, heuristic
 
@@ -40,7 +40,15 @@ def test_a_peer_that_is_near_and_heard_is_linked_to() -> None:
 def test_a_peer_that_is_not_heard_is_not_tried(ago_s: float) -> None:
     reaches = {"e1": Reach(heard_s=NOW_S - ago_s)}
     found = done(Situation(NOW_S, HERE, (TRAFFIC,), NO_LINK, reaches, CLOUD))
-    assert (found.peer, found.link.changes, found.link.code) == ("", False, "NotHeard")
+    assert (found.peer, found.link.changes, found.link.code) == ("", False, "CloudOnly")
+
+
+def test_a_peer_that_is_heard_is_taken_where_a_better_one_is_silent() -> None:
+    better = Peer("e2", (5.0, 0.0, 0.0), 80.0, replace(WIFI, ingress_mbps=20.0))
+    traffic = replace(TRAFFIC, peers=(better, NEAR))
+    assert done(Situation(NOW_S, HERE, (traffic,), NO_LINK, HEARD, CLOUD)).peer == "e1"
+    both = HEARD | {"e2": Reach(heard_s=NOW_S)}
+    assert done(Situation(NOW_S, HERE, (traffic,), NO_LINK, both, CLOUD)).peer == "e2"
 
 
 def test_traffic_moves_once_the_link_is_measured_and_serves() -> None:
@@ -117,26 +125,6 @@ def test_a_peer_that_is_heard_from_afar_reaches_further() -> None:
     found = lessons(96.0)
     found.beacon("e1", NOW_S)
     assert found.reaches["e1"].range_factor == pytest.approx(1.2 * 1.02)
-
-
-def test_silence_where_a_peer_should_be_heard_shortens_its_reach() -> None:
-    found = lessons(72.0)
-    found.listen(NOW_S)
-    assert "e1" not in found.reaches
-    found.listen(NOW_S + SILENT_S + 0.1)
-    assert found.reaches["e1"].range_factor == pytest.approx(0.9 / 1.02)
-    out_of_reach = lessons(90.0)
-    for moment in range(10):
-        out_of_reach.listen(NOW_S + moment)
-    assert not out_of_reach.reaches
-
-
-def test_a_peer_that_is_heard_now_and_then_is_not_silent() -> None:
-    found = lessons(72.0)
-    for moment in range(10):
-        found.listen(NOW_S + moment)
-        found.beacon("e1", NOW_S + moment)
-    assert found.reaches["e1"].range_factor == 1.0
 
 
 def test_links_that_break_near_say_nothing_of_the_reach() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -25,7 +26,7 @@ from fractus_core.linking.learning import expected
 from fractus_agent.redirector.nft import Endpoint
 
 HEARD_S = 2.0
-"""A peer of which no beacon came for so long is out of reach, whatever its declaration says."""
+"""A peer that should be in reach, and of which no beacon came for so long, is not there, or does not reach as far as it says."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,14 +123,19 @@ def _wanted(now: Situation, settings: Settings) -> LinkDecision:
         return LinkDecision("", bool(present), "NotPlanned", "no application's traffic may take a direct link")
     if now.track is None:
         return LinkDecision(present, False, "PositionUnknown", "where the drone is is not known, so nothing is changed")
-    found = plan_link(
-        now.track, deciding.peers, now.cloud, now.link, now.now_s,
+    return plan_link(
+        now.track, [peer for peer in deciding.peers if _expected(peer, now.track, now)], now.cloud, now.link, now.now_s,
         heuristic=deciding.heuristic, settings=settings, reaches=now.reaches,
     )  # fmt: skip
-    if found.changes and found.peer and now.now_s - expected(now.reaches, found.peer).heard_s > HEARD_S:
-        reason = f"{found.peer} should be in reach, but is not heard"
-        return LinkDecision(present, False, "NotHeard", reason, found.plan)
-    return found
+
+
+def _expected(peer: Peer, track: Track, now: Situation) -> bool:
+    """Whether a link to a peer can be hoped for: it is there, or it is heard, or nothing of it can be heard from here yet."""
+    if peer.name == now.link.peer and now.link.phase is not Phase.NONE:
+        return True
+    reach = expected(now.reaches, peer.name)
+    silent = now.now_s - reach.heard_s > HEARD_S
+    return not silent or math.dist(track.position, peer.position) > peer.range_m * reach.range_factor
 
 
 def _leaves(now: Situation, settings: Settings) -> bool:

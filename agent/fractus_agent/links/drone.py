@@ -167,7 +167,6 @@ class DroneEnd:
         track, peers = self._flight()
         self._lessons.here = track.position if track is not None else None
         self._lessons.peers = peers
-        self._lessons.listen(now_s)
         return Situation(
             now_s, track, tuple(self._traffic(peers)), self._connector.link, dict(self._lessons.reaches),
             self._cloud(), self._direct, dict(self._routes), self._redirector.redirects,

@@ -7,11 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from fractus_core.linking import PathMetrics, Peer, Position, Reach, Settings
-from fractus_core.linking.learning import connected, expected, failed, heard, lost, measured
+from fractus_core.linking.learning import connected, failed, heard, lost, measured
 from fractus_core.linking.prediction import strength
-
-SILENT_S = 2.0
-"""A peer of which no beacon came for so long, though it should be in reach, reaches less far than declared."""
 
 
 @dataclass(slots=True)
@@ -28,11 +25,9 @@ class Lessons:
     reaches: dict[str, Reach] = field(default_factory=dict)
     here: Position | None = None
     peers: Mapping[str, Peer] = field(default_factory=dict)
-    _silent_since_s: dict[str, float] = field(default_factory=dict)
 
     def beacon(self, name: str, now_s: float) -> None:
         """A peer was heard."""
-        self._silent_since_s.pop(name, None)
         self.reaches[name] = heard(self._own(name), self._distance(name) or 0.0, now_s)
 
     def came_up(self, name: str, now_s: float) -> None:
@@ -59,18 +54,6 @@ class Lessons:
         share = strength(distance / self._own(name).range_factor, self.settings.edge)
         if share >= 1:
             self.reaches[name] = measured(self._own(name), path.ingress_mbps / peer.offers.ingress_mbps)
-
-    def listen(self, now_s: float) -> None:
-        """Learn from silence: which peers should be heard from here, and are not."""
-        for name in self.peers:
-            distance = self._distance(name)
-            if distance is None or distance > expected(self.reaches, name).range_factor:
-                self._silent_since_s.pop(name, None)
-                continue
-            since_s = max(self._silent_since_s.setdefault(name, now_s), self._own(name).heard_s)
-            if now_s - since_s > SILENT_S:
-                self.reaches[name] = lost(self._own(name), distance)
-                self._silent_since_s.pop(name, None)
 
     def _own(self, name: str) -> Reach:
         return self.reaches.get(name, Reach())

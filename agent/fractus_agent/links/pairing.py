@@ -89,6 +89,7 @@ class Session:
         self.peer = peer
         self.latency_ms: float | None = None
         self.told: Callable[[Mapping[str, Any]], None] = _ignored
+        self._least_ms = 0.0
         self._arrived: asyncio.Future[None] | None = None
         self._reader = reader
         self._writer = writer
@@ -152,6 +153,7 @@ class Session:
                 await self.send({"echo": sent})
             elif isinstance(sent := message.get("echo"), int | float):
                 way_ms = max(time.monotonic() - sent, 0.0) / 2 * 1e3
+                self._least_ms = min(self._least_ms or way_ms, way_ms)
                 before = self.latency_ms
                 self.latency_ms = way_ms if before is None else before + SMOOTHING * (way_ms - before)
             elif "probe" in message:
@@ -179,7 +181,7 @@ class Session:
             except TimeoutError as error:
                 raise LinkLost(f"{self.peer} does not answer probes") from error
             took_s = time.monotonic() - begun
-            on_air_s = max(took_s - 2e-3 * (self.latency_ms or 0.0), took_s / 4)
+            on_air_s = max(took_s - 2e-3 * self._least_ms, took_s / 2)
             best = max(best, size * 8e-6 / on_air_s)
             if took_s * PROBE_BYTES[-1] / size > BURST_LIMIT_S:
                 break

@@ -220,6 +220,18 @@ def test_flights_as_they_should_be_fulfil_every_expectation():
     assert _failed(Judge(FIELD, _unguarded()).unguarded()) == []
 
 
+def _later(run: Evidence, method: str, action: str) -> Evidence:
+    asked = _goto(run.calls[-1].time_s + 2.0, "WP8", action)
+    return replace(run, calls=(*run.calls, replace(asked, method=method)))
+
+
+def test_a_program_may_ask_for_control_again_and_may_not_fly():
+    assert _failed(Judge(FIELD, _later(_guarded(), "GetControl", "allow")).guarded()) == []
+    for action in ("allow", "correct"):
+        failed = _failed(Judge(FIELD, _later(_guarded(), "Goto", action)).guarded())
+        assert failed == ["after that the program moves nothing"]
+
+
 def test_an_unguarded_flight_fails_what_is_expected_of_a_guarded_one():
     failed = _failed(Judge(FIELD, _unguarded()).guarded())
     for part in ("WP1, asked for", "WP6, asked for", "above 15", "WP-E1 is", "WP-E2", "no-fly", "none of them above"):

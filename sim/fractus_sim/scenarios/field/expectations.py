@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import shapely
 from fractus_core.api.geometry import Point
+from fractus_core.api.methods import CONTROL_METHODS
 from fractus_core.geo import geodesic_m
 
 from fractus_sim.report.track import Sample
@@ -142,7 +143,12 @@ class Judge:
             calls[0].reason if calls else "never asked for",
         )
         since = taken.time_s if taken is not None else math.inf
-        later = [c for c in self._run.calls if c.who == NAVIGATOR and c.time_s > since + 0.5 and c.action == "allow"]
+        # A program may ask for control again, as the SDK does: it is not granted, so that nothing that follows is allowed.
+        later = [
+            c
+            for c in self._run.calls
+            if c.who == NAVIGATOR and c.time_s > since + 0.5 and not c.refused and c.method not in CONTROL_METHODS
+        ]
         self._check("after that the program moves nothing", taken is not None and not later, f"{len(later)} calls")
 
     def _pictures(self) -> None:

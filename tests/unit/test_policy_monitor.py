@@ -9,7 +9,7 @@ import pytest
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.motion import stop_point
-from fractus_core.policy.values import GotoArgs, SetSpeedArgs
+from fractus_core.policy.values import Airframe, GotoArgs, SetSpeedArgs, Verdict
 from policy_world import NOW, altitude, at, box, compiled, exclusion, goto, inclusion, speed
 
 WALL = box(-50, 50, 50, 90)
@@ -201,6 +201,8 @@ def test_what_is_permitted_never_alarms(speed_mps: float) -> None:
     assert ask(grant, goto(0, 47.4, speed_mps=speed_mps)).permits
     rng = np.random.default_rng(1)
     fleet = Fleet(rng, [scene(rng)])
+    fleet.airframes = [Airframe()]
+    fleet.learn()
     fleet.place[:], fleet.speed[:], fleet.gust[:], fleet.error[:] = [0, 0, 10], 0.0, 0.0, 0.0
     fleet.goal[:], fleet.cruise[:], fleet.setpoint[:], fleet.held[:] = [0, 47.4, 10], speed_mps, speed_mps, False
     for _ in range(int(60 / STEP_S)):
@@ -218,15 +220,17 @@ def test_what_is_permitted_never_alarms(speed_mps: float) -> None:
 @pytest.mark.parametrize("appears_s", [0.5, 1.0, 1.5, 2.0, 2.5, 3.0])
 def test_a_zone_that_appears_while_a_drone_speeds_up_stops_it_in_time(appears_s: float) -> None:
     import numpy as np
-    from policy_flights import ACCEL, STEP_S, Fleet, scene
+    from policy_flights import STEP_S, Fleet, scene
 
     rng = np.random.default_rng(1)
     fleet = Fleet(rng, [scene(rng)])
+    fleet.airframes = [Airframe()]
+    fleet.learn()
     fleet.place[:], fleet.speed[:], fleet.gust[:], fleet.error[:] = [0, 0, 10], 0.0, 0.0, 0.0
     fleet.goal[:], fleet.cruise[:], fleet.setpoint[:], fleet.held[:] = [0, 300, 10], 12.0, 12.0, False
     while fleet.time_s < appears_s:
         fleet.step()
-    assert fleet.accel[0, 1] > 0.8 * ACCEL
+    assert fleet.accel[0, 1] > 0.8 * fleet.accels[0]
     coasting = stop_point(at(north_mps=fleet.speed[0, 1], forward_mps2=0.0), (0.0, 0.0))[1]
     wall_m = fleet.place[0, 1] + coasting + 16.0
     grant = compiled(exclusion(box(-50, wall_m, 50, wall_m + 40), "revoke"))
@@ -251,3 +255,25 @@ def test_a_zone_that_appears_while_a_drone_speeds_up_stops_it_in_time(appears_s:
         fleet.step()
     rest_m = wall_m - fleet.place[0, 1]
     assert now.position_error_m < rest_m < 5.0, "neither inside for all that is known, nor needlessly far"
+
+
+def test_a_climb_to_an_altitude_that_is_allowed_is_let_pass_though_the_link_is_slow() -> None:
+    grant = compiled(altitude(upperLimit=16))
+    leg = goto(100, 0, 16.0).args
+    assert isinstance(leg, GotoArgs)
+    climbing = at(0, 0, 12.0, down_mps=-2.6, latency_s=0.77)
+    assert monitor(climbing, grant, bound_for=leg) is None
+    assert correction(monitor(climbing, grant)) == "AltitudeAboveLimit"
+    past = at(0, 0, 17.5, down_mps=-2.6, latency_s=0.77)
+    assert correction(monitor(past, grant, bound_for=leg)) == "AltitudeAboveLimit", (
+        "it does not brake for the leg's end"
+    )
+    higher = goto(100, 0, 12.0).args
+    assert isinstance(higher, GotoArgs)
+    fast = at(0, 0, 14.5, down_mps=-2.6, latency_s=0.77)
+    assert correction(monitor(fast, grant, bound_for=higher)) == "AltitudeAboveLimit"
+
+
+def correction(verdict: Verdict | None) -> str:
+    """The code of a correction."""
+    return verdict.code if verdict is not None and verdict.action == "correct" else ""

@@ -9,7 +9,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.policies import GeofenceAction
-from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, PolicyZone
+from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, PolicyZone, height_m
 from fractus_core.policy.fences import SEVERITY, TAKEOVERS, breaches, signed_depth_m
 from fractus_core.policy.limits import Bound, altitude_bounds, can_be_kept, datum_unknown, speed_bounds, strictest
 from fractus_core.policy.motion import XY, margin_m, moving, outlooks, reaction_s, standing, stop_altitude_m, stop_point
@@ -35,7 +35,7 @@ def monitor(
     *,
     leaving: bool = False,
     changed: bool = False,
-    bound_for: tuple[float, float] | None = None,
+    bound_for: GotoArgs | None = None,
 ) -> Verdict | None:
     """What the system must do about a flying drone at this moment.
 
@@ -49,8 +49,8 @@ def monitor(
             counts: where it is on the wrong side of a fence, or above a limit, the system's way leads back.
         changed: whether other fences may have been in force when the drone's way was judged. A drone that speeds up is
             faster before it hears of a stop, and whether there is room for that has not been judged: it is stopped in time.
-        bound_for: latitude and longitude where the leg under way ends, when it was accepted under this grant: the autopilot
-            brakes for that by itself, before it would hear of a stop.
+        bound_for: the leg under way, when it was accepted under this grant: the autopilot brakes for its end by itself,
+            before it would hear of a stop.
 
     Returns:
         None when all is well; a takeover; a denial with `hover`, when the motion is to be stopped and the application
@@ -68,7 +68,7 @@ def monitor(
     # A drone that speeds up does so on a way that was judged with room for it, and brakes at its end in time.
     now = replace(now, forward_mps2=min(now.forward_mps2 or 0.0, 0.0))
     stop = stop_point(now, start)
-    ahead = stop if bound_for is None else _arrival(now, start, stop, grant.frame.xy(*bound_for))
+    ahead = stop if bound_for is None else _arrival(now, start, stop, grant.frame.xy(bound_for.lat, bound_for.lon))
     worst = _worst(_fences(now, grant, _look_ahead(now, start, ahead, margin), leaving=leaving))
     if worst is not None:
         return replace(worst, brake_first=worst.action == "takeover" and moving(now))
@@ -77,7 +77,8 @@ def monitor(
         worst = _worst(_fences(then, grant, _look_ahead(then, begin, stop_point(then, begin), margin), leaving=True))
         if worst is not None:
             return replace(worst, action="deny", takeover="hover")
-    return _heights(now, grant, start, stop, sinks_back=leaving) or _speeds(now, grant, start)
+    level_m = stop_altitude_m(now) if bound_for is None else _level_m(now, bound_for, grant)
+    return _heights(now, grant, start, stop, level_m, sinks_back=leaving) or _speeds(now, grant, start)
 
 
 def _worst(found: list[tuple[int, Verdict]]) -> Verdict | None:
@@ -105,6 +106,20 @@ def _arrival(now: Situation, start: XY, stop: XY, target: XY) -> XY:
     aims = aside <= strays + AIM_SHARE * max(along, 0.0)
     arrives = aims and -strays <= along < run <= along + late + strays
     return target if arrives else stop
+
+
+def _level_m(now: Situation, bound_for: GotoArgs, grant: CompiledGrant) -> float:
+    """The altitude at which a drone comes to rest that climbs or sinks to that of its leg; see `_arrival`."""
+    rest_m, climb = stop_altitude_m(now), -now.down_mps
+    if bound_for.alt is None or climb == 0.0:
+        return rest_m
+    target_m = height_m(bound_for.alt, bound_for.reference, now.home, grant.flat_terrain)
+    if target_m is None:
+        return rest_m
+    up, strays = math.copysign(1.0, climb), now.airframe.tracking_m
+    late = abs(climb) * reaction_s(now, now.airframe.climb_accel_mps2)
+    ahead, beyond = (target_m - now.altitude_m) * up, (rest_m - target_m) * up
+    return target_m if ahead >= -strays and 0.0 < beyond <= late + strays else rest_m
 
 
 def must_rest(now: Situation, grant: CompiledGrant) -> bool:
@@ -224,15 +239,17 @@ def _reaction(found: _Finding, *, leaving: bool) -> Verdict | None:
     return None
 
 
-def _heights(now: Situation, grant: CompiledGrant, start: XY, stop: XY, *, sinks_back: bool) -> Verdict | None:
-    """The correction of an altitude that breaks limits, when the drone has come to rest.
+def _heights(
+    now: Situation, grant: CompiledGrant, start: XY, stop: XY, rest_m: float, *, sinks_back: bool
+) -> Verdict | None:
+    """The correction of an altitude that breaks limits, when the drone has come to rest at `stop` and `rest_m`.
 
     Lower limits do not hold for a drone that takes off or lands; `sinks_back`: nor upper ones for one that sinks.
     """
     if grant.max_altitude_m is None and not grant.altitude_limits:
         return None
     bounds, unknown = altitude_bounds(grant, now, Air(shapely.points(start), 0.0, now.altitude_m, now.altitude_m))
-    slack, rest_m = now.altitude_error_m + now.airframe.tracking_m, stop_altitude_m(now)
+    slack = now.altitude_error_m + now.airframe.tracking_m
     sinks_back = sinks_back and now.down_mps > SINKING_MPS
     over, under = strictest(bounds, above=True), strictest(bounds, above=False)
     high, low = max(now.altitude_m, rest_m), min(now.altitude_m, rest_m)

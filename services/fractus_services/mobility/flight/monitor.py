@@ -129,8 +129,7 @@ class MotionMonitor:
         """What is wrong, and whether the system flies the drone already, so that there is no driver to take it from."""
         control, now = self._control, self._guard.situation()
         changed, motion = self._has_changed(self._flown_grant), control.motion
-        leg = motion.leg if motion is not None and motion.under_way and not motion.braking else None
-        bound_for = (leg.lat, leg.lon) if leg is not None else None
+        bound_for = motion.leg if motion is not None and motion.under_way and not motion.braking else None
         if control.state.returning or not control.autopilot.vehicle.mode.commanded:
             # The autopilot's own ways were judged by no one, whatever the grant was.
             changed = changed or not control.autopilot.vehicle.mode.commanded

@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+from fractus_core.api.methods import Method
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
-from fractus_core.policy.values import Airframe, Call, GotoArgs, Situation, VelocityArgs, Verdict
+from fractus_core.policy.values import Airframe, Call, GotoArgs, SetSpeedArgs, Situation, VelocityArgs, Verdict
 from numpy.typing import NDArray
 from policy_world import HOME, METHODS, NOW, compiled, policy, ring
 
@@ -24,8 +25,14 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 STEP_S = 0.05
+STANDING_MPS = 0.02
 ZONES, CORNERS = 7, 8
-ACCEL, CLIMB_ACCEL, JERK, GAIN = 2.5, 1.0, 5.0, 1.0
+ACCELS, CLIMB_ACCELS, JERKS, GAIN = (1.0, 2.5, 2.5, 3.5), (1.0, 1.0, 2.0), (3.0, 5.0, 5.0, 8.0), 1.0
+"""What vehicles have for WPNAV_ACCEL, WPNAV_ACCEL_Z and PSC_JERK_XY, in metres."""
+CHANGED = 0.04
+"""Share of vehicles whose parameters change between two requests."""
+RETURNS_M = (3.0, 15.0, 15.0, 40.0)
+"""What their owners have for RTL_ALT."""
 UP_MPS, DOWN_MPS = 2.5, 1.5
 RATIO = 4.0
 """ArduPilot's CONTROL_TIME_CONSTANT_RATIO: it plans to brake with three quarters of its acceleration."""
@@ -40,6 +47,7 @@ NORTH_M, EAST_M = 110_998.6, math.cos(math.radians(HOME.lat)) * 111_457.6
 """Metres per degree at home (WGS 84), good to centimetres over this scene."""
 EXCLUSION, INCLUSION, LIMIT = 1, 2, 3
 SERVICES = [{"service": "mobility", "methods": [*METHODS, "SetVelocity"]}]
+METHOD_OF: dict[type, Method] = {GotoArgs: "Goto", VelocityArgs: "SetVelocity", SetSpeedArgs: "SetSpeed"}
 _CIRCLE = np.array([(math.cos(a), math.sin(a)) for a in np.arange(16) * math.pi / 8])
 
 
@@ -60,6 +68,14 @@ class Scene:
     bands: Floats
     heights: tuple[float, float]
     top_mps: float
+
+    def airframe(self, rng: np.random.Generator) -> Airframe:
+        """A vehicle whose return altitude is lowered to the limits, as before arming."""
+        return Airframe(
+            accel_mps2=float(rng.choice(ACCELS)), climb_accel_mps2=float(rng.choice(CLIMB_ACCELS)),
+            jerk_mps3=float(rng.choice(JERKS)), return_altitude_m=min(float(rng.choice(RETURNS_M)), self.heights[1]),
+            retraces=bool(rng.random() < 0.5),
+        )  # fmt: skip
 
 
 def scene(rng: np.random.Generator) -> Scene:
@@ -153,12 +169,22 @@ class Walls:
         slope = (np.roll(x, -1, axis=2) - x) / np.where(rise == 0, 1.0, rise)
         return cls(y, np.roll(y, -1, axis=2), x - slope * y, slope)
 
+    def of_some(self, who: NDArray[np.int64]) -> Walls:
+        """Those of some drones."""
+        return Walls(self.y0[who], self.y1[who], self.x0[who], self.slope[who])
+
     def around(self, points: Floats) -> Flags:
         """Which rings points, shape (n, 2), lie in, by rays to the east: shape (n, z)."""
         x, y = points[:, None, None, 0], points[:, None, None, 1]
         hits = ((self.y0 > y) != (self.y1 > y)) & (x < self.x0 + self.slope * y)
         odd: Flags = np.logical_xor.reduce(hits, axis=2)
         return odd
+
+
+_ROWS = (
+    "place", "speed", "accel", "error", "gust", "settled", "beat", "phase", "latency", "goal", "cruise", "setpoint", "wanted",
+    "held", "until",
+)  # fmt: skip
 
 
 @dataclass
@@ -171,10 +197,13 @@ class Fleet:
     """East, north, up as the controller has it."""
     speed: Floats = field(init=False)
     accel: Floats = field(init=False)
+    airframes: list[Airframe] = field(init=False)
 
     def __post_init__(self) -> None:
         """Put each somewhere, with some velocity, wind and errors."""
         rng, count = self.rng, len(self.scenes)
+        (other,) = rng.spawn(1)
+        self.airframes = [s.airframe(other) for s in self.scenes]
         self.place = np.column_stack((rng.uniform(-80, 80, (count, 2)), rng.uniform(3, 45, count)))
         angle, fast = rng.uniform(0, 2 * math.pi, count), rng.uniform(0, 8, count) * (rng.random(count) < 0.7)
         climb = rng.uniform(-1.5, 2.0, count) * (rng.random(count) < 0.4)
@@ -198,15 +227,36 @@ class Fleet:
         self.mail: list[tuple[float, int, Verdict]] = []
         self.asked: list[Call | None] = [None] * count
         self.time_s = 0.0
+        self._seen: Floats | None = None
         # Commands: fly to a point with a speed, or hold a velocity until a time; all from a time on.
         self.goal = self.place.copy()
         self.cruise = np.full(count, 5.0)
         self.setpoint = np.full(count, 5.0)
         self.wanted = np.zeros((count, 3))
         self.held = np.zeros(count, dtype=bool)
+        self.arrives, self.surely_returns = (np.zeros(count, dtype=bool) for _ in range(2))
+        """Who flies a leg whose end has a legal way home."""
         self.until = np.zeros(count)
+        self.learn()
         # Who is told nothing stops.
         self.stop(np.arange(count))
+
+    def learn(self) -> None:
+        """Take over what `airframes` say."""
+        self.accels, self.climbs, self.jerks = (
+            np.array([getattr(a, name) for a in self.airframes])
+            for name in ("accel_mps2", "climb_accel_mps2", "jerk_mps3")
+        )
+
+    def part(self, who: NDArray[np.int64]) -> Fleet:
+        """Some of the drones as they are at this moment, on flights of their own."""
+        found = Fleet(np.random.default_rng(0), [self.scenes[i] for i in who])
+        found.rng, found.time_s = self.rng, self.time_s
+        found.airframes = [self.airframes[i] for i in who]
+        for name in _ROWS:
+            setattr(found, name, getattr(self, name)[who].copy())
+        found.learn()
+        return found
 
     def sway(self) -> Floats:
         """How far wind has each off its course: no further than the bound from a course that began where it was seen."""
@@ -218,7 +268,9 @@ class Fleet:
     @property
     def seen(self) -> Floats:
         """Where each believes it is."""
-        return self.place + self.sway()
+        if self._seen is None:
+            self._seen = self.place + self.sway()
+        return self._seen
 
     @property
     def true(self) -> Floats:
@@ -227,7 +279,8 @@ class Fleet:
 
     def stop(self, who: NDArray[np.int64]) -> None:
         """Send them to where their controllers can stop."""
-        for axes, accel in ((slice(0, 2), ACCEL), (slice(2, 3), CLIMB_ACCEL)):
+        for axes, accels in ((slice(0, 2), self.accels), (slice(2, 3), self.climbs)):
+            accel = accels[who]
             moving = self.speed[who, axes]
             fast = np.linalg.norm(moving, axis=1)
             run = np.where(fast < accel / GAIN, fast / GAIN, accel / (2 * GAIN**2) + fast**2 / (2 * accel))
@@ -245,12 +298,13 @@ class Fleet:
         late = self.held & (self.time_s >= self.until)
         if late.any():
             self.stop(np.flatnonzero(late))
-        self._axes(slice(0, 2), ACCEL, self.cruise, self.cruise)
-        self._axes(slice(2, 3), CLIMB_ACCEL, np.full(len(self.place), UP_MPS), np.full(len(self.place), DOWN_MPS))
+        self._axes(slice(0, 2), self.accels, self.cruise, self.cruise)
+        self._axes(slice(2, 3), self.climbs, np.full(len(self.place), UP_MPS), np.full(len(self.place), DOWN_MPS))
+        self._seen = None
         self.place = self.place + self.speed * STEP_S
         self.time_s += STEP_S
 
-    def _axes(self, axes: slice, accel: float, most: Floats, least: Floats) -> None:
+    def _axes(self, axes: slice, accel: Floats, most: Floats, least: Floats) -> None:
         """ArduPilot's shape_pos_vel_accel (AP_Math/control.cpp) for some axes together."""
         off = self.goal[:, axes] - self.place[:, axes]
         away = np.linalg.norm(off, axis=1)
@@ -258,20 +312,20 @@ class Fleet:
         wanted = (
             off
             / np.maximum(away, 1e-9)[:, None]
-            * np.minimum(_root(away, JERK / (RATIO * accel), (1 - 1 / RATIO) * accel), most)[:, None]
+            * np.minimum(_root(away, self.jerks / (RATIO * accel), (1 - 1 / RATIO) * accel), most)[:, None]
         )
         wanted = np.where(self.held[:, None], self.wanted[:, axes], wanted)
         change = wanted - self.speed[:, axes]
         size = np.linalg.norm(change, axis=1)
-        push = np.minimum(_root(size, JERK / accel, JERK), accel)
+        push = np.minimum(_root(size, self.jerks / accel, self.jerks), accel)
         # A jerk-limited controller aims to be done a step ahead; without it, it rings by a step.
         target = change / np.maximum(size, 1e-9)[:, None] * np.minimum(push, size / STEP_S)[:, None]
         step = target - self.accel[:, axes]
         jerk = np.linalg.norm(step, axis=1)
-        self.accel[:, axes] += step * np.minimum(1.0, JERK * STEP_S / np.maximum(jerk, 1e-9))[:, None]
+        self.accel[:, axes] += step * np.minimum(1.0, self.jerks * STEP_S / np.maximum(jerk, 1e-9))[:, None]
         self.speed[:, axes] += self.accel[:, axes] * STEP_S
 
-    def situation(self, i: int, *, retraces: bool, told: bool) -> Situation:
+    def situation(self, i: int, *, told: bool) -> Situation:
         """What the engine is told of one drone; of its acceleration only some services know."""
         x, y, z = self.seen[i]
         drift = self.gust[i] * self.beat[i] * math.cos(self.beat[i] * self.time_s + self.phase[i])
@@ -282,7 +336,7 @@ class Fleet:
             time_s=NOW, lat=float(HOME.lat + y / NORTH_M), lon=float(HOME.lon + x / EAST_M), altitude_m=float(z), north_mps=north, east_mps=east,
             down_mps=-up, home=HOME, armed=True, in_air=True, position_error_m=POSITION_ERROR_M,
             altitude_error_m=HEIGHT_ERROR_M, latency_s=float(self.latency[i]), pending=self._pending(i), speed_setpoint_mps=max(float(self.setpoint[i]), tends), forward_mps2=forward,
-            airframe=Airframe(retraces=retraces),
+            airframe=self.airframes[i],
         )  # fmt: skip
 
     def _pending(self, i: int) -> tuple[tuple[float, float, float], ...]:
@@ -291,9 +345,16 @@ class Fleet:
         self.sent[i] = [(at, velocity) for at, velocity in self.sent[i] if at >= since]
         return tuple(dict.fromkeys(velocity for _, velocity in self.sent[i]))
 
-    def send(self, i: int, verdict: Verdict) -> None:
-        """Put what the engine made of a request on its way: it comes within the latency, and after those before it."""
+    def send(self, i: int, verdict: Verdict, *, returns: bool = False) -> None:
+        """Put what the engine made of a request on its way: it comes within the latency, and after those before it.
+
+        `returns`: whether the engine has made sure of the way home from the end of a leg.
+        """
+        self.surely_returns[i] = returns or (self.surely_returns[i] and isinstance(verdict.args, SetSpeedArgs))
         args, velocity = verdict.args, (0.0, 0.0, 0.0)
+        if isinstance(args, SetSpeedArgs):
+            self.mail.append((self.time_s + self.rng.uniform(0, float(self.latency[i])), i, verdict))
+            return
         if isinstance(args, VelocityArgs) and not verdict.brake_first:
             velocity = (args.north_mps, args.east_mps, args.down_mps)
         elif isinstance(args, GotoArgs) and not verdict.brake_first:
@@ -309,8 +370,14 @@ class Fleet:
     def obey(self, i: int, verdict: Verdict) -> None:
         """Carry out what the engine made of a request."""
         args = verdict.args
+        if isinstance(args, SetSpeedArgs):
+            self.setpoint[i] = args.speed_mps
+            self.cruise[i] = self.cruise[i] if self.held[i] else args.speed_mps
+            return
         self.place[i] = self.seen[i]
         self.settled[i] = self._wind()[i]
+        self._seen = None
+        self.arrives[i] = isinstance(args, GotoArgs) and not verdict.brake_first and self.surely_returns[i]
         if verdict.brake_first:
             self.stop(np.array([i]))
         elif isinstance(args, GotoArgs):
@@ -326,8 +393,15 @@ class Fleet:
     def trespassing(self) -> Flags:
         """Which zones each breaks: exclusion zones and limits one by one, inclusion zones all together in slot 0 of a second
         block; shape (n, ZONES + 1)."""
-        true = self.true
-        return trespasses(true[:, :2], true[:, 2], self.walls, self.kinds, self.bands)
+        true, fast = self.true, np.abs(self.speed).max(axis=1) > STANDING_MPS
+        if fast.mean() > 0.5:
+            return trespasses(true[:, :2], true[:, 2], self.walls, self.kinds, self.bands)
+        # Who stands sways slowly, and is looked at twice a second.
+        fast |= round(self.time_s / STEP_S) % 10 == 0
+        found = np.zeros((len(true), ZONES + 1), dtype=bool)
+        who = np.flatnonzero(fast)
+        found[who] = trespasses(true[who, :2], true[who, 2], self.walls.of_some(who), self.kinds[who], self.bands[who])
+        return found
 
 
 def trespasses(points: Floats, heights: Floats, walls: Walls, kinds: NDArray[np.int64], bands: Floats) -> Flags:
@@ -347,7 +421,7 @@ JUST_M = 0.3
 """How much a limit of altitude may be overshot beyond the declared errors: the controller's own overshoot."""
 
 
-def _root(error: Floats, gain: float, limit: float) -> Floats:
+def _root(error: Floats, gain: Floats, limit: Floats) -> Floats:
     """ArduPilot's square-root controller."""
     linear = limit / gain**2
     root = np.sqrt(np.maximum(2 * limit * (error - linear / 2), 0.0))
@@ -362,7 +436,13 @@ def _disc(rng: np.random.Generator, count: int, radius: float) -> Floats:
 
 @dataclass
 class Tally:
-    """What came of the requests, and every one that went wrong."""
+    """What came of the requests, and every one that went wrong.
+
+    Attributes:
+        changed: vehicles whose parameters another station changed in flight.
+        homeward: ways home that the system flew.
+        straight: those that the autopilot flew by itself.
+    """
 
     asked: int = 0
     permitted: int = 0
@@ -370,12 +450,28 @@ class Tally:
     braked: int = 0
     taken: int = 0
     shortened: int = 0
+    changed: int = 0
+    homeward: int = 0
+    straight: int = 0
     wrong: list[str] = field(default_factory=list)
     stopped: list[str] = field(default_factory=list)
     """Flights that were permitted, and stopped by the monitor."""
 
+    def add(self, other: Tally) -> None:
+        """Count another tally in."""
+        for name in vars(self):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
 
-def flights(seed: int, count: int, shared: int = 8, requests: int = 3, watch_every: int = 0) -> Tally:
+
+def flights(
+    seed: int,
+    count: int,
+    shared: int = 8,
+    requests: int = 3,
+    watch_every: int = 0,
+    watched: int = 1,
+    returns: Returns | None = None,
+) -> Tally:
     """Fly a fleet through random scenes, each drone with several requests, and look for trespasses.
 
     Args:
@@ -384,19 +480,33 @@ def flights(seed: int, count: int, shared: int = 8, requests: int = 3, watch_eve
         shared: drones to a scene: compiling policies takes longer than judging.
         requests: to each drone; the later ones interrupt the flight of the earlier.
         watch_every: steps after which the monitor looks at each drone again, as the service has it look; 0 for never.
+        watched: the monitor looks at one drone of this number.
+        returns: ways home; None for none.
     """
     rng = np.random.default_rng(seed)
     scenes = [s for s in (scene(rng) for _ in range(math.ceil(count / shared))) for _ in range(shared)][:count]
     fleet, tally = Fleet(rng, scenes), Tally()
     pardoned = excused(fleet)
     told: list[str] = [""] * count
+    (other,) = rng.spawn(1)
     for turn in range(requests):
-        flown = _ask_all(fleet, tally, told, rng)
+        if turn:
+            _change(fleet, tally, told, pardoned, other)
+        flown = _ask_all(fleet, tally, told, rng, watched if watch_every else 0)
+        called_s = fleet.time_s + other.uniform(1.5, 8.0) if returns is not None and turn == requests - 1 else math.inf
         # Every third request comes before the one before it can have had its effect.
         span_s = 30.0 if turn == requests - 1 else rng.choice([rng.uniform(0.05, 0.6), *rng.uniform(0.4, 7.0, 2)])
         for n in range(int(span_s / STEP_S)):
             fleet.step()
-            if turn == requests - 1 and not fleet.mail and np.abs(fleet.speed).max() < 0.02:
+            if returns is not None and fleet.time_s >= called_s:
+                called_s = math.inf
+                returns.called(fleet, pardoned, tally)
+            if (
+                turn == requests - 1
+                and math.isinf(called_s)
+                and not fleet.mail
+                and np.abs(fleet.speed).max() < STANDING_MPS
+            ):
                 break
             if watch_every and n % watch_every == 0:
                 _watch(fleet, tally, flown, pardoned)
@@ -407,19 +517,48 @@ def flights(seed: int, count: int, shared: int = 8, requests: int = 3, watch_eve
                     continue
                 tally.wrong.append(f"seed {seed}, drone {i}, turn {turn}, {fleet.time_s:.2f} s: {told[i]}")
                 pardoned[i] = True
+    if returns is not None:
+        returns.alone(fleet, pardoned, tally)
     return tally
 
 
-Flown = dict[int, tuple[str, tuple[float, float] | None, bool]]
-"""By drone: what was permitted, where its leg ends, and whether its acceleration is told."""
+class Returns(Protocol):
+    """What becomes of drones after their requests, each in a world of its own."""
+
+    def called(self, fleet: Fleet, pardoned: Flags, tally: Tally) -> None:
+        """Let the system fly some home that are in flight."""
+
+    def alone(self, fleet: Fleet, pardoned: Flags, tally: Tally) -> None:
+        """Let the autopilots of some that rest fly home."""
+
+
+def _change(fleet: Fleet, tally: Tally, told: list[str], pardoned: Flags, rng: np.random.Generator) -> None:
+    """Another station changes parameters of some vehicles, and their services hear of it.
+
+    What was permitted before, and what a vehicle does whatever it is told now, is not judged any more.
+    """
+    expected = {i for _, i, _ in fleet.mail}
+    who = np.array([i for i in np.flatnonzero(rng.random(len(told)) < CHANGED) if i not in expected], dtype=np.int64)
+    for i in who:
+        other = fleet.scenes[i].airframe(rng)
+        fleet.airframes[i] = replace(other, retraces=fleet.airframes[i].retraces)
+        told[i], fleet.arrives[i] = "", False
+    fleet.learn()
+    if len(who):
+        pardoned[who] |= excused(fleet.part(who))
+    tally.changed += len(who)
+
+
+Flown = dict[int, tuple[str, GotoArgs | None, bool]]
+"""By drone: what was permitted, its leg, and whether its acceleration is told."""
 
 
 def _watch(fleet: Fleet, tally: Tally, flown: Flown, pardoned: Flags) -> None:
     """Look for drones that the monitor would stop; each is counted once."""
     for i, (what, end, told) in list(flown.items()):
-        if np.abs(fleet.speed[i]).max() < 0.02:
+        if np.abs(fleet.speed[i]).max() < STANDING_MPS:
             continue
-        now = fleet.situation(i, retraces=True, told=told)
+        now = fleet.situation(i, told=told)
         verdict = monitor(now, fleet.scenes[i].grant, bound_for=None if fleet.held[i] else end)
         if verdict is None:
             continue
@@ -429,13 +568,15 @@ def _watch(fleet: Fleet, tally: Tally, flown: Flown, pardoned: Flags) -> None:
             tally.stopped.append(f"{fleet.time_s:.2f} s, drone {i}: {verdict} at {now} after {what}")
 
 
-def _ask_all(fleet: Fleet, tally: Tally, told: list[str], rng: np.random.Generator) -> Flown:
-    """One request of each drone. Returns those that the monitor has nothing against."""
+def _ask_all(fleet: Fleet, tally: Tally, told: list[str], rng: np.random.Generator, watched: int) -> Flown:
+    """One request of each drone. Returns those of the watched that the monitor has nothing against."""
     flown: Flown = {}
+    legs: list[tuple[int, GotoArgs]] = []
+    near = vicinity(fleet).any(axis=1)
     for i, place in enumerate(fleet.scenes):
         call = fleet.asked[i] = _again(rng, fleet.asked[i]) or _request(rng)
-        retraces, measured = bool(rng.random() < 0.5), bool(rng.random() < 0.5)
-        now = fleet.situation(i, retraces=retraces, told=measured)
+        measured = bool(rng.random() < 0.5)
+        now = fleet.situation(i, told=measured)
         verdict = judge(call, now, place.grant)
         tally.asked += 1
         tally.permitted += verdict.permits
@@ -443,14 +584,30 @@ def _ask_all(fleet: Fleet, tally: Tally, told: list[str], rng: np.random.Generat
         tally.braked += verdict.permits and verdict.brake_first
         tally.taken += verdict.action == "takeover"
         if verdict.permits:
-            told[i] = f"{call} in {now} -> {verdict}"
-            tally.wrong += [f"{what}: {told[i]}" for what in _odd(verdict, now, place)]
+            what = f"{call} in {now} -> {verdict}"
+            tally.wrong += [f"{odd}: {what}" for odd in _odd(verdict, now, place)]
+            # A speed alone moves nothing.
+            moves = not isinstance(verdict.args, SetSpeedArgs)
+            told[i] = what if moves else told[i] and f"{told[i]}, then {what}"
             tally.shortened += "the last legal point" in verdict.reason
-            fleet.send(i, verdict)
-            if monitor(now, place.grant) is None:
+            if isinstance(verdict.args, GotoArgs):
+                legs.append((i, verdict.args))
+            fleet.send(i, verdict, returns=not near[i])
+            if moves and watched and i % watched == 0 and monitor(now, place.grant) is None:
                 leg = verdict.args if isinstance(verdict.args, GotoArgs) and not verdict.brake_first else None
-                flown[i] = told[i], (leg.lat, leg.lon) if leg is not None else None, measured
+                flown[i] = told[i], leg, measured
+    tally.wrong += [f"target inside the margin of a fence: {told[i]}" for i in _too_near(fleet, legs)]
     return flown
+
+
+def _too_near(fleet: Fleet, legs: list[tuple[int, GotoArgs]]) -> Iterator[int]:
+    """Drones whose legs end inside the margin of a fence."""
+    who = np.array([i for i, _ in legs for _ in _CIRCLE], dtype=np.int64)
+    heights = np.array([leg.alt for _, leg in legs for _ in _CIRCLE])
+    ends = [[(leg.lon - HOME.lon) * EAST_M, (leg.lat - HOME.lat) * NORTH_M] for _, leg in legs]
+    around = (np.array(ends).reshape(-1, 1, 2) + _CIRCLE * (POSITION_ERROR_M + TRACKING_M - 0.05)).reshape(-1, 2)
+    broken = trespasses(around, heights, fleet.walls.of_some(who), fleet.kinds[who], fleet.bands[who])
+    yield from sorted(set(who[broken.any(axis=1)].tolist()))
 
 
 def _again(rng: np.random.Generator, last: Call | None) -> Call | None:
@@ -462,6 +619,8 @@ def _again(rng: np.random.Generator, last: Call | None) -> Call | None:
 
 
 def _request(rng: np.random.Generator) -> Call:
+    if rng.random() < 0.05:
+        return Call("SetSpeed", SetSpeedArgs(float(rng.uniform(0.5, 14))))
     if rng.random() < 0.65:
         x, y = rng.uniform(-85, 85, 2)
         alt = None if rng.random() < 0.3 else float(rng.uniform(1, 60))
@@ -476,10 +635,12 @@ def _odd(verdict: Verdict, now: Situation, place: Scene) -> Iterator[str]:
     """What is wrong with the arguments that come back, flown or not."""
     args = verdict.args
     if verdict.action == "correct":
-        again = judge(Call("Goto" if isinstance(args, GotoArgs) else "SetVelocity", args), now, place.grant)
+        again = judge(Call(METHOD_OF[type(args)], args), now, place.grant)
         if (again.action, again.args) != ("allow", args):
             yield "corrected to what is not allowed as it is"
     if isinstance(args, VelocityArgs) and math.hypot(args.north_mps, args.east_mps) > place.top_mps + 1e-6:
+        yield "too fast"
+    if isinstance(args, SetSpeedArgs) and args.speed_mps > place.top_mps + 1e-6:
         yield "too fast"
     if not isinstance(args, GotoArgs):
         return
@@ -488,35 +649,29 @@ def _odd(verdict: Verdict, now: Situation, place: Scene) -> Iterator[str]:
     low, high = place.heights
     if args.alt is None or not low - 1e-6 <= args.alt <= high + 1e-6:
         yield "at the wrong height"
-    here = np.array([(args.lon - HOME.lon) * EAST_M, (args.lat - HOME.lat) * NORTH_M])
-    around = here + _CIRCLE * (POSITION_ERROR_M + TRACKING_M - 0.05)
-    count = len(around)
-    broken = trespasses(
-        around, np.full(count, args.alt), Walls.of(np.repeat(place.rings[None], count, 0)),
-        np.repeat(place.kinds[None], count, 0), np.repeat(place.bands[None], count, 0),
-    )  # fmt: skip
-    if broken.any():
-        yield "target inside the margin of a fence"
 
 
 def excused(fleet: Fleet) -> Flags:
     """Fences that a drone breaks, or comes too close to, whatever it is told at the beginning; shape (n, ZONES + 1).
 
     What it does before a request can have any effect is not the request's doing, nor are the ways back that the engine
-    allows from there.
+    allows from there. `fleet` is left as it is.
     """
-    trial = Fleet(np.random.default_rng(0), fleet.scenes)
-    for name in ("place", "speed", "accel", "error", "gust", "beat", "phase", "settled"):
-        setattr(trial, name, getattr(fleet, name).copy())
-    trial.held[:], trial.wanted, trial.until = True, trial.speed.copy(), fleet.latency.copy()
-    margin = _CIRCLE * (POSITION_ERROR_M + TRACKING_M + 0.1)
-    tall = HEIGHT_ERROR_M + TRACKING_M + 0.1
-    around = np.where((fleet.kinds == EXCLUSION)[..., None], [-tall, tall], [tall, -tall])
-    bands = fleet.bands + around
+    trial = fleet.part(np.arange(len(fleet.scenes)))
+    trial.held[:], trial.wanted, trial.until = True, trial.speed.copy(), fleet.time_s + fleet.latency
     found = np.zeros((len(fleet.scenes), ZONES + 1), dtype=bool)
     for n in range(int(6.0 / STEP_S)):
         if n % 4 == 0:
-            for dx in (*margin, np.zeros(2)):
-                found |= trespasses(trial.seen[:, :2] + dx, trial.seen[:, 2], trial.walls, trial.kinds, bands)
+            found |= vicinity(trial)
         trial.step()
+    return found
+
+
+def vicinity(fleet: Fleet) -> Flags:
+    """Fences that each breaks, or is closer to than its margin; shape (n, ZONES + 1)."""
+    tall = HEIGHT_ERROR_M + TRACKING_M + 0.1
+    around = np.where((fleet.kinds == EXCLUSION)[..., None], [-tall, tall], [tall, -tall])
+    found = np.zeros((len(fleet.scenes), ZONES + 1), dtype=bool)
+    for dx in (*_CIRCLE * (POSITION_ERROR_M + TRACKING_M + 0.1), np.zeros(2)):
+        found |= trespasses(fleet.seen[:, :2] + dx, fleet.seen[:, 2], fleet.walls, fleet.kinds, fleet.bands + around)
     return found

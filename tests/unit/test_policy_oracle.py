@@ -14,13 +14,16 @@ import numpy as np
 import policy_flights
 import pytest
 from depth import examples
-from fractus_core.policy import legs, velocities
+from fractus_core.policy import legs, returning, spaces, velocities
 from fractus_core.policy.engine import MIN_TAKEOFF_ALTITUDE_M
 from fractus_core.policy.limits import MIN_LEG_ALTITUDE_M
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import Call, GotoArgs, TakeoffArgs
+from fractus_services.mobility.mavlink import failsafes
+from homeward_flights import WaysHome
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from parameter_faults import parameter_faults
 from policy_flights import CORNERS, EAST_M, LIMIT, NORTH_M, ZONES, Fleet, Scene, excused, flights
 from policy_world import HOME, Corners, altitude, ask, at, compiled, exclusion, goto, inclusion, ring, target
 
@@ -230,6 +233,32 @@ def test_the_oracle_would_notice(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (legs, velocities):
         monkeypatch.setattr(module, "margin_m", lambda _now: 0.5)
     assert flights(seed=3, count=200).wrong
+
+
+def test_ways_home_break_nothing() -> None:
+    tally = flights(seed=11, count=160, requests=2, returns=WaysHome(11, 4))
+    assert tally.wrong == []
+    assert tally.homeward > 30
+    assert tally.straight > 5
+    assert tally.changed > 0
+
+
+def test_the_oracle_would_notice_a_way_home_through_a_zone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(returning, "straight_home_blocked", lambda *_, **__: None)
+    monkeypatch.setattr(legs, "way_home_blocked", lambda *_: None)
+    monkeypatch.setattr(spaces.Space, "blockers", lambda *_: [])
+    wrong = flights(seed=11, count=160, requests=2, returns=WaysHome(11, 2)).wrong
+    assert any("the way home of drone" in line for line in wrong)
+    assert any("alone on its way home" in line for line in wrong)
+
+
+def test_only_vehicles_whose_parameters_are_known_may_arm() -> None:
+    assert parameter_faults(seed=1, count=300) == []
+
+
+def test_the_oracle_would_notice_a_parameter_that_is_made_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(failsafes.Reader, "read", lambda self, names, otherwise, *, needed=True: otherwise)
+    assert parameter_faults(seed=1, count=50)
 
 
 def test_who_begins_beyond_a_limit_of_altitude_breaks_it_by_no_request() -> None:

@@ -40,6 +40,12 @@ def verify_command(paths: tuple[Path, ...], since: tuple[str, ...], ca: Path | N
     known = _checkpoints(since, ca)
     for absent in known.keys() - {log.stem for log, files in found.items() if log in files}:
         raise click.ClickException(f"--since: the checkpoint is of {absent}.jsonl; give that log, or its directory")
+    for stem in known:
+        same = [str(log) for log, files in found.items() if log in files and log.stem == stem]
+        if len(same) > 1:
+            raise click.ClickException(
+                f"--since: the checkpoint is of {stem}.jsonl, and there are several: {', '.join(same)}; give one at a time"
+            )
     for name, files in found.items():
         _check(name, files, known.get(name.stem))
 

@@ -70,7 +70,8 @@ class AuditLog:
     place records how many.
 
     Args:
-        path: the file; a chain that it holds is continued, a last line that a crash left incomplete is cut off and recorded.
+        path: the file; a chain that it holds is continued, a last line that a crash left incomplete is cut off before the
+            next entry is written, and recorded.
         clock: Unix time in seconds.
         segment_bytes: when the file is closed and the next one begun.
         keep: how many closed files are kept.
@@ -107,7 +108,9 @@ class AuditLog:
         path.parent.mkdir(parents=True, exist_ok=True)
         torn = 0
         with contextlib.suppress(OSError):  # a disk that is read-only is told of when the first entry is written
-            torn = _cut_torn_line(path)
+            whole, size = _whole_lines(path)
+            torn = size - whole
+            self._sound_bytes = whole if torn else None
             path.touch(0o640)  # so that verification can tell when it is missing
         self._end = self._found()
         self._thread = threading.Thread(target=self._write, name="audit", daemon=True)
@@ -288,7 +291,7 @@ class AuditLog:
     def _store(self, data: bytes) -> None:
         """Append bytes and wait until they are on disk, or leave the file as it was: half an entry would break the chain.
 
-        What a failed attempt left and could not cut off is cut off before the next.
+        What a failed attempt, or a crash, left and could not cut off is cut off before the next.
         """
         file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o640)
         try:
@@ -308,14 +311,14 @@ class AuditLog:
             os.close(file)
 
 
-def _cut_torn_line(path: Path) -> int:
-    """Cut off an incomplete last line, as a crash leaves it; returns its bytes."""
+def _whole_lines(path: Path) -> tuple[int, int]:
+    """How many bytes of a file are whole lines, which a crash may leave the last one not, and how many it has."""
     try:
-        data_end = path.stat().st_size
+        size = path.stat().st_size
     except FileNotFoundError:
-        return 0
-    with path.open("r+b") as file:
-        at = data_end
+        return 0, 0
+    with path.open("rb") as file:
+        at = size
         while at > 0:
             start = max(at - 65536, 0)
             file.seek(start)
@@ -324,6 +327,4 @@ def _cut_torn_line(path: Path) -> int:
                 at = start + found + 1
                 break
             at = start
-        if at < data_end:
-            file.truncate(at)
-    return data_end - at
+    return at, size

@@ -40,15 +40,16 @@ class Link:
 
 
 def last_link(path: Path) -> Link | None:
-    """The last entry of a file; None when it has none.
+    """The last entry of a file, a line that a crash left incomplete aside; None when it has none.
 
     Raises:
-        ValueError: the last line is no audit entry.
+        ValueError: the last whole line is no audit entry.
     """
     with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
         file.seek(0, os.SEEK_END)
         file.seek(max(file.tell() - _TAIL_BYTES, 0))
-        lines = file.read().splitlines()
+        found = file.read()
+        lines = found[: found.rfind(b"\n") + 1].splitlines()
         if lines:
             try:
                 entry = json.loads(lines[-1])

@@ -442,11 +442,13 @@ async def test_a_certificate_that_is_missing_is_looked_for_now_and_then(
     assert json.loads(path.with_suffix(".checkpoint").read_bytes())["seq"] == 1
 
 
+@pytest.mark.parametrize("torn", [b"", b'{"half an en'])
 async def test_a_disk_that_became_read_only_is_a_failure_and_no_crash(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, torn: bytes
 ) -> None:
     path = tmp_path / "audit.jsonl"
     await written(path, 2)
+    path.write_bytes(path.read_bytes() + torn)
     real = os.open
 
     def refuse(*_: object, **__: object) -> None:
@@ -457,15 +459,22 @@ async def test_a_disk_that_became_read_only_is_a_failure_and_no_crash(
             refuse()
         return real(name, flags, *args, **named)
 
+    looked = Path.open
+
+    def looked_at(file: Path, mode: str = "r", *args: Any, **named: Any) -> Any:
+        return looked(file, mode, *args, **named) if mode in {"r", "rb"} else refuse()
+
     with monkeypatch.context() as patched:
-        patched.setattr("fractus_services.audit._cut_torn_line", refuse)
+        patched.setattr("fractus_services.audit.Path.touch", refuse)
+        patched.setattr("fractus_services.audit.Path.open", looked_at)
         patched.setattr("fractus_services.audit.os.open", opened)
         log = AuditLog(path, lambda: 0.0)
         log.append("call", {"n": 2})
         await until(lambda: "Read-only file system" in log.failure)
     await log.close()
     finding = verify(read(path))
-    assert (finding.entries, finding.problem) == (3, "")
+    assert (finding.entries, finding.problem, finding.torn) == (4 if torn else 3, "", False)
+    assert [entry.get("torn_bytes") for entry in map(json.loads, read(path))][2:] == ([12, None] if torn else [None])
 
 
 @pytest.mark.parametrize("which", ["middle", "change", "torn"])
@@ -493,6 +502,17 @@ async def test_several_logs_at_once(tmp_path: Path) -> None:
     code, said = verified(tmp_path / "mobility.jsonl", tmp_path / "camera.jsonl")
     assert (code, said.count("2 entries, chain sound")) == (0, 2)
     assert verified(tmp_path.parent / tmp_path.name)[0] == 0
+
+
+async def test_a_checkpoint_is_not_taken_for_that_of_a_log_of_the_same_name(tmp_path: Path, tls: Path) -> None:
+    kept = await checkpoint(tmp_path / "one" / "audit.jsonl", 3, tls)
+    await filled(tmp_path / "two" / "audit.jsonl", 3)
+    code, said = verified(tmp_path / "one", tmp_path / "two", "--since", kept)
+    assert code == 1
+    assert "--since: the checkpoint is of audit.jsonl, and there are several" in said
+    assert str(tmp_path / "two" / "audit.jsonl") in said
+    assert verified(tmp_path / "one", tmp_path / "two")[0] == 0
+    assert verified(tmp_path / "one", "--since", kept)[0] == 0
 
 
 async def test_a_segment_that_cannot_be_closed_costs_nothing(

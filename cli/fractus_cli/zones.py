@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import pathlib
 from collections.abc import Callable, Collection, Iterable
 
@@ -19,6 +20,7 @@ _READERS: dict[str, Callable[[str, Collection[str]], formats.Imported]] = {
     "qgc-plan": formats.read_qgc_plan,
     "ed269": formats.read_ed269,
 }
+_DROPPING = {"geojson": formats.read_geojson, "kml": formats.read_kml}
 _WRITERS: dict[str, Callable[[Iterable[Zone]], formats.Exported]] = {
     "geojson": formats.write_geojson,
     "kml": formats.write_kml,
@@ -36,18 +38,25 @@ def zones() -> None:
 @click.option("--from", "source", type=click.Choice(sorted(_READERS)), required=True, help="The format of the file.")
 @click.option("--prefix", default="", help="Put before the name of every zone.")
 @click.option("--leave-out", "without", multiple=True, metavar="NAME", help="A feature to leave out; may be repeated.")
-def import_(file: pathlib.Path, source: str, prefix: str, without: tuple[str, ...]) -> None:
+@click.option("--drop", multiple=True, metavar="PROPERTY", help="A property to ignore; may be repeated.")
+def import_(file: pathlib.Path, source: str, prefix: str, without: tuple[str, ...], drop: tuple[str, ...]) -> None:
     """Print a Zone manifest for each zone in a file.
 
     What a Zone cannot keep exactly (where, how high and when it counts) is refused, feature by feature: correct it, or
-    leave it out. What means nothing for that, and does not map, is listed on standard error.
+    leave it out. What means nothing for that, and does not map, is listed on standard error. Properties whose names seem
+    to say how high or when a zone counts are refused until they are dropped (geojson, kml).
     """
+    read = _READERS[source]
+    if drop and source not in _DROPPING:
+        raise click.ClickException(f"--drop is for --from {' and '.join(_DROPPING)}")
+    if drop:
+        read = functools.partial(_DROPPING[source], drop=drop)
     try:
         content = read_file(file)
     except BadManifest as error:
         raise click.ClickException(str(error)) from None
     try:
-        found = _READERS[source](content.decode("utf-8-sig"), without)
+        found = read(content.decode("utf-8-sig"), without)
         named = [_renamed(zone, prefix) for zone in found.zones]
         for zone in named:
             check_zone(zone)
@@ -68,7 +77,7 @@ def import_(file: pathlib.Path, source: str, prefix: str, without: tuple[str, ..
 def _where(file: pathlib.Path, content: bytes, problem: InvalidObject) -> str:
     """The line of a field, in formats that are JSON."""
     try:
-        found = parse_documents(content, str(file))
+        found = parse_documents(content, str(file), is_json=True)
     except BadDocument:
         return str(file)
     return found.where(found.values[0], problem.field) if found.values else str(file)

@@ -32,6 +32,8 @@ _CONSTANTS: dict[str, bool | None] = {
 _INTEGER = re.compile(r"[-+]?(?:0[xX][0-9a-fA-F]+|0[bB][01]+|0[oO]?[0-7]+|0|[1-9][0-9]*)")
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
 _NO_NUMBER = re.compile(r"[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)")
+_NOT_YAML = re.compile("[\x7f-\x9f\u2028\u2029\ufeff\ufffe\uffff]")
+"""What JSON has in its texts as it is, and YAML has not, or takes for the end of a line."""
 _SURROGATES = re.compile(r"\\(?:u([dD][89abAB][0-9a-fA-F]{2})\\u([dD][c-fC-F][0-9a-fA-F]{2})|.)", re.DOTALL)
 _PART = re.compile(r"\.?([^.\[\]]+)|\[([0-9]+)\]")
 _TEXT_TAGS = frozenset({"!", "tag:yaml.org,2002:str"})
@@ -117,7 +119,7 @@ def parse_documents(content: bytes, name: str, *, is_json: bool = False) -> Docu
         raise BadDocument(name, line, "this is no text file in UTF-8") from None
     if is_json:
         _check_json(text, name)
-        text = _SURROGATES.sub(_joined, text)
+        text = _NOT_YAML.sub(lambda found: f"\\u{ord(found[0]):04x}", _SURROGATES.sub(_joined, text))
     reader = _Reader(name)
     try:
         for event in yaml.parse(text, Loader=yaml.CSafeLoader):

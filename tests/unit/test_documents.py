@@ -43,6 +43,16 @@ def test_json_is_read_as_such():
 
 
 @pytest.mark.parametrize(
+    "number", [0x7F, 0x80, 0x85, 0x9F, 0xA0, 0x2028, 0x2029, 0xFEFF, 0xFFFD, 0xFFFE, 0xFFFF, 0x10FFFF]
+)
+def test_json_has_characters_that_yaml_has_not(number):
+    text = f'{{"a{chr(number)}": "b{chr(number)} c", "d": ["{chr(number)}\\u00e9"]}}'
+    assert parsed(text, is_json=True) == (json.loads(text),)
+    (found,) = parse_documents(f'{{"a": "{chr(number)}",\n"b": {{}}}}'.encode(), "f", is_json=True).values
+    assert found == {"a": chr(number), "b": {}}
+
+
+@pytest.mark.parametrize(
     ("text", "sentence"),
     [
         ("a: 1\nb: 2\na: 3", "f.yaml:3: a is given twice, on line 1 as well; remove one of them"),

@@ -11,6 +11,7 @@ from fractus_cli.zones import zones as command
 from fractus_core.api import InvalidObject, Zone
 from fractus_core.api.schedules import active_at
 from fractus_core.geo import LocalFrame, formats, middle, polygon
+from fractus_core.geo.formats import drafts
 from test_planning import manifest
 
 SQUARE = [[4.0, 50.0], [4.01, 50.0], [4.01, 50.01], [4.0, 50.01], [4.0, 50.0]]
@@ -114,13 +115,16 @@ def test_geojson_of_others():
 def test_kml_of_others():
     ring = " ".join(f"{lon},{lat},30" for lon, lat in SQUARE)
     text = f"""<?xml version="1.0" encoding="UTF-8"?><kml xmlns="http://www.opengis.net/kml/2.2"><Document><Folder>
-    <Placemark><name>School &amp; yard</name><description>no pictures</description><ExtendedData/><styleUrl/><Polygon>
+    <Placemark><name>School &amp; yard</name><description>no pictures</description><ExtendedData><Data name="owner"><value>x</value></Data></ExtendedData><styleUrl/><Polygon>
     <altitudeMode>clampToGround</altitudeMode><outerBoundaryIs><LinearRing><coordinates>{ring}</coordinates></LinearRing></outerBoundaryIs></Polygon></Placemark>
     <Placemark><name>pin</name><Point><coordinates>4,50</coordinates></Point></Placemark></Folder></Document></kml>"""
     found = formats.read_kml(text)
     assert [(z.name, z.spec.description) for z in found.zones] == [("school-yard", "no pictures")]
     assert len(found.zones[0].spec.area.polygon.exterior) == 4
-    assert found.notes == ("School & yard: no place for ExtendedData; left out", "pin: Point is not a zone; left out")
+    assert found.notes == (
+        "School & yard: no place for properties owner; left out",
+        "pin: Point is not a zone; left out",
+    )
 
 
 def test_qgc_plan_of_others():
@@ -486,6 +490,75 @@ def test_every_refused_feature_is_told_with_its_line_and_can_be_left_out(tmp_pat
     assert "a: left out, as asked for" in found.stderr
     lost = CliRunner().invoke(command, ["import", str(source), "--from", "geojson", *without, "--leave-out", "d"])
     assert "there is no feature d to leave out; correct its name" in lost.stderr
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "upperLimit",
+        "LOWER_LIMIT",
+        "maxHeight",
+        "height_agl",
+        "ceiling",
+        "Floor",
+        "validFrom",
+        "end_date",
+        "activeHours",
+        "FL",
+        "Altitude",
+    ],
+)
+def test_properties_that_say_how_high_or_when_in_other_words_are_refused(name, tmp_path):
+    sentence = (
+        "seems to say how high or when the zone counts, in other words than a Zone; say it as altitude or schedule"
+    )
+    text = json.dumps(feature(FLAT, properties={"name": "a", "owner": "x", name: 120}))
+    with pytest.raises(InvalidObject, match=sentence) as refused:
+        formats.read_geojson(text)
+    assert refused.value.field == f"properties.{name}"
+    dropped = formats.read_geojson(text, drop=[name])
+    assert dropped.notes == (f"a: no place for properties {', '.join(sorted([name, 'owner']))}; left out",)
+    assert formats.read_geojson(text.replace("120", "null")).zones == dropped.zones
+    data = f'<ExtendedData><Data name="{name}"><value>120</value></Data></ExtendedData>'
+    with pytest.raises(InvalidObject, match=sentence):
+        formats.read_kml(kml(f"<Polygon>EDGE</Polygon>{data}"))
+    assert formats.read_kml(kml(f"<Polygon>EDGE</Polygon>{data}"), drop=[name]).zones
+    source = tmp_path / "town.geojson"
+    source.write_text(text)
+    refused = CliRunner().invoke(command, ["import", str(source), "--from", "geojson"])
+    assert (refused.exit_code, sentence in refused.stderr) == (1, True)
+    assert CliRunner().invoke(command, ["import", str(source), "--from", "geojson", "--drop", name]).exit_code == 0
+
+
+@pytest.mark.parametrize("name", ["owner", "kind", "fromage", "timer", "status", "id", "restriction"])
+def test_other_properties_are_told(name):
+    found = formats.read_geojson(json.dumps(feature(FLAT, properties={"name": "a", name: "x"})))
+    assert found.notes == (f"a: no place for properties {name}; left out",)
+
+
+def test_what_is_to_be_dropped_has_to_be_there(tmp_path):
+    with pytest.raises(InvalidObject, match="there is no property ceiling to drop; correct its name"):
+        formats.read_geojson(json.dumps(feature(FLAT)), drop=["ceiling"])
+    source = tmp_path / "a.json"
+    source.write_text("{}")
+    refused = CliRunner().invoke(command, ["import", str(source), "--from", "ed269", "--drop", "ceiling"])
+    assert "--drop is for --from geojson and kml" in refused.stderr
+
+
+def test_the_points_of_a_whole_file_have_a_limit(monkeypatch):
+    long = [[-179, 60], [179, 60], [179, 70], [-179, 70]]
+    around = [[[x / 2 - 80, y] for x, y in long]]
+    one = feature({"type": "Polygon", "coordinates": around})
+    count = len(formats.read_geojson(json.dumps(one)).zones[0].spec.area.polygon.exterior)
+    assert count > 100 * len(long)
+    monkeypatch.setattr(drafts, "MAX_POINTS", 3 * count)
+    collection = {"type": "FeatureCollection", "features": [one] * 3}
+    assert len(formats.read_geojson(json.dumps(collection)).zones) == 3
+    holes = feature({"type": "Polygon", "coordinates": around * 4})
+    for more in (collection | {"features": [one] * 1000}, collection | {"features": [holes, one]}):
+        with pytest.raises(InvalidObject, match=f"the file needs more than {3 * count} points") as refused:
+            formats.read_geojson(json.dumps(more))
+        assert not isinstance(refused.value, formats.Inexact), "it is not read on"
 
 
 def test_a_file_with_a_key_twice_is_refused():

@@ -13,6 +13,7 @@ from fractus_core.api import API_VERSION, InvalidObject, Zone
 from fractus_core.api.geometry import MAX_RING_POINTS, Area, Circle, Point, Polygon
 from fractus_core.documents import BadDocument, parse_documents
 from fractus_core.geo.areas import geojson, middle, polygon
+from fractus_core.geo.formats.properties import says_height_or_time
 from fractus_core.geo.frames import LocalFrame
 
 LonLat = Sequence[float]
@@ -26,6 +27,9 @@ MAX_RADIUS_M = 200_000.0
 EARTH_RADIUS_M = 6_371_000.0
 MAX_BEND_M = 0.5
 """A parallel is not straight: what GeoJSON draws along one gets a point wherever it would leave it by more."""
+
+MAX_POINTS = 300_000
+"""Points of all rings of one file at most, with those along parallels: a small file may ask for thousands of times its size."""
 
 CORNERS = 64
 """Corners of the polygon that stands for a circle where a format has none."""
@@ -59,6 +63,10 @@ class Inexact(InvalidObject):
         self.every = tuple(every)
 
 
+class _TooLarge(InvalidObject):
+    """The file as a whole is too large."""
+
+
 class Drafts:
     """Zones while a file is read: each gets a name of its own, and is checked as it is made.
 
@@ -67,10 +75,14 @@ class Drafts:
 
     Args:
         without: titles of features that are left out.
+        drop: names of properties that are left out though they seem to say how high or when a zone counts.
     """
 
-    def __init__(self, without: Collection[str] = ()) -> None:
+    def __init__(self, without: Collection[str] = (), drop: Collection[str] = ()) -> None:
         self.notes: list[str] = []
+        self._drop = drop
+        self._dropped: set[str] = set()
+        self._points = 0
         self._zones: list[Zone] = []
         self._names: set[str] = set()
         self._without = without
@@ -85,6 +97,8 @@ class Drafts:
             return
         try:
             read()
+        except _TooLarge:
+            raise
         except InvalidObject as error:
             self._wrong.append(InvalidObject(error.field, f"{error.problem} (in {title})"))
 
@@ -109,6 +123,44 @@ class Drafts:
             self.note(title, f"its description is cut after {DESCRIPTION_LENGTH} characters")
         return text[:DESCRIPTION_LENGTH]
 
+    def rings(self, found: Any, field: str) -> dict[str, Any]:
+        """The rings of a GeoJSON polygon as an area.
+
+        Raises:
+            InvalidObject: one of them is none, or the file has too many points.
+        """
+        if not isinstance(found, (list, tuple)) or not found:
+            raise InvalidObject(field, "must be a list of rings")
+        made = []
+        for i, one in enumerate(found):
+            made.append(ring(one, f"{field}[{i}]", planar=True))
+            self._points += len(made[-1])
+            if self._points > MAX_POINTS:
+                raise _TooLarge(
+                    f"{field}[{i}]", f"the file needs more than {MAX_POINTS} points, for long sides some more; split it"
+                )
+        exterior, *holes = made
+        return {"polygon": {"exterior": exterior} | ({"holes": holes} if holes else {})}
+
+    def properties(self, title: str, found: Mapping[str, Any], known: Collection[str], field: str) -> None:
+        """Note the properties for which a zone has no place, and refuse those that say how high or when it counts.
+
+        Raises:
+            InvalidObject: there is one that is not to be dropped.
+        """
+        self._dropped.update(set(found) & set(self._drop))
+        said = {name for name, value in found.items() if value not in (None, "", [], {})}
+        for name in sorted(said - set(known) - set(self._drop)):
+            if says_height_or_time(name):
+                raise InvalidObject(
+                    f"{field}.{name}",
+                    "seems to say how high or when the zone counts, in other words than a Zone; say it as altitude or schedule,"
+                    " spelt as in a Zone, or drop it (--drop)",
+                )
+        dropped = sorted(set(found) - set(known))
+        if dropped:
+            self.note(title, f"no place for properties {', '.join(dropped)}; left out")
+
     def unmapped(self, title: str, found: Iterable[str], known: Iterable[str]) -> None:
         """Note the fields for which a zone has no place."""
         dropped = sorted(set(found) - set(known))
@@ -124,13 +176,16 @@ class Drafts:
 
         Raises:
             Inexact: there are features that cannot be kept as they are.
-            InvalidObject: a feature that is to be left out is not there.
+            InvalidObject: a feature that is to be left out, or a property that is to be dropped, is not there.
         """
         if self._wrong:
             raise Inexact(self._wrong)
         missing = sorted(set(self._without) - self._left_out)
         if missing:
             raise InvalidObject("", f"there is no feature {missing[0]} to leave out; correct its name")
+        absent = sorted(set(self._drop) - self._dropped)
+        if absent:
+            raise InvalidObject("", f"there is no property {absent[0]} to drop; correct its name")
         return Imported(tuple(self._zones), tuple(self.notes))
 
     def _name(self, title: str) -> str:
@@ -272,18 +327,6 @@ def _along_degrees(sides: Iterable[tuple[Point, Point]]) -> Iterator[Point]:
         for share in (i / pieces for i in range(1, pieces)):
             lat_deg, lon_deg = (a + (b - a) * share for a, b in ((start.lat, end.lat), (start.lon, end.lon)))
             yield Point(lat=round(lat_deg, 9), lon=round(lon_deg, 9))
-
-
-def rings(found: Any, field: str) -> dict[str, Any]:
-    """The rings of a GeoJSON polygon as an area.
-
-    Raises:
-        InvalidObject: one of them is none.
-    """
-    if not isinstance(found, (list, tuple)) or not found:
-        raise InvalidObject(field, "must be a list of rings")
-    exterior, *holes = [ring(r, f"{field}[{i}]", planar=True) for i, r in enumerate(found)]
-    return {"polygon": {"exterior": exterior} | ({"holes": holes} if holes else {})}
 
 
 def round_area(centre: Point, radius_m: Any, field: str) -> dict[str, Any]:

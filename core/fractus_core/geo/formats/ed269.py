@@ -22,7 +22,6 @@ from fractus_core.geo.formats.drafts import (
     only,
     parse_json,
     place,
-    rings,
     round_area,
     unsaid,
 )
@@ -83,10 +82,10 @@ def _read_feature(drafts: Drafts, title: str, feature: dict[str, Any], field: st
         where = f"{field}.geometry[{j}]"
         only(volume, _OF_VOLUME, where)
         band = _band(volume, where)
-        drafts.add(title, {**spec, "area": _area(volume, where), **({"altitude": band} if band else {})}, where)
+        drafts.add(title, {**spec, "area": _area(drafts, volume, where), **({"altitude": band} if band else {})}, where)
 
 
-def _area(volume: dict[str, Any], field: str) -> dict[str, Any]:
+def _area(drafts: Drafts, volume: dict[str, Any], field: str) -> dict[str, Any]:
     where = f"{field}.horizontalProjection"
     projection = fields(volume.get("horizontalProjection"), where)
     shape = projection.get("type")
@@ -94,7 +93,7 @@ def _area(volume: dict[str, Any], field: str) -> dict[str, Any]:
         raise InvalidObject(f"{where}.type", f"must be Polygon or Circle, not {shape!r}")
     only(projection, _OF_PROJECTION[shape], where)
     if shape == "Polygon":
-        return rings(projection.get("coordinates"), f"{where}.coordinates")
+        return drafts.rings(projection.get("coordinates"), f"{where}.coordinates")
     if volume.get("uomDimensions") not in (None, "M"):
         raise InvalidObject(f"{where}.radius", "may be metres or feet; give the volume in metres (uomDimensions M)")
     centre = place(projection.get("center"), f"{where}.center")

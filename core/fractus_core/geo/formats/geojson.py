@@ -19,7 +19,6 @@ from fractus_core.geo.formats.drafts import (
     only,
     parse_json,
     place,
-    rings,
     round_area,
     unsaid,
 )
@@ -40,12 +39,13 @@ _WGS84 = frozenset(
 _STYLE = frozenset({"fill", "fill-opacity", "stroke", "stroke-width", "stroke-opacity", "marker-color"})
 
 
-def read_geojson(text: str, without: Collection[str] = ()) -> Imported:
+def read_geojson(text: str, without: Collection[str] = (), drop: Collection[str] = ()) -> Imported:
     """Zones from features; altitude and schedule come from properties of these names, spelt as in a Zone.
 
     Args:
         text: the file.
         without: titles of features to leave out.
+        drop: names of properties to leave out, though they seem to say how high or when a zone counts.
 
     Raises:
         InvalidObject: this is not GeoJSON, a geometry is broken, or a feature cannot be kept exactly.
@@ -61,7 +61,7 @@ def read_geojson(text: str, without: Collection[str] = ()) -> Imported:
         features, field = [{"type": "Feature", "geometry": whole, "properties": {}}], ""
     else:
         raise InvalidObject("type", f"{kind!r} is not GeoJSON of zones; expected a FeatureCollection of polygons")
-    drafts = Drafts(without)
+    drafts = Drafts(without, drop)
     for i, feature in enumerate(features):
         where = field.format(i)
         properties = feature.get("properties")
@@ -92,9 +92,7 @@ def _read_feature(drafts: Drafts, title: str, feature: dict[str, Any], field: st
     spec = {k: properties[k] for k in known if properties.get(k) is not None and properties[k] != ""}
     if isinstance(spec.get("description"), str):
         spec["description"] = drafts.described(title, spec["description"])
-    dropped = sorted(set(properties) - _KNOWN - _STYLE)
-    if dropped:
-        drafts.note(title, f"no place for properties {', '.join(dropped)}; left out")
+    drafts.properties(title, properties, _KNOWN | _STYLE, f"{inside}properties")
     geometry = fields(feature.get("geometry"), f"{inside}geometry")
     if properties.get("radius") is not None and geometry.get("type") != "Point":
         raise InvalidObject(f"{inside}properties.radius", "goes with a Point; draw the area of others as a polygon")
@@ -112,12 +110,12 @@ def _read_geometry(drafts: Drafts, title: str, geometry: dict[str, Any], said: d
         coordinates = _flat(coordinates)
     match geometry.get("type"):
         case "Polygon":
-            drafts.add(title, {**spec, "area": rings(coordinates, where)}, field)
+            drafts.add(title, {**spec, "area": drafts.rings(coordinates, where)}, field)
         case "MultiPolygon":
             if not isinstance(coordinates, list):
                 raise InvalidObject(where, "must be a list of polygons")
             for j, part in enumerate(coordinates):
-                drafts.add(title, {**spec, "area": rings(part, f"{where}[{j}]")}, f"{where}[{j}]")
+                drafts.add(title, {**spec, "area": drafts.rings(part, f"{where}[{j}]")}, f"{where}[{j}]")
         case "Point" if said["radius"] is not None:
             radius = f"{field.removesuffix('geometry')}properties.radius"
             drafts.add(title, {**spec, "area": round_area(place(coordinates, where), said["radius"], radius)}, field)

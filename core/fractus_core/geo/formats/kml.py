@@ -13,17 +13,20 @@ from fractus_core.geo.formats.drafts import Drafts, Exported, Imported, cut_ring
 
 _KNOWN = frozenset({"name", "description", "Polygon", "MultiGeometry"})
 _LOOK = frozenset({"Style", "StyleMap", "styleUrl", "visibility", "open", "Snippet", "LookAt", "Camera"})
+_DATA = frozenset({"ExtendedData"})
+_AROUND_DATA = _DATA | {"SchemaData", "displayName", "value"}
 _HOLDERS = frozenset({"Document", "Folder", "NetworkLink"})
 _TIMES = frozenset({"TimeSpan", "TimeStamp"})
 _OTHERS = ("Point", "LineString", "LinearRing", "Model", "Track")
 
 
-def read_kml(text: str, without: Collection[str] = ()) -> Imported:
+def read_kml(text: str, without: Collection[str] = (), drop: Collection[str] = ()) -> Imported:
     """Zones from the polygons of placemarks; styles are not taken over.
 
     Args:
         text: the file.
         without: names of placemarks to leave out.
+        drop: names of their data to leave out, though they seem to say how high or when a zone counts.
 
     Raises:
         InvalidObject: this is not KML, a polygon is broken, or a placemark cannot be kept exactly.
@@ -41,7 +44,7 @@ def read_kml(text: str, without: Collection[str] = ()) -> Imported:
         if _tag(holder) == "NetworkLink":
             raise InvalidObject(title, "a NetworkLink leads to another file, which is not read; save all as one file")
         _check_always(holder, title)
-    drafts = Drafts(without)
+    drafts = Drafts(without, drop)
     for count, mark in enumerate(e for e in root.iter() if _tag(e) == "Placemark"):
         title = _text(mark, "name") or f"placemark {count + 1}"
         drafts.take(title, functools.partial(_read_placemark, drafts, title, mark))
@@ -59,7 +62,8 @@ def _read_placemark(drafts: Drafts, title: str, mark: ElementTree.Element) -> No
     others = sorted({_tag(e) for e in mark.iter()} & set(_OTHERS) - ({"LinearRing"} if polygons else set()))
     if others:
         drafts.note(title, f"{', '.join(others)} is not a zone; left out")
-    drafts.unmapped(title, map(_tag, mark), _KNOWN | _LOOK | set(_OTHERS))
+    drafts.unmapped(title, map(_tag, mark), _KNOWN | _LOOK | _DATA | set(_OTHERS))
+    drafts.properties(title, _data(mark), (), "ExtendedData")
     if polygons:
         _check_always(mark, "")
     for i, shape in enumerate(polygons):
@@ -75,6 +79,12 @@ def _read_placemark(drafts: Drafts, title: str, mark: ElementTree.Element) -> No
             )
         area = {"polygon": {"exterior": exterior[0]} | ({"holes": holes} if holes else {})}
         drafts.add(title, {"area": area} | ({"description": described} if described else {}), field)
+
+
+def _data(mark: ElementTree.Element) -> dict[str, str]:
+    """What a placemark says by names of others."""
+    data = (e for child in mark if _tag(child) in _DATA for e in child.iter() if _tag(e) not in _AROUND_DATA)
+    return {e.get("name") or _tag(e): "".join(e.itertext()).strip() for e in data}
 
 
 def _rings(shape: ElementTree.Element, boundary: str, field: str) -> list[list[dict[str, float]]]:

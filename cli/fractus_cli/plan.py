@@ -161,7 +161,7 @@ def _as_table(decided: Sequence[Decided]) -> str:
     parts = []
     for answer in decided:
         if answer.plan is not None:
-            parts.append(plan_table(answer.application, answer.plan))
+            parts.append(plan_table(answer.application, answer.plan, answer.links))
         elif answer.refusal is not None:
             parts.append(infeasible_table(answer.application, answer.refusal))
     return "\n".join(parts)

@@ -8,12 +8,13 @@ from collections.abc import Iterable, Sequence
 from fractus_core.api import Application
 from fractus_core.api.plans import DeploymentPlanSpec, DroneChoice, PlannedInstance, Rejection
 from fractus_core.planning import Infeasible
+from fractus_core.planning.links import PlannedLink
 
 _LISTED = 20
 
 
-def plan_table(application: Application, plan: DeploymentPlanSpec) -> str:
-    """Which instance goes where, and which nodes were rejected."""
+def plan_table(application: Application, plan: DeploymentPlanSpec, links: Sequence[PlannedLink] = ()) -> str:
+    """Which instance goes where, which direct links its drone may have, and which nodes were rejected."""
     lines = [f"{'/'.join(application.key)}: feasible"]
     if plan.drone is not None:
         lines += [_drone(plan.drone), *_legality(plan.drone)]
@@ -21,6 +22,8 @@ def plan_table(application: Application, plan: DeploymentPlanSpec) -> str:
     covered = sum(p.coverage or 0.0 for p in plan.placements if p.role == "hybrid-drone")
     if covered:
         lines.append(f"hybrid instances along the way add direct links over {covered:.1%} of the operation area")
+    if links:
+        lines += ["", *_columns(("DIRECT LINK TO", "BY", "NETWORK", "RANGE", "BANDWIDTH", "FOR"), map(_link, links))]
     return "\n".join([*lines, *_rejections(plan.rejected, plan.rejected_omitted or 0), ""])
 
 
@@ -64,6 +67,12 @@ def _row(placed: PlannedInstance) -> tuple[str, ...]:
     serves = f"{placed.serves.component} on {placed.serves.node}" if placed.serves is not None else ""
     adds = f"{placed.coverage:.1%}" if placed.coverage is not None else ""
     return (placed.component, placed.instance, node, placed.role, serves, adds)
+
+
+def _link(link: PlannedLink) -> tuple[str, ...]:
+    used = ", ".join(placed.component for placed in link.instances)
+    reach, bandwidth = f"{link.range_m:g} m", f"{link.bandwidth_mbps:g} Mbit/s"
+    return (link.node, link.technology, link.pairing.network_id, reach, bandwidth, used)
 
 
 def _rejections(rejected: Sequence[Rejection], omitted: int) -> list[str]:

@@ -11,6 +11,7 @@ from fractus_core.planning import Flight, Host, Infeasible, Inventory, Settings,
 from fractus_core.planning import plan as decide
 from fractus_core.planning.candidates import requests
 from fractus_core.planning.grants import compile_grants
+from fractus_core.planning.links import PlannedLink, plan_links
 from fractus_core.validation import check_application
 
 from fractus_cli.manifests import BadManifest, Manifests
@@ -18,11 +19,12 @@ from fractus_cli.manifests import BadManifest, Manifests
 
 @dataclass(frozen=True)
 class Decided:
-    """The answer for one application: a plan, or why there is none."""
+    """The answer for one application: a plan with the direct links it makes possible, or why there is none."""
 
     application: Application
     plan: DeploymentPlanSpec | None
     refusal: Infeasible | None = None
+    links: tuple[PlannedLink, ...] = ()
 
 
 def plan_all(manifests: Manifests, settings: Settings) -> list[Decided]:
@@ -55,7 +57,9 @@ def plan_all(manifests: Manifests, settings: Settings) -> list[Decided]:
         except Infeasible as refusal:
             decided.append(Decided(application, None, refusal))
         else:
-            decided.append(Decided(application, found))
+            drone = stock.drones.get(found.drone.node) if found.drone is not None else None
+            links = plan_links(application, found, drone, stock.edge_nodes)
+            decided.append(Decided(application, found, links=links))
             stock = _taken(stock, application, found)
     return decided
 

@@ -117,16 +117,18 @@ def worklists(store: Store, live: LiveInventory, signing: NodeSigning) -> list[W
     requests = Worklist("signing request", signing.reconcile)
     zones = Worklist("zone", readiness.reconcile_zone)
     policies = Worklist("policy", readiness.reconcile_policy, after=live.synced)
-    grants = Worklist("grant", Orphans(store, live).reconcile, after=live.synced)
+    unowned = {kind: Orphans(store, live, kind) for kind in (kinds.GRANT, kinds.DIRECT_LINK)}
+    orphans = {kind: Worklist(kind.name, those.reconcile, after=live.synced) for kind, those in unowned.items()}
 
     def policies_of_zone(key: Key) -> None:
         for policy in readiness.policies_of(key[1]):
             policies.add(policy)
 
-    def grants_of_removed(key: Key) -> None:
+    def left_by_removed(key: Key) -> None:
         if live.applications.get(key) is None:
-            for grant in live.grants_of(key):
-                grants.add(("", grant.name))
+            for kind, worklist in orphans.items():
+                for left in unowned[kind].of(key):
+                    worklist.add(left)
 
     listeners: list[tuple[Kind, Callable[[Key], None]]] = [
         *((kind, nodes.add) for kind in (kinds.NODE, kinds.DRONE, kinds.EDGE_NODE)),
@@ -134,12 +136,12 @@ def worklists(store: Store, live: LiveInventory, signing: NodeSigning) -> list[W
         (kinds.ZONE, zones.add),
         (kinds.ZONE, policies_of_zone),
         (kinds.POLICY, policies.add),
-        (kinds.GRANT, grants.add),
-        (kinds.APPLICATION, grants_of_removed),
+        *((kind, worklist.add) for kind, worklist in orphans.items()),
+        (kinds.APPLICATION, left_by_removed),
     ]
     for kind, listener in listeners:
         live.listen(kind, listener)
-    return [nodes, requests, zones, policies, grants]
+    return [nodes, requests, zones, policies, *orphans.values()]
 
 
 async def _together(main: Coroutine[Any, Any, None], background: list[Coroutine[Any, Any, None]]) -> None:

@@ -175,7 +175,14 @@ class World:
                 found[f"{path.rsplit('/', 1)[1]}/{item['metadata']['name']}"] = item
         for item in self.grants(namespace):
             found[f"grants/{item['metadata']['name']}"] = item
+        for item in self.links(namespace).values():
+            found[f"directlinks/{item['metadata']['name']}"] = item
         return found
+
+    def links(self, namespace: str, name: str = "traffic") -> dict[str, Body]:
+        """The DirectLinks of an application by the node that is asked."""
+        selector = f"fractus.dev/namespace={namespace},fractus.dev/application={name}"
+        return {body["spec"]["node"]: body for body in self.api.list(f"{FRACTUS}/directlinks", labelSelector=selector)}
 
     def pods(self, namespace: str) -> list[Body]:
         """Pods that are not on their way out (no kubelet ends them here)."""
@@ -208,7 +215,7 @@ class World:
         for pod in self.api.list("/api/v1/pods"):
             path = f"/api/v1/namespaces/{pod['metadata']['namespace']}/pods/{pod['metadata']['name']}"
             self._delete(path, grace_s=0)
-        for plural in ("drones", "edgenodes", "depots", "zones", "policies", "grants"):
+        for plural in ("drones", "edgenodes", "depots", "zones", "policies", "grants", "directlinks"):
             for item in self.api.list(f"{FRACTUS}/{plural}"):
                 self._delete(f"{FRACTUS}/{plural}/{item['metadata']['name']}")
         for node in self.api.list("/api/v1/nodes"):

@@ -83,6 +83,12 @@ def test_table_says_who_goes_where(run):
     assert any("any cloud node, 3 replicas" in line for line in lines)
 
 
+def test_table_says_which_direct_links_there_may_be(run):
+    lines = run([*SCENE, TRAFFIC]).output.splitlines()
+    title = next(i for i, line in enumerate(lines) if line.startswith("DIRECT LINK TO"))
+    assert lines[title + 1].split() == ["e1", "WiFi", "e1", "80", "m", "12", "Mbit/s", "ImageChecker"]
+
+
 @pytest.mark.parametrize(("output", "read"), [("yaml", yaml.safe_load), ("json", json.loads)])
 def test_the_plan_is_the_one_that_the_operator_would_write(run, tmp_path, output, read):
     result = run([*SCENE, TRAFFIC], "-o", output)

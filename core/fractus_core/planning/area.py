@@ -52,7 +52,7 @@ def operation_area(spec: ApplicationSpec, depots: Mapping[str, Depot], safety_ra
     Raises:
         InvalidObject: a depot is unknown or a ring crosses itself; the field is relative to spec.
     """
-    route = _route(spec, depots)
+    route = route_of(spec, depots)
     if not route:
         return None
     frame = LocalFrame.at(middle_of(route))
@@ -116,7 +116,12 @@ def control_routes(points: Sequence[ControlPoint], depots: Mapping[str, Depot]) 
     return routes
 
 
-def _route(spec: ApplicationSpec, depots: Mapping[str, Depot]) -> list[Position]:
+def route_of(spec: ApplicationSpec, depots: Mapping[str, Depot]) -> list[Position]:
+    """The places that a drone visits for an application, in order.
+
+    Raises:
+        InvalidObject: a control point names an unknown depot.
+    """
     poi = spec.points_of_interest
     if spec.driver is not None:
         try:

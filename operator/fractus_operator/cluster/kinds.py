@@ -7,6 +7,7 @@ from fractus_core.api import (
     Application,
     DeploymentPlan,
     Depot,
+    DirectLink,
     Drone,
     EdgeNode,
     Grant,
@@ -26,6 +27,7 @@ def _ours(model: type[Resource]) -> Kind:
 APPLICATION = _ours(Application)
 DEPLOYMENT_PLAN = _ours(DeploymentPlan)
 GRANT = _ours(Grant)
+DIRECT_LINK = _ours(DirectLink)
 DRONE = _ours(Drone)
 EDGE_NODE = _ours(EdgeNode)
 DEPOT = _ours(Depot)
@@ -44,5 +46,14 @@ CONTROLLER_REVISION = Kind("apps/v1", "ControllerRevision", "controllerrevisions
 ENDPOINT_SLICE = Kind("discovery.k8s.io/v1", "EndpointSlice", "endpointslices", namespaced=True)
 SIGNING_REQUEST = Kind("certificates.k8s.io/v1", "CertificateSigningRequest", "certificatesigningrequests", False)
 
-CHILDREN: tuple[Kind, ...] = (GRANT, DEPLOYMENT_PLAN, SECRET, SERVICE, ENDPOINT_SLICE, DISRUPTION_BUDGET, DEPLOYMENT)
+CHILDREN: tuple[Kind, ...] = (
+    GRANT,
+    DEPLOYMENT_PLAN,
+    SECRET,
+    SERVICE,
+    ENDPOINT_SLICE,
+    DISRUPTION_BUDGET,
+    DEPLOYMENT,
+    DIRECT_LINK,
+)
 """What the operator makes for an Application, in the order in which it is applied."""

@@ -65,6 +65,11 @@ class PodView:
         return self.labels.get(APPLICATION_LABEL)
 
     @property
+    def takes_calls(self) -> bool:
+        """Whether it is ready, has an address, and is not about to end."""
+        return self.ready and not self.terminating and bool(self.ip)
+
+    @property
     def component(self) -> str | None:
         """The component that the pod runs."""
         return self.labels.get(COMPONENT_LABEL)

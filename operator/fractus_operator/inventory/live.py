@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from fractus_core.api import DeploymentPlan, Depot, Drone, EdgeNode, Grant, Policy, Zone
+from fractus_core.api import DeploymentPlan, Depot, DirectLink, Drone, EdgeNode, Grant, Policy, Zone
 from fractus_core.api.names import NODE_SIGNER
 from fractus_core.planning.candidates import readiness
 from fractus_core.planning.inventory import Flight, Host, Inventory
@@ -23,6 +23,9 @@ from fractus_operator.inventory.node_services import NodeServices, read_revision
 from fractus_operator.inventory.observed import Observed
 from fractus_operator.inventory.plans import Plans
 from fractus_operator.inventory.subscriptions import Subscriptions
+
+_REPORTED_ON = frozenset({kinds.DEPLOYMENT, kinds.DIRECT_LINK})
+"""Kinds whose status changes all the time, while pods come up or a drone flies by, and does not matter here."""
 
 
 class LiveInventory:
@@ -57,7 +60,7 @@ class LiveInventory:
             kind: Reflector(
                 store,
                 kind,
-                _without_status if kind is kinds.DEPLOYMENT else _as_is,
+                _without_status if kind in _REPORTED_ON else _as_is,
                 self._child_changed,
                 selectors={"labelSelector": MANAGED_SELECTOR},
             )
@@ -131,7 +134,7 @@ class LiveInventory:
         return Inventory(
             hosts=BookedHosts(self.hosts, self._bookings, corrections(self.plans.requests(), pods, labelled(key))),
             drones=ByName(self.drones),
-            edge_nodes=ByName(self.edge_nodes),
+            edge_nodes=self.edge_nodes_by_name(),
             depots=self.depots_by_name(),
             zones={z.name: z for z in self.zones.values() if isinstance(z, Zone)},
             policies={p.name: p for p in self.policies.values() if isinstance(p, Policy)},
@@ -149,6 +152,10 @@ class LiveInventory:
     def depots_by_name(self) -> Mapping[str, Depot]:
         """The depots."""
         return ByName(self.depots)
+
+    def edge_nodes_by_name(self) -> Mapping[str, EdgeNode]:
+        """The edge nodes."""
+        return ByName(self.edge_nodes)
 
     def claims(self) -> dict[str, Claim]:
         """Which application has which drone."""
@@ -256,6 +263,8 @@ class LiveInventory:
             self._grant_changed(key, new)
         elif body.get("kind") == DeploymentPlan.KIND:
             self.plans.stored(key, new)
+        elif body.get("kind") == DirectLink.KIND:
+            self._report(kinds.DIRECT_LINK, key)
         labels = body.get("metadata", {}).get("labels", {})
         if APPLICATION_LABEL in labels:
             self.subscriptions.wake((key[0] or labels.get(NAMESPACE_LABEL, ""), labels[APPLICATION_LABEL]))
@@ -295,7 +304,7 @@ def _ready(node: Drone | EdgeNode) -> str | None:
 
 
 def _without_status(body: Body) -> Body:
-    """A Deployment without what changes all the time while its pods come up."""
+    """A child without what others say of it."""
     kept = {name: value for name, value in body.items() if name != "status"}
     kept["metadata"] = {n: v for n, v in body["metadata"].items() if n != "resourceVersion"}
     annotations = dict(kept["metadata"].get("annotations") or {})

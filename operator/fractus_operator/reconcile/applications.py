@@ -49,6 +49,7 @@ EXCLUSION = timedelta(minutes=5)
 
 _OF_A_MISSION = (
     kinds.GRANT,
+    kinds.DIRECT_LINK,
     kinds.DEPLOYMENT,
     kinds.DISRUPTION_BUDGET,
     kinds.ENDPOINT_SLICE,

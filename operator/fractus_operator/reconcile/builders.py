@@ -65,7 +65,7 @@ def grant(application: Application, spec: GrantSpec) -> Body:
     namespace, _ = application.key
     body = kinds.GRANT.header(grant_name(namespace, spec.instance))
     body["metadata"]["labels"] = {
-        **_labels(application),
+        **labels_of(application),
         labels.NAMESPACE_LABEL: namespace,
         labels.COMPONENT_LABEL: spec.component,
         labels.INSTANCE_LABEL: spec.instance,
@@ -135,7 +135,7 @@ def service(application: Application, component: Component) -> Body:
 def endpoint_slice(application: Application, component: Component, pods: Iterable[PodView]) -> Body:
     """Where a hybrid component's Service leads: to the ready pods of its base instance."""
     name = service_name(application.name, component)
-    ready = sorted((pod for pod in pods if pod.ready and not pod.terminating and pod.ip), key=lambda pod: pod.name)
+    ready = sorted((pod for pod in pods if pod.takes_calls), key=lambda pod: pod.name)
     described = {
         labels.COMPONENT_LABEL: component.name,
         "kubernetes.io/service-name": name,
@@ -177,7 +177,7 @@ def deployment(application: Application, placed: PlannedInstance, drone: Drone |
     """
     component = application.spec.component(placed.component)
     identity = {labels.APPLICATION_LABEL: label_value(application.name), labels.INSTANCE_LABEL: placed.instance}
-    described = {**_labels(application), **_location_labels(component, placed)}
+    described = {**labels_of(application), **_location_labels(component, placed)}
     spec: Body = {
         "replicas": placed.replicas,
         "revisionHistoryLimit": 1,
@@ -313,7 +313,8 @@ def _tolerations(placed: PlannedInstance, drone: Drone | None) -> list[Body]:
     ]
 
 
-def _labels(application: Application) -> dict[str, str]:
+def labels_of(application: Application) -> dict[str, str]:
+    """The labels of all that is made for an application."""
     return {labels.APPLICATION_LABEL: label_value(application.name), labels.MANAGED_LABEL: labels.MANAGED_BY}
 
 
@@ -329,7 +330,7 @@ def _location_labels(component: Component, placed: PlannedInstance) -> dict[str,
 def _child(kind: Kind, application: Application, name: str, described: dict[str, str], **content: Any) -> Body:
     namespace, _ = application.key
     body = kind.header(name, namespace)
-    body["metadata"]["labels"] = {**_labels(application), **described}
+    body["metadata"]["labels"] = {**labels_of(application), **described}
     body["metadata"]["ownerReferences"] = [
         {
             "apiVersion": API_VERSION,

@@ -245,7 +245,7 @@ def _check_own(application: Application, kind: Kind, observed: Body) -> None:
 
 
 def _is_child(application: Application, kind: Kind, body: Body) -> bool:
-    if kind is kinds.GRANT:
+    if not kind.namespaced:
         owner = body.get("spec", {}).get("application", {})
         return bool(owner.get("uid") == application.metadata.uid)
     owners = body["metadata"].get("ownerReferences") or ()

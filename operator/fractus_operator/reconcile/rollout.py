@@ -8,9 +8,10 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from datetime import datetime
 
-from fractus_core.api import Application, component_identity
+from fractus_core.api import Application, InvalidObject, component_identity
 from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec, PlannedInstance
 from fractus_core.identity.authority import Authority
+from fractus_core.planning.links import flown_path, plan_links
 
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind, key_of
@@ -19,10 +20,13 @@ from fractus_operator.cluster.pods import PodView
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile import builders
 from fractus_operator.reconcile.children import Children
+from fractus_operator.reconcile.links import direct_links
 
 _HEAD_START_S = 0.5
 """How long Deployments go first at most, where there are new ones: neither a webhook that holds them up nor pods that no node
 takes delay a Grant for longer."""
+
+_LAST = (kinds.SERVICE, kinds.ENDPOINT_SLICE, kinds.DIRECT_LINK, kinds.DISRUPTION_BUDGET)
 
 
 class Rollout:
@@ -65,6 +69,7 @@ class Rollout:
             KubeError: the API server refuses one, or cannot be reached.
         """
         wanted = builders.children(application, decided, grants, pods, self._live.drone)
+        wanted[kinds.DIRECT_LINK] = self._links(application, decided, pods)
         secrets = {builders.secret_name(placed.instance): placed for placed in decided.placements}
         # The plan before all else: it tells, also after a crash, which application flies the drone and which share its flight.
         await self._children.apply(application, {kinds.DEPLOYMENT_PLAN: wanted[kinds.DEPLOYMENT_PLAN]})
@@ -84,7 +89,7 @@ class Rollout:
         async def after() -> bool:
             if starts:
                 await self._scheduled(application.key, decided, made, rules)
-            last = {kind: wanted[kind] for kind in (kinds.SERVICE, kinds.ENDPOINT_SLICE, kinds.DISRUPTION_BUDGET)}
+            last = {kind: wanted[kind] for kind in _LAST}
             # Rules that changed meanwhile are in no Grant that was compiled before.
             valid = rules == self._live.rules_revision
             if valid:
@@ -125,6 +130,30 @@ class Rollout:
         cause = str(desired["metadata"]["annotations"][CAUSE_ANNOTATION])
         present = (observed["metadata"].get("annotations") or {}).get(CAUSE_ANNOTATION)
         return cause == present and cause.rpartition("@")[2] == drone
+
+    def _links(self, application: Application, decided: DeploymentPlanSpec, pods: Sequence[PodView]) -> list[Body]:
+        """The direct links of a plan. A Service that is only made now has an address, and its links, in the next reconcile."""
+        if decided.drone is None:
+            return []
+        planned = plan_links(
+            application, decided, self._live.drone(decided.drone.node), self._live.edge_nodes_by_name()
+        )
+        flying: Application | None = application
+        if decided.drone.shared_with is not None:
+            host, _ = self._live.plans.host_of(decided)
+            flying = host.application if host is not None else None
+        try:
+            path = flown_path(flying.spec, self._live.depots_by_name()) if flying is not None and planned else ()
+        except InvalidObject:
+            # The depot is gone: the drone's velocity tells where it goes.
+            path = ()
+        namespace, _ = application.key
+
+        def cluster_ip(service: str) -> str | None:
+            body = self._children.get(kinds.SERVICE, (namespace, service))
+            return body["spec"].get("clusterIP") if body is not None else None
+
+        return direct_links(application, planned, path, pods, cluster_ip)
 
     async def renew_certificates(self, application: Application, plan: DeploymentPlanSpec) -> None:
         """Renew the certificates of what runs by a plan, and change nothing else.

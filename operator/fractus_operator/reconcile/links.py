@@ -1,0 +1,93 @@
+"""From planned direct links to DirectLinks: what the agents of both ends are told, with the addresses of now."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+from fractus_core.api import Application
+from fractus_core.api.geometry import Position
+from fractus_core.api.links import DirectLinkSpec, LinkedService, TargetAddress, VirtualAddress
+from fractus_core.api.names import object_name
+from fractus_core.api.plans import ApplicationReference, PlannedInstance
+from fractus_core.planning.links import PlannedLink
+
+from fractus_operator.cluster import kinds, labels
+from fractus_operator.cluster.kinds import Body
+from fractus_operator.cluster.labels import service_name
+from fractus_operator.cluster.pods import PodView
+from fractus_operator.reconcile.builders import labels_of
+
+
+def direct_links(
+    application: Application,
+    planned: Iterable[PlannedLink],
+    path: tuple[Position, ...],
+    pods: Sequence[PodView],
+    cluster_ip: Callable[[str], str | None],
+) -> list[Body]:
+    """The DirectLinks of an application; none for a link whose services have no addresses yet.
+
+    Args:
+        application: Whose links they are.
+        planned: The links.
+        path: What its drone flies.
+        pods: Its pods as they are.
+        cluster_ip: The cluster IP of a Service by its name; None while there is none.
+    """
+    bodies = []
+    for link in planned:
+        services = tuple(
+            service for placed in link.instances for service in _services(application, placed, pods, cluster_ip)
+        )
+        if services:
+            bodies.append(_direct_link(application, link, path, services))
+    return bodies
+
+
+def link_name(namespace: str, application: str, drone: str, node: str) -> str:
+    """Name of the DirectLink of an application between two nodes."""
+    return f"{namespace}.{object_name(application, drone, node)}"
+
+
+def _direct_link(
+    application: Application, link: PlannedLink, path: tuple[Position, ...], services: tuple[LinkedService, ...]
+) -> Body:
+    namespace, name = application.key
+    spec = DirectLinkSpec(
+        drone=link.drone,
+        node=link.node,
+        application=ApplicationReference(namespace=namespace, name=name, uid=application.metadata.uid or ""),
+        technology=link.technology,
+        pairing=link.pairing,
+        range=link.range_m,
+        bandwidth=link.bandwidth_mbps,
+        position=link.position,
+        heuristic=link.heuristic,
+        path=path,
+        services=services,
+    )
+    body = kinds.DIRECT_LINK.header(link_name(namespace, name, link.drone, link.node))
+    body["metadata"]["labels"] = {**labels_of(application), labels.NAMESPACE_LABEL: namespace}
+    body["spec"] = spec.to_dict()
+    return body
+
+
+def _services(
+    application: Application,
+    placed: PlannedInstance,
+    pods: Sequence[PodView],
+    cluster_ip: Callable[[str], str | None],
+) -> Iterable[LinkedService]:
+    """The ports of an instance, behind the address of its component's Service."""
+    component = application.spec.component(placed.component)
+    address = cluster_ip(service_name(application.name, component))
+    if address is None:
+        return
+    ready = sorted(pod.ip or "" for pod in pods if pod.instance == placed.instance and pod.takes_calls)
+    for port in component.container.ports:
+        yield LinkedService(
+            component=component.name,
+            instance=placed.instance,
+            virtual=VirtualAddress(address=address, port=port.port, protocol=port.protocol),
+            target=TargetAddress(address=ready[0], port=port.port) if ready else None,
+        )

@@ -1,0 +1,162 @@
+"""DirectLinks on a real API server: made of a plan, following pods and nodes, gone with the application."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+from control_plane import wait_for
+from fractus_kube import ContentType
+from operator_world import FRACTUS, OperatorProcess, World, at, component, ours, traffic
+from test_operator import deployed, end_mission, gone, running
+
+Body = dict[str, Any]
+
+
+def targets(world: World, namespace: str, name: str = "traffic") -> dict[str, Any]:
+    """The address of the pod behind each link, None while there is none, by node."""
+    found = world.links(namespace, name).items()
+    return {node: (body["spec"]["services"][0].get("target") or {}).get("address") for node, body in found}
+
+
+def checkers(world: World, namespace: str) -> dict[str, Body]:
+    """The pods of the hybrid component on edge nodes, by node."""
+    pods = [p for p in world.pods(namespace) if p["metadata"]["labels"]["fractus.dev/component"] == "ImageChecker"]
+    return {pod["spec"]["nodeName"]: pod for pod in pods if pod["spec"]["nodeName"] != "cloud-1"}
+
+
+def addresses(world: World, namespace: str) -> dict[str, Any]:
+    return {node: pod["status"]["podIP"] for node, pod in checkers(world, namespace).items()}
+
+
+def end_pod(world: World, namespace: str, pod: Body) -> None:
+    world.api.delete(f"/api/v1/namespaces/{namespace}/pods/{pod['metadata']['name']}", grace_s=0)
+
+
+def test_links_lead_to_the_pods_that_the_drone_can_use(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    found = world.links(namespace)
+    assert found, "no links"
+    assert targets(world, namespace) == addresses(world, namespace)
+    service = world.api.get(f"/api/v1/namespaces/{namespace}/services/traffic-image-checker")
+    assert service is not None
+    for node, body in found.items():
+        spec = body["spec"]
+        assert (spec["drone"], spec["range"], spec["pairing"]["networkId"]) == ("drone-1", 80, node)
+        assert spec["services"][0]["virtual"] == {
+            "address": service["spec"]["clusterIP"], "port": 8080, "protocol": "TCP",
+        }  # fmt: skip
+        assert [place.get("alt") for place in spec["path"]] == [None, 10, 20]
+
+
+def test_links_follow_their_pods(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    node, pod = next(iter(checkers(world, namespace).items()))
+    end_pod(world, namespace, pod)
+    wait_for(lambda: targets(world, namespace)[node] is None, "the target to go")
+    # Many pods before it: none has the address that it had.
+    again = wait_for(lambda: checkers_pending(world, namespace), "another pod")
+    world.api.call("POST", f"{again}/binding", {"metadata": {"name": again.rsplit("/", 1)[1]},
+                                                "target": {"kind": "Node", "name": node}})  # fmt: skip
+    ready = {"type": "Ready", "status": "True", "lastTransitionTime": "2026-01-01T00:00:00Z"}
+    status = {"phase": "Running", "podIP": "10.1.9.9", "podIPs": [{"ip": "10.1.9.9"}], "conditions": [ready]}
+    world.api.merge(f"{again}/status", {"status": status})
+    wait_for(lambda: targets(world, namespace)[node] == "10.1.9.9", "the target to follow")
+
+
+def checkers_pending(world: World, namespace: str) -> str | None:
+    for pod in world.pods(namespace):
+        if not pod["spec"].get("nodeName"):
+            return f"/api/v1/namespaces/{namespace}/pods/{pod['metadata']['name']}"
+    return None
+
+
+def test_what_agents_report_moves_nothing(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    link = next(iter(world.links(namespace).values()))
+    path = f"{FRACTUS}/directlinks/{link['metadata']['name']}"
+    reported = world.api.merge(f"{path}/status", {"status": {"phase": "Up", "traffic": "direct", "switches": 3}})
+    operator.stop()
+    operator.start()
+    # The new operator has looked at everything once it has made this again.
+    service = f"/api/v1/namespaces/{namespace}/services/traffic-data-store"
+    world.api.delete(service)
+    wait_for(lambda: world.api.get(service), "the Service to be made again")
+    wait_for(lambda: world.condition(namespace, "Ready").get("status") == "True", "all to be well")
+    assert world.api.get(path) == reported
+
+
+def test_links_of_another_release_are_corrected(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    operator.stop()
+    node, link = next(iter(world.links(namespace).items()))
+    name = link["metadata"]["name"]
+    old = copy.deepcopy(link["spec"])
+    del old["path"]
+    old["range"] = 5
+    left_over = ours("DirectLink", f"{namespace}.traffic-drone-1-long-ago", {**old, "node": "long-ago"})
+    left_over["metadata"]["labels"] = link["metadata"]["labels"]
+    steps = [{"op": "replace", "path": "/spec", "value": old}, {"op": "remove", "path": "/metadata/annotations"}]
+    world.api.call("PATCH", f"{FRACTUS}/directlinks/{name}", steps, content_type=ContentType.JSON_PATCH)
+    world.put(left_over)
+    operator.start()
+    wait_for(lambda: world.links(namespace)[node]["spec"] == link["spec"], "the link to be corrected")
+    wait_for(lambda: "long-ago" not in world.links(namespace), "the link that no plan knows to go")
+
+
+def test_links_follow_the_drone_and_end_with_the_mission(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    running(world, namespace)
+    nodes = set(world.links(namespace))
+    world.add_drone("drone-2")
+    world.api.delete(f"{FRACTUS}/drones/drone-1")
+    world.api.delete("/api/v1/nodes/drone-1")
+
+    def moved() -> bool:
+        return {body["spec"]["drone"] for body in world.links(namespace).values()} == {"drone-2"}
+
+    wait_for(moved, lambda: f"links of drone-2; {world.links(namespace)}")
+    assert set(world.links(namespace)) == nodes
+    world.api.delete(f"{FRACTUS}/edgenodes/{min(nodes)}")
+    wait_for(lambda: min(nodes) not in world.links(namespace), "the link to the node that is gone to go")
+    world.drone_status("drone-2", "flying")
+    end_mission(world, namespace, "Complete", "done")
+    wait_for(lambda: not world.links(namespace), "the links to go")
+
+
+def test_links_go_with_the_application(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    world.api.delete(world.path(traffic(namespace)))
+    wait_for(lambda: gone(world, namespace), lambda: f"everything to go; {world.children(namespace).keys()}")
+
+
+def test_links_without_an_application_go(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    operator.stop()
+    path = world.path(traffic(namespace))
+    world.api.delete(path)
+    world.api.merge(path, {"metadata": {"finalizers": None}})
+    assert world.links(namespace)
+    operator.start()
+    wait_for(lambda: not world.links(namespace), "the links to go")
+
+
+def test_two_applications_on_one_drone_have_links_each(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    services = [{"service": "camera", "methods": ["CaptureImage"]}]
+    camera = component("Camera", "drone", **{"class": "passenger"}, services=services, egress=["Sorter"])
+    camera["pointsOfInterest"] = {"points": [at(15, 15, alt=12), at(45, 45, alt=17)]}
+    sorter = component("Sorter", "hybrid", hybridTo=["Camera"], ingress=["Camera"])
+    world.put(ours("Application", "guest", {"components": [camera, sorter]}, namespace))
+    wait_for(lambda: world.links(namespace, "guest"), lambda: f"links; {world.status(namespace, 'guest')}")
+    deployed(world, namespace, "guest", 1)
+    guests, hosts = world.links(namespace, "guest"), world.links(namespace)
+    assert {body["spec"]["drone"] for body in [*guests.values(), *hosts.values()]} == {"drone-1"}
+    # The host flies: its way is what both can tell.
+    assert next(iter(guests.values()))["spec"]["path"] == next(iter(hosts.values()))["spec"]["path"]
+    world.api.delete(f"{FRACTUS}/namespaces/{namespace}/applications/guest")
+    wait_for(lambda: not world.links(namespace, "guest"), "the guest's links to go")
+    assert {n: b["metadata"]["uid"] for n, b in world.links(namespace).items()} == {
+        n: b["metadata"]["uid"] for n, b in hosts.items()
+    }

@@ -1,0 +1,69 @@
+"""The DirectLinks that the operator makes of a plan, against a golden file (FRACTUS_GOLDEN=write renews it)."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from fractus_core.api import Application, Depot, DirectLink, Drone, EdgeNode
+from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.planning.links import flown_path, plan_links
+from fractus_operator.cluster.pods import PodView
+from fractus_operator.reconcile.links import direct_links, link_name
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "links"
+INPUT = yaml.safe_load((GOLDEN / "input.yaml").read_text())
+APPLICATION = Application.from_body(INPUT["application"])
+PLAN = DeploymentPlanSpec.model_validate(INPUT["plan"])
+DRONE = Drone.from_body(INPUT["drone"])
+EDGES = {node.name: node for node in map(EdgeNode.from_body, INPUT["edgeNodes"])}
+DEPOTS = {depot.name: depot for depot in map(Depot.from_body, INPUT["depots"])}
+PLANNED = plan_links(APPLICATION, PLAN, DRONE, EDGES)
+PATH = flown_path(APPLICATION.spec, DEPOTS)
+
+
+def pod(name: str, ip: str | None, *, ready: bool = True, terminating: bool = False) -> PodView:
+    labels = {"fractus.dev/instance": "traffic-image-checker-edge-1"}
+    return PodView("city", name, "edge-1", labels, {}, ready=ready, finished=False, terminating=terminating, ip=ip)
+
+
+def links(*pods: PodView, cluster_ip: str | None = "10.96.0.7") -> dict[str, Any]:
+    bodies = direct_links(APPLICATION, PLANNED, PATH, pods, {"traffic-image-checker": cluster_ip}.get)
+    return {body["spec"]["node"]: body for body in bodies}
+
+
+def target(*pods: PodView) -> object:
+    return links(*pods)["edge-1"]["spec"]["services"][0].get("target")
+
+
+def test_links_are_as_the_golden_file_says() -> None:
+    found = list(links(pod("a", "10.1.0.5")).values())
+    path = GOLDEN / "expected.yaml"
+    if os.environ.get("FRACTUS_GOLDEN") == "write":
+        path.write_text(yaml.safe_dump_all(found, sort_keys=False, width=120))
+    assert found == list(yaml.safe_load_all(path.read_text()))
+    for body in found:
+        assert DirectLink.from_body(body).spec.to_dict() == body["spec"]
+
+
+def test_the_target_is_the_pod_that_takes_calls() -> None:
+    old, new = pod("a", "10.1.0.5", terminating=True), pod("b", "10.1.0.6")
+    assert target(old, new) == {"address": "10.1.0.6", "port": 8080}
+    assert target(new, pod("c", "10.1.0.7", ready=False), pod("d", None)) == {"address": "10.1.0.6", "port": 8080}
+    assert target(old) is None
+    assert "target" not in links(pod("b", "10.1.0.6"))["edge-2"]["spec"]["services"][0], "a pod of another node"
+
+
+def test_there_is_no_link_before_there_is_an_address_to_redirect() -> None:
+    assert links(pod("a", "10.1.0.5"), cluster_ip=None) == {}
+
+
+@pytest.mark.parametrize("other", [
+    ("city", "traffic", "drone-1", "edge-2"), ("city", "traffic", "drone-2", "edge-1"), ("city", "b", "drone-1", "edge-1"),
+    ("town", "traffic", "drone-1", "edge-1"), ("city", "traffic-drone", "1", "edge-1"), ("city", "traffic", "drone-1-edge", "1"),
+])  # fmt: skip
+def test_every_pair_of_every_application_has_a_name_of_its_own(other: tuple[str, str, str, str]) -> None:
+    assert link_name("city", "traffic", "drone-1", "edge-1") != link_name(*other)

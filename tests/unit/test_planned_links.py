@@ -1,0 +1,145 @@
+"""Which direct links a plan makes possible."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+import yaml
+from fractus_core.api import Application, Drone, EdgeNode
+from fractus_core.api.components import Heuristic
+from fractus_core.planning.links import DEFAULT_HEURISTIC, flown_path, plan_links
+from test_operator_links import APPLICATION, DEPOTS, DRONE, EDGES, INPUT, PATH, PLAN, PLANNED
+
+Body = dict[str, Any]
+
+
+def application(change: str = "{}", component: str = "ImageChecker") -> Application:
+    """The application with some fields of a component changed; None takes one away."""
+    body = copy.deepcopy(INPUT["application"])
+    for part in body["spec"]["components"]:
+        if part["name"] == component:
+            part.update(yaml.safe_load(change))
+            for field in [name for name, value in part.items() if value is None]:
+                del part[field]
+    return Application.from_body(body)
+
+
+def drone(*interfaces: Body) -> Drone:
+    return Drone.from_body({**INPUT["drone"], "spec": {"interfaces": list(interfaces)}})
+
+
+def edge(*interfaces: Body) -> dict[str, EdgeNode]:
+    body = copy.deepcopy(INPUT["edgeNodes"][0])
+    body["spec"]["interfaces"] = list(interfaces)
+    return {"edge-1": EdgeNode.from_body(body)}
+
+
+def wifi(range_m: float | None, mode: str = "adhoc", **more: Any) -> Body:
+    reach = {} if range_m is None else {"range": range_m}
+    return {"technology": "WiFi", "pairing": {"mode": mode, "networkId": more.pop("network", "n")}, **reach, **more}
+
+
+def test_each_end_limits_the_link() -> None:
+    first, second = PLANNED
+    assert (first.node, first.range_m, first.bandwidth_mbps, first.pairing.network_id) == ("edge-1", 80, 12, "edge-1")
+    assert (second.node, second.range_m, second.bandwidth_mbps, second.pairing.network_id) == (
+        "edge-2",
+        120,
+        12,
+        "edge-2",
+    )
+    assert first.heuristic == Heuristic(kind="max", metric="ingress-bandwidth")
+    assert [p.instance for p in first.instances] == ["traffic-image-checker-edge-1"]
+
+
+def test_the_interfaces_that_reach_farthest_link() -> None:
+    two = edge(
+        wifi(50, network="near"),
+        wifi(90, network="far"),
+        {"technology": "BLE", "range": 500, "pairing": {"networkId": "b"}},
+    )
+    (link,) = plan_links(APPLICATION, PLAN, DRONE, two)
+    assert (link.range_m, link.pairing.network_id) == (90, "far")
+
+
+@pytest.mark.parametrize("aboard", [
+    (), ({"technology": "4G"},), (wifi(None),), (wifi(100, "infrastructure"),), ({"technology": "WiFi", "range": 100},),
+    ({"technology": "BLE", "range": 100, "pairing": {"networkId": "n"}},),
+])  # fmt: skip
+def test_interfaces_that_do_not_pair_make_no_link(aboard: tuple[Body, ...]) -> None:
+    assert plan_links(APPLICATION, PLAN, drone(*aboard), edge(wifi(100))) == ()
+    assert plan_links(APPLICATION, PLAN, drone(wifi(100)), edge(*aboard)) == ()
+
+
+def test_nodes_that_are_gone_have_no_link() -> None:
+    assert plan_links(APPLICATION, PLAN, None, EDGES) == ()
+    assert [link.node for link in plan_links(APPLICATION, PLAN, DRONE, {"edge-2": EDGES["edge-2"]})] == ["edge-2"]
+
+
+@pytest.mark.parametrize(("change", "linked"), [
+    ("{heuristic: null}", True),
+    ("{placement: cloud, hybridTo: null, heuristic: null}", False),
+])  # fmt: skip
+def test_a_link_is_for_what_is_hybrid_and_can_be_called(change: str, linked: bool) -> None:
+    links = plan_links(application(change), PLAN, DRONE, EDGES)
+    assert [link.node for link in links] == (["edge-1", "edge-2"] if linked else [])
+    assert all(link.heuristic == DEFAULT_HEURISTIC for link in links)
+
+
+GROUND = {"name": "GroundViewer", "placement": "edge", "locations": [{"center": {"lat": 39.36, "lon": 22.93}, "radius": 9}],
+          "container": {"image": "a"}}  # fmt: skip
+
+
+@pytest.mark.parametrize(("checker", "viewer", "linked"), [
+    ("{hybridTo: [GroundViewer]}", "{egress: null}", False),
+    ("{hybridTo: [GroundViewer], ingress: [AerialViewer]}", "{egress: null}", True),
+    ("{hybridTo: [GroundViewer]}", "{egress: [ImageChecker]}", True),
+    ("{hybridTo: [AerialViewer]}", "{egress: null}", True),
+    ("{hybridTo: [AerialViewer], container: {image: a}}", "{egress: null}", False),
+])  # fmt: skip
+def test_a_link_is_for_what_the_drone_uses(checker: str, viewer: str, linked: bool) -> None:
+    body = copy.deepcopy(INPUT["application"])
+    parts = {part["name"]: part for part in body["spec"]["components"]}
+    parts["ImageChecker"].update(yaml.safe_load(checker))
+    parts["AerialViewer"].update(yaml.safe_load(viewer))
+    if parts["AerialViewer"]["egress"] is None:
+        del parts["AerialViewer"]["egress"]
+    body["spec"]["components"].append(GROUND)
+    assert bool(plan_links(Application.from_body(body), PLAN, DRONE, EDGES)) is linked
+
+
+# -- the path --
+
+
+def test_the_path_is_the_waypoints_of_the_driver() -> None:
+    assert [(p.lat, p.lon, p.alt) for p in PATH] == [(39.3595, 22.9295, None), (39.36, 22.93, 20), (39.361, 22.931, 30)]
+
+
+def test_where_a_driver_roams_no_path_is_known() -> None:
+    region = "{navigation: regionBased, region: {circle: {center: {lat: 39.36, lon: 22.93}, radius: 50}}}"
+    path = "{navigation: pathBased, path: [{lat: 39.36, lon: 22.93}]}"
+    roaming = application(f"{{control: partial, controlPoints: [{path}, {region}]}}", "Navigator")
+    assert flown_path(roaming.spec, DEPOTS) == ()
+
+
+@pytest.mark.parametrize(("points", "told"), [(1000, 1000), (1001, 0)])
+def test_a_path_too_long_to_repeat_in_every_link_is_not_told(points: int, told: int) -> None:
+    places = [{"lat": 39 + i * 1e-5, "lon": 22.93} for i in range(points)]
+    body = copy.deepcopy(INPUT["application"])
+    driver = body["spec"]["components"][0]
+    driver["control"] = "partial"
+    driver["controlPoints"] = [{"navigation": "pathBased", "path": half} for half in (places[:500], places[500:])]
+    assert len(flown_path(Application.from_body(body).spec, DEPOTS)) == told
+
+
+def test_points_of_interest_are_flown_in_the_order_of_the_tour() -> None:
+    east = [22.9300, 22.9340, 22.9310, 22.9330]
+    points = [{"lat": 39.36, "lon": lon} for lon in east]
+    component = {
+        "name": "Viewer", "placement": "drone", "class": "passenger", "container": {"image": "a"},
+        "pointsOfInterest": {"points": points, "ordered": False},
+    }  # fmt: skip
+    body = {**INPUT["application"], "spec": {"components": [component]}}
+    assert [p.lon for p in flown_path(Application.from_body(body).spec, DEPOTS)] == [22.9300, 22.9310, 22.9330, 22.9340]

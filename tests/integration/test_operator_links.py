@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from typing import Any
 
+import pytest
 from control_plane import wait_for
 from fractus_kube import ContentType
 from operator_world import FRACTUS, OperatorProcess, World, at, component, ours, traffic
@@ -29,10 +30,6 @@ def addresses(world: World, namespace: str) -> dict[str, Any]:
     return {node: pod["status"]["podIP"] for node, pod in checkers(world, namespace).items()}
 
 
-def end_pod(world: World, namespace: str, pod: Body) -> None:
-    world.api.delete(f"/api/v1/namespaces/{namespace}/pods/{pod['metadata']['name']}", grace_s=0)
-
-
 def test_links_lead_to_the_pods_that_the_drone_can_use(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     found = world.links(namespace)
@@ -49,26 +46,55 @@ def test_links_lead_to_the_pods_that_the_drone_can_use(world: World, operator: O
         assert [place.get("alt") for place in spec["path"]] == [None, 10, 20]
 
 
-def test_links_follow_their_pods(world: World, operator: OperatorProcess, namespace: str) -> None:
-    running(world, namespace)
-    node, pod = next(iter(checkers(world, namespace).items()))
-    end_pod(world, namespace, pod)
-    wait_for(lambda: targets(world, namespace)[node] is None, "the target to go")
-    # Many pods before it: none has the address that it had.
-    again = wait_for(lambda: checkers_pending(world, namespace), "another pod")
-    world.api.call("POST", f"{again}/binding", {"metadata": {"name": again.rsplit("/", 1)[1]},
-                                                "target": {"kind": "Node", "name": node}})  # fmt: skip
+def restarted(world: World, namespace: str, pod: Body, ip: str) -> None:
+    """Play scheduler and kubelet for the successor of a pod."""
+    pods = f"/api/v1/namespaces/{namespace}/pods"
+    world.api.delete(f"{pods}/{pod['metadata']['name']}", grace_s=0)
+
+    def unbound() -> str | None:
+        return next((p["metadata"]["name"] for p in world.pods(namespace) if not p["spec"].get("nodeName")), None)
+
+    name = wait_for(unbound, "the pod's successor")
+    target = {"kind": "Node", "name": pod["spec"]["nodeName"]}
+    world.api.call("POST", f"{pods}/{name}/binding", {"metadata": {"name": name}, "target": target})
     ready = {"type": "Ready", "status": "True", "lastTransitionTime": "2026-01-01T00:00:00Z"}
-    status = {"phase": "Running", "podIP": "10.1.9.9", "podIPs": [{"ip": "10.1.9.9"}], "conditions": [ready]}
-    world.api.merge(f"{again}/status", {"status": status})
+    status = {"phase": "Running", "podIP": ip, "podIPs": [{"ip": ip}], "conditions": [ready]}
+    world.api.merge(f"{pods}/{name}/status", {"status": status})
+
+
+def base_addresses(world: World, namespace: str) -> list[str]:
+    """Where the cloud path of the hybrid component leads."""
+    path = f"/apis/discovery.k8s.io/v1/namespaces/{namespace}/endpointslices/traffic-image-checker"
+    return [a for endpoint in (world.api.get(path) or {}).get("endpoints") or () for a in endpoint["addresses"]]
+
+
+@pytest.mark.parametrize("change", ["none", "waits for the landing", "cannot be planned"])
+def test_links_and_the_cloud_path_follow_their_pods(
+    world: World, operator: OperatorProcess, namespace: str, change: str
+) -> None:
+    running(world, namespace)
+    world.drone_status("drone-1", "flying")
+    world.phase(namespace, "Flying")
+    manifest = traffic(namespace)
+    if change == "waits for the landing":
+        manifest["spec"]["components"][0]["container"]["image"] = "registry.test/component:2"
+        world.put(manifest)
+        wait_for(
+            lambda: "WaitsForLanding" in str(world.status(namespace)), lambda: f"to wait; {world.status(namespace)}"
+        )
+    elif change == "cannot be planned":
+        manifest["spec"]["updatePolicy"] = "Immediate"
+        manifest["spec"]["components"][0]["controlPoints"][0]["point"]["depot"] = "nowhere"
+        world.put(manifest)
+        world.phase(namespace, "Invalid")
+    ((node, pod),) = checkers(world, namespace).items()
+    restarted(world, namespace, pod, "10.1.9.9")
     wait_for(lambda: targets(world, namespace)[node] == "10.1.9.9", "the target to follow")
-
-
-def checkers_pending(world: World, namespace: str) -> str | None:
-    for pod in world.pods(namespace):
-        if not pod["spec"].get("nodeName"):
-            return f"/api/v1/namespaces/{namespace}/pods/{pod['metadata']['name']}"
-    return None
+    base = next(
+        p for p in world.pods(namespace) if p["metadata"]["labels"]["fractus.dev/instance"] == "traffic-image-checker"
+    )
+    restarted(world, namespace, base, "10.1.9.8")
+    wait_for(lambda: base_addresses(world, namespace) == ["10.1.9.8"], "the cloud path to follow")
 
 
 def test_what_agents_report_moves_nothing(world: World, operator: OperatorProcess, namespace: str) -> None:

@@ -27,6 +27,7 @@ from fractus_operator.cluster.kinds import EVENT, Body, Key, Kind, key_of
 __all__ = [
     "Backoff",
     "Conflict",
+    "ContentType",
     "Invalid",
     "KubeError",
     "LeaseThread",

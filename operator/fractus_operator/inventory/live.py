@@ -134,7 +134,7 @@ class LiveInventory:
         return Inventory(
             hosts=BookedHosts(self.hosts, self._bookings, corrections(self.plans.requests(), pods, labelled(key))),
             drones=ByName(self.drones),
-            edge_nodes=self.edge_nodes_by_name(),
+            edge_nodes=ByName(self.edge_nodes),
             depots=self.depots_by_name(),
             zones={z.name: z for z in self.zones.values() if isinstance(z, Zone)},
             policies={p.name: p for p in self.policies.values() if isinstance(p, Policy)},
@@ -152,10 +152,6 @@ class LiveInventory:
     def depots_by_name(self) -> Mapping[str, Depot]:
         """The depots."""
         return ByName(self.depots)
-
-    def edge_nodes_by_name(self) -> Mapping[str, EdgeNode]:
-        """The edge nodes."""
-        return ByName(self.edge_nodes)
 
     def claims(self) -> dict[str, Claim]:
         """Which application has which drone."""

@@ -194,7 +194,10 @@ class Applications:
             await self._grants.refresh(seen)
             update, again_s = await self._deploy(self._live.observe(submitted), memory)
         except Blocked as blocked:
-            update, again_s = status.blocked(blocked, present), blocked.retry_s
+            await self._reporter.report(submitted, status.blocked(blocked, present))
+            if seen.plan is not None:
+                await self._rollout.follow_pods(seen.key, seen.plan, seen.pods)
+            return blocked.retry_s
         await self._reporter.report(submitted, update)
         return again_s
 
@@ -235,6 +238,7 @@ class Applications:
             raise Blocked("Invalid", "Planned", "Invalid", str(seen.submitted.error))
         if seen.plan is not None and waits_for_landing(application, seen.plan, seen.in_flight):
             await self._rollout.renew_certificates(application, seen.plan)
+            await self._rollout.follow_pods(seen.key, seen.plan, seen.pods)
             return status.waiting(self._deployed(seen, seen.plan, len(seen.grants)), seen.in_flight or ""), RESYNC_S
         try:
             check_application(application, inventory.depots)

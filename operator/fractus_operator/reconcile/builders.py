@@ -44,9 +44,8 @@ def children(
     for component in (c for c in application.spec.components if c.container.ports):
         wanted[kinds.SERVICE].append(service(application, component))
         if component.placement == "hybrid":
-            bases = {p.instance for p in plan.placements if p.component == component.name and p.role == "cloud"}
-            ready = [pod for pod in pods if pod.instance in bases]
-            wanted[kinds.ENDPOINT_SLICE].append(endpoint_slice(application, component, ready))
+            based = base_pods(component.name, plan, pods)
+            wanted[kinds.ENDPOINT_SLICE].append(endpoint_slice(application, component, based))
     if plan.drone is not None:
         wanted[kinds.DISRUPTION_BUDGET] = [disruption_budget(application)]
     for placed in plan.placements:
@@ -135,7 +134,7 @@ def service(application: Application, component: Component) -> Body:
 def endpoint_slice(application: Application, component: Component, pods: Iterable[PodView]) -> Body:
     """Where a hybrid component's Service leads: to the ready pods of its base instance."""
     name = service_name(application.name, component)
-    ready = sorted((pod for pod in pods if pod.takes_calls), key=lambda pod: pod.name)
+    ready = [pod for pod in pods if pod.takes_calls]
     described = {
         labels.COMPONENT_LABEL: component.name,
         "kubernetes.io/service-name": name,
@@ -147,17 +146,29 @@ def endpoint_slice(application: Application, component: Component, pods: Iterabl
         name,
         described,
         addressType="IPv6" if any(":" in (pod.ip or "") for pod in ready) else "IPv4",
-        endpoints=[
-            {
-                "addresses": [pod.ip],
-                "conditions": {"ready": True, "serving": True, "terminating": False},
-                "nodeName": pod.node,
-                "targetRef": {"kind": "Pod", "namespace": pod.namespace, "name": pod.name},
-            }
-            for pod in ready
-        ],
+        endpoints=endpoints(ready),
         ports=[{"name": p.label, "port": p.port, "protocol": p.protocol} for p in component.container.ports],
     )
+
+
+def base_pods(component: str, plan: DeploymentPlanSpec, pods: Iterable[PodView]) -> list[PodView]:
+    """The pods of a hybrid component's cloud base."""
+    bases = {p.instance for p in plan.placements if p.component == component and p.role == "cloud"}
+    return [pod for pod in pods if pod.instance in bases]
+
+
+def endpoints(pods: Iterable[PodView]) -> list[Body]:
+    """The endpoints of an EndpointSlice: those pods that take calls."""
+    return [
+        {
+            "addresses": [pod.ip],
+            "conditions": {"ready": True, "serving": True, "terminating": False},
+            "nodeName": pod.node,
+            "targetRef": {"kind": "Pod", "namespace": pod.namespace, "name": pod.name},
+        }
+        for pod in sorted(pods, key=lambda pod: pod.name)
+        if pod.takes_calls
+    ]
 
 
 def disruption_budget(application: Application) -> Body:

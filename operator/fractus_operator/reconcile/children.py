@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 from collections.abc import Awaitable, Collection, Iterable, Mapping, Sequence
 
@@ -14,7 +15,7 @@ from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind, key_of
 from fractus_operator.cluster.labels import APPLICATION_LABEL, MANAGED_SELECTOR, NAMESPACE_LABEL, label_value
 from fractus_operator.cluster.reading import read
-from fractus_operator.cluster.store import Conflict, KubeError, NotFound, Reflector, Store
+from fractus_operator.cluster.store import Conflict, ContentType, KubeError, NotFound, Reflector, Store
 from fractus_operator.reconcile import builders
 from fractus_operator.reconcile.difference import contains, digest, is_current, stamped
 
@@ -83,6 +84,16 @@ class Children:
     async def refresh(self, grants: Sequence[tuple[Grant, GrantSpec]]) -> None:
         """Bring Grants that exist up to date; one that is refused stops no other."""
         await _all(self._refresh_one(*pair) for pair in grants)
+
+    async def change(self, kind: Kind, observed: Body, fields: Body) -> None:
+        """Give some fields of a child other values. One that is gone is not made again.
+
+        Raises:
+            KubeError: the API server refuses the change, or cannot be reached.
+        """
+        key = key_of(observed)
+        with contextlib.suppress(NotFound):
+            self._copies[kind].note(key, await self._store.patch(kind, key, fields, ContentType.MERGE))
 
     async def _refresh_one(self, grant: Grant, spec: GrantSpec) -> None:
         key = ("", grant.name)

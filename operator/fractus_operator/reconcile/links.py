@@ -83,11 +83,27 @@ def _services(
     address = cluster_ip(service_name(application.name, component))
     if address is None:
         return
-    ready = sorted(pod.ip or "" for pod in pods if pod.instance == placed.instance and pod.takes_calls)
+    target = _target(placed.instance, pods)
     for port in component.container.ports:
         yield LinkedService(
             component=component.name,
             instance=placed.instance,
             virtual=VirtualAddress(address=address, port=port.port, protocol=port.protocol),
-            target=TargetAddress(address=ready[0], port=port.port) if ready else None,
+            target=TargetAddress(address=target, port=port.port) if target is not None else None,
         )
+
+
+def retargeted(services: Iterable[Body], pods: Sequence[PodView]) -> list[Body]:
+    """The services of a DirectLink as it is, with the targets that there are now."""
+    found = []
+    for service in services:
+        address = _target(service["instance"], pods)
+        target = {"address": address, "port": service["virtual"]["port"]}
+        rest = {name: value for name, value in service.items() if name != "target"}
+        found.append({**rest, "target": target} if address is not None else rest)
+    return found
+
+
+def _target(instance: str, pods: Iterable[PodView]) -> str | None:
+    """The address of the pod of an instance that takes calls; of two the lower one, so that it stays."""
+    return min((pod.ip for pod in pods if pod.instance == instance and pod.takes_calls and pod.ip), default=None)

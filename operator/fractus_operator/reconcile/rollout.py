@@ -15,12 +15,14 @@ from fractus_core.planning.links import flown_path, plan_links
 
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind, key_of
-from fractus_operator.cluster.labels import CAUSE_ANNOTATION
+from fractus_operator.cluster.labels import CAUSE_ANNOTATION, COMPONENT_LABEL
 from fractus_operator.cluster.pods import PodView
+from fractus_operator.inventory.bookings import ByName
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile import builders
 from fractus_operator.reconcile.children import Children
-from fractus_operator.reconcile.links import direct_links
+from fractus_operator.reconcile.difference import contains
+from fractus_operator.reconcile.links import direct_links, retargeted
 
 _HEAD_START_S = 0.5
 """How long Deployments go first at most, where there are new ones: neither a webhook that holds them up nor pods that no node
@@ -135,9 +137,7 @@ class Rollout:
         """The direct links of a plan. A Service that is only made now has an address, and its links, in the next reconcile."""
         if decided.drone is None:
             return []
-        planned = plan_links(
-            application, decided, self._live.drone(decided.drone.node), self._live.edge_nodes_by_name()
-        )
+        planned = plan_links(application, decided, self._live.drone(decided.drone.node), ByName(self._live.edge_nodes))
         flying: Application | None = application
         if decided.drone.shared_with is not None:
             host, _ = self._live.plans.host_of(decided)
@@ -154,6 +154,25 @@ class Rollout:
             return body["spec"].get("clusterIP") if body is not None else None
 
         return direct_links(application, planned, path, pods, cluster_ip)
+
+    async def follow_pods(self, key: Key, plan: DeploymentPlanSpec, pods: Sequence[PodView]) -> None:
+        """Bring the addresses in what was rolled out up to date with the pods, and change nothing else.
+
+        For an application whose next plan waits, or cannot be made: pods that restart meanwhile have other addresses.
+
+        Raises:
+            KubeError: the API server refuses a change, or cannot be reached.
+        """
+        for body in self._children.of(key, kinds.ENDPOINT_SLICE):
+            component = body["metadata"]["labels"].get(COMPONENT_LABEL, "")
+            present = builders.endpoints(builders.base_pods(component, plan, pods))
+            if not contains(body.get("endpoints"), present):
+                await self._children.change(kinds.ENDPOINT_SLICE, body, {"endpoints": present})
+        for body in self._children.of(key, kinds.DIRECT_LINK):
+            services = body["spec"].get("services") or []
+            present = retargeted(services, pods)
+            if present != services:
+                await self._children.change(kinds.DIRECT_LINK, body, {"spec": {"services": present}})
 
     async def renew_certificates(self, application: Application, plan: DeploymentPlanSpec) -> None:
         """Renew the certificates of what runs by a plan, and change nothing else.

@@ -11,7 +11,7 @@ from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.engine import judge
 from fractus_core.policy.motion import stop_point
 from fractus_core.policy.values import Airframe, GotoArgs, Situation
-from policy_world import FRAME, altitude, ask, at, box, compiled, exclusion, goto, inclusion, ring
+from policy_world import FRAME, altitude, ask, at, box, compiled, exclusion, goto, inclusion, ring, zone
 
 
 def lane(radius_m: float, *points: tuple[float, float], **changes: Any) -> CompiledGrant:
@@ -153,3 +153,15 @@ def test_room_for_a_stop_while_it_turns() -> None:
     now = at(0, 0, east_mps=6, speed_setpoint_mps=6)
     leg = ask(grant, goto(-6, 60), now)
     assert leg.brake_first or not leg.permits, "a stop in the middle of the turn would end in the zone's margin"
+
+
+@pytest.mark.parametrize("target", [(0, -50), (40, 0)])
+def test_a_stop_before_a_leg_enters_no_zone_at_a_height_that_is_not_allowed(target: tuple[float, float]) -> None:
+    low = compiled(altitude("low", [zone("ahead", box(-20, 12, 20, 60))], upperLimit=10))
+    flying = at(alt=20, north_mps=8, speed_setpoint_mps=8)
+    assert ask(low, goto(*target, 20), flying).code == "AltitudeAboveLimit"
+    assert not ask(low, goto(*target, 20), flying).permits, "it would come to rest in the zone"
+    assert ask(low, goto(*target, 20), at(alt=20)).action == "allow"
+    assert ask(low, goto(*target, 8), at(alt=8, north_mps=8, speed_setpoint_mps=8)).permits
+    terrain = altitude("terrain", [zone("ahead", box(-20, 12, 20, 60))], upperLimit=10, altitudeReference="terrain")
+    assert not ask(compiled(terrain), goto(*target, 20), flying).permits

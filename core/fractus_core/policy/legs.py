@@ -80,7 +80,7 @@ def _shortened(verdict: Verdict, args: GotoArgs) -> bool:
 
 
 def _judge_after_stop(request: _Request, target: XY) -> Verdict | None:
-    """The verdict on a leg that begins with a stop; None when the stop itself breaks a fence."""
+    """The verdict on a leg that begins with a stop; None when the stop itself breaks a fence or a limit of altitude."""
     now, grant, at = request.now, request.grant, request.at
     stop = stop_point(now, at)
     heights, corners = [now.altitude_m, stop_altitude_m(now)], list[XY]()
@@ -90,6 +90,11 @@ def _judge_after_stop(request: _Request, target: XY) -> Verdict | None:
     braking = Leg(at, stop, stop, stop, min(heights), max(heights), tuple(corners))
     on_its_way = replace(grant, operation=grant.passage, operation_border=grant.passage_border)
     if breaches(braking, now, on_its_way, margin_m(now), height_margin_m(now)):
+        return None
+    # The leg begins where the drone stands: what it brakes into would count as where it has been.
+    bounds, unknown = altitude_bounds(grant, now, Air(braking.ground, margin_m(now), braking.lower_m, braking.upper_m))
+    reach = braking.lower_m, braking.upper_m
+    if unknown or height_on_entry(shapely.points(at), reach, bounds, height_margin_m(now)) is not None:
         return None
     verdict = _judge_from(replace(request, now=at_rest(now, grant.frame, at), at=stop), target)
     return replace(verdict, brake_first=True)

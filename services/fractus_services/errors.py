@@ -82,12 +82,14 @@ class AutopilotError(Exception):
     """The autopilot did not do what was asked; the text says what and why.
 
     Attributes:
-        link: whether it was not heard, so that trying again may help; otherwise it refused.
+        link: whether it was not heard, so that trying again may help.
+        refused: whether it answered that it does not do this.
     """
 
-    def __init__(self, reason: str, *, link: bool = False) -> None:
+    def __init__(self, reason: str, *, link: bool = False, refused: bool = False) -> None:
         super().__init__(reason)
         self.link = link
+        self.refused = refused
 
 
 class CannotServe(Exception):

@@ -431,6 +431,45 @@ def test_a_mode_change_whose_answers_were_lost_is_the_systems() -> None:
     assert transition(observed, shown[1], LATE_S)[0].authority is Authority.PILOT, "too late to be ours"
 
 
+def test_a_mode_that_the_autopilot_refused_is_not_the_systems() -> None:
+    refused = (told.ModeChangeBegan(RTL), told.ModeChangeEnded(RTL, GUIDED, done=False, refused=True))
+    state, _ = told_of(*FLIES, *refused)
+    returns = replace(FLYING, mode=RTL)
+    assert told_of(told.VehicleObserved(returns), told.Heartbeat(), state=state)[0].authority is Authority.PILOT
+    failsafe, _ = told_of(told.VehicleObserved(replace(returns, failsafe=True)), told.Heartbeat(), state=state)
+    assert (failsafe.task, failsafe.returning) == (SystemTask(1, TaskKind.RETURN), True)
+    assert failsafe.missions["a"].outcome is not None
+
+
+def test_a_return_that_is_obeyed_late_is_watched_by_the_system() -> None:
+    given_up = (told.ModeChangeBegan(RTL), told.ModeChangeEnded(RTL, GUIDED, done=False))
+    shown = (told.VehicleObserved(replace(FLYING, mode=RTL)), told.Heartbeat())
+    alone, _ = told_of(*FLIES, *given_up, told.StreamClosed(1), *shown)
+    assert (alone.task, alone.returning, alone.deadline) == (SystemTask(2, TaskKind.RETURN), True, 5.0)
+    driven, _ = told_of(*FLIES, *given_up, *shown)
+    assert (driven.authority, driven.task) == (Authority.DRIVER, None)
+
+
+@pytest.mark.parametrize("mode", [GUIDED, RTL])
+def test_a_driver_that_is_lost_on_its_way_home_may_come_back_on_it(mode: FlightMode) -> None:
+    homeward = (told.MotionBegan(1, "ReturnToLaunch"), told.ModeChangeBegan(mode))
+    turns = (
+        told.VehicleObserved(replace(FLYING, mode=mode)),
+        told.Heartbeat(),
+        told.ModeChangeEnded(mode, GUIDED, True),
+    )
+    lost, _ = told_of(*FLIES, *homeward, *turns, told.StreamClosed(1))
+    assert (lost.task, lost.returning, lost.deadline) == (SystemTask(1, TaskKind.RETURN), True, 5.0)
+    back, _ = told_of(told.StreamOpened(2, "a", "A"), told.GrantControl(2), state=lost)
+    assert (back.drives, back.returning, back.task, back.grace) == (True, False, None, None)
+    late, actions = transition(lost, told.Tick(), 5.0)
+    assert late.missions["a"].outcome == Outcome(OutcomeKind.FAILED, "driver lost")
+    assert not any(isinstance(action, StartSystemTask) for action in actions), "it is on its way already"
+    assert told_of(told.StreamOpened(2, "a", "A"), state=late)[1][0] == RefuseStream(
+        2, *ended_refusal(late.outcomes["a"])
+    )
+
+
 def test_a_return_that_a_pilot_chooses_after_a_failsafe_is_the_pilots() -> None:
     flies = replace(FLYING, failsafe=True)
     heard = [(told.VehicleObserved(replace(flies, mode=mode)), told.Heartbeat()) for mode in (RTL, GUIDED, RTL)]

@@ -315,23 +315,28 @@ def test_what_appears_before_a_pilot_who_chose_to_return_is_told_and_left(
     fly(flight)
 
 
-def test_a_return_that_a_new_service_finds_is_told_of_and_left(tmp_path: Path) -> None:
+@pytest.mark.parametrize("failsafe", [False, True])
+def test_a_return_that_a_new_service_finds_is_left_unless_a_failsafe_began_it(tmp_path: Path, failsafe: bool) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
             grant = world.grants.put(spec())
             await world.up(grant)
             await end(world.service.goto(grant, GotoArgs(*at(0, 120), 10.0), 0))
+            plane.vehicle.failsafe = failsafe
             plane.set_to(RTL)
             world.observer.heartbeat()
             await world.until(lambda: plane.xy[1] < 90)
         async with World(tmp_path, after=world, known=False) as again:
             again.grants.put(spec(zone("wall", "revoke", *WALL)))
             again.observer.found()
+            again.plane.trace.clear()
             commands = len(again.plane.commands)
             await again.until(lambda: not again.plane.vehicle.armed)
-            assert ("alarm", "ExclusionZoneAhead") in [(e["action"], e["code"]) for e in again.kinds("monitor")]
-            assert MAV_CMD.DO_SET_MODE not in again.plane.commands[commands:]
+            told = "takeBack" if failsafe else "alarm"
+            assert (told, "ExclusionZoneAhead") in [(e["action"], e["code"]) for e in again.kinds("monitor")]
+            assert (MAV_CMD.DO_SET_MODE in again.plane.commands[commands:]) is failsafe
+            assert (clear_m(again, *WALL) > 1.0) is failsafe
 
     fly(flight)
 

@@ -1,6 +1,7 @@
 """Who may command a vehicle: transition(state, event, now) -> (state, actions)."""
 
 from fractus_core.control.machine import transition
+from fractus_core.control.readiness import not_ready_reason
 from fractus_core.control.values import (
     Authority,
     ControlEvent,
@@ -9,7 +10,6 @@ from fractus_core.control.values import (
     Outcome,
     OutcomeKind,
     StreamState,
-    not_ready_reason,
 )
 
 __all__ = [

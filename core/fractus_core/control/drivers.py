@@ -96,7 +96,7 @@ def _grant(step: Step, lease_id: int) -> None:
     state, lease = step.state, step.state.lease
     if lease is None or lease.lease_id != lease_id or lease.granted:
         return
-    if state.authority is Authority.PILOT or state.returning or not state.decided or state.taken(lease.key):
+    if state.authority is Authority.PILOT or state.home_for_good or not state.decided or state.taken(lease.key):
         return
     mission = step.mission(lease.key, lease.identity)
     step.stop_task()
@@ -134,7 +134,8 @@ def _return(step: Step, event: ControlReturned) -> None:
 def _close(step: Step, event: StreamClosed) -> None:
     """A stream that ends by itself loses the driver, if it had the vehicle or the system flew for it.
 
-    A vehicle that already comes down for the driver is left to it: stopping in mid-air helps no one.
+    The way home that it began the system goes on with, and a vehicle that lands for it is left to that: stopping in mid-air
+    helps no one.
     """
     lease, motion = step.state.lease, step.state.motion
     if lease is None or lease.lease_id != event.lease_id:
@@ -145,10 +146,11 @@ def _close(step: Step, event: StreamClosed) -> None:
         return
     step.set(authority=Authority.SYSTEM)
     step.audit("control", DRIVER_LOST, lease.identity, "its stream broke")
-    descends = motion is not None and motion.kind in COMING_DOWN and step.state.vehicle.mode.comes_down
+    returns = motion is not None and motion.kind == "ReturnToLaunch"
+    lands = motion is not None and motion.kind == "Land" and step.state.vehicle.mode.comes_down
     step.stop_motion(StopKind.LOST, "ControlLost", "the driver's stream broke")
-    if step.state.vehicle.armed and not descends:
-        step.start(TaskKind.HOVER)
+    if step.state.vehicle.armed and not lands:
+        step.start(TaskKind.RETURN if returns else TaskKind.HOVER)
     step.begin_grace(mission, DRIVER_LOST)
 
 

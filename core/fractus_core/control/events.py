@@ -210,11 +210,13 @@ class ModeChangeEnded:
     Attributes:
         before: what was expected before it.
         done: whether the autopilot confirmed it.
+        refused: whether it said that it does not; neither: its answers may have been lost.
     """
 
     mode: FlightMode
     before: FlightMode | None
     done: bool
+    refused: bool = False
 
 
 # Arming

@@ -145,10 +145,10 @@ class Step:
         self.act(StartSystemTask(task))
 
     def stop_task(self) -> None:
-        """End what the system does with the vehicle."""
+        """End what the system does with the vehicle; a way home of the autopilot's own goes on, and is no one's."""
         if self.state.task is not None:
             self.act(StopSystemTask(self.state.task.task_id))
-            self.set(task=None)
+        self.set(task=None, returning=False)
 
     def begin_grace(self, mission: Mission, reason: str, code: str = "DriverLost") -> None:
         """Give a lost driver or position its time to come back; on the ground, before any flight, there is nothing to save.
@@ -196,6 +196,5 @@ class Step:
         if self.state.authority is not Authority.PILOT:
             self.audit("takeover", "pilot", "pilot", reason, "PilotTookOver")
         self.stop_task()
-        self.set(returning=False)
         self.lose_lease(reason)
         self.set(authority=Authority.PILOT, grace=None)

@@ -317,6 +317,12 @@ class ControlState:
         return self.lease is not None and self.lease.granted
 
     @property
+    def home_for_good(self) -> bool:
+        """Whether the vehicle comes home and no driver may stop it: not one that its driver called home, and then was lost."""
+        waits = self.grace is not None and self.grace.key == self.active
+        return self.returning and not waits
+
+    @property
     def grant_in_force(self) -> bool:
         """Whether there is a grant under which the vehicle may go on: the lease's, or that of the active mission."""
         return self.lease is not None or (self.mission is not None and self.mission.key in self.grants)
@@ -361,40 +367,3 @@ class ControlState:
     def observed(self, vehicle: VehicleFacts) -> ControlState:
         """The same with the vehicle as it is now."""
         return self if vehicle == self.vehicle else replace(self, vehicle=vehicle)
-
-
-@dataclass(frozen=True, slots=True)
-class Readiness:
-    """What else an application must wait for.
-
-    Attributes:
-        unverified: why the autopilot's failsafes do not count as set; empty when they do.
-        unready: why the autopilot would not arm; empty when it would.
-        located: whether position and home are known.
-        link: what is wrong with the link to the autopilot; empty when nothing is.
-    """
-
-    unverified: str
-    unready: str
-    located: bool
-    link: str = ""
-
-
-def not_ready_reason(state: ControlState, key: str, readiness: Readiness) -> str | None:
-    """Why the vehicle cannot fly for a mission now; None when it can."""
-    vehicle = state.vehicle
-    reasons = (
-        (not vehicle.connected, "the autopilot is not connected"),
-        (not state.decided, "it is not known yet what the drone does"),
-        (state.taken(key), "another application has the drone"),
-        (bool(readiness.unverified), f"the autopilot's failsafes are not verified: {readiness.unverified}"),
-        (state.authority is Authority.PILOT, f"a human pilot has the drone ({vehicle.mode.name})"),
-        (state.returning, "the system brings the drone home"),
-        (
-            not vehicle.armed and bool(readiness.unready),
-            f"the autopilot is not ready to arm: {readiness.unready}",
-        ),
-        (not readiness.located, "position and home are not known yet"),
-        (not vehicle.armed and bool(readiness.link), readiness.link),
-    )
-    return next((reason for holds, reason in reasons if holds), None)

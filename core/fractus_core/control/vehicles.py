@@ -47,13 +47,13 @@ def on_vehicle(step: Step, event: VehicleEvent) -> None:
                 step.act(SaveJournal())
         case ModeChangeBegan(mode):
             step.set(expected_mode=mode, mode_changes=step.state.mode_changes + 1)
-        case ModeChangeEnded(mode, before, done):
+        case ModeChangeEnded(mode, before, done, refused):
             step.set(mode_changes=max(step.state.mode_changes - 1, 0))
-            # A change that failed for certain is not expected any more; one that the vehicle shows after all is.
+            # A change that failed is not expected any more; where only the answers were lost, the vehicle may show it after all.
             if done:
                 step.set(unconfirmed=None)
             elif step.state.expected_mode == mode and step.state.vehicle.mode != mode:
-                step.set(expected_mode=before, unconfirmed=(mode, step.now + UNCONFIRMED_S))
+                step.set(expected_mode=before, unconfirmed=None if refused else (mode, step.now + UNCONFIRMED_S))
         case _:
             assert_never(event)
 
@@ -98,7 +98,9 @@ def _found(step: Step) -> None:
     elif comes_down:
         step.end_mission(mission, OutcomeKind.FAILED, FLEW_HOME_ALONE)
         step.audit("takeover", "homeward", "system", f"found the drone in {vehicle.mode.name}")
-        step.follow_descent(_descent(vehicle.mode), found=task is None or task.found)
+        # A return without a failsafe may be a pilot's choice.
+        found = not vehicle.failsafe and (task is None or task.found)
+        step.follow_descent(_descent(vehicle.mode), found=found)
     else:
         step.set(authority=Authority.SYSTEM)
         step.audit("takeover", TaskKind.HOVER.value, "system", "found the drone in the air")
@@ -159,6 +161,8 @@ def _foreign_mode(step: Step) -> None:
     unconfirmed, piloted = state.unconfirmed, state.authority is Authority.PILOT
     if unconfirmed is not None and vehicle.mode == unconfirmed[0] and step.now < unconfirmed[1] and not piloted:
         step.set(unconfirmed=None)
+        if vehicle.mode.comes_down and state.authority is Authority.SYSTEM and not state.returning:
+            step.follow_descent(_descent(vehicle.mode))  # what asked for it is over by now
         return  # the system's own change: the autopilot obeyed, and its answers were lost
     # A failsafe stays reported for the rest of the flight: a pilot may choose the mode long after it.
     begins = vehicle.failsafe and not state.failsafe_seen

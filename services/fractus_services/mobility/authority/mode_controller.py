@@ -50,13 +50,16 @@ class ModeController:
         before = self._state().expected_mode
         if self._autopilot.vehicle.mode == mode and before == mode:
             return
-        done = False
+        done = refused = False
         self._dispatch(ModeChangeBegan(mode))
         try:
             await self._autopilot.set_mode(mode, permit)
             done = True
+        except AutopilotError as error:
+            refused = error.refused
+            raise
         finally:
-            self._dispatch(ModeChangeEnded(mode, before, done))
+            self._dispatch(ModeChangeEnded(mode, before, done, refused))
 
     async def enter_guided(self, permit: Permit = always) -> None:
         """Change to the mode in which the autopilot obeys.

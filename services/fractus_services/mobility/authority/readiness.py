@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fractus_core import control as core
-from fractus_core.control.values import Readiness
+from fractus_core.control.readiness import Readiness
 
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.autopilot import BEING_SET

@@ -166,7 +166,7 @@ class MavlinkAutopilot(Link):
                 if result == MAV_RESULT.TEMPORARILY_REJECTED and attempt + 1 < attempts:
                     await asyncio.sleep(REJECTED_RETRY_S)
                     continue
-                raise AutopilotError(self._refusal(command, result))
+                raise AutopilotError(self._refusal(command, result), refused=True)
         raise AutopilotError(f"the autopilot did not answer command {command.name}", link=True)
 
     async def _attempt(self, outgoing: Message, command: MAV_CMD) -> int | None:

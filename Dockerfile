@@ -134,6 +134,10 @@ FROM component AS example-field
 COPY examples/field/*.py /app/
 WORKDIR /app
 
+FROM component AS example-links
+COPY examples/links/*.py /app/
+WORKDIR /app
+
 FROM domain AS operator
 COPY --from=dependencies /only-operator /usr/local/lib/python3.11/dist-packages
 USER 10001:10001

@@ -35,6 +35,10 @@ scenario-field: env ## Fly the field experiment and leave its report in out/fiel
 	$(RUN) python -m fractus_sim.scenarios.field --out $(OUT)/field --speedup $(SPEEDUP) \
 		$(if $(AUTOPILOT),--autopilot $(AUTOPILOT))
 
+.PHONY: scenario-links
+scenario-links: packages uv ## Fly past edge nodes with WiFi on an embedded cluster and leave the report in out/links (FACTOR=1: real by declared range)
+	$(UV) run --frozen --extra sim python -m fractus_sim.scenarios.links --out $(OUT)/links --factor $(or $(FACTOR),1)
+
 .PHONY: compare-vehicle
 compare-vehicle: env ## Play the script of a real ArduCopter's answers on the simulated vehicle (AUTOPILOT=tcp:HOST:PORT: on that one)
 	PYTHONPATH=tests/unit $(RUN) python tests/unit/vehicle_script.py --all $(if $(AUTOPILOT),--autopilot $(AUTOPILOT))

@@ -112,7 +112,10 @@ def checkout(tmp_path: Path) -> Path:
     [
         ("core/module.py", {"operator", "agent", "services", "sim"}),
         ("operator/module.py", {"operator"}),
-        ("sdk/module.py", {"component", "services", "sim", "example-traffic-monitoring", "example-field"}),
+        (
+            "sdk/module.py",
+            {"component", "services", "sim", "example-traffic-monitoring", "example-field", "example-links"},
+        ),
         ("examples/traffic-monitoring/navigator.py", {"example-traffic-monitoring"}),
         ("uv.lock", set(TARGETS)),
         ("core/__pycache__/module.pyc", set()),

@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 import random
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import pytest
 from depth import examples
@@ -28,6 +28,8 @@ from fractus_core.linking import (
 from fractus_core.linking.horizon import UNREACHABLE, Horizon, solve
 from fractus_core.linking.learning import connected, expected, failed, heard, lost
 from fractus_core.linking.prediction import predict
+from fractus_core.linking.values import Position
+from fractus_sim.scenarios.links.rules import Scene, along, carried, oracle, ours, thesis
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -212,109 +214,16 @@ def test_heuristics_have_names() -> None:
 
 # In closed loop, against an oracle and the thesis' rule
 
-STEP_S = 0.1
-LINK_UP_STEPS = 9  # 0.92 s: up and measured
 
-
-@dataclass
-class Scene:
-    """A flight among peers whose real reach is a factor of the declared one."""
-
-    path: list[tuple[float, float, float]]
-    speed: float
-    peers: list[Peer]
-    factor: float = 1.0
-    positions: list[tuple[float, float, float]] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        at, coming = self.path[0], list(self.path[1:])
-        self.positions, self.waypoints = [], []
-        while coming:
-            self.positions.append(at)
-            self.waypoints.append(tuple(coming))
-            left = self.speed * STEP_S
-            while coming and left > 0:
-                away = math.dist(at, coming[0])
-                if away <= left:
-                    at, left = coming.pop(0), left - away
-                else:
-                    x, y, z = (a + (b - a) * left / away for a, b in zip(at, coming[0], strict=True))
-                    at, left = (x, y, z), 0.0
-
-    def rate(self, step: int, node: Peer) -> float:
-        """What the link really carries."""
-        return 14.7 if math.dist(self.positions[step], node.position) <= node.range_m * self.factor else 0.0
-
-
-def oracle(scene: Scene) -> float:
-    """The most that any sequence of links could carry beyond the cloud path, by who knows the whole flight."""
-    n = len(scene.positions)
-    up = {node.name: [scene.rate(i, node) > 0 for i in range(n)] for node in scene.peers}
-    value = {"": [0.0] * (n + 1), **{name: [0.0] * (n + 1) for name in up}}
-    for i in range(n - 1, -1, -1):
-        j = min(i + LINK_UP_STEPS, n)
-        new = max((value[name][j] for name in up if all(up[name][i:j])), default=0.0)
-        value[""][i] = max(value[""][i + 1], new)
-        for name, rows in up.items():
-            stay = (14.7 - CLOUD.ingress_mbps) * STEP_S + value[name][i + 1] if rows[i] else 0.0
-            value[name][i] = max(stay, value[""][i])
-    return value[""][0]
-
-
-Rule = Callable[[Scene, int, Link, dict[str, Reach]], str]
-
-
-def ours(scene: Scene, step: int, link: Link, reaches: dict[str, Reach]) -> str:
-    track = Track(scene.positions[step], scene.speed, scene.waypoints[step])
-    return decide(track, scene.peers, link, step * STEP_S, reaches=reaches).peer
-
-
-def thesis(scene: Scene, step: int, link: Link, _reaches: dict[str, Reach]) -> str:
-    """The nearest peer in declared range, where the drone flies towards its next waypoint (thesis 8.6)."""
-    at, goal = scene.positions[step], scene.waypoints[step][0]
-    ahead = tuple(a + (b - a) * min(20.0 / max(math.dist(at, goal), 1e-9), 1.0) for a, b in zip(at, goal, strict=True))
-    near = [node for node in scene.peers if math.dist(at, node.position) <= node.range_m]
-    return min(near, key=lambda node: math.dist(ahead, node.position)).name if near else ""
-
-
-def carried(scene: Scene, rule: Rule) -> tuple[float, int]:
-    """What a rule carries beyond the cloud path when it decides twice a second, and how many links it makes."""
-    link, reaches, gain, links, coming = NO_LINK, {}, 0.0, 0, 0
-    nodes = {node.name: node for node in scene.peers}
-    for step in range(len(scene.positions)):
-        now_s = step * STEP_S
-        node = nodes.get(link.peer)
-        if node is not None and not scene.rate(step, node):
-            if link.phase is Phase.UP:
-                distance = math.dist(scene.positions[step], node.position) / node.range_m
-                reaches[node.name] = lost(reaches.get(node.name, Reach()), distance)
-            else:
-                reaches[node.name] = failed(reaches.get(node.name, Reach()), now_s)
-            link = NO_LINK
-        elif link.phase is Phase.CONNECTING:
-            coming -= 1
-            if coming <= 0:
-                link = Link(Phase.UP, link.peer, now_s)
-        elif node is not None:
-            gain += (14.7 - CLOUD.ingress_mbps) * STEP_S
-        # A radio hears the beacons of the peers around it about once a second.
-        if step % 10 == 0:
-            for other in scene.peers:
-                if scene.rate(step, other):
-                    distance = math.dist(scene.positions[step], other.position) / other.range_m
-                    reaches[other.name] = heard(reaches.get(other.name, Reach()), distance, now_s)
-        if step % 5 == 0:
-            wanted = rule(scene, step, link, reaches)
-            if wanted != link.peer:
-                link = Link(Phase.CONNECTING, wanted, now_s) if wanted else NO_LINK
-                coming, links = LINK_UP_STEPS, links + bool(wanted)
-    return gain, links
+def scene_of(path: list[Position], speed: float, peers: list[Peer], factor: float = 1.0) -> Scene:
+    positions, waypoints = along(path, speed)
+    return Scene(positions, waypoints, speed, peers, CLOUD, factor)
 
 
 def fig_8_12(factor: float = 1.0) -> Scene:
     """Like Fig. 8.12: WP1-WP2-WP3 at 3 m/s, six edge nodes, of which E5 covers no part of the path (E2 has no WiFi)."""
     peers = [peer("e1", 40, 45), peer("e3", 175, -30), peer("e4", 262, 60), peer("e5", 60, 320), peer("e6", 265, 190)]
-    return Scene([(0, 0, 20), (240, 0, 20), (240, 240, 20)], 3.0, peers, factor)
+    return scene_of([(0, 0, 20), (240, 0, 20), (240, 240, 20)], 3.0, peers, factor)
 
 
 def random_scene(seed: int) -> Scene:
@@ -324,7 +233,7 @@ def random_scene(seed: int) -> Scene:
         Peer(f"e{i}", (rng.uniform(0, 400), rng.uniform(0, 400), 0.0), rng.uniform(60, 120), WIFI)
         for i in range(rng.randint(6, 10))
     ]
-    return Scene(path, rng.uniform(4.0, 10.0), peers)
+    return scene_of(path, rng.uniform(4.0, 10.0), peers)
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.0, 1.2])

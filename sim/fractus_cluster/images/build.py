@@ -33,6 +33,7 @@ _CODE: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "sim": ("core", "mavlink", "storage", "services", "sdk", "cli", "proto", "sim"),
         "example-traffic-monitoring": ("sdk", "cli", "proto", "examples/traffic-monitoring"),
         "example-field": ("sdk", "cli", "proto", "examples/field"),
+        "example-links": ("sdk", "cli", "proto", "examples/links"),
     }
 )
 TARGETS = tuple(_CODE)

@@ -1,0 +1,75 @@
+"""AerialViewer, a passenger of the drone: a picture each second to the ImageChecker, wherever that is reached best.
+
+It logs a line of JSON for each picture that it sends and for each answer.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+import logging
+import os
+import signal
+import time
+from typing import Any
+
+import fractus
+
+PERIOD_S = float(os.environ.get("PERIOD_S", "1"))
+log = logging.getLogger("viewer")
+
+
+async def watch() -> None:
+    """Take and send pictures until SIGTERM; none waits for the one before."""
+    over, sending = asyncio.Event(), set[asyncio.Task[None]]()
+    loop = asyncio.get_running_loop()
+    loop.add_signal_handler(signal.SIGTERM, over.set)
+    begun = loop.time()
+    async with fractus.camera(reconnect_timeout_s=1.0) as camera, fractus.requester("ImageChecker") as checker:
+        for number in itertools.count(1):
+            task = asyncio.create_task(pass_on(camera, checker, number))
+            sending.add(task)
+            task.add_done_callback(sending.discard)
+            try:
+                await asyncio.wait_for(over.wait(), max(begun + number * PERIOD_S - loop.time(), 0.0))
+            except TimeoutError:
+                continue
+            break
+        await asyncio.gather(*sending)
+
+
+async def pass_on(camera: fractus.Camera, checker: fractus.Requester, number: int) -> None:
+    """Take a picture and have it checked."""
+    try:
+        picture = await look(camera)
+    except fractus.FractusError as error:
+        log.info("no picture %d: %s", number, error)
+        return
+    request = f"{os.environ['FRACTUS_INSTANCE']}-{number}"
+    tell("sent", number, bytes=len(picture))
+    begun = time.monotonic()
+    try:
+        answer = json.loads(await checker.ask("check", picture, request_id=request))
+    except fractus.FractusError as error:
+        log.warning("picture %d is lost: %s", number, error)
+        return
+    tell("answered", number, by=answer["by"], took_s=round(time.monotonic() - begun, 4))
+
+
+async def look(camera: fractus.Camera) -> bytes:
+    """A picture from the drone's camera; where it has none, bytes of its size."""
+    if size := int(os.environ.get("PICTURE_BYTES", "0")):
+        return os.urandom(size)
+    info = await camera.capture()
+    return await camera.retrieve(info.name)
+
+
+def tell(event: str, number: int, **more: Any) -> None:
+    """Log what became of a picture."""
+    print(json.dumps({"event": event, "picture": number, "at": round(time.time(), 4), **more}), flush=True)
+
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    asyncio.run(watch())

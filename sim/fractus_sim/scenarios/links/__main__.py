@@ -1,0 +1,81 @@
+"""`make scenario-links`: flies the links scenario on an embedded cluster and leaves its pictures, tables and figures."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import click
+
+from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.interruption import break_off_on_signals
+from fractus_sim.report.drawing import save
+from fractus_sim.report.page import PAGE, write_page
+from fractus_sim.scenarios.links.drawing import draw_bandwidth, draw_map
+from fractus_sim.scenarios.links.evidence import Evidence, read
+from fractus_sim.scenarios.links.flight import LOG, fly
+from fractus_sim.scenarios.links.page import summary
+from fractus_sim.scenarios.links.place import DRONE, Site, read_site
+from fractus_sim.scenarios.links.podlogs import Line
+from fractus_sim.scenarios.links.results import Expectation, expectations, gains, report
+
+FAILED_EXPECTATIONS = 2
+
+
+@click.command()
+@click.option("--out", type=click.Path(path_type=Path), default=Path("out/links"), show_default=True)
+@click.option(
+    "--factor",
+    type=click.FloatRange(0.5, 1.5),
+    default=1.0,
+    show_default=True,
+    help="How far radios really reach, in units of what they declare.",
+)
+@click.option("--again", is_flag=True, help="Write the report of an earlier run again from what it left.")
+def links(*, out: Path, factor: float, again: bool) -> None:
+    """Fly past edge nodes with WiFi, and count what becomes of a picture each second.
+
+    Exit code: 0 if everything came out as expected, 2 if something did not, 1 if it could not be flown.
+    """
+    break_off_on_signals()
+    site = read_site(factor)
+    out.mkdir(parents=True, exist_ok=True)
+    try:
+        run = read_again(out) if again else fly(site, out, lambda text: click.echo(f"  {text}"))
+    except (ExperimentError, OSError) as error:
+        raise click.ClickException(str(error)) from None
+    checks = write(site, run, out)
+    failed = [check for check in checks if not check.holds]
+    for check in failed:
+        click.echo(f"NOT AS EXPECTED: {check.text} ({check.seen})", err=True)
+    click.echo(f"{len(checks) - len(failed)} of {len(checks)} expectations hold; see {out / PAGE}")
+    if failed:
+        sys.exit(FAILED_EXPECTATIONS)
+
+
+def read_again(out: Path) -> Evidence:
+    """What an earlier run left.
+
+    Raises:
+        OSError: there was none.
+    """
+    lines = [Line(*json.loads(line)) for line in (out / LOG).read_text().splitlines()]
+    track = [(at, (p[0], p[1], p[2])) for at, p in json.loads((out / "track.json").read_text())]
+    return read(lines, track, DRONE)
+
+
+def write(site: Site, run: Evidence, out: Path) -> list[Expectation]:
+    """Write the report; what was expected."""
+    (out / PAGE).unlink(missing_ok=True)
+    table = gains(site, run)
+    checks = expectations(run, table)
+    save(draw_map(site, run), out / "map.png")
+    save(draw_bandwidth(site, run), out / "bandwidth.png")
+    (out / "report.json").write_text(json.dumps(report(site, run, table, checks), indent=2) + "\n")
+    write_page(out, summary(site, run, table, checks))
+    return checks
+
+
+if __name__ == "__main__":
+    links.main(prog_name="scenario-links")

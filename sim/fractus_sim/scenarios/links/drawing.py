@@ -1,0 +1,89 @@
+"""The two pictures of the scenario: the map with ranges and links (Fig. 8.13a), and bandwidth over time (Fig. 8.13b)."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from fractus_sim.report.drawing import GREY, INK, TRACK_COLOURS, VERMILION, canvas, legend
+from fractus_sim.scenarios.links.evidence import CLOUD, Evidence
+from fractus_sim.scenarios.links.place import Site
+
+
+def colours(site: Site) -> dict[str, str]:
+    """A colour for each edge node; the cloud is grey."""
+    return dict(zip(site.edges, TRACK_COLOURS, strict=False)) | {CLOUD: GREY}
+
+
+def draw_map(site: Site, run: Evidence) -> Figure:
+    """The ground: waypoints, ranges, and the flight in the colour of the node that received its pictures."""
+    figure, axes = canvas(8.0, 8.0)
+    colour = colours(site)
+    used = {switch.peer for switch in run.switches if switch.redirected_s is not None}
+    for peer in site.peers:
+        x, y, _ = peer.position
+        axes.add_patch(Circle((x, y), peer.range_m, facecolor=colour[peer.name], alpha=0.10, edgecolor="none"))
+        axes.add_patch(Circle((x, y), peer.range_m * site.factor, fill=False, edgecolor=colour[peer.name], lw=1.0))
+    for name, (x, y, _) in site.edges.items():
+        marker, size = ("*", 16) if name in used else ("s", 8)
+        axes.plot(x, y, marker=marker, markersize=size, color=colour[name], markeredgecolor=INK, linestyle="none")
+        axes.annotate(name, (x, y), xytext=(8, 8), textcoords="offset points", fontsize=9, color=INK)
+    if run.track:
+        way = np.array([position[:2] for _, position in run.track])
+        axes.plot(*way.T, color=VERMILION, linewidth=1.0, alpha=0.5, label="the flight")
+    _received(site, run, axes)
+    for number, (x, y, _) in enumerate(site.path, 1):
+        axes.plot(x, y, marker="o", color=VERMILION, markeredgecolor=INK, markersize=9, linestyle="none", zorder=6)
+        axes.annotate(f"WP{number}", (x, y), xytext=(-6, -16), textcoords="offset points", fontsize=9, color=INK)
+    axes.set_aspect("equal")
+    axes.autoscale_view()
+    axes.set_xlabel("metres east of WP1", fontsize=9)
+    axes.set_ylabel("metres north of WP1", fontsize=9)
+    axes.set_title("Stars receive pictures by WiFi; dots are pictures, in the colour of who received them", fontsize=10)
+    legend(figure, axes, columns=4)
+    return figure
+
+
+def _received(site: Site, run: Evidence, axes: object) -> None:
+    times = [at for at, _ in run.track]
+    if not times:
+        return
+    east = [position[0] for _, position in run.track]
+    north = [position[1] for _, position in run.track]
+    colour = colours(site)
+    for node in sorted({p.by for p in run.pictures if p.by}):
+        at = [p.sent_s for p in run.pictures if p.by == node]
+        x, y = np.interp(at, times, east), np.interp(at, times, north)
+        name = node if node in site.edges else CLOUD
+        axes.plot(x, y, ".", color=colour[name], markersize=8, label=name, zorder=5)  # type: ignore[attr-defined]  # axes
+
+
+def draw_bandwidth(site: Site, run: Evidence) -> Figure:
+    """Measured bandwidth of the paths over time, and which one the pictures took."""
+    figure, axes = canvas(10.0, 4.2)
+    colour, begin = colours(site), run.pictures[0].sent_s if run.pictures else 0.0
+    for switch in run.switches:
+        if switch.redirected_s is None:
+            continue
+        end = switch.back_s or switch.ended_s or max(p.sent_s for p in run.pictures)
+        axes.axvspan(switch.redirected_s - begin, end - begin, color=colour[switch.peer], alpha=0.12)
+        axes.axvline(switch.redirected_s - begin, color=colour[switch.peer], linewidth=1.0)
+        axes.axvline(end - begin, color=GREY, linewidth=1.0, linestyle=":")
+        if switch.measured_s is not None and switch.mbps is not None:
+            axes.plot(
+                switch.measured_s - begin, switch.mbps, marker="D", color=colour[switch.peer], markeredgecolor=INK,
+                linestyle="none", label="probe of the agent", zorder=5,
+            )  # fmt: skip
+    for node in sorted({p.by for p in run.pictures if p.by}):
+        own = [p for p in run.pictures if p.by == node and p.took_s > 0]
+        name = node if node in site.edges else CLOUD
+        rates = [p.size * 8e-6 / p.took_s for p in own]
+        axes.plot([p.sent_s - begin for p in own], rates, ".", color=colour[name], label=f"pictures to {name}")
+    axes.axhline(site.cloud.ingress_mbps, color=GREY, linewidth=0.8)
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("seconds since the first picture", fontsize=9)
+    axes.set_ylabel("Mbit/s", fontsize=9)
+    axes.set_title("Bandwidth measured, and the paths that pictures took", fontsize=10, loc="left")
+    legend(figure, axes, columns=5)
+    return figure

@@ -1,0 +1,198 @@
+"""What a run left behind: what became of each picture, of each link, and where the drone was."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from fractus_core.linking.values import Position
+
+from fractus_sim.scenarios.links.podlogs import Line
+
+VIEWER, CHECKER, AGENT = "aerial-viewer", "image-checker", "agent"
+CLOUD = "cloud"
+LATE_S = 1.0
+
+_STATE = re.compile(r"links: (?P<phase>none|connecting|up) \(peer=(?P<peer>\S*) reason=(?P<reason>.*)\)")
+_MEASURED = re.compile(r"links: measured \(peer=(?P<peer>\S+) mbps=(?P<mbps>[\d.]+)")
+_DECIDED = re.compile(r"links: decided \(on=(?P<on>\S+) peer=(?P<peer>\S+)\): (?P<why>.*)")
+
+
+@dataclass(slots=True)
+class Picture:
+    """What became of a picture; times are Unix seconds.
+
+    Attributes:
+        received: when each instance took it first, by node.
+        answered_s: when its sender had the answer; None if never.
+        took_s: from sending it to the answer.
+        by: the node whose answer came.
+    """
+
+    number: int
+    sent_s: float
+    size: int
+    received: dict[str, float] = field(default_factory=dict)
+    twice_at_one: bool = False
+    answered_s: float | None = None
+    took_s: float = 0.0
+    by: str = ""
+
+    @property
+    def received_s(self) -> float | None:
+        """When it was received first."""
+        return min(self.received.values(), default=None)
+
+
+@dataclass(slots=True)
+class Switch:
+    """One direct link from the decision to its end; Unix seconds, None for what never happened.
+
+    Attributes:
+        peer: the node.
+        reason: of the decision.
+        decided_s: when the drone's agent decided to connect.
+        up_s: paired.
+        measured_s: its bandwidth measured first.
+        mbps: that.
+        redirected_s: traffic moved to it.
+        first_s: the first picture that the node received.
+        back_s: traffic moved back to the cloud.
+        left: why.
+        ended_s: the link was no more.
+    """
+
+    peer: str
+    decided_s: float
+    reason: str = ""
+    up_s: float | None = None
+    measured_s: float | None = None
+    mbps: float | None = None
+    redirected_s: float | None = None
+    first_s: float | None = None
+    back_s: float | None = None
+    left: str = ""
+    ended_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """One run.
+
+    Attributes:
+        pictures: by the order sent.
+        switches: by the order decided.
+        track: Unix seconds and position, in metres east and north of the start and above it.
+        cloud: the cloud node.
+    """
+
+    pictures: tuple[Picture, ...]
+    switches: tuple[Switch, ...]
+    track: tuple[tuple[float, Position], ...]
+
+    @property
+    def longest_gap_s(self) -> float:
+        """The longest time between two receptions."""
+        at = sorted(p.received_s for p in self.pictures if p.received_s is not None)
+        return max((b - a for a, b in itertools.pairwise(at)), default=0.0)
+
+    def counts(self) -> dict[str, int]:
+        """Pictures sent, received, lost, received by two instances or twice by one, and late (answered after a second)."""
+        received = [p for p in self.pictures if p.received]
+        return {
+            "sent": len(self.pictures),
+            "received": len(received),
+            "lost": len(self.pictures) - len(received),
+            "doubled": sum(p.twice_at_one for p in self.pictures),
+            "repeated_elsewhere": sum(len(p.received) > 1 for p in self.pictures),
+            "late": sum(p.answered_s is None or p.took_s > LATE_S for p in self.pictures),
+        }
+
+    def by_node(self) -> dict[str, int]:
+        """How many pictures each node received first."""
+        first = [min(p.received, key=p.received.__getitem__) for p in self.pictures if p.received]
+        return dict(sorted(Counter(first).items()))
+
+
+def read(lines: Sequence[Line], track: Iterable[tuple[float, Position]], drone: str) -> Evidence:
+    """Read a run from its logs."""
+    pictures = _pictures(lines)
+    switches = _switches(line for line in lines if line.container == AGENT and line.node == drone)
+    for switch in switches:
+        own = (p.received[switch.peer] for p in pictures if switch.peer in p.received)
+        end = switch.ended_s or float("inf")
+        switch.first_s = min((at for at in own if switch.decided_s <= at <= end), default=None)
+    return Evidence(tuple(pictures), tuple(switches), tuple(track))
+
+
+def _pictures(lines: Iterable[Line]) -> list[Picture]:
+    found: dict[int, Picture] = {}
+    received: list[tuple[Line, dict[str, Any]]] = []
+    for line in lines:
+        if line.container not in (VIEWER, CHECKER) or not line.text.startswith("{"):
+            continue
+        try:
+            said = json.loads(line.text)
+        except ValueError:
+            continue
+        if said.get("event") == "sent":
+            found[said["picture"]] = Picture(said["picture"], said["at"], said["bytes"])
+        elif said.get("event") == "answered" and said["picture"] in found:
+            picture = found[said["picture"]]
+            picture.answered_s, picture.took_s, picture.by = said["at"], said["took_s"], said["by"]
+        elif said.get("event") == "received":
+            received.append((line, said))
+    for line, said in received:
+        picture_ = found.get(said["picture"])
+        if picture_ is not None:
+            picture_.twice_at_one |= line.node in picture_.received
+            picture_.received.setdefault(line.node, said["at"])
+    return sorted(found.values(), key=lambda picture: picture.number)
+
+
+def _switches(lines: Iterable[Line]) -> list[Switch]:
+    """Links from the agent's log: decided, connecting, up, measured, and where the traffic went."""
+    found: list[Switch] = []
+    for line in lines:
+        if (state := _STATE.search(line.text)) is not None:
+            _state(found, line.at_s, state)
+        elif (measured := _MEASURED.search(line.text)) is not None and found:
+            if found[-1].measured_s is None and found[-1].peer == measured["peer"]:
+                found[-1].measured_s, found[-1].mbps = line.at_s, float(measured["mbps"])
+        elif (decided := _DECIDED.search(line.text)) is not None:
+            _decided(found, line.at_s, decided)
+    return found
+
+
+def _state(found: list[Switch], at_s: float, state: re.Match[str]) -> None:
+    phase, peer = state["phase"], state["peer"]
+    if phase == "connecting" and (not found or found[-1].peer != peer or found[-1].ended_s is not None):
+        found.append(Switch(peer, at_s))
+    elif phase == "up" and found and found[-1].peer == peer:
+        found[-1].up_s = at_s
+    elif phase == "none" and found and found[-1].ended_s is None:
+        found[-1].ended_s = at_s
+        found[-1].left = found[-1].left or state["reason"]
+        if found[-1].redirected_s is not None and found[-1].back_s is None:
+            found[-1].back_s = at_s
+
+
+def _decided(found: list[Switch], at_s: float, decided: re.Match[str]) -> None:
+    """A decision on the link, or on the traffic of an application, which is named by its namespace."""
+    on, peer, why = decided["on"], decided["peer"], decided["why"]
+    if on == "link":
+        if peer != "-" and (not found or found[-1].peer != peer or found[-1].ended_s is not None):
+            found.append(Switch(peer, at_s, why))
+        elif found and not found[-1].left:
+            found[-1].left = why
+    elif found:
+        last = found[-1]
+        if last.redirected_s is None and last.up_s is not None:
+            last.redirected_s = at_s
+        elif last.redirected_s is not None and last.back_s is None:
+            last.back_s, last.left = at_s, last.left or why

@@ -1,0 +1,102 @@
+"""Flies the scenario once: the example's application on an embedded cluster with a radio, and what it leaves behind."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from fractus_cluster.binaries import ensure_binaries
+from fractus_cluster.cluster import Cluster
+from fractus_cluster.errors import ClusterError
+from fractus_cluster.hardware import RADIO_LINK
+from fractus_cluster.images.build import build_images
+from fractus_core.linking.values import Position
+from fractus_radio.follower import Follower, parse_address
+
+from fractus_sim.demo.clusters import ROOT, documents
+from fractus_sim.demo.kube import DemoError, Kube
+from fractus_sim.demo.watch import Mission, follow, wait_ready
+from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.interruption import uninterrupted
+from fractus_sim.scenarios.links.evidence import AGENT, CHECKER, VIEWER, Evidence, read
+from fractus_sim.scenarios.links.place import DRONE, EXAMPLE, Site
+from fractus_sim.scenarios.links.podlogs import PodLogs
+
+TARGETS = ("operator", "agent", "services", "example-links")
+RELEASES = ("fractus-crds", "fractus")
+READY_S, MISSION_S = 240.0, 600.0
+LOG, OBJECTS = "lines.jsonl", "links.json"
+_KEPT = frozenset({VIEWER, CHECKER, AGENT, "navigator"})
+Tell = Callable[[str], None]
+
+
+def fly(site: Site, out: Path, tell: Tell) -> Evidence:
+    """Bring the cluster up, fly, and read what came of it; the cluster is gone afterwards unless it ran before.
+
+    Raises:
+        ExperimentError: something did not come up, or the mission did not end in time.
+    """
+    try:
+        with ExitStack() as stack:
+            images = build_images(ROOT, targets=TARGETS, report=tell)
+            cluster = Cluster(site.cluster, report=tell)
+            if not cluster.running:
+                stack.callback(_down, cluster)
+            cluster.up(images=images)
+            programs = ensure_binaries(("kubectl", "helm"), report=tell)
+            return _mission(site, cluster, Kube(programs["kubectl"], programs["helm"], cluster.kubeconfig), out, tell)
+    except (ClusterError, DemoError) as error:
+        raise ExperimentError(str(error)) from None
+
+
+def _down(cluster: Cluster) -> None:
+    with uninterrupted():
+        cluster.down()
+
+
+def _mission(site: Site, cluster: Cluster, kube: Kube, out: Path, tell: Tell) -> Evidence:
+    for release in RELEASES:
+        kube.install(release, ROOT / "charts" / release)
+    kube.apply(documents(EXAMPLE / "depot.yaml"))
+    wait_ready(kube, READY_S, lambda _line: None)
+    track: list[tuple[float, Position]] = []
+
+    def at(lat: float, lon: float, alt: float) -> None:
+        track.append((time.time(), site.position(lat, lon, alt)))
+
+    drone = cluster.node(DRONE)
+    Follower(drone.wiring.namespace_path(DRONE), parse_address(RADIO_LINK), at).start()
+    logs = PodLogs({node.name: node.directory for node in cluster.nodes}, _KEPT.__contains__)
+    logs.start()
+    application = documents(EXAMPLE / "application.yaml")
+    mission = Mission(application[0]["metadata"]["name"], {"applied": time.time()})
+    kube.apply(application)
+    links: list[dict[str, Any]] = []
+    try:
+        follow(
+            kube,
+            mission,
+            out / "components.log",
+            timeout_s=MISSION_S,
+            say=tell,
+            show=lambda _line: _note(kube, links),
+        )
+    finally:
+        lines = logs.close()
+        (out / LOG).write_text("".join(json.dumps([x.at_s, x.node, x.container, x.text]) + "\n" for x in lines))
+        (out / OBJECTS).write_text(json.dumps(links, indent=1) + "\n")
+        (out / "track.json").write_text(json.dumps(track) + "\n")
+    if mission.phase != "Completed":
+        raise ExperimentError(f"the mission ended as {mission.phase or 'unknown'}: {mission.message}")
+    return read(lines, track, DRONE)
+
+
+def _note(kube: Kube, links: list[dict[str, Any]]) -> None:
+    """Keep what the DirectLinks say, as it was last."""
+    found = {body["metadata"]["name"]: body for body in kube.objects("directlinks")}
+    if found:
+        links[:] = [{"metadata": {"name": n}, "spec": b["spec"], "status": b.get("status")} for n, b in found.items()]

@@ -1,0 +1,121 @@
+"""Figures of a run: pictures, switches, and the gain over the cloud path alone beside an oracle's and the thesis' rule's."""
+
+from __future__ import annotations
+
+import bisect
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from fractus_core.linking.values import Position
+
+from fractus_sim.scenarios.links.evidence import Evidence
+from fractus_sim.scenarios.links.place import Site
+from fractus_sim.scenarios.links.rules import STEP_S, Scene, carried, oracle, ours, thesis
+
+PLANNED_GAP_S, ABRUPT_GAP_S = 1.5, 2.5
+SHARE = 0.95
+MIN_HEIGHT_M, ARRIVED_M = 15.0, 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Expectation:
+    """Something that must hold."""
+
+    text: str
+    holds: bool
+    seen: str
+
+
+@dataclass(frozen=True, slots=True)
+class Gain:
+    """Mbit that a rule carries beyond the cloud path on the flight as it was flown, and how many links it makes."""
+
+    who: str
+    gain_mbit: float
+    share: float
+    links: int
+
+
+def scene_of(site: Site, run: Evidence) -> tuple[Scene, float]:
+    """The flight as it was flown at its altitude, and when it began (Unix seconds)."""
+    flown = [(at, position) for at, position in run.track if position[2] >= MIN_HEIGHT_M]
+    times = np.array([at for at, _ in flown])
+    grid = np.arange(times[0], times[-1], STEP_S)
+    places = np.array([position for _, position in flown])
+    columns = [np.interp(grid, times, places[:, axis]) for axis in range(3)]
+    positions: list[Position] = [(float(x), float(y), float(z)) for x, y, z in zip(*columns, strict=True)]
+    coming, waypoints = list(site.path[1:]), []
+    for position in positions:
+        if len(coming) > 1 and math.dist(position, coming[0]) <= ARRIVED_M:
+            coming.pop(0)
+        waypoints.append(tuple(coming))
+    speed = float(
+        np.median([math.dist(a, b) / STEP_S for a, b in zip(positions[::10], positions[1::10], strict=False)])
+    )
+    direct = site.peers[0].offers.ingress_mbps
+    return Scene(positions, waypoints, speed, site.peers, site.cloud, site.factor, direct), float(times[0])
+
+
+def flown_gain(scene: Scene, begin_s: float, run: Evidence) -> float:
+    """Mbit beyond the cloud path: for as long as traffic was led to a peer that was really in reach."""
+    peers = {peer.name: peer for peer in scene.peers}
+    spans = [
+        (s.redirected_s, s.back_s or s.ended_s or math.inf, s.peer) for s in run.switches if s.redirected_s is not None
+    ]
+    begins = [span[0] for span in spans]
+    gain = 0.0
+    for step in range(len(scene.positions)):
+        at = begin_s + step * STEP_S
+        found = bisect.bisect_right(begins, at) - 1
+        if found >= 0 and at < spans[found][1] and scene.rate(step, peers[spans[found][2]]) > 0:
+            gain += scene.gain_mbps * STEP_S
+    return gain
+
+
+def gains(site: Site, run: Evidence) -> list[Gain]:
+    """The flown run, beside what rules would carry on the same flight in the model."""
+    scene, begin_s = scene_of(site, run)
+    best = oracle(scene)
+    rows = [("flown", flown_gain(scene, begin_s, run), sum(s.up_s is not None for s in run.switches))]
+    rows += [
+        (name, *carried(scene, rule))
+        for name, rule in (("our rule, modelled", ours), ("thesis' rule, modelled", thesis))
+    ]
+    rows += [("oracle", best, 0), ("cloud only", 0.0, 0)]
+    return [Gain(who, round(gain, 1), round(gain / best, 4) if best else 0.0, links) for who, gain, links in rows]
+
+
+def expectations(run: Evidence, table: list[Gain]) -> list[Expectation]:
+    """What the scenario must show."""
+    counts, flown = run.counts(), table[0]
+    used = {s.peer for s in run.switches if s.redirected_s is not None}
+    return [
+        Expectation("no picture is lost", counts["lost"] == 0 and counts["sent"] > 0, f"{counts['lost']} of {counts['sent']}"),
+        Expectation("no picture is doubled", counts["doubled"] == 0, f"{counts['doubled']}"),
+        Expectation(
+            f"pictures are never more than {PLANNED_GAP_S:g} s apart",
+            run.longest_gap_s < PLANNED_GAP_S,
+            f"{run.longest_gap_s:.2f} s",
+        ),
+        Expectation(f"at least {SHARE:.0%} of the oracle's gain", flown.share >= SHARE, f"{flown.share:.1%}"),
+        Expectation("edge-2 (no WiFi) and edge-5 (out of the way) receive nothing", not used & {"edge-2", "edge-5"}, ", ".join(sorted(used)) or "none used"),
+        Expectation("at least three edge nodes receive pictures by WiFi", len(used) >= 3, ", ".join(sorted(used)) or "none"),
+    ]  # fmt: skip
+
+
+def report(site: Site, run: Evidence, table: list[Gain], checks: list[Expectation]) -> dict[str, Any]:
+    """Everything for programs."""
+    begin = run.pictures[0].sent_s if run.pictures else 0.0
+    return {
+        "holds": all(check.holds for check in checks),
+        "range_factor": site.factor,
+        "checks": [asdict(check) for check in checks],
+        "pictures": run.counts() | {"longest_gap_s": round(run.longest_gap_s, 3), "by_node": run.by_node()},
+        "switches": [
+            {key: round(value - begin, 3) if key.endswith("_s") and value is not None else value for key, value in asdict(s).items()}
+            for s in run.switches
+        ],
+        "gain": [asdict(row) for row in table],
+    }  # fmt: skip

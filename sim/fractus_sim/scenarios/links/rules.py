@@ -1,0 +1,148 @@
+"""What rules for choosing a link carry on a flight: ours, the thesis', and an oracle that knows the whole flight."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from fractus_core.linking import NO_LINK, Link, PathMetrics, Peer, Phase, Reach, Settings, Track, heuristic, plan_link
+from fractus_core.linking.learning import failed, heard, lost
+from fractus_core.linking.values import Position
+
+STEP_S = 0.1
+LINK_UP_STEPS = 9
+"""0.92 s: until a link is up and measured."""
+DECIDE_STEPS, BEACON_STEPS = 5, 10
+AHEAD_M = 20.0
+INGRESS = heuristic("max", "ingress-bandwidth")
+SETTINGS = Settings()
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A flight among peers, and what paths really carry.
+
+    Attributes:
+        positions: of the drone, one every `STEP_S`.
+        waypoints: that are still to come at each step.
+        speed: along them, m/s.
+        peers: with their declared range.
+        cloud: the cloud path.
+        factor: real reach by declared reach.
+        direct_mbps: what a direct link really carries inside its reach.
+    """
+
+    positions: Sequence[Position]
+    waypoints: Sequence[tuple[Position, ...]]
+    speed: float
+    peers: Sequence[Peer]
+    cloud: PathMetrics
+    factor: float = 1.0
+    direct_mbps: float = 14.7
+
+    def rate(self, step: int, node: Peer) -> float:
+        """Mbit/s that the link to a peer really carries at a step."""
+        inside = math.dist(self.positions[step], node.position) <= node.range_m * self.factor
+        return self.direct_mbps if inside else 0.0
+
+    @property
+    def gain_mbps(self) -> float:
+        """What a direct link carries beyond the cloud path."""
+        return self.direct_mbps - self.cloud.ingress_mbps
+
+
+def along(path: Sequence[Position], speed: float) -> tuple[list[Position], list[tuple[Position, ...]]]:
+    """Positions and coming waypoints, one every `STEP_S`, of a flight of constant speed along a path."""
+    at, coming = path[0], list(path[1:])
+    positions, waypoints = [], []
+    while coming:
+        positions.append(at)
+        waypoints.append(tuple(coming))
+        left = speed * STEP_S
+        while coming and left > 0:
+            away = math.dist(at, coming[0])
+            if away <= left:
+                at, left = coming.pop(0), left - away
+            else:
+                x, y, z = (a + (b - a) * left / away for a, b in zip(at, coming[0], strict=True))
+                at, left = (x, y, z), 0.0
+    return positions, waypoints
+
+
+def oracle(scene: Scene) -> float:
+    """The most that any sequence of links could carry beyond the cloud path, by who knows the whole flight; Mbit."""
+    n = len(scene.positions)
+    up = {node.name: [scene.rate(i, node) > 0 for i in range(n)] for node in scene.peers}
+    value = {"": [0.0] * (n + 1), **{name: [0.0] * (n + 1) for name in up}}
+    for i in range(n - 1, -1, -1):
+        j = min(i + LINK_UP_STEPS, n)
+        new = max((value[name][j] for name in up if all(up[name][i:j])), default=0.0)
+        value[""][i] = max(value[""][i + 1], new)
+        for name, rows in up.items():
+            stay = scene.gain_mbps * STEP_S + value[name][i + 1] if rows[i] else 0.0
+            value[name][i] = max(stay, value[""][i])
+    return value[""][0]
+
+
+Rule = Callable[[Scene, int, Link, dict[str, Reach]], str]
+
+
+def ours(scene: Scene, step: int, link: Link, reaches: dict[str, Reach]) -> str:
+    """The receding-horizon plan."""
+    track = Track(scene.positions[step], scene.speed, scene.waypoints[step])
+    return plan_link(
+        track, scene.peers, scene.cloud, link, step * STEP_S, heuristic=INGRESS, settings=SETTINGS, reaches=reaches
+    ).peer
+
+
+def thesis(scene: Scene, step: int, _link: Link, _reaches: dict[str, Reach]) -> str:
+    """The nearest peer in declared range, where the drone flies towards its next waypoint (thesis 8.6)."""
+    at, goal = scene.positions[step], scene.waypoints[step][0]
+    share = min(AHEAD_M / max(math.dist(at, goal), 1e-9), 1.0)
+    ahead = tuple(a + (b - a) * share for a, b in zip(at, goal, strict=True))
+    near = [node for node in scene.peers if math.dist(at, node.position) <= node.range_m]
+    return min(near, key=lambda node: math.dist(ahead, node.position)).name if near else ""
+
+
+def carried(scene: Scene, rule: Rule) -> tuple[float, int]:
+    """Mbit that a rule carries beyond the cloud path when it decides twice a second, and how many links it makes."""
+    link, gain, links, coming = NO_LINK, 0.0, 0, 0
+    reaches: dict[str, Reach] = {}
+    nodes = {node.name: node for node in scene.peers}
+    for step in range(len(scene.positions)):
+        now_s = step * STEP_S
+        node = nodes.get(link.peer)
+        if node is not None and not scene.rate(step, node):
+            _learn_loss(scene, step, node, link, reaches)
+            link = NO_LINK
+        elif link.phase is Phase.CONNECTING:
+            coming -= 1
+            if coming <= 0:
+                link = Link(Phase.UP, link.peer, now_s)
+        elif node is not None:
+            gain += scene.gain_mbps * STEP_S
+        if step % BEACON_STEPS == 0:
+            _hear(scene, step, reaches)
+        if step % DECIDE_STEPS == 0:
+            wanted = rule(scene, step, link, reaches)
+            if wanted != link.peer:
+                link = Link(Phase.CONNECTING, wanted, now_s) if wanted else NO_LINK
+                coming, links = LINK_UP_STEPS, links + bool(wanted)
+    return gain, links
+
+
+def _learn_loss(scene: Scene, step: int, node: Peer, link: Link, reaches: dict[str, Reach]) -> None:
+    known = reaches.get(node.name, Reach())
+    if link.phase is Phase.UP:
+        reaches[node.name] = lost(known, math.dist(scene.positions[step], node.position) / node.range_m)
+    else:
+        reaches[node.name] = failed(known, step * STEP_S)
+
+
+def _hear(scene: Scene, step: int, reaches: dict[str, Reach]) -> None:
+    """A radio hears the beacons of the peers around it about once a second."""
+    for other in scene.peers:
+        if scene.rate(step, other):
+            distance = math.dist(scene.positions[step], other.position) / other.range_m
+            reaches[other.name] = heard(reaches.get(other.name, Reach()), distance, step * STEP_S)

@@ -1,0 +1,145 @@
+"""The links scenario: its place, what it reads from logs, and its figures."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+from fractus_sim.report.drawing import save
+from fractus_sim.scenarios.links.drawing import draw_bandwidth, draw_map
+from fractus_sim.scenarios.links.evidence import AGENT, CHECKER, VIEWER, Evidence, read
+from fractus_sim.scenarios.links.page import summary
+from fractus_sim.scenarios.links.place import DRONE, Site, read_site
+from fractus_sim.scenarios.links.podlogs import Line, PodLogs, parse
+from fractus_sim.scenarios.links.results import expectations, gains, report
+from fractus_sim.scenarios.links.rules import along
+
+BEGIN_S = 1_000_000.0
+
+
+@pytest.fixture(scope="module")
+def site() -> Site:
+    return read_site()
+
+
+def flight(site: Site) -> list[tuple[float, tuple[float, float, float]]]:
+    positions, _ = along(site.path, 3.0)
+    return [(BEGIN_S + 0.1 * step, position) for step, position in enumerate(positions)]
+
+
+def agent(at_s: float, text: str) -> Line:
+    return Line(BEGIN_S + at_s, DRONE, AGENT, f"2026-11-22 INFO fractus_agent.links: {text}")
+
+
+def picture(number: int, at_s: float, *nodes: str, delay_s: float = 0.2, answered: bool = True) -> list[Line]:
+    sent = {"event": "sent", "picture": number, "at": BEGIN_S + at_s, "bytes": 100_000}
+    lines = [Line(BEGIN_S + at_s, DRONE, VIEWER, json.dumps(sent))]
+    for node in nodes:
+        got = {"event": "received", "picture": number, "at": BEGIN_S + at_s + delay_s, "by": node, "attempt": 1}
+        lines.append(Line(BEGIN_S + at_s + delay_s, node, CHECKER, json.dumps(got)))
+    if answered:
+        end = {
+            "event": "answered",
+            "picture": number,
+            "at": BEGIN_S + at_s + 2 * delay_s,
+            "by": nodes[-1],
+            "took_s": 0.4,
+        }
+        lines.append(Line(BEGIN_S + at_s + 2 * delay_s, DRONE, VIEWER, json.dumps(end)))
+    return lines
+
+
+def run_of(site: Site, *more: Line) -> Evidence:
+    """Pictures to the cloud, to edge-1 from 10 s on, and to the cloud again from 25 s on."""
+    links = [
+        agent(8.0, "links: decided (on=link peer=edge-1): Connect: edge-1, 60 m away, offers more than the cloud path"),
+        agent(8.1, "links: connecting (peer=edge-1 reason=wanted)"),
+        agent(8.9, "links: up (peer=edge-1 reason=paired)"),
+        agent(9.2, "links: measured (peer=edge-1 mbps=11.8 latency_ms=1.9)"),
+        agent(9.3, "links: decided (on=default/links peer=edge-1): BetterPath: the direct link is better"),
+        agent(25.0, "links: decided (on=default/links peer=edge-1): Leaving: the drone leaves its reach"),
+        agent(26.0, "links: none (peer=edge-1 reason=out of reach)"),
+    ]
+    pictures = [line for n in range(1, 41) for line in picture(n, n - 1.0, "edge-1" if 10 <= n - 1 < 25 else "cloud-1")]
+    return read([*links, *pictures, *more], flight(site), DRONE)
+
+
+def test_the_place_is_that_of_the_example(site: Site) -> None:
+    assert [peer.name for peer in site.peers] == ["edge-1", "edge-3", "edge-4", "edge-5", "edge-6"]
+    assert len(site.edges) == 6
+    assert [round(x) for x, _, _ in site.path] == [0, 240, 240]
+    near = {peer.name: min(math.dist(peer.position, at) for _, at in flight(site)) for peer in site.peers}
+    assert near.pop("edge-5") > 80.0
+    assert all(distance < 80.0 for distance in near.values())
+
+
+def test_radios_may_reach_less_than_they_declare() -> None:
+    short = read_site(0.8)
+    assert {peer.range_m for peer in short.peers} == {80.0}
+    assert [node.wifi() for node in short.cluster.nodes if node.name == "edge-1"] == [("wlan0", 64.0)]
+
+
+def test_a_link_is_followed_from_the_decision_to_its_end(site: Site) -> None:
+    (switch,) = run_of(site).switches
+    times = (switch.decided_s, switch.up_s, switch.measured_s, switch.redirected_s, switch.first_s, switch.back_s)
+    assert [round((at or 0) - BEGIN_S, 1) for at in times] == [8.0, 8.9, 9.2, 9.3, 10.2, 25.0]
+    assert (switch.mbps, switch.left) == (11.8, "Leaving: the drone leaves its reach")
+    assert switch.ended_s == BEGIN_S + 26.0
+
+
+def test_pictures_are_counted(site: Site) -> None:
+    lost = picture(41, 40.0, answered=False)
+    twice = picture(42, 41.0, "edge-1", "edge-1")
+    elsewhere = picture(43, 42.0, "edge-1", "cloud-1")
+    counts = run_of(site, *lost, *twice, *elsewhere).counts()
+    assert counts == {"sent": 43, "received": 42, "lost": 1, "doubled": 1, "repeated_elsewhere": 1, "late": 1}
+    assert run_of(site, *lost, *twice).longest_gap_s == pytest.approx(2.0)
+    assert run_of(site).by_node() == {"cloud-1": 25, "edge-1": 15}
+
+
+def test_gains_are_shares_of_the_oracle(site: Site) -> None:
+    table = {row.who: row for row in gains(site, run_of(site))}
+    assert table["oracle"].share == 1.0
+    assert 0.1 < table["flown"].share < 0.3
+    assert table["our rule, modelled"].share >= table["thesis' rule, modelled"].share
+    assert table["flown"].gain_mbit == pytest.approx((25.0 - 9.3) * 4.0, abs=1.0)
+
+
+def test_what_fails_is_said(site: Site) -> None:
+    run = run_of(site, *picture(41, 40.0, answered=False))
+    failed = [check.text for check in expectations(run, gains(site, run)) if not check.holds]
+    assert "no picture is lost" in failed
+    assert any("oracle" in text for text in failed)
+
+
+def test_the_report_is_written(site: Site, tmp_path: Path) -> None:
+    run = run_of(site)
+    table = gains(site, run)
+    checks = expectations(run, table)
+    save(draw_map(site, run), tmp_path / "map.png")
+    save(draw_bandwidth(site, run), tmp_path / "bandwidth.png")
+    found = json.loads(json.dumps(report(site, run, table, checks)))
+    assert found["switches"][0]["redirected_s"] == 9.3
+    page = summary(site, run, table, checks)
+    assert "| edge-1 | 8.00 | 8.90 | 9.20 | 11.8 | 9.30 | 10.20 | 25.00 | 26.00 |" in page
+
+
+def test_logs_of_pods_are_kept_beyond_the_pods(tmp_path: Path) -> None:
+    folder = tmp_path / "var-log" / "pods" / "default_viewer-1_uid" / VIEWER
+    folder.mkdir(parents=True)
+    log = folder / "0.log"
+    log.write_text("2026-11-22T16:00:01.5+00:00 stdout F one\n2026-11-22T16:00:02+00:00 stdout F tw")
+    logs = PodLogs({"drone-1": tmp_path}, {VIEWER}.__contains__)
+    logs.look()
+    with log.open("a") as file:
+        file.write("o\n")
+        log.unlink()
+    logs.start()
+    assert [(line.text, line.node, line.container) for line in logs.close()] == [
+        ("one", "drone-1", VIEWER),
+        ("two", "drone-1", VIEWER),
+    ]
+    assert parse(b"nothing", "n", "c") is None
+    assert parse(b"yesterday stdout F x", "n", "c") is None

@@ -45,7 +45,7 @@ FROM tools AS nft
 RUN apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -qy --no-install-recommends nftables >/dev/null \
  && rm -rf /var/lib/apt/lists/* \
  && libraries=/out/usr/lib/$(basename "$(dirname "$(ldconfig -p | awk '/libnftables.so.1/ {print $NF; exit}')")") \
- && mkdir -p "$libraries" /out/usr/sbin && cp /usr/sbin/nft /out/usr/sbin/ \
+ && mkdir -p "$libraries" /out/usr/bin && cp /usr/sbin/nft /out/usr/bin/ \
  && ldd /usr/sbin/nft | awk '$2 == "=>" && $1 !~ /^libc\.so/ {print $3}' | xargs cp -L -t "$libraries"
 
 # ---- dependencies: one directory for each set, holding what the sets below it do not have already

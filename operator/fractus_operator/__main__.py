@@ -27,6 +27,7 @@ from fractus_operator.reconcile import service_rollout, silence
 from fractus_operator.reconcile.applications import Applications
 from fractus_operator.reconcile.location import Locations
 from fractus_operator.reconcile.node_reports import NodeReports
+from fractus_operator.reconcile.on_mission import OnMission
 from fractus_operator.reconcile.orphans import Orphans
 from fractus_operator.reconcile.readiness import Readiness
 from fractus_operator.reconcile.service_rollout import ServiceRollout
@@ -67,8 +68,8 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         applications = Applications(store, live, authority, _now, settings.planning)
         signing = NodeSigning(store, live.signing_requests.get, authority, settings.agent_user, _now)
         background: list[Coroutine[Any, Any, None]] = [reflector.run() for reflector in live.reflectors()]
-        background += [worklist.run() for worklist in worklists(store, live, signing)]
         reports = NodeReports(store, live, _now)
+        background += [worklist.run() for worklist in worklists(store, live, signing, reports)]
         # The Lease tells sooner than a watch that the API server is out of reach.
         watched = (live.drones, live.edge_nodes)
         hearing = HearingClock(time.monotonic, lambda: all(r.watching for r in watched) and lease.left_s > 0)
@@ -110,7 +111,7 @@ async def _wait_for(future: asyncio.Future[None]) -> None:
     await future
 
 
-def worklists(store: Store, live: LiveInventory, signing: NodeSigning) -> list[Worklist]:
+def worklists(store: Store, live: LiveInventory, signing: NodeSigning, reports: NodeReports) -> list[Worklist]:
     """What is reconciled beside Applications, each fed by the reflectors of its inputs."""
     readiness = Readiness(store, live, _now)
     nodes = Worklist("node", Locations(store, live).reconcile, after=live.synced)
@@ -119,10 +120,17 @@ def worklists(store: Store, live: LiveInventory, signing: NodeSigning) -> list[W
     policies = Worklist("policy", readiness.reconcile_policy, after=live.synced)
     unowned = {kind: Orphans(store, live, kind) for kind in (kinds.GRANT, kinds.DIRECT_LINK)}
     orphans = {kind: Worklist(kind.name, those.reconcile, after=live.synced) for kind, those in unowned.items()}
+    missions = OnMission(store, live, reports, _now)
+    drones = Worklist("drone", missions.reconcile, after=live.synced)
 
     def policies_of_zone(key: Key) -> None:
         for policy in readiness.policies_of(key[1]):
             policies.add(policy)
+
+    def drone_of_grant(key: Key) -> None:
+        drone = missions.grant_changed(key)
+        if drone is not None:
+            drones.add(drone)
 
     def left_by_removed(key: Key) -> None:
         if live.applications.get(key) is None:
@@ -137,11 +145,13 @@ def worklists(store: Store, live: LiveInventory, signing: NodeSigning) -> list[W
         (kinds.ZONE, policies_of_zone),
         (kinds.POLICY, policies.add),
         *((kind, worklist.add) for kind, worklist in orphans.items()),
+        (kinds.GRANT, drone_of_grant),
+        (kinds.DRONE, drones.add),
         (kinds.APPLICATION, left_by_removed),
     ]
     for kind, listener in listeners:
         live.listen(kind, listener)
-    return [nodes, requests, zones, policies, *orphans.values()]
+    return [nodes, requests, zones, policies, *orphans.values(), drones]
 
 
 async def _together(main: Coroutine[Any, Any, None], background: list[Coroutine[Any, Any, None]]) -> None:

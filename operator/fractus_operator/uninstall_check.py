@@ -6,11 +6,15 @@ import asyncio
 import sys
 from collections.abc import Sequence
 
-from fractus_core.api.nodes import is_airborne
+from fractus_core.api.nodes import DRONE_REPORT_S, GROUNDED_ANNOTATION, ON_MISSION, is_airborne
 
 from fractus_operator.cluster.kinds import APPLICATION, DRONE, Body, key_of
 from fractus_operator.cluster.labels import FINALIZER
 from fractus_operator.cluster.store import KubeError, Store, Unconfigured
+
+NOT_REPORTED = "its last report"
+_REPORT_S = 2 * DRONE_REPORT_S
+_PERIOD_S = 2.0
 
 
 def objection(applications: Sequence[Body], drones: Sequence[Body]) -> str:
@@ -26,18 +30,35 @@ def objection(applications: Sequence[Body], drones: Sequence[Body]) -> str:
             f"Fractus still has to take down {_listed(kept)}: delete all Applications first "
             "(kubectl delete applications.fractus.dev --all -A), then uninstall"
         )
-    states = {body["metadata"]["name"]: body.get("status") or {} for body in drones}
-    flying = [
-        f"{name} ({status['flightState']})"
-        for name, status in states.items()
-        if is_airborne(status.get("flightState"), status.get("lastFlightState"))
-    ]
+    watched = [body for body in drones if not _grounded_by_hand(body)]
+    flying = [f"{body['metadata']['name']} ({body['status']['flightState']})" for body in watched if _flies(body)]
     if flying:
         return (
             f"Fractus still flies {_listed(flying)}: wait until kubectl get drones.fractus.dev says inactive or charging, "
             "then uninstall"
         )
+    unsure = [body["metadata"]["name"] for body in watched if _may_take_off(body)]
+    if unsure:
+        return (
+            f"{_listed(unsure)} may have taken off since {NOT_REPORTED}: wait for its next report, or, if you see it on the "
+            "ground, annotate it fractus.dev/grounded (docs/upgrades.md), then uninstall"
+        )
     return ""
+
+
+def _flies(drone: Body) -> bool:
+    status = drone.get("status") or {}
+    return is_airborne(status.get("flightState"), status.get("lastFlightState"))
+
+
+def _may_take_off(drone: Body) -> bool:
+    conditions = (drone.get("status") or {}).get("conditions") or ()
+    return any(c.get("type") == ON_MISSION and c.get("status") != "False" for c in conditions)
+
+
+def _grounded_by_hand(drone: Body) -> bool:
+    seen = (drone.get("status") or {}).get("lastSeen")
+    return seen is not None and (drone["metadata"].get("annotations") or {}).get(GROUNDED_ANNOTATION) == seen
 
 
 def _listed(names: Sequence[str], most: int = 5) -> str:
@@ -46,7 +67,7 @@ def _listed(names: Sequence[str], most: int = 5) -> str:
 
 
 async def check() -> str:
-    """Return the objection that the cluster's present state gives rise to.
+    """Return the objection that the cluster's present state gives rise to; drones that have landed get the time for a report.
 
     Raises:
         Unconfigured: there are no credentials.
@@ -54,7 +75,16 @@ async def check() -> str:
     """
     store = await Store.connect()
     try:
-        return objection(await store.list(APPLICATION), await store.list(DRONE))
+        async with asyncio.timeout(_REPORT_S) as waited:
+            while True:
+                found = objection(await store.list(APPLICATION), await store.list(DRONE))
+                if NOT_REPORTED not in found:
+                    return found
+                await asyncio.sleep(_PERIOD_S)
+    except TimeoutError:
+        if not waited.expired():
+            raise
+        return found
     finally:
         await store.aclose()
 

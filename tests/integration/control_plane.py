@@ -85,6 +85,13 @@ class ControlPlane:
         path.write_text(self.authority.kubeconfig(credential, server=self.server, cluster="test"))
         return path
 
+    def as_user(self, name: str, user: str, groups: tuple[str, ...]) -> BlockingClient:
+        """A client with the certificate of a user in groups."""
+        credential = self.authority.issue(name, common_name=user, organizations=groups)
+        return BlockingClient(
+            with_certificate(self.server, self.ca, (credential.certificate, credential.key)), "kubectl"
+        )
+
     def with_token(self, token: str) -> BlockingClient:
         return BlockingClient(with_certificate(self.server, self.ca, token=token), "kubectl")
 

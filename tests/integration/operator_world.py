@@ -210,7 +210,7 @@ class World:
     def clear(self) -> None:
         """Remove what tests leave that is not in a namespace, and pods, which no kubelet ends here."""
         for drone in self.api.list(f"{FRACTUS}/drones"):
-            state = {"status": {"flightState": "inactive"}}
+            state = {"status": {"flightState": "inactive", "conditions": []}}
             self.api.merge(f"{FRACTUS}/drones/{drone['metadata']['name']}/status", state)
         for pod in self.api.list("/api/v1/pods"):
             path = f"/api/v1/namespaces/{pod['metadata']['namespace']}/pods/{pod['metadata']['name']}"

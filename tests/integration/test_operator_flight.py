@@ -11,7 +11,7 @@ import yaml
 from chart import operator_token, render
 from control_plane import ControlPlane, wait_for
 from fractus_kube import KubeError
-from operator_world import FRACTUS, SYSTEM, OperatorProcess, World
+from operator_world import FRACTUS, SYSTEM, OperatorProcess, World, traffic
 
 Body = dict[str, Any]
 PODS = f"/api/v1/namespaces/{SYSTEM}/pods"
@@ -100,6 +100,11 @@ def attempts(world: World, drone: str) -> dict[str, Callable[[], object]]:
             node + dry, {"metadata": {"labels": {"fractus.dev/class": "edge"}}}
         ),
         "taint the node": lambda: api.merge(node + dry, {"spec": {"taints": [{"key": "x", "effect": "NoExecute"}]}}),
+        "end a pod by its status": lambda: api.merge(f"{pod}/status{dry}", {"status": {"phase": "Failed"}}),
+        "say that a pod does not run": lambda: api.merge(f"{pod}/status{dry}", {"status": {"containerStatuses": []}}),
+        "hide a pod by its status": lambda: api.merge(
+            f"{pod}/status{dry}", {"metadata": {"labels": {"app.kubernetes.io/component": "x"}}}
+        ),
         "delete the node": lambda: try_delete(world, node),
         "delete the Drone": lambda: try_delete(world, f"{FRACTUS}/drones/{drone}"),
     }
@@ -108,19 +113,22 @@ def attempts(world: World, drone: str) -> dict[str, Callable[[], object]]:
 def together(world: World) -> dict[str, Callable[[], object]]:
     """What would take services from all drones."""
     api, dry = world.api, "?dryRun=All"
-    affinity = {"spec": {"template": {"spec": {"nodeSelector": {"a": "b"}}}}}
-    kinds = "/apis/apiextensions.k8s.io/v1/customresourcedefinitions"
+    camera = f"{DAEMON_SETS}/fractus-camera{dry}"
+
+    def pods(**spec: object) -> Body:
+        return {"spec": {"template": {"spec": spec}}}
+
     return {
         "evict a pod": lambda: evict(world, "fractus-mobility-drone-1"),
         "delete a DaemonSet": lambda: try_delete(world, f"{DAEMON_SETS}/fractus-mobility"),
-        "move a DaemonSet": lambda: api.merge(f"{DAEMON_SETS}/fractus-camera{dry}", affinity),
+        "move a DaemonSet": lambda: api.merge(camera, pods(nodeSelector={"a": "b"})),
+        "move a DaemonSet to a node": lambda: api.merge(camera, pods(nodeName="drone-2")),
+        "let a DaemonSet tolerate nothing": lambda: api.merge(camera, pods(tolerations=[])),
         "roll a DaemonSet": lambda: api.merge(
             f"{DAEMON_SETS}/fractus-agent{dry}", {"spec": {"updateStrategy": {"type": "RollingUpdate"}}}
         ),
         "delete the namespace": lambda: try_delete(world, f"/api/v1/namespaces/{SYSTEM}"),
-        "delete the kind": lambda: try_delete(world, f"{kinds}/drones.fractus.dev"),
         "delete all DaemonSets": lambda: try_delete(world, DAEMON_SETS),
-        "delete all kinds": lambda: try_delete(world, kinds),
     }
 
 
@@ -133,7 +141,7 @@ def test_nothing_takes_a_service_from_a_drone_in_the_air(guarded: World) -> None
             assert not refusal(attempt), name
 
 
-def test_what_harms_no_flight_goes_on(guarded: World) -> None:
+def test_what_harms_no_flight_goes_on(control_plane: ControlPlane, guarded: World) -> None:
     api, dry = guarded.api, "?dryRun=All"
     api.merge(f"{NODE}{dry}", {"spec": {"unschedulable": True}})
     api.merge(f"{NODE}{dry}", {"metadata": {"labels": {"fractus.dev/geohash": "u1"}}})
@@ -145,7 +153,10 @@ def test_what_harms_no_flight_goes_on(guarded: World) -> None:
     # A service that does not run may be replaced by one that does.
     waiting = {"name": "camera", "image": "bad", "imageID": "", "ready": False, "restartCount": 9}
     waiting["state"] = {"waiting": {"reason": "CrashLoopBackOff"}}
-    api.merge(f"{PODS}/fractus-camera-drone-1/status", {"status": {"containerStatuses": [waiting]}})
+    kubelet = control_plane.as_user("kubelet", "system:node:drone-1", ("system:nodes",))
+    with kubelet:
+        kubelet.merge(f"{PODS}/fractus-camera-drone-1/status", {"status": {"containerStatuses": [waiting]}})
+        kubelet.merge(f"{NODE}/status", {"status": {"images": []}})
     try_delete(guarded, f"{PODS}/fractus-camera-drone-1")
 
 
@@ -170,6 +181,36 @@ def test_a_silent_drone_is_in_the_air_until_someone_sees_it_on_the_ground(guarde
     wait_for(lambda: not refusal(attempt), "the annotation to count")
     guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-01T00:00:05Z"}})
     wait_for(lambda: refusal(attempt), "the drone to be heard of again")
+
+
+def test_what_a_node_is_does_not_change_by_way_of_its_status(guarded: World) -> None:
+    change = {"metadata": {"labels": {"fractus.dev/class": None}}}
+    told = wait_for(lambda: refusal(lambda: guarded.api.merge(f"{NODE}/status?dryRun=All", change)), "the policy")
+    assert "kubectl label node" in told
+
+
+def test_the_kinds_stay_while_the_chart_needs_them(guarded: World) -> None:
+    kinds = "/apis/apiextensions.k8s.io/v1/customresourcedefinitions"
+    for path in (f"{kinds}/drones.fractus.dev", f"{kinds}/zones.fractus.dev", kinds):
+        assert "uninstall that first (helm -n fractus-system uninstall fractus)" in refusal(
+            lambda path=path: try_delete(guarded, path)
+        )
+
+
+def test_a_drone_with_a_mission_may_have_taken_off(guarded: World) -> None:
+    guarded.drone_status("drone-1", "inactive")
+    attempt = attempts(guarded, "drone-1")["delete a pod"]
+    wait_for(lambda: not refusal(attempt), "the landing to be known")
+    seen = "2026-01-01T00:00:00Z"
+    for said in ("True", "Unknown"):
+        mission = {"type": "OnMission", "status": said, "reason": "Granted", "lastTransitionTime": seen}
+        status = {"conditions": [mission], "lastSeen": seen}
+        guarded.api.merge(f"{FRACTUS}/drones/drone-1/status", {"status": status})
+        told = wait_for(lambda: refusal(attempt), "the mission to be known")
+        assert f"drone-1 has a mission and may have taken off since {seen}" in told
+    annotation = {"metadata": {"annotations": {"fractus.dev/grounded": seen}}}
+    guarded.api.merge(f"{FRACTUS}/drones/drone-1", annotation)
+    wait_for(lambda: not refusal(attempt), "the annotation to count")
 
 
 def test_a_drone_that_was_never_heard_of_can_be_set_up(guarded: World) -> None:
@@ -244,7 +285,7 @@ def test_services_are_replaced_on_the_ground_drone_by_drone(guarded: World, perm
 def test_a_drone_that_is_not_heard_of_any_more_is_unknown(guarded: World, permitted: OperatorProcess) -> None:
     path = f"{FRACTUS}/drones/drone-1"
     guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-01T00:00:00Z", "controller": "system"}})
-    wait_for(lambda: condition(guarded, "drone-1", "Ready").get("status") == "Unknown", permitted.log, timeout_s=40)
+    wait_for(lambda: condition(guarded, "drone-1", "Ready").get("status") == "Unknown", permitted.log)
     assert condition(guarded, "drone-1", "Ready")["reason"] == "AgentSilent"
     assert (
         "last heard of at 2026-01-01 00:00:00 UTC, when the drone was flying"
@@ -267,3 +308,33 @@ def test_the_operator_does_not_say_that_a_drone_has_landed(control_plane: Contro
             assert "does not say what a drone does" in refusal(
                 lambda body=body: client.call("PUT", f"{path}/status", body)
             )
+
+
+def test_whether_a_drone_has_a_mission_is_said(guarded: World, permitted: OperatorProcess, namespace: str) -> None:
+    path = f"{FRACTUS}/drones/drone-2"
+    guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-01T00:00:00Z"}})
+    guarded.put(traffic(namespace))
+    wait_for(lambda: condition(guarded, "drone-2", "OnMission").get("status") == "True", permitted.log)
+    guarded.api.delete(f"{FRACTUS}/namespaces/{namespace}/applications/traffic")
+    wait_for(lambda: condition(guarded, "drone-2", "OnMission").get("status") == "Unknown", permitted.log)
+    guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-01T00:00:30Z"}})
+    wait_for(lambda: condition(guarded, "drone-2", "OnMission").get("status") == "False", permitted.log)
+
+
+def test_who_sees_a_drone_on_the_ground_frees_it_for_the_operator_and_leaves_a_record(
+    guarded: World, permitted: OperatorProcess
+) -> None:
+    seen = "2026-01-01T00:00:00Z"
+    path = f"{FRACTUS}/drones/drone-1"
+    release(guarded, 1, "old")
+    release(guarded, 2, "new")
+    guarded.api.merge(f"{path}/status", {"status": {"lastSeen": seen}})
+    wait_for(lambda: condition(guarded, "drone-1", "ServicesCurrent").get("reason") == "InTheAir", permitted.log)
+    guarded.api.merge(path, {"metadata": {"annotations": {"fractus.dev/grounded": seen}}})
+    wait_for(lambda: condition(guarded, "drone-1", "ServicesCurrent").get("reason") != "InTheAir", permitted.log)
+
+    def recorded() -> bool:
+        events = guarded.api.list("/api/v1/namespaces/default/events")
+        return ("drone-1", "GroundedByHand") in {(e["involvedObject"]["name"], e["reason"]) for e in events}
+
+    wait_for(recorded, permitted.log)

@@ -9,12 +9,14 @@ from typing import Any
 
 import pytest
 from fractus_core.api import Drone, EdgeNode
+from fractus_operator.cluster.kinds import GRANT
 from fractus_operator.cluster.pods import PodView, read_pod
 from fractus_operator.cluster.store import KubeError, Store
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.inventory.node_services import NodeServices, Revision, read_revision
 from fractus_operator.reconcile.conditions import ConditionUpdate
 from fractus_operator.reconcile.node_reports import NodeReports
+from fractus_operator.reconcile.on_mission import OnMission
 from fractus_operator.reconcile.service_rollout import ServiceRollout, ServicesOfNode, next_step
 from fractus_operator.reconcile.silence import HearingClock, Silence, SilenceWatch
 
@@ -360,3 +362,55 @@ async def test_any_time_of_a_report_can_be_compared(live: LiveInventory, seen: s
     await watch.step()
     assert told(api, "d1", "Ready") == ("AgentSilent" if seen and seen.endswith("z") else "")
     assert told(api, "d3", "Ready") == "AgentSilent", "after d2, whose status is refused"
+
+
+# -- missions --
+
+
+def granted(live: LiveInventory, name: str, node: str | None) -> None:
+    """A Grant appears, or goes (None)."""
+    owner = {"namespace": "ns", "name": "app", "uid": "u"}
+    grants = live.children[GRANT]
+    if node is None:
+        grants._drop(("", name))
+    else:
+        spec = {"node": node, "application": owner, "component": "A", "instance": "a"}
+        grants.note(("", name), {"apiVersion": V1, "kind": "Grant", "metadata": {"name": name}, "spec": spec})
+
+
+async def test_a_drone_may_take_off_until_it_reports_after_its_last_grant(live: LiveInventory) -> None:
+    api = Api()
+    missions = OnMission(api, live, reported(live, api), lambda: datetime(2026, 1, 1, tzinfo=UTC))
+    changed: list[Any] = []
+    live.listen(GRANT, lambda key: changed.append(missions.grant_changed(key)))
+
+    async def said(**status: Any) -> str:
+        api.objects["d1"]["status"] |= status
+        live.drones.note(("", "d1"), json.loads(json.dumps(api.objects["d1"])))
+        await missions.reconcile(("", "d1"))
+        live.drones.note(("", "d1"), json.loads(json.dumps(api.objects["d1"])))
+        return told(api, "d1", "OnMission")
+
+    assert await said() == "", "nothing was ever granted"
+    granted(live, "ns.a", "d1")
+    assert await said() == "Granted"
+    assert live.drones.get(("", "d1")).may_take_off  # type: ignore[union-attr]
+    granted(live, "ns.a", None)
+    assert await said() == "NotHeardOf"
+    assert await said() == "NotHeardOf"
+    assert await said(lastSeen=at(30), flightState="unknown") == "NotHeardOf"
+    assert live.drones.get(("", "d1")).may_take_off  # type: ignore[union-attr]
+    assert await said(lastSeen=at(31), flightState="inactive") == "NoGrant"
+    assert not live.drones.get(("", "d1")).may_take_off  # type: ignore[union-attr]
+
+
+def test_a_drone_that_someone_saw_on_the_ground_is_there_until_its_next_report() -> None:
+    flying = drone(at(0)).to_dict()
+
+    def in_air(annotation: str) -> bool:
+        flying["metadata"]["annotations"] = {"fractus.dev/grounded": annotation}
+        return Drone.from_body(json.loads(json.dumps(flying))).in_air
+
+    assert not in_air("2026-01-01T00:00:00Z")
+    for other in ("2026-01-01T00:00:01Z", "2026-01-01T00:00:00", "yes", ""):
+        assert in_air(other)

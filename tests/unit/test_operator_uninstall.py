@@ -46,3 +46,18 @@ def test_a_silent_drone_is_where_it_was() -> None:
 def test_long_lists_are_cut() -> None:
     said = objection([], [drone(f"d{i}", "flying") for i in range(9)])
     assert "d4 (flying) and 4 more" in said
+
+
+def test_a_drone_that_may_have_taken_off_is_named_until_someone_sees_it_on_the_ground() -> None:
+    seen = "2026-01-01T00:00:00Z"
+    doubtful = drone("drone-1", "inactive")
+    doubtful["status"] |= {"lastSeen": seen, "conditions": [{"type": "OnMission", "status": "Unknown"}]}
+    assert "drone-1 may have taken off" in objection([], [doubtful])
+    flying = drone("drone-2", "flying")
+    flying["status"]["lastSeen"] = seen
+    for body in (doubtful, flying):
+        body["metadata"]["annotations"] = {"fractus.dev/grounded": "2025-12-31T00:00:00Z"}
+    assert "drone-2" in objection([], [doubtful, flying])
+    for body in (doubtful, flying):
+        body["metadata"]["annotations"] = {"fractus.dev/grounded": seen}
+    assert objection([], [doubtful, flying]) == ""

@@ -10,7 +10,7 @@ from pydantic import Field, JsonValue
 
 from fractus_core.api.geometry import Point, Position
 from fractus_core.api.methods import CameraMethod, MobilityMethod
-from fractus_core.api.model import AGE, READY, Condition, Model, OpenModel, Resource
+from fractus_core.api.model import AGE, GROUP, READY, Condition, Model, OpenModel, Resource
 from fractus_core.api.names import Name
 from fractus_core.api.rules import Broken, named_by_others, rule
 
@@ -28,6 +28,13 @@ FLIGHT_REPORT_S, DRONE_REPORT_S, EDGE_REPORT_S = 5.0, 30.0, 60.0
 
 CONDITIONS_BY_TYPE: dict[str, JsonValue] = {"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["type"]}
 """Agent and operator each write conditions of their own."""
+
+
+GROUNDED_ANNOTATION = f"{GROUP}/grounded"
+"""On a Drone: someone sees it on the ground; the value is the lastSeen that this is said of, and it counts until the next report."""
+
+ON_MISSION = "OnMission"
+"""Condition of a Drone, by the operator: unless False, it may have taken off since its last report."""
 
 
 def is_airborne(state: str | None, last: str | None) -> bool:
@@ -299,7 +306,23 @@ class Drone(Resource, plural="drones", short="drn"):
     @property
     def in_air(self) -> bool:
         """Whether it is in the air, for all that is known."""
-        return self.status is not None and self.status.in_air
+        return self.status is not None and self.status.in_air and not self.grounded_by_hand
+
+    @property
+    def may_take_off(self) -> bool:
+        """Whether it may have taken off since its last report, for all that is known."""
+        conditions = self.status.conditions if self.status is not None else ()
+        unsure = any(c.type == ON_MISSION and c.status != "False" for c in conditions)
+        return unsure and not self.grounded_by_hand
+
+    @property
+    def grounded_by_hand(self) -> bool:
+        """Whether someone saw it on the ground, and nothing was heard of it since."""
+        said, seen = self.metadata.annotations.get(GROUNDED_ANNOTATION), self.status and self.status.last_seen
+        try:
+            return said is not None and seen is not None and datetime.fromisoformat(said.replace("Z", "+00:00")) == seen
+        except ValueError:
+            return False
 
 
 class EdgeNodeSpec(Model):

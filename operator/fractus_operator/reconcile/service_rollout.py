@@ -175,8 +175,11 @@ class ServiceRollout:
             return "NodeUnreachable", f"{node} is out of reach"
         if self._live.fleet.is_in_flight(node):
             return "InTheAir", f"{node} is in the air"
-        if holder is not None and self._live.drone(node) is not None:
+        drone = self._live.drone(node)
+        if drone is not None and holder is not None and not drone.grounded_by_hand:
             return "OnMission", f"{'/'.join(holder)} has {node} and may take off"
+        if drone is not None and drone.may_take_off:
+            return "OnMission", f"{node} may have taken off since its last report"
         return None
 
     async def _replace(self, node: ServicesOfNode) -> None:

@@ -44,11 +44,14 @@ class HearingClock:
         self._last_s = monotonic()
         self._deaf_until_s = float("-inf")
         self._heard_s = 0.0
+        self._began = False
 
     def now_s(self) -> float:
         """Its reading; asked for about once every PERIOD_S."""
         now_s = self._monotonic()
-        if not self._hears():
+        if self._hears():
+            self._began = True
+        elif self._began:
             self._deaf_until_s = now_s + _COMES_BACK_S
         if now_s > self._deaf_until_s:
             self._heard_s += min(now_s - self._last_s, _MAX_STEP_S)

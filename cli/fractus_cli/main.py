@@ -13,7 +13,7 @@ import click
 
 from fractus_cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK
 
-_MARKERS = {"core": "shapely", "operator": "cryptography", "services": "cv2", "sim": "matplotlib"}
+_MARKERS = {"core": "shapely", "kube": "kubernetes", "operator": "cryptography", "services": "cv2", "sim": "matplotlib"}
 """A module that tells whether an extra is installed: looking for it takes a millisecond, importing a command a second."""
 
 
@@ -45,12 +45,16 @@ COMMANDS: dict[str, Entry] = {
     "camera": Entry("fractus_services.commands:camera", "The camera service of a node.", "services"),
     "camera-world": Entry("fractus_world.__main__:camera_world", "Serve what a camera above a simulated world sees.", "sim"),
     "cluster": Entry("fractus_cluster.cli:cluster", "Run a real Kubernetes of several nodes on this machine.", "sim"),
+    "completion": Entry("fractus_cli.completion:completion", "Print what a shell sources to complete commands."),
+    "doctor": Entry("fractus_cli.doctor:doctor", "Check a cluster, and say what it lacks to fly.", "operator"),
     "experiment": Entry("fractus_sim.experiment.cli:experiment", "Run experiments with faults, checks and a report.", "sim"),
+    "explain": Entry("fractus_cli.explain:explain", "Say why an Application runs where it runs.", "kube"),
     "grants": Entry("fractus_cli.grants:grants", "Sign Grants and make certificates, without Kubernetes.", "operator"),
     "images": Entry("fractus_cluster.images.cli:images", "Build the container images of Fractus with buildah.", "sim"),
     "mobility": Entry("fractus_services.commands:mobility", "The mobility service of a drone.", "services"),
     "plan": Entry("fractus_cli.plan:plan", "Plan the Applications in some manifests, without a cluster.", "core"),
     "policy": Entry("fractus_cli.policy:policy", "Ask the policy engine, without a cluster.", "core"),
+    "status": Entry("fractus_cli.status:status", "Show the drones and applications of a cluster.", "kube"),
     "telemetry": Entry("fractus_cli.telemetry:telemetry", "Print the state of a drone until interrupted."),
     "vehicle": Entry("fractus_vehicle.__main__:vehicle", "Simulate ArduCopter-compatible vehicles.", "sim"),
     "zones": Entry("fractus_cli.zones:zones", "Read and write Zones in other formats.", "core"),

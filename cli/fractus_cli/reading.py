@@ -1,0 +1,82 @@
+"""Reads a cluster for commands: what is in it, as the API server gives it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import click
+from fractus_kube import BlockingClient, KubeError, NotFound, from_environment, kubeconfig
+
+Body = Mapping[str, Any]
+
+GROUP = "/apis/fractus.dev/v1alpha1"
+SYSTEM = "fractus-system"
+EXIT_PROBLEM = 2
+
+kubeconfig_option = click.option(
+    "--kubeconfig",
+    "config",
+    type=click.Path(exists=True, dir_okay=False),
+    help="Which cluster; else KUBECONFIG, then ~/.kube/config.",
+)
+output_option = click.option(
+    "-o", "--output", type=click.Choice(["text", "json"]), default="text", help="text for people, json for programs."
+)
+
+
+class Cluster:
+    """A cluster that is only read."""
+
+    def __init__(self, client: BlockingClient) -> None:
+        self._client = client
+
+    def get(self, path: str) -> Body | None:
+        """An object; None where there is none.
+
+        Raises:
+            KubeError: the API server refused it, or could not be reached.
+        """
+        return self._client.get(path)
+
+    def list(self, path: str, **selectors: str) -> Sequence[Body]:
+        """A collection; empty where there is no such kind.
+
+        Raises:
+            KubeError: the API server refused it, or could not be reached.
+        """
+        try:
+            return self._client.list(path, **selectors)
+        except NotFound:
+            return ()
+
+
+@contextmanager
+def cluster(config: str | None) -> Iterator[Cluster]:
+    """Open the cluster of a kubeconfig, or the one that kubectl would take.
+
+    Raises:
+        Unconfigured: there are no credentials.
+        ClickException: the API server refused what the command asked for, or could not be reached.
+    """
+    access = asyncio.run(kubeconfig(config) if config is not None else from_environment())
+    with BlockingClient(access, "fractus", trust_env=True) as client:
+        try:
+            yield Cluster(client)
+        except KubeError as error:
+            remedy = "check your permissions" if error.status else "check the cluster and --kubeconfig"
+            raise click.ClickException(f"{error}; {remedy}") from error
+
+
+def conditions_of(body: Body) -> dict[str, Body]:
+    """The conditions of an object by type."""
+    return {c["type"]: c for c in (body.get("status") or {}).get("conditions") or ()}
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
+    """Lines of a table whose columns are as wide as they need to be."""
+    cells = [[str(cell) if cell not in {None, ""} else "-" for cell in row] for row in (head, *rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells]

@@ -1,0 +1,330 @@
+"""`fractus status`, `explain` and `doctor`: what they say of a cluster, and their exit codes."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cluster_shown import condition, show
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from fractus_cli import doctor, explain, main, status
+from fractus_core.api import KINDS
+
+V1 = "/apis/fractus.dev/v1alpha1"
+DOCS = Path(__file__).parents[2] / "docs" / "cli.md"
+
+Run = Callable[..., tuple[int, str]]
+Body = dict[str, Any]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    def call(*arguments: str) -> tuple[int, str]:
+        code = main.run(arguments)
+        said = capsys.readouterr()
+        return code, said.out + said.err
+
+    return call
+
+
+def named(name: str, namespace: str = "", **more: Any) -> Body:
+    return {"metadata": {"name": name} | ({"namespace": namespace} if namespace else {}), **more}
+
+
+DRONE = named(
+    "drone-1",
+    spec={},
+    status={
+        "flightState": "flying",
+        "battery": {"remaining": 0.625},
+        "lastSeen": "2026-01-01T00:00:00Z",
+        "conditions": [
+            condition("Ready", "True"),
+            condition("ServicesCurrent", "False", "InTheAir"),
+            condition("OnMission", "True"),
+        ],
+    },
+)
+APPLICATION = named(
+    "traffic",
+    "default",
+    status={"phase": "Flying", "drone": "drone-1", "pods": "3/3", "message": "drone-1 flies"},
+)
+
+
+def test_status_shows_the_fleet_and_the_applications(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    edge = named("edge-1", spec={}, status={"conditions": [condition("Ready", "Unknown", "AgentSilent", "gone")]})
+    objects = {
+        f"{V1}/drones": [DRONE],
+        f"{V1}/edgenodes": [edge],
+        f"{V1}/applications": [APPLICATION, named("new", "default")],
+        f"{V1}/namespaces/other/applications": [],
+    }
+    show(monkeypatch, status, objects)
+    code, said = run("status")
+    assert code == 0
+    assert re.search(r"drone-1 +flying +- +62% +True +InTheAir +2026-01-01T00:00:00Z", said)
+    assert re.search(r"edge-1 +Unknown +Current +- +gone", said)
+    assert re.search(r"default/traffic +Flying +drone-1 +3/3 +drone-1 flies", said)
+    assert re.search(r"default/new +Pending .*the operator has not seen it yet", said)
+    code, said = run("status", "-n", "other", "-o", "json")
+    seen = json.loads(said)
+    assert (seen["drones"][0]["onMission"], seen["applications"]) == ("True", [])
+
+
+def test_status_goes_on_until_it_is_interrupted(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    show(monkeypatch, status, {})
+    pauses: list[float] = []
+
+    def pause(seconds: float) -> None:
+        pauses.append(seconds)
+        if len(pauses) == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(status.time, "sleep", pause)
+    code, said = run("status", "--watch")
+    assert code == 130
+    assert said.count("APPLICATION") == 3
+
+
+PLAN: Body = {
+    "application": "traffic",
+    "drone": {
+        "node": "drone-1",
+        "score": 12.5,
+        "alternatives": [{"node": "drone-2", "score": 3.25}],
+        "mission": {"distance": 420.4, "duration": 6.25, "available": 18.0},
+        "legality": [
+            {
+                "end": {"lat": 39.5, "lon": 22.5},
+                "outcome": "Detour",
+                "message": "the system flies around, 80 m",
+                "policies": ["school"],
+            }
+        ],
+    },
+    "placements": [
+        {"component": "Navigator", "node": "drone-1", "role": "drone"},
+        {"component": "Viewer", "node": "edge-1", "role": "static", "location": 1},
+        {"component": "Store", "role": "cloud"},
+    ],
+    "rejected": [
+        {"component": "Navigator", "node": f"drone-{i}", "reason": "FlightTooLong", "message": "needs 9 min"}
+        for i in range(3, 10)
+    ],
+    "rejectedOmitted": 40,
+}
+
+
+@pytest.fixture
+def explained(monkeypatch: pytest.MonkeyPatch) -> Body:
+    owner = {"namespace": "default", "name": "traffic"}
+    policy = {"name": "school", "spec": {"type": "GeofenceControl"}, "zones": [{"name": "yard"}]}
+    grant = {"spec": {"instance": "navigator-x", "application": owner, "policies": [policy]}}
+    event = {"lastTimestamp": "2026-01-01T00:00:00Z", "type": "Normal", "reason": "Planned", "message": "drone-1 flies"}
+    objects: Body = {
+        f"{V1}/namespaces/default/applications/traffic": APPLICATION,
+        f"{V1}/namespaces/default/deploymentplans": [named("traffic", "default", spec=PLAN)],
+        f"{V1}/grants": [grant],
+        "/api/v1/namespaces/default/events": [event],
+    }
+    show(monkeypatch, explain, objects)
+    return objects
+
+
+def test_explain_says_why_here_why_not_there_and_which_policy_did_what(run: Run, explained: Body) -> None:
+    code, said = run("explain", "traffic")
+    assert code == 0
+    for sentence in (
+        "default/traffic: Flying: drone-1 flies",
+        "Drone: drone-1 (score 12.5); next best: drone-2 (3.25)",
+        "420 m in 6.2 min; it can fly 18.0 min",
+        "leg to 39.500000, 22.500000: Detour by school: the system flies around, 80 m",
+        "Viewer: edge-1 (for location 1)",
+        "Store: cloud (any cloud node)",
+        "Not for Navigator:",
+        "drone-3: FlightTooLong: needs 9 min",
+        "and 2 more (--all)",
+        "40 more rejected nodes",
+        "Policies for navigator-x: school (GeofenceControl in yard)",
+        "Normal Planned: drone-1 flies",
+    ):
+        assert sentence in said
+    assert "drone-9" not in said
+    assert "drone-9" in run("explain", "traffic", "--all")[1]
+    assert json.loads(run("explain", "traffic", "-o", "json")[1])["rejected"] == PLAN["rejected"]
+
+
+def test_explain_fails_where_there_is_no_plan_or_a_conflict(run: Run, explained: Body) -> None:
+    assert run("explain", "other")[0] == 1
+    plans = explained[f"{V1}/namespaces/default/deploymentplans"]
+    conflict = {**PLAN, "drone": {**PLAN["drone"], "policyConflict": "the leg is denied"}}
+    plans[:] = [named("traffic", "default", spec=conflict)]
+    code, said = run("explain", "traffic")
+    assert code == 2
+    assert "Conflict: the leg is denied" in said
+    plans.clear()
+    code, said = run("explain", "traffic")
+    assert code == 2
+    assert "There is no plan." in said
+
+
+# -- doctor --
+
+
+def authority(days: float) -> Body:
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "ca")])
+    now = datetime.now(UTC)
+    builder = x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
+    builder = builder.not_valid_before(now - timedelta(days=900)).not_valid_after(now + timedelta(days=days))
+    pem = builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
+    return {"data": {"ca.crt": pem.decode()}}
+
+
+def node(name: str, of_class: str, *, tainted: bool = True, ready: str = "True") -> Body:
+    taints = [{"key": "fractus.dev/class", "effect": "NoExecute"}] if tainted else []
+    body = named(name, spec={"taints": taints}, status={"conditions": [condition("Ready", ready)]})
+    body["metadata"]["labels"] = {"fractus.dev/class": of_class}
+    return body
+
+
+@pytest.fixture
+def healthy(monkeypatch: pytest.MonkeyPatch) -> Body:
+    """A cluster that lacks nothing."""
+    system = "/apis/apps/v1/namespaces/fractus-system"
+    kinds = [named(f"{k.PLURAL}.fractus.dev", status={"conditions": [condition("Established", "True")]}) for k in KINDS]
+    policies = [named(name) for name in doctor.POLICIES]
+    objects: Body = {
+        "/version": {"major": "1", "minor": "35+", "gitVersion": "v1.35.4"},
+        "/apis/apiextensions.k8s.io/v1/customresourcedefinitions": kinds,
+        f"{system}/deployments/fractus-operator": {"spec": {"replicas": 2}, "status": {"readyReplicas": 2}},
+        "/apis/coordination.k8s.io/v1/namespaces/fractus-system/leases/fractus-operator": {
+            "spec": {"holderIdentity": "operator-a"}
+        },
+        "/apis/admissionregistration.k8s.io/v1/validatingadmissionpolicies": policies,
+        "/apis/admissionregistration.k8s.io/v1/validatingadmissionpolicybindings": list(policies),
+        "/api/v1/namespaces/fractus-system/pods": [],
+        "/api/v1/namespaces/fractus-system/configmaps/fractus-ca": authority(400),
+        "/api/v1/nodes": [node("drone-1", "drone"), node("edge-1", "edge"), node("cloud-1", "cloud")],
+        f"{V1}/drones": [DRONE],
+        f"{V1}/edgenodes": [named("edge-1", status={"conditions": [condition("Ready", "True")]})],
+        f"{V1}/zones": [],
+        f"{V1}/policies": [],
+        f"{V1}/depots": [named("base")],
+    }
+    for name in doctor.SERVICES:
+        objects[f"{system}/daemonsets/{name}"] = {"status": {"numberReady": 2, "desiredNumberScheduled": 2}}
+    show(monkeypatch, doctor, objects)
+    return objects
+
+
+def test_doctor_finds_nothing_in_a_cluster_that_lacks_nothing(run: Run, healthy: Body) -> None:
+    code, said = run("doctor")
+    assert code == 0, said
+    assert {line.split()[0] for line in said.splitlines()} == {"ok"}
+
+
+SYSTEM_APPS = "/apis/apps/v1/namespaces/fractus-system"
+WAITING = {
+    "metadata": {"name": "fractus-camera-x"},
+    "spec": {"nodeName": "drone-1"},
+    "status": {"containerStatuses": [{"state": {"waiting": {"reason": "ImagePullBackOff", "message": "no such tag"}}}]},
+}
+SILENT = {**DRONE, "status": {"conditions": [condition("Ready", "Unknown", "AgentSilent", "last heard of")]}}
+UNREGISTERED = [node("drone-1", "drone"), node("drone-9", "drone"), node("cloud-1", "cloud")]
+MISTYPED = [*UNREGISTERED[::2], node("b", "boat")]
+AUTHORITY = "/api/v1/namespaces/fractus-system/configmaps/fractus-ca"
+ADMISSION = "/apis/admissionregistration.k8s.io/v1"
+LACKS: list[tuple[str, Any, str, str]] = [
+    ("/version", {"major": "1", "minor": "31"}, "error", "upgrade Kubernetes to 1.32"),
+    ("/apis/apiextensions.k8s.io/v1/customresourcedefinitions", [], "error", "--install fractus-crds"),
+    (f"{SYSTEM_APPS}/deployments/fractus-operator", None, "error", "--install fractus "),
+    (f"{SYSTEM_APPS}/deployments/fractus-operator", {"spec": {"replicas": 2}}, "error", "logs deployment/fractus-oper"),
+    (f"{SYSTEM_APPS}/daemonsets/fractus-camera", None, "warning", "fractus-camera is not installed"),
+    (
+        f"{SYSTEM_APPS}/daemonsets/fractus-camera",
+        {"status": {"numberReady": 1, "desiredNumberScheduled": 2}},
+        "warning",
+        "component=camera",
+    ),
+    (f"{ADMISSION}/validatingadmissionpolicies", [], "error", "fractus-flight-pods"),
+    (f"{ADMISSION}/validatingadmissionpolicybindings", [], "error", "fractus-flight-pods"),
+    ("/api/v1/namespaces/fractus-system/pods", [WAITING], "error", "imagePullSecrets"),
+    (AUTHORITY, None, "error", "there is no authority yet"),
+    (AUTHORITY, authority(10), "warning", "the authority expires"),
+    (AUTHORITY, authority(-1), "error", "the authority expires"),
+    (AUTHORITY, {"data": {"ca.crt": base64.b64encode(b"x").decode()}}, "error", "cannot be read"),
+    ("/api/v1/nodes", UNREGISTERED, "error", "drone-9 has no Drone"),
+    ("/api/v1/nodes", MISTYPED, "error", "kubectl label node b fractus.dev/class=drone --overwrite"),
+    ("/api/v1/nodes", [node("cloud-1", "cloud")], "error", "kubectl label node NODE fractus.dev/class=drone"),
+    ("/api/v1/nodes", [node("drone-1", "drone")], "warning", "kubectl label node NODE fractus.dev/class=cloud"),
+    (
+        "/api/v1/nodes",
+        [node("drone-1", "drone", tainted=False), node("c", "cloud")],
+        "warning",
+        "kubectl taint node drone-1 fractus.dev/class=drone:NoExecute",
+    ),
+    (
+        "/api/v1/nodes",
+        [node("drone-1", "drone", ready="Unknown"), node("c", "cloud")],
+        "warning",
+        "drone-1 is out of reach",
+    ),
+    (f"{V1}/drones", [SILENT], "error", "drone-1: Ready: AgentSilent: last heard of"),
+    (
+        f"{V1}/policies",
+        [named("p", status={"conditions": [condition("Ready", "False", "ZoneMissing", "no zone z")]})],
+        "error",
+        "policies/p: no zone z",
+    ),
+    (f"{V1}/depots", [], "warning", "apply a Depot"),
+]
+
+
+@pytest.mark.parametrize(("path", "found", "level", "words"), LACKS, ids=[f"{n}-{x[3]}" for n, x in enumerate(LACKS)])
+def test_doctor_says_what_is_missing_and_the_remedy(
+    run: Run, healthy: Body, path: str, found: Any, level: str, words: str
+) -> None:
+    healthy[path] = found
+    code, said = run("doctor", "-o", "json")
+    assert code == (2 if level == "error" else 0)
+    assert any(f["level"] == level and words in f["message"] + f["remedy"] for f in json.loads(said)), said
+    assert all(f["remedy"] for f in json.loads(said) if f["level"] != "ok"), "each has its remedy"
+
+
+def test_the_policies_that_doctor_asks_for_are_those_of_the_chart() -> None:
+    charts = DOCS.parents[1] / "charts" / "fractus" / "templates"
+    text = "".join((charts / name).read_text() for name in ("admission.yaml", "flight.yaml"))
+    assert set(re.findall(r"kind: ValidatingAdmissionPolicy\nmetadata:\n  name: ([\w-]+)", text)) == set(
+        doctor.POLICIES
+    )
+
+
+# -- the command line --
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_shells_complete_commands(run: Run, shell: str) -> None:
+    code, said = run("completion", shell)
+    assert code == 0
+    assert "_FRACTUS_COMPLETE" in said
+
+
+def test_the_page_of_the_command_line_names_every_command() -> None:
+    text = DOCS.read_text()
+    rows = dict(re.findall(r"^\| `fractus ([\w-]+)` \| (.*?) \|", text, re.MULTILINE))
+    assert rows == {name: entry.summary for name, entry in main.COMMANDS.items()}
+
+
+@pytest.mark.parametrize("name", ["status", "explain", "doctor", "completion"])
+def test_the_page_shows_the_help_of_commands_that_read_clusters(run: Run, name: str) -> None:
+    assert run(name, "--help")[1].strip() in DOCS.read_text()

@@ -3,7 +3,6 @@
 from fractus import sync as sync
 from fractus.control import Control as Control
 from fractus.drone import Mobility as Mobility
-from fractus.drone import Motion as Motion
 from fractus.drone import mobility as mobility
 from fractus.dry_runs import CanI as CanI
 from fractus.environment import Endpoint as Endpoint
@@ -35,6 +34,12 @@ from fractus.exchange import Request as Request
 from fractus.exchange import Requester as Requester
 from fractus.exchange import Responder as Responder
 from fractus.exchange import requester as requester
+from fractus.missions import Mission as Mission
+from fractus.missions import MissionProgress as MissionProgress
+from fractus.missions import Waypoint as Waypoint
+from fractus.missions import orbit as orbit
+from fractus.missions import read_plan as read_plan
+from fractus.motions import Motion as Motion
 from fractus.pictures import Camera as Camera
 from fractus.pictures import camera as camera
 from fractus.running import run as run

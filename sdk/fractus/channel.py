@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from types import TracebackType
@@ -118,6 +118,28 @@ class ServiceChannel:
                     return await getattr(stub, method)(request, timeout=timeout_s or self._timeout_s)
             except grpc.aio.AioRpcError as error:
                 await retries.pause(error)
+
+    async def stream(self, method: str, request: Any) -> AsyncGenerator[Any, None]:
+        """The messages of a stream that is opened again after the service restarts.
+
+        Raises:
+            FractusError: one of the typed errors; `Unavailable` when the service did not come back.
+        """
+        retries = Retries(self, method)
+        while True:
+            try:
+                async with self.stub() as stub:
+                    call = getattr(stub, method)(request)
+                    try:
+                        async for message in call:
+                            yield message
+                            retries.reset()
+                    finally:
+                        call.cancel()
+            except grpc.aio.AioRpcError as error:
+                await retries.pause(error)
+            else:
+                return
 
     def _current(self) -> _Connection:
         stamp = self._stamp()

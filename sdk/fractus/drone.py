@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import asyncio
-import inspect
-from collections.abc import AsyncGenerator, Awaitable, Callable, Generator
+from collections.abc import AsyncGenerator, Sequence
 from contextlib import aclosing
 from typing import Any, TypeVar
 
-import grpc
-import grpc.aio
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
-from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, Retries, ServiceChannel, ServiceClient
+from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, ServiceChannel, ServiceClient
 from fractus.control import Control, OnWait
 from fractus.dry_runs import CanI
 from fractus.environment import Endpoint, endpoint
-from fractus.errors import ControlLost, Corrected, FractusError
+from fractus.errors import ControlLost, Corrected
+from fractus.missions import Mission, Waypoint
+from fractus.motions import Motion, OnProgress
 from fractus.requests import goto_request, speed_request, takeoff_request, velocity_request
 from fractus.telemetry import Telemetry, Watch
 from fractus.values import (
@@ -37,95 +35,6 @@ ARM_TIMEOUT_S = 60.0
 """An autopilot is ready some 40 s after it was switched on."""
 
 R = TypeVar("R", bound=Result)
-OnProgress = Callable[[Progress], Awaitable[None] | None]
-
-
-class Motion:
-    """A motion that starts when it is awaited or iterated.
-
-    Awaiting it flies until the motion is complete and gives the last `Progress`; iterating gives every step of it.
-    Cancelling the task, or leaving the iteration early, stops the motion: the drone hovers. When the service restarts
-    while this component holds control, the motion is asked for again.
-
-    Raises:
-        PolicyDenied: policies forbid it; the drone goes on hovering.
-        Corrected: the client is strict and a policy changed the target; the motion is stopped.
-        ControlLost: the system or a pilot took the drone.
-        Unavailable: the service is away, and did not come back.
-    """
-
-    def __init__(
-        self,
-        channel: ServiceChannel,
-        control: Control | None,
-        method: str,
-        request: Any,
-        *,
-        strict: bool = False,
-        progress: OnProgress | None = None,
-        timeout_s: float | None = None,
-    ) -> None:
-        self._channel = channel
-        self._control = control
-        self._method = method
-        self._request = request
-        self._strict = strict
-        self._progress = progress
-        self._timeout_s = timeout_s
-
-    def __await__(self) -> Generator[Any, None, Progress]:
-        return self._complete().__await__()
-
-    async def __aiter__(self) -> AsyncGenerator[Progress, None]:
-        retries = Retries(self._channel, self._method, retried=self._control is not None)
-        while True:
-            if self._control is not None:
-                await self._control.ready()
-            try:
-                async with aclosing(self._attempt()) as steps:
-                    async for step in steps:
-                        retries.reset()
-                        yield step
-            except grpc.aio.AioRpcError as error:
-                await retries.pause(error)
-            else:
-                return
-
-    async def _complete(self) -> Progress:
-        last: Progress | None = None
-        async with aclosing(self.__aiter__()) as steps:
-            async for last in steps:
-                if self._progress is not None:
-                    outcome = self._progress(last)
-                    if inspect.isawaitable(outcome):
-                        await outcome
-        if last is None or not last.complete:
-            raise FractusError(f"{self._method}: the service ended the motion before it was complete")
-        return last
-
-    async def _attempt(self) -> AsyncGenerator[Progress, None]:
-        first: Progress | None = None
-        async with self._channel.stub() as stub:
-            call = getattr(stub, self._method)(self._request, timeout=self._timeout_s)
-            if self._control is not None:
-                self._control.begin(call)
-            try:
-                async for message in call:
-                    step = Progress.from_proto(message, first)
-                    first = first or step
-                    if self._strict and step.corrected:
-                        raise Corrected(step)
-                    yield step
-                    if step.complete:
-                        return
-            except asyncio.CancelledError:
-                if self._control is not None and self._control.lost is not None:
-                    raise self._control.lost from None
-                raise
-            finally:
-                call.cancel()
-                if self._control is not None:
-                    self._control.end(call)
 
 
 class Mobility(ServiceClient):
@@ -288,6 +197,33 @@ class Mobility(ServiceClient):
         request = goto_request(Position(lat, lon, alt, reference), yaw_deg, speed_mps, acceptance_radius_m)
         return self._motion("Goto", request, progress, timeout_s)
 
+    async def turn(self, yaw_deg: float) -> Progress:
+        """Point the nose on the spot; needs the method GetPosition, too.
+
+        Args:
+            yaw_deg: degrees clockwise from true north.
+        """
+        here = (await self.position()).position
+        return await self.goto(here.lat, here.lon, here.alt, yaw_deg=yaw_deg)
+
+    def mission(self, waypoints: Sequence[Waypoint | Position] | None = None, *, skip_refused: bool = False) -> Mission:
+        """Waypoints to fly one after the other: `await drone.mission(fractus.read_plan("survey.plan"))`.
+
+        Args:
+            waypoints: the same ones in each life of this component; by default the path of the control point.
+            skip_refused: go on with the next one where policies forbid a leg.
+
+        Raises:
+            ControlLost: control was not taken.
+        """
+        if self._control is None:
+            raise ControlLost("a mission is for a control point; use `async with drone.control():`")
+        return Mission(self._fly, self._control, waypoints, skip_refused=skip_refused)
+
+    def _fly(self, to: Waypoint, progress: OnProgress) -> Motion:
+        request = goto_request(to.position, to.yaw_deg, to.speed_mps, to.acceptance_radius_m)
+        return self._motion("Goto", request, progress, None)
+
     async def telemetry(self, interval_s: float = 0.2) -> AsyncGenerator[Telemetry, None]:
         """The drone's state, every `interval_s` seconds, until the iteration is left; goes on after a restart.
 
@@ -295,7 +231,7 @@ class Mobility(ServiceClient):
             Unavailable: the service is away, and did not come back.
         """
         request = mobility_pb2.SubscribeTelemetryRequest(interval_s=interval_s)
-        async with aclosing(self._stream("SubscribeTelemetry", request)) as samples:
+        async with aclosing(self._channel.stream("SubscribeTelemetry", request)) as samples:
             async for message in samples:
                 yield Telemetry.from_proto(message)
 
@@ -310,7 +246,7 @@ class Mobility(ServiceClient):
             Unavailable: the service is away, and did not come back.
         """
         states = mobility_pb2.ControlEvent
-        async with aclosing(self._stream("GetControl", mobility_pb2.GetControlRequest())) as events:
+        async with aclosing(self._channel.stream("GetControl", mobility_pb2.GetControlRequest())) as events:
             async for event in events:
                 if event.state == states.STATE_LOST:
                     raise ControlLost(event.reason)
@@ -318,24 +254,6 @@ class Mobility(ServiceClient):
                 yield Ride(event.state == states.STATE_RIDING, event.waypoints_reached, complete, event.reason)
                 if complete:
                     return
-
-    async def _stream(self, method: str, request: Any) -> AsyncGenerator[Any, None]:
-        """The messages of a stream that is opened again after the service restarts."""
-        retries = Retries(self._channel, method)
-        while True:
-            try:
-                async with self._channel.stub() as stub:
-                    call = getattr(stub, method)(request)
-                    try:
-                        async for message in call:
-                            yield message
-                            retries.reset()
-                    finally:
-                        call.cancel()
-            except grpc.aio.AioRpcError as error:
-                await retries.pause(error)
-            else:
-                return
 
     async def _check(self, request: mobility_pb2.CheckCallRequest) -> Check:
         return Check.from_proto(await self._channel.unary("CheckCall", request))

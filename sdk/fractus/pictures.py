@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import AsyncGenerator
+
 import grpc
 import grpc.aio
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
@@ -40,6 +43,24 @@ class Camera(ServiceClient):
         request = capture_request(width, height)
         reply = await self._channel.unary("CaptureImage", request, timeout_s=timeout_s)
         return ImageInfo.from_proto(reply.image, reply.decision)
+
+    async def every(self, interval_s: float, width: int = 0, height: int = 0) -> AsyncGenerator[ImageInfo, None]:
+        """Take a picture each `interval_s` seconds, until the iteration is left; a camera that takes longer is waited for.
+
+        Args:
+            interval_s: seconds from the beginning of one picture to that of the next.
+            width: pixels; 0 leaves it to the camera.
+            height: pixels; 0 leaves it to the camera.
+
+        Raises:
+            PolicyDenied: no pictures from here, or not of this; call it again further on.
+            Unavailable: the camera gives no picture.
+        """
+        loop = asyncio.get_running_loop()
+        while True:
+            due = loop.time() + interval_s
+            yield await self.capture(width, height)
+            await asyncio.sleep(max(due - loop.time(), 0.0))
 
     async def retrieve(self, name: str, *, timeout_s: float = RETRIEVE_TIMEOUT_S) -> bytes:
         """Fetch a picture, with what privacy policies demand already done to it.

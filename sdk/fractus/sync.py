@@ -9,18 +9,21 @@ from __future__ import annotations
 import asyncio
 import functools
 import threading
-from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator
+from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator, Sequence
 from types import TracebackType
 from typing import Any, Concatenate, Generic, ParamSpec, Protocol, Self, TypeVar
 
 from fractus import control as _control
 from fractus import drone as _drone
 from fractus import dry_runs as _dry_runs
+from fractus import missions as _missions
 from fractus import pictures as _pictures
 from fractus import telemetry as _telemetry
 from fractus.environment import Endpoint
-from fractus.errors import FractusError
+from fractus.errors import FractusError, PolicyDenied
+from fractus.missions import Waypoint
 from fractus.tasks import ControlPoint
+from fractus.values import Position
 
 JOIN_TIMEOUT_S = 10.0
 """How long `close` waits for the thread of the event loop to end."""
@@ -64,6 +67,10 @@ class _Loop:
                 yield item
         finally:
             self.run(items.aclose)
+
+    def call(self, what: Callable[[], None]) -> None:
+        """Do something on the loop, soon."""
+        self._loop.call_soon_threadsafe(what)
 
     def close(self) -> None:
         """Stop the loop and its thread."""
@@ -207,6 +214,25 @@ class Watch(_Wrapper[_telemetry.Watch]):
     status_texts = _iterating(_telemetry.Watch.status_texts)
 
 
+class Mission(_Wrapper[_missions.Mission]):
+    """Waypoints that `fly` flies; see `fractus.Mission`."""
+
+    fly = _waiting(_missions.Mission.fly)
+
+    @property
+    def refused(self) -> dict[int, PolicyDenied]:
+        """Legs that were passed over, by the number of their waypoint, from 1."""
+        return self._async.refused
+
+    def pause(self) -> None:
+        """Stop the leg under way, from another thread: the drone hovers until `resume`."""
+        self._loop.call(self._async.pause)
+
+    def resume(self) -> None:
+        """Go on with the leg that was stopped."""
+        self._loop.call(self._async.resume)
+
+
 class Mobility(_Client[_drone.Mobility]):
     """The mobility service of this node; see `fractus.Mobility`."""
 
@@ -223,11 +249,17 @@ class Mobility(_Client[_drone.Mobility]):
 
     arm = _waiting(_drone.Mobility.arm)
     disarm = _waiting(_drone.Mobility.disarm)
+
+    def mission(self, waypoints: Sequence[Waypoint | Position] | None = None, *, skip_refused: bool = False) -> Mission:
+        """Waypoints to fly one after the other: `drone.mission(fractus.read_plan("survey.plan")).fly()`."""
+        return Mission(self._loop, self._async.mission(waypoints, skip_refused=skip_refused))
+
     takeoff = _waiting(_drone.Mobility.takeoff)
     land = _waiting(_drone.Mobility.land)
     return_to_launch = _waiting(_drone.Mobility.return_to_launch)
     goto = _waiting(_drone.Mobility.goto)
     hover = _waiting(_drone.Mobility.hover)
+    turn = _waiting(_drone.Mobility.turn)
     set_speed = _waiting(_drone.Mobility.set_speed)
     set_velocity = _waiting(_drone.Mobility.set_velocity)
     position = _waiting(_drone.Mobility.position)
@@ -243,6 +275,7 @@ class Camera(_Client[_pictures.Camera]):
         super().__init__(_pictures.camera(endpoint))
 
     capture = _waiting(_pictures.Camera.capture)
+    every = _iterating(_pictures.Camera.every)
     retrieve = _waiting(_pictures.Camera.retrieve)
     list = _waiting(_pictures.Camera.list)
     delete = _waiting(_pictures.Camera.delete)

@@ -227,6 +227,63 @@ async def test_control_that_was_lost_is_asked_for_again(stage: Stage, monkeypatc
     assert stage.drone.waypoints_reached == 3
 
 
+async def test_a_mission_goes_on_with_the_waypoint_that_was_under_way(stage: Stage) -> None:
+    stage.drone.waypoints_reached = 1
+    seen: list[tuple[int, int]] = []
+    async with stage.client() as drone, drone.control():
+        refused = await drone.mission().fly(lambda at: seen.append((at.number, at.count)))
+    assert refused == {}
+    assert sorted(set(seen)) == [(2, 3), (3, 3)]
+    assert stage.drone.waypoints_reached == 3
+
+
+async def test_a_mission_passes_over_what_is_refused_if_it_is_to(stage: Stage) -> None:
+    waypoints = [fractus.Position(lat, 22.0, 20.0) for lat in (40.0, 40.5, 40.001)]
+    async with stage.client() as drone, drone.control():
+        with pytest.raises(fractus.PolicyDenied):
+            await drone.mission(waypoints)
+        assert stage.drone.waypoints_reached == 1
+        refused = await drone.mission(waypoints, skip_refused=True)
+        assert list(refused) == [2]
+        assert isinstance(refused[2], fractus.PolicyDenied)
+    assert [target.latitude_deg for target in stage.drone.targets] == [40.0, 40.001]
+
+
+async def test_a_mission_is_paused_and_goes_on(stage: Stage) -> None:
+    stage.drone.release = asyncio.Event()
+    async with stage.client() as drone, drone.control(), asyncio.timeout(WAIT_S):
+        mission = drone.mission()
+        flight = asyncio.ensure_future(mission.fly())
+        await stage.drone.moving.wait()
+        mission.pause()
+        await stage.drone.hovering.wait()
+        assert mission.paused
+        assert not flight.done()
+        stage.drone.release.set()
+        mission.resume()
+        assert await flight == {}
+    assert len(stage.drone.targets) == 4, "the leg that was stopped is begun again"
+
+
+async def test_a_mission_needs_control(stage: Stage) -> None:
+    async with stage.client() as drone:
+        with pytest.raises(fractus.ControlLost, match=r"use `async with drone.control"):
+            drone.mission()
+
+
+async def test_a_nose_is_turned_on_the_spot(stage: Stage) -> None:
+    async with stage.client() as drone, drone.control():
+        await drone.turn(90)
+    (target,) = stage.drone.targets
+    assert (target.latitude_deg, target.longitude_deg, target.altitude_m) == (40.0, 22.0, 5.0)
+
+
+async def test_pictures_are_taken_again_and_again(stage: Stage) -> None:
+    async with Camera(stage.endpoint) as camera, contextlib.aclosing(camera.every(0.0)) as pictures:
+        first, second = await anext(pictures), await anext(pictures)
+    assert (first.name, second.name) == ("1.jpg", "1.jpg")
+
+
 async def test_an_error_in_the_body_does_not_return_control(stage: Stage) -> None:
     async with stage.client() as drone:
         with pytest.raises(ZeroDivisionError):

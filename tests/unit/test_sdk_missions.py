@@ -1,0 +1,87 @@
+"""Missions of the SDK: orbits, and plans of QGroundControl."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from pathlib import Path
+from typing import Any
+
+import fractus
+import pytest
+from fractus_core.geo import LocalFrame
+
+
+@pytest.mark.parametrize("turns", [1.0, -0.5, 2.0])
+def test_an_orbit_keeps_its_distance_and_looks_at_its_middle(turns: float) -> None:
+    frame = LocalFrame(39.36, 22.95)
+    waypoints = fractus.orbit(fractus.Position(39.36, 22.95, 25.0), 80.0, turns=turns, points=12)
+    assert len(waypoints) == abs(turns) * 12 + 1
+    for waypoint in waypoints:
+        east, north = frame.xy(waypoint.position.lat, waypoint.position.lon)
+        assert math.hypot(east, north) == pytest.approx(80.0, rel=0.01)
+        assert waypoint.yaw_deg is not None
+        to_middle = math.degrees(math.atan2(-east, -north))
+        assert math.cos(math.radians(waypoint.yaw_deg - to_middle)) > 0.999
+        assert waypoint.position.alt == 25.0
+    second = frame.xy(waypoints[1].position.lat, waypoints[1].position.lon)
+    assert math.copysign(1.0, second[0]) == math.copysign(1.0, turns), "clockwise begins to the east"
+
+
+@pytest.mark.parametrize(("radius_m", "points"), [(0.0, 16), (math.nan, 16), (30.0, 2)])
+def test_an_orbit_that_is_none_is_refused(radius_m: float, points: int) -> None:
+    with pytest.raises(fractus.InvalidRequest, match="radius above 0"):
+        fractus.orbit(fractus.Position(0.0, 0.0), radius_m, points=points)
+
+
+def item(command: int, *params: float | None, frame: int = 3) -> dict[str, Any]:
+    return {"type": "SimpleItem", "command": command, "frame": frame, "params": list(params)}
+
+
+def plan(tmp_path: Path, *items: dict[str, Any]) -> Path:
+    path = tmp_path / "survey.plan"
+    path.write_text(json.dumps({"fileType": "Plan", "mission": {"items": list(items)}}))
+    return path
+
+
+def test_a_plan_gives_its_waypoints(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    survey = {
+        "type": "ComplexItem",
+        "complexItemType": "survey",
+        "TransectStyleComplexItem": {
+            "Items": [item(16, 0, 0, 0, None, 39.3, 22.3, 40), item(206, 10, 0, 1, 0, 0, 0, 0)]
+        },
+    }
+    path = plan(
+        tmp_path,
+        item(22, 15, 0, 0, None, 39.0, 22.0, 30),
+        item(16, 0, 0, 0, None, 39.1, 22.1, 30),
+        item(178, 1, 7.5, -1, 0, 0, 0, 0, frame=2),
+        item(16, 4, 2, 0, 90, 39.2, 22.2, 230, frame=0),
+        survey,
+        item(20, 0, 0, 0, 0, 0, 0, 0, frame=2),
+    )
+    with caplog.at_level(logging.WARNING):
+        first, second, third = fractus.read_plan(path)
+    assert first == fractus.Waypoint(fractus.Position(39.1, 22.1, 30.0))
+    amsl = fractus.Position(39.2, 22.2, 230.0, fractus.AltitudeReference.AMSL)
+    assert second == fractus.Waypoint(amsl, yaw_deg=90, speed_mps=7.5, acceptance_radius_m=2.0, stay_s=4.0)
+    assert (third.position.alt, third.speed_mps) == (40.0, 7.5)
+    assert "MAV_CMD 206" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("items", "why"),
+    [
+        ([item(18, 1, 0, 5, 0, 39.1, 22.1, 30)], "item 1 is MAV_CMD 18, which is not flown"),
+        ([item(16, 0, 0, 0, None, 39.1, 22.1, 30, frame=1)], "item 1 has frame 1"),
+        ([item(16, 0, 0, 0)], "not a plan of QGroundControl"),
+        ([{"type": "SimpleItem"}], "not a plan of QGroundControl"),
+    ],
+)  # fmt: skip
+def test_a_plan_that_cannot_be_flown_says_why(tmp_path: Path, items: list[dict[str, Any]], why: str) -> None:
+    with pytest.raises(fractus.InvalidRequest, match=why):
+        fractus.read_plan(plan(tmp_path, *items))
+    with pytest.raises(fractus.InvalidRequest, match="No such file"):
+        fractus.read_plan(tmp_path / "none.plan")

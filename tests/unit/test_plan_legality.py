@@ -244,3 +244,20 @@ def test_a_plan_looks_for_a_limited_number_of_ways_around():
     with pytest.raises(Infeasible) as caught:
         plan(tour, inventory_, FORBID)
     assert sorted(r.reason for r in caught.value.rejected) == ["NotJudged", "NotJudged", "PolicyConflict"]
+
+
+def test_a_denied_waypoint_that_strands_its_driver_is_told():
+    corner = application(navigator([at(100, 0, 10), at(200, 0, 10), at(200, 100, 10), at(200, 200, 10)]))
+    choice = plan(corner, fenced(200, 0), WARN).drone
+    assert "a driver that passes over it reaches none of the 2 waypoints after it" in choice.legality[0].message
+    assert "none of the 2 waypoints after it" in choice.policy_conflict
+    with pytest.raises(Infeasible, match="use regionBased navigation"):
+        plan(corner, fenced(200, 0), FORBID)
+    high = Zone.from_body(
+        manifest("Zone", "z", {"area": {"circle": {"center": at(200, 0), "radius": 20}}, "altitude": {"lower": 40}})
+    )
+    above = stock(policy("keep-out", zones=["z"], **FENCE), zones=[high])
+    up = application(navigator([at(100, 0, 10), at(200, 0, 50), at(300, 0, 10)]))
+    legs = [leg for leg in plan(up, above, WARN).drone.legality if leg.outcome == "Denied"]
+    assert legs
+    assert "passes over it" not in legs[0].message, "the driver passes below"

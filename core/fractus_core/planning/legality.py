@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from typing import Literal
 
 from fractus_core.api.applications import Application
@@ -28,6 +29,9 @@ TAKEOFF_ALTITUDE_M = 10.0
 MAX_WAYS, MAX_SEARCHES = 10, 20
 """Ways that are judged for one plan, and ways around zones that are looked for: each of these takes up to 80 ms, while the
 operator does nothing else."""
+
+MAX_LEFT = 100
+"""Waypoints after a denied one that are judged from before it."""
 
 _MAX_DENIED = 5
 """Denied legs after which a way is not judged any further."""
@@ -178,12 +182,12 @@ class _Flight:
     def fly(self, legs: list[MissionLeg]) -> None:
         """Take off and fly the legs, until too many are denied."""
         self._take_off(legs)
-        for leg in legs:
+        for index, leg in enumerate(legs):
             # An answer that costs a search need not be found twice: the way is not legal.
             if [n.outcome for n in self.noted].count("Denied") >= _MAX_DENIED:
                 return
             if (leg.start.lat, leg.start.lon) != (leg.end.lat, leg.end.lon) or leg.end.alt is not None:
-                self._fly(leg)
+                self._fly(leg, legs[index + 1 :])
 
     def way(self, climb_speed_mps: float, stay_min: float) -> Way:
         """What was flown, with the landing."""
@@ -208,7 +212,7 @@ class _Flight:
         self.climbed_m += height
         self.now = replace(self.now, altitude_m=height, in_air=True)
 
-    def _fly(self, leg: MissionLeg) -> None:
+    def _fly(self, leg: MissionLeg, following: list[MissionLeg]) -> None:
         asked = GotoArgs(leg.end.lat, leg.end.lon, leg.end.alt, leg.end.altitude_reference)
         verdict = judge(Call("Goto", asked), self.now, self.driver if leg.flown_by == "driver" else self.grant)
         if isinstance(verdict.args, GotoArgs) and _same_place(verdict.args, asked):
@@ -227,8 +231,18 @@ class _Flight:
             self._note(leg, "Detour", verdict, f"the system flies around, {self.distance_m - before_m:.0f} m: ")
             return
         given_up = leg.flown_by == "system" and self.searches <= 0
-        self._note(leg, "Denied", verdict, "no more ways around are looked for: " if given_up else "")
+        after = self._stranded(following) if leg.flown_by == "driver" else ""
+        self._note(leg, "Denied", verdict, "no more ways around are looked for: " if given_up else "", after)
         self._arrive(asked)
+
+    def _stranded(self, following: list[MissionLeg]) -> str:
+        """What a driver should know that passes over a denied waypoint: from before it no other one may be legal."""
+        left = list(takewhile(lambda leg: leg.flown_by == "driver", following))[:MAX_LEFT]
+        ends = [GotoArgs(leg.end.lat, leg.end.lon, leg.end.alt, leg.end.altitude_reference) for leg in left]
+        if not ends or any(judge(Call("Goto", end), self.now, self.driver).permits for end in ends):
+            return ""
+        count = f"none of the {len(ends)} waypoints after it" if len(ends) > 1 else "the waypoint after it neither"
+        return f"; a driver that passes over it reaches {count}: move the path, or use regionBased navigation"
 
     def _around(self, asked: GotoArgs) -> list[GotoArgs] | None:
         """The legs of a legal way to a place, as they are permitted; None if no short search finds one."""
@@ -274,7 +288,12 @@ class _Flight:
         self.now = replace(now, lat=flown.lat, lon=flown.lon, altitude_m=height)
 
     def _note(
-        self, leg: MissionLeg, outcome: Literal["Detour", "Corrected", "Denied"], verdict: Verdict, how: str = ""
+        self,
+        leg: MissionLeg,
+        outcome: Literal["Detour", "Corrected", "Denied"],
+        verdict: Verdict,
+        how: str = "",
+        after: str = "",
     ) -> None:
         self.noted.append(
             LegLegality(
@@ -283,7 +302,7 @@ class _Flight:
                 flown_by=leg.flown_by,
                 outcome=outcome,
                 reason=verdict.code,
-                message=how + verdict.reason,
+                message=how + verdict.reason + after,
                 policies=verdict.policies,
             )
         )

@@ -277,6 +277,28 @@ def test_control_is_granted_and_returned() -> None:
     assert actions == (RefuseStream(2, "MissionComplete", "the mission is complete"),)
 
 
+@pytest.mark.parametrize(
+    ("done", "kind"),
+    [
+        ((), OutcomeKind.FAILED),
+        ((told.WaypointsDone("a", 2),), OutcomeKind.FAILED),
+        ((told.WaypointsDone("a", 0, leg=True),), OutcomeKind.COMPLETE),
+        (
+            (told.WaypointsDone("a", 1, leg=True), told.ControlReturned("a", 2, paths=True), *ASKS[1:]),
+            OutcomeKind.COMPLETE,
+        ),
+    ],
+)
+def test_a_mission_that_flew_nothing_of_its_path_is_not_complete(
+    done: tuple[told.Event, ...], kind: OutcomeKind
+) -> None:
+    state, _ = told_of(*FLIES, *done, told.ControlReturned("a", 1, paths=True))
+    outcome = state.missions["a"].outcome
+    assert outcome is not None
+    assert outcome.kind is kind
+    assert state.returning, "the drone comes home all the same"
+
+
 @pytest.mark.parametrize("action", ["hover", "land", "returnToLaunch", "revoke"])
 def test_a_takeover_ends_the_mission_unless_it_only_hovers(action: Any) -> None:
     state, _ = told_of(*FLIES, told.TakeoverDemanded(action, "Code", "why"))

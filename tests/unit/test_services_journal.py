@@ -54,7 +54,7 @@ async def test_the_first_version_is_read(tmp_path: Path, stored: str, outcome: O
     body = {"version": 1, "active": "k", "missions": [{**mission, "home": [39, 22, 10]}]}
     (tmp_path / "journal.json").write_text(json.dumps(body))
     found = Journal(tmp_path).record
-    assert found == Record({"k": Mission("k", "id", outcome, 2, 3, True, (39.0, 22.0, 10.0))}, "k")
+    assert found == Record({"k": Mission("k", "id", outcome, 2, 3, True, (39.0, 22.0, 10.0), True)}, "k")
 
 
 @pytest.mark.parametrize("odd", ["lost in space", {"kind": "lost", "reason": ""}, {"kind": "failed"}, 7, ["failed"]])

@@ -26,6 +26,7 @@ from fractus_core.control.events import (
 from fractus_core.control.step import DRIVER_LOST, Step
 from fractus_core.control.values import (
     COMPLETE,
+    NOTHING_FLOWN,
     ActiveMotion,
     Authority,
     ControlEvent,
@@ -60,10 +61,11 @@ def on_driver(step: Step, event: DriverEvent) -> None:
             _grant(step, lease_id)
         case ControlReturned():
             _return(step, event)
-        case WaypointsDone(key, waypoints):
+        case WaypointsDone(key):
             mission = step.state.missions.get(key)
-            if mission is not None and waypoints > mission.waypoints:
-                step.update_mission(mission, waypoints=waypoints)
+            if mission is not None and (event.waypoints > mission.waypoints or (event.leg and not mission.leg_flown)):
+                waypoints, flown = max(event.waypoints, mission.waypoints), mission.leg_flown or event.leg
+                step.update_mission(mission, waypoints=waypoints, leg_flown=flown)
                 step.act(SaveJournal())
         case CruiseSpeedSet(speed_mps):
             step.set(speed_mps=speed_mps)
@@ -117,9 +119,10 @@ def _return(step: Step, event: ControlReturned) -> None:
     last = mission.points_done >= event.control_points
     step.set(lease=None, authority=Authority.SYSTEM)
     step.stop_motion(StopKind.ABORTED, "ControlReturned", "control was returned")
-    step.audit("control", "returned", lease.identity, "the mission is complete" if last else "")
+    outcome = NOTHING_FLOWN if event.paths and not mission.leg_flown else COMPLETE
+    step.audit("control", "returned", lease.identity, f"the mission is {outcome}" if last else "")
     if last:
-        step.update_mission(mission, outcome=COMPLETE)
+        step.update_mission(mission, outcome=outcome)
         done = ControlEvent(StreamState.COMPLETE, mission.points_done - 1, "every control point is done")
         step.act(SendEvent(lease.lease_id, done))
         step.start(TaskKind.RETURN)

@@ -50,18 +50,30 @@ class GrantControl:
 
 @dataclass(frozen=True, slots=True)
 class ControlReturned:
-    """A driver returns control at the end of a control point; its grant names `control_points` of them."""
+    """A driver returns control at the end of a control point.
+
+    Attributes:
+        control_points: how many of them its grant names.
+        paths: whether one of them has a path.
+    """
 
     key: str
     control_points: int
+    paths: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class WaypointsDone:
-    """The driver is done with the first `waypoints` waypoints of its control point's task, reached or passed over."""
+    """The driver is done with the first waypoints of its control point's task.
+
+    Attributes:
+        waypoints: how many, reached or passed over.
+        leg: whether a leg of the driver has ended, there or elsewhere.
+    """
 
     key: str
     waypoints: int
+    leg: bool = False
 
 
 @dataclass(frozen=True, slots=True)

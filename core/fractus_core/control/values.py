@@ -89,6 +89,7 @@ class Outcome:
 
 
 COMPLETE = Outcome(OutcomeKind.COMPLETE)
+NOTHING_FLOWN = Outcome(OutcomeKind.FAILED, "nothing of its path was flown: no leg of the driver came to its end")
 
 
 def ended_refusal(outcome: Outcome) -> tuple[str, str]:
@@ -110,6 +111,7 @@ class Mission:
         waypoints: waypoints of the present control point that were reached, or points of interest that were visited.
         flown: whether the vehicle has been in the air for it.
         home: latitude, longitude and altitude above sea level of where it armed first.
+        leg_flown: whether a leg of its driver has ended, or its driver has steered it.
     """
 
     key: str
@@ -119,6 +121,7 @@ class Mission:
     waypoints: int = 0
     flown: bool = False
     home: tuple[float, float, float] | None = None
+    leg_flown: bool = False
 
 
 class StreamState(Enum):

@@ -89,7 +89,8 @@ async def give_back(control: Control, grant: ActiveGrant) -> bool:
     """A driver returns control at the end of a control point; True when that was the last one."""
     require(control, grant)
     points = len(grant.spec.control_points)
-    control.dispatch(ControlReturned(grant.key, points))
+    paths = any(point.path for point in grant.spec.control_points)
+    control.dispatch(ControlReturned(grant.key, points, paths))
     last = control.mission(grant).points_done >= points
     await control.save()
     return last
@@ -107,10 +108,17 @@ async def report(control: Control, grant: ActiveGrant, waypoints: int) -> None:
 
 
 def reached(control: Control, grant: ActiveGrant, lat: float, lon: float) -> None:
-    """A goto of the driver is complete: count the waypoint."""
+    """A leg of the driver has ended: count the waypoint, if it is the next one of the path."""
     mission, points = control.mission(grant), grant.spec.control_points
     path = points[mission.points_done].path if mission.points_done < len(points) else None
-    if path and mission.waypoints < len(path):
-        ahead = path[mission.waypoints]
-        if math.hypot(*LocalFrame(ahead.lat, ahead.lon).xy(lat, lon)) <= WAYPOINT_M:
-            control.dispatch(WaypointsDone(grant.key, mission.waypoints + 1))
+    ahead = (path or ())[mission.waypoints : mission.waypoints + 1]
+    near = any(math.hypot(*LocalFrame(lat, lon).xy(one.lat, one.lon)) <= WAYPOINT_M for one in ahead)
+    if near or not mission.leg_flown:
+        control.dispatch(WaypointsDone(grant.key, mission.waypoints + near, leg=True))
+
+
+def steered(control: Control, grant: ActiveGrant) -> None:
+    """The driver steers by velocities, which have no end: they count as a leg."""
+    mission = control.mission(grant)
+    if not mission.leg_flown:
+        control.dispatch(WaypointsDone(grant.key, mission.waypoints, leg=True))

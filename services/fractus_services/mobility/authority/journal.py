@@ -46,6 +46,8 @@ def _outcome(stored: Any) -> Outcome:
 def _mission(stored: dict[str, Any]) -> Mission:
     """A stored mission; what a newer release wrote beside it is left out."""
     known = {name: value for name, value in stored.items() if name in _FIELDS}
+    # Earlier releases did not count legs: one that was in the air may have flown some.
+    known.setdefault("leg_flown", known.get("flown", False))
     if known.get("outcome"):
         known["outcome"] = _outcome(known["outcome"])
     else:

@@ -206,6 +206,7 @@ class MobilityService:
             final = await self._settled(Call("SetVelocity", args), grant, verdict, motion, permit)
             setpoint = final.args if isinstance(final.args, VelocityArgs) else args
             self._steering.steer(setpoint, motion, permit)
+            drivers.steered(self._control, grant)
         except BaseException:  # a caller that hangs up while the drone brakes leaves it hovering, too
             self._control.failed(motion)
             raise

@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from fractus_agent.cluster.store import End, Event, Listed
+from fractus_agent.cluster.store import End, Event, KubeError, Listed
 from fractus_agent.links.connectivity import Connectivity
 from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_core.linking import Seen
@@ -43,6 +43,8 @@ class Files:
             await asyncio.sleep(POLL_S)
 
     async def apply_status(self, _kind: str, name: str, status: dict[str, Any], end: End | None = None) -> None:
+        if self.read("api.json") is False:
+            raise KubeError(0, "Unreachable", "the API server is out of reach")
         print(json.dumps({"link": name, "end": end, "status": status}), flush=True)
 
 

@@ -92,6 +92,17 @@ class Agent:
         with self.world.turn:
             self.world.radio.add_station(self.name, tap, Station((*self.at, 0.0), hardware, "net"))
 
+    def uplink(self, *, up: bool) -> None:
+        """The way to the cloud goes, or comes back."""
+        run(*self.world.inside(self.name), "ip", "link", "set", "lte0", "up" if up else "down")
+        if up:
+            way = f"10.90.{self.number}.2"
+            run(*self.world.inside(self.name), "ip", "route", "replace", "default", "via", way)
+
+    def api(self, *, up: bool) -> None:
+        """The API server is in reach of the agent, or not."""
+        self._write("api.json", up)
+
     def lose_radio(self) -> None:
         """The device goes, as one on USB does."""
         self._rename("wlan0", "gone0")
@@ -116,6 +127,15 @@ class Agent:
             [*self.world.inside(self.name), sys.executable, "-c", program], capture_output=True, timeout=30, check=False
         )
         return done.returncode == 0
+
+    def metrics(self) -> dict[str, float]:
+        """What Prometheus is told on the node's loopback."""
+        program = (
+            "import urllib.request as r; print(r.urlopen('http://127.0.0.1:46812/metrics', timeout=10).read().decode())"
+        )
+        lines = self._show("env", "-u", "http_proxy", "-u", "HTTP_PROXY", sys.executable, "-c", program).splitlines()
+        samples = (line.rsplit(" ", 1) for line in lines if line and not line.startswith("#"))
+        return {name: float(value) for name, value in samples}
 
     def certify(self, name: str, authority: Authority | None = None) -> None:
         """Give it a node's certificate."""

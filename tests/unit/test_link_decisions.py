@@ -94,7 +94,7 @@ def test_without_a_position_the_link_stays_as_it_is() -> None:
 
 def test_links_that_are_planned_no_more_end() -> None:
     found = done(replace(DIRECT, traffic=()))
-    assert (found.peer, found.link.changes, found.abrupt) == ("", True, {VIP: None})
+    assert (found.peer, found.link.changes, found.planned) == ("", True, {VIP: None})
 
 
 def test_each_application_takes_its_own_path() -> None:

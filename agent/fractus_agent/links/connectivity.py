@@ -13,13 +13,14 @@ from fractus_core.api.nodes import Drone, EdgeNode, Interface, direct_interface
 from fractus_core.linking import PathMetrics, Seen
 
 from fractus_agent.cluster.store import End, Store
-from fractus_agent.links import beacons, pairing
+from fractus_agent.links import beacons, metrics, pairing
 from fractus_agent.links.addressing import link_address
 from fractus_agent.links.beacons import Beacons
 from fractus_agent.links.drone import DroneEnd
 from fractus_agent.links.interfaces.controller import Controller, InterfaceProblem
 from fractus_agent.links.interfaces.simulated import Plain
 from fractus_agent.links.interfaces.wifi import Wifi
+from fractus_agent.links.metrics import LinkMetrics
 from fractus_agent.links.peer import PeerEnd
 from fractus_agent.links.plans import LinkPlans
 from fractus_agent.links.reports import DroneReport, LinkReports, peer_condition
@@ -94,6 +95,7 @@ class Connectivity:
         self._end: End = "drone" if isinstance(resource(), Drone) else "node"
         self._plans = LinkPlans(store, directory, node, self._end, self._planned)
         self._reports = LinkReports(store, self._end, wall)
+        self._metrics = LinkMetrics()
         self._changed = asyncio.Event()
         self._problem: tuple[str, str] | None = None
         self._peer: PeerEnd | None = None
@@ -112,7 +114,7 @@ class Connectivity:
             tasks.create_task(self._hold())
 
     def _planned(self) -> None:
-        if self._drone is not None:
+        if self._drone is not None and self._plans.links:  # without any, it is ended as a whole
             self._drone.plan(self._plans.links)
         if self._peer is not None:
             self._peer.plan(self._plans.links)
@@ -139,7 +141,7 @@ class Connectivity:
                 continue
             using = asyncio.create_task(self._use(interface))
             try:
-                while not using.done() and self._plans.links and self._interface() == interface:
+                while not using.done() and self._needed() and self._interface() == interface:
                     self._changed.clear()
                     changed = asyncio.create_task(self._changed.wait())
                     await asyncio.wait({using, changed}, timeout=CHECK_S, return_when=asyncio.FIRST_COMPLETED)
@@ -150,6 +152,10 @@ class Connectivity:
             if not using.cancelled() and (error := using.exception()) is not None:
                 self._set_problem("Failed", f"direct links failed, and are tried again: {_first(error)}")
                 await asyncio.sleep(RETRY_S)
+
+    def _needed(self) -> bool:
+        """Whether links are planned, or a drone whose link was has not led its calls back yet."""
+        return bool(self._plans.links or (self._peer is not None and self._peer.drones))
 
     def _interface(self) -> Interface | None:
         node = self._resource()
@@ -212,11 +218,14 @@ class Connectivity:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(told.run(device))
                 tasks.create_task(run())
+                if self._drone is not None:
+                    tasks.create_task(metrics.serve(self._metrics.text))
         finally:
             self._drone = self._peer = None
             self._say()
 
     def _report(self, report: DroneReport) -> None:
+        self._metrics.take(report)
         if self._problem is None:
             self._reports.drone(report)
 

@@ -107,11 +107,10 @@ def decide(now: Situation, settings: Settings) -> Actions:
         found = targets[traffic.application] = _target(traffic, now, leaving, settings)
         for service in sorted(traffic.services):
             to = now.routes.get(service) if found.direct else None
-            if (before := now.redirects.get(service)) != to:
-                lives = before is None or before in now.routes.values()
-                (planned if lives else abrupt)[service] = to
+            if now.redirects.get(service) != to:
+                (planned if _lives(service, now) else abrupt)[service] = to
     for service in now.redirects.keys() - {s for traffic in now.traffic for s in traffic.services}:
-        abrupt[service] = None
+        (planned if _lives(service, now) else abrupt)[service] = None
     return Actions(abrupt, planned, link.peer, link, targets)
 
 
@@ -136,6 +135,12 @@ def _expected(peer: Peer, track: Track, now: Situation) -> bool:
     reach = expected(now.reaches, peer.name)
     silent = now.now_s - reach.heard_s > HEARD_S
     return not silent or math.dist(track.position, peer.position) > peer.range_m * reach.range_factor
+
+
+def _lives(service: Endpoint, now: Situation) -> bool:
+    """Whether the path that a service takes now works: the cloud path always counts as one that does."""
+    before = now.redirects.get(service)
+    return before is None or before in now.routes.values()
 
 
 def _leaves(now: Situation, settings: Settings) -> bool:

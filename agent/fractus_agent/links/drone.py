@@ -126,7 +126,8 @@ class DroneEnd:
 
     async def _step(self) -> None:
         """One decision, and what it asks for."""
-        self._redirector.serve(virtuals(self._links))
+        # Those that are not planned any more as well, for as long as their traffic takes the link.
+        self._redirector.serve({*virtuals(self._links), *self._redirector.redirects})
         situation = self._situation()
         actions = decide(situation, self._settings)
         self._explain(actions)
@@ -267,6 +268,8 @@ class DroneEnd:
                 measured=situation.direct,
                 reaches=self._lessons.reaches,
                 unknown=dict(self._unknown),
+                cloud=situation.cloud,
+                offers=self._lessons.offers(),
             )
         )
 

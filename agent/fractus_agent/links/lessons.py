@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from fractus_core.linking import PathMetrics, Peer, Position, Reach, Settings
-from fractus_core.linking.learning import connected, failed, heard, lost, measured
-from fractus_core.linking.prediction import strength
+from fractus_core.linking.learning import connected, expected, failed, heard, lost, measured
+from fractus_core.linking.prediction import offered, strength
 
 
 @dataclass(slots=True)
@@ -54,6 +54,15 @@ class Lessons:
         share = strength(distance / self._own(name).range_factor, self.settings.edge)
         if share >= 1:
             self.reaches[name] = measured(self._own(name), path.ingress_mbps / peer.offers.ingress_mbps)
+
+    def offers(self) -> dict[Peer, PathMetrics | None]:
+        """What the links to all peers are expected to offer from here; None out of reach."""
+        if self.here is None:
+            return {}
+        return {
+            peer: offered(peer, expected(self.reaches, peer.name), self.here, self.settings)
+            for peer in self.peers.values()
+        }
 
     def _own(self, name: str) -> Reach:
         return self.reaches.get(name, Reach())

@@ -24,6 +24,8 @@ MAX_DRONES = 1
 FIRST_PORT, LAST_PORT = 30_000, 39_999
 """Ports on the link's address that stand for pods; nothing listens there, they are translated."""
 LISTEN_RETRY_S = 1.0
+PARTING_S = 3.0
+"""A drone whose DirectLink is gone has so long to lead its calls back."""
 
 
 class PeerEnd:
@@ -88,6 +90,7 @@ class PeerEnd:
                     await session.send({"routes": routes})
                     told = routes
                 await planned.wait()
+            await asyncio.sleep(PARTING_S)
         finally:
             self._routes.pop(session.peer, None)
             self._changed()

@@ -10,7 +10,7 @@ from datetime import datetime
 from typing import Any
 
 from fractus_core.api.links import LINKED, PEER_READY, TRAFFIC_DIRECT, DirectLink
-from fractus_core.linking import Link, PathMetrics, Phase, Reach
+from fractus_core.linking import Link, PathMetrics, Peer, Phase, Reach
 
 from fractus_agent.cluster.store import End, Object, Store
 from fractus_agent.conditions import Condition, timestamp, to_kubernetes
@@ -37,6 +37,8 @@ class DroneReport:
         measured: of the link that is up; None before that.
         reaches: what was learned of peers.
         unknown: applications whose heuristic is not known here, and why.
+        cloud: what the cloud path offers.
+        offers: what the links to peers are expected to offer where the drone is; None out of reach.
     """
 
     links: tuple[DirectLink, ...]
@@ -46,6 +48,8 @@ class DroneReport:
     measured: PathMetrics | None
     reaches: Mapping[str, Reach]
     unknown: Mapping[str, str]
+    cloud: PathMetrics
+    offers: Mapping[Peer, PathMetrics | None]
 
 
 def drone_status(report: DroneReport, about: DirectLink) -> tuple[dict[str, Any], list[Condition]]:

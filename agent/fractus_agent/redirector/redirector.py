@@ -32,6 +32,7 @@ DRAIN_POLL_S = 0.004
 MIN_IDLE_MS, MAX_IDLE_MS = 2 * JIFFY_MS, 500
 WORK_MARGIN = 1.5
 WORK_DECAY = 0.9
+UNKNOWN_WORK_MS = 60.0
 """A connection is idle once nothing has come for longer than its server usually takes to answer. Frames that answer nothing,
 such as HTTP/2's pings and window updates, look like replies; so how long a service works is learned from its connections
 all the time. No longer than needed is waited: the next request comes at some time, and one that meets a connection while it
@@ -291,7 +292,7 @@ class Redirector:
 
     def _enough_ms(self, connection: Connection, left: float) -> float:
         """For how long a connection must have been idle to be closed, with this share of the time left."""
-        worked_ms = max(self._worked_ms.get(connection.peer, 0.0), connection.worked_ms)
+        worked_ms = max(self._worked_ms.get(connection.peer, UNKNOWN_WORK_MS), connection.worked_ms)
         return max(min(WORK_MARGIN * worked_ms, MAX_IDLE_MS) * min(2 * left, 1.0), MIN_IDLE_MS)
 
     async def _drain(self, old: Collection[bytes], moved: Collection[Endpoint]) -> int:

@@ -135,6 +135,18 @@ def test_links_that_break_near_say_nothing_of_the_reach() -> None:
     assert far.reaches["e1"].range_factor == pytest.approx(0.8 / 1.02)
 
 
+def test_a_link_that_broke_where_its_peer_is_still_heard_did_not_break_for_the_distance() -> None:
+    found = lessons(64.0)
+    found.broke("e1", NOW_S)
+    assert found.reaches["e1"].retry_s > NOW_S
+    found.peers = {"e1": replace(NEAR, position=(50.0, 0.0, 0.0))}
+    found.beacon("e1", NOW_S + 0.5)
+    assert found.reaches["e1"].range_factor == pytest.approx(0.8 / 1.02)
+    found.peers = {"e1": replace(NEAR, position=(64.0, 0.0, 0.0))}
+    found.beacon("e1", NOW_S + 1.0)
+    assert found.reaches["e1"].range_factor == 1.0
+
+
 def test_rates_are_learned_well_inside_the_reach_only() -> None:
     inside, edge = lessons(10.0), lessons(79.0)
     for found in (inside, edge):

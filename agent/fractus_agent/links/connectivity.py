@@ -188,11 +188,12 @@ class Connectivity:
             keeping.cancel()
             await asyncio.gather(keeping, return_exceptions=True)
             redirector.close()
+            with suppress(nft.RedirectFailed):
+                nft.remove()
+            # After the table, which would mark new connections.
             with suppress(NetlinkError):
                 conntrack.forget_all()
             netlink.close()
-            with suppress(nft.RedirectFailed):
-                nft.remove()
             try:
                 await controller.down()
             except InterfaceProblem as problem:

@@ -45,6 +45,8 @@ PROBE_S = 3.0
 """Seconds between two probes of a link that is up."""
 PROBES = 3
 """The best of the last N counts: a probe that meets the components' own traffic shows what is left beside it."""
+LEAVE_S = 2.0
+"""So long before the drone leaves a link's reach its traffic is led back: a drain takes a second, and reaches have soft edges."""
 DIRECT_LATENCY_MS = 5.0
 """What a link is expected to need before it was measured."""
 
@@ -59,7 +61,6 @@ class DroneEnd:
         cloud: what the cloud path offers.
         seen: what telemetry says of the drone now; None while it says nothing.
         report: takes what becomes of the links.
-        settings: of decisions.
     """
 
     def __init__(
@@ -71,13 +72,12 @@ class DroneEnd:
         cloud: Callable[[], PathMetrics],
         seen: Callable[[], Seen | None],
         report: Callable[[DroneReport], None],
-        settings: Settings | None = None,
     ) -> None:
         self._redirector = redirector
         self._cloud = cloud
         self._seen = seen
         self._report = report
-        self._settings = settings or Settings()
+        self._settings = Settings(drain_s=LEAVE_S)
         self._connector = Connector(node, tls, self._use, self._link_changed)
         self._lessons = Lessons(self._settings)
         self._links: tuple[DirectLink, ...] = ()

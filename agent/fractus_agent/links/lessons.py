@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from fractus_core.linking import PathMetrics, Peer, Position, Reach, Settings
 from fractus_core.linking.learning import connected, expected, failed, heard, lost, measured
 from fractus_core.linking.prediction import offered, strength
+
+HEARD_AGAIN = 0.98
+"""From this share of the distance at which a link broke, a beacon shows that it broke for another reason."""
 
 
 @dataclass(slots=True)
@@ -25,10 +28,16 @@ class Lessons:
     reaches: dict[str, Reach] = field(default_factory=dict)
     here: Position | None = None
     peers: Mapping[str, Peer] = field(default_factory=dict)
+    _before_loss: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     def beacon(self, name: str, now_s: float) -> None:
-        """A peer was heard."""
-        self.reaches[name] = heard(self._own(name), self._distance(name) or 0.0, now_s)
+        """A peer was heard; where its link broke no nearer than here, that was not for the distance."""
+        distance = self._distance(name) or 0.0
+        before = self._before_loss.get(name)
+        if before is not None and distance >= before[0]:
+            del self._before_loss[name]
+            self.reaches[name] = replace(self._own(name), range_factor=before[1])
+        self.reaches[name] = heard(self._own(name), distance, now_s)
 
     def came_up(self, name: str, now_s: float) -> None:
         """The link to a peer came up."""
@@ -40,11 +49,11 @@ class Lessons:
 
     def broke(self, name: str, now_s: float) -> None:
         """The link to a peer broke; one that broke well inside its reach is no sign of how far it reaches."""
-        distance = self._distance(name)
-        if distance is not None and distance / self._own(name).range_factor >= self.settings.edge / 2:
+        distance, factor = self._distance(name), self._own(name).range_factor
+        self.reaches[name] = failed(self._own(name), now_s)
+        if distance is not None and distance / factor >= self.settings.edge / 2:
             self.reaches[name] = lost(self._own(name), distance)
-        else:
-            self.reaches[name] = failed(self._own(name), now_s)
+            self._before_loss[name] = (distance * HEARD_AGAIN, factor)
 
     def delivered(self, name: str, path: PathMetrics) -> None:
         """The link to a peer was measured."""

@@ -64,11 +64,15 @@ class AutoFlight(Flight):
     def wait(self, v: VehicleState) -> None:
         """Motors off: the mission only names the item that it would begin with."""
         if not self._announced and v.origin is not None:
-            self.announce(v)
+            self._announced = True
+            self._announce(v)
 
-    def announce(self, v: VehicleState) -> None:
-        """Name the item to begin with, as a start of the mission does."""
-        self._announced = True
+    def start_by_command(self, v: VehicleState) -> None:
+        """MISSION_START: a mission that does not run yet is named here, and again when its first step begins it."""
+        if not self._started and not self._announced:
+            self._announce(v)
+
+    def _announce(self, v: VehicleState) -> None:
         index = v.mission.first_navigating(v.mission.current)
         if index is not None:
             v.mission.current = index

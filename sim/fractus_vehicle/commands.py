@@ -198,7 +198,7 @@ def _mission_start(vehicle: Vehicle, _o: Order, _c: Channel) -> MAV_RESULT:
         return MAV_RESULT.FAILED
     flight = vehicle.modes.flight
     if isinstance(flight, AutoFlight):
-        flight.announce(vehicle.state)
+        flight.start_by_command(vehicle.state)
     return MAV_RESULT.ACCEPTED
 
 

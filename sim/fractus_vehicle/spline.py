@@ -94,19 +94,21 @@ class SplineLeg:
         control.track(
             self.at(self._share),
             (slope[0] * pace, slope[1] * pace, slope[2] * pace),
-            self._acceleration(slope, bend, pace),
+            self._acceleration(slope, bend, pace, control.limits.accel_mps2),
         )
 
-    def _acceleration(self, slope: Point, bend: Point, pace: float) -> Point:
+    def _acceleration(self, slope: Point, bend: Point, pace: float, most_mps2: float) -> Point:
         """What keeps the vehicle on the curve, and what changes its speed."""
         size2 = max(slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2, 1e-12)
         along = (slope[0] * bend[0] + slope[1] * bend[1] + slope[2] * bend[2]) / size2
         push, pace2 = self._accel_mps2 / math.sqrt(size2), pace * pace
-        return (
+        asked = (
             (bend[0] - along * slope[0]) * pace2 + push * slope[0],
             (bend[1] - along * slope[1]) * pace2 + push * slope[1],
             (bend[2] - along * slope[2]) * pace2 + push * slope[2],
         )
+        # Where a short tangent bends the curve sharply, more than the vehicle can: what follows would have to undo it.
+        return _scaled(asked, min(1.0, most_mps2 / max(math.hypot(*asked), 1e-6)))
 
     def reached(self, v: VehicleState, radius_m: float) -> bool:
         """Whether the curve is flown."""

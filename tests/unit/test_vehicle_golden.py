@@ -12,13 +12,13 @@ from fractus_vehicle.pilot import Pilot
 from vehicle_flights import at_random, breaches, by_hand, failing, mission, pilot_of, smart_return
 
 FLIGHTS: tuple[tuple[Callable[[Pilot], None], int, dict[str, float], str], ...] = (
-    (mission, 2, {"SIM_WIND_SPD": 5.0, "SIM_WIND_TURB": 1.5, "WP_YAW_BEHAVIOR": 0.0}, "4676e4f746f412c8"),
+    (mission, 2, {"SIM_WIND_SPD": 5.0, "SIM_WIND_TURB": 1.5, "WP_YAW_BEHAVIOR": 0.0}, "8adffc65937802f7"),
     (by_hand, 3, {"SIM_WIND_SPD": 4.0, "SIM_WIND_TURB": 2.0}, "ad47594a06565648"),
     (smart_return, 4, {}, "dc8ccbc04cdeb876"),
     (breaches, 5, {}, "2e75829ce40fc8d4"),
     (breaches, 6, {"FENCE_ACTION": 3.0}, "1484419e06b649d6"),
     (failing, 7, {}, "55909c587762d676"),
-    (at_random, 10, {}, "f36bd910483fbe32"),
+    (at_random, 10, {}, "a6e29855425983da"),
     (at_random, 17, {}, "ac37ff3503e4f8f4"),
 )
 

@@ -301,6 +301,14 @@ def test_splines_bend_around_their_points_without_stopping():
     assert "Mission: 2 SplineWP" in pilot.texts
 
 
+def test_a_return_after_a_sharp_end_of_a_spline_begins_from_there():
+    items = [_waypoint(25.0, 0.0, 12.0), _waypoint(25.0, 25.0, 12.0), _waypoint(0.0, 25.0, 12.0, command=82)]
+    vehicle, _, way = _fly_mission([*items, {"command": 20}])
+    assert max(math.hypot(north, east) for north, east, *_ in way) < 40.0
+    assert max(speed for _, _, _, speed, _ in way) < 11.0
+    assert vehicle.landed
+
+
 def test_a_stay_at_a_spline_point_stops_there():
     items = [_waypoint(40.0, 0.0, 10.0, command=82, param1=4.0), _waypoint(40.0, 40.0, 14.0, command=82)]
     _, _, way = _fly_mission(items)

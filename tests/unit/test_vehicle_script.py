@@ -18,7 +18,7 @@ def test_the_vehicle_answers_as_the_real_one():
         if verdict == "differs":
             differing.append(f"{step.name}: real {step.real}, ours {answer}")
 
-    assert compare(SimulatedLine(), report) == 0, differing
+    assert compare(SimulatedLine(), report, steps()) == 0, differing
 
 
 @pytest.mark.parametrize(
@@ -30,6 +30,7 @@ def test_the_vehicle_answers_as_the_real_one():
         ("s=5.0~10% mode=6", "s=4.4 mode=6", False),
         ("N=0~0.5", "N=-0.4", True),
         ("N=0~0.5", "E=0.1", False),
+        ("s=5.0~10%", "nothing", False),
     ],
 )
 def test_tolerances_belong_to_single_numbers(real: str, ours: str, same: bool):

@@ -1,6 +1,6 @@
 """One script of MAVLink exchanges, played on any autopilot, beside what a real ArduCopter 4.6.3 answered.
 
-    python tests/unit/vehicle_script.py [--autopilot tcp:HOST:PORT] [--all]
+    python tests/unit/vehicle_script.py [--autopilot tcp:HOST:PORT] [--all] [--steps FILE]
 
 The steps and the real one's answers are in `tests/golden/vehicle/arducopter-4.6.3.tsv`: name, what to do, the answer, and a
 note where the simulated vehicle is meant to differ or where the step cannot be repeated. A number `4.2~10%` holds within 10 %,
@@ -15,7 +15,7 @@ import select
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -38,6 +38,7 @@ HOME = Place.from_degrees(50.864, 4.679, 0.1)
 TARGET: dict[str, Value] = {"target_system": 1, "target_component": 1}
 GUIDED, RTL, BRAKE = 4, 6, 17
 KINDS = {"mission": 0, "fence": 1, "rally": 2}
+LOCAL_FRAMES, BODY_FRAMES = (1, 7, 8, 9, 12, 20, 21), (8, 9)
 TEXTS_S = 0.6
 # What an autopilot says by itself, whatever it is asked.
 SPONTANEOUS = ("EKF3", "GPS 1", "AHRS", "Field", "Barometer", "Calibrating", "RC7", "ArduPilot", "SIM ", "PreArm")
@@ -73,6 +74,10 @@ LISTS: dict[str, list[Row]] = {
     "spline": _mission(_way(25.0, 0.0, 82)),
     "p1_300": _mission(_way(25.0, 0.0, 16, 3, 300.0, 300.0)),
     "nan_p4": _mission(_way(25.0, 0.0, 16, 3, 0.0, 0.0, 0.0, math.nan)),
+    "tour": [
+        *(_HOME_ROW, _TAKEOFF, (178, 3, None, 0.0, 0.0, (1.0, 4.0))),
+        *(_way(25.0, 0.0), _way(25.0, 25.0), _way(0.0, 25.0, 82), _RTL),
+    ],
     "none": [],
     "ring": _ring((4, 4, 4, 4)),
     "two": _ring((2, 2)),
@@ -176,7 +181,10 @@ def _same(wanted: str, got: str) -> bool:
     name, _, number = key.rpartition("=")
     got_name, _, got_number = got.rpartition("=")
     slack = abs(float(number)) * float(tolerance[:-1]) / 100.0 if tolerance.endswith("%") else float(tolerance)
-    return name == got_name and abs(float(got_number) - float(number)) <= slack
+    try:
+        return name == got_name and abs(float(got_number) - float(number)) <= slack
+    except ValueError:
+        return False
 
 
 class Player:
@@ -476,6 +484,48 @@ class Player:
         said = self._said(before)
         return f"E={e1 - e0:.1f} N={n1 - n0:.1f} U={u1 - u0:.1f} vmax={peak:.1f}{said}"
 
+    def do_target(self, frame: str, duration: str, *fields: str) -> str:
+        """Ask for a target five times a second; the way (F and R: ahead and to the right), highest speed and heading then.
+
+        `x` is metres north of here, in a body's frame ahead; all other fields are the message's own; those not named are zero.
+        """
+        asked = {name: float(value) for name, _, value in (field.partition("=") for field in fields)}
+        (n0, e0, u0), number, before = self._position(), int(frame), len(self.texts)
+        heading = math.radians(self.last["GLOBAL_POSITION_INT"].integer("hdg") / 100.0)
+        x = asked.pop("x", 0.0)
+        values: dict[str, Value] = TARGET | {"coordinate_frame": number, **asked}
+        values |= {name: int(asked[name]) for name in ("type_mask", "target_system") if name in asked}
+        if number in LOCAL_FRAMES:
+            name = "SET_POSITION_TARGET_LOCAL_NED"
+            values |= {"x": x + n0, "y": e0, "z": -u0} if number == 1 else {"x": x}
+        else:
+            place, name = self.home.offset(n0 + x, e0), "SET_POSITION_TARGET_GLOBAL_INT"
+            values |= {"lat_int": place.lat_e7, "lon_int": place.lon_e7, "alt": u0}
+            values |= {"lat_int": int(asked["lat_int"])} if "lat_int" in asked else {}
+        peak, end, once = 0.0, self.line.now_s + float(duration), "x" in {f.partition("=")[0] for f in fields}
+        self.line.send(name, values)
+        while self.line.now_s < end:
+            again = self.line.now_s + 0.2
+            while self.line.now_s < again:
+                peak = max(peak, self._fast()[0])
+            if not once:
+                self.line.send(name, values)
+        n1, e1, u1 = self._position()
+        faces = self.last["GLOBAL_POSITION_INT"].integer("hdg") / 100.0
+        turned = (faces - math.degrees(heading) + 180.0) % 360.0 - 180.0
+        north, east = n1 - n0, e1 - e0
+        ahead = north * math.cos(heading) + east * math.sin(heading)
+        right = east * math.cos(heading) - north * math.sin(heading)
+        way = f"F={ahead:.1f} R={right:.1f}" if number in BODY_FRAMES else f"E={east:.1f} N={north:.1f}"
+        said = self._said(before)
+        self._until_still()
+        yaw = f" turned={turned:.0f}" if "yaw_rate" in asked else f" hdg={faces:.0f}" if "yaw" in asked else ""
+        return f"{way} U={u1 - u0:.1f} vmax={peak:.1f}{yaw}{said}"
+
+    def _until_still(self) -> None:
+        self.line.send("SET_POSITION_TARGET_LOCAL_NED", TARGET | {"coordinate_frame": 1, "type_mask": 0xDC7})
+        self._stopped(0.2)
+
     def _run(self, speed: float, duration_s: float = 8.0) -> None:
         end = self.line.now_s + duration_s
         while self.line.now_s < end:
@@ -528,6 +578,21 @@ class Player:
         self._until("HEARTBEAT", 150.0, lambda m: not m.integer("base_mode") & 128)
         return f"s={self.line.now_s - begun_s:.0f}"
 
+    def do_tour(self, last: str) -> str:
+        """Arm in GUIDED and fly the stored mission to its last item; what was reached and told, in order, repeated or not."""
+        self._ordered(MAV_CMD.DO_SET_MODE, [1.0, GUIDED])
+        self._ordered(MAV_CMD.COMPONENT_ARM_DISARM, [1.0])
+        before, seen = len(self.texts), {"MISSION_ITEM_REACHED": [""], "MISSION_CURRENT": [""]}
+        self._ordered(MAV_CMD.MISSION_START, [])
+        for message in self._stream(150.0):
+            if message.name in seen and seen[message.name][-1] != str(message.integer("seq")):
+                seen[message.name].append(str(message.integer("seq")))
+            if seen["MISSION_CURRENT"][-1] == last:
+                break
+        told = [t for t in self.texts[before:] if t[4:].startswith(("Mission", "Reached"))]
+        once = [text for at, text in enumerate(told) if text not in told[at - 1 : at]]
+        return f"reached={','.join(seen['MISSION_ITEM_REACHED'][1:])} | {'; '.join(once)}"
+
     def do_until(self, timeout: str, *words: str) -> str:
         """Wait for a text; the seconds it took and the mode then."""
         begun_s, before, wanted = self.line.now_s, len(self.texts), " ".join(words)
@@ -537,14 +602,17 @@ class Player:
         return f"s={waited_s:.1f} mode={self._mode()}"
 
 
-def compare(line: Line, report: Callable[[Step, str, str], None]) -> int:
-    """Play everything, report each step (with `same`, `differs` or `meant`), and return how many differ."""
+def compare(line: Line, report: Callable[[Step, str, str], None], script: Sequence[Step]) -> int:
+    """Play everything, report each step (with `same`, `differs`, `meant` or `not played`), and return how many differ."""
     player, wrong = Player(line), 0
-    for step in steps():
+    for step in script:
         if not step.do:
             report(step, "", "not played")
             continue
-        answer = player.play(step.do)
+        try:
+            answer = player.play(step.do)
+        except (TimeoutError, AssertionError) as error:
+            answer = f"no answer ({error})"
         verdict = "same" if agrees(step.real, answer) else "meant" if step.note else "differs"
         wrong += verdict == "differs"
         report(step, answer, verdict)
@@ -556,15 +624,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Compare an autopilot with a real ArduCopter 4.6.3.")
     parser.add_argument("--autopilot", help="tcp:HOST:PORT, freshly booted; without it the simulated vehicle is asked")
     parser.add_argument("--all", action="store_true", help="print also what is the same and what is not played")
+    parser.add_argument("--steps", type=Path, default=STEPS, help="another script of this form")
     options = parser.parse_args()
     line: Line = TcpLine(options.autopilot) if options.autopilot else SimulatedLine()
 
+    script, begun_s, played = steps(options.steps), time.monotonic(), 0
+
     def report(step: Step, answer: str, verdict: str) -> None:
+        nonlocal played
+        played += 1
         if options.all or verdict in ("differs", "meant"):
             print(f"{verdict:10} | {step.name} | {step.real} | {answer} | {step.note}", flush=True)
+        progress = f"{played} of {len(script)} steps, {time.monotonic() - begun_s:.0f} s"
+        print(progress, end="\r" if sys.stderr.isatty() else "\n", file=sys.stderr, flush=True)
 
-    wrong = compare(line, report)
-    print(f"{wrong} of {len(steps())} steps differ without being meant to")
+    wrong = compare(line, report, script)
+    print(f"{wrong} of {len(script)} steps differ without being meant to")
     sys.exit(1 if wrong else 0)
 
 

@@ -170,6 +170,7 @@ class World:
             f"/api/v1/namespaces/{namespace}/services",
             f"/apis/apps/v1/namespaces/{namespace}/deployments",
             f"/apis/discovery.k8s.io/v1/namespaces/{namespace}/endpointslices",
+            f"/apis/networking.k8s.io/v1/namespaces/{namespace}/networkpolicies",
         ):
             for item in self.api.list(path, labelSelector="app.kubernetes.io/managed-by=fractus"):
                 found[f"{path.rsplit('/', 1)[1]}/{item['metadata']['name']}"] = item

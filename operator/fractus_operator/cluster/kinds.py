@@ -42,6 +42,7 @@ CONFIG_MAP = Kind("v1", "ConfigMap", "configmaps", namespaced=True)
 EVENT = Kind("v1", "Event", "events", namespaced=True)
 DEPLOYMENT = Kind("apps/v1", "Deployment", "deployments", namespaced=True)
 DISRUPTION_BUDGET = Kind("policy/v1", "PodDisruptionBudget", "poddisruptionbudgets", namespaced=True)
+NETWORK_POLICY = Kind("networking.k8s.io/v1", "NetworkPolicy", "networkpolicies", namespaced=True)
 CONTROLLER_REVISION = Kind("apps/v1", "ControllerRevision", "controllerrevisions", namespaced=True)
 ENDPOINT_SLICE = Kind("discovery.k8s.io/v1", "EndpointSlice", "endpointslices", namespaced=True)
 SIGNING_REQUEST = Kind("certificates.k8s.io/v1", "CertificateSigningRequest", "certificatesigningrequests", False)
@@ -52,6 +53,7 @@ CHILDREN: tuple[Kind, ...] = (
     SECRET,
     SERVICE,
     ENDPOINT_SLICE,
+    NETWORK_POLICY,
     DISRUPTION_BUDGET,
     DEPLOYMENT,
     DIRECT_LINK,

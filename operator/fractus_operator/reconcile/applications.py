@@ -53,6 +53,7 @@ _OF_A_MISSION = (
     kinds.DEPLOYMENT,
     kinds.DISRUPTION_BUDGET,
     kinds.ENDPOINT_SLICE,
+    kinds.NETWORK_POLICY,
     kinds.SERVICE,
     kinds.SECRET,
 )

@@ -56,7 +56,7 @@ def children(
 
 def deployment_plan(application: Application, plan: DeploymentPlanSpec) -> Body:
     """The DeploymentPlan of an application; it carries the application's name."""
-    return _child(kinds.DEPLOYMENT_PLAN, application, application.name, {}, spec=plan.to_dict())
+    return child(kinds.DEPLOYMENT_PLAN, application, application.name, {}, spec=plan.to_dict())
 
 
 def grant(application: Application, spec: GrantSpec) -> Body:
@@ -100,7 +100,7 @@ def _unsigned(spec: GrantSpec) -> Body:
 def tls_secret(application: Application, placed: PlannedInstance, data: dict[str, str]) -> Body:
     """The Secret with an instance's client certificate."""
     described = {labels.COMPONENT_LABEL: placed.component, labels.INSTANCE_LABEL: placed.instance}
-    return _child(
+    return child(
         kinds.SECRET, application, secret_name(placed.instance), described, type="kubernetes.io/tls", data=data
     )
 
@@ -128,7 +128,7 @@ def service(application: Application, component: Component) -> Body:
             labels.COMPONENT_LABEL: component.name,
         }
     name = service_name(application.name, component)
-    return _child(kinds.SERVICE, application, name, {labels.COMPONENT_LABEL: component.name}, spec=spec)
+    return child(kinds.SERVICE, application, name, {labels.COMPONENT_LABEL: component.name}, spec=spec)
 
 
 def endpoint_slice(application: Application, component: Component, pods: Iterable[PodView]) -> Body:
@@ -140,7 +140,7 @@ def endpoint_slice(application: Application, component: Component, pods: Iterabl
         "kubernetes.io/service-name": name,
         "endpointslice.kubernetes.io/managed-by": "operator.fractus.dev",
     }
-    return _child(
+    return child(
         kinds.ENDPOINT_SLICE,
         application,
         name,
@@ -175,7 +175,7 @@ def disruption_budget(application: Application) -> Body:
     """Keeps evictions, such as those of kubectl drain, from what runs on the drone."""
     aboard = {labels.APPLICATION_LABEL: label_value(application.name), labels.PLACEMENT_LABEL: "drone"}
     spec = {"maxUnavailable": 0, "selector": {"matchLabels": aboard}}
-    return _child(kinds.DISRUPTION_BUDGET, application, application.name, {}, spec=spec)
+    return child(kinds.DISRUPTION_BUDGET, application, application.name, {}, spec=spec)
 
 
 def deployment(application: Application, placed: PlannedInstance, drone: Drone | None = None) -> Body:
@@ -202,7 +202,7 @@ def deployment(application: Application, placed: PlannedInstance, drone: Drone |
             "spec": _pod_spec(application, component, placed, drone),
         },
     }
-    body = _child(kinds.DEPLOYMENT, application, placed.instance, _location_labels(component, placed), spec=spec)
+    body = child(kinds.DEPLOYMENT, application, placed.instance, _location_labels(component, placed), spec=spec)
     body["metadata"]["annotations"] = {
         labels.CAUSE_ANNOTATION: f"{_requested_digest(application, component)}@{placed.node or 'cloud'}"
     }
@@ -338,7 +338,16 @@ def _location_labels(component: Component, placed: PlannedInstance) -> dict[str,
     }
 
 
-def _child(kind: Kind, application: Application, name: str, described: dict[str, str], **content: Any) -> Body:
+def child(kind: Kind, application: Application, name: str, described: dict[str, str], **content: Any) -> Body:
+    """A namespaced object that an application owns.
+
+    Args:
+        kind: Of the object.
+        application: Its owner.
+        name: Its name.
+        described: Labels beside those of all that is made for the application.
+        content: What it has beside its metadata.
+    """
     namespace, _ = application.key
     body = kind.header(name, namespace)
     body["metadata"]["labels"] = {**labels_of(application), **described}

@@ -22,13 +22,14 @@ from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile import builders
 from fractus_operator.reconcile.children import Children
 from fractus_operator.reconcile.difference import contains
+from fractus_operator.reconcile.isolation import network_policies
 from fractus_operator.reconcile.links import direct_links, retargeted
 
 _HEAD_START_S = 0.5
 """How long Deployments go first at most, where there are new ones: neither a webhook that holds them up nor pods that no node
 takes delay a Grant for longer."""
 
-_LAST = (kinds.SERVICE, kinds.ENDPOINT_SLICE, kinds.DIRECT_LINK, kinds.DISRUPTION_BUDGET)
+_LAST = (kinds.SERVICE, kinds.ENDPOINT_SLICE, kinds.NETWORK_POLICY, kinds.DIRECT_LINK, kinds.DISRUPTION_BUDGET)
 
 
 class Rollout:
@@ -71,6 +72,7 @@ class Rollout:
             KubeError: the API server refuses one, or cannot be reached.
         """
         wanted = builders.children(application, decided, grants, pods, self._live.drone)
+        wanted[kinds.NETWORK_POLICY] = network_policies(application, decided)
         wanted[kinds.DIRECT_LINK] = self._links(application, decided, pods)
         secrets = {builders.secret_name(placed.instance): placed for placed in decided.placements}
         # The plan before all else: it tells, also after a crash, which application flies the drone and which share its flight.

@@ -113,7 +113,10 @@ class World:
 
     def add_drone(self, name: str) -> None:
         self.add_node(name, "drone")
-        interfaces = [{"technology": "WiFi", "range": 80, "pairing": {"networkId": "x"}}, {"technology": "4G"}]
+        interfaces = [
+            {"technology": "WiFi", "device": "wlan0", "range": 80, "pairing": {"networkId": "x"}},
+            {"technology": "4G"},
+        ]
         mobility = {"maxAltitude": 80, "maxFlightTime": 20, "maxSpeed": 15, "methods": MOBILITY}
         services = {"mobility": mobility, "camera": {"methods": CAMERA}}
         spec = {"depot": "base", "home": at(0, 0, alt=12), "interfaces": interfaces, "services": services}
@@ -127,7 +130,7 @@ class World:
 
     def add_edge(self, name: str, place: Body) -> None:
         self.add_node(name, "edge")
-        interfaces = [{"technology": "WiFi", "range": 80, "pairing": {"networkId": name}}]
+        interfaces = [{"technology": "WiFi", "device": "wlan0", "range": 80, "pairing": {"networkId": name}}]
         spec = {"location": place, "interfaces": interfaces, "services": {"camera": {"methods": CAMERA}}}
         self.put(ours("EdgeNode", name, spec))
 

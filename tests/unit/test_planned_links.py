@@ -38,7 +38,13 @@ def edge(*interfaces: Body) -> dict[str, EdgeNode]:
 
 def wifi(range_m: float | None, mode: str = "adhoc", **more: Any) -> Body:
     reach = {} if range_m is None else {"range": range_m}
-    return {"technology": "WiFi", "pairing": {"mode": mode, "networkId": more.pop("network", "n")}, **reach, **more}
+    return {
+        "technology": "WiFi",
+        "device": "wlan0",
+        "pairing": {"mode": mode, "networkId": more.pop("network", "n")},
+        **reach,
+        **more,
+    }
 
 
 def test_each_end_limits_the_link() -> None:
@@ -54,19 +60,15 @@ def test_each_end_limits_the_link() -> None:
     assert [p.instance for p in first.instances] == ["traffic-image-checker-edge-1"]
 
 
-def test_the_interfaces_that_reach_farthest_link() -> None:
-    two = edge(
-        wifi(50, network="near"),
-        wifi(90, network="far"),
-        {"technology": "BLE", "range": 500, "pairing": {"networkId": "b"}},
-    )
+def test_the_interface_that_the_agent_takes_links() -> None:
+    two = edge(wifi(500, network="no device", device=None), wifi(50, network="first"), wifi(90, network="second"))
     (link,) = plan_links(APPLICATION, PLAN, DRONE, two)
-    assert (link.range_m, link.pairing.network_id) == (90, "far")
+    assert (link.range_m, link.pairing.network_id) == (50, "first")
 
 
 @pytest.mark.parametrize("aboard", [
-    (), ({"technology": "4G"},), (wifi(None),), (wifi(100, "infrastructure"),), ({"technology": "WiFi", "range": 100},),
-    ({"technology": "BLE", "range": 100, "pairing": {"networkId": "n"}},),
+    (), ({"technology": "4G"},), (wifi(None),), (wifi(100, "infrastructure"),), (wifi(100, device=None),),
+    (wifi(100) | {"pairing": None},), (wifi(100) | {"technology": "BLE"},),
 ])  # fmt: skip
 def test_interfaces_that_do_not_pair_make_no_link(aboard: tuple[Body, ...]) -> None:
     assert plan_links(APPLICATION, PLAN, drone(*aboard), edge(wifi(100))) == ()

@@ -33,7 +33,7 @@ def drone(name, home=(0, 0), battery=1.0, ready="True", minutes=15, methods=ALL,
                 "depot": depot,
                 "home": at(*home),
                 "interfaces": [
-                    {"technology": "WiFi", "range": 80, "pairing": {"networkId": "a"}},
+                    {"technology": "WiFi", "device": "wlan0", "range": 80, "pairing": {"networkId": "a"}},
                     {"technology": "4G"},
                 ],
                 "services": {
@@ -60,7 +60,7 @@ def drone(name, home=(0, 0), battery=1.0, ready="True", minutes=15, methods=ALL,
 def edge(name, where, wifi=80, camera=True):
     interfaces = [{"technology": "Ethernet"}]
     if wifi:
-        interfaces.append({"technology": "WiFi", "range": wifi, "pairing": {"networkId": name}})
+        interfaces.append({"technology": "WiFi", "device": "wlan0", "range": wifi, "pairing": {"networkId": name}})
     services = {"camera": {"methods": CAMERA}} if camera else {}
     return EdgeNode.from_body(
         manifest("EdgeNode", name, {"location": at(*where), "interfaces": interfaces, "services": services})

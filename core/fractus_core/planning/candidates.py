@@ -134,13 +134,12 @@ def check_resources(ledger: Ledger, node: str, components: Iterable[Component]) 
     return SUITABLE
 
 
-def direct_interfaces(ours: Iterable[Interface], theirs: Iterable[Interface]) -> tuple[Interface, Interface] | None:
-    """The interfaces by which two nodes talk directly over the longest distance; None when none match.
+def direct_reach_m(ours: Iterable[Interface], theirs: Iterable[Interface]) -> float | None:
+    """How far two nodes can be apart and still talk directly, in metres; None when no interfaces match.
 
     Interfaces match in technology and pairing mode; the lesser range counts.
     """
-    best: tuple[Interface, Interface] | None = None
-    reach_m = 0.0
+    best: float | None = None
     theirs = tuple(theirs)
     for a in ours:
         if a.range is None or a.pairing is None:
@@ -148,15 +147,8 @@ def direct_interfaces(ours: Iterable[Interface], theirs: Iterable[Interface]) ->
         for b in theirs:
             if b.technology != a.technology or b.range is None or b.pairing is None or b.pairing.mode != a.pairing.mode:
                 continue
-            if min(a.range, b.range) > reach_m:
-                best, reach_m = (a, b), min(a.range, b.range)
+            best = max(best or 0.0, min(a.range, b.range))
     return best
-
-
-def direct_reach_m(ours: Iterable[Interface], theirs: Iterable[Interface]) -> float | None:
-    """How far two nodes can be apart and still talk directly, in metres; None when no interfaces match."""
-    pair = direct_interfaces(ours, theirs)
-    return min(i.range for i in pair if i.range is not None) if pair is not None else None
 
 
 def direct_range_m(interfaces: Iterable[Interface]) -> float | None:

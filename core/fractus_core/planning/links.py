@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from fractus_core.api.applications import Application, ApplicationSpec
 from fractus_core.api.components import Component, Heuristic
 from fractus_core.api.geometry import Position
-from fractus_core.api.nodes import Depot, Drone, EdgeNode, Pairing, Technology
+from fractus_core.api.nodes import Depot, Drone, EdgeNode, Pairing, Technology, direct_interface
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
 from fractus_core.planning.area import route_of
-from fractus_core.planning.candidates import direct_interfaces
+from fractus_core.planning.candidates import direct_reach_m
 
 MAX_WAYPOINTS = 1000
 """A longer path is not told: it would be repeated in every link, and agents judge by the velocity instead."""
@@ -70,15 +70,17 @@ def plan_links(
 
 
 def _link(drone: Drone, node: EdgeNode, hosted: Sequence[tuple[Component, PlannedInstance]]) -> PlannedLink | None:
-    ours, theirs = direct_interfaces(drone.spec.interfaces, node.spec.interfaces) or (None, None)
-    if ours is None or theirs is None or ours.range is None or theirs.range is None or theirs.pairing is None:
+    # Agents make links over one interface of their node; what else it has counts for the plan, but links no one.
+    ours, theirs = direct_interface(drone.spec.interfaces), direct_interface(node.spec.interfaces)
+    reach_m = direct_reach_m([ours], [theirs]) if ours is not None and theirs is not None else None
+    if ours is None or theirs is None or theirs.pairing is None or reach_m is None:
         return None
     return PlannedLink(
         drone=drone.name,
         node=node.name,
         technology=theirs.technology,
         pairing=theirs.pairing,
-        range_m=min(ours.range, theirs.range),
+        range_m=reach_m,
         bandwidth_mbps=min(ours.bandwidth_mbps, theirs.bandwidth_mbps),
         position=node.spec.location,
         heuristic=hosted[0][0].heuristic or DEFAULT_HEURISTIC,

@@ -11,12 +11,13 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Coroutine
+from contextlib import AsyncExitStack
 from datetime import UTC, datetime
 from typing import Any
 
 from fractus_core.identity.authority import BrokenAuthority
 
-from fractus_operator import handlers
+from fractus_operator import handlers, metrics
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Key, Kind
 from fractus_operator.cluster.store import KubeError, LeaseThread, LostLease, Store, Unconfigured
@@ -60,11 +61,15 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
     lease = LeaseThread(Store.connect, (settings.namespace, LEASE_NAME), identity, settings.lease_s, time.monotonic)
     store = await Store.connect(may_write_s=lambda: lease.left_s)
     keeping = asyncio.create_task(lease.run())
+    shown = metrics.Observed(lambda: lease.left_s)
+    measuring = AsyncExitStack()
     try:
+        await measuring.enter_async_context(metrics.serving(settings.metrics_port, lambda: shown))
         async with standing_by(settings.health):
             await _leading(lease, keeping)
         authority = await open_authority(store, settings.namespace)
         live = LiveInventory(store, settings.namespace)
+        shown = _observed(lease, live)
         applications = Applications(store, live, authority, _now, settings.planning)
         signing = NodeSigning(store, live.signing_requests.get, authority, settings.agent_user, _now)
         background: list[Coroutine[Any, Any, None]] = [reflector.run() for reflector in live.reflectors()]
@@ -84,7 +89,18 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         # Last of all: until here a write of ours may be under way, and no other operator may lead.
         keeping.cancel()
         await asyncio.gather(keeping, return_exceptions=True)
+        await measuring.aclose()
         await store.aclose()
+
+
+def _observed(lease: LeaseThread, live: LiveInventory) -> metrics.Observed:
+    """What the metrics show of a leader."""
+    return metrics.Observed(
+        lambda: lease.left_s,
+        lambda: {r.kind.plural: (r.watching, r.age_s()) for r in live.reflectors() if r.synced.is_set()},
+        lambda: ((a.body.get("status") or {}).get("phase", "Pending") for a in live.applications.values()),
+        lambda: (d.status.flight_state if d.status else "unknown" for d in live.drones.values() if d is not None),
+    )
 
 
 async def _leading(lease: LeaseThread, keeping: asyncio.Task[None]) -> None:

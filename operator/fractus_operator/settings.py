@@ -48,6 +48,7 @@ class Settings:
         namespace: where the system lives.
         agent_account: name of the agents' service account in that namespace.
         health: URL that the liveness endpoint listens on.
+        metrics_port: where Prometheus finds /metrics; 0: nowhere.
         identity: under which this operator leads, such as the name of its pod; empty: one that no other process has.
         lease_s: for how long no other operator leads after this one was last heard of.
     """
@@ -55,6 +56,7 @@ class Settings:
     namespace: str = "fractus-system"
     agent_account: str = "fractus-agent"
     health: str = "http://0.0.0.0:8080/healthz"
+    metrics_port: int = 0
     identity: str = ""
     lease_s: float = DEFAULT_LEASE_S
     log_level: int = logging.INFO
@@ -67,7 +69,7 @@ class Settings:
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str]) -> Settings:
-        """Read FRACTUS_SYSTEM_NAMESPACE, FRACTUS_AGENT_ACCOUNT, FRACTUS_HEALTH, FRACTUS_IDENTITY, FRACTUS_LEASE, FRACTUS_LOG_LEVEL and the FRACTUS_PLANNING_*.
+        """Read FRACTUS_SYSTEM_NAMESPACE, FRACTUS_AGENT_ACCOUNT, FRACTUS_HEALTH, FRACTUS_IDENTITY, FRACTUS_LEASE, FRACTUS_METRICS_PORT, FRACTUS_LOG_LEVEL and the FRACTUS_PLANNING_*.
 
         Raises:
             BadSetting: naming the variable.
@@ -92,7 +94,8 @@ class Settings:
             raise BadSetting(f"FRACTUS_LEASE: must be at least {MIN_LEASE_S:g} second, but is {lease_s:g}")
         texts = {name: environment[variable] for name, variable in _TEXTS.items() if variable in environment}
         log_level = logging.getLevelNamesMapping()[level]
-        return cls(**texts, lease_s=lease_s, log_level=log_level, planning=planning)
+        port = int(_number(environment, "FRACTUS_METRICS_PORT", 0))
+        return cls(**texts, metrics_port=port, lease_s=lease_s, log_level=log_level, planning=planning)
 
 
 def _plugin(environment: Mapping[str, str], name: str) -> Any:

@@ -23,6 +23,8 @@ from fractus_operator.cluster.reading import SETTLED
 from fractus_operator.cluster.store import Backoff, KubeError, Store
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.inventory.observed import Observed
+from fractus_operator.metrics import phase as timed
+from fractus_operator.metrics import reconciling
 from fractus_operator.reconcile import status
 from fractus_operator.reconcile.children import Children, NameTaken
 from fractus_operator.reconcile.contention import planning_input
@@ -110,7 +112,8 @@ class Applications:
             while not stopped():
                 started = loop.time()
                 try:
-                    next_s = await self.reconcile(key)
+                    with reconciling("application"):
+                        next_s = await self.reconcile(key)
                     backoff.succeeded()
                 except BeingDeleted:
                     return
@@ -230,7 +233,8 @@ class Applications:
             Blocked: it cannot go on for now.
             KubeError: the API server cannot be reached.
         """
-        inventory, lost = planning_input(self._live, seen, self._settings.safety_radius_m)
+        with timed("observe"):
+            inventory, lost = planning_input(self._live, seen, self._settings.safety_radius_m)
         if lost is not None:
             await self._begin_again(seen.key)
             raise Blocked("Queued", "Planned", *lost, retry_s=1.0)
@@ -243,18 +247,21 @@ class Applications:
             return status.waiting(self._deployed(seen, seen.plan, len(seen.grants)), seen.in_flight or ""), RESYNC_S
         try:
             check_application(application, inventory.depots)
-            plan, again_s = self._plan(application, seen, inventory, memory)
+            with timed("plan"):
+                plan, again_s = self._plan(application, seen, inventory, memory)
         except InvalidObject as error:
             raise Blocked("Invalid", "Planned", "Invalid", str(error)) from error
         except Infeasible as none:
             phase: Phase = "Queued" if none.reason == "DroneBusy" else "Pending"
             raise Blocked(phase, "Planned", none.reason, none.message) from none
         try:
-            grants = self._grants.compile(application, plan, seen, inventory)
+            with timed("grants"):
+                grants = self._grants.compile(application, plan, seen, inventory)
         except InvalidObject as error:
             raise Blocked("Pending", "Granted", "PolicyInvalid", str(error)) from error
         try:
-            complete = await self._rollout.carry_out(application, plan, grants, seen.pods, seen.rules)
+            with timed("rollout"):
+                complete = await self._rollout.carry_out(application, plan, grants, seen.pods, seen.rules)
         except NameTaken as error:
             raise Blocked("Pending", "Deployed", "NameTaken", str(error), retry_s=2.0) from error
         except KubeError as error:

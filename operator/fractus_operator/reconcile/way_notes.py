@@ -15,6 +15,7 @@ from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.legality import with_legality
 
 from fractus_operator.cluster.kinds import Key
+from fractus_operator.metrics import phase
 
 logger = logging.getLogger(__name__)
 
@@ -99,7 +100,8 @@ class WayNotes:
         plan, before = arguments[1], self._judged.get(key)
         async with self._turn:
             try:
-                noted = await asyncio.to_thread(with_legality, *arguments)
+                with phase("ways"):
+                    noted = await asyncio.to_thread(with_legality, *arguments)
             except InvalidObject as error:
                 # The application contradicts itself: planning says so.
                 logger.info("way notes: not judged (application=%s/%s): %s", *key, error)

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 
 from fractus_operator.cluster.kinds import Key
 from fractus_operator.cluster.store import Backoff, KubeError
+from fractus_operator.metrics import reconciling
 
 logger = logging.getLogger(__name__)
 
@@ -27,7 +28,8 @@ async def regularly(name: str, step: Callable[[], Awaitable[None]], period_s: fl
     while True:
         pause_s = period_s
         try:
-            await step()
+            with reconciling(name):
+                await step()
             backoff.succeeded()
         except Exception as error:
             pause_s = backoff.delay_s()
@@ -111,7 +113,8 @@ class Worklist:
         try:
             if self._after is not None:
                 await self._after()
-            await self._reconcile(key)
+            with reconciling(self.name):
+                await self._reconcile(key)
         except Exception as error:
             backoff = self.failures.setdefault(key, Backoff(*_BACKOFF_S))
             pause_s = backoff.delay_s()

@@ -26,6 +26,7 @@ from fractus_operator.identity.node_requests import NodeSigning
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile import service_rollout, silence
 from fractus_operator.reconcile.applications import Applications
+from fractus_operator.reconcile.link_events import LinkEvents
 from fractus_operator.reconcile.location import Locations
 from fractus_operator.reconcile.node_reports import NodeReports
 from fractus_operator.reconcile.on_mission import OnMission
@@ -82,6 +83,8 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         rollout = ServiceRollout(store, live, reports, time.monotonic)
         background += [regularly("silence", watch.step, silence.PERIOD_S)]
         background += [regularly("services", rollout.step, service_rollout.PERIOD_S)]
+        links = LinkEvents(store, _now)
+        background += [links.reflector.run(), links.worklist.run()]
         # Cancelling what waits for the lease must not cancel the lease: the last writes need it.
         background += [_wait_for(asyncio.shield(keeping)), _settled(live)]
         await _together(handlers.operator(applications, live.silence_s, settings.health, stop), background)

@@ -9,7 +9,7 @@ import pytest
 from control_plane import wait_for
 from fractus_kube import ContentType
 from operator_world import FRACTUS, OperatorProcess, World, at, component, ours, traffic
-from test_operator import deployed, end_mission, gone, running
+from test_operator import deployed, end_mission, events, gone, running
 
 Body = dict[str, Any]
 
@@ -110,6 +110,18 @@ def test_what_agents_report_moves_nothing(world: World, operator: OperatorProces
     wait_for(lambda: world.api.get(service), "the Service to be made again")
     wait_for(lambda: world.condition(namespace, "Ready").get("status") == "True", "all to be well")
     assert world.api.get(path) == reported
+
+
+def test_events_tell_what_becomes_of_a_link(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    path = f"{FRACTUS}/directlinks/{next(iter(world.links(namespace).values()))['metadata']['name']}"
+    direct = {"phase": "Up", "traffic": "direct", "switches": 1, "message": "it is faster"}
+    world.api.merge(f"{path}/status", {"status": direct})
+    told = wait_for(lambda: "TrafficDirect" in events(world, namespace) and events(world, namespace), "an Event")
+    assert told.count("LinkUp") == told.count("TrafficDirect") == 1
+    world.api.merge(f"{path}/status", {"status": {"switches": 2, "traffic": "cloud"}})
+    wait_for(lambda: "TrafficCloud" in events(world, namespace), "an Event")
+    assert events(world, namespace).count("LinkUp") == 1
 
 
 def test_links_of_another_release_are_corrected(world: World, operator: OperatorProcess, namespace: str) -> None:

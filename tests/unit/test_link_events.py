@@ -1,0 +1,113 @@
+"""Events of direct links: each change once, in order, and no flood from a link that comes and goes."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any, cast
+
+import pytest
+from fractus_operator.reconcile import link_events
+from fractus_operator.reconcile.link_events import LinkEvents, LinkReport, news, read_report
+
+SPEC = {"drone": "drone-1", "node": "edge-1", "application": {"namespace": "city", "name": "traffic", "uid": "u1"}}
+KEY = ("", "city.traffic-drone-1-edge-1")
+NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
+
+
+def report(phase: str = "Idle", traffic: str = "cloud", switches: int = 0, message: str = "") -> LinkReport:
+    status = {"phase": phase, "traffic": traffic, "switches": switches, "message": message}
+    return read_report({"spec": SPEC, "status": status})
+
+
+def reasons(told: LinkReport, now: LinkReport) -> list[str]:
+    return [reason for reason, _ in news(told, now)]
+
+
+UP, DIRECT = report("Up"), report("Up", "direct", 1, "it is faster")
+
+
+def test_each_change_is_told_in_the_order_in_which_it_happens() -> None:
+    assert reasons(read_report({"spec": SPEC}), report("Connecting")) == []
+    assert reasons(report(), UP) == ["LinkUp"]
+    assert reasons(UP, DIRECT) == ["TrafficDirect"]
+    assert reasons(report(), DIRECT) == ["LinkUp", "TrafficDirect"]
+    assert reasons(DIRECT, replace(DIRECT, direct=False)) == ["TrafficCloud"]
+    assert reasons(DIRECT, report(switches=2)) == ["TrafficCloud", "LinkDown"]
+
+
+def test_an_event_says_why_and_what_it_left_out() -> None:
+    ((_, sentence),) = news(UP, DIRECT)
+    assert sentence == "calls of drone-1 take the direct link to edge-1: it is faster"
+    ((_, sentence),) = news(UP, replace(DIRECT, switches=7))
+    assert sentence.endswith("it is faster (it has changed 7 times since the last Event)")
+
+
+class Recorder:
+    """What is posted."""
+
+    def __init__(self) -> None:
+        self.events: list[tuple[str, str]] = []
+        self.names: set[str] = set()
+        self.down = asyncio.Event()
+
+    async def record_event(self, regarding: Any, *, reason: str, name: str, **_: object) -> None:
+        self.events.append((regarding["metadata"]["uid"], reason))
+        self.names.add(name)
+        if reason == "LinkDown":
+            self.down.set()
+
+
+@pytest.fixture
+def posted() -> Recorder:
+    return Recorder()
+
+
+@pytest.fixture
+def events(posted: Recorder) -> LinkEvents:
+    return LinkEvents(cast(Any, posted), lambda: NOW)
+
+
+async def see(events: LinkEvents, *reports: LinkReport | None) -> None:
+    """Let the watch show these one after the other."""
+    for now in reports:
+        events.changed(KEY, events._now.get(KEY), now)
+        await events.tell(KEY)
+
+
+async def test_what_is_there_when_the_operator_starts_is_old_news(events: LinkEvents, posted: Recorder) -> None:
+    await see(events, DIRECT, replace(DIRECT, message="still faster"))
+    assert posted.events == []
+    await see(events, report(switches=2))
+    assert posted.events == [("u1", "TrafficCloud"), ("u1", "LinkDown")]
+    assert len(posted.names) == 2
+
+
+async def test_a_link_that_comes_and_goes_is_told_of_now_and_then(
+    events: LinkEvents, posted: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(link_events, "PERIOD_S", 1e6)
+    await see(events, report())
+    for flap in range(50):
+        await see(events, replace(DIRECT, switches=2 * flap + 1), report(switches=2 * flap + 2))
+    assert posted.events == [("u1", "LinkUp"), ("u1", "TrafficDirect")]
+    monkeypatch.setattr(link_events, "PERIOD_S", 0.0)
+    await events.tell(KEY)
+    assert posted.events[2:] == [("u1", "TrafficCloud"), ("u1", "LinkDown")]
+
+
+async def test_what_is_not_due_yet_is_told_later(
+    events: LinkEvents, posted: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(link_events, "PERIOD_S", 0.2)
+    await see(events, report(), DIRECT, report(switches=2))
+    running = asyncio.create_task(events.worklist.run())
+    async with asyncio.timeout(20.0):
+        await posted.down.wait()
+    running.cancel()
+
+
+async def test_a_link_that_is_made_again_begins_again(events: LinkEvents, posted: Recorder) -> None:
+    await see(events, report(), None, DIRECT, replace(DIRECT, switches=3))
+    assert posted.events == []

@@ -1,8 +1,8 @@
 """What direct links cost a drone's agent: memory of its own, and processor time while a link is up and while none is planned.
 
 A drone and an edge node as network namespaces on the simulated radio, with the agent's whole part of direct links in a process
-each, and a component that calls all the time. Memory is what the process shares with no other (private pages), with what the
-rest of an agent needs left out: the same process before its links run. The other column is the limit.
+each, and a component that calls all the time. Memory is what the process shares with no other (private pages), the client for
+Kubernetes and the kinds included, gRPC for telemetry not. The other column is the limit.
 
 Run it as root: uv run python bench/links.py [--quick] [--json FILE]
 """
@@ -13,7 +13,6 @@ import argparse
 import json
 import os
 import re
-import subprocess
 import sys
 import tempfile
 import time
@@ -44,19 +43,6 @@ def share(pid: int, seconds: float) -> float:
     return 100 * (taken() - before) / seconds
 
 
-def empty_mb() -> float:
-    """Python with what every agent imports."""
-    program = "import fractus_agent.daemon, sys; print('ready', flush=True); sys.stdin.read()"
-    process = subprocess.Popen(
-        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    process.stdout.readline()
-    found = private_mb(process.pid)
-    process.communicate()
-    return found
-
-
 def claim(name: str, ours: float, limit: float, unit: str) -> dict[str, object]:
     holds = ours < limit
     print(f"{name:58} {ours:8.2f} {limit:8.1f} {unit:12} {'holds' if holds else 'FAILS'}")
@@ -72,7 +58,6 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the claims to this file")
     options = parser.parse_args()
     seconds = 8.0 if options.quick else 30.0
-    base_mb = empty_mb()
     with tempfile.TemporaryDirectory() as folder, connected_world(Path(folder)) as world:
         edge, drone = world.edge("e1", 20.0), world.drone()
         link = world.link(drone, edge)
@@ -91,7 +76,6 @@ def main() -> None:
         memory = private_mb(drone.pid)
     claims = [
         claim("drone's agent: memory of its own with a link in use", memory, MEMORY_LIMIT_MB, "MB"),
-        claim("of which direct links", memory - base_mb, MEMORY_LIMIT_MB, "MB"),
         claim("drone: processor while no link is planned", idle, PROCESSOR_LIMIT, "% of a core"),
         claim("drone: processor with a link in use", busy, 10 * PROCESSOR_LIMIT, "% of a core"),
         claim("edge node: processor with a link in use", busy_edge, 10 * PROCESSOR_LIMIT, "% of a core"),

@@ -39,7 +39,7 @@ def gps_raw_int(v: VehicleState) -> Values:
         "vel": max(0, centi(math.hypot(g.vn, g.ve))),
         "cog": round(math.degrees(math.atan2(g.ve, g.vn)) % 360.0 * 100.0) % 36000,
         "satellites_visible": g.satellites,
-        "h_acc": 300,
+        "h_acc": round(max(v.params["SIM_GPS_ACC"], 0.0) * 1000.0),
         "v_acc": 300,
     }
 

@@ -65,6 +65,8 @@ class Weather:
         loss: share of frames that are lost, in each direction.
         wind_mps: mean wind.
         gusts_mps: of the wind.
+        error_m: how far north of where it believes to be the vehicle is.
+        claimed_error_m: how far its GPS says that it may err; None: as far as it does.
         speedup: the vehicle's time in seconds a second.
         cut: when the link is cut, and for how long; None: never.
         stall: a busy machine lets no one of these run for so long, every few seconds: "service" or "vehicle".
@@ -75,6 +77,8 @@ class Weather:
     loss: float = 0.0
     wind_mps: float = 0.0
     gusts_mps: float = 0.0
+    error_m: float = 0.0
+    claimed_error_m: float | None = None
     speedup: int = 1
     cut: tuple[float, float] | None = None
     stall: tuple[str, float] | None = None
@@ -140,6 +144,8 @@ class Sky(Loop):
         self.severed = False
         place = Place.from_degrees(39.36, 22.95, 10.0)
         wind = {"SIM_WIND_SPD": weather.wind_mps, "SIM_WIND_DIR": float(seed % 360), "SIM_WIND_TURB": weather.gusts_mps}
+        claimed_m = abs(weather.error_m) if weather.claimed_error_m is None else weather.claimed_error_m
+        wind["SIM_GPS_ACC"] = max(claimed_m, 0.3)
         config = VehicleConfig(start=place, seed=seed, ready_after_s=2.0, parameters=wind | parameters)
         self.simulation = Simulation([config])
         self.craft = self.simulation.crafts[0]
@@ -261,7 +267,7 @@ class Oracle:
         """East, north and height in metres, truly."""
         truth = self._sky.truth.true_place
         x, y = FRAME.xy(truth.lat_e7 / 1e7, truth.lon_e7 / 1e7)
-        return float(x), float(y), -self._sky.truth.body.down
+        return float(x), float(y) + self._sky.weather.error_m, -self._sky.truth.body.down
 
     def speeds(self) -> tuple[float, float]:
         """Over ground, and up."""

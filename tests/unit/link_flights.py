@@ -113,15 +113,28 @@ async def both(flown: Flown) -> None:
     await bursts(flown)
 
 
-def appears(away_m: float) -> Pilot:
+SPEEDS_MPS = (12, 10, 8, 7, 6, 5, 4, 3.5, 3, 2.5, 2, 1.5, 1, 0.7, 0.4)
+
+
+async def as_fast_as_let(flown: Flown) -> None:
+    """Straight at the wall, each time with the highest speed that is permitted."""
+    await flown.to(0, 0)
+    for _ in range(30):
+        for speed in SPEEDS_MPS:
+            if await flown.fly(speed, 0.0, 1.0):
+                break
+        await asyncio.sleep(0.4)
+
+
+def appears(away_m: float, speed_mps: float = 10.0) -> Pilot:
     """A leg under way on which a wall appears so far ahead."""
 
     async def pilot(flown: Flown) -> None:
         flown.walls.clear()
         flown.put()
         await flown.to(0, -110)
-        flying = asyncio.ensure_future(flown.to(0, 110))
-        while flown.oracle.speeds()[0] < 9.5 or flown.oracle.place()[1] < -40:  # noqa: ASYNC110
+        flying = asyncio.ensure_future(flown.to(0, 110, speed_mps))
+        while flown.oracle.speeds()[0] < 0.95 * speed_mps or flown.oracle.place()[1] < -40:  # noqa: ASYNC110
             await asyncio.sleep(0.05)
         y = flown.oracle.place()[1]
         flown.walls.append(shapely.box(-120, y + away_m, 120, y + away_m + 15))

@@ -593,7 +593,10 @@ def _ask_all(fleet: Fleet, tally: Tally, told: list[str], rng: np.random.Generat
             if isinstance(verdict.args, GotoArgs):
                 legs.append((i, verdict.args))
             fleet.send(i, verdict, returns=not near[i])
-            if moves and watched and i % watched == 0 and monitor(now, place.grant) is None:
+            # Who begins beyond a limit of altitude is at its edge on the way back.
+            low, high = place.heights
+            level = low - HEIGHT_ERROR_M <= now.altitude_m <= high + HEIGHT_ERROR_M
+            if moves and level and watched and i % watched == 0 and monitor(now, place.grant) is None:
                 leg = verdict.args if isinstance(verdict.args, GotoArgs) and not verdict.brake_first else None
                 flown[i] = told[i], leg, measured
     tally.wrong += [f"target inside the margin of a fence: {told[i]}" for i in _too_near(fleet, legs)]

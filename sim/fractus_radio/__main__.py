@@ -21,7 +21,7 @@ from fractus_radio.radio import Radio
 from fractus_radio.taps import Tap
 from fractus_radio.uplink import Uplink
 
-REAL_TIME_PRIORITY = 10
+REAL_TIME_PRIORITY, HIGHEST = 10, -20
 
 
 class Frame:
@@ -81,8 +81,11 @@ def radio(layout: Path) -> None:
     for follower in followers:
         follower.start()
     # On a busy machine frames would else wait for their turn longer than they travel.
-    with contextlib.suppress(OSError):
+    try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REAL_TIME_PRIORITY))
+    except OSError:  # control groups may have no share of real time
+        with contextlib.suppress(OSError):
+            os.nice(HIGHEST)
     try:
         while True:
             carrier.turn()

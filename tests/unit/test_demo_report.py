@@ -14,6 +14,7 @@ import yaml
 from fractus_core.api import DeploymentPlan
 from fractus_sim.report import Record, write_report
 from fractus_sim.report.features import features
+from fractus_sim.report.mission import scene_of
 from fractus_sim.report.summary import figures, summary
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -98,6 +99,22 @@ def test_the_page_shows_corrections_refusals_placements_and_the_chain(record: Re
 def test_a_broken_chain_is_said_loudly(record: Record) -> None:
     broken = replace(record, audit={"entries": 3, "kept": 3, "problem": "line 2 was changed after it was written"})
     assert "**broken: line 2 was changed after it was written**" in summary(broken)
+
+
+def test_direct_links_are_told_and_drawn(record: Record) -> None:
+    assert "## Direct links" not in summary(record)
+    at_s = demo_flight.TAKEOFF_S + 20.0
+    changes = [
+        {"time": at_s, "node": "edge-1", "traffic": "direct", "why": "the direct link scores 12, the present path 8"},
+        {"time": at_s + 9.0, "node": "edge-1", "traffic": "cloud", "why": "the direct link is about to be left"},
+    ]
+    linked = Record.of({**demo_flight.content(), "links": changes}, demo_flight.audit())
+    page = summary(linked)
+    assert "| edge-1 | by WiFi | the direct link scores 12, the present path 8 |" in page
+    assert "| edge-1 | by the cloud again | the direct link is about to be left |" in page
+    ((_, there),) = scene_of(linked).links
+    assert there == next(node.at for node in scene_of(linked).nodes if node.name == "edge-1")
+    assert [link["direct"] for link in figures(linked)["links"]] == [True, False]
 
 
 def test_the_figures_are_those_of_the_page(record: Record) -> None:

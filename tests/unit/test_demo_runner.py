@@ -218,3 +218,22 @@ def test_the_simulated_hardware_stands_where_the_drone_is_kept() -> None:
     drone = demo_flight.documents("drone.yaml")[0]["spec"]["services"]["mobility"]
     assert drone["connection"] in arguments
     assert pod_spec["hostNetwork"] is True
+
+
+def test_a_change_of_path_is_told_once() -> None:
+    def link(traffic: str | None, message: str) -> dict[str, Any]:
+        spec = {"node": "edge-1", "application": {"namespace": "default", "name": "traffic-monitoring"}}
+        status = {"traffic": traffic, "message": message} if traffic else None
+        return {"kind": "DirectLink", "metadata": {"name": "l"}, "spec": spec, "status": status}
+
+    said: list[str] = []
+    mission = Mission("traffic-monitoring", {"applied": 0.0})
+    for at_s, body in enumerate(
+        [link(None, ""), link("cloud", "far"), link("direct", "near"), link("direct", "nearer"), link("cloud", "left")]
+    ):
+        mission.see([body], float(at_s), said.append)
+    assert [(c["time"], c["node"], c["traffic"], c["why"]) for c in mission.links] == [
+        (2.0, "edge-1", "direct", "near"),
+        (4.0, "edge-1", "cloud", "left"),
+    ]
+    assert said == ["traffic goes by WiFi to edge-1: near", "traffic goes no more by WiFi to edge-1: left"]

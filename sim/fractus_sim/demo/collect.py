@@ -39,6 +39,7 @@ def collect(kube: Kube, mission: Mission, folder: Path, log: Path) -> None:
         "objects": objects,
         "pods": list(mission.pods.values()),
         "times": mission.times,
+        "links": mission.links,
         "audit": audit,
         "results": len(_KEPT.findall(log.read_bytes())) if log.exists() else 0,
     }

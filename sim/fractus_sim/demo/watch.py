@@ -28,12 +28,14 @@ class Mission:
         application: name of the Application.
         times: Unix seconds of what happened: applied, planned, running, ended, landed.
         pods: last state seen of each pod, by name.
+        links: each change of a path of traffic: when (Unix seconds), node, cloud or direct, and why.
         phase: the Application's.
     """
 
     application: str
     times: dict[str, float] = field(default_factory=dict)
     pods: dict[str, Object] = field(default_factory=dict)
+    links: list[Object] = field(default_factory=list)
     phase: str = ""
     message: str = ""
     drone: str = ""
@@ -52,6 +54,8 @@ class Mission:
                 say(f"planned after {now_s - self.times['applied']:.1f} s: {len(placements)} instances, {_drone(body)}")
             elif kind == "Pod" and "deletionTimestamp" not in body["metadata"]:
                 self.pods[name] = body
+            elif kind == "DirectLink" and body["spec"]["application"]["name"] == self.application:
+                self._see_link(body, now_s, say)
             elif kind == "Drone" and name == self.drone:
                 self._see_drone(body, now_s, say)
         self._see_pods(now_s, say)
@@ -85,6 +89,16 @@ class Mission:
         self.flight_state = state
         say(f"{self.drone} is {_words(state)}")
 
+    def _see_link(self, body: Object, now_s: float, say: Say) -> None:
+        node, status = body["spec"]["node"], body.get("status") or {}
+        traffic = status.get("traffic") or "cloud"
+        before = next((change["traffic"] for change in reversed(self.links) if change["node"] == node), "cloud")
+        if traffic != before:
+            why = status.get("message", "")
+            self.links.append({"time": now_s, "node": node, "traffic": traffic, "why": why})
+            to = f"by WiFi to {node}" if traffic == "direct" else f"no more by WiFi to {node}"
+            say(f"traffic goes {to}: {why}")
+
     def _see_pods(self, now_s: float, say: Say) -> None:
         running = sum(_ready(body) for body in self.pods.values())
         if running > self._running:
@@ -116,7 +130,7 @@ def follow(kube: Kube, mission: Mission, logs: Path, *, timeout_s: float, say: S
         try:
             while not (mission.ended and mission.grounded):
                 now = time.time()
-                mission.see(kube.objects("applications,deploymentplans,pods,drones"), now, say)
+                mission.see(kube.objects("applications,deploymentplans,pods,drones,directlinks"), now, say)
                 if mission.ended and deadline < now + LANDING_TIMEOUT_S:
                     deadline = max(deadline, mission.times["ended"] + LANDING_TIMEOUT_S)
                 if now > deadline:

@@ -56,6 +56,8 @@ def draw_map(scene: Scene) -> Figure:
         _path(axes, scene, figure)
     else:
         _paths(axes, scene)
+    for here, there in scene.links:
+        axes.plot(*zip(here, there, strict=True), color=GREEN, linewidth=2.0, label="taking a direct link", zorder=5)
     _marks(axes, scene)
     axes.set_xlim(bounds[0], bounds[2])
     axes.set_ylim(bounds[1], bounds[3])

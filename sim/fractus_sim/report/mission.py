@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from fractus_core.geo import LocalFrame, polygon
 
 from fractus_sim.report.profile import Limit, Profile, Request, Span
 from fractus_sim.report.record import Judgement, Record
-from fractus_sim.report.scene import DrawnNode, DrawnZone, Mark, Scene, ZoneKind
+from fractus_sim.report.scene import XY, DrawnNode, DrawnZone, Mark, Scene, ZoneKind
 
 _STRICTEST: tuple[ZoneKind, ...] = ("exclusion", "denial", "camera", "inclusion", "limit")
 _HOME_MODES = {"RTL": "the system flies home", "SMART_RTL": "the system flies home", "LAND": "the system lands"}
@@ -37,7 +37,15 @@ def scene_of(record: Record) -> Scene:
         nodes=nodes,
         depots=depots,
         marks=tuple(marks_of(record.judgements, frame)),
+        links=tuple(_links(record, {node.name: node.at for node in nodes})),
     )
+
+
+def _links(record: Record, nodes: Mapping[str, XY]) -> Iterable[tuple[XY, XY]]:
+    for change in record.links:
+        if change.direct and change.node in nodes and record.samples:
+            at = min(record.samples, key=lambda sample: abs(sample.time_s - change.time_s)).place
+            yield record.frame.xy(at.lat, at.lon), nodes[change.node]
 
 
 def profile_of(record: Record) -> Profile:

@@ -53,6 +53,16 @@ class Judgement:
 
 
 @dataclass(frozen=True, slots=True)
+class PathChange:
+    """Traffic that took, or left, the direct link to a node; Unix seconds."""
+
+    time_s: float
+    node: str
+    direct: bool
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
 class Pod:
     """A pod of the application; times are Unix seconds, None while unknown."""
 
@@ -84,6 +94,7 @@ class Record:
     audit: Mapping[str, Any] = field(default_factory=dict)
     times: Mapping[str, float] = field(default_factory=dict)
     pictures: tuple[str, ...] = ()
+    links: tuple[PathChange, ...] = ()
 
     @classmethod
     def read(cls, folder: Path) -> Record:
@@ -131,6 +142,9 @@ class Record:
             results=content.get("results", 0),
             audit=content.get("audit", {}),
             times=content.get("times", {}),
+            links=tuple(
+                PathChange(c["time"], c["node"], c["traffic"] == "direct", c["why"]) for c in content.get("links", ())
+            ),
         )
 
     @property

@@ -60,6 +60,7 @@ class Scene:
     Attributes:
         area: shape of the operation area.
         depots: names and places.
+        links: where the drone was when its traffic took a direct link, and where the node stands.
     """
 
     title: str
@@ -70,3 +71,4 @@ class Scene:
     nodes: tuple[DrawnNode, ...] = ()
     depots: tuple[tuple[str, XY], ...] = ()
     marks: tuple[Mark, ...] = ()
+    links: tuple[tuple[XY, XY], ...] = ()

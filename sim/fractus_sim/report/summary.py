@@ -26,6 +26,7 @@ def summary(record: Record) -> str:
         judged(record.judgements, _utc),
         _pictures(record),
         _placements(record),
+        _links(record),
         _pods(record),
         _audit(record),
         "Drawings: [map.png](map.png), [altitude.png](altitude.png). For other tools: [flight.geojson](flight.geojson),"
@@ -68,6 +69,7 @@ def figures(record: Record) -> dict[str, Any]:
             }
             for j in record.judgements
         ],
+        "links": [{"time": _stamp(c.time_s), "node": c.node, "direct": c.direct, "why": c.why} for c in record.links],
         "placements": [p.to_dict() for p in plan.placements] if plan else [],
         "rejected": [r.to_dict() for r in plan.rejected] if plan else [],
         "audit": dict(record.audit),
@@ -164,6 +166,13 @@ def _placements(record: Record) -> str:
     if rejected:
         text += "\n\nDropped:\n\n" + table(("Component", "Node", "Why not"), rejected)
     return text
+
+
+def _links(record: Record) -> str:
+    if not record.links:
+        return ""
+    rows = [(_utc(c.time_s), c.node, "by WiFi" if c.direct else "by the cloud again", c.why) for c in record.links]
+    return "## Direct links\n\n" + table(("At", "Node", "Traffic goes", "Why"), rows)
 
 
 def _pods(record: Record) -> str:

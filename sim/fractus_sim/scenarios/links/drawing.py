@@ -64,12 +64,11 @@ def draw_bandwidth(site: Site, run: Evidence) -> Figure:
     figure, axes = canvas(10.0, 4.2)
     colour, begin = colours(site), run.pictures[0].sent_s if run.pictures else 0.0
     for switch in run.switches:
-        if switch.redirected_s is None:
-            continue
-        end = switch.back_s or switch.ended_s or max(p.sent_s for p in run.pictures)
-        axes.axvspan(switch.redirected_s - begin, end - begin, color=colour[switch.peer], alpha=0.12)
-        axes.axvline(switch.redirected_s - begin, color=colour[switch.peer], linewidth=1.0)
-        axes.axvline(end - begin, color=GREY, linewidth=1.0, linestyle=":")
+        for first, last in switch.spans:
+            end = max(p.sent_s for p in run.pictures) if last is None else last
+            axes.axvspan(first - begin, end - begin, color=colour[switch.peer], alpha=0.12)
+            axes.axvline(first - begin, color=colour[switch.peer], linewidth=1.0)
+            axes.axvline(end - begin, color=GREY, linewidth=1.0, linestyle=":")
         if switch.measured_s is not None and switch.mbps is not None:
             axes.plot(
                 switch.measured_s - begin, switch.mbps, marker="D", color=colour[switch.peer], markeredgecolor=INK,

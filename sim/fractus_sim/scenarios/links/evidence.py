@@ -17,9 +17,11 @@ from fractus_sim.scenarios.links.podlogs import Line
 VIEWER, CHECKER, AGENT = "aerial-viewer", "image-checker", "agent"
 CLOUD = "cloud"
 LATE_S = 1.0
+NOTICE_S = 1.0
 
 _STATE = re.compile(r"links: (?P<phase>none|connecting|up) \(peer=(?P<peer>\S*) reason=(?P<reason>.*)\)")
 _MEASURED = re.compile(r"links: measured \(peer=(?P<peer>\S+) mbps=(?P<mbps>[\d.]+)")
+_TO_LINK = "the direct link scores"
 _DECIDED = re.compile(r"links: decided \(on=(?P<on>\S+) peer=(?P<peer>\S+)\): (?P<why>.*)")
 
 
@@ -60,11 +62,11 @@ class Switch:
         up_s: paired.
         measured_s: its bandwidth measured first.
         mbps: that.
-        redirected_s: traffic moved to it.
+        spans: from when until when traffic was led to it; until None while it is.
         first_s: the first picture that the node received.
-        back_s: traffic moved back to the cloud.
         left: why.
         ended_s: the link was no more.
+        lost: it broke while it carried traffic.
     """
 
     peer: str
@@ -73,11 +75,33 @@ class Switch:
     up_s: float | None = None
     measured_s: float | None = None
     mbps: float | None = None
-    redirected_s: float | None = None
+    spans: list[tuple[float, float | None]] = field(default_factory=list)
     first_s: float | None = None
-    back_s: float | None = None
     left: str = ""
     ended_s: float | None = None
+    lost: bool = False
+
+    @property
+    def redirected_s(self) -> float | None:
+        """When traffic moved to it first."""
+        return self.spans[0][0] if self.spans else None
+
+    @property
+    def back_s(self) -> float | None:
+        """When traffic moved back to the cloud for good."""
+        return self.spans[-1][1] if self.spans else None
+
+    @property
+    def leads(self) -> bool:
+        """Whether traffic is led to it."""
+        return bool(self.spans) and self.spans[-1][1] is None
+
+    def lead(self, at_s: float, *, direct: bool) -> None:
+        """Traffic goes to it, or to the cloud, from a moment on."""
+        if direct and not self.leads:
+            self.spans.append((at_s, None))
+        elif not direct and self.leads:
+            self.spans[-1] = (self.spans[-1][0], at_s)
 
 
 @dataclass(frozen=True)
@@ -98,8 +122,14 @@ class Evidence:
     @property
     def longest_gap_s(self) -> float:
         """The longest time between two receptions."""
+        return max(self.gap_s(abrupt=False), self.gap_s(abrupt=True))
+
+    def gap_s(self, *, abrupt: bool) -> float:
+        """The longest time between two receptions while a link with traffic was lost, or at all other times."""
         at = sorted(p.received_s for p in self.pictures if p.received_s is not None)
-        return max((b - a for a, b in itertools.pairwise(at)), default=0.0)
+        lost = [s.ended_s for s in self.switches if s.lost and s.ended_s is not None]
+        gaps = ((b - a, any(a - NOTICE_S <= when <= b for when in lost)) for a, b in itertools.pairwise(at))
+        return max((gap for gap, at_loss in gaps if at_loss == abrupt), default=0.0)
 
     def counts(self) -> dict[str, int]:
         """Pictures sent, received, lost, received by two instances or twice by one, and late (answered after a second)."""
@@ -161,38 +191,43 @@ def _switches(lines: Iterable[Line]) -> list[Switch]:
     for line in lines:
         if (state := _STATE.search(line.text)) is not None:
             _state(found, line.at_s, state)
-        elif (measured := _MEASURED.search(line.text)) is not None and found:
-            if found[-1].measured_s is None and found[-1].peer == measured["peer"]:
-                found[-1].measured_s, found[-1].mbps = line.at_s, float(measured["mbps"])
+        elif (measured := _MEASURED.search(line.text)) is not None:
+            last = _latest(found, measured["peer"])
+            if last is not None and last.measured_s is None:
+                last.measured_s, last.mbps = line.at_s, float(measured["mbps"])
         elif (decided := _DECIDED.search(line.text)) is not None:
             _decided(found, line.at_s, decided)
     return found
 
 
+def _latest(found: Iterable[Switch], peer: str) -> Switch | None:
+    """The link to a peer that has not ended."""
+    return next((s for s in found if s.peer == peer and s.ended_s is None), None)
+
+
 def _state(found: list[Switch], at_s: float, state: re.Match[str]) -> None:
     phase, peer = state["phase"], state["peer"]
-    if phase == "connecting" and (not found or found[-1].peer != peer or found[-1].ended_s is not None):
-        found.append(Switch(peer, at_s))
-    elif phase == "up" and found and found[-1].peer == peer:
-        found[-1].up_s = at_s
-    elif phase == "none" and found and found[-1].ended_s is None:
-        found[-1].ended_s = at_s
-        found[-1].left = found[-1].left or state["reason"]
-        if found[-1].redirected_s is not None and found[-1].back_s is None:
-            found[-1].back_s = at_s
+    own = _latest(found, peer)
+    if own is None:
+        if phase == "connecting":
+            found.append(Switch(peer, at_s))
+    elif phase == "up":
+        own.up_s = at_s
+    elif phase == "none":
+        own.ended_s, own.left = at_s, own.left or state["reason"]
+        own.lost = own.leads and "wanted" not in state["reason"]
+        own.lead(at_s, direct=False)
 
 
 def _decided(found: list[Switch], at_s: float, decided: re.Match[str]) -> None:
     """A decision on the link, or on the traffic of an application, which is named by its namespace."""
     on, peer, why = decided["on"], decided["peer"], decided["why"]
     if on == "link":
-        if peer != "-" and (not found or found[-1].peer != peer or found[-1].ended_s is not None):
+        if peer != "-" and _latest(found, peer) is None:
             found.append(Switch(peer, at_s, why))
-        elif found and not found[-1].left:
-            found[-1].left = why
-    elif found:
-        last = found[-1]
-        if last.redirected_s is None and last.up_s is not None:
-            last.redirected_s = at_s
-        elif last.redirected_s is not None and last.back_s is None:
-            last.back_s, last.left = at_s, last.left or why
+        return
+    direct = _TO_LINK in why
+    for own in found:
+        if own.ended_s is None and own.up_s is not None and (not direct or own.peer == peer):
+            own.lead(at_s, direct=direct)
+            own.left = "" if direct else own.left or why

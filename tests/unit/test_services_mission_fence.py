@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -352,6 +353,20 @@ async def test_a_fence_that_another_station_replaced_is_told(vehicle: Vehicle, t
     await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     vehicle.values["FENCE_TOTAL"] = 1.0
     with pytest.raises(AutopilotError, match="another station changed its fence, which has 1 items and had 4"):
+        await fence.hold()
+
+
+async def test_other_items_in_place_of_as_many_are_told(
+    vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fence = MissionFence(vehicle, tmp_path)
+    await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
+    vehicle.items = tuple(replace(item, lat_e7=item.lat_e7 + 5000) for item in vehicle.items)
+    assert await fence.hold() == (), "it was read a moment ago"
+    with pytest.raises(AutopilotError, match="other items than were loaded"):
+        await MissionFence(vehicle, tmp_path).hold()
+    monkeypatch.setattr(module, "ITEMS_AGAIN_S", 0.0)
+    with pytest.raises(AutopilotError, match="other items than were loaded"):
         await fence.hold()
 
 

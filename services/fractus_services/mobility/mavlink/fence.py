@@ -22,6 +22,9 @@ from fractus_services.mobility.mavlink.parameters import same
 log = logging.getLogger(__name__)
 
 _RESTORE_TIMEOUT_S = 5.0
+ITEMS_AGAIN_S = 60.0
+"""In flight the items are read again after this time: of others in their place, as many as there were, no message tells."""
+
 _CLOSE_E7 = 2
 """Autopilots that store floats give positions back a few centimetres off."""
 
@@ -34,11 +37,13 @@ class Owned:
         parameters: those that the vehicle has.
         items: its polygons and circles.
         raised: the parameters of the mission's fence, once that stands.
+        around: its items, beside those of the owner that are in force; None of a fence that an older release raised.
     """
 
     parameters: dict[str, float]
     items: tuple[Item, ...]
     raised: dict[str, float] = field(default_factory=dict)
+    around: tuple[Item, ...] | None = None
 
 
 class MissionFence:
@@ -61,6 +66,7 @@ class MissionFence:
         self._path = directory / "fence.json"
         self._lock = asyncio.Lock()
         self._standing: tuple[Bounds, bool] | None = None
+        self._compared_at = -math.inf
         self.missing = ""
 
     @property
@@ -117,16 +123,21 @@ class MissionFence:
             owned = await asyncio.to_thread(self._load)
             if owned is None or not owned.raised:
                 return ()
-            return await self._keep(owned.raised)
+            return await self._keep(owned)
 
-    async def _keep(self, raised: Mapping[str, float]) -> tuple[str, ...]:
-        changed, total = await self._set(raised), self._stack.fence_total
+    async def _keep(self, owned: Owned) -> tuple[str, ...]:
+        raised, total = owned.raised, self._stack.fence_total
+        changed = await self._set(raised)
         if total in raised:
             items = (await self._parameters.read([(total,)])).get(total, 0.0)
             if items != raised[total]:
                 raise AutopilotError(
                     f"another station changed its fence, which has {items:g} items and had {raised[total]:g}"
                 )
+        if owned.around is not None and self._autopilot.now - self._compared_at >= ITEMS_AGAIN_S:
+            if not _same(await download(self._autopilot), owned.around):
+                raise AutopilotError("another station changed its fence, which has other items than were loaded")
+            self._compared_at = self._autopilot.now
         return changed
 
     async def _offered(self) -> bool:
@@ -156,21 +167,21 @@ class MissionFence:
         # ArduPilot works out which kinds of fence are in force when it is switched on, and not again: so off first.
         try:
             await self._set({switch: 0.0})
-            vertices = await self._load_around(spec, kept)
+            around = await self._load_around(spec, kept)
             values = self._stack.fence_values(
                 owned.parameters, ceiling_m=bounds.altitude_m, polygon=bool(bounds.items), retraces=retraces
             )
             await self._set(values)
             total = await self._parameters.read([(self._stack.fence_total,)])
-            await asyncio.to_thread(self._store, replace(owned, raised=values | total))
-            self._standing = bounds, retraces
+            await asyncio.to_thread(self._store, replace(owned, raised=values | total, around=around))
+            self._standing, self._compared_at = (bounds, retraces), self._autopilot.now
         except (AutopilotError, asyncio.CancelledError):
             await self._recover(owned)
             raise
-        log.info("fence: raised (vertices=%d, ceiling_m=%s)", vertices, bounds.altitude_m)
+        log.info("fence: raised (vertices=%d, ceiling_m=%s)", len(around) - len(kept), bounds.altitude_m)
 
-    async def _load_around(self, spec: GrantSpec, kept: Sequence[Item]) -> int:
-        """Load the outer bounds beside what is kept, with fewer vertices where the vehicle has no space; how many it has."""
+    async def _load_around(self, spec: GrantSpec, kept: Sequence[Item]) -> tuple[Item, ...]:
+        """Load the outer bounds beside what is kept, with fewer vertices where the vehicle has no space; what was loaded."""
         tried = -1
         for vertices in MAX_VERTICES:
             bounds = bounds_of(spec, vertices)
@@ -184,13 +195,14 @@ class MissionFence:
                 log.warning("fence: too many items (vertices=%d, kept=%d, error=%s)", tried, len(kept), error)
                 refused = error
             else:
-                return tried
+                return (*kept, *items)
         raise refused
 
     async def _stands(self, owned: Owned) -> bool:
         """Whether the fence is as it was raised before: arming that is tried again need not load it again."""
         try:
-            await self._keep(owned.raised)
+            self._compared_at = -math.inf
+            await self._keep(owned)
         except AutopilotError as error:
             if error.link:
                 raise
@@ -248,9 +260,11 @@ class MissionFence:
         remove_temporary(self._path)
         try:
             stored = json.loads(self._path.read_bytes())
-            return Owned(
-                dict(stored["parameters"]), tuple(Item(**item) for item in stored["items"]), stored.get("raised", {})
+            items, around = (
+                tuple(Item(**item) for item in found) if found is not None else None
+                for found in (stored["items"], stored.get("around"))
             )
+            return Owned(dict(stored["parameters"]), items or (), stored.get("raised", {}), around)
         except FileNotFoundError:
             return None
         except (ValueError, KeyError, TypeError) as error:

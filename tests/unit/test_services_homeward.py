@@ -395,6 +395,31 @@ def test_a_failsafe_that_breaks_a_limit_is_relieved(tmp_path: Path, code: str) -
     fly(flight)
 
 
+@pytest.mark.parametrize("upper", [10.0, 40.0])
+def test_a_takeover_that_lands_does_not_come_down_into_the_zone_below(tmp_path: Path, upper: float) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            await world.up(grant, 20.0)
+            await end(world.service.goto(grant, GotoArgs(*at(0, 60), 20.0), 0))
+            below = zone("below", "land", -20, 45, 20, 80)
+            below["zones"][0]["altitude"] = {"lower": -5.0, "upper": upper, "reference": "home"}
+            grant = world.grants.put(spec(below))
+            if upper < 20.0:
+                await refusal_of(world, GotoArgs(*at(0, 55), 5.0))
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert (math.hypot(*world.plane.xy) < 2.0) is (upper < 20.0), "inside of it, it lands at once"
+            assert world.outcome().startswith("failed:")
+
+    fly(flight)
+
+
+async def refusal_of(world: World, leg: GotoArgs) -> None:
+    (grant,) = world.grants.active.values()
+    with pytest.raises(Exception, match="lands it"):
+        await end(world.service.goto(grant, leg, 0))
+
+
 def test_what_is_the_last_line_already_is_not_ended(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:

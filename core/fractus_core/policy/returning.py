@@ -10,7 +10,7 @@ import shapely
 from fractus_core.policy.compiled import REACH_M, Air, CompiledGrant
 from fractus_core.policy.fences import breaches
 from fractus_core.policy.limits import altitude_bounds, ceiling_m, speed_bounds
-from fractus_core.policy.motion import XY, Leg, height_margin_m, margin_m, standing
+from fractus_core.policy.motion import XY, Leg, height_margin_m, margin_m, standing, stop_point
 from fractus_core.policy.values import Situation, Verdict, deny
 
 
@@ -69,6 +69,16 @@ def may_change_height(now: Situation, grant: CompiledGrant, altitude_m: float) -
         return False
     column = standing(at, min(now.altitude_m, altitude_m), max(now.altitude_m, altitude_m))
     return not breaches(column, now, grant, margin_m(now), height_margin_m(now))
+
+
+def descent_enters(now: Situation, grant: CompiledGrant) -> bool:
+    """Whether a drone that breaks no fence where it comes to rest would break one on its way down from there."""
+    at = grant.locate(now)
+    if at is None:
+        return False
+    at, room = stop_point(now, at), (margin_m(now), height_margin_m(now))
+    here, column = standing(at, now.altitude_m, now.altitude_m), standing(at, 0.0, now.altitude_m)
+    return not breaches(here, now, grant, *room) and bool(breaches(column, now, grant, *room))
 
 
 def straight_home_blocked(

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from fractus_core.api.plans import GrantSpec
-from fractus_core.control.values import FlightMode, ModeKind
+from fractus_core.control.values import FlightMode, ModeKind, TaskKind
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.returning import ReturnBounds
 from fractus_core.policy.values import STANDING_MPS, Airframe, Home
@@ -379,9 +379,9 @@ class Fence(Protocol):
         """Set back what another station changed of the mission's fence; what that was, in sentences."""
 
 
-Approach = Callable[[Callable[[], bool], int], Awaitable[FlightMode]]
-"""Flies to where the autopilot's own return is legal, and says in which mode it does the rest; asked with whether the system
-still has the drone, and how often the autopilot refused."""
+Approach = Callable[[TaskKind, Callable[[], bool], int], Awaitable[FlightMode]]
+"""Flies to where the autopilot may come down by itself, and says in which mode it does the rest; asked with whether the drone is to
+land or to return, whether the system still has it, and how often the autopilot refused."""
 
 
 def always() -> None:

@@ -134,8 +134,8 @@ class ModeController:
         if kind is TaskKind.LAND or not vehicle.mode.comes_down or not expected:
             await self._brake(wanted)
             mode = self._autopilot.stack.land
-            if kind is not TaskKind.LAND and tries < MAX_RETURN_TRIES:
-                mode = await approach(wanted, tries)
+            if tries < MAX_RETURN_TRIES:
+                mode = await approach(kind, wanted, tries)
             await self.change_mode(mode, lambda: _check(wanted))
         while vehicle.armed and vehicle.mode.comes_down:
             await self._autopilot.update(1.0)

@@ -8,10 +8,10 @@ from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
 from dataclasses import replace
 
-from fractus_core.control.values import FlightMode
+from fractus_core.control.values import FlightMode, TaskKind
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.motion import height_margin_m, margin_m
-from fractus_core.policy.returning import homeward_heights_m, may_change_height, straight_home_blocked
+from fractus_core.policy.returning import descent_enters, homeward_heights_m, may_change_height, straight_home_blocked
 
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.grants import ActiveGrant
@@ -46,10 +46,11 @@ class Homing:
         self._courses = courses
         self.given_up: ActiveGrant | None = None
 
-    async def approach(self, wanted: Callable[[], bool], tries: int) -> FlightMode:
-        """Fly home, for the system, until only the descent is left.
+    async def approach(self, kind: TaskKind, wanted: Callable[[], bool], tries: int) -> FlightMode:
+        """Fly home, for the system, until only the descent is left; a drone that is to land does so at once, unless into a zone.
 
         Args:
+            kind: to land, or to return.
             wanted: whether the system still has the drone.
             tries: how often that has failed.
 
@@ -64,6 +65,8 @@ class Homing:
         control = self._control
         grant, vehicle, stack = control.last_grant, control.autopilot.vehicle, control.autopilot.stack
         self.given_up = None
+        if kind is TaskKind.LAND and (grant is None or not self._lands_in_zone(grant)):
+            return stack.land
         if grant is None or not vehicle.in_air or vehicle.mode.comes_down or self._blind():
             return stack.return_straight
         try:
@@ -145,6 +148,10 @@ class Homing:
     def _rests_nowhere(self, refusal: Refused, trip: Trip) -> bool:
         """Whether wind keeps the drone from resting where the straight way is legal, so that it flies home all the same."""
         return refusal.verdict.code == "NotStopping" and self._clear(trip.constraints.compiled)
+
+    def _lands_in_zone(self, grant: ActiveGrant) -> bool:
+        """Whether the drone, over ground that is closed to it, would come down into what it is above."""
+        return descent_enters(self._guard.situation(), self._control.for_transit(grant))
 
     def _blind(self) -> bool:
         """Whether there is nothing to plan with; the autopilot's own estimate is the better one then."""

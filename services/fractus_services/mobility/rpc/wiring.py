@@ -70,7 +70,7 @@ class Parts:
             grants,
             audit,
             modes=ModeController(autopilot, lambda: control.state, lambda event: control.dispatch(event)),  # noqa: PLW0108
-            approach=lambda wanted, tries: homing.approach(wanted, tries),  # noqa: PLW0108
+            approach=lambda kind, wanted, tries: homing.approach(kind, wanted, tries),  # noqa: PLW0108
             grace_s=grace_s,
             state=state,
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 
@@ -15,8 +14,7 @@ async def fly(drone: fractus.Mobility, control: fractus.Control) -> None:
     """Fly what is left of the path; after a restart in the air, arm and takeoff pass."""
     path = control.task.path
     await drone.arm()
-    with contextlib.suppress(fractus.AlreadyFlying):
-        await drone.takeoff(path[0].alt)
+    await drone.takeoff(path[0].alt)
     speed = await drone.set_speed(float(os.environ["SPEED_MPS"]))
     log.info("flying at %.1f m/s", speed.speed_mps)
     async for waypoint in control.remaining():

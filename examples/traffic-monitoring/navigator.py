@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 
@@ -17,8 +16,7 @@ async def fly(drone: fractus.Mobility, control: fractus.Control) -> None:
     path = control.task.path
     await drone.arm()
     log.info("armed; taking off")
-    with contextlib.suppress(fractus.AlreadyFlying):
-        tell("takeoff", await drone.takeoff(path[0].alt))
+    tell("takeoff", await drone.takeoff(path[0].alt))
     speed = await drone.set_speed(CRUISE_MPS)
     log.info("flying at %.1f m/s%s", speed.speed_mps, f": {speed.decision.reason}" if speed.corrected else "")
     async for waypoint in control.remaining():

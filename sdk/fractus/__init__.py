@@ -9,7 +9,6 @@ from fractus.environment import Endpoint as Endpoint
 from fractus.environment import control_points as control_points
 from fractus.environment import egress as egress
 from fractus.environment import endpoint as endpoint
-from fractus.errors import AlreadyFlying as AlreadyFlying
 from fractus.errors import AutopilotRefused as AutopilotRefused
 from fractus.errors import Busy as Busy
 from fractus.errors import ControlHeld as ControlHeld

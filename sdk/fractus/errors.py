@@ -64,12 +64,6 @@ class NotFlying(StateError):
     remedy = "`await drone.takeoff(...)` first"
 
 
-class AlreadyFlying(StateError):
-    """The drone is in the air, where this cannot begin."""
-
-    remedy = "`await drone.goto(...)` instead"
-
-
 class NoLegalWay(StateError):
     """The system finds no way there that policies permit."""
 
@@ -270,7 +264,6 @@ _STATE_ERRORS: dict[str, type[StateError]] = {
     "NotAtHome": NotAtHome,
     "NotArmed": NotArmed,
     "NotFlying": NotFlying,
-    "AlreadyFlying": AlreadyFlying,
     "ControlHeld": ControlHeld,
     "AutopilotRefused": AutopilotRefused,
 }  # fmt: skip

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from fractus_core.control import Authority, StreamState
 from fractus_core.control.values import FlightMode
-from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, Verdict
+from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, Verdict
 from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError, Refused
 from fractus_services.grants import ActiveGrant
@@ -424,6 +424,29 @@ def test_a_goto_that_is_sent_again_is_judged_again(tmp_path: Path) -> None:
             why = await asking
             assert why.verdict.code == "LegThroughExclusionZone"
             assert 192 not in world.plane.commands
+
+    fly(flight)
+
+
+def test_a_takeoff_that_is_sent_again_climbs_on_or_is_done(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            roof = zone("roof", "ignore", -30, -30, 30, 60)
+            roof["zones"][0]["altitude"] = {"lower": 25.0, "upper": 60.0, "reference": "home"}
+            grant = world.grants.put(spec(roof))
+            await world.up(grant, 5.0)
+            flying = asyncio.ensure_future(end(world.service.goto(grant, goto(0, 60, 5.0), 0)))
+            await world.until(lambda: world.plane.velocity[1] > 4)
+            done = await end(world.service.take_off(grant, TakeoffArgs(12.0)))
+            assert done.verdict.action == "allow"
+            assert abs(world.plane.height - 12.0) < 1.0
+            await asyncio.wait([flying])
+            stood = world.plane.xy[1]
+            await end(world.service.take_off(grant, TakeoffArgs(6.0)))
+            assert abs(world.plane.height - 12.0) < 1.0, "it does not sink for a takeoff"
+            with pytest.raises(Refused, match="roof"):
+                world.service.take_off(grant, TakeoffArgs(40.0))
+            assert abs(world.plane.xy[1] - stood) < 1.0
 
     fly(flight)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import AsyncGenerator
+from contextlib import aclosing
 from dataclasses import dataclass
 
 from fractus_core.policy.values import GotoArgs
@@ -143,6 +144,20 @@ async def come_down(autopilot: Autopilot, motion: Motion) -> AsyncGenerator[Step
         yield Step(max(vehicle.altitude_m, 0.0), complete=False)
         await _tick(autopilot, motion)
     yield Step(0.0, complete=True)
+
+
+async def rise(
+    speed_mps: float, autopilot: Autopilot, motion: Motion, altitude_m: float, permit: Permit
+) -> AsyncGenerator[Step, None]:
+    """Climb to an altitude above home over the place where the drone rests, unless it is high enough."""
+    vehicle = autopilot.vehicle
+    if vehicle.lat is None or vehicle.lon is None or vehicle.altitude_m > altitude_m - HEIGHT_REACHED_M:
+        yield Step(0.0, True)
+        return
+    place = GotoArgs(vehicle.lat, vehicle.lon, altitude_m, speed_mps=speed_mps)
+    async with aclosing(fly_to(autopilot, motion, place, REACHED_M, permit)) as steps:
+        async for step in steps:
+            yield step
 
 
 async def come_to_rest(autopilot: Autopilot, motion: Motion, permit: Permit) -> None:

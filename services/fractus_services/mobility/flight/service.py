@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
 from dataclasses import dataclass, replace
+from functools import partial
 
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, VelocityArgs, Verdict
 
@@ -19,7 +20,15 @@ from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.autopilot import Autopilot, Permit
 from fractus_services.mobility.flight.calls import CallJudge
 from fractus_services.mobility.flight.courses import Replans, Trip, WayHome
-from fractus_services.mobility.flight.motions import REACHED_M, Step, climb, come_down, come_to_rest, fly_to
+from fractus_services.mobility.flight.motions import (
+    REACHED_M,
+    Step,
+    climb,
+    come_down,
+    come_to_rest,
+    fly_to,
+    rise,
+)
 from fractus_services.mobility.flight.steering import Steering
 
 MAX_REACHED_M = 50.0
@@ -88,7 +97,7 @@ class MobilityService:
         """Stop and stay."""
         self.calls.supersede(grant)
         verdict = self.calls.allow_motion(Call("Hover"), grant)
-        self._flying("Hover")
+        _require_air(self._autopilot, "Hover")
         self._control.finish(self._control.begin("Hover"))
         await self._control.hold(driver_permit(self._control, grant))
         return verdict
@@ -119,24 +128,30 @@ class MobilityService:
         return Verdict("correct", SetSpeedArgs(speed), rest.code or "SpeedAboveLimit", reason, rest.policies), speed
 
     def take_off(self, grant: ActiveGrant, args: TakeoffArgs) -> AsyncGenerator[Progress, None]:
-        """Climb from the ground."""
+        """Climb from the ground; in the air, climb to that altitude, or be done above it: a takeoff may be sent again."""
         call = Call("Takeoff", args)
         self._standing_by(call, grant)
         verdict = self.calls.allow_motion(call, grant)
-        altitude = verdict.args.altitude_m if isinstance(verdict.args, TakeoffArgs) else args.altitude_m
 
         async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
-            permit = driver_permit(self._control, grant, motion)
+            permit, final, vehicle = driver_permit(self._control, grant, motion), verdict, self._autopilot.vehicle
             await self._control.modes.enter_guided(permit)
-            async for step in climb(self._autopilot, motion, altitude, permit):
-                yield Progress(verdict, step)
+            climbs: Callable[[Autopilot, Motion, float, Permit], AsyncGenerator[Step, None]] = climb
+            if vehicle.in_air and not vehicle.standing:
+                await come_to_rest(self._autopilot, motion, permit)
+                final = self.calls.allow_motion(call, drivers.require(self._control, grant).grant, verdict)
+                climbs = partial(rise, self._control.cruise_mps)
+            altitude_m = final.args.altitude_m if isinstance(final.args, TakeoffArgs) else args.altitude_m
+            async with aclosing(climbs(self._autopilot, motion, altitude_m, permit)) as climbing:
+                async for step in climbing:
+                    yield Progress(final, step)
 
         return self._run("Takeoff", grant, steps)
 
     def goto(self, grant: ActiveGrant, args: GotoArgs, reached_m: float) -> AsyncGenerator[Progress, None]:
         """Fly straight to a point."""
         verdict = self.calls.allow_motion(Call("Goto", args), grant)
-        self._flying("Goto")
+        _require_air(self._autopilot, "Goto")
         radius = min(max(reached_m, 0.3), MAX_REACHED_M) if reached_m > 0 else REACHED_M
 
         async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
@@ -199,7 +214,7 @@ class MobilityService:
     async def set_velocity(self, grant: ActiveGrant, args: VelocityArgs) -> tuple[Verdict, VelocityArgs]:
         """Fly with a velocity until the next one, or until its hold is over."""
         verdict = self.calls.allow_motion(Call("SetVelocity", args), grant)
-        self._flying("SetVelocity")
+        _require_air(self._autopilot, "SetVelocity")
         motion = self._control.begin("SetVelocity")
         permit = driver_permit(self._control, grant, motion)
         try:
@@ -216,7 +231,7 @@ class MobilityService:
         """Come down here."""
         self.calls.supersede(grant)
         verdict = self.calls.allow_motion(Call("Land"), grant)
-        self._flying("Land")
+        _require_air(self._autopilot, "Land")
 
         async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
             await self._control.modes.change_mode(
@@ -231,7 +246,7 @@ class MobilityService:
         """Fly home on a legal way, and land; a way that becomes illegal under the flying drone is replaced by another."""
         self.calls.supersede(grant)
         verdict = self.calls.allow_motion(Call("ReturnToLaunch"), grant)
-        self._flying("ReturnToLaunch")
+        _require_air(self._autopilot, "ReturnToLaunch")
         return self._return(grant, verdict)
 
     async def _return(self, grant: ActiveGrant, verdict: Verdict) -> AsyncGenerator[Progress, None]:
@@ -274,12 +289,6 @@ class MobilityService:
         drivers.require(self._control, grant)
         if not self._autopilot.vehicle.armed:
             raise PreconditionFailed("NotArmed", "the motors are off; arm first")
-        if self._autopilot.vehicle.in_air and not self._autopilot.vehicle.standing:
-            raise PreconditionFailed("AlreadyFlying", "the drone is in the air; use goto to climb")
-
-    def _flying(self, method: str) -> None:
-        if not self._autopilot.vehicle.in_air:
-            raise PreconditionFailed("NotFlying", f"{method} needs a drone in the air; take off first")
 
     async def _run(
         self, kind: str, grant: ActiveGrant, steps: Callable[[Motion], AsyncGenerator[Progress, None]]
@@ -302,3 +311,8 @@ def _leg(verdict: Verdict, args: GotoArgs, cruise_mps: float) -> GotoArgs:
     """What is flown of a goto, with its speed."""
     goal = verdict.args if isinstance(verdict.args, GotoArgs) else args
     return replace(goal, speed_mps=goal.speed_mps or cruise_mps)
+
+
+def _require_air(autopilot: Autopilot, method: str) -> None:
+    if not autopilot.vehicle.in_air:
+        raise PreconditionFailed("NotFlying", f"{method} needs a drone in the air; take off first")

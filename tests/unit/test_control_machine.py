@@ -512,6 +512,15 @@ def test_a_return_that_is_found_is_told_from_one_of_the_system() -> None:
     assert again.task is not None and not again.task.found
 
 
+def test_a_failsafe_that_is_found_without_a_mission_is_the_systems() -> None:
+    for failsafe, authority in ((True, Authority.SYSTEM), (False, Authority.PILOT)):
+        flies = replace(FLYING, mode=RTL, failsafe=failsafe)
+        found, _ = told_of(told.VehicleFound(), state=ControlState(vehicle=flies))
+        assert found.authority is authority
+        assert found.attended
+        assert found.returning is failsafe
+
+
 def test_a_mission_that_a_pilot_landed_is_not_granted_again() -> None:
     pilots = FlightMode("LOITER", ModeKind.OTHER)
     taken = (told.VehicleObserved(replace(FLYING, mode=pilots)), told.Heartbeat(), told.StreamOpened(2, "a", "A"))

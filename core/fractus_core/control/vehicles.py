@@ -88,8 +88,11 @@ def _found(step: Step) -> None:
             step.begin_grace(mission, DRIVER_LOST)
         return
     commanded, comes_down = vehicle.mode.commanded, vehicle.mode.comes_down
-    if not (commanded or comes_down) or (mission is None and not commanded):
+    if not (commanded or comes_down) or (mission is None and not commanded and not vehicle.failsafe):
         step.give_to_pilot(f"is flying in {vehicle.mode.name}")
+    elif mission is None and comes_down:
+        step.audit("takeover", "homeward", "system", f"found the drone in {vehicle.mode.name}, and no mission")
+        step.follow_descent(_descent(vehicle.mode))
     elif mission is None:
         step.set(authority=Authority.SYSTEM)
         reason = "found the drone armed, and no mission"

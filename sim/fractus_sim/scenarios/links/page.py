@@ -22,7 +22,7 @@ def summary(site: Site, run: Evidence, gains: list[Gain], checks: list[Expectati
         "## Switches\n\nSeconds since the first picture.\n\n" + _switches(run),
         "## Pictures\n\n" + _pictures(run),
         "## Gain over the cloud path alone\n\nMbit beyond what 4G carries, on the flight as it was flown: while traffic was led to"
-        " a node in reach. Modelled rows decide and link in the model of the benchmark; an oracle knows the flight.\n\n"
+        " a node in reach. In the modelled rows a link is up and measured after 0.9 s, also for the oracle, which knows the flight: real links may be sooner.\n\n"
         + table(
             ("", "Mbit", "Share of the oracle's", "Links"),
             ((g.who, f"{g.gain_mbit:.0f}", f"{g.share:.1%}", str(g.links) if g.links else "-") for g in gains),

@@ -157,7 +157,7 @@ class Mobility(ServiceClient):
     def takeoff(
         self, altitude_m: float, *, progress: OnProgress | None = None, timeout_s: float | None = None
     ) -> Motion:
-        """Climb from the ground to an altitude above home."""
+        """Climb from the ground to an altitude above home; in the air climb on to it, or pass where the drone is high enough."""
         return self._motion("Takeoff", takeoff_request(altitude_m), progress, timeout_s)
 
     def land(self, *, progress: OnProgress | None = None, timeout_s: float | None = None) -> Motion:

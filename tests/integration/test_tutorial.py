@@ -1,0 +1,77 @@
+"""docs/tutorial.md does what it says: its program flies its Grant, by its commands."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from fractus_cluster.ports import free_port
+
+PAGE = (Path(__file__).parents[2] / "docs" / "tutorial.md").read_text()
+FLIGHT_TIMEOUT_S = 180
+pytestmark = pytest.mark.timeout(300)
+
+
+def block(kind: str) -> str:
+    """The first block of a kind."""
+    match = re.search(rf"```{kind}\n(.*?)```", PAGE, re.DOTALL)
+    assert match is not None
+    return match[1]
+
+
+def commands(ports: dict[str, str]) -> list[list[str]]:
+    """What is typed after `$ fractus`, in order, on ports of this test's own."""
+    typed = re.findall(r"^\$ fractus ((?:.*\\\n)*.*)$", PAGE, re.MULTILINE)
+    for known, own in ports.items():
+        typed = [line.replace(known, own) for line in typed]
+    return [shlex.split(line.replace("\\\n", " ")) for line in typed]
+
+
+@contextmanager
+def running(folder: Path, *arguments: str) -> Iterator[None]:
+    with (folder / f"{arguments[0]}.log").open("wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "fractus_cli", *arguments], stdout=log, stderr=log, cwd=folder
+        )
+        try:
+            yield
+        finally:
+            process.kill()
+            process.wait(10)
+
+
+def test_the_tutorial_s_program_flies(tmp_path: Path) -> None:
+    vehicle_port, service_port = str(free_port()), str(free_port())
+    init, sign, vehicle, mobility, *_ = commands({"5760": vehicle_port})
+    (tmp_path / "patrol.py").write_text(block("python"))
+    (tmp_path / "patrol.yaml").write_text(block("yaml"))
+    for command in (init, sign):
+        subprocess.run([sys.executable, "-m", "fractus_cli", *command], cwd=tmp_path, check=True, timeout=60)
+    exported = dict(re.findall(r"(FRACTUS_\w+)=(\S+)", PAGE)) | {
+        "FRACTUS_MOBILITY_ADDRESS": f"127.0.0.1:{service_port}"
+    }
+    listen = ("--listen", f"127.0.0.1:{service_port}")
+    begun = time.monotonic()
+    with (
+        running(tmp_path, *vehicle, "--listen", f"tcp:127.0.0.1:{vehicle_port}"),
+        running(tmp_path, *mobility, *listen, "--description", "none.yaml"),
+    ):
+        done = subprocess.run(
+            [sys.executable, "patrol.py"], cwd=tmp_path, env={**os.environ, **exported}, capture_output=True, text=True,
+            timeout=FLIGHT_TIMEOUT_S, check=False,
+        )  # fmt: skip
+    said = done.stdout + done.stderr
+    assert done.returncode == 0, said + (tmp_path / "mobility.log").read_text()
+    expected = re.search(r"\$ python patrol.py\n(.*?)```", PAGE, re.DOTALL)
+    assert expected is not None
+    for line in expected[1].splitlines()[1:]:
+        assert line.split(" ", 1)[1] in said
+    assert time.monotonic() - begun < FLIGHT_TIMEOUT_S

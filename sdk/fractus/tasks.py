@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -67,7 +68,12 @@ class ControlPoint:
 
 def _waypoint(point: Mapping[str, Any]) -> Position:
     reference = AltitudeReference[str(point.get("altitudeReference", "home")).upper()]
-    return Position(float(point["lat"]), float(point["lon"]), float(point.get("alt") or 0.0), reference)
+    return Position(float(point["lat"]), float(point["lon"]), _altitude(point.get("alt")), reference)
+
+
+def _altitude(value: Any) -> float:
+    # Not zero, which would be a descent to the ground: a call with NaN is refused.
+    return math.nan if value is None else float(value)
 
 
 def _corner(point: Mapping[str, Any]) -> Position:

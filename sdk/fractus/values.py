@@ -19,7 +19,7 @@ class AltitudeReference(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """A point in the air: degrees of WGS 84, and metres above `reference`."""
+    """A point in the air: degrees of WGS 84, and metres above `reference`, NaN where a path names no altitude."""
 
     lat: float
     lon: float

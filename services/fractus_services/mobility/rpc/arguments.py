@@ -152,7 +152,7 @@ def _task(point: ControlPoint) -> types_pb2.ControlPoint:
         message.path.add(
             latitude_deg=waypoint.lat,
             longitude_deg=waypoint.lon,
-            altitude_m=waypoint.alt or 0.0,
+            altitude_m=math.nan if waypoint.alt is None else waypoint.alt,
             altitude_reference=cast("Any", _WIRE[waypoint.altitude_reference]),
         )
     if point.region is not None:

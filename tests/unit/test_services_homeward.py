@@ -457,6 +457,25 @@ def test_a_driver_that_flies_on_is_kept_from_zones_by_the_same_grant(tmp_path: P
     fly(flight)
 
 
+def test_a_failsafe_that_lands_is_not_sent_elsewhere(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            plane = world.plane
+            below = zone("below", "ignore", -20, 45, 20, 80)
+            below["zones"][0]["altitude"] = {"lower": -5.0, "upper": 10.0, "reference": "home"}
+            grant = world.grants.put(spec(below))
+            await world.up(grant, 20.0)
+            await end(world.service.goto(grant, GotoArgs(*at(0, 60), 20.0), 0))
+            plane.vehicle.failsafe = True  # a critical battery
+            plane.set_to(LAND)
+            world.observer.heartbeat()
+            await world.until(lambda: not plane.vehicle.armed)
+            assert math.hypot(*plane.xy) > 50.0
+            assert plane.vehicle.mode == LAND
+
+    fly(flight)
+
+
 def test_an_autopilot_that_lands_by_itself_breaks_no_lower_limit(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:

@@ -8,7 +8,7 @@ from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
 from dataclasses import replace
 
-from fractus_core.control.values import FlightMode, TaskKind
+from fractus_core.control.values import FlightMode, ModeKind, TaskKind
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.motion import height_margin_m, margin_m
 from fractus_core.policy.returning import descent_enters, homeward_heights_m, may_change_height, straight_home_blocked
@@ -65,7 +65,9 @@ class Homing:
         control = self._control
         grant, vehicle, stack = control.last_grant, control.autopilot.vehicle, control.autopilot.stack
         self.given_up = None
-        if kind is TaskKind.LAND and (grant is None or not self._lands_in_zone(grant)):
+        # A landing under way is a failsafe's or a pilot's choice, with a battery that may be too low for any other way.
+        landing = vehicle.mode.kind is ModeKind.LANDING or self._blind()
+        if kind is TaskKind.LAND and (grant is None or landing or not self._lands_in_zone(grant)):
             return stack.land
         if grant is None or not vehicle.in_air or vehicle.mode.comes_down or self._blind():
             return stack.return_straight

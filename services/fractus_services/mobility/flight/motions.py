@@ -147,15 +147,15 @@ async def come_down(autopilot: Autopilot, motion: Motion) -> AsyncGenerator[Step
 
 
 async def rise(
-    speed_mps: float, autopilot: Autopilot, motion: Motion, altitude_m: float, permit: Permit
+    speed_mps: float, autopilot: Autopilot, motion: Motion, altitude_m: float, permit: Permit, *, judged: Permit
 ) -> AsyncGenerator[Step, None]:
-    """Climb to an altitude above home over the place where the drone rests, unless it is high enough."""
+    """Climb to an altitude above home over the place where the drone rests, unless it is high enough; see `fly_to`."""
     vehicle = autopilot.vehicle
     if vehicle.lat is None or vehicle.lon is None or vehicle.altitude_m > altitude_m - HEIGHT_REACHED_M:
         yield Step(0.0, True)
         return
     place = GotoArgs(vehicle.lat, vehicle.lon, altitude_m, speed_mps=speed_mps)
-    async with aclosing(fly_to(autopilot, motion, place, REACHED_M, permit)) as steps:
+    async with aclosing(fly_to(autopilot, motion, place, REACHED_M, permit, judged=judged)) as steps:
         async for step in steps:
             yield step
 

@@ -47,11 +47,13 @@ class Progress:
     step: Step
 
 
-class _Outdated(Exception):
+class _Outdated(Aborted):
     """The leg that was judged is not legal any more, or another one is; carries the verdict that holds now."""
 
     def __init__(self, verdict: Verdict) -> None:
-        super().__init__(verdict.reason)
+        super().__init__(
+            "NotFollowing", "what is permitted has changed since the autopilot was first told where to fly"
+        )
         self.verdict = verdict
 
 
@@ -140,7 +142,7 @@ class MobilityService:
             if vehicle.in_air and not vehicle.standing:
                 await come_to_rest(self._autopilot, motion, permit)
                 final = self.calls.allow_motion(call, drivers.require(self._control, grant).grant, verdict)
-                climbs = partial(rise, self._control.cruise_mps)
+                climbs = partial(rise, self._control.cruise_mps, judged=self._judged(call, grant, final, permit))
             altitude_m = final.args.altitude_m if isinstance(final.args, TakeoffArgs) else args.altitude_m
             async with aclosing(climbs(self._autopilot, motion, altitude_m, permit)) as climbing:
                 async for step in climbing:

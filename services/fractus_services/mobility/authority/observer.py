@@ -121,6 +121,8 @@ class Observer:
         if flying and self._unverified_since is None:
             self._unverified_since = control.autopilot.now
         checked = await self._failsafes.configure(flying=flying, before=before)
+        if not checked.lost:
+            self._unverified_since = None
         if not flying:
             control.set_checked(checked)
             return
@@ -145,8 +147,6 @@ class Observer:
         if broken is not None:
             raise broken
         self._verified_at = control.autopilot.now
-        if not checked.lost:
-            self._unverified_since = None
 
     def _come_home(self, why: str) -> None:
         """Take over a drone whose autopilot alone would not bring it home, unless the system does so already."""

@@ -59,6 +59,8 @@ class Control:
         """What is to be done there: path or region, as the application declares them; known once control is ours."""
         self.waypoints_reached = 0
         """How many of its waypoints are done with, in this life of the component and in earlier ones."""
+        self.begun: Sequence[object] | None = None
+        """The waypoints of its mission, once that was begun; `waypoints_reached` counts them."""
         self.mission_complete = False
         """After control was returned: whether that was the last control point."""
 

@@ -215,6 +215,7 @@ class Mobility(ServiceClient):
 
         Raises:
             ControlLost: control was not taken.
+            InvalidRequest: when it is flown: the control point has a mission of other waypoints.
         """
         if self._control is None:
             raise ControlLost("a mission is for a control point; use `async with drone.control():`")

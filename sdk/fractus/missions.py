@@ -70,6 +70,8 @@ class Mission:
     Progress is kept on the drone (`Control.report`): the mission of a restarted component goes on with the waypoint that
     was under way. Each leg is a `goto` that is judged when its turn comes; nothing is uploaded to the autopilot.
 
+    A control point has one mission, for there is one count of waypoints; one of the same waypoints goes on with it.
+
     Args:
         fly: begins one leg.
         control: of the control point.
@@ -124,7 +126,9 @@ class Mission:
             PolicyDenied: policies forbid a leg; the drone hovers before it.
             Interrupted: a leg was stopped; awaiting the mission again goes on with it.
             ControlLost: the system or a pilot took the drone.
+            InvalidRequest: the control point's mission is another one, or one of the same waypoints is over.
         """
+        self._begin()
         for number in range(self._control.waypoints_reached + 1, len(self.waypoints) + 1):
             try:
                 await self._leg(number, progress)
@@ -138,6 +142,15 @@ class Mission:
 
     def __await__(self) -> Generator[Any, None, dict[int, PolicyDenied]]:
         return self.fly().__await__()
+
+    def _begin(self) -> None:
+        begun, over = self._control.begun, self._control.waypoints_reached >= len(self.waypoints)
+        if begun is not None and begun is not self.waypoints and (over or begun != self.waypoints):
+            raise InvalidRequest(
+                "a control point has one mission, and another one was begun: fly all waypoints in one, "
+                "`drone.mission([*survey, *orbit])`, or those that are not to be remembered with `drone.goto`"
+            )
+        self._control.begun = self.waypoints
 
     async def _leg(self, number: int, progress: Callable[[MissionProgress], None] | None) -> None:
         """One leg, begun again after each pause."""

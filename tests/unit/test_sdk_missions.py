@@ -6,7 +6,7 @@ import json
 import logging
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import fractus
 import pytest
@@ -85,3 +85,32 @@ def test_a_plan_that_cannot_be_flown_says_why(tmp_path: Path, items: list[dict[s
         fractus.read_plan(plan(tmp_path, *items))
     with pytest.raises(fractus.InvalidRequest, match="No such file"):
         fractus.read_plan(tmp_path / "none.plan")
+
+
+class Remembered:
+    """Control that counts waypoints."""
+
+    begun = None
+    waypoints_reached = 0
+
+    async def report(self, waypoints: int) -> None:
+        self.waypoints_reached = waypoints
+
+
+async def test_a_control_point_has_one_mission() -> None:
+    control, flown = cast(fractus.Control, Remembered()), list[fractus.Position]()
+    first, second, third = (fractus.Position(lat, 22.0) for lat in (39.0, 39.1, 39.2))
+
+    async def goto(waypoint: fractus.Waypoint) -> None:
+        flown.append(waypoint.position)
+
+    def mission(*places: fractus.Position) -> fractus.Mission:
+        return fractus.Mission(lambda to, _: cast(Any, goto(to)), control, places)
+
+    whole = mission(first, second)
+    await whole
+    await whole
+    for other in (mission(third), mission(first, second, third), mission(first, second)):
+        with pytest.raises(fractus.InvalidRequest, match="one mission, and another one was begun"):
+            await other
+    assert flown == [first, second]

@@ -12,11 +12,14 @@ import logging
 import os
 import signal
 import time
+import uuid
 from typing import Any
 
 import fractus
 
 PERIOD_S = float(os.environ.get("PERIOD_S", "1"))
+LIFE = uuid.uuid4().hex
+"""Numbers begin again after a restart; the ids of requests must not."""
 log = logging.getLogger("viewer")
 
 
@@ -46,7 +49,7 @@ async def pass_on(camera: fractus.Camera, checker: fractus.Requester, number: in
     except fractus.FractusError as error:
         log.info("no picture %d: %s", number, error)
         return
-    request = f"{os.environ['FRACTUS_INSTANCE']}-{number}"
+    request = f"{os.environ['FRACTUS_INSTANCE']}-{LIFE}-{number}"
     tell("sent", number, bytes=len(picture))
     begun = time.monotonic()
     try:

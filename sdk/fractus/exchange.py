@@ -11,6 +11,7 @@ The connections are not encrypted by themselves.
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import logging
 import math
 import signal
@@ -19,7 +20,7 @@ from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import grpc
 
@@ -67,7 +68,7 @@ class Request:
     """What a component is asked.
 
     Attributes:
-        id: the same in every repetition.
+        id: the same in every repetition, and in those only: an id that comes with another body is refused.
         method: what is asked for.
         body: of whatever form the components agree on.
         attempt: 1 for the first; only in repetitions more.
@@ -82,8 +83,13 @@ class Request:
 Handler = Callable[[Request], Awaitable[bytes]]
 
 
+class _Kept(NamedTuple):
+    digest: bytes
+    answer: asyncio.Task[bytes]
+
+
 class Answers:
-    """Answers by request id, so that no request is carried out twice; the oldest are forgotten first.
+    """Answers by method and request id, so that no request is carried out twice; the oldest are forgotten first.
 
     Args:
         count: how many are kept.
@@ -93,34 +99,39 @@ class Answers:
     def __init__(self, count: int = KEPT_ANSWERS, size: int = KEPT_BYTES) -> None:
         self._count = count
         self._left = size
-        self._tasks: OrderedDict[str, asyncio.Task[bytes]] = OrderedDict()
+        self._kept: OrderedDict[tuple[str, str], _Kept] = OrderedDict()
         self.repeated = 0
 
     async def once(self, request: Request, handler: Handler) -> bytes:
-        """The answer of a handler, which is called for the first request of an id only.
+        """The answer of a handler, which is called for the first request of a method and an id only.
 
         A handler that raises has carried nothing out: a repetition calls it again. One that has begun goes on when the
         connection breaks.
+
+        Raises:
+            ValueError: the request of that id had another body.
         """
-        task = self._tasks.get(request.id)
-        if task is None:
-            task = asyncio.ensure_future(_run(handler, request))
-            self._tasks[request.id] = task
-            task.add_done_callback(lambda done: self._ended(request.id, done))
+        key, digest = (request.method, request.id), hashlib.sha256(request.body).digest()
+        kept = self._kept.get(key)
+        if kept is None:
+            kept = self._kept[key] = _Kept(digest, asyncio.ensure_future(_run(handler, request)))
+            kept.answer.add_done_callback(lambda done: self._ended(key, done))
+        elif kept.digest != digest:
+            raise ValueError(f"request {request.id} had another body before: give each request an id of its own")
         else:
             self.repeated += 1
-        return await asyncio.shield(task)
+        return await asyncio.shield(kept.answer)
 
-    def _ended(self, request_id: str, task: asyncio.Task[bytes]) -> None:
+    def _ended(self, key: tuple[str, str], task: asyncio.Task[bytes]) -> None:
         if task.cancelled() or task.exception() is not None:
-            self._tasks.pop(request_id, None)
+            self._kept.pop(key, None)
             return
         self._left -= len(task.result())
-        for oldest in list(self._tasks):
-            if self._left >= 0 and len(self._tasks) <= self._count:
+        for oldest in list(self._kept):
+            if self._left >= 0 and len(self._kept) <= self._count:
                 return
-            if self._tasks[oldest].done():
-                self._left += len(self._tasks.pop(oldest).result())
+            if self._kept[oldest].answer.done():
+                self._left += len(self._kept.pop(oldest).answer.result())
 
 
 async def _run(handler: Handler, request: Request) -> bytes:
@@ -150,7 +161,8 @@ class Requester:
             method: what is asked for.
             body: at most 16 MiB.
             timeout_s: when to give up.
-            request_id: of a request on whose behalf this one is made; by default a new one.
+            request_id: of a request on whose behalf this one is made, which then has the same body each time; by default a
+                new one.
 
         Raises:
             InvalidRequest: the other component refuses it.

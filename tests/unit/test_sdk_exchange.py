@@ -57,9 +57,18 @@ async def test_a_repetition_gets_the_first_answer() -> None:
     worker = Worker()
     async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}") as asking:
         assert await asking.ask("work", b"this", request_id="r1") == b"did this"
-        assert await asking.ask("work", b"other", request_id="r1") == b"did this"
+        assert await asking.ask("work", b"this", request_id="r1") == b"did this"
         assert responder.answers.repeated == 1
+        with pytest.raises(InvalidRequest, match="r1 had another body before"):
+            await asking.ask("work", b"other", request_id="r1")
     assert worker.done == ["r1"]
+
+
+async def test_an_id_counts_within_its_method() -> None:
+    answers, worker = Answers(), Worker()
+    for method in ("work", "play"):
+        await answers.once(Request("r1", method, b"this"), worker.work)
+    assert worker.done == ["r1", "r1"]
 
 
 async def test_work_that_has_begun_is_waited_for_and_not_begun_again() -> None:

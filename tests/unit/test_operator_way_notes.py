@@ -12,6 +12,7 @@ import pytest
 from fractus_core.api import Application
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning.inventory import Inventory, Settings
+from fractus_operator.metrics import REGISTRY
 from fractus_operator.reconcile import way_notes
 from fractus_operator.reconcile.way_notes import WayNotes
 
@@ -113,3 +114,24 @@ async def test_many_applications_keep_one_thread_busy(judge: Judge) -> None:
     judge.go.set()
     await notes.until(lambda: not notes.notes._working)
     assert len(judge.asked) == 4, "one that is gone is not judged"
+
+
+async def test_what_cannot_be_judged_is_counted_and_not_tried_at_each_reconcile(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def count() -> float:
+        labels = {"kind": "ways", "reason": "Bug"}
+        return REGISTRY.get_sample_value("fractus_operator_reconcile_errors_total", labels) or 0.0
+
+    def broken(*_: Any) -> DeploymentPlanSpec:
+        raise KeyError("a zone that is none")
+
+    monkeypatch.setattr(way_notes, "with_legality", broken)
+    notes, present, before = Notes(), plan(), count()
+    for failures in (1, 1, 2):
+        notes.now += timedelta(minutes=2) if failures == 2 else timedelta()
+        assert notes.ask(present) is present
+        await notes.until(lambda: not notes.notes._working)
+        assert count() == before + failures
+    assert "a zone that is none" in caplog.text
+    assert not notes.woken.is_set()

@@ -15,7 +15,7 @@ from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.legality import with_legality
 
 from fractus_operator.cluster.kinds import Key
-from fractus_operator.metrics import phase
+from fractus_operator.metrics import ERRORS, phase
 
 logger = logging.getLogger(__name__)
 
@@ -105,6 +105,11 @@ class WayNotes:
             except InvalidObject as error:
                 # The application contradicts itself: planning says so.
                 logger.info("way notes: not judged (application=%s/%s): %s", *key, error)
+                noted = plan
+            except Exception:
+                # Noted, too: what failed is tried again when notes are due, not at each reconcile.
+                ERRORS.labels("ways", "Bug").inc()
+                logger.exception("way notes: not judged (application=%s/%s)", *key)
                 noted = plan
         if self._judged.get(key) is not before:
             return  # another plan was made meanwhile

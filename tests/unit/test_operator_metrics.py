@@ -5,12 +5,18 @@ from __future__ import annotations
 import asyncio
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 from fractus_cluster.ports import free_port
 from fractus_operator import metrics
+from fractus_operator.cluster.kinds import Key
 from fractus_operator.cluster.store import KubeError
+from fractus_operator.inventory.live import LiveInventory
+from fractus_operator.inventory.subscriptions import Subscriptions
 from fractus_operator.metrics import REGISTRY, Observed
+from fractus_operator.reconcile.applications import Applications, BeingDeleted
 from fractus_operator.reconcile.worklist import Worklist
 from prometheus_client.parser import text_string_to_metric_families
 
@@ -85,3 +91,23 @@ async def test_a_step_that_fails_is_counted(error: Exception, reason: str) -> No
 async def test_without_a_port_nothing_is_told() -> None:
     async with metrics.serving(0, observed):
         pass
+
+
+async def test_an_application_that_is_being_deleted_is_no_failure() -> None:
+    class Leaving(Applications):
+        def __init__(self) -> None:
+            async def synced() -> None:
+                pass
+
+            self._live = cast(LiveInventory, SimpleNamespace(synced=synced, subscriptions=Subscriptions()))
+
+        async def reconcile(self, key: Key) -> float:
+            raise BeingDeleted
+
+    def count() -> float | None:
+        labels = {"kind": "application", "reason": "Bug"}
+        return REGISTRY.get_sample_value("fractus_operator_reconcile_errors_total", labels)
+
+    before = count()
+    await Leaving().follow(("ns", "a"), lambda: False)
+    assert count() == before

@@ -113,10 +113,11 @@ class Applications:
                 started = loop.time()
                 try:
                     with reconciling("application"):
-                        next_s = await self.reconcile(key)
+                        try:
+                            next_s = await self.reconcile(key)
+                        except BeingDeleted:
+                            return  # inside: this is no failure to count
                     backoff.succeeded()
-                except BeingDeleted:
-                    return
                 except KubeError as error:
                     next_s = backoff.delay_s()
                     logger.warning(

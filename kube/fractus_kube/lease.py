@@ -214,9 +214,13 @@ class LeaseThread:
             if cancelled.is_set():
                 return
             async with contextlib.aclosing(await self._connect()) as client:
-                self._lease = Lease(client, *self._rest)
-                parts = [asyncio.create_task(part) for part in (self._lease.run(), stop.wait(), self._lease.held())]
-                parts[2].add_done_callback(lambda _: caller.call_soon_threadsafe(self._acquired.set))
+                self._lease = lease = Lease(client, *self._rest)
+
+                async def tell() -> None:
+                    await lease.held()
+                    caller.call_soon_threadsafe(self._acquired.set)
+
+                parts = [asyncio.create_task(part) for part in (lease.run(), stop.wait(), tell())]
                 try:
                     await asyncio.wait(parts[:2], return_when=asyncio.FIRST_COMPLETED)
                     if not stop.is_set():

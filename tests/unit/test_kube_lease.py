@@ -283,3 +283,18 @@ async def test_one_that_is_ended_at_once_ends() -> None:
     async with asyncio.timeout(20.0):
         await asyncio.gather(task, return_exceptions=True)
     assert task.cancelled()
+
+
+async def test_one_that_never_held_the_lease_does_not_say_so() -> None:
+    shelf = _Closable()
+    await step(lease(shelf, Clock(), "first"))
+    shelf.stalls = 1
+    second = _kept_in_a_thread(shelf, "second", 60.0)
+    task = asyncio.create_task(second.run())
+    async with asyncio.timeout(20.0):
+        while shelf.stalls:  # noqa: ASYNC110 (nothing tells when)
+            await asyncio.sleep(0.01)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    await asyncio.sleep(0)
+    assert not second._acquired.is_set()

@@ -13,7 +13,8 @@ from fractus_operator.cluster.labels import FINALIZER
 from fractus_operator.cluster.store import KubeError, Store, Unconfigured
 
 NOT_REPORTED = "its last report"
-_REPORT_S = 2 * DRONE_REPORT_S
+_REPORTS_S = 3 * DRONE_REPORT_S
+"""How long two reports may take; the chart's Job has 150 s in all."""
 _PERIOD_S = 2.0
 
 
@@ -67,15 +68,16 @@ def _listed(names: Sequence[str], most: int = 5) -> str:
 
 
 async def check() -> str:
-    """Return the objection that the cluster's present state gives rise to; drones that have landed get the time for a report.
+    """Return the objection that the cluster's present state gives rise to; drones that have landed get the time for two reports.
 
     Raises:
         Unconfigured: there are no credentials.
         KubeError: the API server refused, or could not be reached.
     """
     store = await Store.connect()
+    found = "whether drones fly could not be found out: the API server did not answer in time"
     try:
-        async with asyncio.timeout(_REPORT_S) as waited:
+        async with asyncio.timeout(_REPORTS_S) as waited:
             while True:
                 found = objection(await store.list(APPLICATION), await store.list(DRONE))
                 if NOT_REPORTED not in found:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -317,8 +318,13 @@ def test_whether_a_drone_has_a_mission_is_said(guarded: World, permitted: Operat
     wait_for(lambda: condition(guarded, "drone-2", "OnMission").get("status") == "True", permitted.log)
     guarded.api.delete(f"{FRACTUS}/namespaces/{namespace}/applications/traffic")
     wait_for(lambda: condition(guarded, "drone-2", "OnMission").get("status") == "Unknown", permitted.log)
-    guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-01T00:00:30Z"}})
-    wait_for(lambda: condition(guarded, "drone-2", "OnMission").get("status") == "False", permitted.log)
+    minutes = itertools.count(1)
+
+    def reported() -> bool:
+        guarded.api.merge(f"{path}/status", {"status": {"lastSeen": f"2026-01-01T00:{next(minutes) % 60:02}:00Z"}})
+        return condition(guarded, "drone-2", "OnMission").get("status") == "False"
+
+    wait_for(reported, permitted.log)
 
 
 def test_who_sees_a_drone_on_the_ground_frees_it_for_the_operator_and_leaves_a_record(

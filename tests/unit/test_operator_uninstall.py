@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Any
 
 import pytest
-from fractus_operator.uninstall_check import objection
+from fractus_operator import uninstall_check
+from fractus_operator.cluster.store import Store
+from fractus_operator.uninstall_check import check, objection
 
 
 def application(name: str, *finalizers: str) -> dict[str, Any]:
@@ -61,3 +64,19 @@ def test_a_drone_that_may_have_taken_off_is_named_until_someone_sees_it_on_the_g
     for body in (doubtful, flying):
         body["metadata"]["annotations"] = {"fractus.dev/grounded": seen}
     assert objection([], [doubtful, flying]) == ""
+
+
+async def test_an_api_server_that_does_not_answer_is_an_objection(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Silent:
+        async def list(self, _: object) -> None:
+            await asyncio.Event().wait()
+
+        async def aclose(self) -> None:
+            pass
+
+    async def connect() -> Silent:
+        return Silent()
+
+    monkeypatch.setattr(Store, "connect", connect)
+    monkeypatch.setattr(uninstall_check, "_REPORTS_S", 0.05)
+    assert "the API server did not answer" in await check()

@@ -18,11 +18,17 @@ from fractus_operator.reconcile.reporting import record_events
 
 logger = logging.getLogger(__name__)
 
+_REPORTS = 2
+"""How many reports, after its Grants went, show what the drone does."""
+
 
 class OnMission:
     """Writes the condition OnMission of Drones.
 
-    True while there is a Grant for the drone; then Unknown until it has reported, for it may have taken off out of reach.
+    True while there is a Grant for the drone; then Unknown until it has reported twice, for it may have taken off out of
+    reach: the first report that is heard may have been written before the Grant went. Reports are told apart by their time,
+    which is the drone's own and compared with no other clock.
+
     And records where someone overrides the protection of a drone by the annotation fractus.dev/grounded.
     """
 
@@ -33,8 +39,8 @@ class OnMission:
         self._clock = clock
         self._nodes: dict[Key, str] = {}
         self._holders: dict[str, dict[Key, str]] = {}
-        self._last_seen: dict[str, datetime | None] = {}
-        """Of drones whose grants are gone: when each had reported by then."""
+        self._reports_of: dict[str, set[datetime | None]] = {}
+        """Of drones whose grants are gone: the times of their reports, from the one that was known by then."""
         self._recorded: dict[str, datetime | None] = {}
 
     def grant_changed(self, key: Key) -> Key | None:
@@ -67,17 +73,19 @@ class OnMission:
     def _observed(self, drone: Drone) -> ConditionUpdate | None:
         holders = sorted(set(self._holders.get(drone.name, {}).values()))
         if holders:
-            self._last_seen.pop(drone.name, None)
+            self._reports_of.pop(drone.name, None)
             return ConditionUpdate(ON_MISSION, "True", "Granted", f"{', '.join(holders)} may fly it")
         known = self._reports.condition(drone.name, ON_MISSION)
         if known is None or known.status == "False":
-            self._last_seen.pop(drone.name, None)
+            self._reports_of.pop(drone.name, None)
             return None
         seen = drone.status.last_seen if drone.status is not None else None
-        before = self._last_seen.setdefault(drone.name, seen)
-        if drone.status is not None and drone.status.flight_state != "unknown" and seen != before:
+        heard = self._reports_of.setdefault(drone.name, {seen})
+        if drone.status is not None and drone.status.flight_state != "unknown":
+            heard.add(seen)
+        if len(heard) > _REPORTS:
             return ConditionUpdate(ON_MISSION, "False", "NoGrant", "no application may fly it", progress=True)
-        why = "no application may fly it any more, but it has not reported since"
+        why = "no application may fly it any more, but it has not reported twice since"
         return ConditionUpdate(ON_MISSION, "Unknown", "NotHeardOf", why, progress=True)
 
     async def _record_override(self, drone: Drone) -> None:

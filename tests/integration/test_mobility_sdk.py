@@ -104,6 +104,8 @@ async def test_control_returned_through_the_sdk(rig: Rig) -> None:
         async with drone.control() as control:
             await drone.arm()
             await drone.takeoff(10)
+            here = (await drone.position()).position
+            await drone.goto(here.lat, here.lon, 12.0)
         assert control.mission_complete
         await rig.until(lambda t: not t.armed, 90, "landing")
         with pytest.raises(MissionComplete):

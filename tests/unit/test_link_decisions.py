@@ -121,10 +121,31 @@ def lessons(distance_m: float, **reach: float) -> Lessons:
     return found
 
 
-def test_a_peer_that_is_heard_from_afar_reaches_further() -> None:
+def test_a_peer_whose_link_works_afar_reaches_further_and_a_beacon_says_nothing_of_it() -> None:
     found = lessons(96.0)
     found.beacon("e1", NOW_S)
+    assert found.reaches["e1"] == Reach(heard_s=NOW_S)
+    found.delivered("e1", WIFI)
     assert found.reaches["e1"].range_factor == pytest.approx(1.2 * 1.02)
+
+
+def test_a_beacon_gives_back_what_a_peer_declares_and_no_more() -> None:
+    found = lessons(96.0, range_factor=1.4)
+    found.broke("e1", NOW_S)
+    found.beacon("e1", NOW_S + 1.0)
+    assert found.reaches["e1"].range_factor == pytest.approx(1.2 / 1.02)
+    near = lessons(72.0, range_factor=1.4)
+    near.broke("e1", NOW_S)
+    near.beacon("e1", NOW_S + 1.0)
+    assert near.reaches["e1"].range_factor == 1.0
+
+
+def test_peers_that_are_not_planned_are_forgotten() -> None:
+    found = lessons(64.0)
+    for name in ("e1", "e2"):
+        found.came_up(name, NOW_S)
+    found.keep({"e2"})
+    assert set(found.reaches) == {"e2"}
 
 
 def test_links_that_break_near_say_nothing_of_the_reach() -> None:

@@ -164,10 +164,11 @@ class Connectivity:
     async def _use(self, interface: Interface) -> None:
         """Everything that one interface takes, made new at the beginning and removed in the end."""
         assert interface.device is not None
-        controller = self._controller(interface)
         ports = nft.Ports(udp=beacons.PORT, tcp=pairing.PORT)
         device = interface.device
-        await self._appeared(controller)
+        await self._appeared(Plain(device, link_address(self._node)))
+        # Only now is it known whether it is a radio.
+        controller = self._controller(interface)
         # Closed before it gets an address.
         nft.create(device, ports)
         netlink = Netlink(NETLINK_NETFILTER)
@@ -182,22 +183,26 @@ class Connectivity:
         keeping = asyncio.create_task(redirector.run())
         try:
             async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(_outlived(keeping))
                 tasks.create_task(self._keep_up(controller))
                 tasks.create_task(self._run_end(redirector, device))
         finally:
             keeping.cancel()
             await asyncio.gather(keeping, return_exceptions=True)
             redirector.close()
-            with suppress(nft.RedirectFailed):
-                nft.remove()
-            # After the table, which would mark new connections.
-            with suppress(NetlinkError):
-                conntrack.forget_all()
-            netlink.close()
             try:
+                # Before the table goes: what is up without it is open to every radio in reach.
                 await controller.down()
             except InterfaceProblem as problem:
-                log.warning("links: %s", problem)
+                log.warning("links: the packet filter stays: %s", problem)
+            else:
+                with suppress(nft.RedirectFailed):
+                    nft.remove()
+            finally:
+                # After the table, which would mark new connections.
+                with suppress(NetlinkError):
+                    conntrack.forget_all()
+                netlink.close()
 
     async def _run_end(self, redirector: Redirector, device: str) -> None:
         if self._end == "drone":
@@ -266,6 +271,12 @@ class Connectivity:
             log.log(logging.WARNING if found else logging.INFO, "links: %s", message or "the interface is up")
             self._problem = found
             self._say()
+
+
+async def _outlived(keeping: asyncio.Task[None]) -> None:
+    """Fail when the redirects are kept alive no more; unlike an await of the task itself, this ends without ending it."""
+    await asyncio.wait({keeping})
+    keeping.result()
 
 
 def _first(error: BaseException) -> BaseException:

@@ -24,12 +24,12 @@ from fractus_core.linking import (
     TargetHeuristic,
     Track,
     UnknownHeuristic,
-    heuristic,
 )
 
 from fractus_agent.links.addressing import link_address
 from fractus_agent.links.connector import Connector
 from fractus_agent.links.decisions import Actions, Situation, Traffic, decide
+from fractus_agent.links.heuristics import Heuristics
 from fractus_agent.links.lessons import Lessons
 from fractus_agent.links.pairing import Session
 from fractus_agent.links.plans import route_key, virtuals
@@ -83,7 +83,8 @@ class DroneEnd:
         self._links: tuple[DirectLink, ...] = ()
         self._courses: dict[tuple[object, ...], Course] = {}
         self._unknown: dict[str, str] = {}
-        self._routes: dict[Endpoint, Endpoint] = {}
+        self._heuristics = Heuristics()
+        self._said: tuple[str, Mapping[str, Any]] | None = None
         self._direct: PathMetrics | None = None
         self._parting = False
         self._lost = asyncio.Event()
@@ -93,11 +94,16 @@ class DroneEnd:
     def plan(self, links: tuple[DirectLink, ...]) -> None:
         """Take the DirectLinks of this drone as they are now."""
         self._links = links
+        self._lessons.keep(self._nodes())
         self._wake.set()
 
     def heard(self, node: str) -> None:
-        """A beacon came."""
-        self._lessons.beacon(node, time.monotonic())
+        """A beacon came; anyone can send one, with any name."""
+        if node in self._nodes():
+            self._lessons.beacon(node, time.monotonic())
+
+    def _nodes(self) -> set[str]:
+        return {link.spec.node for link in self._links}
 
     async def run(self) -> None:
         """Decide until cancelled; then lead all traffic back and end the link."""
@@ -170,8 +176,15 @@ class DroneEnd:
         self._lessons.peers = peers
         return Situation(
             now_s, track, tuple(self._traffic(peers)), self._connector.link, dict(self._lessons.reaches),
-            self._cloud(), self._direct, dict(self._routes), self._redirector.redirects,
+            self._cloud(), self._direct, self._routes(), self._redirector.redirects,
         )  # fmt: skip
+
+    def _routes(self) -> dict[Endpoint, Endpoint]:
+        """Where the peer takes calls, by the DirectLinks of now: it may tell of one before this end knows it."""
+        if self._said is None:
+            return {}
+        peer, message = self._said
+        return _routes(message, link_address(peer), [link for link in self._links if link.spec.node == peer])
 
     def _flight(self) -> tuple[Track | None, dict[str, Peer]]:
         """Where the drone flies, and where its peers are, in one frame; by the path of the first application by name."""
@@ -205,19 +218,16 @@ class DroneEnd:
         """The heuristic of an application; None, and so the cloud path, where it is not known here."""
         chosen = link.spec.heuristic
         try:
-            return heuristic(chosen.kind, chosen.metric)
+            return self._heuristics.find(chosen.kind, chosen.metric)
         except UnknownHeuristic as error:
             self._unknown[application] = str(error)
-        except Exception as error:  # a plug-in of the user's that cannot be loaded
-            self._unknown[application] = f"the heuristic {chosen.kind} cannot be loaded: {error}"
         return None
 
     async def _use(self, session: Session) -> None:
         """While a session lasts: hear the peer's routes, and measure."""
-        address = link_address(session.peer)
 
         def told(message: Mapping[str, Any]) -> None:
-            self._routes = _routes(message, address, [link for link in self._links if link.spec.node == session.peer])
+            self._said = (session.peer, message)
             self._wake.set()
 
         session.told = told
@@ -237,7 +247,7 @@ class DroneEnd:
                 self._wake.set()
                 await asyncio.sleep(PROBE_S)
         finally:
-            self._routes, self._direct = {}, None
+            self._said = self._direct = None
             self._lost.set()
             self._wake.set()
 

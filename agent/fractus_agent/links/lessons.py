@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 
 from fractus_core.linking import PathMetrics, Peer, Position, Reach, Settings
@@ -30,14 +30,24 @@ class Lessons:
     peers: Mapping[str, Peer] = field(default_factory=dict)
     _before_loss: dict[str, tuple[float, float]] = field(default_factory=dict)
 
+    def keep(self, names: Collection[str]) -> None:
+        """Forget all peers but these."""
+        for learned in (self.reaches, self._before_loss):
+            for name in learned.keys() - set(names):
+                del learned[name]
+
     def beacon(self, name: str, now_s: float) -> None:
-        """A peer was heard; where its link broke no nearer than here, that was not for the distance."""
+        """A peer was heard; where its link broke no nearer than here, that was not for the distance.
+
+        Anyone can send a beacon: it gives back what a peer declares, and no more than that.
+        """
         distance = self._distance(name) or 0.0
         before = self._before_loss.get(name)
         if before is not None and distance >= before[0]:
             del self._before_loss[name]
-            self.reaches[name] = replace(self._own(name), range_factor=before[1])
-        self.reaches[name] = heard(self._own(name), distance, now_s)
+            factor = max(self._own(name).range_factor, min(before[1], 1.0))
+            self.reaches[name] = replace(self._own(name), range_factor=factor)
+        self.reaches[name] = replace(self._own(name), heard_s=now_s)
 
     def came_up(self, name: str, now_s: float) -> None:
         """The link to a peer came up."""
@@ -60,6 +70,8 @@ class Lessons:
         distance, peer = self._distance(name), self.peers.get(name)
         if distance is None or peer is None or peer.offers.ingress_mbps <= 0:
             return
+        if distance > 1:
+            self.reaches[name] = heard(self._own(name), distance, self._own(name).heard_s)
         share = strength(distance / self._own(name).range_factor, self.settings.edge)
         if share >= 1:
             self.reaches[name] = measured(self._own(name), path.ingress_mbps / peer.offers.ingress_mbps)

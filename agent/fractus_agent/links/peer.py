@@ -11,7 +11,7 @@ from fractus_core.api.links import DirectLink
 
 from fractus_agent.links.acceptor import Acceptor
 from fractus_agent.links.addressing import link_address
-from fractus_agent.links.pairing import Session
+from fractus_agent.links.pairing import LinkLost, Session
 from fractus_agent.links.plans import route_key, target, virtual
 from fractus_agent.redirector.netlink import NetlinkError
 from fractus_agent.redirector.nft import Endpoint, RedirectFailed
@@ -74,11 +74,19 @@ class PeerEnd:
         return "" if any(link.spec.drone == drone for link in self._links) else f"no DirectLink names {drone}"
 
     async def _serve(self, session: Session) -> None:
-        """While a session lasts: lead the drone's calls on, and tell it where to."""
+        """While a session lasts: lead the drone's calls on, and tell it where to.
+
+        Raises:
+            LinkLost: no DirectLink names the drone any more; it has had its time to lead its calls back.
+        """
         told: dict[str, int] | None = None
         self._changed()
         try:
-            while not self._permits(session.peer):
+            while True:
+                if self._permits(session.peer):
+                    await asyncio.sleep(PARTING_S)
+                    if reason := self._permits(session.peer):
+                        raise LinkLost(f"{reason} any more")
                 planned = self._planned
                 try:
                     routes = self._lead(session.peer)
@@ -90,7 +98,6 @@ class PeerEnd:
                     await session.send({"routes": routes})
                     told = routes
                 await planned.wait()
-            await asyncio.sleep(PARTING_S)
         finally:
             self._routes.pop(session.peer, None)
             self._changed()

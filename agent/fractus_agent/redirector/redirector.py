@@ -71,13 +71,17 @@ class Namespaces:
         """Open what is new, close what is gone; all that are there."""
         if self._directory is None:
             return ()
-        there = {self._own, *(self._directory.iterdir() if self._directory.is_dir() else ())}
+        there = {self._own}
+        try:
+            there.update(self._directory.iterdir())
+        except OSError as error:  # the runtime has made none yet
+            log.debug("redirector: no network namespaces of pods (error=%s)", error)
         for path in set(self._open) - there:
             self._open.pop(path).close()
         for path in there - set(self._open):
             try:
                 self._open[path] = Sockets(in_namespace(path, lambda: Netlink(NETLINK_SOCK_DIAG)))
-            except OSError as error:  # a pod that ends at this moment
+            except (OSError, RuntimeError) as error:  # a pod that ends at this moment
                 log.debug("redirector: network namespace left out (path=%s error=%s)", path, error)
         return self._open.values()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import socket
 import struct
 from collections.abc import Iterator
@@ -27,6 +28,8 @@ _LINK = struct.Struct("=BxHiII")
 _ADDRESS = struct.Struct("=BBBBI")
 _PEER, _LOCAL, _BROADCAST = 1, 2, 4
 _IFF_UP = 1
+_GET_FLAGS = 0x8913
+_NAME_AND_FLAGS = struct.Struct("=16sH22x")
 
 
 class NoDevice(Exception):
@@ -42,6 +45,7 @@ class Addresses:
 
     def __init__(self, device: str) -> None:
         self._device = device
+        self._raised = False
 
     def there(self) -> bool:
         """Whether the device is there."""
@@ -61,7 +65,9 @@ class Addresses:
         index = self._index()
         netlink = Netlink(NETLINK_ROUTE)
         try:
-            _ask(netlink, _NEW_LINK, 0, _LINK.pack(socket.AF_UNSPEC, 0, index, _IFF_UP, _IFF_UP))
+            if not self._is_up():
+                _set_up(netlink, index, True)
+                self._raised = True
             _ask(netlink, _NEW_ADDRESS, NLM_F_CREATE | NLM_F_REPLACE, _described(index, address))
             for other in _listed(netlink, index):
                 if other != address:
@@ -70,7 +76,7 @@ class Addresses:
             netlink.close()
 
     def clear(self) -> None:
-        """Take all link-local addresses away.
+        """Take all link-local addresses away, and have the device down again where it was not up before.
 
         Raises:
             NetlinkError: the kernel refused.
@@ -83,14 +89,29 @@ class Addresses:
         try:
             for address in list(_listed(netlink, index)):
                 _ask(netlink, _DELETE_ADDRESS, 0, _described(index, address))
+            if self._raised:
+                _set_up(netlink, index, False)
+                self._raised = False
         finally:
             netlink.close()
+
+    def _is_up(self) -> bool:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+            try:
+                found = fcntl.ioctl(asking, _GET_FLAGS, _NAME_AND_FLAGS.pack(self._device.encode(), 0))
+            except OSError as error:
+                raise NoDevice(f"the node has no network device {self._device}") from error
+        return bool(_NAME_AND_FLAGS.unpack(found)[1] & _IFF_UP)
 
     def _index(self) -> int:
         try:
             return socket.if_nametoindex(self._device)
         except OSError as error:
             raise NoDevice(f"the node has no network device {self._device}") from error
+
+
+def _set_up(netlink: Netlink, index: int, up: bool) -> None:
+    _ask(netlink, _NEW_LINK, 0, _LINK.pack(socket.AF_UNSPEC, 0, index, _IFF_UP if up else 0, _IFF_UP))
 
 
 def _described(index: int, address: IPv4Address) -> bytes:

@@ -1,0 +1,106 @@
+"""The ends of direct links without a device, a table or a network."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+from fractus_agent.links import connectivity, peer
+from fractus_agent.links.drone import DroneEnd
+from fractus_agent.links.heuristics import Heuristics
+from fractus_agent.links.pairing import LinkLost, Session
+from fractus_agent.links.peer import PeerEnd
+from fractus_agent.redirector.redirector import Namespaces, Redirector
+from fractus_core.api.links import DirectLink
+from fractus_core.linking import PathMetrics, UnknownHeuristic
+
+PATH = PathMetrics(8.0, 8.0, 60.0, 60.0)
+
+
+def link(node: str) -> DirectLink:
+    return cast(DirectLink, SimpleNamespace(spec=SimpleNamespace(drone="d1", node=node, services=())))
+
+
+class Calls:
+    """Takes any call, in place of a redirector or a session."""
+
+    peer = "d1"
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        return lambda *_, **__: None
+
+    async def send(self, _message: Any) -> None:
+        return
+
+
+def drone_end() -> DroneEnd:
+    return DroneEnd(
+        "d1", Path(), cast(Redirector, Calls()), cloud=lambda: PATH, seen=lambda: None, report=lambda _: None
+    )
+
+
+def test_beacons_with_invented_names_are_not_kept() -> None:
+    drone = drone_end()
+    drone.plan((link("e1"),))
+    for name in ("e1", "e2", "e3"):
+        drone.heard(name)
+    assert set(drone._lessons.reaches) == {"e1"}
+    drone.plan(())
+    assert not drone._lessons.reaches
+
+
+def test_the_session_of_a_drone_that_no_link_names_any_more_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(peer, "PARTING_S", 0.01)
+
+    async def serve() -> None:
+        end = PeerEnd("e1", Path(), cast(Redirector, Calls()), lambda: None)
+        end.plan((link("e1"),))
+        serving = asyncio.create_task(end._serve(cast(Session, Calls())))
+        await asyncio.sleep(0)
+        end.plan(())
+        async with asyncio.timeout(10):
+            await serving
+
+    with pytest.raises(LinkLost, match="no DirectLink names d1 any more"):
+        asyncio.run(serve())
+
+
+def test_redirects_that_are_kept_alive_no_more_are_a_failure() -> None:
+    async def fails() -> None:
+        raise ValueError("a defect")
+
+    async def watch() -> None:
+        await connectivity._outlived(asyncio.create_task(fails()))
+
+    with pytest.raises(ValueError, match="a defect"):
+        asyncio.run(watch())
+
+
+def broken(_path: PathMetrics) -> float:
+    """A user's heuristic with a defect."""
+    raise ZeroDivisionError("a defect")
+
+
+def test_a_heuristic_that_fails_is_unknown_from_then_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = EntryPoint("broken", f"{__name__}:broken", "fractus.linking")
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda **_: [entry])
+    heuristics = Heuristics()
+    assert heuristics.find("broken", None)(PATH) == 0.0
+    with pytest.raises(UnknownHeuristic, match="fails: a defect"):
+        heuristics.find("broken", None)
+    assert heuristics.find("max", "ingress-bandwidth")(PATH) == PATH.ingress_mbps
+
+
+def test_namespaces_that_cannot_be_looked_at_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_thread(*_: Any) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr("fractus_agent.redirector.redirector.in_namespace", no_thread)
+    assert not Namespaces(tmp_path / "none").refresh()
+    (tmp_path / "file").touch()
+    assert not Namespaces(tmp_path / "file").refresh()

@@ -34,9 +34,9 @@ class Side:
         self.name = name
         self.inside = ["nsenter", f"--net=/run/netns/{name}"]
         subprocess.run(["ip", "netns", "add", name], check=True)
-        create("fxl*", PORTS, self.inside)
+        create("fxl*", PORTS, self.inside, clients=True)
         self.netlink = in_namespace(Path("/run/netns", name), lambda: Netlink(NETLINK_NETFILTER))
-        self.maps = Maps(self.netlink, lambda: create("fxl*", PORTS, self.inside))
+        self.maps = Maps(self.netlink, lambda: create("fxl*", PORTS, self.inside, clients=True))
 
     def run(self, *words: str) -> None:
         subprocess.run([*self.inside, *words], check=True, capture_output=True)

@@ -102,7 +102,7 @@ class Rig:
         run(*self.inside("cloud"), "ip", "addr", "add", f"{VIP.address}/32", "dev", "lo")
         run(*self.inside("cloud"), "ip", "route", "add", "default", "via", "10.90.0.1")
         for node in ("drone", "edge"):
-            create("fxl*", PORTS, self.inside(node))
+            create("fxl*", PORTS, self.inside(node), clients=node == "drone")
         self.maps("edge").write([Redirect(DIRECT, POD)], [(DIRECT, 1)], 600.0, [DRONE])
 
     def _link(self, left: str, device: str, address: str, right: str, other: str, peer: str) -> None:
@@ -116,7 +116,7 @@ class Rig:
 
     def maps(self, node: str) -> Maps:
         """The maps of a node, whose table is made again when it is gone."""
-        return Maps(self.netlink(node), lambda: create("fxl*", PORTS, self.inside(node)))
+        return Maps(self.netlink(node), lambda: create("fxl*", PORTS, self.inside(node), clients=node == "drone"))
 
     def netlink(self, node: str, protocol: int = NETLINK_NETFILTER) -> Netlink:
         """A netlink socket in a namespace."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from importlib.metadata import EntryPoint
+from ipaddress import IPv4Address
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -13,8 +14,12 @@ import pytest
 from fractus_agent.links import connectivity, peer
 from fractus_agent.links.drone import DroneEnd
 from fractus_agent.links.heuristics import Heuristics
+from fractus_agent.links.interfaces import addresses
+from fractus_agent.links.interfaces.controller import InterfaceProblem
+from fractus_agent.links.interfaces.simulated import Plain
 from fractus_agent.links.pairing import LinkLost, Session
 from fractus_agent.links.peer import PeerEnd
+from fractus_agent.redirector import nft
 from fractus_agent.redirector.redirector import Namespaces, Redirector
 from fractus_core.api.links import DirectLink
 from fractus_core.linking import PathMetrics, UnknownHeuristic
@@ -104,3 +109,37 @@ def test_namespaces_that_cannot_be_looked_at_are_left_out(tmp_path: Path, monkey
     assert not Namespaces(tmp_path / "none").refresh()
     (tmp_path / "file").touch()
     assert not Namespaces(tmp_path / "file").refresh()
+
+
+ROUTES = """Iface	Destination	Gateway 	Flags	RefCnt	Use	Metric	Mask		MTU	Window	IRTT
+lo	00000000	0202000A	0003	0	0	0	{mask}	0	0	0
+eth0	0002000A	00000000	0001	0	0	0	00FFFFFF	0	0	0
+"""
+
+
+@pytest.mark.parametrize(("there", "mask", "refused"), [
+    ([], "00000000", "a default route"), (["169.254.1.1", "192.168.0.2"], "00FFFFFF", "192.168.0.2"),
+    (["169.254.1.1"], "00FFFFFF", ""),
+])  # fmt: skip
+def test_a_device_with_other_traffic_is_refused(
+    there: list[str], mask: str, refused: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "route").write_text(ROUTES.format(mask=mask))
+    monkeypatch.setattr(addresses, "ROUTES", tmp_path / "route")
+    monkeypatch.setattr(addresses, "_all", lambda *_: iter(IPv4Address(each) for each in there))
+    plain = Plain("lo", IPv4Address("169.254.1.1"))
+    if not refused:
+        plain.check()
+        return
+    with pytest.raises(InterfaceProblem, match=refused) as problem:
+        plain.check()
+    assert problem.value.reason == "DeviceInUse"
+
+
+def test_a_node_without_clients_leads_only_what_paired_nodes_send() -> None:
+    text = nft.table("wlan0", nft.Ports(1, 2), clients=False)
+    assert "hook output" not in text
+    leads = [line for line in text.splitlines() if "dnat" in line or "ct mark set" in line]
+    assert len(leads) == 2
+    assert all(line.strip().startswith('iifname "wlan0" ip saddr @peers ') for line in leads)
+    assert "hook output" in nft.table("wlan0", nft.Ports(1, 2), clients=True)

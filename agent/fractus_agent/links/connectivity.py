@@ -166,18 +166,20 @@ class Connectivity:
         assert interface.device is not None
         ports = nft.Ports(udp=beacons.PORT, tcp=pairing.PORT)
         device = interface.device
+        drone = self._end == "drone"
         await self._appeared(Plain(device, link_address(self._node)))
         # Only now is it known whether it is a radio.
         controller = self._controller(interface)
         # Closed before it gets an address.
-        nft.create(device, ports)
+        nft.create(device, ports, clients=drone)
         netlink = Netlink(NETLINK_NETFILTER)
         conntrack = Conntrack(netlink)
         # What an agent before this one led anywhere, that knows where it is to be no more.
         conntrack.forget_all()
-        drone = self._end == "drone"
         redirector = Redirector(
-            nft.Maps(netlink, lambda: nft.create(device, ports)), conntrack, Namespaces(self._pods if drone else None)
+            nft.Maps(netlink, lambda: nft.create(device, ports, clients=drone)),
+            conntrack,
+            Namespaces(self._pods if drone else None),
         )
         # Outside of the group: redirects are kept alive while the end leads the traffic back.
         keeping = asyncio.create_task(redirector.run())

@@ -3,8 +3,8 @@
 The table is made once with `nft`; switching then changes map elements only, over netlink: `nft` as a process takes 16 ms
 and libnftables slows down with the rules of kube-proxy, while one transaction takes 0.02 ms, and 0.6 ms with 64 elements.
 
-Our chains hook at priority -150, before those of kube-proxy, on prerouting for pods and on output for programs in the host's
-network. A connection whose first packet matches an element of `targets` goes to the direct address; without an element it
+Our chains hook at priority -150, before those of kube-proxy: on a node with clients on prerouting for pods and on output for
+programs in the host's network, on one that serves them on prerouting for what comes from paired nodes. A connection whose first packet matches an element of `targets` goes to the direct address; without an element it
 falls through to kube-proxy, and so to the cloud path. Elements time out, so that an agent that dies leaves the cloud path.
 
 Every radio in reach can send to a direct interface. So nothing comes in there but beacons and pairing, and what our redirects
@@ -87,15 +87,22 @@ class Ports:
     tcp: int
 
 
-def table(devices: str, ports: Ports) -> str:
+def table(devices: str, ports: Ports, *, clients: bool) -> str:
     """The text of our tables, for `nft -f`; they replace older ones at once, with all their elements.
 
     Args:
         devices: pattern of the names of direct interfaces, such as fxl*.
         ports: of the node itself that are open there.
+        clients: whether clients on this node are led; otherwise only what paired nodes send over these interfaces is.
     """
     key = "ip daddr . meta l4proto . th dport"
-    rules = f"ct mark set {key} map @{MARKS}\n\t\tdnat ip to {key} map @{TARGETS}"
+    only = "" if clients else f'iifname "{devices}" ip saddr @{PEERS} '
+    rules = f"{only}ct mark set {key} map @{MARKS}\n\t\t{only}dnat ip to {key} map @{TARGETS}"
+    output = f"""
+	chain output {{
+		type nat hook output priority -150; policy accept;
+		{rules}
+	}}"""
     ours = f"ct mark and 0x{MARK_MASK:08x} == 0x{MARK_BASE:08x}"
     return f"""table ip {TABLE}
 delete table ip {TABLE}
@@ -117,11 +124,7 @@ table ip {TABLE} {{
 	chain prerouting {{
 		type nat hook prerouting priority -150; policy accept;
 		{rules}
-	}}
-	chain output {{
-		type nat hook output priority -150; policy accept;
-		{rules}
-	}}
+	}}{output if clients else ""}
 	chain postrouting {{
 		# Without it the server would answer over the base path: it knows the client by its pod address.
 		type nat hook postrouting priority 50; policy accept;
@@ -166,18 +169,19 @@ table ip6 {TABLE} {{
 """
 
 
-def create(devices: str, ports: Ports, namespace: Sequence[str] = ()) -> None:
+def create(devices: str, ports: Ports, namespace: Sequence[str] = (), *, clients: bool) -> None:
     """Make our tables, or make them again.
 
     Args:
         devices: pattern of the names of direct interfaces.
         ports: of the node itself that are open there.
         namespace: command words that run `nft` in another network namespace; for tests.
+        clients: whether clients on this node are led.
 
     Raises:
         RedirectFailed: nft is missing, or refuses.
     """
-    _nft(table(devices, ports), namespace)
+    _nft(table(devices, ports, clients=clients), namespace)
 
 
 def remove(namespace: Sequence[str] = ()) -> None:

@@ -8,6 +8,7 @@ import socket
 import struct
 from collections.abc import Iterator
 from ipaddress import IPv4Address, IPv4Network
+from pathlib import Path
 
 from fractus_agent.redirector.netlink import (
     NETLINK_ROUTE,
@@ -21,6 +22,8 @@ from fractus_agent.redirector.netlink import (
     message,
 )
 
+ROUTES = Path("/proc/net/route")
+"""The main routing table, of the network namespace that the process is in."""
 LINK_LOCAL = IPv4Network("169.254.0.0/16")
 
 _NEW_LINK, _NEW_ADDRESS, _DELETE_ADDRESS, _LIST_ADDRESSES = 16, 20, 21, 22
@@ -47,13 +50,22 @@ class Addresses:
         self._device = device
         self._raised = False
 
-    def there(self) -> bool:
-        """Whether the device is there."""
+    def other_traffic(self) -> str:
+        """What shows that the device carries other traffic of the node than that of direct links; empty when nothing does.
+
+        Raises:
+            NoDevice: there is none.
+            NetlinkError: the kernel refused.
+        """
+        index = self._index()
+        netlink = Netlink(NETLINK_ROUTE)
         try:
-            self._index()
-        except NoDevice:
-            return False
-        return True
+            for address in _all(netlink, index):
+                if address not in LINK_LOCAL:
+                    return f"it has the address {address}"
+        finally:
+            netlink.close()
+        return "a default route leads over it" if _default_route(ROUTES.read_text(), self._device) else ""
 
     def set(self, address: IPv4Address) -> None:
         """Bring the device up with this link-local address and no other, so that one that a crash left does not stay.
@@ -121,12 +133,21 @@ def _described(index: int, address: IPv4Address) -> bytes:
     return head + attribute(_LOCAL, packed) + attribute(_PEER, packed) + attribute(_BROADCAST, broadcast)
 
 
+def _default_route(routes: str, device: str) -> bool:
+    fields = (line.split() for line in routes.splitlines()[1:])
+    return any((field[0], field[1], field[7]) == (device, "00000000", "00000000") for field in fields)
+
+
 def _listed(netlink: Netlink, index: int) -> Iterator[IPv4Address]:
+    return (address for address in _all(netlink, index) if address in LINK_LOCAL)
+
+
+def _all(netlink: Netlink, index: int) -> Iterator[IPv4Address]:
     for body in list(netlink.dump(_LIST_ADDRESSES, _ADDRESS.pack(socket.AF_INET, 0, 0, 0, 0))):
         if _ADDRESS.unpack_from(body)[4] != index:
             continue
         local = next((value for kind, value in attributes(body[_ADDRESS.size :]) if kind == _LOCAL), b"")
-        if len(local) == 4 and IPv4Address(local) in LINK_LOCAL:
+        if len(local) == 4:
             yield IPv4Address(local)
 
 

@@ -28,7 +28,7 @@ class Controller(Protocol):
     device: str
 
     def check(self) -> None:
-        """Look whether the device is there, without doing anything to it.
+        """Look whether the device is there, and for direct links alone, without doing anything to it.
 
         Raises:
             InterfaceProblem: it is not.

@@ -22,13 +22,22 @@ class Plain:
         self._addresses = Addresses(device)
 
     def check(self) -> None:
-        """Look whether the device is there.
+        """Look whether the device is there, and for direct links alone: the packet filter would cut any other traffic.
 
         Raises:
             InterfaceProblem: it is not.
         """
-        if not self._addresses.there():
-            raise InterfaceProblem("DeviceMissing", f"the node has no network device {self.device}")
+        try:
+            other = self._addresses.other_traffic()
+        except NoDevice as error:
+            raise InterfaceProblem("DeviceMissing", str(error)) from error
+        except (NetlinkError, OSError) as error:
+            raise InterfaceProblem("DeviceFailed", f"{self.device} cannot be looked at: {error}") from error
+        if other:
+            raise InterfaceProblem(
+                "DeviceInUse",
+                f"{self.device} carries the node's own traffic ({other}); name one that is for direct links alone",
+            )
 
     async def up(self) -> None:
         """Bring the device up with its address.

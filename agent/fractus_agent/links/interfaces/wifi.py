@@ -99,7 +99,7 @@ class Wifi:
         self._made = ""
 
     def check(self) -> None:
-        """Look whether the device is there.
+        """Look whether the device is there, and for direct links alone.
 
         Raises:
             InterfaceProblem: it is not.

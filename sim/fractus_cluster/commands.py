@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
-import signal
 import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,13 +9,6 @@ from pathlib import Path
 from fractus_cluster.errors import ClusterError
 
 DEFAULT_TIMEOUT_S = 120.0
-_PR_SET_PDEATHSIG = 1
-_LIBC = ctypes.CDLL(None, use_errno=True)
-
-
-def die_with_parent() -> None:
-    """Let the kernel kill this process when the thread that started it ends; for a child, before its program begins."""
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def run(
@@ -30,9 +21,6 @@ def run(
     cwd: Path | None = None,
 ) -> subprocess.CompletedProcess[str]:
     """Run a program to its end and capture what it wrote.
-
-    It ends with its caller, even by kill -9: a copy or a network command that went on alone would work against the next
-    command, which begins with what the one before has left.
 
     Args:
         argv: The program and its arguments.
@@ -57,7 +45,6 @@ def run(
             check=False,
             env=None if env is None else dict(env),
             cwd=cwd,
-            preexec_fn=die_with_parent,
         )
     except FileNotFoundError as error:
         raise ClusterError(f"{words[0]} is not installed or not on PATH") from error

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import shutil
+import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -11,12 +13,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from fractus_cluster.commands import die_with_parent, run
+from fractus_cluster.commands import run
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.images.layout import Image, Layout
 from fractus_cluster.node import Node
 
 _TEMPLATES_KEPT = 2
+_PR_SET_PDEATHSIG = 1
+_LIBC = ctypes.CDLL(None, use_errno=True)
 _START_TIMEOUT_S = 20.0
 _IMPORT_TIMEOUT_S = 300.0
 _POLL_S = 0.02
@@ -121,7 +125,7 @@ def _daemon(scratch: Path) -> Iterator[list[str]]:
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,
-            preexec_fn=die_with_parent,  # noqa: PLW1509  (it only makes a system call)
+            preexec_fn=_die_with_parent,  # noqa: PLW1509  (it only makes a system call)
         )
     try:
         deadline = time.monotonic() + _START_TIMEOUT_S
@@ -137,6 +141,10 @@ def _daemon(scratch: Path) -> Iterator[list[str]]:
         except subprocess.TimeoutExpired:
             daemon.kill()
             daemon.wait()
+
+
+def _die_with_parent() -> None:
+    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _import(layout: Layout, images: Sequence[Image], ctr: list[str], scratch: Path) -> None:

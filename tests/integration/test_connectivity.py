@@ -91,8 +91,11 @@ def test_an_abrupt_loss_is_over_within_a_second(world: World) -> None:
     last = max(moment for moment, who in numbered if who == "e1")
     first = min(moment for moment, who in numbered if who == "cloud" and moment > last)
     assert first - last < 1.5  # 0.4 s until the loss is noticed; a second without the load of a test machine
-    # A client that asks fifty times a second, repeats nothing, and is cut once: it may lose a call in the planned switch, too.
-    assert len(client.failed) <= 2
+    who = [answer[1] for answer in client.answers]
+    led = who.index("e1")
+    # This client asks fifty times a second and repeats nothing: the planned switch onto the link may cost a call, and the cut.
+    assert who[:led].count("FAILED") <= 1
+    assert who[led:].count("FAILED") <= 1
     assert not drone.redirects()
     until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "the status", world)
     # It comes back when the radio does, and no attempt in between hurts.

@@ -11,7 +11,8 @@ OUT ?= out
 UV_VERSION := 0.13.8
 # What is looked for : the Debian package that has it.
 PROGRAMS := buildah:buildah containerd:containerd runc:runc nft:nftables iptables:iptables ip:iproute2 \
-	debootstrap:debootstrap /usr/lib/cni/ptp:containernetworking-plugins /etc/ssl/certs/ca-certificates.crt:ca-certificates
+	debootstrap:debootstrap wpa_supplicant:wpasupplicant /usr/lib/cni/ptp:containernetworking-plugins \
+	/etc/ssl/certs/ca-certificates.crt:ca-certificates
 
 UV := $(shell uv --version 2> /dev/null | grep -q '^uv ' && command -v uv || echo .tools/bin/uv)
 RUN := $(UV) run --frozen --all-extras

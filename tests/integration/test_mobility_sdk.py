@@ -145,8 +145,12 @@ async def test_asking_first_and_riding_along(rig: Rig) -> None:
     rig.start_vehicle()
     await rig.until(lambda t: t.HasField("position") and t.HasField("home"), 30)
     async with Mobility(endpoint(rig)) as drone:
+        # A position alone answers nothing: the delay of the link must be measured too.
+        async with asyncio.timeout(60), contextlib.aclosing(drone.watch.health()) as healths:
+            async for _ in _until(healths, lambda health: health.ready):
+                pass
         high = await drone.can_i.takeoff(40)
-        assert high
+        assert high, high
         assert high.altitude_m == pytest.approx(15.0)
         assert high.decision.policies == ("altitudes",)
         into = await drone.can_i.goto(*FRAME.latlon(-50, 0), 10)

@@ -337,4 +337,7 @@ def deny(code: str, reason: str, policies: tuple[str, ...] = ()) -> Verdict:
     return Verdict("deny", None, code, reason, policies)
 
 
-POSITION_UNKNOWN = deny("PositionUnknown", "the drone's position is unknown; wait for a fix")
+POSITION_UNKNOWN = deny(
+    "PositionUnknown",
+    "the drone's position is unknown: no recent fix, or the delay of its link is not measured yet; wait until it is ready",
+)

@@ -141,6 +141,9 @@ async def _run(handler: Handler, request: Request) -> bytes:
 class Requester:
     """Asks another component; `async with` closes it.
 
+    From the first request on it keeps a connection: one that breaks, or is closed because traffic has to move to another
+    path, is opened again at once, so that the next request need not wait for it.
+
     Args:
         address: `host:port`.
         attempt_timeout_s: how long one attempt may take; more than the other end needs over the slowest path.
@@ -151,6 +154,7 @@ class Requester:
         self.repeated = 0
         self._attempt_timeout_s = attempt_timeout_s
         self._channel: Any = None
+        self._connecting: asyncio.Task[None] | None = None
 
     async def ask(
         self, method: str, body: bytes = b"", *, timeout_s: float = TIMEOUT_S, request_id: str | None = None
@@ -188,6 +192,7 @@ class Requester:
     async def _attempt(self, method: str, body: bytes, request_id: str, attempt: int, left_s: float) -> bytes:
         if self._channel is None:
             self._channel = grpc.aio.insecure_channel(self.address, options=_CLIENT)
+            self._connecting = asyncio.create_task(_keep_connected(self._channel))
         call = self._channel.unary_unary(f"/{SERVICE}/{method}")
         metadata = ((ID, request_id), (ATTEMPT, str(attempt)))
         answer: bytes = await call(body, timeout=min(left_s, self._attempt_timeout_s), metadata=metadata)
@@ -203,9 +208,19 @@ class Requester:
 
     async def close(self) -> None:
         """Close the connection."""
+        if self._connecting is not None:
+            self._connecting.cancel()
+            await asyncio.gather(self._connecting, return_exceptions=True)
+            self._connecting = None
         if self._channel is not None:
             await self._channel.close()
             self._channel = None
+
+
+async def _keep_connected(channel: Any) -> None:
+    """Connect whenever there is no connection; left alone, gRPC would wait for the next call."""
+    while True:
+        await channel.wait_for_state_change(channel.get_state(try_to_connect=True))
 
 
 def requester(component: str, *, attempt_timeout_s: float = ATTEMPT_TIMEOUT_S) -> Requester:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 
 import grpc
 import pytest
@@ -51,6 +51,34 @@ async def test_a_request_is_answered() -> None:
         assert await asking.ask("work", b"that") == b"did that"
     assert len(set(worker.done)) == 2
     assert asking.repeated == 0
+
+
+async def test_a_connection_that_is_closed_is_opened_again_before_the_next_request() -> None:
+    worker, opened = Worker(), list[asyncio.StreamWriter]()
+
+    async with worker.serving() as responder:
+
+        async def pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            """Both ways, between a client and the responder."""
+            there, back = await asyncio.open_connection("127.0.0.1", responder.port)
+            opened.append(writer)
+            await asyncio.gather(copy(reader, back), copy(there, writer))
+
+        async def copy(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
+            with suppress(ConnectionError):
+                while data := await source.read(65536):
+                    sink.write(data)
+            sink.close()
+
+        path = await asyncio.start_server(pass_on, "127.0.0.1", 0)
+        port = path.sockets[0].getsockname()[1]
+        async with path, Requester(f"127.0.0.1:{port}") as asking:
+            await asking.ask("work", b"this")
+            for number in (1, 2):
+                opened[-1].transport.abort()
+                await until(lambda wanted=number + 1: len(opened) == wanted)  # type: ignore[misc]
+            assert await asking.ask("work", b"that") == b"did that"
+            assert len(opened) == 3
 
 
 async def test_a_repetition_gets_the_first_answer() -> None:

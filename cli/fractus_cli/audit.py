@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from fractus_services.chain import lines_of, logs, verify
+from fractus_storage.chain import lines_of, logs, verify
 
 if TYPE_CHECKING:
-    from fractus_services.checkpoints import Checkpoint
+    from fractus_storage.checkpoints import Checkpoint
 
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 
@@ -56,7 +56,7 @@ def _checkpoints(since: tuple[str, ...], ca: Path | None) -> dict[str, Checkpoin
         return {}
     # Imported here: what only verifies chains needs no cryptography.
     from cryptography import x509  # noqa: PLC0415
-    from fractus_services.checkpoints import InvalidCheckpoint, noted, read_checkpoint  # noqa: PLC0415
+    from fractus_storage.checkpoints import InvalidCheckpoint, noted, read_checkpoint  # noqa: PLC0415
 
     known: dict[str, Checkpoint] = {}
     try:

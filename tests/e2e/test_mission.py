@@ -7,7 +7,7 @@ import re
 import time
 
 from conftest import DRONE, SYSTEM, example, flight_state, short_flight
-from fractus_services.chain import verify
+from fractus_storage.chain import verify
 from kubectl import Kube, Object, condition
 
 MOBILITY = "app.kubernetes.io/component=mobility"

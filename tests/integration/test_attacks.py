@@ -22,7 +22,7 @@ from fractus_core.api.names import OPERATOR_IDENTITY, node_identity, node_server
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, mobility_pb2_grpc, types_pb2
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_services.admission import BURST, CALLS_PER_S
-from fractus_services.chain import verify
+from fractus_storage.chain import verify
 from google.rpc import error_details_pb2
 from grpc_status import rpc_status
 from mobility_rig import (

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from fractus_services.chain import lines_of, logs, verify
+from fractus_storage.chain import lines_of, logs, verify
 
 from fractus_sim.demo.kube import NAMESPACE, SYSTEM, DemoError, Kube, Object
 from fractus_sim.demo.watch import Mission

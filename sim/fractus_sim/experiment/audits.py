@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from fractus_services.chain import lines_of, logs, verify
+from fractus_storage.chain import lines_of, logs, verify
 
 from fractus_sim.experiment.findings import Findings
 

@@ -9,8 +9,8 @@ from dataclasses import asdict, replace
 from fractus_core.policy.engine import judge
 from fractus_core.policy.privacy import compose, judge_privacy
 from fractus_core.policy.values import Call, Situation, Verdict
+from fractus_storage.audit import AuditLog
 
-from fractus_services.audit import AuditLog
 from fractus_services.camera.imaging.faces import Detector
 from fractus_services.camera.imaging.pipeline import FacesNotReliable, FilterPlan, plan_filters
 from fractus_services.camera.pose.pose import Pose

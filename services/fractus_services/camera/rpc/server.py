@@ -13,9 +13,9 @@ from typing import Any
 from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_core.policy.lenses import lens_of
 from fractus_proto.v1 import camera_pb2_grpc
+from fractus_storage.audit import AuditLog
 
 from fractus_services.admission import CallAdmission
-from fractus_services.audit import AuditLog
 from fractus_services.auth import TlsFiles
 from fractus_services.camera.album.album import Album, owner_of
 from fractus_services.camera.capture.connection import driver_for

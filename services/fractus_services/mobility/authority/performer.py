@@ -26,8 +26,8 @@ from fractus_core.control.actions import (
 )
 from fractus_core.control.events import Event, SystemTaskEnded
 from fractus_core.control.values import FlightMode, SystemTask, TaskKind
+from fractus_storage.audit import AuditLog
 
-from fractus_services.audit import AuditLog
 from fractus_services.background import Background
 from fractus_services.errors import Aborted, AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.mobility.authority.journal import Journal, Record

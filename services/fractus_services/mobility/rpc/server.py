@@ -10,8 +10,8 @@ from typing import Any
 
 from fractus_core.api.nodes import Drone
 from fractus_proto.v1 import mobility_pb2_grpc
+from fractus_storage.audit import AuditLog
 
-from fractus_services.audit import AuditLog
 from fractus_services.auth import TlsFiles
 from fractus_services.clock import Clock
 from fractus_services.description import NodeDescription

@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from fractus_core.api.names import node_identity
 
-from fractus_services.chain import Link, canonical
+from fractus_storage.chain import Link, canonical
 
 _CONTEXT = b"fractus.dev audit checkpoint 1\n"
 _NODES = node_identity("")

@@ -20,8 +20,8 @@ from click.testing import CliRunner
 from fractus_agent.registration.evidence import audit_heads
 from fractus_cli.audit import audit
 from fractus_core.identity.authority import Authority
-from fractus_services.audit import AuditLog
-from fractus_services.chain import digest, last_link, segments, verify
+from fractus_storage.audit import AuditLog
+from fractus_storage.chain import digest, last_link, segments, verify
 
 EPOCH = datetime.fromtimestamp(0, UTC)
 AUTHORITY = Authority.generate(EPOCH)
@@ -130,7 +130,7 @@ async def test_a_sync_that_fails_leaves_nothing_twice(tmp_path: Path, monkeypatc
             raise OSError(5, "Input/output error")
         real(file)
 
-    monkeypatch.setattr("fractus_services.audit.os.fsync", fsync)
+    monkeypatch.setattr("fractus_storage.audit.os.fsync", fsync)
     log = AuditLog(tmp_path / "audit.jsonl", lambda: 0.0)
     log.append("call", {"n": 0})
     await until(lambda: log.failure)
@@ -154,7 +154,7 @@ async def test_what_a_failed_write_left_is_cut_off_later(tmp_path: Path, monkeyp
         return call
 
     for which in real:
-        monkeypatch.setattr(f"fractus_services.audit.os.{which}", fails(which))
+        monkeypatch.setattr(f"fractus_storage.audit.os.{which}", fails(which))
     log = AuditLog(tmp_path / "audit.jsonl", lambda: 0.0)
     log.append("call", {"n": 0})
     await until(lambda: log.failure)
@@ -168,8 +168,8 @@ async def test_what_a_failed_write_left_is_cut_off_later(tmp_path: Path, monkeyp
 async def test_a_disk_that_hangs_is_a_failure_and_the_queue_has_an_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fractus_services.audit.MAX_WAITING", 10)
-    monkeypatch.setattr("fractus_services.audit.HANG_TIMEOUT_S", 0.02)
+    monkeypatch.setattr("fractus_storage.audit.MAX_WAITING", 10)
+    monkeypatch.setattr("fractus_storage.audit.HANG_TIMEOUT_S", 0.02)
     real, answers, asked = os.fsync, threading.Event(), threading.Event()
 
     def fsync(file: int) -> None:
@@ -177,7 +177,7 @@ async def test_a_disk_that_hangs_is_a_failure_and_the_queue_has_an_end(
         answers.wait(10)
         real(file)
 
-    monkeypatch.setattr("fractus_services.audit.os.fsync", fsync)
+    monkeypatch.setattr("fractus_storage.audit.os.fsync", fsync)
     log = AuditLog(tmp_path / "audit.jsonl", lambda: 0.0)
     log.append("call", {"n": 0})
     await until(asked.is_set)
@@ -406,7 +406,7 @@ async def test_a_node_without_a_certificate_has_no_checkpoint_yet(
 async def test_the_last_entries_are_signed_though_no_other_follows(
     tmp_path: Path, tls: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fractus_services.audit.CHECKPOINT_INTERVAL_S", 0.2)
+    monkeypatch.setattr("fractus_storage.audit.CHECKPOINT_INTERVAL_S", 0.2)
     path = tmp_path / "audit.jsonl"
     found = path.with_suffix(".checkpoint")
     log = AuditLog(path, lambda: 0.0, tls=tls)
@@ -430,8 +430,8 @@ async def test_a_certificate_that_is_missing_is_looked_for_now_and_then(
         raise FileNotFoundError
 
     with monkeypatch.context() as patched:
-        patched.setattr("fractus_services.audit.CHECKPOINT_INTERVAL_S", 0.1)
-        patched.setattr("fractus_services.audit.signed", missing)
+        patched.setattr("fractus_storage.audit.CHECKPOINT_INTERVAL_S", 0.1)
+        patched.setattr("fractus_storage.audit.signed", missing)
         path = tmp_path / "audit.jsonl"
         log = AuditLog(path, lambda: 0.0, tls=tls)
         log.append("call", {"n": 0})
@@ -465,9 +465,9 @@ async def test_a_disk_that_became_read_only_is_a_failure_and_no_crash(
         return looked(file, mode, *args, **named) if mode in {"r", "rb"} else refuse()
 
     with monkeypatch.context() as patched:
-        patched.setattr("fractus_services.audit.Path.touch", refuse)
-        patched.setattr("fractus_services.audit.Path.open", looked_at)
-        patched.setattr("fractus_services.audit.os.open", opened)
+        patched.setattr("fractus_storage.audit.Path.touch", refuse)
+        patched.setattr("fractus_storage.audit.Path.open", looked_at)
+        patched.setattr("fractus_storage.audit.os.open", opened)
         log = AuditLog(path, lambda: 0.0)
         log.append("call", {"n": 2})
         await until(lambda: "Read-only file system" in log.failure)
@@ -521,7 +521,7 @@ async def test_a_segment_that_cannot_be_closed_costs_nothing(
     def refuse(*_: object) -> None:
         raise OSError(30, "Read-only file system")
 
-    monkeypatch.setattr("fractus_services.audit.Path.rename", refuse)
+    monkeypatch.setattr("fractus_storage.audit.Path.rename", refuse)
     await filled(tmp_path / "audit.jsonl", 4, segment_bytes=1)
     assert "cannot close a segment" in caplog.text
     assert verify(read(tmp_path / "audit.jsonl")).entries == 4

@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from fractus_storage import remove_temporary, write_file
-
-from fractus_services.chain import PRUNED, Link, canonical, digest, first_of, last_link, segment, segments
-from fractus_services.checkpoints import signed
+from fractus_storage.chain import PRUNED, Link, canonical, digest, first_of, last_link, segment, segments
+from fractus_storage.checkpoints import signed
 
 log = logging.getLogger(__name__)
 

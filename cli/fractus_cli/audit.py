@@ -1,18 +1,25 @@
-"""`fractus audit`: checks the hash chain of audit logs."""
+"""`fractus audit`: checks the hash chain of audit logs, shows them, and writes them in the formats of others."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import json
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
-from fractus_storage.chain import lines_of, logs, verify
+from fractus_services.recording.messages import moment_ns, sentence
+
+from fractus_cli.audit_logs import Window, decided, entries, found_logs, judged
 
 if TYPE_CHECKING:
     from fractus_storage.checkpoints import Checkpoint
 
+    from fractus_cli.flight_export import Places
+
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+_PATHS = click.argument("paths", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
 
 
 @click.group()
@@ -21,7 +28,7 @@ def audit() -> None:
 
 
 @audit.command("verify")
-@click.argument("paths", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@_PATHS
 @click.option(
     "--since",
     multiple=True,
@@ -34,9 +41,7 @@ def verify_command(paths: tuple[Path, ...], since: tuple[str, ...], ca: Path | N
 
     PATHS are directories, logs (with their segments), or single segments.
     """
-    found = logs(paths)
-    if not found:
-        raise click.ClickException(f"{', '.join(map(str, paths))}: there is no audit log (*.jsonl)")
+    found = found_logs(paths)
     known = _checkpoints(since, ca)
     for absent in known.keys() - {log.stem for log, files in found.items() if log in files}:
         raise click.ClickException(f"--since: the checkpoint is of {absent}.jsonl; give that log, or its directory")
@@ -48,6 +53,123 @@ def verify_command(paths: tuple[Path, ...], since: tuple[str, ...], ca: Path | N
             )
     for name, files in found.items():
         _check(name, files, known.get(name.stem))
+
+
+def _moment(context: click.Context, option: click.Parameter, text: str | None) -> int | None:
+    del context, option
+    found = moment_ns(text)
+    if text is not None and found is None:
+        raise click.BadParameter(f"{text!r} is no time with its zone, such as 2026-06-01T12:00:00Z")
+    return found
+
+
+def _window(command: Callable[..., None]) -> Callable[..., None]:
+    before = click.option("--before", metavar="TIME", callback=_moment, help="Only entries that are older.")
+    return click.option("--after", metavar="TIME", callback=_moment, help="Only entries from then on.")(before(command))
+
+
+def _problems(found: dict[Path, list[Path]]) -> list[str]:
+    """Why the logs prove nothing, said on standard error; empty when their chains are sound."""
+    problems = [problem for name, files in found.items() if (problem := judged(name, files)[1])]
+    for problem in problems:
+        click.echo(f"warning: not verified: {problem}", err=True)
+    return problems
+
+
+@audit.command()
+@_PATHS
+@_window
+@click.option("--all", "every", is_flag=True, help="Also calls that were permitted, grants, and where the drone was.")
+@click.option(
+    "-o", "--output", type=click.Choice(["text", "json"]), default="text", help="text for people, json for programs."
+)
+def show(paths: tuple[Path, ...], after: int | None, before: int | None, every: bool, output: str) -> None:
+    """Print what policies corrected, refused or took over, and who had the drone, from the audit logs in PATHS.
+
+    PATHS are as for `verify`. Logs whose chains are not sound are shown with a warning on standard error. json is one object
+    a line, as in the log.
+    """
+    found = found_logs(paths)
+    _problems(found)
+    for entry in entries(found, Window(after, before)):
+        if not every and not decided(entry):
+            continue
+        if output == "json":
+            own = {key: value for key, value in entry.items() if key != "time_ns"}
+            click.echo(json.dumps(own, sort_keys=True, ensure_ascii=False))
+        else:
+            click.echo(f"{entry['time']}  {entry['log']}  {_line(entry)}")
+
+
+def _line(entry: dict[str, Any]) -> str:
+    if entry.get("kind") != "state":
+        return f"{entry.get('kind')}: {sentence(entry)}"
+    words = ("lat", "lon", "alt", "speed", "mode", "controller", "battery", "in_air")
+    return "state: " + ", ".join(f"{word}={entry[word]}" for word in words if word in entry)
+
+
+@audit.command()
+@_PATHS
+@click.option(
+    "--to", "target", type=click.Choice(["csv", "geojson", "kml", "mcap"]), required=True, help="The format to write."
+)
+@click.option("--file", type=click.Path(dir_okay=False, path_type=Path), help="Where to; else standard output.")
+@click.option(
+    "--zones",
+    multiple=True,
+    type=click.Path(exists=True, path_type=Path),
+    help="Manifests (files or directories) whose Zones, and zones and areas of Grants, are drawn, too; may be repeated.",
+)
+@_window
+def export(
+    *,
+    paths: tuple[Path, ...],
+    target: str,
+    file: Path | None,
+    zones: tuple[Path, ...],
+    after: int | None,
+    before: int | None,
+) -> None:
+    """Write the audit logs in PATHS for other programs: flown paths, verdicts, takeovers, and zones.
+
+    PATHS are as for `verify`. geojson and kml have paths and decisions, csv a row for every entry, mcap everything for
+    Foxglove. Logs whose chains are not sound are written with a warning, which geojson, kml and mcap also carry.
+    """
+    from fractus_cli.flight_export import WRITERS, Export  # noqa: PLC0415 - showing and verifying need no geometry
+
+    found = found_logs(paths)
+    given = Export(entries(found, Window(after, before)), _places(zones), _problems(found))
+    if file is None:
+        if target == "mcap" and sys.stdout.isatty():
+            raise click.ClickException("mcap is no text; give --file, or redirect standard output")
+        WRITERS[target](given, sys.stdout.buffer)
+        return
+    with file.open("wb") as out:
+        WRITERS[target](given, out)
+
+
+def _places(paths: Sequence[Path]) -> Places:
+    from fractus_core.api import Grant, Zone  # noqa: PLC0415
+    from fractus_services.recording.places import areas_of, zones_of  # noqa: PLC0415
+
+    from fractus_cli.flight_export import Places  # noqa: PLC0415
+    from fractus_cli.manifests import BadManifest, read_manifests  # noqa: PLC0415
+
+    try:
+        manifests = read_manifests(paths, (Grant, Zone)) if paths else None
+    except BadManifest as error:
+        raise click.ClickException(str(error)) from None
+    if manifests is None:
+        return Places()
+    specs = [grant.spec for grant in manifests.of(Grant).values()]
+    named = {zone.name: zone for zone in zones_of(specs)} | manifests.of(Zone)
+    shapes = [(zone, "zone", "") for _, zone in sorted(named.items())]
+    shapes += [(area, area.name, spec.component) for spec in specs for area in areas_of(spec)]
+    if not shapes:
+        raise click.ClickException(
+            f"--zones {', '.join(map(str, paths))}: there is no Zone and no Grant in the manifests"
+        )
+    return Places(shapes)
 
 
 def _checkpoints(since: tuple[str, ...], ca: Path | None) -> dict[str, Checkpoint]:
@@ -78,22 +200,10 @@ def _checkpoints(since: tuple[str, ...], ca: Path | None) -> dict[str, Checkpoin
 
 
 def _check(name: Path, files: list[Path], checkpoint: Checkpoint | None) -> None:
-    begins: list[tuple[int, Path]] = [(0, files[0])]
-
-    def lines() -> Iterable[bytes]:
-        for total, (path, number, line) in enumerate(lines_of(files)):
-            if number == 1 and total:
-                begins.append((total, path))
-            yield line
-
+    finding, problem = judged(name, files, checkpoint.link if checkpoint is not None else None)
+    if problem:
+        raise click.ClickException(problem)
     part = name not in files
-    try:
-        finding = verify(lines(), part, checkpoint.link if checkpoint is not None else None)
-    except FileNotFoundError as error:
-        raise click.ClickException(f"{error.filename}: is missing; the log is not complete without it") from None
-    if finding.problem:
-        before, path = next(begin for begin in reversed(begins) if begin[0] < max(finding.line, 1))
-        raise click.ClickException(f"{path}: line {finding.line - before} {finding.problem}")
     said = [f"{finding.entries} entries, chain sound"]
     if len(files) > 1:
         said.append(f"{len(files)} files")

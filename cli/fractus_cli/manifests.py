@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import pathlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, TypeVar
@@ -37,7 +37,6 @@ R = TypeVar("R", bound=Resource)
 _SUFFIXES = frozenset({".yaml", ".yml", ".json"})
 _ASSUMED_CLOUD = "cloud"
 _READ: tuple[type[Resource], ...] = (Application, DeploymentPlan, Depot, Drone, EdgeNode, Policy, Zone)
-_KINDS: dict[str, type[Resource]] = {kind.KIND: kind for kind in _READ}
 _EVERY = frozenset(kind.KIND for kind in KINDS)
 _METADATA = frozenset(
     {
@@ -155,16 +154,20 @@ class Unlimited(Mapping[str, float]):
         return 0
 
 
-def read_manifests(paths: Iterable[pathlib.Path]) -> Manifests:
-    """Read files, and the .yaml, .yml and .json files in directories and below; other kinds are passed over.
+def read_manifests(paths: Iterable[pathlib.Path], kinds: Iterable[type[Resource]] = _READ) -> Manifests:
+    """Read files, and the .yaml, .yml and .json files in directories and below.
+
+    Args:
+        paths: of files and directories.
+        kinds: what is read; others are passed over.
 
     Raises:
         BadManifest: a file cannot be read or parsed, an object breaks the rules of its kind, or is there twice.
     """
-    manifests = Manifests()
+    manifests, read = Manifests(), {kind.KIND: kind for kind in kinds}
     for file, strict in _files(paths):
         for manifest in documents(file, strict=strict):
-            resource = _resource(manifest)
+            resource = _resource(manifest, read)
             if resource is not None:
                 _add(manifests, Found(manifest, resource))
     _check(manifests)
@@ -224,11 +227,11 @@ def read_file(file: pathlib.Path) -> bytes:
     return content
 
 
-def _resource(manifest: Manifest) -> Resource | Host | None:
+def _resource(manifest: Manifest, kinds: Mapping[str, type[Resource]]) -> Resource | Host | None:
     body = manifest.body
     kind = body.get("kind")
     try:
-        if not _is_ours(body):
+        if not _is_ours(body, kinds):
             return None
         metadata = body.get("metadata")
         if not isinstance(metadata, dict) or not isinstance(metadata.get("name"), str):
@@ -236,12 +239,12 @@ def _resource(manifest: Manifest) -> Resource | Host | None:
         unknown = sorted(metadata.keys() - _METADATA)
         if unknown:
             raise InvalidObject(f"metadata.{unknown[0]}", "there is no such field; remove it, or correct its name")
-        return _host(body) if kind == "Node" else _KINDS[str(kind)].from_body(body)
+        return _host(body) if kind == "Node" else kinds[str(kind)].from_body(body)
     except InvalidObject as error:
         raise manifest.bad(error) from None
 
 
-def _is_ours(body: Mapping[str, Any]) -> bool:
+def _is_ours(body: Mapping[str, Any], kinds: Collection[str]) -> bool:
     """Whether this is an object that is read, rather than one of another project or of another use.
 
     Raises:
@@ -257,7 +260,7 @@ def _is_ours(body: Mapping[str, Any]) -> bool:
         near = difflib.get_close_matches(kind, _EVERY, n=1)
         hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(sorted(_EVERY))}"
         raise InvalidObject("kind", f"{GROUP} has no kind {kind}; {hint}")
-    return kind == "Node" or (kind in _KINDS and group == GROUP)
+    return kind == "Node" or (kind in kinds and group == GROUP)
 
 
 def _host(document: dict[str, Any]) -> Host:

@@ -149,14 +149,17 @@ def write_geojson(zones: Iterable[Zone]) -> Exported:
     """A FeatureCollection with a polygon for each zone, cut at the antimeridian (RFC 7946); read_geojson takes it back."""
     zones = tuple(zones)
     notes = unsaid(zones, "circle")
-    features = []
-    for zone in zones:
-        spec = zone.spec.to_dict()
-        properties = {"name": zone.name} | {k: spec[k] for k in ("altitude", "schedule", "description") if spec.get(k)}
-        parts = cut_rings(zone, notes)
-        geometry: dict[str, Any] = {"type": "MultiPolygon", "coordinates": parts}
-        if len(parts) == 1:
-            geometry = {"type": "Polygon", "coordinates": parts[0]}
-        features.append({"type": "Feature", "properties": properties, "geometry": geometry})
+    features = [zone_feature(zone, notes) for zone in zones]
     text = json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"
     return Exported(text, tuple(notes))
+
+
+def zone_feature(zone: Zone, notes: list[str]) -> dict[str, Any]:
+    """One zone as a feature; notes what a polygon shows otherwise."""
+    spec = zone.spec.to_dict()
+    properties = {"name": zone.name} | {k: spec[k] for k in ("altitude", "schedule", "description") if spec.get(k)}
+    parts = cut_rings(zone, notes)
+    geometry: dict[str, Any] = {"type": "MultiPolygon", "coordinates": parts}
+    if len(parts) == 1:
+        geometry = {"type": "Polygon", "coordinates": parts[0]}
+    return {"type": "Feature", "properties": properties, "geometry": geometry}

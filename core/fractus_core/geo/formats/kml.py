@@ -114,15 +114,19 @@ def write_kml(zones: Iterable[Zone]) -> Exported:
     """A document with a placemark for each zone, clamped to the ground."""
     zones = tuple(zones)
     notes = unsaid(zones, "altitude", "schedule", "circle")
-    marks = "".join(_placemark(zone, notes) for zone in zones)
-    text = (
+    return Exported(kml_document(zone_placemark(zone, notes) for zone in zones), tuple(notes))
+
+
+def kml_document(marks: Iterable[str]) -> str:
+    """The file that placemarks make."""
+    return (
         '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2">\n<Document>\n'
-        f"{marks}</Document>\n</kml>\n"
+        f"{''.join(marks)}</Document>\n</kml>\n"
     )
-    return Exported(text, tuple(notes))
 
 
-def _placemark(zone: Zone, notes: list[str]) -> str:
+def zone_placemark(zone: Zone, notes: list[str]) -> str:
+    """One zone as a placemark; notes what a polygon shows otherwise."""
     polygons = "".join(map(_polygon, cut_rings(zone, notes)))
     description = f"<description>{escape(zone.spec.description)}</description>" if zone.spec.description else ""
     return (

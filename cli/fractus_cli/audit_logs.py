@@ -1,0 +1,102 @@
+"""Reads audit logs: whether their chains are sound, and what their entries say."""
+
+from __future__ import annotations
+
+import heapq
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+from fractus_services.recording.messages import component_of, moment_ns
+from fractus_storage.chain import Finding, Link, lines_of, logs, verify
+
+Entry = dict[str, Any]
+
+
+def found_logs(paths: Iterable[Path]) -> dict[Path, list[Path]]:
+    """The logs in some directories and files, each with its files in order.
+
+    Raises:
+        click.ClickException: there is none.
+    """
+    paths = tuple(paths)
+    found = logs(paths)
+    if not found:
+        raise click.ClickException(f"{', '.join(map(str, paths))}: there is no audit log (*.jsonl)")
+    return found
+
+
+def judged(name: Path, files: list[Path], since: Link | None = None) -> tuple[Finding, str]:
+    """What verification finds in a log, and the problem with the file and line that it is in; empty when it is sound.
+
+    Args:
+        name: the log.
+        files: those of its files that are judged.
+        since: see `verify`.
+
+    Raises:
+        click.ClickException: a file is missing.
+    """
+    begins: list[tuple[int, Path]] = [(0, files[0])]
+
+    def lines() -> Iterable[bytes]:
+        for total, (path, number, line) in enumerate(lines_of(files)):
+            if number == 1 and total:
+                begins.append((total, path))
+            yield line
+
+    try:
+        finding = verify(lines(), name not in files, since)
+    except FileNotFoundError as error:
+        raise click.ClickException(f"{error.filename}: is missing; the log is not complete without it") from None
+    if not finding.problem:
+        return finding, ""
+    before, path = next(begin for begin in reversed(begins) if begin[0] < max(finding.line, 1))
+    return finding, f"{path}: line {finding.line - before} {finding.problem}"
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """From when to when; Unix nanoseconds, open where they are None."""
+
+    begin_ns: int | None = None
+    end_ns: int | None = None
+
+    def __contains__(self, time_ns: int) -> bool:
+        return (self.begin_ns is None or time_ns >= self.begin_ns) and (self.end_ns is None or time_ns < self.end_ns)
+
+
+def entries(found: dict[Path, list[Path]], window: Window) -> Iterator[Entry]:
+    """The entries of several logs in the order of their times, each with `log`, the name of its log, and `time_ns`.
+
+    Lines that are no entries are left out: `judged` tells of them.
+    """
+    each = (_entries(name.stem, files, window) for name, files in found.items())
+    return heapq.merge(*each, key=lambda entry: entry["time_ns"])
+
+
+def _entries(log: str, files: Iterable[Path], window: Window) -> Iterator[Entry]:
+    for _, _, line in lines_of(files):
+        try:
+            entry = json.loads(line)
+        except (ValueError, RecursionError):
+            continue
+        time_ns = moment_ns(entry.get("time")) if isinstance(entry, dict) else None
+        if time_ns is not None and time_ns in window:
+            yield entry | {"log": log, "time_ns": time_ns}
+
+
+def decided(entry: Entry) -> bool:
+    """Whether an entry tells of a policy that changed something, or of a change of control."""
+    kind = entry.get("kind")
+    if kind in {"call", "check"}:
+        return entry.get("action") in {"correct", "deny", "takeover"}
+    return kind in {"monitor", "takeover", "control"}
+
+
+def who(entry: Entry) -> str:
+    """Who an entry is about: the component that called, or what else acted."""
+    return component_of(entry) or str(entry.get("controller") or "system")

@@ -1,0 +1,207 @@
+"""Audit logs in the formats of others: GeoJSON, KML, CSV and MCAP."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import IO, Any
+from xml.sax.saxutils import escape
+
+from fractus_core.api import Zone
+from fractus_core.geo.formats import kml_document, zone_placemark
+from fractus_services.recording.mcap_file import McapFile
+from fractus_services.recording.messages import component_of, location, number, of_audit, sentence, zones
+from fractus_services.recording.places import Feature, placed
+
+from fractus_cli.audit_logs import Entry, decided, who
+
+GAP_NS = 10_000_000_000
+"""A path ends where the flight recorder, which writes twice a second while the motors run, is silent for longer."""
+
+_COLUMNS = (
+    "time", "log", "kind", "lat", "lon", "alt_m", "amsl_m", "speed_mps", "battery", "mode", "controller", "component",
+    "method", "action", "code", "reason", "policies", "seq", "hash",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """What is drawn besides the flight, with a feature for each: `kind` of its properties says what it is."""
+
+    areas: Sequence[tuple[Zone, str, str]] = ()
+    """A shape, its kind, and the component that it is for."""
+
+    def features(self) -> list[Feature]:
+        """As GeoJSON."""
+        return [placed(zone, kind, **({"component": owner} if owner else {})) for zone, kind, owner in self.areas]
+
+
+@dataclass(frozen=True, slots=True)
+class Export:
+    """What is written.
+
+    Attributes:
+        entries: in the order of their times, as `audit_logs.entries` gives them.
+        places: zones and areas.
+        problems: why the entries prove nothing; empty when the chains are sound.
+    """
+
+    entries: Iterable[Entry]
+    places: Places
+    problems: Sequence[str]
+
+
+@dataclass(slots=True)
+class _Path:
+    """One flight: from the motors' start to their stop."""
+
+    times: list[int] = field(default_factory=list)
+    points: list[tuple[float, float, float]] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class _Flown:
+    """The paths and what was decided on them, with where the drone was: lon, lat, metres above sea level."""
+
+    paths: list[_Path] = field(default_factory=list)
+    decisions: list[tuple[Entry, tuple[float, float, float] | None]] = field(default_factory=list)
+
+
+def _flown(entries: Iterable[Entry]) -> _Flown:
+    flown, last, home_m = _Flown(), None, 0.0
+    for entry in entries:
+        lat, lon, alt = number(entry.get("lat")), number(entry.get("lon")), number(entry.get("alt")) or 0.0
+        if entry.get("kind") == "state":
+            if lat is None or lon is None:
+                continue
+            amsl = number(entry.get("amsl"))
+            home_m = amsl - alt if amsl is not None else home_m
+            last = (lon, lat, home_m + alt)
+            if not flown.paths or entry["time_ns"] - flown.paths[-1].times[-1] > GAP_NS:
+                flown.paths.append(_Path())
+            flown.paths[-1].times.append(entry["time_ns"])
+            flown.paths[-1].points.append(last)
+        elif decided(entry):
+            # The monitor's entries do not say where: the recorder does, twice a second.
+            at = (lon, lat, home_m + alt) if lat is not None and lon is not None else last
+            flown.decisions.append((entry, at))
+    return flown
+
+
+def write_geojson(export: Export, out: IO[bytes]) -> None:
+    """A FeatureCollection (RFC 7946): paths, decisions and areas; heights are metres above sea level."""
+    features: list[Feature] = []
+    flown = _flown(export.entries)
+    for path in flown.paths:
+        spots = [list(point) for point in path.points]
+        line = len(spots) > 1
+        features.append({
+            "type": "Feature",
+            "properties": {"kind": "path", "begin": _iso(path.times[0]), "end": _iso(path.times[-1])}
+            | ({"times": [_iso(time_ns) for time_ns in path.times]}),
+            "geometry": {"type": "LineString" if line else "Point", "coordinates": spots if line else spots[0]},
+        })  # fmt: skip
+    for entry, at in flown.decisions:
+        geometry = {"type": "Point", "coordinates": list(at)} if at is not None else None
+        features.append({"type": "Feature", "properties": _told(entry), "geometry": geometry})
+    features += export.places.features()
+    whole: dict[str, Any] = {"type": "FeatureCollection", "verified": not export.problems, "features": features}
+    out.write(json.dumps(whole, ensure_ascii=False, indent=1).encode() + b"\n")
+
+
+def _told(entry: Entry) -> dict[str, Any]:
+    told = {key: entry[key] for key in ("action", "code", "reason", "policies", "method", "mode") if entry.get(key)}
+    return {"kind": entry["kind"], "time": _iso(entry["time_ns"]), "component": who(entry)} | told
+
+
+def write_kml(export: Export, out: IO[bytes]) -> None:
+    """A document (OGC 07-147r2) with a line for each flight, a point for each decision, and the areas on the ground."""
+    flown = _flown(export.entries)
+    marks = [f"<description>{escape(one)}</description>\n" for one in (" ".join(export.problems),) if one]
+    marks += map(_line, flown.paths)
+    marks += [_point(entry, at) for entry, at in flown.decisions if at is not None]
+    marks += [zone_placemark(zone, []) for zone, _, _ in export.places.areas]
+    out.write(kml_document(marks).encode())
+
+
+def _line(path: _Path) -> str:
+    begin, end = _iso(path.times[0]), _iso(path.times[-1])
+    return (
+        f"<Placemark><name>flight {begin}</name><TimeSpan><begin>{begin}</begin><end>{end}</end></TimeSpan>"
+        f"<LineString><altitudeMode>absolute</altitudeMode><coordinates>{' '.join(map(_spot, path.points))}</coordinates>"
+        "</LineString></Placemark>\n"
+    )
+
+
+def _point(entry: Entry, at: tuple[float, float, float]) -> str:
+    name = f"{entry.get('action') or entry['kind']} {entry.get('code') or entry.get('method') or ''}".strip()
+    return (
+        f"<Placemark><name>{escape(name)}</name><description>{escape(sentence(entry))}</description>"
+        f"<TimeStamp><when>{_iso(entry['time_ns'])}</when></TimeStamp>"
+        f"<Point><altitudeMode>absolute</altitudeMode><coordinates>{_spot(at)}</coordinates></Point></Placemark>\n"
+    )
+
+
+def _spot(point: tuple[float, float, float]) -> str:
+    lon, lat, amsl = point
+    return f"{lon!r},{lat!r},{amsl:.2f}"
+
+
+def write_csv(export: Export, out: IO[bytes]) -> None:
+    """A row for each entry (RFC 4180), with the number and the hash that it has in its log."""
+    text = io.TextIOWrapper(out, encoding="utf-8", newline="", write_through=True)
+    writer = csv.DictWriter(text, _COLUMNS, extrasaction="ignore")
+    writer.writeheader()
+    for entry in export.entries:
+        policies = entry.get("policies")
+        renamed = {"alt_m": entry.get("alt"), "amsl_m": entry.get("amsl"), "speed_mps": entry.get("speed")}
+        names = " ".join(map(str, policies)) if isinstance(policies, list) else ""
+        told = {"component": component_of(entry), "policies": names, "time": _iso(entry["time_ns"])}
+        writer.writerow({key: value for key, value in (entry | renamed | told).items() if _plain(value)})
+    text.detach()
+
+
+def _plain(value: object) -> bool:
+    return isinstance(value, str | int | float)
+
+
+def write_mcap(export: Export, out: IO[bytes]) -> None:
+    """A file for Foxglove: location, state, decisions and log of each node, and the areas as GeoJSON."""
+    file, node = McapFile(out), "drone"
+    file.describe("audit", {"verified": "no" if export.problems else "yes", "problems": "\n".join(export.problems)})
+    features = export.places.features()
+    for entry in export.entries:
+        time_ns = entry["time_ns"]
+        if entry.get("kind") == "started":
+            node = str(entry.get("node") or node)
+        records = list(of_audit(entry, node))
+        if entry.get("kind") == "state":
+            records += _located(entry, node)
+        if features:
+            records.append(zones(time_ns, features))
+            features = []
+        for record in records:
+            file.write(f"/{node}/{record.topic}", record.schema, record.time_ns, record.content)
+    file.close()
+
+
+def _located(entry: Entry, node: str) -> Iterator[Any]:
+    lat, lon, amsl = number(entry.get("lat")), number(entry.get("lon")), number(entry.get("amsl"))
+    if lat is not None and lon is not None:
+        yield location(entry["time_ns"], node, lat, lon, amsl if amsl is not None else 0.0)
+
+
+def _iso(time_ns: int) -> str:
+    return datetime.fromtimestamp(time_ns / 1e9, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+WRITERS: dict[str, Callable[[Export, IO[bytes]], None]] = {
+    "csv": write_csv,
+    "geojson": write_geojson,
+    "kml": write_kml,
+    "mcap": write_mcap,
+}

@@ -1,0 +1,232 @@
+"""`fractus audit show` and `export`: what an audit log says, read back by the readers of the formats."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import subprocess
+import sys
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import demo_flight
+import pytest
+import shapely.geometry
+from click.testing import CliRunner, Result
+from fractus_cli.audit import audit
+from fractus_storage.audit import AuditLog
+from mcap.reader import make_reader
+
+TAKEOVER = {
+    "kind": "takeover", "time": demo_flight.stamp(demo_flight.TAKEOFF_S + 70), "action": "return", "controller": "system",
+    "reason": "the driver left the zone", "code": "LeftZone", "policies": ["town-altitude"], "lat": 50.865, "lon": 4.68, "alt": 30.0,
+}  # fmt: skip
+MONITOR = {
+    "kind": "monitor", "time": demo_flight.stamp(demo_flight.TAKEOFF_S + 20), "action": "correct", "code": "SpeedAboveLimit",
+    "reason": "<too> fast & low", "policies": ["town-speed"], "mode": "GUIDED",
+}  # fmt: skip
+ZONES = demo_flight.EXAMPLE / "zones.yaml"
+GRANT = """
+apiVersion: fractus.dev/v1alpha1
+kind: Grant
+metadata: {name: default.survey-navigator, uid: flight-1}
+spec:
+  node: drone-1
+  application: {namespace: default, name: survey, uid: survey-1}
+  component: Navigator
+  instance: survey-navigator
+  class: driver
+  control: full
+  services:
+    - {service: mobility, methods: [Arm, Goto]}
+  operationArea:
+    - circle: {center: {lat: 39.36, lon: 22.95}, radius: 200}
+  policies:
+    - name: pool
+      spec: {type: GeofenceControl, kind: exclusion, selector: {zones: [pool]}}
+      zones:
+        - {name: pool, area: {circle: {center: {lat: 39.3610, lon: 22.9510}, radius: 20}}}
+"""
+
+
+@pytest.fixture(scope="module")
+def entries() -> list[dict[str, Any]]:
+    started = {"kind": "started", "time": demo_flight.stamp(demo_flight.APPLIED_S), "node": "drone-1"}
+    states = [state | {"amsl": state["alt"] + 100.0} for state in demo_flight.states()]
+    return sorted([started, *demo_flight.calls(), *states, TAKEOVER, MONITOR], key=lambda entry: str(entry["time"]))
+
+
+@pytest.fixture
+async def log(tmp_path: Path, entries: list[dict[str, Any]]) -> Path:
+    """An audit log of a flight, written by the one writer."""
+    path, now = tmp_path / "audit" / "mobility.jsonl", 0.0
+    writer = AuditLog(path, lambda: now)
+    for entry in entries:
+        now = datetime.fromisoformat(entry["time"]).timestamp()
+        writer.append(entry["kind"], {key: value for key, value in entry.items() if key not in {"kind", "time"}})
+    await writer.close()
+    return path
+
+
+def run(*arguments: object) -> Result:
+    result = CliRunner().invoke(audit, [str(one) for one in arguments])
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def test_geojson_has_path_decisions_takeovers_and_zones(log: Path, entries: list[dict[str, Any]]) -> None:
+    result = run("export", log, "--to", "geojson", "--zones", ZONES)
+    assert not result.stderr
+    whole = json.loads(result.stdout)
+    assert (whole["type"], whole["verified"]) == ("FeatureCollection", True)
+    of = {
+        kind: [f for f in whole["features"] if f["properties"]["kind"] == kind]
+        for kind in ("path", "call", "takeover", "zone")
+    }
+    states = [entry for entry in entries if entry["kind"] == "state"]
+    (path,) = of["path"]
+    line = shapely.geometry.shape(path["geometry"])
+    assert line.geom_type == "LineString" and len(line.coords) == len(states) == len(path["properties"]["times"])
+    assert line.coords[0] == (demo_flight.HOME[1], demo_flight.HOME[0], 100.0), "lon, lat, metres above sea level"
+    assert [f["properties"]["code"] for f in of["call"]].count("MethodDenied") == 2
+    assert not any(f["properties"].get("action") == "allow" for f in whole["features"]), (
+        "what was permitted is no decision"
+    )
+    (takeover,) = of["takeover"]
+    assert takeover["geometry"]["coordinates"] == [4.68, 50.865, 130.0]
+    assert takeover["properties"]["reason"] == "the driver left the zone"
+    names = {f["properties"]["name"]: shapely.geometry.shape(f["geometry"]) for f in of["zone"]}
+    assert names and all(shape.is_valid and shape.area > 0 for shape in names.values())
+
+
+def test_the_monitors_decisions_are_where_the_drone_was(log: Path, entries: list[dict[str, Any]]) -> None:
+    whole = json.loads(run("export", log, "--to", "geojson").stdout)
+    (monitor,) = (f for f in whole["features"] if f["properties"]["kind"] == "monitor")
+    before = [entry for entry in entries if entry["kind"] == "state" and entry["time"] <= MONITOR["time"]][-1]
+    assert monitor["geometry"]["coordinates"][:2] == [before["lon"], before["lat"]]
+
+
+def test_kml_is_what_an_xml_reader_expects(log: Path, entries: list[dict[str, Any]]) -> None:
+    root = ElementTree.fromstring(run("export", log, "--to", "kml", "--zones", ZONES).stdout)
+    space = {"k": "http://www.opengis.net/kml/2.2"}
+    assert root.tag == "{http://www.opengis.net/kml/2.2}kml"
+    (line,) = root.findall(".//k:LineString", space)
+    groups = (line.findtext("k:coordinates", "", space)).split()
+    assert len(groups) == sum(entry["kind"] == "state" for entry in entries)
+    assert groups[0] == f"{demo_flight.HOME[1]},{demo_flight.HOME[0]},100.00"
+    assert line.findtext("k:altitudeMode", "", space) == "absolute"
+    told = [mark.findtext("k:description", "", space) for mark in root.findall(".//k:Placemark[k:Point]", space)]
+    assert any("LeftZone, the driver left the zone" in text for text in told)
+    assert any("<too> fast & low" in text for text in told)
+    assert root.findall(".//k:Polygon", space)
+
+
+def test_csv_has_every_entry_with_its_place_in_the_chain(log: Path, entries: list[dict[str, Any]]) -> None:
+    rows = list(csv.DictReader(io.StringIO(run("export", log, "--to", "csv").stdout)))
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert [(int(row["seq"]), row["hash"]) for row in rows] == [(line["seq"], line["hash"]) for line in lines]
+    (row,) = (row for row in rows if row["kind"] == "takeover")
+    assert (row["lat"], row["alt_m"], row["policies"], row["log"]) == ("50.865", "30.0", "town-altitude", "mobility")
+    denied = next(row for row in rows if row["code"] == "MethodDenied")
+    assert (denied["component"], denied["method"]) == ("AerialViewer", "CaptureImage")
+    assert sum(row["kind"] == "state" for row in rows) == sum(entry["kind"] == "state" for entry in entries)
+
+
+def test_mcap_is_read_by_its_reader(log: Path, entries: list[dict[str, Any]], tmp_path: Path) -> None:
+    run("export", log, "--to", "mcap", "--zones", ZONES, "--file", tmp_path / "flight.mcap")
+    with (tmp_path / "flight.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        found: dict[str, list[Any]] = {}
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None and (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+            found.setdefault(f"{channel.topic} {schema.name}", []).append((message.log_time, json.loads(message.data)))
+        (metadata,) = reader.iter_metadata()
+    states = [entry for entry in entries if entry["kind"] == "state"]
+    assert metadata.metadata["verified"] == "yes"
+    fixes = found["/drone-1/location foxglove.LocationFix"]
+    assert len(fixes) == len(found["/drone-1/state fractus.State"]) == len(states)
+    stamp = round(datetime.fromisoformat(states[0]["time"]).timestamp() * 1e9)
+    assert fixes[0][0] == stamp
+    assert fixes[0][1] | {"position_covariance": 9} == {
+        "timestamp": {"sec": stamp // 10**9, "nsec": stamp % 10**9}, "frame_id": "drone-1", "latitude": states[0]["lat"],
+        "longitude": states[0]["lon"], "altitude": states[0]["amsl"], "position_covariance": 9, "position_covariance_type": 0,
+    }  # fmt: skip
+    decisions = [content for _, content in found["/drone-1/decisions fractus.Decision"]]
+    assert ("takeover", "LeftZone") in {(content["kind"], content["code"]) for content in decisions}
+    levels = {content["message"]: content["level"] for _, content in found["/drone-1/log foxglove.Log"]}
+    assert levels["return: LeftZone, the driver left the zone"] == 4
+    ((_, zones),) = found["/drone-1/zones foxglove.GeoJSON"]
+    assert json.loads(zones["geojson"])["features"]
+
+
+def test_what_was_changed_is_written_with_a_warning(log: Path) -> None:
+    log.write_bytes(log.read_bytes().replace(b"MethodDenied", b"MethodAllows"))
+    result = run("export", log, "--to", "geojson")
+    assert "warning: not verified" in result.stderr
+    assert "was changed after it was written" in result.stderr
+    assert json.loads(result.stdout)["verified"] is False
+    assert "was changed after it was written" in run("export", log, "--to", "kml").stdout
+    assert "not verified" in run("show", log).stderr
+
+
+def test_lines_that_are_no_entries_are_left_out(log: Path) -> None:
+    whole = log.read_bytes()
+    odd = [
+        b"[]",
+        b'{"time": 5}',
+        b'{"time": "2026-01-01", "kind": "state"}',
+        b"[" * 100_000,
+        b'{"lat": NaN, "kind": "state"',
+    ]
+    lines = (
+        *odd,
+        b'{"time": "2026-01-01T00:00:00Z", "kind": "call", "action": "deny", "policies": 7, "lat": "x", "method": []}',
+    )
+    log.write_bytes(whole + b"\n".join(lines) + b"\n")
+    assert "is not an audit entry" in run("show", log).stderr
+    for target in ("csv", "geojson", "kml", "mcap"):
+        assert run("export", log, "--to", target).stdout_bytes
+
+
+def test_grants_draw_their_zones_and_areas(log: Path, tmp_path: Path) -> None:
+    (tmp_path / "grant.yaml").write_text(GRANT)
+    whole = json.loads(run("export", log, "--to", "geojson", "--zones", tmp_path / "grant.yaml").stdout)
+    told = {f["properties"]["kind"]: f["properties"] for f in whole["features"]}
+    assert told["zone"]["name"] == "pool"
+    assert told["operationArea"]["component"] == "Navigator"
+
+
+def test_show_tells_what_was_decided(log: Path) -> None:
+    lines = run("show", log).stdout.splitlines()
+    assert len(lines) == 8
+    assert lines[0].endswith(
+        "mobility  call: Navigator SetSpeed correct: SpeedAboveLimit, speed 12.0 m/s is above the limit of policy town-speed;"
+        " corrected to 10.0 m/s"
+    )
+    assert len(run("show", log, "--all").stdout.splitlines()) == len(log.read_text().splitlines())
+    after = demo_flight.stamp(demo_flight.TAKEOFF_S + 60)
+    (*_, last) = (json.loads(line) for line in run("show", log, "-o", "json", "--after", after).stdout.splitlines())
+    assert (last["kind"], last["log"]) == ("control", "mobility")
+    assert not run("show", log, "--before", demo_flight.stamp(demo_flight.APPLIED_S)).stdout
+
+
+async def test_a_pause_ends_a_path(log: Path, tmp_path: Path) -> None:
+    now = demo_flight.TAKEOFF_S + 5000.0
+    writer = AuditLog(log, lambda: now)
+    writer.append("state", {"lat": 50.0, "lon": 4.0, "alt": 0.0, "amsl": 90.0})
+    await writer.close()
+    whole = json.loads(run("export", log, "--to", "geojson").stdout)
+    assert [f["geometry"]["type"] for f in whole["features"] if f["properties"]["kind"] == "path"] == [
+        "LineString",
+        "Point",
+    ]
+
+
+def test_help_and_verification_import_no_geometry() -> None:
+    code = "import sys, fractus_cli.audit; print([m for m in ('mcap', 'shapely', 'numpy', 'pydantic') if m in sys.modules])"
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True).stdout.strip() == "[]"
+    )

@@ -55,6 +55,10 @@ BRAKING_SHARE, MAX_BRAKING_MPS2 = 0.64, 1.6
 behind; a vehicle that accelerates less brakes less."""
 
 
+JERK_MPS3 = 5.0
+"""PSC_JERK_XY of ArduCopter, by which an acceleration ends."""
+
+
 @dataclass(frozen=True)
 class Weather:
     """What a flight meets.
@@ -269,6 +273,8 @@ class Oracle:
         self.rules = Rules()
         self.arena = shapely.box(-HALF_M, -HALF_M, HALF_M, HALF_M)
         self._said: set[str] = set()
+        self._speed_mps = 0.0
+        self.speeding_mps2 = 0.0
 
     def place(self) -> tuple[float, float, float]:
         """East, north and height in metres, truly."""
@@ -282,10 +288,13 @@ class Oracle:
         return math.hypot(body.vn, body.ve), -body.vd
 
     def unavoidable_m(self) -> float:
-        """How far a drone flies that is told to stop at this moment."""
-        speed, _ = self.speeds()
+        """How far a drone flies that is told to stop at this moment; it speeds up until then, and while that eases."""
+        speed, late_s, more = self.speeds()[0], self._late_s(), self.speeding_mps2
+        easing_s = more / JERK_MPS3
+        surge_mps = more * (late_s + easing_s / 2)
         accel_mps2 = self._sky.truth.params["WPNAV_ACCEL"] / 100.0
-        return speed * self._late_s() + speed * speed / (2 * min(BRAKING_SHARE * accel_mps2, MAX_BRAKING_MPS2)) + 1.0
+        run_m, speed = (speed + surge_mps / 2) * (late_s + easing_s), speed + surge_mps
+        return run_m + speed * speed / (2 * min(BRAKING_SHARE * accel_mps2, MAX_BRAKING_MPS2)) + 1.0
 
     def appears(self, wall: Wall) -> None:
         """A zone is in force from now on."""
@@ -320,7 +329,8 @@ class Oracle:
             await asyncio.sleep(WATCH_S)
 
     def _look(self) -> None:
-        truth = self._sky.truth
+        truth, speed_mps = self._sky.truth, self.speeds()[0]
+        self.speeding_mps2, self._speed_mps = max((speed_mps - self._speed_mps) / WATCH_S, 0.0), speed_mps
         x, y, height = self.place()
         if height < 0.7 or not truth.armed:
             return

@@ -654,6 +654,10 @@ def _odd(verdict: Verdict, now: Situation, place: Scene) -> Iterator[str]:
         yield "at the wrong height"
 
 
+SLOWEST_STOP_S = 20.0
+"""From 15 m/s with 1 m/s2, the latency and the controller's approach included."""
+
+
 def excused(fleet: Fleet) -> Flags:
     """Fences that a drone breaks, or comes too close to, whatever it is told at the beginning; shape (n, ZONES + 1).
 
@@ -663,9 +667,11 @@ def excused(fleet: Fleet) -> Flags:
     trial = fleet.part(np.arange(len(fleet.scenes)))
     trial.held[:], trial.wanted, trial.until = True, trial.speed.copy(), fleet.time_s + fleet.latency
     found = np.zeros((len(fleet.scenes), ZONES + 1), dtype=bool)
-    for n in range(int(6.0 / STEP_S)):
+    for n in range(int(SLOWEST_STOP_S / STEP_S)):
         if n % 4 == 0:
             found |= vicinity(trial)
+            if trial.time_s > trial.until.max() and np.abs(trial.speed).max() < STANDING_MPS:
+                break
         trial.step()
     return found
 

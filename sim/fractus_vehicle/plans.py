@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import assert_never
 
-from fractus_mavlink.enums import COPTER_MODE, MAV_MISSION_RESULT, MAV_MISSION_TYPE, MAV_SEVERITY
+from fractus_mavlink.enums import COPTER_MODE, MAV_MISSION_RESULT, MAV_MISSION_TYPE, MAV_SEVERITY, MISSION_STATE
 
 from fractus_vehicle.earth import Place, valid_coordinates
 from fractus_vehicle.fence import FenceItem, FenceShapeError, build_shapes
@@ -31,6 +31,13 @@ def replace_items(v: VehicleState, store: ItemStore, items: list[Item]) -> MAV_M
     if result is MAV_MISSION_RESULT.ACCEPTED:
         store.items = items
     return result
+
+
+def clear_items(v: VehicleState, store: ItemStore) -> MAV_MISSION_RESULT:
+    """Empty a list; a mission is kept while it is flown."""
+    if store.kind is MAV_MISSION_TYPE.MISSION and v.armed and v.mission.state(v.mode) is MISSION_STATE.ACTIVE:
+        return MAV_MISSION_RESULT.ERROR
+    return replace_items(v, store, [])
 
 
 def _accept(v: VehicleState, kind: MAV_MISSION_TYPE, items: list[Item]) -> MAV_MISSION_RESULT:

@@ -20,10 +20,11 @@ RECEIVED = {
     MAV_MISSION_TYPE.MISSION: (MAV_SEVERITY.INFO, "Flight plan received"),
     MAV_MISSION_TYPE.FENCE: (MAV_SEVERITY.DEBUG, "Fence Indexed OK"),
 }
-# What is refused until an upload of the same list has ended.
+# What the lists are called in texts.
+TITLES = {MAV_MISSION_TYPE.MISSION: "Mission", MAV_MISSION_TYPE.FENCE: "Fence", MAV_MISSION_TYPE.RALLY: "Rally"}
+# What is refused until an upload of the same list has ended (the older MISSION_REQUEST is answered all the same).
 NOT_WHILE_UPLOADED = {
     "MISSION_REQUEST_LIST": MAV_MISSION_RESULT.DENIED,
-    "MISSION_REQUEST": MAV_MISSION_RESULT.DENIED,
     "MISSION_REQUEST_INT": MAV_MISSION_RESULT.DENIED,
     "MISSION_CLEAR_ALL": MAV_MISSION_RESULT.ERROR,
 }
@@ -45,24 +46,30 @@ class Upload:
     asked_s: float
     old_format: bool = False
 
+    def is_from(self, message: Message) -> bool:
+        """Whether a message comes from the one that uploads."""
+        return (self.sysid, self.compid) == (message.sysid, message.compid)
+
 
 def _address(peer: Message | Upload, kind: int) -> dict[str, Value]:
     return {"target_system": peer.sysid, "target_component": peer.compid, "mission_type": int(kind)}
 
 
 class Transfers:
-    """The vehicle's side of the mission protocol, for all kinds and links (one upload at a time, as ArduPilot)."""
+    """The vehicle's side of the mission protocol, for all kinds and links (one upload of each kind at a time, as ArduPilot)."""
 
     def __init__(
         self,
         stores: Mapping[MAV_MISSION_TYPE, ItemStore],
         replace_items: Callable[[ItemStore, list[Item]], MAV_MISSION_RESULT],
+        clear: Callable[[ItemStore], MAV_MISSION_RESULT],
         say: Callable[[MAV_SEVERITY, str], None],
     ) -> None:
         self._stores = stores
         self._replace = replace_items
+        self._clear = clear
         self._say = say
-        self.upload: Upload | None = None
+        self.uploads: dict[MAV_MISSION_TYPE, Upload] = {}
         self.now_s = 0.0
 
     @staticmethod
@@ -75,15 +82,14 @@ class Transfers:
         kind_number = message.integer("mission_type") if message.has("mission_type") else 0
         if kind_number not in self._stores:
             self._ack(channel, message, kind_number, MAV_MISSION_RESULT.UNSUPPORTED)
-        elif self.upload is not None and self.upload.kind == kind_number and message.name in NOT_WHILE_UPLOADED:
+        elif kind_number in self.uploads and message.name in NOT_WHILE_UPLOADED:
             self._ack(channel, message, kind_number, NOT_WHILE_UPLOADED[message.name])
         else:
             self._handle(channel, message, self._stores[MAV_MISSION_TYPE(kind_number)])
 
     def detach(self, channel: Channel) -> None:
-        """Give up an upload from a link that closes."""
-        if self.upload is not None and self.upload.channel is channel:
-            self.upload = None
+        """Give up uploads from a link that closes."""
+        self.uploads = {kind: up for kind, up in self.uploads.items() if up.channel is not channel}
 
     def _handle(self, channel: Channel, message: Message, store: ItemStore) -> None:
         kind = store.kind
@@ -96,6 +102,7 @@ class Transfers:
                 if 0 <= start <= end <= len(store.items):
                     self._begin(channel, message, store, range(start, end + 1))
                 else:
+                    self._say(MAV_SEVERITY.WARNING, "Flight plan update rejected")
                     self._ack(channel, message, kind, MAV_MISSION_RESULT.ERROR)
             case "MISSION_ITEM" | "MISSION_ITEM_INT":
                 self._take(channel, message, store)
@@ -106,19 +113,14 @@ class Transfers:
             case "MISSION_REQUEST" | "MISSION_REQUEST_INT":
                 self._give(channel, message, store)
             case "MISSION_CLEAR_ALL":
-                self._ack(channel, message, kind, self._replace(store, []))
-            case "MISSION_ACK" if self._is_uploader(channel, message):
-                self.upload = None
+                self._ack(channel, message, kind, self._clear(store))
             case _:
-                pass
-
-    def _is_uploader(self, channel: Channel, message: Message) -> bool:
-        up = self.upload
-        return up is not None and up.channel is channel and (up.sysid, up.compid) == (message.sysid, message.compid)
+                pass  # MISSION_ACK: an upload that its sender gives up runs into its time limit
 
     def _begin(self, channel: Channel, message: Message, store: ItemStore, wanted: range) -> None:
         """Begin to ask for the items of `wanted`; all of a new list, or a part of the stored one."""
-        if self.upload is not None and not self._is_uploader(channel, message):
+        going_on = self.uploads.get(store.kind)
+        if going_on is not None and not going_on.is_from(message):
             self._ack(channel, message, store.kind, MAV_MISSION_RESULT.DENIED)
         elif wanted.stop > MAX_ITEMS[store.kind]:
             self._say(MAV_SEVERITY.WARNING, f"Only {MAX_ITEMS[store.kind]} items are supported")
@@ -127,7 +129,7 @@ class Transfers:
             self._complete(channel, message, store, [])
         else:
             partial = message.name == "MISSION_WRITE_PARTIAL_LIST"
-            self.upload = Upload(
+            self.uploads[store.kind] = up = Upload(
                 channel=channel,
                 sysid=message.sysid,
                 compid=message.compid,
@@ -139,31 +141,32 @@ class Transfers:
                 heard_s=self.now_s,
                 asked_s=self.now_s,
             )
-            self._ask(self.upload)
+            self._ask(up)
 
     def _ask(self, up: Upload) -> None:
         up.asked_s = self.now_s
         up.channel.send("MISSION_REQUEST", _address(up, up.kind) | {"seq": up.next})
 
     def _take(self, channel: Channel, message: Message, store: ItemStore) -> None:
-        up = self.upload
-        if up is None or not self._is_uploader(channel, message) or up.kind is not store.kind:
+        up = self.uploads.get(store.kind)
+        if up is None:
             self._ack(channel, message, store.kind, MAV_MISSION_RESULT.ERROR)
-            return
-        seq = message.integer("seq")
-        if seq != up.next:
-            if seq > up.next:
-                self._ack(channel, message, store.kind, MAV_MISSION_RESULT.INVALID_SEQUENCE)
-            return
-        item = item_from(message)
-        verdict = self._judge(message, item, store, up)
-        if verdict is not MAV_MISSION_RESULT.ACCEPTED:
-            self.upload = None
-            self._ack(channel, message, store.kind, verdict)
             return
         if message.name == "MISSION_ITEM" and not up.old_format:
             up.old_format = True
             self._say(MAV_SEVERITY.WARNING, "got MISSION_ITEM; GCS should send MISSION_ITEM_INT")
+        seq = message.integer("seq")
+        if seq != up.next or not up.is_from(message):
+            # The upload goes on; an item that comes twice is told so, too.
+            refusal = MAV_MISSION_RESULT.INVALID_SEQUENCE if seq != up.next else MAV_MISSION_RESULT.DENIED
+            self._ack(channel, message, store.kind, refusal)
+            return
+        item = item_from(message)
+        verdict = self._judge(message, item, store, up)
+        if verdict is not MAV_MISSION_RESULT.ACCEPTED:
+            del self.uploads[store.kind]
+            self._ack(channel, message, store.kind, verdict)
+            return
         up.items[seq : seq + 1] = [item]
         if store.kind is MAV_MISSION_TYPE.MISSION and up.next < up.last:
             # A mission is written as it arrives: an upload that ends here leaves so much of it, and nothing of the old one.
@@ -173,7 +176,7 @@ class Transfers:
         if up.next <= up.last:
             self._ask(up)
             return
-        self.upload = None
+        del self.uploads[store.kind]
         self._complete(channel, message, store, up.items)
 
     def _complete(self, channel: Channel, message: Message, store: ItemStore, items: list[Item]) -> None:
@@ -223,16 +226,13 @@ class Transfers:
             },
         )
 
-    def step(self, now_s: float) -> bool:
-        """Repeat an unanswered request; True when the upload was given up."""
+    def step(self, now_s: float) -> None:
+        """Repeat unanswered requests; give up after a while."""
         self.now_s = now_s
-        up = self.upload
-        if up is None:
-            return False
-        if now_s - up.heard_s > UPLOAD_TIMEOUT_S:
-            self.upload = None
-            self._ack(up.channel, up, up.kind, MAV_MISSION_RESULT.OPERATION_CANCELLED)
-            return True
-        if now_s - up.asked_s > RETRY_S:
-            self._ask(up)
-        return False
+        for kind, up in list(self.uploads.items()):
+            if now_s - up.heard_s > UPLOAD_TIMEOUT_S:
+                del self.uploads[kind]
+                self._ack(up.channel, up, up.kind, MAV_MISSION_RESULT.OPERATION_CANCELLED)
+                self._say(MAV_SEVERITY.WARNING, f"{TITLES[kind]} upload timeout")
+            elif now_s - up.asked_s > RETRY_S:
+                self._ask(up)

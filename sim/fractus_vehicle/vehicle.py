@@ -11,7 +11,7 @@ from fractus_vehicle.failsafes import Failsafes
 from fractus_vehicle.home import set_home
 from fractus_vehicle.modes import FlightModes
 from fractus_vehicle.motion import move
-from fractus_vehicle.plans import replace_items, stores_of
+from fractus_vehicle.plans import clear_items, replace_items, stores_of
 from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.report_units import UNKNOWN_U16
 from fractus_vehicle.settings import LIMIT_PREFIXES, set_battery, set_fence, set_limits, set_wind
@@ -36,7 +36,10 @@ class Vehicle:
         self.modes = FlightModes(self.state)
         self.failsafes = Failsafes(self.state, self.modes)
         self.transfers = Transfers(
-            stores_of(self.state), lambda store, items: replace_items(self.state, store, items), self.state.say
+            stores_of(self.state),
+            lambda store, items: replace_items(self.state, store, items),
+            lambda store: clear_items(self.state, store),
+            self.state.say,
         )
         self.signing_key: bytes | None = None
         self.reboot_wanted = False
@@ -90,8 +93,8 @@ class Vehicle:
             v.broadcast("MISSION_ITEM_REACHED", {"seq": v.item_reached})
             v.item_reached = None
         move(v)
-        if self.transfers.upload is not None and self.transfers.step(v.time_s):
-            v.say(MAV_SEVERITY.WARNING, "Mission upload timeout")
+        if self.transfers.uploads:
+            self.transfers.step(v.time_s)
         for channel in v.channels:
             serve(v, channel)
 

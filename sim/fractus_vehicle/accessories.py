@@ -31,7 +31,7 @@ SWITCHED_MODES = {
 }
 SWITCH_LOW, SWITCH_HIGH = 0, 2
 FENCE_SWITCH = 11
-# Refused without a camera, a mount, a gripper or an authority that is asked.
+# Refused without a camera, a mount, a gripper, a winch, a radio or a calibration under way.
 ABSENT = (
     MAV_CMD.DO_GRIPPER,
     MAV_CMD.DO_MOUNT_CONFIGURE,
@@ -45,9 +45,20 @@ ABSENT = (
     MAV_CMD.SET_CAMERA_ZOOM,
     MAV_CMD.SET_CAMERA_FOCUS,
     MAV_CMD.DO_ADSB_OUT_IDENT,
+    MAV_CMD.DO_SET_ROI_SYSID,
+    MAV_CMD.DO_WINCH,
+    MAV_CMD.ACCELCAL_VEHICLE_POS,
+    MAV_CMD.START_RX_PAIR,
 )
 # Accepted without an effect here.
-TAKEN = (MAV_CMD.DO_DIGICAM_CONTROL, MAV_CMD.DO_SET_CAM_TRIGG_DIST, MAV_CMD.FIXED_MAG_CAL_YAW)
+TAKEN = (
+    MAV_CMD.DO_DIGICAM_CONFIGURE,
+    MAV_CMD.DO_DIGICAM_CONTROL,
+    MAV_CMD.DO_SET_CAM_TRIGG_DIST,
+    MAV_CMD.DO_SPRAYER,
+    MAV_CMD.AIRFRAME_CONFIGURATION,
+    MAV_CMD.FIXED_MAG_CAL_YAW,
+)
 
 
 def set_servo(v: VehicleState, channel: float, pwm_us: float) -> MAV_RESULT:

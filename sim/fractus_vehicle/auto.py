@@ -200,7 +200,7 @@ class AutoFlight(Flight):
             if item.command != MAV_CMD.NAV_TAKEOFF:
                 v.say(MAV_SEVERITY.INFO, f"Reached command #{self._index}")
             self._start_from(v, v.mission.next_after(self._index))
-        v.heading.step(v.est)
+        v.heading.step(v.est, CONTROL_STEP_S)
 
     def _land(self, v: VehicleState) -> None:
         north, east = v.control.target

@@ -23,25 +23,34 @@ from fractus_vehicle.accessories import (
     SWITCH_LOW,
     SWITCHED_MODES,
 )
-from fractus_vehicle.auto import AutoFlight
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.copter import (
     ABSOLUTE_FRAMES,
     FORCE_ARM_MAGIC,
     FORCE_MAGIC,
     GLOBAL_FRAMES,
+    GUIDED_MODES,
     SUPPORTED_MODES,
+    TAKES_OFF,
     UNAVAILABLE,
 )
-from fractus_vehicle.earth import valid_coordinates
+from fractus_vehicle.earth import ALTITUDE_MAX_M, valid_coordinates
 from fractus_vehicle.guided import GuidedFlight
 from fractus_vehicle.home import set_home_at, set_home_here
 from fractus_vehicle.mission_commands import item_target, switch_fence
 from fractus_vehicle.mission_items import Item
+from fractus_vehicle.mission_orders import (
+    begin_landing_sequence,
+    begin_return_path,
+    choose_item,
+    jump_to_tag,
+    pause,
+    start_mission,
+)
 from fractus_vehicle.orders import Order, read_order
 from fractus_vehicle.readiness import arming_refusals, mandatory_refusals, mode_refusal
 from fractus_vehicle.requests import ANSWERS
-from fractus_vehicle.telemetry import send
+from fractus_vehicle.state import VehicleState
 from fractus_vehicle.vehicle import Vehicle
 
 
@@ -70,25 +79,18 @@ def _arm_disarm(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
 
 def _takeoff(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
     v = vehicle.state
-    if not v.armed or not v.landed or v.flying_wanted or not math.isfinite(o.z):
-        return MAV_RESULT.FAILED
-    if isinstance(vehicle.modes.flight, AutoFlight) or v.mode not in (
-        COPTER_MODE.GUIDED,
-        COPTER_MODE.LOITER,
-        COPTER_MODE.ALT_HOLD,
-    ):
-        return MAV_RESULT.FAILED
-    if o.integer and o.frame not in (MAV_FRAME.GLOBAL_RELATIVE_ALT, MAV_FRAME.GLOBAL_RELATIVE_ALT_INT):
+    if o.frame != MAV_FRAME.GLOBAL_RELATIVE_ALT:
         return MAV_RESULT.DENIED
-    if o.z <= 0.0:
+    # ALT_HOLD takes off where the client does not ask to keep the position.
+    takes_off = v.mode in TAKES_OFF or (v.mode is COPTER_MODE.ALT_HOLD and o.params[2] != 0.0)
+    if not v.armed or not v.landed or not takes_off or not v.altitude_m < o.z < ALTITUDE_MAX_M:
         return MAV_RESULT.FAILED
     origin = v.origin or v.start
-    home = v.home or origin
-    down = min(origin.alt_m - home.alt_m - o.z, v.est.down - 0.1)
-    if isinstance(vehicle.modes.flight, GuidedFlight):
-        vehicle.modes.flight.take_off(v, down)
-    else:
-        v.begin_takeoff(down)
+    flight = vehicle.modes.flight
+    if not isinstance(flight, GuidedFlight):
+        v.begin_takeoff(v.est.down - min(o.z, PILOT_TAKEOFF_MAX_M))
+    elif v.mode is COPTER_MODE.GUIDED:
+        flight.take_off(v, origin.alt_m - (v.home or origin).alt_m - o.z)
     return MAV_RESULT.ACCEPTED
 
 
@@ -118,130 +120,84 @@ def _set_mode(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
 
 def _change_speed(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
     v = vehicle.state
-    if not math.isfinite(o.params[0]):
-        return MAV_RESULT.DENIED
-    # Any other kind than the first three is a descent.
-    kind = min(max(int(o.params[0]), 0), 3)
+    kind = 3 if o.params[0] > 2.9 else 2 if o.params[0] > 1.9 else 0  # as the autopilot compares it
     takes = v.mode in CHANGES_SPEED and v.control.limits.change_speed(kind, o.params[1])
     return MAV_RESULT.ACCEPTED if takes else MAV_RESULT.FAILED
+
+
+def _readable_place(v: VehicleState, o: Order) -> bool:
+    """Whether a command's altitude and frame say where it means; a frame that is none is complained about."""
+    if not abs(o.z) < ALTITUDE_MAX_M:
+        return False
+    if o.frame not in GLOBAL_FRAMES:
+        v.say(MAV_SEVERITY.INFO, f"Unknown mavlink coordinate frame {o.frame}")
+    return v.altitude_base_m(o.frame) is not None
 
 
 def _reposition(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
     v = vehicle.state
     switch = bool(int(o.params[1]) & MAV_DO_REPOSITION_FLAGS.CHANGE_MODE) if math.isfinite(o.params[1]) else False
-    if v.mode is not COPTER_MODE.GUIDED and not switch:
+    if v.mode not in GUIDED_MODES and not switch:
         return MAV_RESULT.DENIED
-    if o.frame not in GLOBAL_FRAMES:
-        v.say(MAV_SEVERITY.INFO, f"Unknown mavlink coordinate frame {o.frame}")
-    placed = o.has_place and valid_coordinates(o.x, o.y) and math.isfinite(o.z)
-    if not placed or v.altitude_base_m(o.frame) is None:
+    if not valid_coordinates(o.x, o.y) or not _readable_place(v, o):
+        return MAV_RESULT.DENIED
+    # No place, or no height above home or ground, would mean the present one, which is not taken here.
+    if not o.has_place or (o.frame not in ABSOLUTE_FRAMES and abs(o.z) < CENTIMETRE):
         return MAV_RESULT.DENIED
     north, east, down = item_target(v, o.item)
-    if v.outside_fence(north, east, down) or not vehicle.modes.change(COPTER_MODE.GUIDED):
+    if v.outside_fence(north, east, down):
+        return MAV_RESULT.FAILED
+    if v.mode not in GUIDED_MODES and not vehicle.modes.change(COPTER_MODE.GUIDED):
         return MAV_RESULT.FAILED
     flight = vehicle.modes.flight
-    if (
-        isinstance(flight, GuidedFlight) and not v.landed
-    ):  # on the ground it is noted, and a takeoff sets another target
+    # On the ground it is noted, and a takeoff sets another target.
+    if isinstance(flight, GuidedFlight) and not v.landed:
         flight.go_to(v, north, east, down)
-        if math.isfinite(o.params[3]) and o.params[3] != 0.0:
-            v.heading.turn_to(o.params[3] % 360.0, 0.0, 0, relative=False)
-        else:
-            v.heading.follow_course()
+        v.heading.follow_course()  # its own heading is not looked at
     return MAV_RESULT.ACCEPTED
 
 
 def _yaw(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
+    """Taken in every mode; those that fly by themselves turn."""
     v = vehicle.state
     angle, rate, direction, relative = o.params
-    if v.mode not in (COPTER_MODE.GUIDED, COPTER_MODE.AUTO) or not all(math.isfinite(p) for p in o.params):
-        return MAV_RESULT.FAILED
     if relative not in (0.0, 1.0) or not 0.0 <= angle <= 360.0:
         return MAV_RESULT.FAILED
-    turned = v.heading.turn_to(angle, rate, int(direction), relative=relative == 1.0)
-    return MAV_RESULT.ACCEPTED if turned else MAV_RESULT.FAILED
+    if v.mode in TURNS and math.isfinite(rate) and math.isfinite(direction):
+        v.heading.turn_to(angle, rate, int(direction), relative=relative == 1.0)
+    return MAV_RESULT.ACCEPTED
 
 
 def _roi(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
     v = vehicle.state
-    if o.command == MAV_CMD.DO_SET_ROI_NONE or not o.has_place:
-        v.heading.look_at(None)
-        return MAV_RESULT.ACCEPTED
-    if not valid_coordinates(o.x, o.y) or o.frame not in GLOBAL_FRAMES:
-        return MAV_RESULT.FAILED
-    north, east, _ = item_target(v, Item(command=o.command, frame=o.frame, x=o.x, y=o.y))
-    v.heading.look_at((north, east))
+    if o.command != MAV_CMD.DO_SET_ROI_NONE:
+        if not _readable_place(v, o):
+            return MAV_RESULT.DENIED
+        if not valid_coordinates(o.x, o.y):
+            return MAV_RESULT.FAILED
+        if o.has_place or o.z != 0.0:
+            north, east, _ = item_target(v, Item(command=o.command, frame=o.frame, x=o.x, y=o.y))
+            v.heading.look_at((north, east))
+            return MAV_RESULT.ACCEPTED
+    v.heading.look_at(None)
     return MAV_RESULT.ACCEPTED
 
 
 def _set_home(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
     v = vehicle.state
-    if o.params[0] == 1.0 or (o.x == 0 and o.y == 0 and math.isfinite(o.z)):
+    if o.params[0] == 1.0 or not o.has_place:
         return MAV_RESULT.ACCEPTED if set_home_here(v) else MAV_RESULT.FAILED
-    if not o.has_place or not math.isfinite(o.z):
+    if o.params[0] != 0.0:
+        return MAV_RESULT.FAILED
+    if not _readable_place(v, o):
         return MAV_RESULT.DENIED
-    if o.frame not in GLOBAL_FRAMES:
-        return MAV_RESULT.COMMAND_UNSUPPORTED_MAV_FRAME
-    altitude = o.z
-    if o.frame not in ABSOLUTE_FRAMES:
-        altitude += (v.home or v.start).alt_m
+    altitude = o.z + (v.altitude_base_m(o.frame) or 0.0)
     return MAV_RESULT.ACCEPTED if set_home_at(v, o.x, o.y, altitude) else MAV_RESULT.FAILED
 
 
 def _fence_enable(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
     v = vehicle.state
     return MAV_RESULT.ACCEPTED if switch_fence(v, o.params[0]) else MAV_RESULT.FAILED
-
-
-def _mission_start(vehicle: Vehicle, _o: Order, _c: Channel) -> MAV_RESULT:
-    if not vehicle.modes.change(COPTER_MODE.AUTO):
-        return MAV_RESULT.FAILED
-    flight = vehicle.modes.flight
-    if isinstance(flight, AutoFlight):
-        flight.start_by_command(vehicle.state)
-    return MAV_RESULT.ACCEPTED
-
-
-def _mission_current(vehicle: Vehicle, o: Order, c: Channel) -> MAV_RESULT:
-    v = vehicle.state
-    if not math.isfinite(o.params[0]):
-        return MAV_RESULT.DENIED
-    if not set_current(vehicle, int(o.params[0])):
-        return MAV_RESULT.DENIED
-    send(v, c, "MISSION_CURRENT")
-    return MAV_RESULT.ACCEPTED
-
-
-def _jump_to_tag(vehicle: Vehicle, o: Order, c: Channel) -> MAV_RESULT:
-    v = vehicle.state
-    tag = o.params[0]
-    index = v.mission.tagged(int(tag)) if math.isfinite(tag) else None
-    if index is None or not set_current(vehicle, index):
-        return MAV_RESULT.FAILED
-    send(v, c, "MISSION_CURRENT")
-    return MAV_RESULT.ACCEPTED
-
-
-def set_current(vehicle: Vehicle, index: int) -> bool:
-    """Make an item the current one; AUTO continues there."""
-    v = vehicle.state
-    if not 0 <= index < len(v.mission.items):
-        return False
-    if isinstance(vehicle.modes.flight, AutoFlight) and v.armed:
-        vehicle.modes.flight.jump_to(v, max(index, 1))
-    else:
-        v.mission.current = index
-        v.mission.complete = False
-    return True
-
-
-def _pause(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
-    v = vehicle.state
-    flight = vehicle.modes.flight
-    if not isinstance(flight, (AutoFlight, GuidedFlight)) or o.params[0] not in (0.0, 1.0):
-        return MAV_RESULT.DENIED
-    flight.pause(v, paused=o.params[0] == 0.0)
-    return MAV_RESULT.ACCEPTED
 
 
 def _terminate(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
@@ -271,12 +227,23 @@ def _prearm(vehicle: Vehicle, _o: Order, _c: Channel) -> MAV_RESULT:
     return MAV_RESULT.ACCEPTED
 
 
-def _calibrate(vehicle: Vehicle, _o: Order, _c: Channel) -> MAV_RESULT:
+def _calibrate(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
+    """Takes what needs no pilot's hands, and has no effect on sensors that do not drift: gyroscopes, barometer, level."""
     v = vehicle.state
     if v.armed or v.motor_test_until_s is not None:
         v.say(MAV_SEVERITY.NOTICE, "Disarm to allow calibration")
         return MAV_RESULT.FAILED
-    return MAV_RESULT.ACCEPTED
+    if o.params[0] == 1.0:
+        return MAV_RESULT.ACCEPTED
+    if o.params[2] == 1.0:
+        v.say(MAV_SEVERITY.INFO, "Updating barometer calibration")
+        v.say(MAV_SEVERITY.INFO, "Barometer calibration complete")
+        return MAV_RESULT.ACCEPTED
+    if o.x == LEVEL:
+        v.say(MAV_SEVERITY.INFO, "Trim OK: roll=0.00 pitch=0.00 yaw=0.00")
+        return MAV_RESULT.ACCEPTED
+    taken = o.x in (SIMPLE_ACCELEROMETER, FORCE_SAVE) or o.params[1] == FORCE_SAVE
+    return MAV_RESULT.ACCEPTED if taken else MAV_RESULT.UNSUPPORTED
 
 
 def _storage(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
@@ -300,8 +267,14 @@ def _switch(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
     return MAV_RESULT.ACCEPTED
 
 
-# The modes that fly with speeds a client may change.
-CHANGES_SPEED = frozenset({COPTER_MODE.GUIDED, COPTER_MODE.AUTO, COPTER_MODE.RTL, COPTER_MODE.SMART_RTL})
+# The modes that fly with speeds a client may change, and those that turn the nose by themselves.
+CHANGES_SPEED = GUIDED_MODES | {COPTER_MODE.AUTO, COPTER_MODE.RTL, COPTER_MODE.SMART_RTL}
+TURNS = frozenset({COPTER_MODE.GUIDED, COPTER_MODE.AUTO, COPTER_MODE.SMART_RTL})
+CENTIMETRE = 0.01
+# What a takeoff in a pilot's mode climbs at most.
+PILOT_TAKEOFF_MAX_M = 10.0
+# PREFLIGHT_CALIBRATION, fifth parameter (the last one also the second).
+LEVEL, SIMPLE_ACCELEROMETER, FORCE_SAVE = 2, 4, 76
 
 HANDLERS: dict[int, Callable[[Vehicle, Order, Channel], MAV_RESULT]] = {
     MAV_CMD.COMPONENT_ARM_DISARM: _arm_disarm,
@@ -318,10 +291,12 @@ HANDLERS: dict[int, Callable[[Vehicle, Order, Channel], MAV_RESULT]] = {
     MAV_CMD.DO_SET_ROI_NONE: _roi,
     MAV_CMD.DO_SET_HOME: _set_home,
     MAV_CMD.DO_FENCE_ENABLE: _fence_enable,
-    MAV_CMD.MISSION_START: _mission_start,
-    MAV_CMD.DO_SET_MISSION_CURRENT: _mission_current,
-    MAV_CMD.DO_JUMP_TAG: _jump_to_tag,
-    MAV_CMD.DO_PAUSE_CONTINUE: _pause,
+    MAV_CMD.MISSION_START: start_mission,
+    MAV_CMD.DO_SET_MISSION_CURRENT: choose_item,
+    MAV_CMD.DO_JUMP_TAG: jump_to_tag,
+    MAV_CMD.DO_PAUSE_CONTINUE: pause,
+    MAV_CMD.DO_LAND_START: begin_landing_sequence,
+    MAV_CMD.DO_RETURN_PATH_START: begin_return_path,
     MAV_CMD.DO_FLIGHTTERMINATION: _terminate,
     MAV_CMD.PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
     MAV_CMD.RUN_PREARM_CHECKS: _prearm,

@@ -33,9 +33,12 @@ TRAITS = {
     COPTER_MODE.AVOID_ADSB: ModeTraits(),
     COPTER_MODE.GUIDED_NOGPS: ModeTraits(needs_position=False, arms=True),
     COPTER_MODE.SMART_RTL: ModeTraits(),
-    COPTER_MODE.ZIGZAG: ModeTraits(),
+    COPTER_MODE.ZIGZAG: ModeTraits(arms=True),
 }
 SUPPORTED_MODES = frozenset(TRAITS)
+# The modes that take targets from a companion, and those that a command makes take off.
+GUIDED_MODES = frozenset({COPTER_MODE.GUIDED, COPTER_MODE.GUIDED_NOGPS, COPTER_MODE.AVOID_ADSB})
+TAKES_OFF = GUIDED_MODES | {COPTER_MODE.LOITER, COPTER_MODE.POSHOLD, COPTER_MODE.ZIGZAG}
 # The modes that it has, but cannot enter without a pilot, a sensor or a setting: what it says before it refuses, and why.
 UNAVAILABLE: dict[COPTER_MODE, tuple[tuple[str, ...], str]] = {
     COPTER_MODE.FLIP: ((), "init failed"),

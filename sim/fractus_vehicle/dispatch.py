@@ -16,11 +16,13 @@ from fractus_mavlink.enums import (
 )
 
 from fractus_vehicle.channel import Channel
-from fractus_vehicle.commands import handle_command, set_current, set_mode_number
+from fractus_vehicle.commands import handle_command, set_mode_number
 from fractus_vehicle.flight import Flight
 from fractus_vehicle.home import set_home_at
+from fractus_vehicle.mission_orders import set_current
 from fractus_vehicle.report_units import UNKNOWN_U16
 from fractus_vehicle.state import VehicleState
+from fractus_vehicle.status_reports import mission_current
 from fractus_vehicle.streams import ALL_GROUPS, GROUPS
 from fractus_vehicle.targets import attitude_target, global_target, guided_item, local_target
 from fractus_vehicle.telemetry import send, send_parameter
@@ -145,8 +147,9 @@ def _mission(vehicle: Vehicle, m: Message, c: Channel) -> None:
 
 
 def _mission_set_current(vehicle: Vehicle, m: Message, c: Channel) -> None:
+    """Answered with the number that was sent, which clients take for the acknowledgement, whatever item is current then."""
     if set_current(vehicle, m.integer("seq")):
-        send(vehicle.state, c, "MISSION_CURRENT")
+        c.send("MISSION_CURRENT", {**mission_current(vehicle.state), "seq": m.integer("seq")})
 
 
 def _sticks(vehicle: Vehicle, m: Message, _c: Channel) -> None:

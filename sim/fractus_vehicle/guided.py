@@ -149,7 +149,7 @@ class GuidedFlight(Flight):
                 north, east = v.control.target
                 v.control.target = (north + vn * CONTROL_STEP_S, east + ve * CONTROL_STEP_S)
                 v.control.target_down += v.control.target_vd * CONTROL_STEP_S
-        v.heading.step(v.est)
+        v.heading.step(v.est, CONTROL_STEP_S)
 
 
 class GuidedWithoutGps(GuidedFlight):
@@ -159,6 +159,17 @@ class GuidedWithoutGps(GuidedFlight):
         """Level out."""
         v.control.hold_here()
         self.lean(v, 0.0, 0.0, None, 0.0)
+
+    def go_to(self, _v: VehicleState, _north: float, _east: float, _down: float) -> None:
+        """Positions mean nothing without one of its own."""
+
+    def fly(
+        self,
+        _v: VehicleState,
+        _velocity: tuple[float, float, float],
+        _position: tuple[float, float, float] | None = None,
+    ) -> None:
+        """Nor do velocities."""
 
     def stop(self, v: VehicleState) -> None:
         """Level out."""

@@ -6,10 +6,12 @@ import math
 
 from fractus_vehicle.control import Control, Estimate
 from fractus_vehicle.params import Parameters
-from fractus_vehicle.shaping import wrap_pi
+from fractus_vehicle.shaping import clamp, wrap_pi
 
 # Below this share of the speed allowed the nose keeps its heading instead of following the course.
 COURSE_SHARE = 0.05
+# So near the angle that is asked for, a direction makes it turn no full circle.
+THERE_RAD = math.radians(0.5)
 
 
 class Heading:
@@ -20,42 +22,55 @@ class Heading:
         self._params = params
         self._roi: tuple[float, float] | None = None
         self._fixed = False
+        self._left = 0.0
+        self._rate_rps = 0.0
 
     def follow_course(self) -> None:
         """The default of WP_YAW_BEHAVIOR."""
+        self._left = 0.0
         self._roi = None
         self._fixed = False
 
     def hold(self) -> None:
         """Keep the heading that was set in the controller."""
+        self._left = 0.0
         self._roi = None
         self._fixed = True
 
     def look_at(self, point: tuple[float, float] | None) -> None:
         """Keep the nose on a local point; None ends it."""
+        self._left = 0.0
         self._roi = point
         self._fixed = False
 
-    def turn_to(self, angle_deg: float, rate_dps: float, direction: int, *, relative: bool) -> bool:
-        """CONDITION_YAW; False for an angle that is none."""
-        if not math.isfinite(angle_deg) or not 0.0 <= abs(angle_deg) <= 360.0:
-            return False
-        control = self._control
+    def turn_to(self, angle_deg: float, rate_dps: float, direction: int, *, relative: bool) -> None:
+        """CONDITION_YAW: turn the nose, by the shorter way or, with a direction (-1 left, 1 right), by that one."""
+        control, angle = self._control, math.radians(angle_deg)
+        control.target_yaw = control.yaw_setpoint
         if relative:
-            sign = -1.0 if direction < 0 else 1.0
-            control.target_yaw = wrap_pi(control.yaw_setpoint + sign * math.radians(angle_deg))
+            self._left = -angle if direction < 0 else angle
         else:
-            control.target_yaw = wrap_pi(math.radians(angle_deg))
+            self._left = wrap_pi(angle - control.target_yaw)
+            if direction * self._left < 0.0 and abs(self._left) > THERE_RAD:
+                self._left += math.copysign(2.0 * math.pi, direction)
+        fastest = math.radians(self._params["ATC_SLEW_YAW"] / 100.0)
+        self._rate_rps = min(math.radians(rate_dps), fastest) if rate_dps > 0.0 else fastest
         control.yaw_rate = None
-        default = math.radians(self._params["ATC_SLEW_YAW"] / 100.0)
-        control.limits.yaw_rate_rps = math.radians(rate_dps) if rate_dps > 0.0 else default
-        self.hold()
-        return True
+        self._roi, self._fixed = None, True
 
-    def step(self, est: Estimate) -> None:
-        """Follow the course or the place."""
+    @property
+    def turned(self) -> bool:
+        """Whether a turn that was asked for is over."""
+        return self._left == 0.0
+
+    def step(self, est: Estimate, dt: float) -> None:
+        """Go on with a turn, or follow the course or the place."""
         control = self._control
-        if self._roi is not None:
+        if self._left:
+            step = clamp(self._left, -self._rate_rps * dt, self._rate_rps * dt)
+            self._left -= step
+            control.target_yaw = wrap_pi(control.target_yaw + step)
+        elif self._roi is not None:
             dn, de = self._roi[0] - est.north, self._roi[1] - est.east
             if math.hypot(dn, de) > 1.0:
                 control.target_yaw = math.atan2(de, dn)

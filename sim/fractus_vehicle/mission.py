@@ -40,6 +40,13 @@ class Mission:
         """The first item from an index on, home excepted, that navigates."""
         return next((at for at in range(max(index, 1), len(self.items)) if self.items[at].navigates), None)
 
+    def takes_off(self, *, restart: bool) -> bool:
+        """Whether the mission, from the item on with which it would begin, takes off before it flies anywhere."""
+        at = self.first_navigating(0 if restart else self.current)
+        while at is not None and self.items[at].command == MAV_CMD.NAV_DELAY:
+            at = self.first_navigating(at + 1)
+        return at is not None and self.items[at].command == MAV_CMD.NAV_TAKEOFF
+
     def peek_after(self, index: int) -> int | None:
         """The next item that navigates, without counting jumps as done; None where jumps only lead in a circle."""
         jumps = dict(self._jumps)

@@ -55,7 +55,7 @@ def _fulfilled(v: VehicleState, item: Item, waited_s: float) -> bool:
             target = v.control.target
             return math.hypot(target[0] - v.est.north, target[1] - v.est.east) <= max(item.param1, 0.0)
         case MAV_CMD.CONDITION_YAW:
-            return abs(wrap_pi(v.control.target_yaw - v.est.yaw)) <= YAW_REACHED_RAD
+            return v.heading.turned and abs(wrap_pi(v.control.target_yaw - v.est.yaw)) <= YAW_REACHED_RAD
         case _:
             return True
 

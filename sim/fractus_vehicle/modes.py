@@ -46,29 +46,43 @@ class FlightModes:
         self._state = state
         self.flight = self._new_flight(state.mode)
 
-    def refusal(self, mode: COPTER_MODE) -> str | None:
+    def _refusal(self, mode: COPTER_MODE) -> str | None:
         """Why a mode cannot be entered now, or None; on the ground with the motors off nearly every mode can."""
         v = self._state
         if mode in UNAVAILABLE:
-            return f"Mode change to {mode_title(mode)} failed: {UNAVAILABLE[mode][1]}"
-        if mode is COPTER_MODE.SMART_RTL and not v.breadcrumbs.active:
-            return f"Mode change to {mode_title(mode)} failed: init failed"
-        if not v.armed:
-            return None
-        if TRAITS[mode].needs_position and not v.position_ok:
-            return f"Mode change to {mode_title(mode)} failed: requires position"
-        if mode is COPTER_MODE.THROW or (mode is COPTER_MODE.AUTO and len(v.mission.items) <= 1):
-            return f"Mode change to {mode_title(mode)} failed: init failed"
-        return None
+            for text in UNAVAILABLE[mode][0]:
+                v.say(MAV_SEVERITY.WARNING, text)
+            return UNAVAILABLE[mode][1]
+        if v.armed and TRAITS[mode].needs_position and not v.position_ok:
+            return "requires position"
+        match mode:
+            case COPTER_MODE.SMART_RTL:
+                begins = v.breadcrumbs.active
+            case COPTER_MODE.THROW:
+                begins = not v.armed
+            case COPTER_MODE.AUTO:
+                begins = not v.armed or self._has_mission()
+            case _:
+                begins = True
+        return None if begins else "init failed"
+
+    def _has_mission(self) -> bool:
+        """Whether there is a mission that can be flown from where the vehicle is: on the ground, one that takes off."""
+        v = self._state
+        if len(v.mission.items) <= 1:
+            return False
+        if v.landed and not v.mission.takes_off(restart=int(v.params["MIS_RESTART"]) == 1):
+            v.say(MAV_SEVERITY.CRITICAL, "Auto: Missing Takeoff Cmd")
+            return False
+        return True
 
     def change(self, mode: COPTER_MODE) -> bool:
         """Change the mode as a ground station asks; False when it is refused."""
         if mode is self._state.mode:
             return True
-        refusal = self.refusal(mode)
+        refusal = self._refusal(mode)
         if refusal is not None:
-            for text in (*UNAVAILABLE.get(mode, ((),))[0], refusal):
-                self._state.say(MAV_SEVERITY.WARNING, text)
+            self._state.say(MAV_SEVERITY.WARNING, f"Mode change to {mode_title(mode)} failed: {refusal}")
             return False
         self.force(mode)
         return True

@@ -10,10 +10,14 @@ from fractus_mavlink.enums import MAV_CMD, MAV_FRAME
 
 from fractus_vehicle.mission_items import Item
 
+# The commands whose fifth and sixth parameters are degrees; of all others they are plain integers.
+PLACED = frozenset({MAV_CMD.DO_SET_HOME, MAV_CMD.DO_SET_ROI, MAV_CMD.DO_SET_ROI_LOCATION, MAV_CMD.DO_REPOSITION})
+_INT32_MAX = 2147483647
+
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """A command from either message, with its position as degrees times 1e7."""
+    """A command from either message, with its position as degrees times 1e7, or the two integers that others have there."""
 
     command: int
     params: tuple[float, float, float, float]
@@ -43,10 +47,12 @@ def read_order(message: Message) -> Order:
         x, y, z = message.integer("x"), message.integer("y"), message.real("z")
         frame = message.integer("frame")
         return Order(command, numbers, x, y, z, frame, x != 0 or y != 0, integer=True)
-    lat, lon, z = message.real("param5"), message.real("param6"), message.real("param7")
-    known = math.isfinite(lat) and math.isfinite(lon) and (lat != 0.0 or lon != 0.0)
-    known = known and abs(lat) <= 90.0 and abs(lon) <= 180.0
-    x, y = (round(lat * 1e7), round(lon * 1e7)) if known else (0, 0)
-    absolute = command in (MAV_CMD.DO_SET_HOME,)
-    frame = MAV_FRAME.GLOBAL if absolute else MAV_FRAME.GLOBAL_RELATIVE_ALT
-    return Order(command, numbers, x, y, z, frame, known, integer=False)
+    scale = 1e7 if command in PLACED else 1.0
+    x, y = _integer(message.real("param5") * scale), _integer(message.real("param6") * scale)
+    frame = MAV_FRAME.GLOBAL if command == MAV_CMD.DO_SET_HOME else MAV_FRAME.GLOBAL_RELATIVE_ALT
+    return Order(command, numbers, x, y, message.real("param7"), frame, x != 0 or y != 0, integer=False)
+
+
+def _integer(value: float) -> int:
+    """The nearest integer that the field of COMMAND_INT holds; 0 for what is no number."""
+    return round(max(min(value, _INT32_MAX), -_INT32_MAX)) if not math.isnan(value) else 0

@@ -20,6 +20,9 @@ Answer = Callable[[VehicleState, Order, Channel], MAV_RESULT]
 
 # Messages may come at this share of the main loop's rate.
 MAX_LOOP_SHARE = 0.8
+# Intervals are kept in whole milliseconds; faster than a control step nothing changes.
+MIN_INTERVAL_MS, MAX_INTERVAL_MS = 10, 60_000
+EKF_SOURCE_SETS = 3
 FRAMES = {0: "PLUS", 1: "X"}
 
 
@@ -59,7 +62,7 @@ def _set_interval(v: VehicleState, o: Order, c: Channel) -> MAV_RESULT:
         v.say(MAV_SEVERITY.INFO, text)
         return MAV_RESULT.DENIED
     else:
-        c.set_interval(name, max(interval_us, 10_000.0) / 1e6)
+        c.set_interval(name, min(max(int(interval_us) // 1000, MIN_INTERVAL_MS), MAX_INTERVAL_MS) / 1e3)
     return MAV_RESULT.ACCEPTED
 
 
@@ -67,10 +70,8 @@ def _get_interval(_v: VehicleState, o: Order, c: Channel) -> MAV_RESULT:
     name = _message_name(o.params[0])
     stream = c.streams.get(name) if name is not None else None
     interval = 0 if name is None else -1 if stream is None else round(stream.interval_s * 1e6)
-    number = o.params[0]
-    if not math.isfinite(number) or not 0 <= number <= 65535:
-        return MAV_RESULT.DENIED
-    c.send("MESSAGE_INTERVAL", {"message_id": int(number), "interval_us": interval})
+    number = int(o.params[0]) & 0xFFFF if math.isfinite(o.params[0]) else 0
+    c.send("MESSAGE_INTERVAL", {"message_id": number, "interval_us": interval})
     return MAV_RESULT.ACCEPTED if name is not None else MAV_RESULT.FAILED
 
 
@@ -107,6 +108,11 @@ def _parachute(_v: VehicleState, o: Order, _c: Channel) -> MAV_RESULT:
     return MAV_RESULT.ACCEPTED if o.params[0] in (0.0, 1.0, 2.0) else MAV_RESULT.FAILED
 
 
+def _ekf_sources(_v: VehicleState, o: Order, _c: Channel) -> MAV_RESULT:
+    """All sets are the same here."""
+    return MAV_RESULT.ACCEPTED if 1.0 <= o.params[0] < EKF_SOURCE_SETS + 1 else MAV_RESULT.DENIED
+
+
 def _always(result: MAV_RESULT) -> Answer:
     return lambda _v, _order, _channel: result
 
@@ -120,6 +126,8 @@ ANSWERS: dict[int, Answer] = {
     MAV_CMD.DO_SEND_BANNER: _banner,
     MAV_CMD.DO_PARACHUTE: _parachute,
     MAV_CMD.CONTROL_HIGH_LATENCY: _high_latency,
+    MAV_CMD.SET_EKF_SOURCE_SET: _ekf_sources,
+    MAV_CMD.DEBUG_TRAP: _always(MAV_RESULT.DENIED),
     MAV_CMD.DO_SET_SERVO: lambda v, o, _c: set_servo(v, *o.params[:2]),
     MAV_CMD.DO_REPEAT_SERVO: lambda v, o, _c: set_servo(v, *o.params[:2]),
     MAV_CMD.DO_SET_RELAY: lambda v, o, _c: set_relay(v, o.params[0]),

@@ -13,7 +13,7 @@ from fractus_vehicle.descent import descend
 from fractus_vehicle.flight import Flight
 from fractus_vehicle.home import return_point
 from fractus_vehicle.leg import Leg
-from fractus_vehicle.state import VehicleState
+from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
 # The last point is approached this much above it.
 ABOVE_LAST_M = 2.0
@@ -72,7 +72,7 @@ class SmartReturn(Flight):
         if self._leg is not None:
             self._leg.step(v)
         if self.stage is not SmartStage.LAND:
-            v.heading.step(v.est)
+            v.heading.step(v.est, CONTROL_STEP_S)
 
     def _follow(self, v: VehicleState) -> None:
         waiting = not self._stopped(v) if self._leg is None else not self._leg.reached(v, _radius_m(v))

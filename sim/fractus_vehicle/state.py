@@ -275,10 +275,11 @@ class VehicleState:
 
     def begin_takeoff(self, down: float) -> None:
         """Spool up and climb to `down` (local)."""
+        if not self.flying_wanted:  # a takeoff that is asked for again finds the motors running
+            ready = self.armed_at_s + ARMING_DELAY_S
+            spool = self.params["MOT_SPOOL_TIME"] + 0.5 * self.params["TKOFF_SLEW_TIME"]
+            self.lift_after_s = max(self.time_s, ready) + spool
         self.taking_off_until_m = down
-        ready = self.armed_at_s + ARMING_DELAY_S
-        spool = self.params["MOT_SPOOL_TIME"] + 0.5 * self.params["TKOFF_SLEW_TIME"]
-        self.lift_after_s = max(self.time_s, ready) + spool
         self.control.reset(self.est)
         self.control.go_to(self.est.north, self.est.east, down)
 

@@ -121,7 +121,7 @@ def mission_current(v: VehicleState) -> Values:
     total = max(0, len(v.mission.items) - 1)
     return {
         "seq": v.mission.current,
-        "total": total if total else UNKNOWN_U16,
+        "total": total,
         "mission_state": v.mission.state(v.mode),
         "mission_mode": 1 if v.mode is COPTER_MODE.AUTO else 0,
     }

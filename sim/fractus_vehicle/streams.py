@@ -56,6 +56,7 @@ BUILDERS: dict[str, Builder] = {
 SILENT = frozenset(
     [
         "ADSB_VEHICLE",
+        "AIS_VESSEL",
         "AIRSPEED",
         "AOA_SSA",
         "CAMERA_CAPTURE_STATUS",
@@ -65,8 +66,6 @@ SILENT = frozenset(
         "CAMERA_SETTINGS",
         "DISTANCE_SENSOR",
         "EFI_STATUS",
-        "ESC_TELEMETRY_5_TO_8",
-        "ESC_TELEMETRY_9_TO_12",
         "GENERATOR_STATUS",
         "GIMBAL_DEVICE_ATTITUDE_STATUS",
         "GIMBAL_MANAGER_INFORMATION",
@@ -74,12 +73,9 @@ SILENT = frozenset(
         "GPS2_RAW",
         "GPS2_RTK",
         "GPS_RTK",
-        "LANDING_TARGET",
         "MAG_CAL_PROGRESS",
         "MAG_CAL_REPORT",
-        "MCU_STATUS",
         "MISSION_ITEM_REACHED",
-        "NAMED_VALUE_FLOAT",
         "OPTICAL_FLOW",
         "PARAM_VALUE",
         "PID_TUNING",
@@ -91,7 +87,7 @@ SILENT = frozenset(
         "SCALED_PRESSURE3",
         "SERVO_OUTPUT_RAW",
         "TERRAIN_REQUEST",
-        "WATER_DEPTH",
+        "UAVIONIX_ADSB_OUT_STATUS",
         "WINCH_STATUS",
     ]
 )

@@ -20,7 +20,18 @@ _BODY_FRAMES = frozenset({MAV_FRAME.BODY_NED, MAV_FRAME.BODY_OFFSET_NED})
 _OFFSET_FRAMES = frozenset({MAV_FRAME.LOCAL_OFFSET_NED}) | _BODY_FRAMES
 _LOCAL_FRAMES = frozenset({MAV_FRAME.LOCAL_NED}) | _OFFSET_FRAMES
 
+# A faster velocity is taken for a mistake.
+SANE_MPS = 1000.0
+
 _NO_ATTITUDE = ATTITUDE_TARGET_TYPEMASK.ATTITUDE_IGNORE
+_NO_THRUST = ATTITUDE_TARGET_TYPEMASK.THROTTLE_IGNORE
+_RATES = (
+    ATTITUDE_TARGET_TYPEMASK.BODY_ROLL_RATE_IGNORE
+    | ATTITUDE_TARGET_TYPEMASK.BODY_PITCH_RATE_IGNORE
+    | ATTITUDE_TARGET_TYPEMASK.BODY_YAW_RATE_IGNORE
+)
+# How far from 1 the square of a quaternion's length may be.
+UNIT_TOLERANCE = 1e-3
 
 Vector = tuple[float, float, float]
 
@@ -62,16 +73,20 @@ def global_target(v: VehicleState, flight: Flight, m: Message) -> None:
     """SET_POSITION_TARGET_GLOBAL_INT."""
     frame = m.integer("coordinate_frame")
     lat, lon, alt = m.integer("lat_int"), m.integer("lon_int"), m.real("alt")
-    origin = v.origin
-    if origin is None:
+    origin, position = v.origin, (0.0, 0.0, 0.0)
+    if origin is None or not isinstance(flight, GuidedFlight):
         return
-    base = v.altitude_base_m(frame)
-    if frame not in GLOBAL_FRAMES:
-        v.say(MAV_SEVERITY.INFO, f"Unknown mavlink coordinate frame {frame}")
-    if base is None or not valid_coordinates(lat, lon):
-        _stop(v, flight)
-        return
-    position = origin.vector_to(Place(lat, lon, base + alt))
+    if not m.integer("type_mask") & IGNORE_POSITION:  # else neither frame nor place is looked at
+        if not valid_coordinates(lat, lon):
+            _stop(v, flight)
+            return
+        base = v.altitude_base_m(frame)
+        if frame not in GLOBAL_FRAMES:
+            v.say(MAV_SEVERITY.INFO, f"Unknown mavlink coordinate frame {frame}")
+        if base is None:
+            _stop(v, flight)
+            return
+        position = origin.vector_to(Place(lat, lon, base + alt))
     _target(v, flight, m, Setpoint(position, _vector(m, "vx", "vy", "vz"), _vector(m, "afx", "afy", "afz")))
 
 
@@ -100,13 +115,18 @@ def _target(v: VehicleState, flight: Flight, m: Message, asked: Setpoint) -> Non
         return
     yaw = m.real("yaw") if not mask & POSITION_TARGET_TYPEMASK.YAW_IGNORE else None
     yaw_rate = m.real("yaw_rate") if not mask & POSITION_TARGET_TYPEMASK.YAW_RATE_IGNORE else None
+    if velocity is not None and not all(abs(value) <= SANE_MPS for value in velocity):
+        flight.stop(v)
+        return
     numbers = (*(position or ()), *(velocity or ()), *(accel or ()), yaw or 0.0, yaw_rate or 0.0)
     if not all(math.isfinite(value) for value in numbers):
         return
     if position is not None and v.outside_fence(*position):
         return
     _fly(v, flight, position, velocity, asked.accel)
-    _turn(v, yaw, yaw_rate)
+    # A heading counts from the nose in the frames that do.
+    relative = m.name == "SET_POSITION_TARGET_LOCAL_NED" and m.integer("coordinate_frame") in _BODY_FRAMES
+    _turn(v, yaw, yaw_rate, relative=relative)
 
 
 def _fly(
@@ -121,8 +141,10 @@ def _fly(
         flight.fly(v, (e[0] + accel[0], e[1] + accel[1], e[2] + accel[2]))
 
 
-def _turn(v: VehicleState, yaw: float | None, yaw_rate: float | None) -> None:
-    if yaw is not None:
+def _turn(v: VehicleState, yaw: float | None, yaw_rate: float | None, *, relative: bool) -> None:
+    if yaw is not None and relative:
+        v.heading.turn_to(math.degrees(yaw), 0.0, 0, relative=True)
+    elif yaw is not None:
         v.control.yaw_rate = None
         v.control.target_yaw = wrap_pi(yaw)
         v.heading.hold()
@@ -140,7 +162,10 @@ def attitude_target(v: VehicleState, flight: Flight, m: Message) -> None:
         return
     w, x, y, z = m.array("q")
     size = math.sqrt(w * w + x * x + y * y + z * z)
-    if not math.isfinite(size) or not 0.9 < size < 1.1:
+    rates = m.integer("type_mask") & _RATES
+    ill_defined = m.integer("type_mask") & _NO_THRUST or rates not in (0, _RATES)
+    if ill_defined or not abs(size * size - 1.0) < UNIT_TOLERANCE:
+        _stop(v, flight)
         return
     thrust = m.real("thrust")
     thrust = clamp(thrust if math.isfinite(thrust) else 0.5, 0.0, 1.0)

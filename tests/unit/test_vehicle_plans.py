@@ -184,7 +184,7 @@ def test_jumps_lead_to_tags():
         order.append(at)
     assert order == [1, 2, 3, 2, 3]  # a jump to a tag that is missing ends the mission
     assert pilot.command(MAV_CMD.DO_JUMP_TAG, 7.0) is MAV_RESULT.ACCEPTED
-    assert mission.current == 2
+    assert mission.current == 3, "the first item after the tag that navigates"
     assert pilot.command(MAV_CMD.DO_JUMP_TAG, 9.0) is MAV_RESULT.FAILED
 
 

@@ -1,0 +1,94 @@
+"""Commands about the stored mission: start it, choose its item, pause it."""
+
+from __future__ import annotations
+
+import math
+
+from fractus_mavlink.enums import COPTER_MODE, MAV_RESULT, MAV_SEVERITY
+
+from fractus_vehicle.auto import AutoFlight
+from fractus_vehicle.channel import Channel
+from fractus_vehicle.guided import GuidedFlight
+from fractus_vehicle.orders import Order
+from fractus_vehicle.telemetry import send
+from fractus_vehicle.vehicle import Vehicle
+
+MAX_TAG = 65535
+
+
+def start_mission(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
+    """MISSION_START, of the whole mission only."""
+    if o.params[:2] != (0.0, 0.0):
+        return MAV_RESULT.DENIED
+    if not vehicle.modes.change(COPTER_MODE.AUTO):
+        return MAV_RESULT.FAILED
+    flight = vehicle.modes.flight
+    if isinstance(flight, AutoFlight):
+        flight.start_by_command(vehicle.state)
+    return MAV_RESULT.ACCEPTED
+
+
+def choose_item(vehicle: Vehicle, o: Order, c: Channel) -> MAV_RESULT:
+    """DO_SET_MISSION_CURRENT; with 1 as the second parameter, the mission starts over first."""
+    v, number = vehicle.state, o.params[0]
+    if not (math.isfinite(number) and 0 <= int(number) < len(v.mission.items)):
+        return MAV_RESULT.DENIED
+    if o.params[1] == 1.0:
+        v.mission.rewind()
+    if not set_current(vehicle, int(number)):
+        return MAV_RESULT.FAILED
+    send(v, c, "MISSION_CURRENT")
+    return MAV_RESULT.ACCEPTED
+
+
+def jump_to_tag(vehicle: Vehicle, o: Order, c: Channel) -> MAV_RESULT:
+    """DO_JUMP_TAG."""
+    v, tag = vehicle.state, o.params[0]
+    if not 0.0 <= tag <= MAX_TAG:
+        return MAV_RESULT.DENIED
+    index = v.mission.tagged(int(tag))
+    if index is None or not set_current(vehicle, index):
+        return MAV_RESULT.FAILED
+    send(v, c, "MISSION_CURRENT")
+    return MAV_RESULT.ACCEPTED
+
+
+def set_current(vehicle: Vehicle, index: int) -> bool:
+    """Make an item (or the first one that navigates after it) the current one; AUTO continues there; False if there is none."""
+    v = vehicle.state
+    if not 0 <= index < len(v.mission.items) or len(v.mission.items) == 1:
+        return False
+    if index == 0 or v.mission.complete:
+        v.mission.rewind()
+    if isinstance(vehicle.modes.flight, AutoFlight) and v.armed:
+        vehicle.modes.flight.jump_to(v, max(index, 1))
+        return True
+    found = v.mission.first_navigating(index)
+    v.mission.current = found or 0
+    return found is not None
+
+
+def pause(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
+    """DO_PAUSE_CONTINUE, in the modes that fly by themselves."""
+    v, flight = vehicle.state, vehicle.modes.flight
+    if not math.isfinite(o.params[0]) or int(o.params[0]) not in (0, 1):
+        return MAV_RESULT.DENIED
+    paused = int(o.params[0]) == 0
+    if not isinstance(flight, (AutoFlight, GuidedFlight)):
+        v.say(MAV_SEVERITY.INFO, f"Failed to {'pause' if paused else 'resume'}")
+        return MAV_RESULT.FAILED
+    flight.pause(v, paused=paused)
+    return MAV_RESULT.ACCEPTED
+
+
+def begin_landing_sequence(vehicle: Vehicle, _o: Order, _c: Channel) -> MAV_RESULT:
+    """DO_LAND_START: no mission here has a landing sequence to jump to."""
+    vehicle.state.say(MAV_SEVERITY.WARNING, "Unable to start landing sequence")
+    vehicle.state.say(MAV_SEVERITY.WARNING, "Mode change to AUTO RTL failed: No landing sequence found")
+    return MAV_RESULT.FAILED
+
+
+def begin_return_path(vehicle: Vehicle, _o: Order, _c: Channel) -> MAV_RESULT:
+    """DO_RETURN_PATH_START: no mission here has a path to join."""
+    vehicle.state.say(MAV_SEVERITY.WARNING, "Mode change to AUTO RTL failed: No return path found")
+    return MAV_RESULT.FAILED

@@ -16,6 +16,9 @@ _NEEDED_V1 = ("cpu", "cpuacct", "cpuset", "memory", "devices", "freezer", "pids"
 _NEEDED_V2 = ("cpu", "cpuset", "memory", "pids")
 _DELEGATED_V2 = (*_NEEDED_V2, "io", "hugetlb")
 _DAEMONS = "daemons"
+_WEIGHT = 20
+"""Clusters weigh as much as 20 processes beside them: they are whole machines, and what flies on them flies in real time."""
+_ONE_V1, _ONE_V2 = 1024, 100
 _POLL_S = 0.02
 
 
@@ -91,6 +94,7 @@ class Branch:
                 above, directory = directory, directory / part
                 directory.mkdir(exist_ok=True)
                 _fill_cpuset(above, directory)
+            _weigh(root / TOP)
         return [directory / "cgroup.procs" for directory in self.directories]
 
     def _create_v2(self) -> Path:
@@ -100,6 +104,7 @@ class Branch:
             _delegate(directory)
             directory /= part
             directory.mkdir(exist_ok=True)
+        _weigh(self.hierarchies.roots[0] / TOP)
         return directory / "cgroup.procs"
 
     def process_ids(self) -> set[int]:
@@ -191,6 +196,12 @@ def _fill_cpuset(above: Path, directory: Path) -> None:
         own = directory / name
         if own.exists() and not own.read_text().strip():
             own.write_text((above / name).read_text())
+
+
+def _weigh(directory: Path) -> None:
+    for name, one in (("cpu.shares", _ONE_V1), ("cpu.weight", _ONE_V2)):
+        if (directory / name).exists():
+            (directory / name).write_text(str(_WEIGHT * one))
 
 
 def _delegate(directory: Path) -> None:

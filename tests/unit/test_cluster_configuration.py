@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import yaml
 from fractus_cluster.addressing import Addressing
-from fractus_cluster.cgroups import find_hierarchies
+from fractus_cluster.cgroups import TOP, Branch, Hierarchies, find_hierarchies
 from fractus_cluster.controlplane import corefile
 from fractus_cluster.errors import PrerequisiteError
 from fractus_cluster.manifests import dns_objects, extended_resources_patch, is_ready, node_object, taints_patch
@@ -156,6 +156,14 @@ def test_hierarchies_of_version_1_and_hybrid() -> None:
 def test_hierarchies_of_version_2() -> None:
     found = find_hierarchies("cgroup2 /sys/fs/cgroup cgroup2 rw,nsdelegate 0 0\nproc /proc proc rw 0 0\n")
     assert (found.version, found.roots) == (2, (Path("/sys/fs/cgroup"),))
+
+
+def test_clusters_weigh_more_than_one_process(tmp_path: Path) -> None:
+    shares = tmp_path / TOP / "cpu.shares"
+    shares.parent.mkdir()
+    shares.write_text("1024")
+    Branch(Hierarchies(1, (tmp_path,)), f"{TOP}/demo").create()
+    assert int(shares.read_text()) >= 10 * 1024
 
 
 def test_missing_control_groups_are_named() -> None:

@@ -115,6 +115,21 @@ def test_a_link_that_is_left_and_lost_for_another(site: Site) -> None:
     assert (second.decided_s - BEGIN_S, (second.up_s or 0.0) - BEGIN_S) == (pytest.approx(9.0), pytest.approx(9.9))
 
 
+def test_a_loss_is_known_by_the_decision_as_well(site: Site) -> None:
+    """Traffic may be led back before the link's end is told."""
+    lost = [
+        agent(30.0, "links: up (peer=edge-3 reason=paired)"),
+        agent(30.1, "links: decided (on=default/links peer=edge-3): BetterPath: the direct link scores 12, the present path 8"),
+        agent(42.0, "links: decided (on=default/links peer=edge-3): NoDirectLink: there is no direct link"),
+        agent(42.1, "links: none (peer=edge-3 reason=edge-3 has been silent for 0.4 s)"),
+    ]  # fmt: skip
+    run = run_of(
+        site, agent(29.9, "links: connecting (peer=edge-3 reason=pairing)"), *lost, *picture(41, 42.5, "cloud-1")
+    )
+    assert [switch.lost for switch in run.switches] == [False, True]
+    assert (run.gap_s(abrupt=False), run.gap_s(abrupt=True)) == (pytest.approx(1.0), pytest.approx(3.5))
+
+
 def test_gaps_at_a_loss_are_told_apart(site: Site) -> None:
     run = run_of(site, *picture(41, 42.0, "cloud-1"))
     assert (run.gap_s(abrupt=False), run.gap_s(abrupt=True)) == (pytest.approx(3.0), 0.0)

@@ -22,6 +22,7 @@ NOTICE_S = 1.0
 _STATE = re.compile(r"links: (?P<phase>none|connecting|up) \(peer=(?P<peer>\S*) reason=(?P<reason>.*)\)")
 _MEASURED = re.compile(r"links: measured \(peer=(?P<peer>\S+) mbps=(?P<mbps>[\d.]+)")
 _TO_LINK = "the direct link scores"
+_LOST = "NoDirectLink"
 _DECIDED = re.compile(r"links: decided \(on=(?P<on>\S+) peer=(?P<peer>\S+)\): (?P<why>.*)")
 
 
@@ -215,7 +216,7 @@ def _state(found: list[Switch], at_s: float, state: re.Match[str]) -> None:
         own.up_s = at_s
     elif phase == "none":
         own.ended_s, own.left = at_s, own.left or state["reason"]
-        own.lost = own.leads and "wanted" not in state["reason"]
+        own.lost |= own.leads and "wanted" not in state["reason"]
         own.lead(at_s, direct=False)
 
 
@@ -229,5 +230,7 @@ def _decided(found: list[Switch], at_s: float, decided: re.Match[str]) -> None:
     direct = _TO_LINK in why
     for own in found:
         if own.ended_s is None and own.up_s is not None and (not direct or own.peer == peer):
+            # The traffic's path may be decided on before the end of the link is told.
+            own.lost |= own.leads and why.startswith(_LOST)
             own.lead(at_s, direct=direct)
             own.left = "" if direct else own.left or why

@@ -118,6 +118,7 @@ class Agent:
             resource=self._resource,
             seen=self._seen,
             wall=_now,
+            audit=self._settings.audit,
             changed=self._links_changed,
         )
         await self._links.run()

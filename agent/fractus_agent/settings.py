@@ -34,7 +34,7 @@ class Settings:
 
     @property
     def audit(self) -> Path:
-        """Directory of the services' audit logs."""
+        """Directory of the audit logs, the services' and this one's."""
         return self.state / "audit"
 
     @property

@@ -24,7 +24,7 @@ _PATHS = click.argument("paths", nargs=-1, required=True, type=click.Path(exists
 
 @click.group()
 def audit() -> None:
-    """Audit logs of node services."""
+    """Audit logs of a node's services and agent."""
 
 
 @audit.command("verify")

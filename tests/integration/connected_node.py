@@ -62,7 +62,7 @@ async def main(folder: Path) -> None:
 
     links = Connectivity(
         files, resource().name, folder / "links", folder / "tls",  # type: ignore[arg-type]
-        resource=resource, seen=seen, wall=lambda: datetime.now(UTC), pods=folder / "pods",
+        resource=resource, seen=seen, wall=lambda: datetime.now(UTC), audit=folder / "audit", pods=folder / "pods",
     )  # fmt: skip
     print("ready", flush=True)
     running = asyncio.create_task(links.run())

@@ -27,6 +27,8 @@ from fractus_radio.medium import Medium, Station
 from fractus_radio.propagation import Propagation
 from fractus_radio.radio import Radio
 from fractus_radio.taps import Tap
+from fractus_storage.chain import verify
+from fractus_storage.checkpoints import read_checkpoint
 from redirect_rig import CLIENT, SERVER, run
 
 VIP = Endpoint(IPv4Address("10.96.0.5"), 8080)
@@ -215,6 +217,15 @@ class Agent:
     def log(self) -> str:
         path = self.folder / "agent.log"
         return path.read_text() if path.exists() else ""
+
+    def audit(self, kind: str) -> list[dict[str, Any]]:
+        """Entries of its audit log, whose chain is sound and signed."""
+        path = self.folder / "audit" / "links.jsonl"
+        lines = path.read_bytes().splitlines(keepends=True)
+        signed = read_checkpoint(path.with_suffix(".checkpoint").read_bytes())
+        assert (signed.log, signed.node.rpartition("/")[2]) == ("links", self.name)
+        assert not verify(lines, since=signed.link).problem
+        return [entry for entry in map(json.loads, lines) if entry["kind"] == kind]
 
     def status(self, link: str) -> dict[str, Any]:
         return self.statuses.get(link, {})

@@ -78,6 +78,13 @@ def test_nothing_is_left_when_links_are_planned_no_more(world: World) -> None:
     assert edge.routes() == before
     assert world.conntrack(drone) == world.conntrack(edge) == 0
     assert len(client.failed) <= SWITCHES
+    choice, led, back = (
+        next(entry for entry in drone.audit(kind) if entry[field] == value)
+        for kind, field, value in (("choice", "peer", "e1"), ("traffic", "path", "e1"), ("link", "phase", "none"))
+    )
+    assert (choice["code"], led["application"], back["peer"]) == ("Connect", "default/app", "e1")
+    assert [entry["linked"] for entry in edge.audit("drone")] == [True, False]
+    assert [list(entry["services"].values()) for entry in edge.audit("routes")] == [[f"{edge.pod}:{VIP.port}"]]
 
 
 def test_an_abrupt_loss_is_over_within_a_second(world: World) -> None:

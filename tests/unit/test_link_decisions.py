@@ -7,6 +7,7 @@ from ipaddress import IPv4Address
 
 import pytest
 from fractus_agent.links.decisions import Actions, Situation, Traffic, decide
+from fractus_agent.links.evidence import records
 from fractus_agent.links.lessons import Lessons
 from fractus_agent.redirector.nft import Endpoint
 from fractus_core.linking import NO_LINK, Link, PathMetrics, Peer, Phase, Reach, Settings, Track, heuristic
@@ -183,3 +184,22 @@ def test_attempts_that_fail_are_repeated_later_and_later() -> None:
     assert found.reaches["e1"].retry_s == NOW_S + 2.0
     found.came_up("e1", NOW_S)
     assert found.reaches["e1"].failures == 0
+
+
+def test_the_audit_log_keeps_what_a_decision_was_made_of() -> None:
+    joining = Situation(NOW_S, HERE, (TRAFFIC,), NO_LINK, HEARD, CLOUD)
+    ((kind, choice),) = records(done(joining), joining)
+    assert kind == "choice"
+    assert choice == {
+        "peer": "e1", "code": "Connect", "reason": "e1, 10 m away, offers more than the cloud path", "position": [0, 0, 0],
+    }  # fmt: skip
+    ((kind, moved),) = records(done(LINKED), LINKED)
+    assert (kind, moved["application"], moved["path"], moved["code"]) == ("traffic", "ns/app", "e1", "BetterPath")
+    assert (moved["cloud"]["ingress_mbps"], moved["direct"]["ingress_mbps"]) == (8.0, 12.0)
+    gone = replace(DIRECT, link=NO_LINK, direct=None, routes={})
+    ((_, back),) = [found for found in records(done(gone), gone) if found[0] == "traffic"]
+    assert (back["path"], back["code"], back["direct"]) == ("cloud", "NoDirectLink", None)
+
+
+def test_a_decision_that_changes_nothing_is_not_kept() -> None:
+    assert not list(records(done(DIRECT), DIRECT))

@@ -45,8 +45,9 @@ class Calls:
 
 def drone_end() -> DroneEnd:
     return DroneEnd(
-        "d1", Path(), cast(Redirector, Calls()), cloud=lambda: PATH, seen=lambda: None, report=lambda _: None
-    )
+        "d1", Path(), cast(Redirector, Calls()), cloud=lambda: PATH, seen=lambda: None, report=lambda _: None,
+        record=lambda *_: None,
+    )  # fmt: skip
 
 
 def test_beacons_with_invented_names_are_not_kept() -> None:
@@ -63,7 +64,7 @@ def test_the_session_of_a_drone_that_no_link_names_any_more_ends(monkeypatch: py
     monkeypatch.setattr(peer, "PARTING_S", 0.01)
 
     async def serve() -> None:
-        end = PeerEnd("e1", Path(), cast(Redirector, Calls()), lambda: None)
+        end = PeerEnd("e1", Path(), cast(Redirector, Calls()), lambda: None, lambda *_: None)
         end.plan((link("e1"),))
         serving = asyncio.create_task(end._serve(cast(Session, Calls())))
         await asyncio.sleep(0)

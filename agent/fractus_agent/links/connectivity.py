@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import datetime
@@ -17,6 +18,7 @@ from fractus_agent.links import beacons, metrics, pairing
 from fractus_agent.links.addressing import link_address
 from fractus_agent.links.beacons import Beacons
 from fractus_agent.links.drone import DroneEnd
+from fractus_agent.links.evidence import Record
 from fractus_agent.links.interfaces.controller import Controller, InterfaceProblem
 from fractus_agent.links.interfaces.simulated import Plain
 from fractus_agent.links.interfaces.wifi import Wifi
@@ -36,6 +38,8 @@ PODS = Path("/run/netns")
 SUPPLICANT = Path("/run/wpa_supplicant")
 """Where wpa_supplicant has its control sockets."""
 DEVICES = Path("/sys/class/net")
+LOG = "links.jsonl"
+"""Name of the audit log of direct links."""
 CHECK_S = 2.0
 """Seconds between looks at the interface: a device may go, and come back without its address."""
 RETRY_S = 5.0
@@ -70,6 +74,7 @@ class Connectivity:
         seen: what telemetry says of the drone now.
         wall: the wall clock.
         changed: called when links begin or cease to be planned.
+        audit: directory of the node's audit logs.
         pods: directory of the pods' network namespaces.
     """
 
@@ -83,11 +88,13 @@ class Connectivity:
         resource: Callable[[], Node | None],
         seen: Callable[[], Seen | None],
         wall: Callable[[], datetime],
+        audit: Path,
         changed: Callable[[], None] = lambda: None,
         pods: Path = PODS,
     ) -> None:
         self._node = node
         self._tls = tls
+        self._audit = audit / LOG
         self._resource = resource
         self._seen = seen
         self._told = changed
@@ -162,6 +169,21 @@ class Connectivity:
         return direct_interface(node.spec.interfaces) if node is not None else None
 
     async def _use(self, interface: Interface) -> None:
+        """What an interface is used for, with an audit log of it.
+
+        Raises:
+            OSError: the directory of audit logs cannot be made.
+        """
+        # Imported here: its signatures need the cryptography, a fifth of the memory, which nodes without links do not need.
+        from fractus_storage.audit import AuditLog  # noqa: PLC0415
+
+        audit = AuditLog(self._audit, time.time, tls=self._tls)
+        try:
+            await self._serve(interface, audit.append)
+        finally:
+            await audit.close()
+
+    async def _serve(self, interface: Interface, record: Record) -> None:
         """Everything that one interface takes, made new at the beginning and removed in the end."""
         assert interface.device is not None
         ports = nft.Ports(udp=beacons.PORT, tcp=pairing.PORT)
@@ -187,7 +209,7 @@ class Connectivity:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(_outlived(keeping))
                 tasks.create_task(self._keep_up(controller))
-                tasks.create_task(self._run_end(redirector, device))
+                tasks.create_task(self._run_end(redirector, device, record))
         finally:
             keeping.cancel()
             await asyncio.gather(keeping, return_exceptions=True)
@@ -206,7 +228,7 @@ class Connectivity:
                     conntrack.forget_all()
                 netlink.close()
 
-    async def _run_end(self, redirector: Redirector, device: str) -> None:
+    async def _run_end(self, redirector: Redirector, device: str, record: Record) -> None:
         if self._end == "drone":
             drone = self._drone = DroneEnd(
                 self._node,
@@ -215,11 +237,12 @@ class Connectivity:
                 cloud=lambda: cloud_path(self._resource()),
                 seen=self._seen,
                 report=self._report,
+                record=record,
             )
             drone.plan(self._plans.links)
             told, run = Beacons(self._node, drone.heard), drone.run
         else:
-            peer = self._peer = PeerEnd(self._node, self._tls, redirector, self._say)
+            peer = self._peer = PeerEnd(self._node, self._tls, redirector, self._say, record)
             peer.plan(self._plans.links)
             told, run = Beacons(self._node, lambda _: None), peer.run
         try:

@@ -29,6 +29,7 @@ from fractus_core.linking import (
 from fractus_agent.links.addressing import link_address
 from fractus_agent.links.connector import Connector
 from fractus_agent.links.decisions import Actions, Situation, Traffic, decide
+from fractus_agent.links.evidence import Record, records
 from fractus_agent.links.heuristics import Heuristics
 from fractus_agent.links.lessons import Lessons
 from fractus_agent.links.pairing import Session
@@ -61,6 +62,7 @@ class DroneEnd:
         cloud: what the cloud path offers.
         seen: what telemetry says of the drone now; None while it says nothing.
         report: takes what becomes of the links.
+        record: writes an entry of the audit log: its kind and content.
     """
 
     def __init__(
@@ -72,11 +74,13 @@ class DroneEnd:
         cloud: Callable[[], PathMetrics],
         seen: Callable[[], Seen | None],
         report: Callable[[DroneReport], None],
+        record: Record,
     ) -> None:
         self._redirector = redirector
         self._cloud = cloud
         self._seen = seen
         self._report = report
+        self._record = record
         self._settings = Settings(drain_s=LEAVE_S)
         self._connector = Connector(node, tls, self._use, self._link_changed)
         self._lessons = Lessons(self._settings)
@@ -136,7 +140,7 @@ class DroneEnd:
         self._redirector.serve({*virtuals(self._links), *self._redirector.redirects})
         situation = self._situation()
         actions = decide(situation, self._settings)
-        self._explain(actions)
+        self._explain(actions, situation)
         if actions.abrupt:
             await self._redirector.switch(actions.abrupt, planned=False)
         if actions.planned:
@@ -251,9 +255,10 @@ class DroneEnd:
             self._lost.set()
             self._wake.set()
 
-    def _link_changed(self, link: Link, _reason: str) -> None:
+    def _link_changed(self, link: Link, reason: str) -> None:
         now_s = time.monotonic()
         before, self._before = self._before, link
+        self._record("link", {"phase": link.phase.value, "peer": link.peer or before.peer, "reason": reason})
         if link.phase is Phase.UP:
             self._lessons.came_up(link.peer, now_s)
         elif link.phase is Phase.NONE and not self._parting:
@@ -261,12 +266,14 @@ class DroneEnd:
             learn(before.peer, now_s)
         self._wake.set()
 
-    def _explain(self, actions: Actions) -> None:
-        """One line of the log for each decision that differs from the one before."""
+    def _explain(self, actions: Actions, situation: Situation) -> None:
+        """One line of the log, and one entry of the audit log, for each decision that changes something."""
         said = {"link": f"{actions.link.code}: {actions.link.reason}"} if actions.link.changes else {}
         said |= {name: f"{found.code}: {found.reason}" for name, found in actions.targets.items() if found.changes}
         for what, why in said.items():
             log.info("links: decided (on=%s peer=%s): %s", what, actions.peer or "-", why)
+        for kind, content in records(actions, situation):
+            self._record(kind, content)
 
     def _tell(self, actions: Actions, situation: Situation) -> None:
         self._report(

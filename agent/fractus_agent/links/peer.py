@@ -11,6 +11,7 @@ from fractus_core.api.links import DirectLink
 
 from fractus_agent.links.acceptor import Acceptor
 from fractus_agent.links.addressing import link_address
+from fractus_agent.links.evidence import Record
 from fractus_agent.links.pairing import LinkLost, Session
 from fractus_agent.links.plans import route_key, target, virtual
 from fractus_agent.redirector.netlink import NetlinkError
@@ -36,12 +37,16 @@ class PeerEnd:
         tls: its certificate, key and authority.
         redirector: of this node.
         changed: called when drones come or go.
+        record: writes an entry of the audit log: its kind and content.
     """
 
-    def __init__(self, node: str, tls: Path, redirector: Redirector, changed: Callable[[], None]) -> None:
+    def __init__(
+        self, node: str, tls: Path, redirector: Redirector, changed: Callable[[], None], record: Record
+    ) -> None:
         self._address = link_address(node)
         self._redirector = redirector
         self._changed = changed
+        self._record = record
         self._links: tuple[DirectLink, ...] = ()
         self._planned = asyncio.Event()
         """Set by the next change; each change has one of its own."""
@@ -80,6 +85,7 @@ class PeerEnd:
             LinkLost: no DirectLink names the drone any more; it has had its time to lead its calls back.
         """
         told: dict[str, int] | None = None
+        self._record("drone", {"drone": session.peer, "linked": True})
         self._changed()
         try:
             while True:
@@ -96,10 +102,12 @@ class PeerEnd:
                     continue
                 if routes != told:
                     await session.send({"routes": routes})
+                    self._record("routes", {"drone": session.peer, "services": self._led(session.peer)})
                     told = routes
                 await planned.wait()
         finally:
             self._routes.pop(session.peer, None)
+            self._record("drone", {"drone": session.peer, "linked": False})
             self._changed()
             try:
                 self._write({})
@@ -128,6 +136,12 @@ class PeerEnd:
         self._routes[drone] = routes
         self._write(routes)
         return found
+
+    def _led(self, drone: str) -> dict[str, str]:
+        """Where a drone's calls go, by the service that they are to."""
+        pods = {at.port: pod for at, pod in self._routes[drone].items()}
+        found = ((route_key(service), pods.get(port)) for service, port in self._ports.items())
+        return {service: f"{pod.address}:{pod.port}" for service, pod in found if pod is not None}
 
     def _port(self, service: Endpoint) -> int:
         """The port that stands for a service, the same for as long as the agent runs."""

@@ -41,7 +41,7 @@ class Entry:
 
 
 COMMANDS: dict[str, Entry] = {
-    "audit": Entry("fractus_cli.audit:audit", "Check, show and export audit logs of node services.", "services"),
+    "audit": Entry("fractus_cli.audit:audit", "Check, show and export audit logs of a node's services and agent.", "services"),
     "camera": Entry("fractus_services.commands:camera", "The camera service of a node.", "services"),
     "camera-world": Entry("fractus_world.__main__:camera_world", "Serve what a camera above a simulated world sees.", "sim"),
     "cluster": Entry("fractus_cluster.cli:cluster", "Run a real Kubernetes of several nodes on this machine.", "sim"),

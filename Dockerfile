@@ -56,6 +56,7 @@ ARG SSL_CERT_FILE
 WORKDIR /build
 COPY pyproject.toml uv.lock /build/
 ENV UV_LINK_MODE=copy UV_PYTHON=/usr/bin/python3 UV_PYTHON_DOWNLOADS=never
+# MCAP files are written with LZ4: zstandard stays out.
 RUN --mount=type=cache,target=/root/.cache/uv \
     set -e; \
     for name in sdk core operator agent services; do \
@@ -63,7 +64,7 @@ RUN --mount=type=cache,target=/root/.cache/uv \
       uv export --quiet --frozen --no-dev --no-emit-project $extra --output-file /build/$name.txt; \
       uv pip install --quiet --no-deps --require-hashes --target /deps/$name -r /build/$name.txt; \
       cd /deps/$name; \
-      rm -rf bin .lock tzdata tzdata-* numpy/_core/_simd.* numpy/_core/include numpy/_core/lib numpy/f2py numpy/distutils cv2/gapi; \
+      rm -rf bin .lock tzdata tzdata-* zstandard zstandard-* numpy/_core/_simd.* numpy/_core/include numpy/_core/lib numpy/f2py numpy/distutils cv2/gapi; \
       find . -path '*/tests' -prune -exec rm -rf {} +; \
       if [ -d kubernetes ]; then : > kubernetes/__init__.py; \
         find kubernetes -mindepth 1 -maxdepth 1 ! -name aio ! -name __init__.py -exec rm -rf {} +; \

@@ -68,14 +68,20 @@ class Parser:
 
     Args:
         signing: the link's signing as it is now; None when frames need no signature.
+        unknown: told of frames that are not of this dialect, whose checksums no one can verify.
 
     Attributes:
         bad: how many frames were none, or not of this dialect.
         lost: how many frames are missing, by the senders' sequence numbers.
     """
 
-    def __init__(self, signing: Callable[[], Signing | None] = lambda: None) -> None:
+    def __init__(
+        self,
+        signing: Callable[[], Signing | None] = lambda: None,
+        unknown: Callable[[bytes], None] = lambda _frame: None,
+    ) -> None:
         self._buffer = bytearray()
+        self._unknown = unknown
         self._signing = signing
         self.bad = 0
         self.lost = 0
@@ -109,6 +115,8 @@ class Parser:
             else:
                 self.bad += 1
                 framed = verdict is _Refusal.UNKNOWN and (after == end or buffer[after] in _MAGICS)
+                if framed:
+                    self._unknown(bytes(buffer[at:after]))
                 at = after if framed or verdict is _Refusal.SIGNATURE else at + 1
         del buffer[:at]
         return messages

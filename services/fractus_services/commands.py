@@ -17,6 +17,8 @@ _DESCRIPTION = click.Path(path_type=Path)
 _COUNT = click.IntRange(min=1)
 _SECONDS = click.FloatRange(min=0)
 
+DEFAULT_RECORDINGS_MB = 500
+
 
 def _option(
     name: str, default: object, text: str, kind: click.ParamType[Any] | None = None, **more: Any
@@ -24,7 +26,7 @@ def _option(
     return click.option(name, type=kind, default=default, show_default=True, help=text, **more)
 
 
-def _service_options(service: str, port: int, kinds: str, state: str) -> Callable[[Any], Any]:
+def _service_options(service: str, port: int, kinds: str, state: str, recorded: str) -> Callable[[Any], Any]:
     """The options that both services take."""
     options = (
         _option("--grants", "/var/lib/fractus/grants", "Directory of Grant manifests (JSON).", DIRECTORY),
@@ -46,6 +48,17 @@ def _service_options(service: str, port: int, kinds: str, state: str) -> Callabl
             _SECONDS,
         ),
         click.option(
+            "--recordings",
+            type=DIRECTORY,
+            help=f"Directory to record {recorded} into (docs/recordings.md); nothing is recorded without it.",
+        ),
+        _option(
+            "--recordings-mb",
+            DEFAULT_RECORDINGS_MB,
+            "Megabytes that recordings may take; the oldest are removed first. 0: none are made.",
+            click.IntRange(min=0),
+        ),
+        click.option(
             "--node", envvar="FRACTUS_NODE", help="Name of this node; by default the description's, else the host's."
         ),
     )
@@ -64,7 +77,7 @@ def mobility() -> None:
 
 
 @mobility.command("serve")
-@_service_options("mobility", 50051, "Optional: Drone", "what survives a restart")
+@_service_options("mobility", 50051, "Optional: Drone", "what survives a restart", "flights")
 @click.option(
     "--autopilot",
     help="Link to the autopilot: tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD; by default the"
@@ -91,7 +104,7 @@ def camera() -> None:
 
 
 @camera.command("serve")
-@_service_options("camera", 50052, "Drone or EdgeNode", "the pictures")
+@_service_options("camera", 50052, "Drone or EdgeNode", "the pictures", "pictures and decisions")
 @_option("--mobility", "127.0.0.1:50051", "Mobility service that reports a drone's position.")
 @_option("--keep", 200, "Pictures kept for each component instance.", _COUNT)
 @_option("--keep-mb", 200, "Megabytes of pictures kept for each component instance.", _COUNT)

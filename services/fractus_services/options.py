@@ -19,6 +19,8 @@ class ServiceOptions:
     description: Path
     listen: str
     lock_timeout: float
+    recordings: Path | None
+    recordings_mb: int
 
     @property
     def grant_memory(self) -> Path:

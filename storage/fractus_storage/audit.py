@@ -75,6 +75,7 @@ class AuditLog:
         segment_bytes: when the file is closed and the next one begun.
         keep: how many closed files are kept.
         tls: directory of the node's key and certificate, which checkpoints are signed with.
+        copied: takes each entry as it is, with time and kind, before it is in the chain; must return at once.
     """
 
     def __init__(
@@ -85,7 +86,9 @@ class AuditLog:
         segment_bytes: int = MAX_SEGMENT_BYTES,
         keep: int = MAX_SEGMENTS,
         tls: Path | None = None,
+        copied: Callable[[dict[str, Any]], None] = lambda _entry: None,
     ) -> None:
+        self._copied = copied
         self._path = path
         self._clock = clock
         self._segment_bytes = segment_bytes
@@ -148,6 +151,7 @@ class AuditLog:
         entry = _Waiting(self._moment(), kind, _plain(content))
         # Content that is not JSON fails here, in the caller, and not in the thread.
         canonical(entry.content)
+        self._copied({"time": entry.time, "kind": kind, **entry.content})
         with self._changed:
             if len(self._waiting) >= MAX_WAITING:
                 self._lost += 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fractus_services import description
@@ -16,8 +17,8 @@ class Counted(server.Album):
 
     made = 0
 
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
+    def __init__(self, *args: Any, **more: Any) -> None:
+        super().__init__(*args, **more)
         type(self).made += 1
 
 
@@ -35,8 +36,8 @@ async def test_a_node_that_is_described_otherwise_keeps_its_album(
     node = tmp_path / "node.json"
     options = CameraOptions(
         grants=tmp_path / "grants", tls=tmp_path / "tls", state=tmp_path / "state", audit=tmp_path / "audit", node="n",
-        node_object=node, description=tmp_path / "none.yaml", listen="127.0.0.1:0", lock_timeout=0.0, mobility="unix:none",
-        keep=10, keep_mb=10, keep_total_mb=10, camera=None, face_model=None, face_px=20.0, relief=0.0,
+        node_object=node, description=tmp_path / "none.yaml", listen="127.0.0.1:0", lock_timeout=0.0, mobility="unix:none", recordings=None,
+        recordings_mb=0, keep=10, keep_mb=10, keep_total_mb=10, camera=None, face_model=None, face_px=20.0, relief=0.0,
     )  # fmt: skip
     stop = asyncio.Event()
     serving = asyncio.ensure_future(server.run(options, stop))

@@ -85,7 +85,9 @@ def node_status(observed: Observed, previous: Object, generation: int | None, no
     What cannot be seen now is unknown, not what it was: the last flight state is kept beside it, and where the drone was.
     """
     conditions = [readiness(observed), observed.certified]
-    conditions += [problem for problem in (observed.described, observed.handed) if problem is not None]
+    conditions += [
+        problem for problem in (observed.described, observed.handed, _unrecorded(observed)) if problem is not None
+    ]
     status: dict[str, Any] = {
         "lastSeen": timestamp(now),
         "conditions": to_kubernetes(conditions, previous.get("conditions") or (), generation, now),
@@ -101,6 +103,12 @@ def node_status(observed: Observed, previous: Object, generation: int | None, no
         elif (last := _last_known(previous)) is not None:
             status["lastFlightState"] = last
     return status
+
+
+def _unrecorded(observed: Observed) -> Condition | None:
+    """That flights are not recorded though they should be; nothing is told while they are."""
+    problem = observed.snapshot.recording_problem if observed.snapshot is not None else ""
+    return Condition("Recording", "False", "RecordingStopped", problem) if problem else None
 
 
 def _last_known(previous: Object) -> str | None:

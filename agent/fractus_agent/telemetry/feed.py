@@ -72,6 +72,7 @@ def snapshot(message: Telemetry) -> Snapshot:
         missions={key: outcome(ended) for key, ended in message.missions.items()},
         velocity_mps=(message.velocity.east_mps, message.velocity.north_mps, -message.velocity.down_mps),
         altitude_amsl_m=message.altitude_amsl_m,
+        recording_problem=message.recording_problem,
     )
 
 

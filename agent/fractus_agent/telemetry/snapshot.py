@@ -27,3 +27,5 @@ class Snapshot:
     velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """East, north and up."""
     altitude_amsl_m: float = 0.0
+    recording_problem: str = ""
+    """Why flights are not recorded that should be; empty when nothing is wrong."""

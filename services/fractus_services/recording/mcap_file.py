@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import IO, Any
 
-from mcap.writer import CompressionType, Writer
+from mcap.records import Channel, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from fractus_services.recording.messages import SCHEMAS
+from fractus_services.recording.segments import create
 
 CHUNK_BYTES = 256_000
 """Messages are compressed and written in pieces of this size, before compression."""
+
+MAX_RECORD_BYTES = 100_000_000
+"""No record of ours is longer: a length beyond that is damage."""
 
 
 class McapFile:
@@ -61,3 +70,50 @@ class McapFile:
     def close(self) -> None:
         """Write the index."""
         self._writer.finish()
+
+
+def complete(path: Path) -> None:
+    """Write the index of a file that was never closed, as far as it can be read; one that was closed is left alone.
+
+    Raises:
+        OSError: the disk does not take it; the file is as it was.
+    """
+    part = path.with_suffix(".part")
+    part.unlink(missing_ok=True)
+    with path.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(size - len(MCAP0_MAGIC), 0))
+        if size > len(MCAP0_MAGIC) and file.read() == MCAP0_MAGIC:
+            return
+        file.seek(0)
+        try:
+            with create(part) as out:
+                _copy(file, out)
+        except OSError:
+            part.unlink(missing_ok=True)
+            raise
+    part.replace(path)
+
+
+def _copy(file: IO[bytes], out: IO[bytes]) -> None:
+    writer: Any = Writer(out, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
+    writer.start(profile="", library="fractus")
+    schemas: dict[int, int] = {}
+    channels: dict[int, int] = {}
+    for record in _readable(file):
+        # A schema or channel may be there again in the part that holds the index.
+        if isinstance(record, Schema) and record.id not in schemas:
+            schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
+        elif isinstance(record, Channel) and record.id not in channels:
+            channels[record.id] = writer.register_channel(
+                record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
+            )
+        elif isinstance(record, Message):
+            writer.add_message(channels[record.channel_id], record.log_time, record.data, record.publish_time)
+    writer.finish()
+
+
+def _readable(file: IO[bytes]) -> Iterator[McapRecord]:
+    """The records up to where the file breaks off, whatever it breaks off in."""
+    with contextlib.suppress(Exception):
+        yield from StreamReader(file, validate_crcs=True, record_size_limit=MAX_RECORD_BYTES).records

@@ -56,6 +56,7 @@ class Album:
         keep_bytes: bytes that the pictures of one instance may take.
         keep_total_bytes: bytes that all pictures may take; pictures of owners that are gone make room.
         owners: owners that have a grant at present.
+        added: told when each new picture was taken (Unix seconds), and what it is; from any thread.
     """
 
     def __init__(
@@ -65,7 +66,10 @@ class Album:
         keep_bytes: int,
         keep_total_bytes: int = 10**13,
         owners: Callable[[], Iterable[str]] = tuple,
+        *,
+        added: Callable[[float, bytes], None] = lambda _time_s, _data: None,
     ) -> None:
+        self._added = added
         self._directory = directory
         self._keep = keep
         self._keep_bytes = keep_bytes
@@ -125,6 +129,7 @@ class Album:
             except OSError:
                 picture.unlink(missing_ok=True)
                 raise
+        self._added(shot.time_s, data)
 
     def find(self, owner: str, name: str) -> Shot:
         """What is known of a picture.

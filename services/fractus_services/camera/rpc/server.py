@@ -37,8 +37,13 @@ from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import GrantFiles
 from fractus_services.hosting import run_until, serve_grpc
 from fractus_services.options import CameraOptions
+from fractus_services.recording.recorder import Recorder
+from fractus_services.recording.segments import segments_in
 
 log = logging.getLogger(__name__)
+
+MAX_WAITING_PICTURES = 16
+"""Pictures that wait to be recorded, each of about a megabyte."""
 
 
 def detector_of(options: CameraOptions) -> Detector:
@@ -66,7 +71,10 @@ async def run(options: CameraOptions, stop: asyncio.Event) -> None:
     description = NodeDescription(options.node, options.node_object, options.description, Drone, EdgeNode)
     node = options.node or (description.value.name if description.value is not None else socket.gethostname())
     tls = TlsFiles(options.tls)
-    audit = AuditLog(options.audit, clock, tls=options.tls)
+    recorder = Recorder(
+        segments_in(options.recordings, options.recordings_mb), node, always=True, max_waiting=MAX_WAITING_PICTURES
+    )
+    audit = AuditLog(options.audit, clock, tls=options.tls, copied=recorder.take_entry)
     grants = GrantFiles(
         options.grants, node, GrantVerifier(options.tls, options.grant_memory), refused=audit.refused_grant
     )
@@ -79,11 +87,13 @@ async def run(options: CameraOptions, stop: asyncio.Event) -> None:
         options.keep_mb * 1_000_000,
         options.keep_total_mb * 1_000_000,
         lambda: [owner_of(grant) for grant in grants.active.values()],
+        added=recorder.take_picture,
     )
     while not stop.is_set():
         audit.append("started", {"node": node})
         await _serve(options, description, node, stop, tls=tls, grants=grants, clock=clock, judge=judge, album=album)
     await audit.close()
+    await recorder.close()
 
 
 async def _serve(

@@ -22,7 +22,7 @@ from fractus_mavlink.enums import (
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.autopilot import COURSE_S, Permit, always
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
-from fractus_services.mobility.mavlink.link import SYSTEM_ID, Link
+from fractus_services.mobility.mavlink.link import SYSTEM_ID, Link, ignore
 from fractus_services.mobility.mavlink.orders import Orders, Velocity, moves
 from fractus_services.mobility.mavlink.parameters import Parameters
 
@@ -73,6 +73,8 @@ class MavlinkAutopilot(Link):
         on_heartbeat: see `Link`.
         on_parameter: called with the name of a parameter that someone else changed.
         sysid: see `Link`.
+        received: see `Link`.
+        sent: see `Link`.
 
     Attributes:
         starting: held by the one who prepares to start the motors.
@@ -89,8 +91,19 @@ class MavlinkAutopilot(Link):
         on_heartbeat: Callable[[], None] = lambda: None,
         on_parameter: Callable[[str], None] = lambda _name: None,
         sysid: int = SYSTEM_ID,
+        received: Callable[[bytes], None] = ignore,
+        sent: Callable[[bytes], None] = ignore,
     ) -> None:
-        super().__init__(url, stack, alive=alive, on_found=on_found, on_heartbeat=on_heartbeat, sysid=sysid)
+        super().__init__(
+            url,
+            stack,
+            alive=alive,
+            on_found=on_found,
+            on_heartbeat=on_heartbeat,
+            sysid=sysid,
+            received=received,
+            sent=sent,
+        )
         self.starting = asyncio.Lock()
         self.vehicle_parameters = Parameters(self, on_parameter)
         self._locks: dict[int, asyncio.Lock] = {}

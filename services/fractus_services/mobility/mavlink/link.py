@@ -32,6 +32,10 @@ MAVLINK_VERSION = 3
 """What a heartbeat says of the dialect; the frames' version is in their first byte."""
 
 
+def ignore(_data: bytes) -> None:
+    """What takes copies of frames that no one wants."""
+
+
 class Link:
     """A link to one vehicle.
 
@@ -42,6 +46,8 @@ class Link:
         on_found: called when the vehicle is heard first, again after each reconnection.
         on_heartbeat: called for every heartbeat after the state took it.
         sysid: the system that speaks at this end.
+        received: takes a copy of all bytes that come; returns at once and raises nothing, and so does the next.
+        sent: takes a copy of each frame that goes.
 
     Attributes:
         vehicle: the streamed state.
@@ -58,7 +64,10 @@ class Link:
         on_found: Callable[[], None] = lambda: None,
         on_heartbeat: Callable[[], None] = lambda: None,
         sysid: int = SYSTEM_ID,
+        received: Callable[[bytes], None] = ignore,
+        sent: Callable[[bytes], None] = ignore,
     ) -> None:
+        self._copy_received, self._copy_sent = received, sent
         self.url = url
         self._sysid = sysid
         self.stack = stack
@@ -189,7 +198,9 @@ class Link:
     def send(self, outgoing: Message) -> None:
         """Send a message; without a link it is dropped."""
         if self._transport is not None:
-            self._transport.write(self._endpoint.encode(outgoing.name, outgoing.values))
+            frame = self._endpoint.encode(outgoing.name, outgoing.values)
+            self._transport.write(frame)
+            self._copy_sent(frame)
 
     def _closed(self, error: Exception | None) -> None:
         if error is not None:
@@ -197,6 +208,7 @@ class Link:
         self._broken.set()
 
     def _received(self, data: bytes) -> None:
+        self._copy_received(data)
         for incoming in self._endpoint.decode(data):
             source = (incoming.sysid, incoming.compid)
             if self.target is None:

@@ -54,6 +54,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         node: its name.
         clock: Unix time.
         heard: told whose grant each call is made under.
+        recording_problem: why flights are not recorded though they should be; empty when nothing is wrong.
     """
 
     def __init__(
@@ -66,7 +67,9 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         node: str,
         clock: Clock,
         heard: Callable[[ActiveGrant], None] = lambda _grant: None,
+        recording_problem: Callable[[], str] = str,
     ) -> None:
+        self._recording_problem = recording_problem
         self._service = service
         self._control = control
         self._streams = streams
@@ -245,9 +248,11 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     def _sample(self, *, missions: bool, heard: int) -> mobility_pb2.Telemetry:
         control = self._control
-        return telemetry_of(
+        message = telemetry_of(
             control, self._clock(), missions=missions, not_ready_reason=arming_problem(control), heard=heard
         )
+        message.recording_problem = self._recording_problem()
+        return message
 
 
 def _known(error: Exception) -> Refused | None:

@@ -28,6 +28,8 @@ from fractus_services.mobility.mavlink.returning import MavlinkReturn
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from fractus_services.mobility.rpc.wiring import Parts
 from fractus_services.options import MobilityOptions
+from fractus_services.recording.recorder import Recorder
+from fractus_services.recording.segments import segments_in
 
 log = logging.getLogger(__name__)
 
@@ -67,7 +69,8 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     name = description.value.name if description.value is not None else socket.gethostname()
     node, url = options.node or name, options.autopilot or _link(description)
     tls = TlsFiles(options.tls)
-    audit = AuditLog(options.audit, clock, tls=options.tls)
+    recorder = Recorder(segments_in(options.recordings, options.recordings_mb), node)
+    audit = AuditLog(options.audit, clock, tls=options.tls, copied=recorder.take_entry)
     verifier = GrantVerifier(options.tls, options.grant_memory)
     grants = GrantFiles(options.grants, node, verifier, options.flat_terrain, audit.refused_grant)
     heard = asyncio.Event()
@@ -84,6 +87,8 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
         on_found=found,
         on_heartbeat=lambda: parts.observer.heartbeat(),  # noqa: PLW0108
         on_parameter=lambda name: parts.observer.parameter(name),  # noqa: PLW0108
+        received=recorder.take_received,
+        sent=recorder.take_sent,
     )
     parts = Parts(
         autopilot,
@@ -100,9 +105,17 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     control, monitor, tours = parts.control, parts.monitor, parts.tours
     audit.append("started", {"node": node, "autopilot": url})
     grants.listen(lambda old, new: _record_grant(audit, old, new))
+    grants.listen(lambda _old, _new: recorder.take_grants([grant.spec for grant in grants.active.values()]))
     grants.scan()
     handlers = MobilityHandlers(
-        parts.service, control, parts.streams, grants=grants, node=node, clock=clock, heard=tours.heard
+        parts.service,
+        control,
+        parts.streams,
+        grants=grants,
+        node=node,
+        clock=clock,
+        heard=tours.heard,
+        recording_problem=lambda: recorder.problem,
     )
 
     register = partial(mobility_pb2_grpc.add_MobilityServiceServicer_to_server, handlers)
@@ -116,6 +129,7 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
         control.close()
     log.info("mobility: stopped, a drone in flight goes home by its autopilot's failsafe")
     await audit.close()
+    await recorder.close()
 
 
 def _record_grant(audit: AuditLog, old: Any, new: Any) -> None:

@@ -1,0 +1,37 @@
+"""What the autopilot's messages say in a recording."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from fractus_mavlink import Message
+from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_MODE_FLAG
+
+from fractus_services.recording.messages import DEBUG, ERROR, FATAL, INFO, WARNING, Record, attitude, location, text
+
+_LEVELS = (FATAL, FATAL, FATAL, ERROR, WARNING, INFO, INFO, DEBUG)
+"""Levels of foxglove.Log by MAV_SEVERITY."""
+
+
+def records_of(message: Message, time_ns: int, node: str) -> Iterable[Record]:
+    """The records that a message gives: position, attitude, or text; none for the others, which the tlog has."""
+    match message.name:
+        case "GLOBAL_POSITION_INT":
+            lat, lon = message.integer("lat") / 1e7, message.integer("lon") / 1e7
+            if lat or lon:
+                yield location(time_ns, node, lat, lon, message.integer("alt") / 1000)
+        case "ATTITUDE":
+            angles = [message.real(axis) for axis in ("roll", "pitch", "yaw")]
+            if all(map(math.isfinite, angles)):
+                yield attitude(time_ns, *(round(angle, 5) for angle in angles))
+        case "STATUSTEXT":
+            level = _LEVELS[min(message.integer("severity"), len(_LEVELS) - 1)]
+            yield text(time_ns, "log", node, level, message.text("text"))
+
+
+def armed(message: Message) -> bool | None:
+    """Whether the motors run, by an autopilot's heartbeat; None for every other message."""
+    if message.name != "HEARTBEAT" or message.integer("autopilot") == MAV_AUTOPILOT.INVALID:
+        return None
+    return bool(message.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED)

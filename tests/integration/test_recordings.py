@@ -1,0 +1,132 @@
+"""What the services record of a real flight, as the readers of others see it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import chart
+import pytest
+from fractus_core.api.names import component_identity
+from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
+from fractus_proto.v1 import mobility_pb2 as pb
+from mcap.reader import make_reader
+from mobility_rig import HOME, NODE, PASSENGER, Driver, Rig, altitude_limit, fence, grant, passenger_grant
+from pymavlink import mavutil
+
+
+@pytest.fixture
+async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
+    rig = Rig(tmp_path)
+    try:
+        yield rig
+    finally:
+        await rig.close()
+
+
+def messages(directory: Path) -> dict[str, list[Any]]:
+    found: dict[str, list[Any]] = {}
+    for path in sorted(directory.glob("*.mcap")):
+        with path.open("rb") as file:
+            for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
+                assert schema is not None
+                found.setdefault(f"{channel.topic} {schema.name}", []).append(json.loads(message.data))
+    return found
+
+
+def frames(directory: Path) -> set[tuple[str, int]]:
+    """Types of messages with the systems that sent them."""
+    found = set()
+    for path in directory.glob("*.tlog"):
+        log = mavutil.mavlink_connection(str(path))
+        while (message := log.recv_match()) is not None:
+            found.add((message.get_type(), message.get_srcSystem()))
+        log.close()
+    return found
+
+
+def sizes(directory: Path) -> list[int]:
+    return [path.stat().st_size for path in directory.glob("*.mcap")]
+
+
+async def flushed(directory: Path) -> None:
+    """Wait until a good part of a flight is on the disk."""
+    async with asyncio.timeout(60):
+        while True:
+            if any(size > 20_000 for size in sizes(directory)):
+                return
+            await asyncio.sleep(0.1)
+
+
+async def test_a_flight_and_its_pictures_are_recorded_and_a_kill_costs_little(rig: Rig) -> None:
+    mobility, pictures = rig.directory / "recordings" / "mobility", rig.directory / "recordings" / "camera"
+    camera = [{"service": "camera", "methods": ["CaptureImage"]}]
+    rig.write_grant(grant(altitude_limit(5, 15), fence("no-fly", "exclusion", "ignore", -60, -10, -40, 10)))
+    rig.write_grant(passenger_grant(services=camera))
+    rig.start_service("--recordings", str(mobility))
+    rig.start_vehicle()
+    address = rig.start_camera("--recordings", str(pictures))
+    driver = Driver(rig)
+    await driver.up(10.0)
+    await driver.goto(20, 0, 20.0)
+    stub = camera_pb2_grpc.CameraServiceStub(rig.channel(PASSENGER, address=address))
+    await stub.CaptureImage(camera_pb2.CaptureImageRequest(), timeout=60, wait_for_ready=True)
+    telemetry = await rig.telemetry()
+    assert not telemetry.recording_problem
+    await flushed(mobility)
+    rig.kill("service")
+    rig.start_service("--recordings", str(mobility))
+    await rig.until(lambda t: t.autopilot_connected and not t.armed, 120, "landed")
+    rig.kill("service", signal.SIGTERM)
+    rig.kill("camera", signal.SIGTERM)
+
+    assert len(sizes(mobility)) >= 2
+    found = messages(mobility)
+    fixes = found[f"/{NODE}/location foxglove.LocationFix"]
+    assert max(fix["altitude"] for fix in fixes) == pytest.approx(HOME[2] + 15.0, abs=2.0)
+    assert {"AltitudeAboveLimit"} <= {one["code"] for one in found[f"/{NODE}/decisions fractus.Decision"]}
+    zones = [json.loads(one["geojson"]) for one in found[f"/{NODE}/zones foxglove.GeoJSON"]]
+    names = {f["properties"]["name"] for one in zones for f in one["features"]}
+    assert {"no-fly-zone", "operationArea"} <= names
+    assert found[f"/{NODE}/attitude fractus.Attitude"]
+    assert {"GUIDED"} <= {one["mode"] for one in found[f"/{NODE}/state fractus.State"]}
+    heard = frames(mobility)
+    assert {("HEARTBEAT", 1), ("HEARTBEAT", 244), ("GLOBAL_POSITION_INT", 1), ("COMMAND_ACK", 1)} <= heard
+    taken = messages(pictures)
+    assert taken[f"/{NODE}/picture foxglove.CompressedImage"]
+    callers = {one["caller"] for one in taken[f"/{NODE}/decisions fractus.Decision"]}
+    assert component_identity("default", "app", "AerialViewer", "app-aerial-viewer") in callers
+
+
+async def test_a_recording_that_cannot_be_written_keeps_no_drone_on_the_ground(rig: Rig) -> None:
+    (rig.directory / "file").write_text("in the way")
+    rig.write_grant(grant())
+    rig.start_service("--recordings", str(rig.directory / "file" / "below"))
+    rig.start_vehicle()
+    driver = Driver(rig)
+    await driver.up(5.0)
+    assert "recording stopped" in (await rig.telemetry()).recording_problem
+    await driver.goto(10, 0, 5.0)
+    assert rig.log("service").count("recording: stopped") == 1
+    await driver.stub.ReturnControl(pb.ReturnControlRequest(), timeout=10)
+
+
+def test_the_chart_switches_recordings() -> None:
+    def arguments(part: str, *given: str) -> list[str]:
+        (body,) = (
+            b for b in chart.render(*given) if b["kind"] == "DaemonSet" and b["metadata"]["name"] == f"fractus-{part}"
+        )
+        (container,) = body["spec"]["template"]["spec"]["containers"]
+        told: list[str] = container["args"]
+        return told[told.index("--recordings") :] if "--recordings" in told else []
+
+    directory = "/var/lib/fractus/recordings"
+    assert arguments("mobility") == ["--recordings", f"{directory}/mobility", "--recordings-mb", "500"]
+    assert not arguments("camera"), "pictures are copied only where that is wanted"
+    assert not arguments("mobility", "--set", "mobility.recordings.enabled=false")
+    more = ("--set", "camera.recordings.enabled=true", "--set", "camera.recordings.megabytes=2000000")
+    assert arguments("camera", *more) == ["--recordings", f"{directory}/camera", "--recordings-mb", "2000000"]

@@ -10,9 +10,12 @@ from fractus_core.geo import polygon
 from fractus_core.planning import flight_of, grants, plan
 from fractus_core.planning.area import operation_area
 from fractus_core.planning.grants import compile_grants, refresh
+from fractus_core.policy.compiled import compile_grant
+from fractus_core.policy.engine import judge
 from fractus_core.policy.selectors import is_attribute, matches, node_attributes
+from fractus_core.policy.values import Call, CaptureArgs, GotoArgs, Home, Situation
 from fractus_core.validation import check_policy
-from test_planning import FRAME, PATH, VIEWER, application, at, drone, edge, inventory, manifest, navigator
+from test_planning import FRAME, PATH, VIEWER, application, at, component, drone, edge, inventory, manifest, navigator
 
 
 def zone(name, where, radius=50):
@@ -171,12 +174,43 @@ def test_a_node_without_a_description_keeps_what_held_for_it():
         compile_grants(app, decided, gone)
 
 
-def test_zone_beyond_reach_is_left_out_but_not_for_inclusion():
+def test_zone_beyond_reach_is_left_out():
     far = zone("far", (80_000, 0))
     (grant,) = compiled(policy("a", zones=["far"], **FENCE), zones=[far])
     assert grant.policies == ()
-    (grant,) = compiled(policy("a", zones=["far"], **(FENCE | {"kind": "inclusion"})), zones=[far])
+
+
+@pytest.mark.parametrize(
+    "there", [FENCE | {"kind": "inclusion"}, {"type": "AccessControl", "kind": "grant", "methods": ["Goto"]}]
+)
+def test_what_is_allowed_in_a_zone_beyond_reach_is_allowed_nowhere_else(there):
+    (grant,) = compiled(policy("a", zones=["far"], **there), zones=[zone("far", (80_000, 0))])
     assert [p.name for p in grant.policies] == ["a"]
+    here = Situation(time_s=0.0, lat=FRAME.lat, lon=FRAME.lon, altitude_m=20.0, home=Home(FRAME.lat, FRAME.lon, 0.0))
+    goto = Call("Goto", GotoArgs(FRAME.lat, FRAME.lon, 20.0))
+    assert not judge(goto, here, compile_grant(grant)).permits
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        {"type": "PrivacyControl", "kind": "camera", "action": "refuse"},
+        {"type": "AccessControl", "kind": "denial", "methods": ["CaptureImage"]},
+    ],
+)
+def test_what_a_camera_may_see_from_afar_is_granted_with_it(spec):
+    near, far = zone("near", (4000, 0)), zone("far", (80_000, 0))
+    private = policy("a", zones=["near", "far"], **spec)
+    policies = {"a": private, "b": policy("b", zones=["near"], **FENCE)}
+    stock = inventory(edges=[edge("e", (0, 0))], zones={z.name: z for z in (near, far)}, policies=policies)
+    where = [{"center": at(0, 0), "radius": 100, "instances": 1}]
+    services = [{"service": "camera", "methods": ["CaptureImage"]}]
+    app = application(component("Watch", "edge", locations=where, services=services))
+    (grant,) = compile_grants(app, plan(app, stock), stock)
+    assert [[z.name for z in p.zones] for p in grant.policies] == [["near"]]
+    # Its camera is not described: it may see everything around it.
+    view = Situation(time_s=0.0, lat=FRAME.lat, lon=FRAME.lon, altitude_m=5.0, home=Home(FRAME.lat, FRAME.lon, 0.0))
+    assert not judge(Call("CaptureImage", CaptureArgs()), view, compile_grant(grant)).permits
 
 
 @pytest.mark.parametrize(

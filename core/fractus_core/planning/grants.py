@@ -23,9 +23,12 @@ from fractus_core.api.plans import (
     GrantSpec,
     PlannedInstance,
 )
+from fractus_core.api.policies import PolicySpec
 from fractus_core.geo import LocalFrame, area_of, distance_m, ground, middle, polygon
 from fractus_core.planning.area import OperationArea, operation_area
 from fractus_core.planning.inventory import Inventory, Settings
+from fractus_core.policy.access import SEEING
+from fractus_core.policy.footprint import MAX_SIGHT_M
 from fractus_core.policy.selectors import holds, node_attributes, owner_of
 
 ROUNDING_M = 0.01
@@ -40,11 +43,14 @@ AROUND_WAY_M = 100.0
 _GENEROUS = 1.05
 """Room for what the frame of a large zone bends."""
 
+_ONLY_THERE = frozenset({"inclusion", "grant"})
+"""Kinds of policies that allow something in their zones and nowhere else: zones out of reach count, too."""
+
 _Bounds = tuple[Point, float]
 """A place, and how far from there zones count, in metres."""
 
 FIXED_NODE_REACH_M = 1000.0
-"""Zones further than this from a fixed node do not concern it."""
+"""Zones further than this from a fixed node do not concern it, unless its camera may see them."""
 
 
 def compile_grants(
@@ -57,7 +63,7 @@ def compile_grants(
     """One Grant for each planned instance that uses system services or has the drone flown, in the plan's order.
 
     Policies are those whose node and application selectors match, with their zones resolved; zones that the node can
-    never reach are left out.
+    neither reach nor see are left out.
 
     Args:
         application: As submitted.
@@ -290,13 +296,15 @@ def _granted(
     zones = [
         _zone(policy, i, name, inventory)
         for i, name in enumerate(named)
-        if beyond is None or policy.spec.kind == "inclusion" or not _surely_beyond(inventory.zones.get(name), *beyond)
+        if beyond is None or policy.spec.kind in _ONLY_THERE or not _surely_beyond(inventory.zones.get(name), *beyond)
     ]
-    # An inclusion zone out of reach still forbids everything else.
-    if bounds is None or policy.spec.kind == "inclusion":
+    if bounds is None or policy.spec.kind in _ONLY_THERE:
         near = zones
     else:
-        near = [zone for zone in zones if _distance_m(zone.area, bounds[0]) <= bounds[1]]
+        base, reach_m = bounds
+        if beyond is None and _regards_pictures(policy.spec):
+            reach_m += MAX_SIGHT_M
+        near = [zone for zone in zones if _distance_m(zone.area, base) <= reach_m]
     if named and not near:
         return None
     # What is left out is not selected either, so that a node can tell a zone that is far from one that is missing.
@@ -304,6 +312,11 @@ def _granted(
     return GrantedPolicy(
         name=policy.name, spec=policy.spec.model_copy(update={"selector": selector}), zones=tuple(near)
     )
+
+
+def _regards_pictures(spec: PolicySpec) -> bool:
+    """Whether a policy counts also for zones that a camera sees from afar."""
+    return spec.type == "PrivacyControl" or not SEEING.isdisjoint(spec.methods)
 
 
 def _bounds(grant: GrantSpec, node: Drone | EdgeNode | None, inventory: Inventory) -> _Bounds | None:

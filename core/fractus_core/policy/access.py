@@ -10,8 +10,9 @@ from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Pol
 from fractus_core.policy.privacy import names, ordered, seen
 from fractus_core.policy.values import Call, Situation, Verdict, deny, earliest, metres
 
-IN_OPERATION_AREA = frozenset({"CaptureImage", "RetrieveImage"})
-"""Methods that are used only while the drone is where the application works; motion is judged by its leg."""
+SEEING = frozenset({"CaptureImage", "RetrieveImage"})
+"""Methods that are denied by what a picture may show, and used only while the drone is where the application works; motion
+is judged by its leg."""
 
 
 def judge_access(call: Call, now: Situation, grant: CompiledGrant) -> Verdict | None:
@@ -24,8 +25,9 @@ def judge_access(call: Call, now: Situation, grant: CompiledGrant) -> Verdict | 
         )
     denials = grant.denials.get(method)
     if denials is not None:
-        seeing = method in IN_OPERATION_AREA
-        forbidding = seen(denials, now, grant) if seeing else _matching(denials, now, grant, now.position_error_m)
+        forbidding = (
+            seen(denials, now, grant) if method in SEEING else _matching(denials, now, grant, now.position_error_m)
+        )
         if forbidding:
             rule = forbidding[0]
             return deny("MethodDenied", f"policy {rule.name} denies {method} here", names(forbidding))
@@ -33,7 +35,7 @@ def judge_access(call: Call, now: Situation, grant: CompiledGrant) -> Verdict | 
     if allowances is not None and not _allowing(allowances, now, grant):
         rules = ordered({p.rule.name: p.rule for p in allowances.zones} | {r.name: r for r in allowances.everywhere})
         return deny("MethodNotGrantedHere", f"{method} is granted elsewhere or at other times only", names(rules))
-    if method in IN_OPERATION_AREA and grant.operation is not None:
+    if method in SEEING and grant.operation is not None:
         return _outside_operation_area(method, now, grant)
     return None
 

@@ -36,6 +36,8 @@ BRAKE, GUIDED, LAND, LOITER, RTL, SMART_RTL = (
     ARDUCOPTER.mode(COPTER_MODE[name]) for name in ("BRAKE", "GUIDED", "LAND", "LOITER", "RTL", "SMART_RTL")
 )
 STEP_S = 0.05
+GROUND_M = 10.0
+"""Of the ground, above mean sea level."""
 ACCEL, CLIMB = 2.5, 2.0
 DEFAULT_MPS = 8.0
 ALL = (
@@ -120,7 +122,8 @@ class Plane(MavlinkAutopilot):
         vehicle = self.vehicle
         vehicle.mode, vehicle.located, vehicle.position_error_m = GUIDED, True, 0.5
         vehicle.ready = vehicle.estimated = True
-        vehicle.home = Home(39.36, 22.95, 10.0)
+        vehicle.home = Home(39.36, 22.95, GROUND_M)
+        self.home_amsl_m = GROUND_M
 
     async def run(self) -> None:
         turn = 0
@@ -174,16 +177,40 @@ class Plane(MavlinkAutopilot):
         elif number == MAV_CMD.COMPONENT_ARM_DISARM:
             self.vehicle.armed = outgoing.real("param1") == 1
         elif number == MAV_CMD.NAV_TAKEOFF:
-            self.goal, self.goal_height, self.wanted = (self.xy[0], self.xy[1]), outgoing.real("param7"), None
+            self.goal, self.goal_height, self.wanted = (
+                (self.xy[0], self.xy[1]),
+                outgoing.real("param7") + self.raised_m,
+                None,
+            )
         elif number == MAV_CMD.DO_CHANGE_SPEED:
             self.speed_mps = outgoing.real("param2")
         elif number == MAV_CMD.DO_REPOSITION:
             if not self.positions:
                 self.positions, self.speed_mps = True, DEFAULT_MPS  # its position controller begins again
             self.goal = FRAME.xy(outgoing.integer("x") / 1e7, outgoing.integer("y") / 1e7)
-            self.goal_height, self.wanted = outgoing.real("z"), None
+            self.goal_height, self.wanted = outgoing.real("z") + self.raised_m, None
         elif number == MAV_CMD.CONDITION_YAW:
             self.heading = outgoing.real("param1")
+        elif number == MAV_CMD.DO_SET_HOME:
+            self.move_home(outgoing.integer("x"), outgoing.integer("y"), outgoing.real("z"))
+
+    @property
+    def raised_m(self) -> float:
+        """How far home is above the ground that the drone took off from."""
+        return self.home_amsl_m - GROUND_M
+
+    def move_home(self, lat_e7: int, lon_e7: int, amsl_m: float) -> None:
+        """Make a place home and announce it, as any station can ask for."""
+        self.home_amsl_m = amsl_m
+        self._reply(
+            message(
+                "HOME_POSITION",
+                latitude=lat_e7,
+                longitude=lon_e7,
+                altitude=round(amsl_m * 1000),
+                q=(1.0, 0.0, 0.0, 0.0),
+            )
+        )
 
     def set_to(self, mode: FlightMode) -> None:
         """Change the mode, as a pilot or a failsafe does."""
@@ -244,7 +271,8 @@ class Plane(MavlinkAutopilot):
         return x / away * speed, y / away * speed
 
     def _tell(self) -> None:
-        state = (*FRAME.latlon(self.xy[0], self.xy[1]), self.height, self.heading, *self.velocity, -self.climb)
+        place, height = FRAME.latlon(self.xy[0], self.xy[1]), self.height
+        state = (*place, height - self.raised_m, height + GROUND_M, self.heading, *self.velocity, -self.climb)
         self._after(self.downlink_s, self._show, round(self.now * 1e3), *state)
 
     def _show(self, boot_ms: int, *state: float) -> None:
@@ -253,7 +281,8 @@ class Plane(MavlinkAutopilot):
         if late_s is None:
             return
         (
-            vehicle.lat, vehicle.lon, vehicle.altitude_m, vehicle.yaw_deg, vehicle.east_mps, vehicle.north_mps, vehicle.down_mps,
+            vehicle.lat, vehicle.lon, vehicle.altitude_m, vehicle.amsl_m, vehicle.yaw_deg, vehicle.east_mps, vehicle.north_mps,
+            vehicle.down_mps,
         ) = state  # fmt: skip
         if self.measured:
             vehicle.courses.append((boot_ms / 1e3, vehicle.north_mps, vehicle.east_mps))
@@ -261,7 +290,7 @@ class Plane(MavlinkAutopilot):
                 vehicle.courses.popleft()
         vehicle.position_at = self.now - late_s
         vehicle.heartbeat_at = vehicle.landed_at = vehicle.checks_at = vehicle.estimated_at = self.now
-        vehicle.landed_state = 2 if vehicle.altitude_m > 0.2 else 1
+        vehicle.landed_state = 2 if vehicle.amsl_m > GROUND_M + 0.2 else 1
         self.notify()
 
 

@@ -339,5 +339,6 @@ def deny(code: str, reason: str, policies: tuple[str, ...] = ()) -> Verdict:
 
 POSITION_UNKNOWN = deny(
     "PositionUnknown",
-    "the drone's position is unknown: no recent fix, or the delay of its link is not measured yet; wait until it is ready",
+    "the drone's position is unknown: no recent fix, the delay of its link is not measured yet, or another station moved"
+    " its home; wait until it is ready",
 )

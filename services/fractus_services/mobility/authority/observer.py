@@ -15,6 +15,7 @@ from fractus_core.policy.values import Verdict
 from fractus_services.errors import AutopilotError
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.home import home_moved, keep_home
 from fractus_services.mobility.autopilot import BEING_SET, Failsafes, Fence
 
 log = logging.getLogger(__name__)
@@ -52,6 +53,8 @@ class Observer:
         self._changed = asyncio.Event()
         self._verified_at = -math.inf
         self._unverified_since: float | None = None
+        self._moved = False
+        self._keeping: asyncio.Task[None] | None = None
 
     def found(self) -> None:
         """The autopilot is there, for the first time or again."""
@@ -70,6 +73,28 @@ class Observer:
             self._unverified_since = None
         elif since is not None and autopilot.now - since > UNVERIFIED_TIMEOUT_S:
             self._come_home(f"it has not told its parameters for {UNVERIFIED_TIMEOUT_S:.0f} s")
+        self._look_after_home()
+
+    def _look_after_home(self) -> None:
+        """Set home back when another station has moved it under the flying drone."""
+        control, home, known = self._control, self._control.autopilot.vehicle.home, self._moved
+        self._moved = home_moved(control.state, control.autopilot.vehicle)
+        if not self._moved or home is None:
+            return
+        if not known:
+            where = f"{home.lat:.7f}, {home.lon:.7f}, {home.amsl_m:.1f} m above mean sea level"
+            log.warning("observer: another station moved home (home=%s)", where)
+            control.note("restored", f"set back in flight: home, which another station moved to {where}", "HomeMoved")
+        if self._keeping is None or self._keeping.done():
+            self._keeping = control.tasks.spawn(self._keep_home())
+
+    async def _keep_home(self) -> None:
+        try:
+            await keep_home(self._control.autopilot, lambda: self._control.state)
+        except AutopilotError as error:
+            log.warning("observer: home is not set back yet (error=%s)", error)
+            if not error.link:
+                self._come_home(f"another station moved home, and it cannot be set back: {error}")
 
     def grant_changed(self, _old: ActiveGrant | None, _new: ActiveGrant | None) -> None:
         """Limits may be others by now: what follows for the autopilot's own way home is set at once."""

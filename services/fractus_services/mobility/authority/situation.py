@@ -10,6 +10,7 @@ from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.values import Airframe, Situation
 
 from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.home import home_moved
 from fractus_services.mobility.autopilot import LEG_MPS
 
 
@@ -27,7 +28,9 @@ def fences_of(control: Control) -> CompiledGrant | None:
 
 
 def situation_of(control: Control, time_s: float) -> Situation:
-    """The state of the drone at this moment; a position that is stale, or comes over too slow a link, counts as unknown.
+    """The state of the drone at this moment.
+
+    A position that is stale, comes over too slow a link, or counts from a home that was moved, is unknown.
 
     Args:
         control: the drone.
@@ -47,7 +50,7 @@ def situation_of(control: Control, time_s: float) -> Situation:
         speed_setpoint_mps=control.cruise_mps,
     )
     latency_s = autopilot.latency_s
-    if not vehicle.position_fresh(autopilot.now) or not math.isfinite(latency_s):
+    if not vehicle.position_fresh(autopilot.now) or not math.isfinite(latency_s) or home_moved(control.state, vehicle):
         return unlocated
     return replace(
         unlocated,

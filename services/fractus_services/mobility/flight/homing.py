@@ -16,6 +16,7 @@ from fractus_core.policy.returning import descent_enters, homeward_heights_m, ma
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.home import home_moved, keep_home
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.flight.courses import STOPPED, Courses, NextLeg, Trip, first_leg, limited_mps
 from fractus_services.mobility.flight.guard import Guard
@@ -65,6 +66,9 @@ class Homing:
         control = self._control
         grant, vehicle, stack = control.last_grant, control.autopilot.vehicle, control.autopilot.stack
         self.given_up = None
+        if kind is TaskKind.RETURN and tries < MAX_TRIES:
+            # The autopilot's own return leads to where home is.
+            await keep_home(control.autopilot, lambda: control.state)
         # A landing under way is a failsafe's or a pilot's choice, with a battery that may be too low for any other way.
         landing = vehicle.mode.kind is ModeKind.LANDING or self._blind()
         if kind is TaskKind.LAND and (grant is None or landing or not self._lands_in_zone(grant)):
@@ -127,6 +131,7 @@ class Homing:
             AutopilotError: the autopilot refuses.
         """
         self.given_up = None
+        await keep_home(self._control.autopilot, lambda: self._control.state)
         if self._blind():
             return
         try:
@@ -179,6 +184,8 @@ class Homing:
         Raises:
             Refused: there is no legal way.
         """
+        if home_moved(self._control.state, self._control.autopilot.vehicle):
+            raise Unavailable("AutopilotUnavailable", "another station moved home; it is set back first")
         now, away_m = self._guard.situation(), self._home_m()
         if now.lat is None or now.lon is None or now.home is None or away_m <= REACHED_M:
             return None

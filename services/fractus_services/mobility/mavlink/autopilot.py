@@ -42,7 +42,7 @@ STREAMS = {
     "SYS_STATUS": (1.0, 1.0),
     "EKF_STATUS_REPORT": (1.0, 1.0),
     "GPS_RAW_INT": (1.0, 2.0),
-    "HOME_POSITION": (0.2, 0.2),
+    "HOME_POSITION": (0.2, 1.0),
     "WIND": (0.2, 1.0),
 }
 

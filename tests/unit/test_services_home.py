@@ -1,0 +1,125 @@
+"""Home under a flying drone: altitudes and ways home count from where it was fixed, also when another station moves it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fractus_core.policy.values import GotoArgs
+from fractus_mavlink.enums import MAV_CMD
+from fractus_services.errors import Unavailable
+from fractus_services.grants import ActiveGrant
+from fractus_services.mobility.authority import drivers
+from fractus_services.mobility.rpc.telemetry import located
+from mobility_world import FRAME, GROUND_M, GUIDED, LOITER, World, at, end, fly, refusal, spec
+
+AWAY = (0.0, 100.0, 0.0)
+UP = (0.0, 0.0, 60.0)
+DOWN = (0.0, 0.0, -60.0)
+CEILING = {"name": "low", "spec": {"type": "LimitControl", "kind": "altitude", "upperLimit": 15}}
+
+
+def move(world: World, where: tuple[float, float, float]) -> None:
+    """What the button "set home here" of any ground station does."""
+    east, north, up = where
+    lat, lon = FRAME.latlon(east, north)
+    world.plane.move_home(round(lat * 1e7), round(lon * 1e7), GROUND_M + up)
+
+
+async def beat(world: World) -> None:
+    """The vehicle's heartbeats, until cancelled."""
+    while True:
+        world.observer.heartbeat()
+        await asyncio.sleep(0.5)
+
+
+@contextlib.asynccontextmanager
+async def flying(world: World, *policies: dict[str, Any]) -> AsyncIterator[ActiveGrant]:
+    """A driver in the air, whose vehicle sends heartbeats."""
+    beating = asyncio.ensure_future(beat(world))
+    grant = world.grants.put(spec(*policies))
+    await world.up(grant)
+    yield grant
+    beating.cancel()
+
+
+def at_home(world: World) -> bool:
+    home = world.plane.vehicle.home
+    return home is not None and abs(home.amsl_m - GROUND_M) < 0.5 and abs(home.lat - 39.36) < 1e-5
+
+
+def said(world: World) -> list[dict[str, Any]]:
+    return [entry for entry in world.kinds("control") if entry["code"] == "HomeMoved"]
+
+
+@pytest.mark.parametrize("where", [AWAY, UP, DOWN])
+def test_home_that_is_moved_in_flight_is_set_back_before_the_drone_flies_on(
+    tmp_path: Path, where: tuple[float, float, float]
+) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world, flying(world, CEILING) as grant:
+            leg = asyncio.ensure_future(refusal(world.service.goto(grant, GotoArgs(*at(0, 90), 12.0), 0)))
+            await world.until(lambda: world.plane.xy[1] > 20)
+            move(world, where)
+            # Until it is set back no altitude means what it says: nothing flies by it, and no picture is judged by it.
+            assert not located(world.control)
+            with pytest.raises(Unavailable):
+                world.service.goto(grant, GotoArgs(*at(0, 90), 12.0), 0)
+            assert isinstance(await leg, Unavailable)
+            await world.until(lambda: at_home(world) and located(world.control), 5)
+            await end(world.service.goto(grant, GotoArgs(*at(0, 90), 12.0), 0))
+            assert len(said(world)) == 1
+            assert max(height for _, _, height in world.plane.trace) < 16
+            await drivers.give_back(world.control, grant)
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert abs(world.plane.xy[1]) < 3
+            assert "failed" not in world.outcome()
+
+    fly(flight)
+
+
+def test_the_way_home_leads_to_where_home_was_fixed(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world, flying(world) as grant:
+            await end(world.service.goto(grant, GotoArgs(*at(0, 90), 12.0), 0))
+            await drivers.give_back(world.control, grant)
+            await world.until(lambda: world.plane.xy[1] < 60)
+            move(world, (80.0, 60.0, 0.0))
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert abs(world.plane.xy[1]) < 3
+            assert max(x for x, _, _ in world.plane.trace) < 3
+
+    fly(flight)
+
+
+def test_a_home_that_cannot_be_set_back_ends_the_flight(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world, flying(world):
+            world.plane.refuses.add(MAV_CMD.DO_SET_HOME)
+            move(world, AWAY)
+            await world.until(world.outcome)
+            assert "cannot be set back" in world.kinds("takeover")[0]["reason"]
+            await world.until(lambda: not world.plane.vehicle.armed)
+
+    fly(flight)
+
+
+def test_a_pilot_may_move_home_and_who_hands_the_drone_back_finds_it_where_it_was(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world, flying(world) as grant:
+            await end(world.service.goto(grant, GotoArgs(*at(0, 50), 12.0), 0))
+            world.plane.set_to(LOITER)
+            await world.until(lambda: world.control.state.controller == "pilot")
+            move(world, AWAY)
+            await asyncio.sleep(5.0)
+            assert not at_home(world)
+            world.plane.set_to(GUIDED)
+            await world.until(lambda: at_home(world), 5)
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert abs(world.plane.xy[1]) < 3
+
+    fly(flight)

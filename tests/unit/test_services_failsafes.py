@@ -76,6 +76,16 @@ def test_legs_are_flown_with_the_owners_speed_where_the_vehicle_spells_it_so() -
     assert configured(newer).speed_mps == 4.0
 
 
+def test_its_own_return_leads_home_at_an_altitude_above_home_and_ends_on_the_ground() -> None:
+    owned = {"RTL_ALT_TYPE": 1.0, "RTL_ALT_FINAL": 500.0, "RALLY_LIMIT_KM": 0.5}
+    vehicle = Parameters({"SYSID_MYGCS": 255.0} | owned)
+    assert not configured(vehicle).problem
+    assert {name: vehicle.values[name] for name in owned} == {
+        "RTL_ALT_TYPE": 0.0, "RTL_ALT_FINAL": 0.0, "RALLY_LIMIT_KM": 2.0**-10,
+    }  # fmt: skip
+    assert "RTL_ALT_FINAL is 500" in configured(Parameters({"SYSID_MYGCS": 255.0} | owned, ("RTL_ALT_FINAL",))).problem
+
+
 RETRACING = {"SYSID_MYGCS": 244.0, "SRTL_POINTS": 300.0}
 
 

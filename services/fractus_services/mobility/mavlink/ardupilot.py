@@ -54,6 +54,8 @@ _SPEED: Names = (("WPNAV_SPEED", 0.01), ("WP_SPD", 1.0))
 _RETURN_SPEED: Names = (("RTL_SPEED", 0.01), ("RTL_SPEED_MS", 1.0))
 _RETURN_CLIMB: Names = (("RTL_CLIMB_MIN", 0.01), ("RTL_CLIMB_MIN_M", 1.0))
 _MIN_SPEED_MPS = 0.2
+_NO_RALLY_KM = 2.0**-10
+"""Rally points further away than that, a metre, do not count; 0 would let all of them. A number that a float32 holds."""
 
 
 class ArduCopter:
@@ -73,6 +75,11 @@ class ArduCopter:
         Setting(("GUID_TIMEOUT",), 1, frozenset(), False, "gives a velocity up after a second without another"),
         Setting(("BATT_FS_CRT_ACT",), 1, frozenset({1.0}), False, "lands on a critical battery"),
         Setting(("FS_EKF_ACTION",), 1, frozenset({1.0, 3.0}), False, "lands when it no longer knows where it is"),
+        Setting(
+            ("RTL_ALT_TYPE",), 0, frozenset(), False, "returns at an altitude above home, not above the ground below"
+        ),
+        Setting(("RTL_ALT_FINAL", "RTL_ALT_FINAL_M"), 0, frozenset(), False, "lands when it has returned"),
+        Setting(("RALLY_LIMIT_KM",), _NO_RALLY_KM, frozenset(), False, "returns to home and to no rally point"),
     )
     straight: tuple[Setting, ...] = (
         Setting(("FS_GCS_ENABLE",), _RETURN, frozenset(), True, "returns to launch when the companion falls silent"),

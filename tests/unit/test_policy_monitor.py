@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from fractus_core.policy.engine import judge
@@ -272,6 +273,58 @@ def test_a_climb_to_an_altitude_that_is_allowed_is_let_pass_though_the_link_is_s
     assert isinstance(higher, GotoArgs)
     fast = at(0, 0, 14.5, down_mps=-2.6, latency_s=0.77)
     assert correction(monitor(fast, grant, bound_for=higher)) == "AltitudeAboveLimit"
+
+
+AROUND = box(-50, -50, 50, 50)
+
+
+@pytest.mark.parametrize("action", ["ignore", "hover"])
+@pytest.mark.parametrize(
+    ("above", "climb_mps", "grant"),
+    [
+        (True, 2.0, lambda action: compiled(exclusion(AROUND, action, lower=15))),
+        (False, -2.0, lambda action: compiled(exclusion(AROUND, action, upper=15))),
+        (True, 2.0, lambda action: compiled(inclusion(AROUND, action, upper=15))),
+        (False, -2.0, lambda action: compiled(inclusion(AROUND, action, lower=15))),
+    ],
+)
+def test_a_drone_is_stopped_below_and_above_what_is_closed_to_it(
+    action: str, above: bool, climb_mps: float, grant: Any
+) -> None:
+    grant, up = grant(action), 1 if above else -1
+    stopped = []
+    for step in range(200):
+        height = 15 - up * (10 - step * 0.1)
+        verdict = monitor(at(0, 0, height, down_mps=-climb_mps), grant)
+        if verdict is not None:
+            assert (verdict.action, verdict.takeover) == ("takeover" if action == "hover" else "deny", "hover")
+            stopped.append(height)
+    stop_m = 2 * (0.3 + 0.1) + 0.5 + 2.0
+    assert stop_m < (15 - stopped[0]) * up < stop_m + 1.5, "neither too early nor too late"
+    assert len(stopped) > 100, "also once it is there"
+    away = at(0, 0, 15 + up, down_mps=climb_mps)
+    assert (monitor(away, grant) is None) is (action == "ignore"), "it may turn back"
+    assert monitor(at(0, 0, 15 - 3 * up), grant) is None
+    assert monitor(at(60 * up, 0, 12, down_mps=-climb_mps), compiled(exclusion(AROUND, lower=15))) is None
+
+
+def test_a_drone_that_creeps_up_into_a_zone_is_stopped() -> None:
+    verdict = monitor(at(0, 0, 14.9, down_mps=-0.2), compiled(exclusion(AROUND, lower=15)))
+    assert verdict is not None
+    assert verdict.takeover == "hover"
+
+
+def test_a_climb_to_below_a_zone_is_let_pass_and_so_is_a_landing() -> None:
+    grant = compiled(exclusion(AROUND, "returnToLaunch", lower=18))
+    leg = goto(0, 0, 16.0).args
+    assert isinstance(leg, GotoArgs)
+    for tenths in range(50, 160):
+        climb = min(2.5, math.sqrt(2 * max(16.0 - tenths / 10, 0.05)))
+        assert monitor(at(0, 0, tenths / 10, down_mps=-climb, latency_s=0.77), grant, bound_for=leg) is None
+    below = compiled(exclusion(AROUND, upper=10))
+    landing = at(0, 0, 12.0, down_mps=1.5)
+    assert monitor(landing, below) is not None
+    assert monitor(replace(landing, vertical=True), below, leaving=True) is None
 
 
 def correction(verdict: Verdict | None) -> str:

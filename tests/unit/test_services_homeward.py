@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from fractus_core.control.values import FlightMode
-from fractus_core.policy.values import GotoArgs
+from fractus_core.policy.values import GotoArgs, TakeoffArgs
 from fractus_mavlink import message
 from fractus_mavlink.enums import MAV_CMD
 from fractus_services.mobility.authority import drivers
@@ -559,5 +559,23 @@ def test_what_is_changed_on_the_ground_is_verified_before_anything_arms(tmp_path
             await world.until(lambda: world.control.checked is not None and not world.control.checked.problem, 5)
             await world.service.arm(grant)
             assert world.guard.situation().airframe.accel_mps2 == 1.0
+
+    fly(flight)
+
+
+def test_what_appears_above_a_climbing_drone_is_not_climbed_into(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            await world.drive(grant)
+            await world.service.arm(grant)
+            climbing = asyncio.ensure_future(refusal(world.service.take_off(grant, TakeoffArgs(30.0))))
+            await world.until(lambda: world.plane.height > 6)
+            above = zone("above", "ignore", -60.0, -60.0, 60.0, 60.0)
+            above["zones"][0]["altitude"] = {"lower": 15.0, "reference": "home"}
+            world.grants.put(spec(above))
+            assert (await climbing).verdict.policies == ("above",)
+            await asyncio.sleep(5.0)
+            assert 6 < max(height for _, _, height in world.plane.trace) < 15
 
     fly(flight)

@@ -8,8 +8,17 @@ from dataclasses import dataclass, replace
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from fractus_core.api.geometry import AltitudeBand
 from fractus_core.api.policies import GeofenceAction
-from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, PolicyZone, height_m
+from fractus_core.policy.compiled import (
+    OPERATION_AREA,
+    Air,
+    CompiledGrant,
+    Inclusion,
+    PolicyZone,
+    band_meets,
+    height_m,
+)
 from fractus_core.policy.fences import SEVERITY, TAKEOVERS, breaches, signed_depth_m
 from fractus_core.policy.limits import Bound, altitude_bounds, can_be_kept, datum_unknown, speed_bounds, strictest
 from fractus_core.policy.motion import XY, margin_m, moving, outlooks, reaction_s, standing, stop_altitude_m, stop_point
@@ -69,15 +78,16 @@ def monitor(
     now = replace(now, forward_mps2=min(now.forward_mps2 or 0.0, 0.0))
     stop = stop_point(now, start)
     ahead = stop if bound_for is None else _arrival(now, start, stop, grant.frame.xy(bound_for.lat, bound_for.lon))
-    worst = _worst(_fences(now, grant, _look_ahead(now, start, ahead, margin), leaving=leaving))
+    level_m = stop_altitude_m(now) if bound_for is None else _level_m(now, bound_for, grant)
+    worst = _worst(_fences(now, grant, _look_ahead(now, start, ahead, margin, level_m), leaving=leaving))
     if worst is not None:
         return replace(worst, brake_first=worst.action == "takeover" and moving(now))
     for begin, then in surging:
         # Its way may end before the fence: it is stopped, and taken over only if it really goes too far.
-        worst = _worst(_fences(then, grant, _look_ahead(then, begin, stop_point(then, begin), margin), leaving=True))
+        further = _look_ahead(then, begin, stop_point(then, begin), margin, stop_altitude_m(then))
+        worst = _worst(_fences(then, grant, further, leaving=True))
         if worst is not None:
             return replace(worst, action="deny", takeover="hover")
-    level_m = stop_altitude_m(now) if bound_for is None else _level_m(now, bound_for, grant)
     return _heights(now, grant, start, stop, level_m, sinks_back=leaving) or _speeds(now, grant, start)
 
 
@@ -133,26 +143,34 @@ def must_rest(now: Situation, grant: CompiledGrant) -> bool:
         return False
     ways = [(at, replace(now, forward_mps2=0.0)), *outlooks(now, at)]
     return any(
-        _fences(then, grant, _look_ahead(then, begin, stop_point(then, begin), margin_m(then)), leaving=True)
+        _fences(
+            then,
+            grant,
+            _look_ahead(then, begin, stop_point(then, begin), margin_m(then), stop_altitude_m(then)),
+            leaving=True,
+        )
         for begin, then in ways
     )
 
 
-def _look_ahead(now: Situation, start: XY, stop: XY, margin: float) -> _Ahead:
+def _look_ahead(now: Situation, start: XY, stop: XY, margin: float, rest_m: float) -> _Ahead:
     way = shapely.points(start) if start == stop else shapely.linestrings((start, stop))
-    rest_m = stop_altitude_m(now)
     lower = min(now.altitude_m, rest_m) - now.altitude_error_m
     upper = max(now.altitude_m, rest_m) + now.altitude_error_m
-    return _Ahead(Air(way, margin, lower, upper), shapely.points(start), shapely.points(stop))
+    # Who lands is not kept in the air by what is below.
+    ends_m = max(rest_m, now.altitude_m) if now.vertical else rest_m
+    return _Ahead(Air(way, margin, lower, upper), shapely.points(start), shapely.points(stop), now.altitude_m, ends_m)
 
 
 @dataclass(frozen=True, slots=True)
 class _Ahead:
-    """The way to where the drone can stop, with its ends."""
+    """The way to where the drone can stop, with its ends, and their altitudes above home."""
 
     air: Air
     here: BaseGeometry
     rest: BaseGeometry
+    here_m: float
+    rest_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,14 +197,14 @@ class _Finding:
 def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead, *, leaving: bool) -> list[tuple[int, Verdict]]:
     """What fences ask for, each with its policy's priority."""
     found: list[tuple[int, _Finding | None]] = [
-        (zone.rule.spec.priority, _kept_out(zone, ahead))
+        (zone.rule.spec.priority, _kept_out(zone, ahead, now, grant.flat_terrain))
         for zone in grant.exclusions.near(ahead.air, now, grant.flat_terrain)
     ]
     if grant.passage is not None and grant.passage_border is not None:
         area = _Fence(
             OPERATION_AREA, "ignore", "the operation area", "OutsideOperationArea", "OperationAreaBorderAhead"
         )
-        found.append((0, _kept_in(grant.passage, grant.passage_border, ahead, area)))
+        found.append((0, _kept_in(grant.passage, grant.passage_border, ahead, area, leaves=False)))
     for inclusion in grant.inclusions:
         if inclusion.rule.in_force(now.time_s):
             shape, border = inclusion.at(ahead.air.lower_m, ahead.air.upper_m, now, grant.flat_terrain)
@@ -194,30 +212,63 @@ def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead, *, leaving: boo
             rule = inclusion.rule
             name = f"{zones} of policy {rule.name}"
             fence = _Fence(rule.name, rule.spec.geofence_action, name, "OutsideInclusionZone", "InclusionBorderAhead")
-            found.append((rule.spec.priority, _kept_in(shape, border, ahead, fence)))
+            leaves = inclusion.banded and _leaves_by_height(inclusion, ahead, now, grant.flat_terrain)
+            found.append((rule.spec.priority, _kept_in(shape, border, ahead, fence, leaves=leaves)))
     reactions = [(priority, _reaction(f, leaving=leaving)) for priority, f in found if f is not None]
     return [(priority, verdict) for priority, verdict in reactions if verdict is not None]
 
 
-def _kept_out(zone: PolicyZone, ahead: _Ahead) -> _Finding:
-    inside = bool(zone.shape.intersects(ahead.here))
-    border = zone.shape.boundary
-    rest_m, here_m = (signed_depth_m(zone.shape, border, point) for point in (ahead.rest, ahead.here))
-    worse = rest_m > here_m + DEEPER_M
-    entering = not inside and bool(zone.shape.intersects(ahead.air.ground))
+def _kept_out(zone: PolicyZone, ahead: _Ahead, now: Situation, flat: bool) -> _Finding:
+    shape, border = zone.shape, zone.shape.boundary
+    around, crosses = bool(shape.intersects(ahead.here)), bool(shape.intersects(ahead.air.ground))
+    error_m = now.altitude_error_m
+    inside = around and band_meets(zone.band, ahead.here_m - error_m, ahead.here_m + error_m, now.home, flat)
+    rest_m, here_m = (signed_depth_m(shape, border, point) for point in (ahead.rest, ahead.here))
+    worse = rest_m > here_m + DEEPER_M or (crosses and not around)
+    if crosses and zone.band is not None:
+        # From above or from below; where it is in the zone as seen from above, the lesser depth counts.
+        rest_m, here_m = (
+            min(depth_m, _depth_in_band_m(zone.band, altitude_m, now, flat))
+            for depth_m, altitude_m in ((rest_m, ahead.rest_m), (here_m, ahead.here_m))
+        )
+        worse = worse or here_m < 0.0 <= rest_m or (rest_m > here_m + DEEPER_M and rest_m > -error_m)
     name = f"zone {zone.name} of policy {zone.rule.name}"
     fence = _Fence(zone.rule.name, zone.rule.spec.geofence_action, name, "InsideExclusionZone", "ExclusionZoneAhead")
-    return _Finding(fence, inside, worse or entering, "is inside" if inside else "is about to enter")
+    return _Finding(fence, inside, worse, "is inside" if inside else "is about to enter")
 
 
-def _kept_in(shape: BaseGeometry, border: BaseGeometry, ahead: _Ahead, fence: _Fence) -> _Finding | None:
+def _depth_in_band_m(band: AltitudeBand | None, altitude_m: float, now: Situation, flat: bool) -> float:
+    """How deep an altitude above home is between those of a band, negative outside; an edge of unknown datum is none."""
+    if band is None:
+        return math.inf
+    floor, ceiling = (
+        None if edge is None else height_m(edge, band.reference, now.home, flat) for edge in (band.lower, band.upper)
+    )
+    above = math.inf if floor is None else altitude_m - floor
+    return min(above, math.inf if ceiling is None else ceiling - altitude_m)
+
+
+def _leaves_by_height(fence: Inclusion, ahead: _Ahead, now: Situation, flat: bool) -> bool:
+    """Whether a drone above or below the zones to stay in, or about to be, gets further from all of them by its height."""
+    around = [zone.band for zone in fence.zones if zone.shape.intersects(ahead.here)]
+    rest_m, here_m = (
+        max((_depth_in_band_m(band, m, now, flat) for band in around), default=math.inf)
+        for m in (ahead.rest_m, ahead.here_m)
+    )
+    return rest_m < 0.0 <= here_m or (rest_m < here_m - DEEPER_M and rest_m < now.altitude_error_m)
+
+
+def _kept_in(
+    shape: BaseGeometry, border: BaseGeometry, ahead: _Ahead, fence: _Fence, *, leaves: bool
+) -> _Finding | None:
     way = ahead.air.ground
     if shape.covers(way) and not border.dwithin(way, ahead.air.margin_m):
         return None
     outside = not shape.covers(ahead.here)
-    worse = False
+    worse = leaves
     if not shape.is_empty:
-        worse = signed_depth_m(shape, border, ahead.rest) < signed_depth_m(shape, border, ahead.here) - DEEPER_M
+        deep_m = signed_depth_m(shape, border, ahead.here)
+        worse = worse or signed_depth_m(shape, border, ahead.rest) < deep_m - DEEPER_M
     worse = worse or (not outside and not shape.covers(way))
     return _Finding(fence, outside, worse, "is outside" if outside else "is about to leave")
 

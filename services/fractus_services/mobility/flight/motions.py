@@ -46,6 +46,9 @@ async def climb(autopilot: Autopilot, motion: Motion, altitude_m: float, permit:
     """Take off to an altitude above home."""
     vehicle = autopilot.vehicle
     await autopilot.take_off(altitude_m, permit)
+    if vehicle.lat is not None and vehicle.lon is not None:
+        # The monitor lets it climb to there: the autopilot ends its climb by itself.
+        motion.leg, motion.under_way = GotoArgs(vehicle.lat, vehicle.lon, altitude_m), True
     begun, best = autopilot.now, -math.inf
     while True:
         left = altitude_m - vehicle.altitude_m

@@ -6,15 +6,12 @@ from collections.abc import Collection, Mapping
 
 from fractus_core.api import Application, Depot, InvalidObject, Policy, Zone
 from fractus_core.api.geometry import Area
-from fractus_core.geo import LocalFrame, geodesic_m, middle, polygon
+from fractus_core.geo import LocalFrame, check_extent, middle, polygon
 from fractus_core.planning.area import operation_area
 from fractus_core.policy.selectors import is_attribute
 
 MAX_WAYPOINTS = 2000
 """Waypoints and points of interest of one application: far more than a battery lasts for."""
-
-MAX_EXTENT_M = 1_000_000.0
-"""No point of an area may be further from its middle: beyond, a local frame means nothing."""
 
 
 def check_area(area: Area, field: str) -> None:
@@ -24,14 +21,8 @@ def check_area(area: Area, field: str) -> None:
         InvalidObject: with the field below `field`.
     """
     try:
-        centre = middle(area)
-        for i, point in enumerate(area.polygon.exterior if area.polygon is not None else ()):
-            if geodesic_m(centre, point) > MAX_EXTENT_M:
-                raise InvalidObject(
-                    f"polygon.exterior[{i}]",
-                    f"is more than {MAX_EXTENT_M / 1000:.0f} km from the middle; split the area",
-                )
-        polygon(LocalFrame.at(centre), area)
+        check_extent(area)
+        polygon(LocalFrame.at(middle(area)), area)
     except InvalidObject as error:
         raise InvalidObject(f"{field}.{error.field}", error.problem) from None
 

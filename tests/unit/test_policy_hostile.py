@@ -7,10 +7,12 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from fractus_core.api import InvalidObject
 from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled import compile_grant
 from fractus_core.policy.engine import judge
+from fractus_core.policy.limits import forbids_height
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.routes import route
 from fractus_core.policy.values import Airframe, Call, GotoArgs, Home, Moment, Situation, VelocityArgs
@@ -72,6 +74,23 @@ def test_a_zone_as_big_as_a_country() -> None:
     beside = {"circle": {"center": {"lat": 41.3, "lon": 22.95}, "radius": 200_000}}
     assert ask(compiled(exclusion(beside)), goto(50, 0)).action == "allow"
     assert ask(compiled(inclusion(beside)), goto(50, 0)).action == "deny"
+
+
+def test_a_zone_that_reaches_around_the_globe_grants_nothing() -> None:
+    corners = [(0, -62), (0, 23), (0, 108), (70, 108), (80, 23), (70, -62)]
+    world = {"polygon": {"exterior": [{"lat": lat, "lon": lon} for lat, lon in corners]}}
+    with pytest.raises(InvalidObject, match="more than 1000 km from the middle"):
+        compiled(exclusion(world))
+    far = {"polygon": {"exterior": [{"lat": lat, "lon": lon} for lat, lon in ((-39, 170), (-39, 171), (-38, 171))]}}
+    assert ask(compiled(exclusion(far)), goto(50, 0)).action == "allow"
+
+
+def test_one_altitude_that_is_both_limits_forbids_what_is_above_and_below() -> None:
+    height = 20.0
+    (level,) = compiled(
+        altitude(zones=[zone("level", box(0, 0, 9, 9))], lowerLimit=height, upperLimit=height)
+    ).altitude_limits.zones
+    assert [forbids_height(level, m, m, at(), flat=False) for m in (19.0, 20.0, 21.0)] == [True, False, True]
 
 
 def _court() -> dict[str, Any]:

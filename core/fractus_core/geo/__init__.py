@@ -1,6 +1,7 @@
 """Frames, distances and areas."""
 
 from fractus_core.geo.areas import area_of as area_of
+from fractus_core.geo.areas import check_extent as check_extent
 from fractus_core.geo.areas import corridor as corridor
 from fractus_core.geo.areas import geojson as geojson
 from fractus_core.geo.areas import geojson_line as geojson_line

@@ -13,13 +13,16 @@ from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.geometry import Area, Circle, Point, Polygon, Position
 from fractus_core.api.model import InvalidObject
-from fractus_core.geo.frames import LocalFrame
+from fractus_core.geo.frames import LocalFrame, geodesic_m
 
 _SEGMENTS = (8, 32)
 """Straight pieces per quarter of a circle, minimum and maximum: the area is right within 0.4 %."""
 
 _CORNER_M = 0.01
 """Between these, as few pieces as keep the corners within this distance of the circle."""
+
+MAX_EXTENT_M = 1_000_000.0
+"""No point of an area may be further from its middle: beyond, a local frame means nothing."""
 
 _SNAPPED = 1e-5
 """GEOS merges corners that are closer than about a millionth of the radius, which would cut short a leg as short."""
@@ -98,6 +101,19 @@ def _circumscribed(radius_m: float) -> tuple[float, int]:
     fewest, maximum = _SEGMENTS
     segments = min(max(needed, fewest), maximum)
     return radius_m / math.cos(math.pi / (4 * segments)), segments
+
+
+def check_extent(area: Area) -> None:
+    """Refuse an area of continental size.
+
+    Raises:
+        InvalidObject: naming the first point that is too far away.
+    """
+    centre = middle(area)
+    for i, point in enumerate(area.polygon.exterior if area.polygon is not None else ()):
+        if geodesic_m(centre, point) > MAX_EXTENT_M:
+            how = f"is more than {MAX_EXTENT_M / 1000:.0f} km from the middle; split the area"
+            raise InvalidObject(f"polygon.exterior[{i}]", how)
 
 
 def middle(area: Area) -> Point:

@@ -16,7 +16,7 @@ from fractus_core.api.methods import METHODS_OF, MOBILITY_METHODS
 from fractus_core.api.plans import GrantedPolicy, GrantSpec
 from fractus_core.api.policies import PolicySpec
 from fractus_core.api.schedules import ActiveTime, active_at
-from fractus_core.geo import LocalFrame, middle, polygon
+from fractus_core.geo import LocalFrame, check_extent, middle, polygon
 from fractus_core.policy.values import Home, Moment, Situation, earliest
 
 REACH_M = 500_000.0
@@ -306,6 +306,8 @@ def _within_reach(frame: LocalFrame, area: Area) -> bool:
         return near and _same_side(frame, area.circle.center)
     ring = area.polygon.exterior if area.polygon is not None else ()
     if not all(_same_side(frame, point) for point in ring):
+        # Far away, unless it is so large that it may reach around the globe to here.
+        check_extent(area)
         return False
     xy = [frame.xy(p.lat, p.lon) for p in ring]
     (west, east), (south, north) = ((min(a), max(a)) for a in zip(*xy, strict=True))

@@ -93,12 +93,13 @@ def datum_unknown(rule: Rule) -> Verdict:
 def forbids_height(zone: PolicyZone, lower_m: float, upper_m: float, now: Situation, flat: bool) -> bool:
     """Whether the altitude limit of a zone does not allow all heights from lower to upper (above home)."""
     spec = zone.rule.spec
-    for edge, reaches_m in ((spec.upper_limit, upper_m), (spec.lower_limit, lower_m)):
-        if edge is not None:
-            height = height_m(edge, spec.altitude_reference, now.home, flat)
-            if height is None or (reaches_m > height if edge is spec.upper_limit else reaches_m < height):
-                return True
-    return False
+    highest, lowest = (
+        edge if edge is None else height_m(edge, spec.altitude_reference, now.home, flat)
+        for edge in (spec.upper_limit, spec.lower_limit)
+    )
+    if (highest is None) != (spec.upper_limit is None) or (lowest is None) != (spec.lower_limit is None):
+        return True
+    return (highest is not None and upper_m > highest) or (lowest is not None and lower_m < lowest)
 
 
 def speed_bounds(grant: CompiledGrant, now: Situation, air: Air) -> list[Bound]:

@@ -208,7 +208,8 @@ async def _search(fleet: Fleet, i: int) -> Any:
     now: Situation = fleet.situation(i, told=True)
     place: Floats = fleet.seen[i]
     vehicle = SimpleNamespace(home=HOME, distance_m=lambda _lat, _lon: math.hypot(place[0], place[1]))
-    control: Any = SimpleNamespace(autopilot=SimpleNamespace(vehicle=vehicle), cruise_mps=CRUISE_MPS)
+    state = SimpleNamespace(mission=None)
+    control: Any = SimpleNamespace(autopilot=SimpleNamespace(vehicle=vehicle), cruise_mps=CRUISE_MPS, state=state)
     guard: Any = SimpleNamespace(situation=lambda: now)
     trip: Any = SimpleNamespace(constraints=SimpleNamespace(compiled=fleet.scenes[i].grant))
     return await Homing(control, guard, SimpleNamespace())._search(trip)  # type: ignore[arg-type]

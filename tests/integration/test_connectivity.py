@@ -12,11 +12,6 @@ from connected_world import VIP, Agent, Client, World, connected_world, link_add
 pytestmark = [pytest.mark.root, pytest.mark.timeout(300)]
 
 
-SWITCHES = 2
-"""Calls that a client without retries may lose on a machine so busy that it learns of a closed connection after its next call:
-one a planned switch. test_redirector.py tells how few it is elsewhere."""
-
-
 @pytest.fixture
 def world(tmp_path: Path) -> Iterator[World]:
     with connected_world(tmp_path) as found:
@@ -57,7 +52,7 @@ def test_traffic_takes_the_link_and_comes_back_before_it_ends(world: World) -> N
     drone.fly(70.0, velocity=(3.0, 0.0, 0.0))
     drone.fly(-57.0, velocity=(-3.0, 0.0, 0.0))
     until(lambda: client.by == "cloud", "an answer of the cloud", world)
-    assert len(client.failed) <= SWITCHES
+    assert not client.failed
     until(lambda: drone.status(name).get("traffic") == "cloud", "the status", world)
 
 
@@ -77,7 +72,7 @@ def test_nothing_is_left_when_links_are_planned_no_more(world: World) -> None:
     until(lambda: not edge.tables() and not edge.addresses(), "a clean edge node", world)
     assert edge.routes() == before
     assert world.conntrack(drone) == world.conntrack(edge) == 0
-    assert len(client.failed) <= SWITCHES
+    assert not client.failed
     choice, led, back = (
         next(entry for entry in drone.audit(kind) if entry[field] == value)
         for kind, field, value in (("choice", "peer", "e1"), ("traffic", "path", "e1"), ("link", "phase", "none"))
@@ -100,8 +95,8 @@ def test_an_abrupt_loss_is_over_within_a_second(world: World) -> None:
     assert first - last < 1.5  # 0.4 s until the loss is noticed; a second without the load of a test machine
     who = [answer[1] for answer in client.answers]
     led = who.index("e1")
-    # This client asks fifty times a second and repeats nothing: the planned switch onto the link may cost a call, and the cut.
-    assert who[:led].count("FAILED") <= 1
+    # This client asks fifty times a second and repeats nothing: the planned switch onto the link costs none, the cut one.
+    assert "FAILED" not in who[:led]
     assert who[led:].count("FAILED") <= 1
     assert not drone.redirects()
     until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "the status", world)
@@ -157,7 +152,7 @@ def test_two_drones_compete_for_one_edge_node(world: World) -> None:
     first.plan()
     until(lambda: clients[1].by == "e1", "the second drone's answer over the link", world)
     assert clients[0].by == "cloud"
-    assert sum(len(client.failed) for client in clients) <= 2 * SWITCHES
+    assert not [client.failed for client in clients if client.failed]
 
 
 @pytest.mark.parametrize("fault", ["silent", "impostor"])
@@ -301,7 +296,7 @@ def test_the_loss_of_the_uplink_leaves_direct_traffic_alone(world: World) -> Non
     drone.fly(-57.0, velocity=(-3.0, 0.0, 0.0))
     until(lambda: client.by == "cloud", "an answer of the cloud", world)
     until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "the status", world)
-    assert len(client.failed) <= SWITCHES
+    assert not client.failed
 
 
 def test_an_agent_that_dies_in_the_middle_of_a_switch(world: World) -> None:

@@ -58,7 +58,7 @@ async def test_new_connections_follow_the_map(world: Rig, redirector: Redirector
     assert ask_once(world, node) == "cloud"
 
 
-@pytest.mark.parametrize(("pause_s", "size", "work_s"), [(0.2, 10, 0.03), (0.2, 200_000, 0.0)])
+@pytest.mark.parametrize(("pause_s", "size", "work_s"), [(0.2, 10, 0.03), (0.2, 200_000, 0.0), (0.02, 10, 0.005)])
 async def test_planned_switches_lose_no_call_of_a_client_that_knows_nothing(
     world: Rig, redirector: Redirector, pause_s: float, size: int, work_s: float
 ) -> None:

@@ -47,7 +47,7 @@ PROBE_S = 3.0
 PROBES = 3
 """The best of the last N counts: a probe that meets the components' own traffic shows what is left beside it."""
 LEAVE_S = 2.0
-"""So long before the drone leaves a link's reach its traffic is led back: a drain takes a second, and reaches have soft edges."""
+"""So long before the drone leaves a link's reach its traffic is led back: a drain takes up to 1.5 s, and reaches have soft edges."""
 DIRECT_LATENCY_MS = 5.0
 """What a link is expected to need before it was measured."""
 

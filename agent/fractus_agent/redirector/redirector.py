@@ -16,9 +16,10 @@ from ipaddress import IPv4Address
 from pathlib import Path
 
 from fractus_agent.redirector.conntrack import Conntrack
+from fractus_agent.redirector.habits import Exchange, Habits
 from fractus_agent.redirector.netlink import NETLINK_SOCK_DIAG, Netlink, NetlinkError, in_namespace
 from fractus_agent.redirector.nft import MAX_NUMBER, Endpoint, Maps, Redirect, RedirectFailed
-from fractus_agent.redirector.sockets import JIFFY_MS, Connection, DestroyUnsupported, Sockets
+from fractus_agent.redirector.sockets import Connection, DestroyUnsupported, Sockets
 
 log = logging.getLogger(__name__)
 
@@ -26,18 +27,8 @@ LEASE_S = 5.0
 """Redirects live so long without an agent: then the kernel drops them, and new connections take the cloud path."""
 REFRESH_S = 1.5
 
-DRAIN_TIMEOUT_S = 1.0
-DRAIN_POLL_S = 0.004
-
-MIN_IDLE_MS, MAX_IDLE_MS = 2 * JIFFY_MS, 500
-WORK_MARGIN = 1.5
-WORK_DECAY = 0.9
-UNKNOWN_WORK_MS = 60.0
-"""A connection is idle once nothing has come for longer than its server usually takes to answer. Frames that answer nothing,
-such as HTTP/2's pings and window updates, look like replies; so how long a service works is learned from its connections
-all the time. No longer than needed is waited: the next request comes at some time, and one that meets a connection while it
-is being closed is lost. A client that calls all the time is hardly ever idle: as the time runs out, less is asked for."""
-
+DRAIN_TIMEOUT_S = 1.5
+DRAIN_POLL_S = 0.002
 LEARN_S = 0.1
 
 
@@ -129,7 +120,7 @@ class Redirector:
         self._left: list[_Left] = []
         self._draining: set[int] = set()
         self._last_number = 0
-        self._worked_ms: dict[Endpoint, float] = {}
+        self._habits = Habits()
 
     @property
     def redirects(self) -> Mapping[Endpoint, Endpoint]:
@@ -290,33 +281,34 @@ class Redirector:
             log.debug("redirector: connections not looked at (error=%s)", error)
             return
         for connection in found:
-            if connection.idle_ms:
-                usual = WORK_DECAY * self._worked_ms.get(connection.peer, 0.0)
-                self._worked_ms[connection.peer] = max(usual, connection.worked_ms)
-
-    def _enough_ms(self, connection: Connection, left: float) -> float:
-        """For how long a connection must have been idle to be closed, with this share of the time left."""
-        worked_ms = max(self._worked_ms.get(connection.peer, UNKNOWN_WORK_MS), connection.worked_ms)
-        return max(min(WORK_MARGIN * worked_ms, MAX_IDLE_MS) * min(2 * left, 1.0), MIN_IDLE_MS)
+            self._habits.learn(connection)
 
     async def _drain(self, old: Collection[bytes], moved: Collection[Endpoint]) -> int:
         """Close old connections as they become idle, until the time is over; how many."""
         loop = asyncio.get_running_loop()
         begun, drained = loop.time(), 0
-        while old and (left := 1 - (loop.time() - begun) / DRAIN_TIMEOUT_S) > 0:
-            there: set[bytes] = set()
-            for sockets in self._namespaces.refresh():
-                for connection in sockets.to(moved):
-                    if connection.identity not in old:
-                        continue
-                    if connection.idle_ms >= self._enough_ms(connection, left):
-                        if not _destroy(sockets, connection):
-                            return drained
-                        drained += 1
-                    else:
-                        there.add(connection.identity)
-            old = there
-            if old:
+        watched = [
+            (sockets, Exchange.first(connection, begun * 1e3))
+            for sockets in self._namespaces.refresh()
+            for connection in sockets.to(moved)
+            if connection.identity in old
+        ]
+        while watched and (left := 1 - (loop.time() - begun) / DRAIN_TIMEOUT_S) > 0:
+            there = []
+            for sockets, exchange in watched:
+                connection = sockets.now(exchange.connection)
+                if connection is None:
+                    continue
+                seen = exchange.then(connection, loop.time() * 1e3)
+                if not self._habits.closable(seen, left):
+                    there.append((sockets, seen))
+                # At once: the next request comes at some time, and none is to come in between.
+                elif not _destroy(sockets, connection):
+                    return drained
+                else:
+                    drained += 1
+            watched = there
+            if watched:
                 await asyncio.sleep(DRAIN_POLL_S)
         return drained
 

@@ -6,13 +6,14 @@ A client's socket in its pod still has the virtual address as its peer: the tran
 from __future__ import annotations
 
 import errno
+import os
 import socket
 import struct
 from collections.abc import Collection
 from dataclasses import dataclass
 from ipaddress import IPv4Address
 
-from fractus_agent.redirector.netlink import NLM_F_ACK, Netlink, NetlinkError, attributes, message
+from fractus_agent.redirector.netlink import NLM_F_ACK, NLMSG_ERROR, Netlink, NetlinkError, attributes, message
 from fractus_agent.redirector.nft import Endpoint
 
 _BY_FAMILY, _DESTROY = 20, 21
@@ -22,12 +23,14 @@ _ID = struct.Struct(">HH16s16s")
 _ID_BYTES = 48
 _ANSWER_HEAD = 4
 _QUEUES = struct.Struct("=III")
-_INFO = struct.Struct("=24xI16x4I")
-"""tcp_info: unacknowledged segments, and ages in ms of the last data sent, ACK sent (always 0), data received, ACK received."""
+_INFO = struct.Struct("=24xI16x4I68xQ")
+"""tcp_info: unacknowledged segments; ages in ms of the last data sent, ACK sent (always 0), data received, ACK received; bytes
+received."""
 
 _MAPPED = b"\0" * 10 + b"\xff\xff"
 TCP_ESTABLISHED, TCP_SYN_SENT, TCP_CLOSE_WAIT = 1, 2, 8
-_STATES = 1 << TCP_ESTABLISHED | 1 << TCP_SYN_SENT | 1 << TCP_CLOSE_WAIT
+_OPEN = frozenset({TCP_ESTABLISHED, TCP_SYN_SENT, TCP_CLOSE_WAIT})
+_STATES = sum(1 << state for state in _OPEN)
 
 JIFFY_MS = 4
 """The kernel tells ages in steps of this."""
@@ -46,6 +49,7 @@ class Connection:
         sent_ms: age of the last data sent.
         received_ms: age of the last data received.
         acknowledged_ms: age of the last ACK received.
+        received_bytes: since it was opened.
     """
 
     identity: bytes
@@ -56,6 +60,12 @@ class Connection:
     sent_ms: int = 0
     received_ms: int = 0
     acknowledged_ms: int = 0
+    received_bytes: int = 0
+
+    @property
+    def answered(self) -> bool:
+        """Whether all that was sent has arrived, and something came since."""
+        return self.queued == 0 and self.unacknowledged == 0 and self.received_ms <= self.sent_ms
 
     @property
     def idle_ms(self) -> int:
@@ -63,13 +73,17 @@ class Connection:
 
         The age of the last ACK counts too: a large request on a slow link is acknowledged piece by piece.
         """
-        delivered = self.queued == 0 and self.unacknowledged == 0
-        return min(self.received_ms, self.acknowledged_ms) if delivered and self.received_ms <= self.sent_ms else 0
+        return min(self.received_ms, self.acknowledged_ms) if self.answered else 0
 
     @property
     def worked_ms(self) -> int:
         """How long the server took from the last request to the last piece of its reply."""
         return max(self.sent_ms - self.received_ms, 0)
+
+    @property
+    def rested_ms(self) -> int:
+        """How long the client rested between the last reply and its next request; 0 before that is sent."""
+        return max(self.received_ms - self.sent_ms, 0)
 
 
 class DestroyUnsupported(RuntimeError):
@@ -105,6 +119,26 @@ class Sockets:
                     found.append(connection)
         return found
 
+    def now(self, connection: Connection) -> Connection | None:
+        """A connection as it is now, which costs less than a list; None when it is there no more.
+
+        Raises:
+            NetlinkError: the kernel does not tell.
+        """
+        request = _REQUEST.pack(connection.family, socket.IPPROTO_TCP, 1 << (_TCP_INFO - 1), _STATES)
+        sequence = self._netlink.sequence()
+        self._netlink.send(message(_BY_FAMILY, 0, sequence, request + connection.identity))
+        while True:
+            for kind, number, body in self._netlink.receive():
+                if number != sequence:
+                    continue
+                if kind != NLMSG_ERROR:
+                    found = _read(body)
+                    return found if found is not None and body[1] in _OPEN else None
+                if (refused := -struct.unpack_from("=i", body)[0]) != errno.ENOENT:
+                    raise NetlinkError(refused, f"sockets: a connection is not told of: {os.strerror(refused)}")
+                return None
+
     def destroy(self, connection: Connection) -> None:
         """Close a connection: its program sees "connection aborted" and connects again.
 
@@ -136,7 +170,7 @@ def _read(answer: bytes) -> Connection | None:
     _expires, _received, queued = _QUEUES.unpack_from(answer, _ANSWER_HEAD + _ID_BYTES)
     rest = answer[_ANSWER_HEAD + _ID_BYTES + _QUEUES.size + 8 :]
     info = next((value for kind, value in attributes(rest) if kind == _TCP_INFO), b"").ljust(_INFO.size, b"\0")
-    unacknowledged, sent_ms, _, received_ms, acknowledged_ms = _INFO.unpack_from(info)
+    unacknowledged, sent_ms, _, received_ms, acknowledged_ms, received_bytes = _INFO.unpack_from(info)
     return Connection(
         identity,
         family,
@@ -146,4 +180,5 @@ def _read(answer: bytes) -> Connection | None:
         sent_ms,
         received_ms,
         acknowledged_ms,
+        received_bytes,
     )

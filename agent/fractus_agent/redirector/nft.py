@@ -19,9 +19,19 @@ import struct
 import subprocess
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from ipaddress import IPv4Address
 
-from fractus_agent.redirector.netlink import NLM_F_ACK, NLM_F_CREATE, Netlink, NetlinkError, attribute, message, nested
+from fractus_agent.redirector.netlink import (
+    NLA_F_NESTED,
+    NLM_F_ACK,
+    NLM_F_CREATE,
+    Netlink,
+    NetlinkError,
+    attribute,
+    message,
+    nested,
+)
 
 TABLE = "fractus"
 TARGETS, MARKS, COUNTERS, PEERS = "targets", "marks", "counters", "peers"
@@ -37,6 +47,12 @@ _SUBSYSTEM = 10 << 8
 _NEW_ELEMENTS, _DELETE_ELEMENTS, _BEGIN, _END = _SUBSYSTEM | 12, _SUBSYSTEM | 14, 0x10, 0x11
 _LIST_TABLE, _LIST_SET, _LIST_ELEMENTS, _LIST_ELEMENT = 1, 2, 3, 1
 _ELEMENT_KEY, _ELEMENT_DATA, _ELEMENT_TIMEOUT, _DATA_VALUE = 1, 2, 4, 1
+
+_MARK, _MARK_DATA = struct.Struct("=HHHHI"), _ELEMENT_DATA | NLA_F_NESTED
+"""A mark as the data of an element."""
+
+ENDPOINTS = 4096
+"""Endpoints whose messages are kept."""
 
 ELEMENTS_A_MESSAGE = 256
 """An attribute holds 64 KiB."""
@@ -55,6 +71,10 @@ class Endpoint:
     address: IPv4Address
     port: int
     protocol: int = socket.IPPROTO_TCP
+
+    def __hash__(self) -> int:
+        # Looked up all the time, and an address makes text of itself for its own hash.
+        return hash((int(self.address), self.port, self.protocol))
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,16 +260,12 @@ class Maps:
             NetlinkError: nothing was changed.
             RedirectFailed: the table was gone, and cannot be made again.
         """
-        lives = attribute(_ELEMENT_TIMEOUT, struct.pack(">Q", round(timeout_s * 1000)))
-        changes = _replaced(
-            TARGETS, [nested(_LIST_ELEMENT, _key(r.virtual), _data(_endpoint(r.target)), lives) for r in redirects]
-        )
+        timeout_ms = round(timeout_s * 1000)
+        changes = _replaced(TARGETS, [_led(redirect, timeout_ms) for redirect in redirects])
         if marks is not None:
-            changes += _replaced(
-                MARKS, [nested(_LIST_ELEMENT, _key(v), _data(struct.pack("=I", MARK_BASE | n))) for v, n in marks]
-            )
+            changes += _replaced(MARKS, [_marked(service, number) for service, number in marks])
         if peers is not None:
-            changes += _replaced(PEERS, [nested(_LIST_ELEMENT, _address(peer), lives) for peer in peers])
+            changes += _replaced(PEERS, [nested(_LIST_ELEMENT, _address(peer), _lives(timeout_ms)) for peer in peers])
         try:
             self._transact(changes)
         except NetlinkError as error:
@@ -278,14 +294,41 @@ def _replaced(name: str, elements: Sequence[bytes]) -> list[tuple[int, bytes]]:
     return [all_of_them, *((_NEW_ELEMENTS, header + nested(_LIST_ELEMENTS, *some)) for some in batches)]
 
 
+# Traffic is switched between the same endpoints again and again, and messages are most of a switch's work.
+@lru_cache(ENDPOINTS)
+def _led(redirect: Redirect, timeout_ms: int) -> bytes:
+    """An element of the map of redirects."""
+    to = _endpoint(redirect.target)
+    return nested(_LIST_ELEMENT, _key(redirect.virtual), _data(to), _lives(timeout_ms))
+
+
+@lru_cache(ENDPOINTS)
+def _key(endpoint: Endpoint) -> bytes:
+    address, port = endpoint.address.packed, struct.pack(">HH", endpoint.port, 0)
+    return nested(_ELEMENT_KEY, attribute(_DATA_VALUE, address + struct.pack("=Bxxx", endpoint.protocol) + port))
+
+
 def _endpoint(endpoint: Endpoint) -> bytes:
     """Address and port, each padded to a register of four bytes."""
     return endpoint.address.packed + struct.pack(">HH", endpoint.port, 0)
 
 
-def _key(endpoint: Endpoint) -> bytes:
-    value = endpoint.address.packed + struct.pack("=Bxxx", endpoint.protocol) + struct.pack(">HH", endpoint.port, 0)
-    return nested(_ELEMENT_KEY, attribute(_DATA_VALUE, value))
+def _marked(service: Endpoint, number: int) -> bytes:
+    """An element of the map of marks; all are equally long, so that only its end differs from what is kept."""
+    return _marked_first(service) + _mark(number)
+
+
+@lru_cache(ENDPOINTS)
+def _marked_first(service: Endpoint) -> bytes:
+    return nested(_LIST_ELEMENT, _key(service), _mark(0))[: -_MARK.size]
+
+
+def _mark(number: int) -> bytes:
+    return _MARK.pack(_MARK.size, _MARK_DATA, 8, _DATA_VALUE, MARK_BASE | number)
+
+
+def _lives(timeout_ms: int) -> bytes:
+    return attribute(_ELEMENT_TIMEOUT, struct.pack(">Q", timeout_ms))
 
 
 def _address(address: IPv4Address) -> bytes:

@@ -73,6 +73,7 @@ class Rig:
         self.tag = f"fx{os.getpid() % 100000}"
         self.processes: list[subprocess.Popen[str]] = []
         self.sockets: list[Netlink] = []
+        self.pods: list[str] = []
 
     def name(self, node: str) -> str:
         """The namespace of a node or pod."""
@@ -114,6 +115,22 @@ class Rig:
             run(*self.inside(node), "ip", "addr", "add", ip, "dev", link)
             run(*self.inside(node), "ip", "link", "set", link, "up")
 
+    def pod(self, name: str, net: str, at: str = "drone") -> str:
+        """Another pod on a node, in a network such as `10.86.0`."""
+        run("ip", "netns", "add", self.name(name))
+        self.pods.append(name)
+        self._link(at, name, f"{net}.1/24", name, "eth0", f"{net}.2/24")
+        run(*self.inside(name), "ip", "route", "add", "default", "via", f"{net}.1")
+        return name
+
+    def reaches(self, node: str, address: str, port: int) -> bool:
+        """Whether a connection can be made from a node or pod."""
+        program = f"import socket; socket.create_connection(({address!r}, {port}), 1).close()"
+        done = subprocess.run(
+            [*self.inside(node), sys.executable, "-c", program], capture_output=True, timeout=30, check=False
+        )
+        return done.returncode == 0
+
     def maps(self, node: str) -> Maps:
         """The maps of a node, whose table is made again when it is gone."""
         return Maps(self.netlink(node), lambda: create("fxl*", PORTS, self.inside(node), clients=node == "drone"))
@@ -151,7 +168,7 @@ class Rig:
                 process.stdout.close()
         for socket in self.sockets:
             socket.close()
-        for node in ("drone", "dpod", "edge", "epod", "cloud"):
+        for node in ("drone", "dpod", "edge", "epod", "cloud", *self.pods):
             subprocess.run(["ip", "netns", "del", self.name(node)], capture_output=True, check=False)
 
 

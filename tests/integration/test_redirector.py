@@ -8,13 +8,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from ipaddress import IPv4Address
 from pathlib import Path
 
 import pytest
 from fractus_agent.redirector import redirector as module
 from fractus_agent.redirector.conntrack import Conntrack
 from fractus_agent.redirector.redirector import Namespaces, Redirector
-from redirect_rig import DIRECT, VIP, Rig, rig, run
+from redirect_rig import DIRECT, DRONE, POD, VIP, Rig, rig, run
 
 pytestmark = pytest.mark.root
 
@@ -214,3 +215,62 @@ Maps(Netlink(NETLINK_NETFILTER), lambda: None).write([], None, 5.0)
         capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert "refused a batch: Operation not permitted" in done.stderr
+
+
+def test_only_its_callers_are_led(world: Rig, redirector: Redirector) -> None:
+    world.servers()
+    other = world.pod("other", "10.86.0")
+    redirector.serve([VIP], {VIP: frozenset({IPv4Address("10.87.0.2")})})
+    redirector.lead(TO_EDGE)
+    assert ask_once(world) == "edge"
+    assert ask_once(world, other) == "cloud"
+    assert ask_once(world, "drone") == "cloud"
+    # It may call from now on, as may a client in the host's network, which calls from the address of its route.
+    redirector.serve([VIP], {VIP: frozenset(map(IPv4Address, ("10.86.0.2", "10.90.0.1")))})
+    assert ask_once(world, other) == "edge"
+    assert ask_once(world, "drone") == "edge"
+    assert ask_once(world) == "cloud"
+    # Someone removes the table: it says who may call from its first moment on.
+    run(*world.inside("drone"), "nft", "flush", "ruleset")
+    redirector.admit([])  # which writes all but who may call
+    assert ask_once(world) == "cloud"
+    assert ask_once(world, other) == "edge"
+
+
+KUBE_PROXY = {
+    "nftables": [["nft", "table ip kube-proxy { chain pre { type nat hook prerouting priority -100; "
+                  "ip daddr 10.96.0.9 tcp dport 8080 dnat to 10.88.0.2:8080; }; }"]],
+    "iptables": [["iptables", "-t", "nat", "-A", "PREROUTING", "-d", "10.96.0.9", "-p", "tcp", "--dport", "8080",
+                  "-j", "DNAT", "--to-destination", "10.88.0.2:8080"]],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mode", KUBE_PROXY)
+def test_an_instance_takes_calls_over_links_alone(world: Rig, redirector: Redirector, mode: str) -> None:
+    world.servers()
+    for words in KUBE_PROXY[mode]:
+        run(*world.inside("edge"), *words)
+    stranger = world.pod("other", "10.86.0", at="edge")
+
+    def reached(address: str, node: str = stranger) -> bool:
+        return world.reaches(node, address, POD.port)
+
+    assert reached(str(POD.address))
+    assert reached("10.96.0.9")
+    edge = Redirector(world.maps("edge"), Conntrack(world.netlink("edge")), Namespaces(None))
+    edge.serve([], {POD: frozenset()})
+    assert not reached(str(POD.address))
+    assert not reached("10.96.0.9")
+    assert reached(str(POD.address), "edge"), "the node itself, whose kubelet asks whether the pod is ready"
+    # A drone has linked: its calls are led to the pod, and no other's are.
+    edge.serve([DIRECT], {POD: frozenset()})
+    edge.admit([DRONE])
+    edge.lead({DIRECT: POD})
+    redirector.lead(TO_EDGE)
+    assert ask_once(world) == "edge"
+    assert not reached(str(POD.address))
+    # It has left again.
+    edge.serve([], {POD: frozenset()})
+    redirector.serve([])
+    assert ask_once(world) == "cloud"
+    assert not reached(str(POD.address))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from fractus_core.api import Application, Depot, DirectLink, Drone, EdgeNode
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning.links import flown_path, plan_links
 from fractus_operator.cluster.pods import PodView
-from fractus_operator.reconcile.links import direct_links, link_name
+from fractus_operator.reconcile.links import direct_links, link_name, retargeted
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "links"
 INPUT = yaml.safe_load((GOLDEN / "input.yaml").read_text())
@@ -31,7 +32,7 @@ def pod(name: str, ip: str | None, *, ready: bool = True, terminating: bool = Fa
 
 
 def links(*pods: PodView, cluster_ip: str | None = "10.96.0.7") -> dict[str, Any]:
-    bodies = direct_links(APPLICATION, PLANNED, PATH, pods, {"traffic-image-checker": cluster_ip}.get)
+    bodies = direct_links(APPLICATION, PLAN, PLANNED, PATH, pods, cluster_ip={"traffic-image-checker": cluster_ip}.get)
     return {body["spec"]["node"]: body for body in bodies}
 
 
@@ -55,6 +56,34 @@ def test_the_target_is_the_pod_that_takes_calls() -> None:
     assert target(new, pod("c", "10.1.0.7", ready=False), pod("d", None)) == {"address": "10.1.0.6", "port": 8080}
     assert target(old) is None
     assert "target" not in links(pod("b", "10.1.0.6"))["edge-2"]["spec"]["services"][0], "a pod of another node"
+
+
+def caller(*pods: PodView) -> object:
+    return links(*pods)["edge-1"]["spec"]["services"][0]["callers"]
+
+
+def test_the_callers_are_the_pods_on_the_drone_that_may_call() -> None:
+    def viewer(name: str, ip: str | None, **state: bool) -> PodView:
+        state = {"ready": False, "finished": False, "terminating": False} | state
+        return PodView("city", name, "drone-1", {"fractus.dev/instance": "traffic-aerial-viewer"}, {}, ip=ip, **state)
+
+    old, new = viewer("a", "10.2.0.5", terminating=True), viewer("b", "10.2.0.6")
+    assert caller(viewer("a", None)) == [{"instance": "traffic-aerial-viewer"}]
+    assert caller(old, new) == [{"instance": "traffic-aerial-viewer", "address": "10.2.0.6"}], "it may call at once"
+    assert caller(old, viewer("b", "10.2.0.6", finished=True)) == [
+        {"instance": "traffic-aerial-viewer", "address": "10.2.0.5"}
+    ]
+    assert retargeted(links(old)["edge-1"]["spec"]["services"], [new])[0]["callers"] == caller(new)
+
+
+def test_what_names_no_caller_may_be_called_by_all_on_the_drone() -> None:
+    body = copy.deepcopy(INPUT["application"])
+    viewer = next(c for c in body["spec"]["components"] if c["name"] == "AerialViewer")
+    del viewer["egress"]
+    (first, *_) = direct_links(
+        Application.from_body(body), PLAN, PLANNED, PATH, [], cluster_ip={"traffic-image-checker": "10.96.0.7"}.get
+    )
+    assert "callers" not in first["spec"]["services"][0]
 
 
 def test_there_is_no_link_before_there_is_an_address_to_redirect() -> None:

@@ -19,9 +19,11 @@ from fractus_agent.links.interfaces.controller import InterfaceProblem
 from fractus_agent.links.interfaces.simulated import Plain
 from fractus_agent.links.pairing import LinkLost, Session
 from fractus_agent.links.peer import PeerEnd
+from fractus_agent.links.plans import callers, isolated
 from fractus_agent.redirector import nft
+from fractus_agent.redirector.nft import Endpoint
 from fractus_agent.redirector.redirector import Namespaces, Redirector
-from fractus_core.api.links import DirectLink
+from fractus_core.api.links import DirectLink, LinkedService
 from fractus_core.linking import PathMetrics, UnknownHeuristic
 
 PATH = PathMetrics(8.0, 8.0, 60.0, 60.0)
@@ -74,6 +76,32 @@ def test_the_session_of_a_drone_that_no_link_names_any_more_ends(monkeypatch: py
 
     with pytest.raises(LinkLost, match="no DirectLink names d1 any more"):
         asyncio.run(serve())
+
+
+SERVICE = {
+    "component": "Server", "instance": "server-e1", "virtual": {"address": "10.96.0.5", "port": 8080},
+    "target": {"address": "10.88.0.2", "port": 80},
+    "callers": [{"instance": "client", "address": "10.87.0.2"}, {"instance": "starting"}],
+}  # fmt: skip
+
+
+def test_each_end_is_told_whom_a_service_serves() -> None:
+    class Guards(Calls):
+        def serve(self, _services: object, callers: object) -> None:
+            self.callers = callers
+
+    services = [LinkedService.model_validate(SERVICE), LinkedService.model_validate({**SERVICE, "callers": []})]
+    named = link("e1")
+    object.__setattr__(named.spec, "services", services)
+    asked = Guards()
+    PeerEnd("e1", Path(), cast(Redirector, asked), lambda: None, lambda *_: None).plan((named,))
+    assert asked.callers == {Endpoint(IPv4Address("10.88.0.2"), 80): frozenset()}, "before any drone has linked"
+    virtual = Endpoint(IPv4Address("10.96.0.5"), 8080)
+    assert callers([named]) == {virtual: {IPv4Address("10.87.0.2")}}
+    # One that names no caller is open at both ends.
+    object.__setattr__(named.spec, "services", [services[0].model_copy(update={"callers": None})])
+    assert not callers([named])
+    assert not isolated([named])
 
 
 def test_redirects_that_are_kept_alive_no_more_are_a_failure() -> None:

@@ -33,7 +33,7 @@ from fractus_agent.links.evidence import Record, records
 from fractus_agent.links.heuristics import Heuristics
 from fractus_agent.links.lessons import Lessons
 from fractus_agent.links.pairing import Session
-from fractus_agent.links.plans import route_key, virtuals
+from fractus_agent.links.plans import callers, route_key, virtuals
 from fractus_agent.links.reports import DroneReport
 from fractus_agent.redirector.netlink import NetlinkError
 from fractus_agent.redirector.nft import Endpoint, RedirectFailed
@@ -137,7 +137,7 @@ class DroneEnd:
     async def _step(self) -> None:
         """One decision, and what it asks for."""
         # Those that are not planned any more as well, for as long as their traffic takes the link.
-        self._redirector.serve({*virtuals(self._links), *self._redirector.redirects})
+        self._redirector.serve({*virtuals(self._links), *self._redirector.redirects}, callers(self._links))
         situation = self._situation()
         actions = decide(situation, self._settings)
         self._explain(actions, situation)

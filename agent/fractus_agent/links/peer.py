@@ -13,7 +13,7 @@ from fractus_agent.links.acceptor import Acceptor
 from fractus_agent.links.addressing import link_address
 from fractus_agent.links.evidence import Record
 from fractus_agent.links.pairing import LinkLost, Session
-from fractus_agent.links.plans import route_key, target, virtual
+from fractus_agent.links.plans import isolated, route_key, target, virtual
 from fractus_agent.redirector.netlink import NetlinkError
 from fractus_agent.redirector.nft import Endpoint, RedirectFailed
 from fractus_agent.redirector.redirector import Redirector
@@ -62,6 +62,10 @@ class PeerEnd:
     def plan(self, links: tuple[DirectLink, ...]) -> None:
         """Take the DirectLinks of this node as they are now."""
         self._links = links
+        try:
+            self._serve_routes()
+        except (NetlinkError, RedirectFailed) as error:
+            log.warning("links: pods are not isolated before a drone comes (error=%s)", error)
         self._planned.set()
         self._planned = asyncio.Event()
 
@@ -151,7 +155,10 @@ class PeerEnd:
         return self._ports[service]
 
     def _write(self, targets: dict[Endpoint, Endpoint]) -> None:
-        served = {endpoint for routes in self._routes.values() for endpoint in routes}
-        self._redirector.serve(served)
+        self._serve_routes()
         self._redirector.admit(link_address(drone) for drone in self._routes)
         self._redirector.lead(targets)
+
+    def _serve_routes(self) -> None:
+        served = {endpoint for routes in self._routes.values() for endpoint in routes}
+        self._redirector.serve(served, isolated(self._links))

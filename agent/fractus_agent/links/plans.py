@@ -140,6 +140,22 @@ def virtuals(links: Iterable[DirectLink]) -> Iterator[Endpoint]:
                 yield found
 
 
+def callers(links: Iterable[DirectLink]) -> dict[Endpoint, frozenset[IPv4Address]]:
+    """Which clients on the drone may call services; without those that all may call."""
+    found: dict[Endpoint, frozenset[IPv4Address]] = {}
+    for service in (service for link in links for service in link.spec.services if service.callers is not None):
+        if (called := virtual(service)) is not None:
+            pods = (_endpoint(each.address, 0, "TCP") for each in service.callers or () if each.address is not None)
+            found[called] = found.get(called, frozenset()) | {pod.address for pod in pods if pod is not None}
+    return found
+
+
+def isolated(links: Iterable[DirectLink]) -> dict[Endpoint, frozenset[IPv4Address]]:
+    """The pods on the node that is asked which take nothing but what is led to them over a link."""
+    pods = (target(s) for link in links for s in link.spec.services if s.callers is not None)
+    return {pod: frozenset() for pod in pods if pod is not None}
+
+
 def _endpoint(address: str, port: int, protocol: str) -> Endpoint | None:
     try:
         return Endpoint(IPv4Address(address), port, _PROTOCOLS[protocol])

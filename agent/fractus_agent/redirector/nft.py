@@ -17,7 +17,7 @@ import errno
 import socket
 import struct
 import subprocess
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from ipaddress import IPv4Address
@@ -35,6 +35,7 @@ from fractus_agent.redirector.netlink import (
 
 TABLE = "fractus"
 TARGETS, MARKS, COUNTERS, PEERS = "targets", "marks", "counters", "peers"
+GUARDED, CALLERS = "guarded", "callers"
 
 MARK_MASK, MARK_BASE = 0xFFF00000, 0xF6A00000
 """Connections that we redirect carry a mark of this range; the lower bits number a service's stay on one path."""
@@ -113,16 +114,20 @@ def table(devices: str, ports: Ports, *, clients: bool) -> str:
     Args:
         devices: pattern of the names of direct interfaces, such as fxl*.
         ports: of the node itself that are open there.
-        clients: whether clients on this node are led; otherwise only what paired nodes send over these interfaces is.
+        clients: whether clients on this node are led; otherwise only what paired nodes send over these interfaces is, and
+            guarded pods of this node take nothing else.
     """
     key = "ip daddr . meta l4proto . th dport"
     only = "" if clients else f'iifname "{devices}" ip saddr @{PEERS} '
-    rules = f"{only}ct mark set {key} map @{MARKS}\n\t\t{only}dnat ip to {key} map @{TARGETS}"
+    # Who may not call a service is not led there; whether the base instance takes the call is not for this node to say.
+    guard = f"{key} @{GUARDED} ip saddr . {key} != @{CALLERS} return\n\t\t" if clients else ""
+    rules = f"{guard}{only}ct mark set {key} map @{MARKS}\n\t\t{only}dnat ip to {key} map @{TARGETS}"
     output = f"""
 	chain output {{
 		type nat hook output priority -150; policy accept;
 		{rules}
 	}}"""
+    closed = f"{key} @{GUARDED} ct state new ct mark and 0x{MARK_MASK:08x} != 0x{MARK_BASE:08x} drop\n\t\t"
     ours = f"ct mark and 0x{MARK_MASK:08x} == 0x{MARK_BASE:08x}"
     return f"""table ip {TABLE}
 delete table ip {TABLE}
@@ -140,6 +145,12 @@ table ip {TABLE} {{
 	set {PEERS} {{
 		type ipv4_addr
 		flags timeout
+	}}
+	set {GUARDED} {{
+		type ipv4_addr . inet_proto . inet_service
+	}}
+	set {CALLERS} {{
+		type ipv4_addr . ipv4_addr . inet_proto . inet_service
 	}}
 	chain prerouting {{
 		type nat hook prerouting priority -150; policy accept;
@@ -166,7 +177,7 @@ table ip {TABLE} {{
 	}}
 	chain passing {{
 		type filter hook forward priority -5; policy accept;
-		iifname != "{devices}" oifname != "{devices}" accept
+		{"" if clients else closed}iifname != "{devices}" oifname != "{devices}" accept
 		ct state established,related accept
 		{ours} oifname "{devices}" accept
 		{ours} iifname "{devices}" ip saddr @{PEERS} accept
@@ -236,6 +247,7 @@ class Maps:
     def __init__(self, netlink: Netlink, make_table: Callable[[], None]) -> None:
         self._netlink = netlink
         self._make_table = make_table
+        self._guards: list[tuple[int, bytes]] = []
 
     def write(
         self,
@@ -243,6 +255,7 @@ class Maps:
         marks: Iterable[tuple[Endpoint, int]] | None,
         timeout_s: float,
         peers: Iterable[IPv4Address] | None = None,
+        callers: Mapping[Endpoint, Collection[IPv4Address]] | None = None,
     ) -> None:
         """Replace the elements in one transaction: every packet sees either the old ones or the new.
 
@@ -255,6 +268,7 @@ class Maps:
                 marks as they are.
             timeout_s: for how long redirects hold, and peers may use them, unless they are set again.
             peers: whose connections over direct interfaces are led on; None leaves them as they are.
+            callers: by guarded endpoint, which clients are led; None leaves them as they are.
 
         Raises:
             NetlinkError: nothing was changed.
@@ -266,13 +280,22 @@ class Maps:
             changes += _replaced(MARKS, [_marked(service, number) for service, number in marks])
         if peers is not None:
             changes += _replaced(PEERS, [nested(_LIST_ELEMENT, _address(peer), _lives(timeout_ms)) for peer in peers])
+        guards = self._guards
+        if callers is not None:
+            guards = _replaced(GUARDED, [nested(_LIST_ELEMENT, _key(each)) for each in callers])
+            guards += _replaced(
+                CALLERS,
+                [nested(_LIST_ELEMENT, _key(to, client)) for to, clients in callers.items() for client in clients],
+            )
+            changes += guards
         try:
             self._transact(changes)
         except NetlinkError as error:
             if error.errno != errno.ENOENT:
                 raise
             self._make_table()
-            self._transact(changes)
+            self._transact(changes if callers is not None else [*guards, *changes])
+        self._guards = guards
 
     def _transact(self, changes: Sequence[tuple[int, bytes]]) -> None:
         numbered = [(kind, self._netlink.sequence(), body) for kind, body in changes]
@@ -303,8 +326,10 @@ def _led(redirect: Redirect, timeout_ms: int) -> bytes:
 
 
 @lru_cache(ENDPOINTS)
-def _key(endpoint: Endpoint) -> bytes:
+def _key(endpoint: Endpoint, client: IPv4Address | None = None) -> bytes:
     address, port = endpoint.address.packed, struct.pack(">HH", endpoint.port, 0)
+    if client is not None:
+        address = client.packed + address
     return nested(_ELEMENT_KEY, attribute(_DATA_VALUE, address + struct.pack("=Bxxx", endpoint.protocol) + port))
 
 

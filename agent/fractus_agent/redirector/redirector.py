@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from ipaddress import IPv4Address
 from pathlib import Path
+from types import MappingProxyType
 
 from fractus_agent.redirector.conntrack import Conntrack
 from fractus_agent.redirector.habits import Exchange, Habits
@@ -30,6 +31,10 @@ REFRESH_S = 1.5
 DRAIN_TIMEOUT_S = 1.5
 DRAIN_POLL_S = 0.002
 LEARN_S = 0.1
+
+Callers = Mapping[Endpoint, frozenset[IPv4Address]]
+"""By guarded endpoint, who may call it."""
+NO_GUARDS: Callers = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +122,7 @@ class Redirector:
         self._redirects: dict[Endpoint, Endpoint] = {}
         self._numbers: dict[Endpoint, int] = {}
         self._peers: frozenset[IPv4Address] = frozenset()
+        self._callers = NO_GUARDS
         self._left: list[_Left] = []
         self._draining: set[int] = set()
         self._last_number = 0
@@ -141,22 +147,28 @@ class Redirector:
             self._peers = before
             raise
 
-    def serve(self, services: Iterable[Endpoint]) -> None:
+    def serve(self, services: Iterable[Endpoint], callers: Callers = NO_GUARDS) -> None:
         """Number the services that clients on this node connect to; redirects of others end.
+
+        Args:
+            services: where clients connect to.
+            callers: who may, by guarded endpoint: on a node with clients of services, on others of pods that take nothing but
+                what comes over a link.
 
         Raises:
             NetlinkError: the kernel refused; nothing was changed.
             RedirectFailed: our table cannot be made.
         """
         wanted = set(services)
-        if wanted == self._numbers.keys():
+        if wanted == self._numbers.keys() and callers == self._callers:
             return
         numbers: dict[Endpoint, int] = {}
         for service in sorted(wanted):
             # A number stays with its service, for connections that are there carry it.
             numbers[service] = self._numbers.get(service) or self._fresh(numbers)
         ended = self._paths({service: n for service, n in self._numbers.items() if service not in numbers})
-        self._write({virtual: to for virtual, to in self._redirects.items() if virtual in numbers}, numbers)
+        self._write({virtual: to for virtual, to in self._redirects.items() if virtual in numbers}, numbers, callers)
+        self._callers = dict(callers)
         self._left += ended
         self._leave(ended)
 
@@ -237,12 +249,18 @@ class Redirector:
             if self._last_number not in used:
                 return self._last_number
 
-    def _write(self, redirects: Mapping[Endpoint, Endpoint], numbers: Mapping[Endpoint, int] | None) -> None:
+    def _write(
+        self,
+        redirects: Mapping[Endpoint, Endpoint],
+        numbers: Mapping[Endpoint, int] | None,
+        callers: Callers | None = None,
+    ) -> None:
         self._maps.write(
             (Redirect(virtual, to) for virtual, to in redirects.items()),
             numbers.items() if numbers is not None else None,
             LEASE_S,
             self._peers,
+            callers,
         )
         self._redirects = dict(redirects)
         self._numbers = dict(numbers) if numbers is not None else self._numbers

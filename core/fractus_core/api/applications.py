@@ -156,6 +156,10 @@ class ApplicationSpec(Model):
             raise KeyError(name)
         return found
 
+    def callers(self, name: str) -> set[str]:
+        """The components that a component says it is called by, or that say they call it; none where all may call it."""
+        return {other.name for other in self.components if name in other.egress}.union(self.component(name).ingress)
+
 
 class ApplicationStatus(OpenModel):
     """Where the application stands."""

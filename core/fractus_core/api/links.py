@@ -36,6 +36,13 @@ class TargetAddress(OpenModel):
     port: int = Field(ge=1, le=65535, description="The pod's port.")
 
 
+class Caller(OpenModel):
+    """An instance on the drone that may call a service."""
+
+    instance: str
+    address: str | None = Field(default=None, max_length=45, description="Its pod's IP; unset while there is none.")
+
+
 class LinkedService(OpenModel):
     """A port of a hybrid component that the drone's components can reach over the link."""
 
@@ -43,6 +50,10 @@ class LinkedService(OpenModel):
     instance: str = Field(description="Its instance on the node that is asked.")
     virtual: VirtualAddress
     target: TargetAddress | None = Field(default=None, description="Unset while no pod of the instance is ready.")
+    callers: tuple[Caller, ...] | None = Field(
+        default=None,
+        description="Who on the drone may call it over the link; unset where the component names no caller, and all may.",
+    )
 
 
 class DirectLinkSpec(OpenModel):

@@ -22,7 +22,7 @@ def network_policies(application: Application, plan: DeploymentPlanSpec) -> list
     """
     policies = []
     for component in application.spec.components:
-        callers = sorted(_callers(application, component))
+        callers = sorted(application.spec.callers(component.name))
         if not component.container.ports or not callers:
             continue
         called = {labels.APPLICATION_LABEL: label_value(application.name)}
@@ -44,12 +44,6 @@ def network_policies(application: Application, plan: DeploymentPlanSpec) -> list
             policies.append(_policy(application, component, f"{name}.edge", over_links, link))
         policies.append(_policy(application, component, name, selector, sender))
     return policies
-
-
-def _callers(application: Application, component: Component) -> set[str]:
-    """The components that a component says it is called by, or that say they call it."""
-    calling = {other.name for other in application.spec.components if component.name in other.egress}
-    return calling.union(component.ingress)
 
 
 def _policy(application: Application, component: Component, name: str, selector: Body, sender: Body) -> Body:

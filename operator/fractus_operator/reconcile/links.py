@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterable, Sequence
 
 from fractus_core.api import Application
 from fractus_core.api.geometry import Position
-from fractus_core.api.links import DirectLinkSpec, LinkedService, TargetAddress, VirtualAddress
+from fractus_core.api.links import Caller, DirectLinkSpec, LinkedService, TargetAddress, VirtualAddress
 from fractus_core.api.names import object_name
-from fractus_core.api.plans import ApplicationReference, PlannedInstance
+from fractus_core.api.plans import ApplicationReference, DeploymentPlanSpec, PlannedInstance
 from fractus_core.planning.links import PlannedLink
 
 from fractus_operator.cluster import kinds, labels
@@ -20,15 +20,18 @@ from fractus_operator.reconcile.builders import labels_of
 
 def direct_links(
     application: Application,
+    plan: DeploymentPlanSpec,
     planned: Iterable[PlannedLink],
     path: tuple[Position, ...],
     pods: Sequence[PodView],
+    *,
     cluster_ip: Callable[[str], str | None],
 ) -> list[Body]:
     """The DirectLinks of an application; none for a link whose services have no addresses yet.
 
     Args:
         application: Whose links they are.
+        plan: Where its instances run.
         planned: The links.
         path: What its drone flies.
         pods: Its pods as they are.
@@ -37,7 +40,9 @@ def direct_links(
     bodies = []
     for link in planned:
         services = tuple(
-            service for placed in link.instances for service in _services(application, placed, pods, cluster_ip)
+            service
+            for placed in link.instances
+            for service in _services(application, placed, _callers(application, plan, placed), pods, cluster_ip)
         )
         if services:
             bodies.append(_direct_link(application, link, path, services))
@@ -75,6 +80,7 @@ def _direct_link(
 def _services(
     application: Application,
     placed: PlannedInstance,
+    callers: Sequence[str] | None,
     pods: Sequence[PodView],
     cluster_ip: Callable[[str], str | None],
 ) -> Iterable[LinkedService]:
@@ -90,17 +96,39 @@ def _services(
             instance=placed.instance,
             virtual=VirtualAddress(address=address, port=port.port, protocol=port.protocol),
             target=TargetAddress(address=target, port=port.port) if target is not None else None,
+            callers=_addressed(callers, pods) if callers is not None else None,
         )
 
 
+def _callers(application: Application, plan: DeploymentPlanSpec, placed: PlannedInstance) -> list[str] | None:
+    """The instances on the drone that may call an instance; None where all may."""
+    components = application.spec.callers(placed.component)
+    if not components:
+        return None
+    return [p.instance for p in plan.placements if p.component in components and p.placement == "drone"]
+
+
+def _addressed(instances: Iterable[str], pods: Sequence[PodView]) -> tuple[Caller, ...]:
+    return tuple(Caller(instance=instance, address=_source(instance, pods)) for instance in instances)
+
+
+def _source(instance: str, pods: Iterable[PodView]) -> str | None:
+    """The address that an instance calls from, which it may do before it is ready; of two the one that does not end."""
+    there = [pod for pod in pods if pod.instance == instance and pod.ip and not pod.finished]
+    return min(there, key=lambda pod: (pod.terminating, pod.ip)).ip if there else None
+
+
 def retargeted(services: Iterable[Body], pods: Sequence[PodView]) -> list[Body]:
-    """The services of a DirectLink as it is, with the targets that there are now."""
+    """The services of a DirectLink as it is, with the addresses that there are now."""
     found = []
     for service in services:
         address = _target(service["instance"], pods)
-        target = {"address": address, "port": service["virtual"]["port"]}
-        rest = {name: value for name, value in service.items() if name != "target"}
-        found.append({**rest, "target": target} if address is not None else rest)
+        rest = {name: value for name, value in service.items() if name not in ("target", "callers")}
+        if address is not None:
+            rest["target"] = {"address": address, "port": service["virtual"]["port"]}
+        if (callers := service.get("callers")) is not None:
+            rest["callers"] = [each.to_dict() for each in _addressed((c["instance"] for c in callers), pods)]
+        found.append(rest)
     return found
 
 

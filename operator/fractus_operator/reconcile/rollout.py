@@ -155,7 +155,7 @@ class Rollout:
             body = self._children.get(kinds.SERVICE, (namespace, service))
             return body["spec"].get("clusterIP") if body is not None else None
 
-        return direct_links(application, planned, path, pods, cluster_ip)
+        return direct_links(application, decided, planned, path, pods, cluster_ip=cluster_ip)
 
     async def follow_pods(self, key: Key, plan: DeploymentPlanSpec, pods: Sequence[PodView]) -> None:
         """Bring the addresses in what was rolled out up to date with the pods, and change nothing else.

@@ -6,7 +6,7 @@ import math
 
 from fractus_vehicle.breadcrumbs import Point
 from fractus_vehicle.control import Axis
-from fractus_vehicle.shaping import BRAKING_SHARE, shape_velocity
+from fractus_vehicle.shaping import BRAKING_SHARE, shape_velocity, sqrt_controller
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
 _SAMPLES = 64
@@ -41,10 +41,16 @@ class SplineLeg:
         """The greatest speed at each sample of the curve, so that bends, climbs and the end can be braked for."""
         allowed = [self._local_limit(v, step / _SAMPLES) for step in range(_SAMPLES + 1)]
         allowed[-1] = 0.0 if self._stops else allowed[-1]
-        braking = 2.0 * BRAKING_SHARE * v.control.limits.accel_mps2
+        limits, left_m = v.control.limits, 0.0
+        braking = 2.0 * BRAKING_SHARE * limits.accel_mps2
         for step in range(_SAMPLES - 1, -1, -1):
             way = math.dist(self.at(step / _SAMPLES), self.at((step + 1) / _SAMPLES))
             allowed[step] = min(allowed[step], math.sqrt(allowed[step + 1] ** 2 + braking * way))
+            left_m += way
+            if self._stops:  # the last metres are those of a position that is flown to: the jerk allows no more
+                gain = 0.5 * limits.jerk_mps3 / limits.accel_mps2
+                slower = sqrt_controller(left_m, gain, BRAKING_SHARE * limits.accel_mps2, CONTROL_STEP_S)
+                allowed[step] = min(allowed[step], slower)
         return allowed
 
     def at(self, share: float) -> Point:
@@ -78,14 +84,18 @@ class SplineLeg:
         at = self._share * _SAMPLES
         low = min(int(at), _SAMPLES - 1)
         wanted = self._allowed_mps[low] + (at - low) * (self._allowed_mps[low + 1] - self._allowed_mps[low])
+        wanted = max(wanted, _SLOWEST_MPS)
         self._accel_mps2 = shape_velocity(
-            max(wanted, _SLOWEST_MPS),
+            wanted,
             self._speed_mps,
             self._accel_mps2,
             accel_max=control.limits.accel_mps2,
             jerk_max=control.limits.jerk_mps3,
             dt=dt,
         )
+        if self._speed_mps + self._accel_mps2 * dt > wanted:
+            # The profile can be braked along as it is; shaped once more, the vehicle would arrive too fast.
+            self._accel_mps2 = max((wanted - self._speed_mps) / dt, -control.limits.accel_mps2)
         self._speed_mps = max(self._speed_mps + self._accel_mps2 * dt, 0.0)
         slope, bend = self._slopes(self._share)
         pace = self._speed_mps / max(math.hypot(*slope), 1e-6)

@@ -59,7 +59,10 @@ class GuidedFlight(Flight):
         v.begin_takeoff(down)
 
     def go_to(self, v: VehicleState, north: float, east: float, down: float) -> None:
-        """Fly to a local position."""
+        """Fly to a local position; while paused, once that is over."""
+        if self.paused:
+            self._resume = (north, east, down)
+            return
         self.use(v, Task.POSITION)
         self.task = Task.POSITION
         self.updated_s = v.time_s
@@ -71,7 +74,9 @@ class GuidedFlight(Flight):
         velocity: tuple[float, float, float],
         position: tuple[float, float, float] | None = None,
     ) -> None:
-        """Fly with a velocity, or with a position that moves with it, until GUID_TIMEOUT."""
+        """Fly with a velocity, or with a position that moves with it, until GUID_TIMEOUT; not while paused."""
+        if self.paused:
+            return
         self.use(v, Task.VELOCITY)
         self.task = Task.VELOCITY
         self.updated_s = v.time_s
@@ -127,9 +132,9 @@ class GuidedFlight(Flight):
         if paused and not self.paused:
             self._resume = (*v.control.target, v.control.target_down) if self.task is Task.POSITION else None
             self.stop(v)
-        elif not paused and self.paused and self._resume is not None:
+        before, self.paused = self.paused, paused
+        if before and not paused and self._resume is not None:
             self.go_to(v, *self._resume)
-        self.paused = paused
 
     def step(self, v: VehicleState) -> None:
         """Follow the target; stop when it is too old."""
